@@ -1,0 +1,1 @@
+"""jtqd: configuration, fixed-step loop, recorder, supervision and the command lines."""

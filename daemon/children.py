@@ -1,0 +1,124 @@
+"""The supervisor's child processes: started lean, spoken to in JSON lines, ended in order."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from typing import Any
+
+
+class ChildError(Exception):
+    """A child process ended or kept silent where an answer was due; the message is for the operator."""
+
+
+_LIBC = ctypes.CDLL(None)
+_PR_SET_PDEATHSIG = 1
+
+
+def _die_with_parent() -> None:
+    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+
+
+class Child:
+    """A Python module as a process of its own, with JSON lines on its standard input and output.
+
+    Its standard error is ours. It gets SIGTERM when we die, however we die.
+    """
+
+    def __init__(self, module: str, arguments: Sequence[str] = (), *, name: str | None = None) -> None:
+        self.name = name or module
+        self.process = subprocess.Popen(
+            # -P: no file of the working directory may stand in for one of our packages.
+            [sys.executable, "-P", "-m", module, *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            preexec_fn=_die_with_parent,  # noqa: PLW1509 - the supervisor has no threads
+        )
+        assert self.process.stdout is not None
+        os.set_blocking(self.process.stdout.fileno(), False)
+        self._pending = b""
+
+    @property
+    def pid(self) -> int:
+        """Process-ID."""
+        return self.process.pid
+
+    def alive(self) -> bool:
+        """True while the process runs."""
+        return self.process.poll() is None
+
+    def tell(self, message: Any) -> None:
+        """Send one JSON line; a child that has gone is noticed by whoever waits for its answer."""
+        assert self.process.stdin is not None
+        try:
+            self.process.stdin.write(json.dumps(message).encode() + b"\n")
+            self.process.stdin.flush()
+        except (BrokenPipeError, ValueError):
+            pass
+
+    def end_of_input(self) -> None:
+        """Nothing more will be told."""
+        assert self.process.stdin is not None
+        try:
+            self.process.stdin.close()
+        except BrokenPipeError:
+            pass
+
+    def poll_answer(self) -> dict[str, Any] | None:
+        """The next JSON line if one is there."""
+        assert self.process.stdout is not None
+        chunk = self.process.stdout.read()
+        if chunk:
+            self._pending += chunk
+        line, newline, rest = self._pending.partition(b"\n")
+        if not newline:
+            return None
+        self._pending = rest
+        answer = json.loads(line)
+        if not isinstance(answer, dict):
+            raise ChildError(f"{self.name} answered {line[:80]!r}")
+        return answer
+
+    def answer(self, timeout_s: float) -> dict[str, Any]:
+        """Wait for the next JSON line.
+
+        Raises:
+            ChildError: the process ended or the time is up.
+        """
+        assert self.process.stdout is not None
+        deadline = time.monotonic() + timeout_s
+        while True:
+            found = self.poll_answer()
+            if found is not None:
+                return found
+            left = deadline - time.monotonic()
+            if left <= 0:
+                raise ChildError(f"{self.name} did not answer within {timeout_s:g} s")
+            if not self.alive() and not select.select([self.process.stdout], [], [], 0)[0]:
+                raise ChildError(f"{self.name} ended with exit status {self.process.returncode}")
+            select.select([self.process.stdout], [], [], min(left, 0.2))
+            if not self.alive():
+                found = self.poll_answer()
+                if found is not None:
+                    return found
+                raise ChildError(f"{self.name} ended with exit status {self.process.returncode}")
+
+    def end(self, timeout_s: float = 5.0) -> int | None:
+        """SIGTERM, wait, SIGKILL if it must be; returns the exit status (None if it had to be killed)."""
+        if self.alive():
+            self.process.send_signal(signal.SIGTERM)
+            # A stopped process would sleep through its SIGTERM.
+            self.process.send_signal(signal.SIGCONT)
+        try:
+            return self.process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+            return None

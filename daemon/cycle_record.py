@@ -1,0 +1,107 @@
+"""The record of one cycle as it lies in shared memory: one fixed-size struct, written by the loop, read by the recorder.
+
+Little endian, 536 bytes, no padding decided by a compiler:
+
+    header   index, times, flags and counters of the cycle
+    joints   two blocks of the same layout: inputs in SI units and every stage of the estimate
+    frames   up to 12 frames as `struct can_frame` with their kernel stamps, in order of arrival
+    tail     the index again: a reader that finds head and tail different has met a half-written record
+
+Quantities are NaN where they are not known in that cycle (an input that did not come, a stage that was not computed).
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import NamedTuple
+
+JOINT_FORMAT = "11d4H"
+HEADER_FORMAT = "QqqIIiI8B"
+FRAME_CAPACITY = 12
+
+HEADER = struct.Struct("<" + HEADER_FORMAT)
+JOINT = struct.Struct("<" + JOINT_FORMAT)
+HEAD = struct.Struct("<" + HEADER_FORMAT + JOINT_FORMAT + JOINT_FORMAT)
+"""Header and both joints in one call: packing them together costs a third of packing them apart."""
+
+FRAMES_OFFSET = HEAD.size
+STAMPS_OFFSET = FRAMES_OFFSET + 16 * FRAME_CAPACITY
+TAIL_OFFSET = STAMPS_OFFSET + 8 * FRAME_CAPACITY
+TAIL = struct.Struct("<Q")
+RECORD_SIZE = TAIL_OFFSET + TAIL.size
+
+FLAG_COMPLETE = 0x01
+"""Every expected input of this cycle arrived before its deadline."""
+FLAG_PUBLISHED = 0x02
+"""The estimate PDO of this cycle was handed to the socket."""
+FLAG_BEFORE_NEXT_SYNC = 0x04
+"""... and that happened before the next SYNC was due."""
+FLAG_SYNC_CONFIRMED = 0x08
+"""The SYNC's own echo came back, so `sync_realtime_ns` is its send time on the wire and not the time of the call."""
+
+
+class Header(NamedTuple):
+    """Times in integer ns; `index` counts cycles since the start, missed slots included."""
+
+    index: int
+    sync_monotonic_ns: int
+    sync_realtime_ns: int
+    flags: int
+    work_ns: int
+    """CPU and wall time from the wake-up for the inputs to the end of the cycle's work [ns]."""
+    late_ns: int
+    """SYNC's send time minus its slot on the grid [ns]."""
+    missed: int
+    """Slots missed so far."""
+    sync_counter: int
+    frame_count: int
+    """Frames stored in this record."""
+    frames_left_out: int
+    """Frames of this cycle that did not fit (255 = that many or more)."""
+    stale_inputs: int
+    late_frames: int
+    duplicate_frames: int
+    rejected_frames: int
+    """Frames with our identifiers and a wrong length, or 29-bit or remote frames."""
+    spare: int
+
+
+class JointRecord(NamedTuple):
+    """SI units, signs of docs/architecture.md; joint side unless the name says motor."""
+
+    current_a: float
+    motor_position_rad: float
+    motor_velocity_rad_s: float
+    link_position_rad: float
+    sensor_torque_nm: float
+    torque_nm: float
+    sigma_nm: float
+    tob_nm: float
+    efficiency_nm: float
+    network_nm: float
+    dt_s: float
+    statusword: int
+    status: int
+    sensor_status: int
+    input_flags: int
+    """Bit n set: input n of this joint (0 TPDO1, 1 TPDO2, 2 sensor) is of this cycle."""
+
+
+def header_of(record: bytes | memoryview) -> Header:
+    """Header of one record of `RECORD_SIZE` bytes."""
+    return Header._make(HEADER.unpack_from(record, 0))
+
+
+def joint_of(record: bytes | memoryview, joint: int) -> JointRecord:
+    """Block of joint 1 or 2 of one record."""
+    return JointRecord._make(JOINT.unpack_from(record, HEADER.size + (joint - 1) * JOINT.size))
+
+
+def frames_of(record: bytes | memoryview) -> list[tuple[bytes, int]]:
+    """Frames of one record as (16 bytes of `struct can_frame`, CLOCK_REALTIME stamp in ns), in order of arrival."""
+    count = header_of(record).frame_count
+    stamps = struct.unpack_from(f"<{count}q", record, STAMPS_OFFSET)
+    view = memoryview(record)
+    return [
+        (bytes(view[FRAMES_OFFSET + 16 * n : FRAMES_OFFSET + 16 * n + 16]), stamp) for n, stamp in enumerate(stamps)
+    ]

@@ -1,0 +1,43 @@
+"""`jtq`, the toolbox: finds the subcommand's module and hands the arguments over; nothing else is loaded."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import sys
+
+COMMANDS = {
+    "sim": ("sim_can.cli", "emulate the bench on a bus, or play a measured run on it"),
+    "bus-load": ("daemon.bus_load_command", "worst-case load of the bus by a configuration"),
+    "measured": ("sysid.measured", "estimate measured runs before and after fitting the joint file's friction"),
+}
+"""Subcommand -> (module with `main(argv) -> int`, one line of help)."""
+
+
+def _help() -> str:
+    width = max(map(len, COMMANDS))
+    rows = "\n".join(f"  {name:<{width}}  {text}" for name, (_, text) in COMMANDS.items())
+    return (
+        f"usage: jtq COMMAND ...\n\nToolbox around jtqd.\n\ncommands:\n{rows}\n\n"
+        "examples:\n  jtq sim --bus vcan0\n  jtq bus-load\n  jtq COMMAND --help\n"
+    )
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run a subcommand; returns its exit status (0 done, 1 failure, 2 usage, 3 done with findings or loss)."""
+    arguments = sys.argv[1:] if argv is None else argv
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(_help(), end="")
+        return 0 if arguments else 2
+    command = COMMANDS.get(arguments[0])
+    if command is None:
+        near = difflib.get_close_matches(arguments[0], COMMANDS, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        print(f"jtq: no command {arguments[0]!r}{hint} (jtq --help lists them)", file=sys.stderr)
+        return 2
+    status = importlib.import_module(command[0]).main(arguments[1:])
+    return int(status or 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,213 @@
+"""The loop process: everything is made and warmed up first, then one cycle after the other until told to stop.
+
+Started by the supervisor as `python -m daemon.loop` with a JSON request as its only argument. It answers on standard output
+with one JSON line when it is ready, reads the boot report as one JSON line from standard input, runs, and ends with one JSON
+line of results. It has no second thread, logs nothing while it runs, and shares only memory with other processes.
+"""
+
+from __future__ import annotations
+
+import json
+import select
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from daemon import realtime
+from daemon.config import Config, JointConfig, load_config
+from daemon.cycle import Cycle, JointInputs
+from daemon.cycle_record import RECORD_SIZE
+from daemon.grid import Grid
+from daemon.intake import InputPdo, Intake
+from daemon.ring import Ring
+from daemon.snapshot import Snapshot
+from drivers.can_filter import CanFilter, look_alikes
+from drivers.devices import drive_tpdo1, drive_tpdo2, sensor_tpdo1, sensor_tpdo2
+from drivers.errors import BusError, BusGone
+from drivers.frame_socket import FrameSocket, open_frame_socket
+from drivers.pdo import PdoMap
+from estimator.checked import ConfigError
+from estimator.joint_estimator import JointEstimator
+from estimator.network import NetworkError, TorqueNetwork
+
+_WARM_UP_STEPS = 300
+
+
+class _Stop:
+    """Set by SIGTERM and SIGINT; asked once per cycle."""
+
+    def __init__(self) -> None:
+        self.requested = False
+        signal.signal(signal.SIGTERM, self._handle)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the supervisor decides
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        self.requested = True
+
+
+def input_pdos(config: Config) -> list[InputPdo]:
+    """Expected PDOs: both TPDOs of each drive, then one per sensor channel in use."""
+
+    def pdo(pdo_map: PdoMap, node: int, what: str) -> InputPdo:
+        return InputPdo(pdo_map.cob_id, pdo_map.length, pdo_map.layout, node, f"{pdo_map.cob_id:03X}h {what}")
+
+    pdos = []
+    for joint in config.joints:
+        pdos.append(pdo(drive_tpdo1(joint.node_id), joint.node_id, f"drive {joint.node_id} TPDO1"))
+        pdos.append(pdo(drive_tpdo2(joint.node_id), joint.node_id, f"drive {joint.node_id} TPDO2"))
+    if config.sensor is not None:
+        node = config.sensor.node_id
+        for channel in config.sensor.channels:
+            pdo_map = sensor_tpdo1(node) if channel == 1 else sensor_tpdo2(node)
+            pdos.append(pdo(pdo_map, node, f"sensor {node} channel {channel}"))
+    return pdos
+
+
+def build_estimator(config: Config, joint: JointConfig) -> JointEstimator:
+    """Estimator of one joint as configured; raises ConfigError or NetworkError."""
+    network = None
+    if joint.network is not None:
+        network = TorqueNetwork(joint.network.path, sha256=joint.network.sha256)
+    return JointEstimator(joint.joint, config.estimator, network)
+
+
+def _joint_inputs(config: Config, report: dict[str, Any]) -> list[JointInputs]:
+    """Indices into `input_pdos` and the scaling that the boot read from the devices."""
+    result = []
+    for number, joint in enumerate(config.joints):
+        drive = report["nodes"][str(joint.node_id)]["scaling"]
+        sensor_index, sensor_nm = None, 0.0
+        if joint.sensor_channel is not None and config.sensor is not None:
+            scaling = report["nodes"][str(config.sensor.node_id)]["scaling"]
+            sensor_index = 4 + config.sensor.channels.index(joint.sensor_channel)
+            sensor_nm = scaling["nm_per_unit"][str(joint.sensor_channel)]
+        result.append(
+            JointInputs(
+                position=2 * number,
+                motion=2 * number + 1,
+                sensor=sensor_index,
+                motor_rad_per_count=drive["motor_rad_per_count"],
+                motor_rad_s_per_unit=drive["motor_rad_s_per_unit"],
+                link_rad_per_count=drive["link_rad_per_count"],
+                ampere_per_unit=drive["ampere_per_unit"],
+                sensor_nm_per_unit=sensor_nm,
+            )
+        )
+    return result
+
+
+def loop_filters(pdos: list[InputPdo], nodes: list[int]) -> list[CanFilter]:
+    """SYNC (own echo and foreign ones), the inputs, the nodes' heartbeats: nothing else wakes the loop.
+
+    Each in every frame format, so that 29-bit and remote frames under our identifiers are seen and counted.
+    """
+    wanted = [0x080, *(pdo.cob_id for pdo in pdos), *(0x700 + node for node in nodes)]
+    return [look_alikes(cob_id) for cob_id in wanted]
+
+
+def warm_up(estimators: list[JointEstimator]) -> None:
+    """Run every estimator often enough that caches, allocators and the interpreter's specialisation have settled."""
+    for estimator in estimators:
+        for n in range(_WARM_UP_STEPS):
+            estimator.step(1e-3, 1.0 + 0.01 * (n % 7), 0.1 * n, 100.0, 0.001 * n)
+        estimator.reset()
+
+
+def run(cycle: Cycle, grid: Grid, stop: Callable[[], bool], duration_s: float | None) -> None:
+    """Cycle until `stop()` or the duration has passed ."""
+    end_ns = None if duration_s is None else grid.slot_ns + round(duration_s * 1e9)
+    monotonic_ns, sleep = time.monotonic_ns, time.sleep
+    while not stop():
+        pause = grid.slot_ns - monotonic_ns()
+        if pause > 0:
+            sleep(pause * 1e-9)
+        now = monotonic_ns()
+        if grid.too_late(now):
+            cycle.skip(grid.advance(now) + 1)
+            grid.missed += 1
+            continue
+        if end_ns is not None and grid.slot_ns >= end_ns:
+            break
+        cycle.begin()
+        cycle.gather()
+        cycle.observe()
+        cycle.publish()
+        cycle.record()
+        cycle.skip(grid.advance(monotonic_ns()))
+
+
+def _answer(**content: Any) -> None:
+    print(json.dumps(content), flush=True)
+
+
+def _build(config: Config, request: dict[str, Any], report: dict[str, Any], socket: FrameSocket, estimators: list[JointEstimator]) -> tuple[Cycle, Grid]:
+    pdos = input_pdos(config)
+    grid = Grid(0, config.period_ns)
+    snapshot = Snapshot(Path(request["snapshot"]), config.period_ns * 1e-9, float(request["worst_load"]))
+    cycle = Cycle(
+        socket,
+        Intake(pdos),
+        list(zip(_joint_inputs(config, report), estimators, strict=True)),
+        Ring(Path(request["ring"]), config.ring_cycles, RECORD_SIZE),
+        snapshot,
+        node_id=config.node_id,
+        counter_overflow=config.counter_overflow,
+        wait_ns=config.input_wait_ns,
+        deadline_ns=config.input_deadline_ns,
+        heartbeat_cycles=max(1, config.heartbeat_ms * 1_000_000 // config.period_ns),
+        grid=grid,
+    )
+    return cycle, grid
+
+
+def serve(request: dict[str, Any]) -> int:
+    """Build, say ready, wait for the boot report, run, say what happened. Returns the exit status."""
+    stop = _Stop()
+    config = load_config(Path(request["config"]) if request["config"] else None)
+    estimators = [build_estimator(config, joint) for joint in config.joints]
+    warm_up(estimators)
+    _answer(ready=True)
+    line = _read_line(stop)
+    if line is None:
+        return 0
+    pdos = input_pdos(config)
+    nodes = [joint.node_id for joint in config.joints] + ([config.sensor.node_id] if config.sensor else [])
+    socket = open_frame_socket(request["bus"], loop_filters(pdos, nodes), receive_own=True)
+    cycle, grid = _build(config, request, json.loads(line), socket, estimators)
+    refused = realtime.prepare(config.realtime.priority, config.realtime.cpu, config.realtime.lock_memory)
+    realtime.freeze()
+    _answer(running=True, refused=refused)
+    grid.slot_ns = time.monotonic_ns() + 2 * config.period_ns
+    error = None
+    try:
+        run(cycle, grid, lambda: stop.requested, request.get("duration_s"))
+        cycle.leave()
+    except BusGone as gone:
+        error = f"the bus went away: {gone}"
+    _answer(done=True, error=error, counters=cycle.intake.counters())
+    return 1 if error else 0
+
+
+def _read_line(stop: _Stop) -> str | None:
+    """The boot report, or None when we are told to stop or the supervisor has gone."""
+    while not stop.requested:
+        if select.select([sys.stdin], [], [], 0.2)[0]:
+            return sys.stdin.readline() or None
+    return None
+
+
+def main(argv: list[str]) -> int:
+    """Entry of the process; every foreseeable failure is one JSON line and exit status 1."""
+    try:
+        return serve(json.loads(argv[0]))
+    except (ConfigError, NetworkError, BusError) as error:
+        _answer(failed=str(error))
+        return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,103 @@
+"""jtqd as a CANopen node (20h): object dictionary readable by any master, EMCY for what the estimate's users must know.
+
+The loop sends the node's PDO and heartbeat; this part answers SDO requests from the snapshot in shared memory and sends EMCY.
+It runs in the supervisor, so that no SDO client can delay a cycle.
+"""
+
+from __future__ import annotations
+
+import struct
+from math import isfinite
+
+from daemon.estimate_pdo import field
+from daemon.snapshot import SnapshotReader
+from drivers.frame import FRAME, pack
+from drivers.frame_socket import FrameSocket
+from drivers.object_dictionary import ObjectStore
+from drivers.sdo_server import SdoServer
+
+COUNTER_OBJECTS = (
+    "cycles",
+    "missed",
+    "stale_inputs",
+    "late_frames",
+    "duplicate_frames",
+    "rejected_frames",
+    "foreign_sync",
+    "tx_dropped",
+    "rx_dropped",
+    "network_fallbacks",
+    "recorder_lost",
+)
+"""Sub-indices 1.. of 2200h, in order."""
+EMCY_INPUT_TIMEOUT = 0x8250
+EMCY_RESET = 0x0000
+_COMMUNICATION_ERROR = 0x11
+"""Error register 1001h: generic and communication bits."""
+_EMCY = struct.Struct("<HB5s")
+
+
+class OwnNode:
+    """Answers SDO requests and reports stale inputs.
+
+    Args:
+        socket: frame socket that receives SDO requests 600h + node_id.
+        store: object dictionary from jtqd.eds.
+        node_id: own node-ID.
+        reader: snapshot of the loop.
+    """
+
+    def __init__(self, socket: FrameSocket, store: ObjectStore, node_id: int, reader: SnapshotReader) -> None:
+        self.socket = socket
+        self._node_id = node_id
+        self._reader = reader
+        self._store = store
+        self._server = SdoServer(store)
+        self._stale = (False, False)
+        self.recorder_lost = 0
+        self._connect_objects()
+
+    def serve(self) -> None:
+        """Answer every request that has arrived."""
+        count = self.socket.receive()
+        for n in range(count):
+            _, length, data = FRAME.unpack_from(self.socket.frames, 16 * n)
+            answer = self._server.handle(bytes(data[:length]))
+            if answer is not None:
+                self.socket.send(pack(0x580 + self._node_id, answer))
+
+    def watch(self) -> None:
+        """Send EMCY 8250h when a joint's inputs go stale and 0000h when all are back; call about ten times a second."""
+        view = self._reader.read()
+        stale = (view.joints[0].status == 4, view.joints[1].status == 4)
+        if stale != self._stale:
+            code = EMCY_INPUT_TIMEOUT if any(stale) else EMCY_RESET
+            register = _COMMUNICATION_ERROR if any(stale) else 0
+            which = sum(1 << n for n, is_stale in enumerate(stale) if is_stale)
+            self._store.set_number(0x1001, 0, register)
+            self.socket.send(pack(0x080 + self._node_id, _EMCY.pack(code, register, bytes((which,)) + bytes(4))))
+            self._stale = stale
+
+    def _connect_objects(self) -> None:
+        store = self._store
+        for n in (0, 1):
+            store.on_read(0x2100, n + 1, lambda n=n: self._field(n)[0])
+            store.on_read(0x2101, n + 1, lambda n=n: self._field(n)[1])
+        store.on_read(0x2102, 0, lambda: self._field(0)[2] | self._field(1)[2] << 4)
+        store.on_read(0x2103, 0, lambda: self._reader.read().index % 240)
+        for sub, name in enumerate(COUNTER_OBJECTS, start=1):
+            store.on_read(0x2200, sub, lambda name=name: self._counter(name))
+        for sub, share in enumerate((0.5, 0.99, 1.0), start=1):
+            store.on_read(0x2201, sub, lambda share=share: self._work_us(share))
+
+    def _field(self, joint: int) -> tuple[int, int, int]:
+        view = self._reader.read().joints[joint]
+        return field(view.torque_nm, view.sigma_nm, view.status)
+
+    def _counter(self, name: str) -> int:
+        value = self.recorder_lost if name == "recorder_lost" else self._reader.read().counters[name]
+        return min(value, 0xFFFF_FFFF)
+
+    def _work_us(self, share: float) -> int:
+        value = self._reader.work_us(share)[0]
+        return round(value) if isfinite(value) else 0

@@ -1,0 +1,27 @@
+"""Where a running jtqd keeps its ring and snapshot: one directory per bus, on a tmpfs, readable by its own user only."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+
+def runtime_dir(bus: str) -> Path:
+    """Directory of the instance on `bus`, made if needed: under $RUNTIME_DIRECTORY (systemd), $XDG_RUNTIME_DIR or /dev/shm.
+
+    Raises:
+        OSError: it cannot be made, or belongs to somebody else.
+    """
+    base = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0] or os.environ.get("XDG_RUNTIME_DIR", "")
+    root = Path(base) if base else Path("/dev/shm")
+    path = root / f"jtqd-{os.getuid()}-{instance_name(bus)}"
+    path.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if path.stat().st_uid != os.getuid():
+        raise PermissionError(f"{path} belongs to another user")
+    return path
+
+
+def instance_name(bus: str) -> str:
+    """Name of the instance as it can stand in a file name, e.g. "vcan0" or "unix-tmp-bench"."""
+    return re.sub(r"[^A-Za-z0-9_.]+", "-", bus).strip("-")

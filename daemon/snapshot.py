@@ -1,0 +1,202 @@
+"""Live state of the loop in shared memory: counters, histograms and the last estimate, for status views and jtqd's own objects.
+
+The loop writes, anybody with access to the file reads; nothing a reader does can delay the loop. The counters are single
+64-bit words; the block of the last estimate is guarded by a sequence number that is odd while it is being written.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import struct
+from pathlib import Path
+from typing import NamedTuple
+
+COUNTERS = (
+    "cycles",
+    "missed",
+    "complete",
+    "published",
+    "published_late",
+    "stale_inputs",
+    "late_frames",
+    "duplicate_frames",
+    "rejected_frames",
+    "unknown_frames",
+    "foreign_sync",
+    "boot_ups",
+    "tx_dropped",
+    "rx_dropped",
+    "bus_errors",
+    "network_fallbacks",
+    "bits_worst_case",
+)
+"""In the order of their words; docs/bus.md says what each one means."""
+
+WORK_BINS, WORK_BIN_NS = 500, 4_000
+LATE_BINS, LATE_BIN_NS = 250, 4_000
+_MAX_NODE = 128
+
+_MAGIC = 0x4A54_5144_5354_4101  # "JTQDSTA", layout 1
+_JOINT = struct.Struct("<6d4xHBB")
+_ESTIMATE = struct.Struct("<qQqdd")
+_COUNTERS_OFFSET = 64
+_SEQUENCE_OFFSET = _COUNTERS_OFFSET + 8 * len(COUNTERS)
+_ESTIMATE_OFFSET = _SEQUENCE_OFFSET + 8
+_ERRORS_OFFSET = _ESTIMATE_OFFSET + _ESTIMATE.size + 2 * _JOINT.size
+_WORK_OFFSET = _ERRORS_OFFSET + 4 * 8
+_LATE_OFFSET = _WORK_OFFSET + 4 * WORK_BINS
+_NODES_OFFSET = _LATE_OFFSET + 4 * LATE_BINS
+_CONFIGURED_OFFSET = _NODES_OFFSET + _MAX_NODE
+SIZE = _CONFIGURED_OFFSET + _MAX_NODE
+_WORD = struct.Struct("<Q")
+
+
+class SnapshotError(Exception):
+    """No snapshot of this layout at the path."""
+
+
+class JointView(NamedTuple):
+    """Last estimate of one joint; NaN where unknown. `sensor_nm` is the reference in the same cycle."""
+
+    torque_nm: float
+    sigma_nm: float
+    tob_nm: float
+    efficiency_nm: float
+    network_nm: float
+    sensor_nm: float
+    statusword: int
+    status: int
+    sensor_status: int
+
+
+class View(NamedTuple):
+    """One consistent reading."""
+
+    pid: int
+    index: int
+    sync_realtime_ns: int
+    period_s: float
+    worst_load: float
+    joints: tuple[JointView, JointView]
+    counters: dict[str, int]
+    rmse_nm: tuple[float, float]
+    node_states: bytes
+
+
+class Snapshot:
+    """Writer's side, one per loop.
+
+    Attributes:
+        counters: memory of the counters, one unsigned 64-bit word each, in the order of `COUNTERS`.
+        work: histogram of the work per cycle, `WORK_BIN_NS` per bin, the last bin takes the rest.
+        late: histogram of the SYNC's lateness, `LATE_BIN_NS` per bin.
+        errors: sum of squared errors and number of samples of each joint: [sum 1, n 1, sum 2, n 2].
+        node_states: last heartbeat state of each node-ID.
+        configured: number of times each node-ID has been configured; written by the supervisor.
+    """
+
+    def __init__(self, path: Path, period_s: float, worst_load: float) -> None:
+        temporary = path.with_name(path.name + ".new")
+        with open(temporary, "w+b") as file:
+            os.fchmod(file.fileno(), 0o600)
+            file.truncate(SIZE)
+            self._memory = mmap.mmap(file.fileno(), 0)
+        struct.pack_into("<QQdd", self._memory, 0, _MAGIC, os.getpid(), period_s, worst_load)
+        os.replace(temporary, path)
+        view = memoryview(self._memory)
+        self.counters = view[_COUNTERS_OFFSET:_SEQUENCE_OFFSET].cast("Q")
+        self.errors = view[_ERRORS_OFFSET:_WORK_OFFSET].cast("d")
+        self.work = view[_WORK_OFFSET:_LATE_OFFSET].cast("I")
+        self.late = view[_LATE_OFFSET:_NODES_OFFSET].cast("I")
+        self.node_states = view[_NODES_OFFSET:_CONFIGURED_OFFSET]
+        self.configured = view[_CONFIGURED_OFFSET:SIZE]
+        self._sequence = view[_SEQUENCE_OFFSET:_ESTIMATE_OFFSET].cast("Q")
+        self._period_s = period_s
+        self._worst_load = worst_load
+
+    def write(self, index: int, sync_realtime_ns: int, joints: tuple[tuple[float, ...], tuple[float, ...]]) -> None:
+        """Publish the last estimate; `joints` are `JointView` tuples."""
+        self._sequence[0] += 1
+        memory = self._memory
+        _ESTIMATE.pack_into(memory, _ESTIMATE_OFFSET, index, 0, sync_realtime_ns, self._period_s, self._worst_load)
+        offset = _ESTIMATE_OFFSET + _ESTIMATE.size
+        _JOINT.pack_into(memory, offset, *joints[0])
+        _JOINT.pack_into(memory, offset + _JOINT.size, *joints[1])
+        self._sequence[0] += 1
+
+
+class SnapshotReader:
+    """Reader's side.
+
+    Raises:
+        SnapshotError: nothing to read at the path, or of another layout.
+    """
+
+    def __init__(self, path: Path, *, supervisor: bool = False) -> None:
+        access = mmap.ACCESS_WRITE if supervisor else mmap.ACCESS_READ
+        try:
+            with open(path, "r+b" if supervisor else "rb") as file:
+                self._memory = mmap.mmap(file.fileno(), 0, access=access)
+        except (OSError, ValueError) as error:
+            raise SnapshotError(f"{path}: no running loop: {error}") from None
+        if len(self._memory) != SIZE or _WORD.unpack_from(self._memory, 0)[0] != _MAGIC:
+            raise SnapshotError(f"{path}: not a status snapshot of this version")
+
+    def read(self) -> View:
+        """A consistent view; retries while the loop is writing and takes the last attempt if it never rests."""
+        memory = self._memory
+        _, pid, period_s, worst_load = struct.unpack_from("<QQdd", memory, 0)
+        for _ in range(100):
+            before = _WORD.unpack_from(memory, _SEQUENCE_OFFSET)[0]
+            block = memory[_ESTIMATE_OFFSET:_ERRORS_OFFSET]
+            if before % 2 == 0 and before == _WORD.unpack_from(memory, _SEQUENCE_OFFSET)[0]:
+                break
+        index, _, realtime_ns, _, _ = _ESTIMATE.unpack_from(block, 0)
+        joints = tuple(
+            JointView._make(_JOINT.unpack_from(block, _ESTIMATE.size + n * _JOINT.size)) for n in range(2)
+        )
+        words = struct.unpack_from(f"<{len(COUNTERS)}Q", memory, _COUNTERS_OFFSET)
+        sums = struct.unpack_from("<4d", memory, _ERRORS_OFFSET)
+        rmse = tuple((sums[2 * n] / sums[2 * n + 1]) ** 0.5 if sums[2 * n + 1] else float("nan") for n in range(2))
+        return View(
+            pid,
+            index,
+            realtime_ns,
+            period_s,
+            worst_load,
+            (joints[0], joints[1]),
+            dict(zip(COUNTERS, words, strict=True)),
+            (rmse[0], rmse[1]),
+            bytes(memory[_NODES_OFFSET:_CONFIGURED_OFFSET]),
+        )
+
+    def work_us(self, *shares: float) -> list[float]:
+        """Quantiles of the work per cycle [us], upper edge of their bin; NaN without data."""
+        return _quantiles(self._histogram(_WORK_OFFSET, WORK_BINS), WORK_BIN_NS, shares)
+
+    def late_us(self, *shares: float) -> list[float]:
+        """Quantiles of the SYNC's lateness [us], upper edge of their bin; NaN without data."""
+        return _quantiles(self._histogram(_LATE_OFFSET, LATE_BINS), LATE_BIN_NS, shares)
+
+    def note_configured(self, node_id: int) -> None:
+        """Tell the loop that a node which had restarted has been configured again (supervisor only)."""
+        offset = _CONFIGURED_OFFSET + node_id
+        self._memory[offset] = (self._memory[offset] + 1) % 256
+
+    def _histogram(self, offset: int, bins: int) -> tuple[int, ...]:
+        return struct.unpack_from(f"<{bins}I", self._memory, offset)
+
+
+def _quantiles(bins: tuple[int, ...], bin_ns: int, shares: tuple[float, ...]) -> list[float]:
+    total = sum(bins)
+    result = []
+    for share in shares:
+        wanted, seen, edge = share * total, 0, float("nan")
+        for n, count in enumerate(bins):
+            seen += count
+            if total and seen >= wanted and count:
+                edge = (n + 1) * bin_ns / 1000.0
+                break
+        result.append(edge)
+    return result

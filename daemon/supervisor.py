@@ -1,0 +1,332 @@
+"""The supervisor: starts bench, loop, boot and recorder, shows how the loop is doing, serves the own node, ends all in order.
+
+It has no thread and touches no frame of the cycle; if it is busy, or dies, no cycle is late for it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from rich.console import Console
+from rich.live import Live
+
+from daemon.children import Child, ChildError
+from daemon.config import Config
+from daemon.load import bus_load_of
+from daemon.live_table import live_table, plain_line
+from daemon.own_node import OwnNode
+from daemon.recording_request import recording_request
+from daemon.runtime_dir import instance_name, runtime_dir
+from daemon.snapshot import SnapshotReader, View
+from daemon.summary import Summary
+from drivers.bus_load import BusLoad, BusLoadError, check_bus_load
+from drivers.errors import BusError
+from drivers.frame import pack
+from drivers.frame_socket import exact, open_frame_socket
+from drivers.object_dictionary import ObjectStore
+
+_WARM_UP_TIMEOUT_S = 60.0
+"""Generous: a controller that loads its libraries from a slow card may take its time; nothing is published meanwhile."""
+_TABLE_PERIOD_S = 0.2
+_LOG_PERIOD_S = 5.0
+_NMT_PRE_OPERATIONAL = 0x80
+
+
+class SupervisorError(Exception):
+    """The daemon cannot start; the message is one line for the operator."""
+
+
+class Supervisor:
+    """One run of the daemon.
+
+    Args:
+        config: what was read from `config_path`.
+        bus: SocketCAN interface, "unix:PATH" or "sim".
+        config_path: the file, None for the one that ships.
+        record: directory for logs, "none", or None for the default.
+        duration_s: end by itself after this time, None to run until told.
+    """
+
+    def __init__(
+        self, config: Config, bus: str, config_path: Path | None, record: str | None, duration_s: float | None
+    ) -> None:
+        self._config = config
+        self._config_path = config_path
+        self._duration_s = duration_s
+        self._stop = False
+        self._load = _checked_load(config)
+        try:
+            self._directory = runtime_dir(bus)
+        except OSError as error:
+            raise SupervisorError(f"no directory for shared memory: {error}") from None
+        self._emulate = bus == "sim"
+        self._bus = f"unix:{self._directory / 'bus'}" if self._emulate else bus
+        self._instance = instance_name(bus)
+        self._log_directory = _log_directory(record)
+        self._ring = self._directory / "ring"
+        self._snapshot = self._directory / "snapshot"
+        self._children: list[Child] = []
+        self._recorder: Child | None = None
+        self._recording: dict[str, Any] | None = None
+        self._console = Console(stderr=True)
+
+    def run(self) -> Summary | None:
+        """Run to the end. None when it was stopped before the loop ran.
+
+        Raises:
+            SupervisorError, BusError: it could not start.
+        """
+        signal.signal(signal.SIGTERM, self._on_signal)
+        signal.signal(signal.SIGINT, self._on_signal)
+        try:
+            return self._run()
+        except ChildError as error:
+            raise SupervisorError(str(error)) from None
+        finally:
+            for child in reversed(self._children):
+                child.end()
+
+    # Start ---------------------------------------------------------------------------------------------------------------
+
+    def _run(self) -> Summary | None:
+        bench = self._start_bench() if self._emulate else None
+        loop = self._child("daemon.loop", [json.dumps(self._loop_request())], "the loop")
+        report = self._boot()
+        ready = self._wait(loop)
+        if ready is None or self._stop:
+            return None
+        _check(ready)
+        loop.tell(report)
+        running = self._wait(loop)
+        if running is None or self._stop:
+            return None
+        _check(running)
+        for line in running["refused"]:
+            print(f"jtqd: not granted: {line}", file=sys.stderr)
+        reader = SnapshotReader(self._snapshot, supervisor=True)
+        self._start_recorder(report)
+        socket = open_frame_socket(self._bus, [exact(0x600 + self._config.node_id)])
+        store = ObjectStore(_eds("jtqd.eds"), self._config.node_id)
+        node = OwnNode(socket, store, self._config.node_id, reader)
+        result = self._watch(loop, node, reader, bench)
+        self._leave(socket.send)
+        self._end_recorder()
+        return self._summary(reader, result, running["refused"])
+
+    def _child(self, module: str, arguments: list[str], name: str) -> Child:
+        child = Child(module, arguments, name=name)
+        self._children.append(child)
+        return child
+
+    def _start_bench(self) -> Child:
+        path = Path(self._bus.removeprefix("unix:"))
+        path.unlink(missing_ok=True)
+        bench = self._child("sim_can", ["--bus", self._bus], "the emulated bench")
+        deadline = time.monotonic() + _WARM_UP_TIMEOUT_S
+        while not path.exists():
+            if not bench.alive():
+                raise SupervisorError(f"the emulated bench ended with exit status {bench.process.returncode}")
+            if time.monotonic() > deadline:
+                raise SupervisorError("the emulated bench did not open its bus")
+            time.sleep(0.01)
+        return bench
+
+    def _loop_request(self) -> dict[str, Any]:
+        return {
+            "config": str(self._config_path) if self._config_path else None,
+            "bus": self._bus,
+            "ring": str(self._ring),
+            "snapshot": str(self._snapshot),
+            "worst_load": self._load.worst,
+            "duration_s": self._duration_s,
+        }
+
+    def _boot(self) -> dict[str, Any]:
+        """Boot all nodes; the report holds their scaling."""
+        child = self._child("drivers.boot", [], "the boot")
+        child.tell(boot_request(self._config, self._bus))
+        child.end_of_input()
+        report = self._wait(child)
+        if report is None:
+            raise SupervisorError("stopped while booting the nodes")
+        if not report["ok"]:
+            raise SupervisorError(report["error"]["message"])
+        for joint in self._config.joints:
+            _check_gear_ratio(joint.number, joint.node_id, joint.joint.gear_ratio, joint.joint_path, report)
+        return report
+
+    def _wait(self, child: Child) -> dict[str, Any] | None:
+        """The child's next answer; None when we were told to stop."""
+        deadline = time.monotonic() + _WARM_UP_TIMEOUT_S
+        while not self._stop:
+            try:
+                return child.answer(0.25)
+            except ChildError:
+                if not child.alive() or time.monotonic() > deadline:
+                    raise
+        return None
+
+    # Run -----------------------------------------------------------------------------------------------------------------
+
+    def _watch(self, loop: Child, node: OwnNode, reader: SnapshotReader, bench: Child | None) -> dict[str, Any]:
+        """Until the loop ends: table, SDO requests, recorder. Returns the loop's last answer."""
+        terminal = self._console.is_terminal
+        title = f"jtqd on {self._instance}, node {self._config.node_id:02X}h, {self._config.estimator.method}"
+        previous = reader.read()
+        shown = time.monotonic()
+        told = False
+        with Live(console=self._console, auto_refresh=False, transient=False) as live:
+            while True:
+                select.select([node.socket.fd, loop.process.stdout], [], [], 0.05)
+                node.serve()
+                node.watch()
+                answer = loop.poll_answer()
+                if answer is not None and answer.get("done"):
+                    return answer
+                if not loop.alive():
+                    final = loop.poll_answer()
+                    return final or {"error": f"the loop ended with exit status {loop.process.returncode}"}
+                if bench is not None and not bench.alive() and not told:
+                    print(f"jtqd: the emulated bench ended with exit status {bench.process.returncode}", file=sys.stderr)
+                if self._stop and not told:
+                    loop.process.send_signal(signal.SIGTERM)
+                    told = True
+                self._watch_recorder(node)
+                now = time.monotonic()
+                if now - shown >= (_TABLE_PERIOD_S if terminal else _LOG_PERIOD_S):
+                    previous, shown = self._show(live, terminal, reader, previous, title), now
+
+    def _show(self, live: Live, terminal: bool, reader: SnapshotReader, previous: View, title: str) -> View:
+        view = reader.read()
+        if terminal:
+            live.update(live_table(reader, previous, view, self._config.bitrate, title), refresh=True)
+        else:
+            print(plain_line(reader, previous, view, self._config.bitrate), file=sys.stderr, flush=True)
+        return view
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self._stop = True
+
+    # Recorder ------------------------------------------------------------------------------------------------------------
+
+    def _start_recorder(self, report: dict[str, Any]) -> None:
+        if self._log_directory is None:
+            return
+        request = recording_request(self._config, self._log_directory, self._ring, self._instance, report)
+        path = self._directory / "recorder.json"
+        path.write_text(json.dumps(request), encoding="utf-8")
+        self._recorder = self._child("daemon.recorder", [str(path)], "the recorder")
+
+    def _watch_recorder(self, node: OwnNode) -> None:
+        if self._recorder is not None and not self._recorder.alive():
+            print(
+                f"jtqd: the recorder ended with exit status {self._recorder.process.returncode}; the loop goes on",
+                file=sys.stderr,
+            )
+            self._recording = self._recorder.poll_answer() or {"path": None, "lost": None, "error": "the recorder died"}
+            self._recorder = None
+
+    def _end_recorder(self) -> None:
+        if self._recorder is None:
+            return
+        self._recorder.process.send_signal(signal.SIGTERM)
+        try:
+            self._recording = self._recorder.answer(10.0)
+        except ChildError as error:
+            self._recording = {"path": None, "lost": None, "error": str(error)}
+
+    # End -----------------------------------------------------------------------------------------------------------------
+
+    def _leave(self, send: Any) -> None:
+        """The SYNC has ended with the loop: put the nodes that we started back to pre-operational."""
+        nodes = [joint.node_id for joint in self._config.joints]
+        nodes += [self._config.sensor.node_id] if self._config.sensor else []
+        for node in nodes:
+            try:
+                send(pack(0x000, bytes((_NMT_PRE_OPERATIONAL, node))))
+            except BusError:
+                return
+
+    def _summary(self, reader: SnapshotReader, result: dict[str, Any], refused: list[str]) -> Summary:
+        view = reader.read()
+        p50, p99, worst = reader.work_us(0.5, 0.99, 1.0)
+        late50, late99, late_worst = reader.late_us(0.5, 0.99, 1.0)
+        return Summary(
+            cycles=view.counters["cycles"] - view.counters["missed"],
+            missed=view.counters["missed"],
+            stale_inputs=view.counters["stale_inputs"],
+            work_us=(p50, p99, worst),
+            late_us=(late50, late99, late_worst),
+            rmse_nm=view.rmse_nm,
+            counters=view.counters,
+            refused=tuple(refused),
+            recording=self._recording,
+            error=result.get("error") or result.get("failed"),
+        )
+
+
+def boot_request(config: Config, bus: str, only: frozenset[int] = frozenset()) -> dict[str, Any]:
+    """Request for `python -m drivers.boot`; `only` limits it to some nodes."""
+    nodes: list[dict[str, Any]] = [
+        {"node": joint.node_id, "kind": "drive", "identity": asdict(joint.identity)} for joint in config.joints
+    ]
+    if config.sensor is not None:
+        sensor = config.sensor
+        nodes.append(
+            {
+                "node": sensor.node_id,
+                "kind": "sensor",
+                "identity": asdict(sensor.identity),
+                "channels": list(sensor.channels),
+            }
+        )
+    return {
+        "bus": bus,
+        "nodes": [node for node in nodes if not only or node["node"] in only],
+        "master_node": config.node_id,
+        "heartbeat_ms": config.heartbeat_ms,
+        "answer_timeout_s": config.boot_timeout_s,
+        "sync": {"counter_overflow": config.counter_overflow},
+    }
+
+
+def _checked_load(config: Config) -> BusLoad:
+    try:
+        return check_bus_load(bus_load_of(config))
+    except BusLoadError as error:
+        raise SupervisorError(f"{config.path}: {error}") from None
+
+
+def _check_gear_ratio(number: int, node: int, expected: float, path: Path, report: dict[str, Any]) -> None:
+    """A drive that tells another gear ratio (6091h) than the joint file belongs to another joint."""
+    found = report["nodes"][str(node)].get("gear_ratio")
+    if found and abs(found - expected) > 0.005 * expected:
+        raise SupervisorError(
+            f"node {node}: 6091h gear ratio: expected {expected:g} ({path}, joint {number}), found {found:g}"
+        )
+
+
+def _check(answer: dict[str, Any]) -> None:
+    if "failed" in answer:
+        raise SupervisorError(str(answer["failed"]))
+
+
+def _log_directory(record: str | None) -> Path | None:
+    if record == "none":
+        return None
+    if record is None:
+        record = os.environ.get("LOGS_DIRECTORY", "").split(":")[0] or "logs"
+    return Path(record)
+
+
+def _eds(name: str) -> Path:
+    return Path(__file__).resolve().parent.parent / "drivers" / "eds" / name

@@ -1,0 +1,137 @@
+"""The boot request as JSON, checked into frozen profiles, and the report as JSON.
+
+{"bus": "can0", "master_node": 32, "heartbeat_ms": 100, "master_timeout_ms": 500, "answer_timeout_s": 0.5,
+ "sync": {"cob_id": 128, "counter_overflow": 240, "check_foreign": true},
+ "nodes": [{"node": 1, "kind": "drive", "identity": {"vendor": 1953, "product": 1026}},
+           {"node": 2, "kind": "drive", "given": {"6091h:1": 100}},
+           {"node": 3, "kind": "sensor", "channels": [1], "unit_words": {"0x00560000": 1.0}}]}
+
+Only "bus" and "nodes" with "node" and "kind" are needed. `given` replaces objects that are then not read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from drivers.boot_procedure import BootedNode, BusSettings, Profile
+from drivers.devices import JTQD_NODE, SYNC_COB_ID, DriveProfile, Identity, SensorProfile, parse_key
+
+_TOP = {"bus", "nodes", "master_node", "sync", "heartbeat_ms", "master_timeout_ms", "answer_timeout_s"}
+_NODE = {"node", "kind", "identity", "channels", "given", "unit_words"}
+_SYNC = {"cob_id", "counter_overflow", "check_foreign"}
+
+
+class RequestError(ValueError):
+    """The request itself is wrong."""
+
+
+@dataclass(frozen=True)
+class BootRequest:
+    """Which nodes to boot on which bus. `check_foreign_sync` is off when jtqd's own SYNC already runs."""
+
+    bus: str
+    profiles: tuple[Profile, ...]
+    settings: BusSettings
+    check_foreign_sync: bool = True
+    answer_timeout_s: float = 0.5
+
+
+def parse_request(raw: object) -> BootRequest:
+    """Checked request; RequestError names the key, what was found and what is expected."""
+    top = _mapping(raw, "request", _TOP)
+    bus = top.get("bus")
+    if not isinstance(bus, str) or not bus:
+        raise RequestError(f"bus: found {bus!r}, expected a name like can0 or unix:PATH")
+    nodes = top.get("nodes")
+    if not isinstance(nodes, list) or not nodes:
+        raise RequestError(f"nodes: found {nodes!r}, expected a list of at least one node")
+    profiles = tuple(_profile(node, f"nodes[{position}]") for position, node in enumerate(nodes))
+    numbers = [profile.node_id for profile in profiles]
+    master = _integer(top, "master_node", 1, 127, JTQD_NODE)
+    if len({*numbers, master}) != len(numbers) + 1:
+        raise RequestError(f"nodes: {numbers} and master {master}, expected different node numbers")
+    sync = _mapping(top.get("sync", {}), "sync", _SYNC)
+    overflow = None
+    if sync.get("counter_overflow") is not None:
+        overflow = _integer(sync, "counter_overflow", 0, 240, 0)
+    settings = BusSettings(
+        master_node=master,
+        master_timeout_ms=_integer(top, "master_timeout_ms", 1, 0xFFFF, 500),
+        heartbeat_ms=_integer(top, "heartbeat_ms", 1, 0xFFFF, 100),
+        sync_cob_id=_integer(sync, "cob_id", 1, 0x7FF, SYNC_COB_ID),
+        counter_overflow=overflow,
+    )
+    timeout = top.get("answer_timeout_s", 0.5)
+    if isinstance(timeout, bool) or not isinstance(timeout, int | float) or not 0 < timeout <= 60:
+        raise RequestError(f"answer_timeout_s: found {timeout!r}, expected seconds above 0 and at most 60")
+    return BootRequest(bus, profiles, settings, bool(sync.get("check_foreign", True)), float(timeout))
+
+
+def _profile(raw: object, where: str) -> Profile:
+    node = _mapping(raw, where, _NODE)
+    number = _integer(node, "node", 1, 127, None, where=where)
+    identity = Identity(**_integers(node.get("identity"), f"{where}.identity", set(asdict(Identity()))))
+    try:
+        given = {
+            parse_key(key): value for key, value in _integers(node.get("given"), f"{where}.given").items()
+        }
+    except ValueError as error:
+        raise RequestError(f"{where}.given: {error}") from error
+    kind = node.get("kind")
+    if kind == "drive":
+        return DriveProfile(number, identity, given)
+    if kind != "sensor":
+        raise RequestError(f"{where}.kind: found {kind!r}, expected 'drive' or 'sensor'")
+    channels = node.get("channels", [1])
+    if channels not in ([1], [1, 2]):
+        raise RequestError(f"{where}.channels: found {channels!r}, expected [1] or [1, 2]")
+    return SensorProfile(number, identity, tuple(channels), given, _unit_words(node, where))
+
+
+def _unit_words(node: Mapping[str, Any], where: str) -> dict[int, float]:
+    words = _mapping(node.get("unit_words", {}), f"{where}.unit_words", None)
+    try:
+        return {int(word, 0): float(nm) for word, nm in words.items()}
+    except (TypeError, ValueError) as error:
+        raise RequestError(f"{where}.unit_words: {error}, expected words and Nm per unit") from error
+
+
+def _mapping(raw: object, where: str, known: set[str] | None) -> Mapping[str, Any]:
+    if not isinstance(raw, dict):
+        raise RequestError(f"{where}: found {raw!r}, expected a mapping")
+    unknown = sorted(set(raw) - known) if known is not None else []
+    if unknown:
+        raise RequestError(f"{where}: unknown key {unknown[0]!r}, expected one of {sorted(known or ())}")
+    return raw
+
+
+def _integer(
+    mapping: Mapping[str, Any], key: str, low: int, high: int, default: int | None, *, where: str = ""
+) -> int:
+    value = mapping.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        path = f"{where}.{key}" if where else key
+        raise RequestError(f"{path}: found {value!r}, expected a whole number {low}..{high}")
+    return value
+
+
+def _integers(raw: object, where: str, known: set[str] | None = None) -> dict[str, int]:
+    """A mapping of 32-bit numbers; null entries are left out."""
+    mapping = _mapping({} if raw is None else raw, where, known)
+    kept = {key: value for key, value in mapping.items() if value is not None}
+    return {key: _integer(kept, key, 0, 0xFFFF_FFFF, None, where=where) for key in kept}
+
+
+def node_report(node: BootedNode) -> dict[str, object]:
+    """One node of the report; `scaling` holds the fields of DriveScaling or SensorScaling."""
+    return {
+        "name": node.name,
+        "device_type": node.device_type,
+        "serial": node.serial,
+        "scaling": asdict(node.scaling),
+        "gear_ratio": node.gear_ratio,
+        "tpdos": [{"cob_id": pdo.cob_id, "words": list(pdo.words)} for pdo in node.tpdos],
+        "configuration_sha256": node.configuration_sha256,
+    }

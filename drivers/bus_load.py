@@ -1,0 +1,151 @@
+"""Load of the bus by a configuration, before it runs: worst case and without stuff bits. Pure.
+
+The worst case of a data frame is 55 + 10 n bits (Davis et al. 2007, Real-Time Systems 35:239). A
+configuration above 95 % of it is refused: what is left must carry SDO, EMCY and a retransmission.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from drivers.devices import (
+    JTQD_NODE,
+    SYNC_COB_ID,
+    drive_tpdo1,
+    drive_tpdo2,
+    estimate_tpdo,
+    sensor_tpdo1,
+    sensor_tpdo2,
+)
+from drivers.frame import unstuffed_bits, worst_case_bits
+from drivers.pdo import LAST_SYNC_TYPE, PdoMap
+
+LIMIT = 0.95
+BITRATE = 1_000_000
+PERIOD_S = 1e-3
+HEARTBEAT_BYTES = 1
+
+
+class BusLoadError(ValueError):
+    """The configuration does not fit the bus, or its load has no bound."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One identifier: `per_cycle` frames of `length` bytes in each cycle."""
+
+    cob_id: int
+    who: str
+    length: int
+    per_cycle: float = 1.0
+
+    @property
+    def worst_bits(self) -> float:
+        """Bits per cycle with every possible stuff bit, intermission included."""
+        return worst_case_bits(self.length) * self.per_cycle
+
+    @property
+    def unstuffed_bits(self) -> float:
+        """Bits per cycle without any stuff bit."""
+        return unstuffed_bits(self.length) * self.per_cycle
+
+
+@dataclass(frozen=True)
+class BusLoad:
+    """The sum over all rows, as share of the bits that a cycle of `period_s` holds."""
+
+    rows: tuple[Row, ...]
+    bitrate: int = BITRATE
+    period_s: float = PERIOD_S
+
+    @property
+    def capacity_bits(self) -> float:
+        """Bits in one cycle."""
+        return self.bitrate * self.period_s
+
+    @property
+    def worst(self) -> float:
+        """Worst-case share, 1.0 = full."""
+        return sum(row.worst_bits for row in self.rows) / self.capacity_bits
+
+    @property
+    def unstuffed(self) -> float:
+        """Share without stuff bits: the load is never below it."""
+        return sum(row.unstuffed_bits for row in self.rows) / self.capacity_bits
+
+    def table(self) -> list[dict[str, object]]:
+        """Rows in the order of priority: cob_id, who, bytes, per_cycle, worst_bits, share (of a cycle)."""
+        return [
+            {
+                "cob_id": f"{row.cob_id:03X}h",
+                "who": row.who,
+                "bytes": row.length,
+                "per_cycle": row.per_cycle,
+                "worst_bits": row.worst_bits,
+                "share": row.worst_bits / self.capacity_bits,
+            }
+            for row in sorted(self.rows, key=lambda row: row.cob_id)
+        ]
+
+
+def sync_row(counter: bool) -> Row:
+    """SYNC, with the counter byte of 1019h or without."""
+    return Row(SYNC_COB_ID, "SYNC", 1 if counter else 0)
+
+
+def pdo_row(who: str, pdo: PdoMap) -> Row:
+    """A synchronous PDO; BusLoadError for an event-driven one, which has no bound."""
+    if not 1 <= pdo.transmission_type <= LAST_SYNC_TYPE:
+        raise BusLoadError(
+            f"PDO {pdo.cob_id:X}h of {who}: transmission type {pdo.transmission_type} is not bound to SYNC, "
+            "its load has no bound"
+        )
+    return Row(pdo.cob_id, who, pdo.length, 1.0 / pdo.transmission_type)
+
+
+def heartbeat_row(who: str, node: int, heartbeat_ms: int, period_s: float = PERIOD_S) -> Row:
+    """Heartbeat of one node."""
+    if heartbeat_ms < 1:
+        raise BusLoadError(f"heartbeat of {who}: {heartbeat_ms} ms, expected at least 1")
+    return Row(0x700 + node, f"heartbeat {who}", HEARTBEAT_BYTES, period_s * 1e3 / heartbeat_ms)
+
+
+def configured_load(
+    drives: Iterable[int],
+    sensors: Mapping[int, tuple[int, ...]],
+    *,
+    sync_counter: bool = True,
+    heartbeat_ms: int = 100,
+    master: int = JTQD_NODE,
+    extra: Iterable[Row] = (),
+    bitrate: int = BITRATE,
+    period_s: float = PERIOD_S,
+) -> BusLoad:
+    """Load of drives (node numbers), sensors (node -> channels), SYNC, estimate, heartbeats and `extra`."""
+    rows = [sync_row(sync_counter), pdo_row("jtqd estimate", estimate_tpdo(master))]
+    rows.append(heartbeat_row("jtqd", master, heartbeat_ms, period_s))
+    for node in drives:
+        rows.append(pdo_row(f"drive {node} TPDO1", drive_tpdo1(node)))
+        rows.append(pdo_row(f"drive {node} TPDO2", drive_tpdo2(node)))
+        rows.append(heartbeat_row(f"drive {node}", node, heartbeat_ms, period_s))
+    for node, channels in sensors.items():
+        pdos = sensor_tpdo1(node), sensor_tpdo2(node)
+        rows += [pdo_row(f"sensor {node} channel {channel}", pdos[channel - 1]) for channel in channels]
+        rows.append(heartbeat_row(f"sensor {node}", node, heartbeat_ms, period_s))
+    return BusLoad((*rows, *extra), bitrate, period_s)
+
+
+def check_bus_load(load: BusLoad, limit: float = LIMIT) -> BusLoad:
+    """The load itself when it fits; BusLoadError above `limit` or when two rows share an identifier."""
+    seen: dict[int, str] = {}
+    for row in load.rows:
+        if row.cob_id in seen:
+            raise BusLoadError(f"COB-ID {row.cob_id:X}h is used twice: {seen[row.cob_id]} and {row.who}")
+        seen[row.cob_id] = row.who
+    if load.worst > limit:
+        raise BusLoadError(
+            f"bus load {load.worst:.1%} in the worst case, expected at most {limit:.0%} "
+            f"of {load.bitrate} bit/s at a period of {load.period_s * 1e3:g} ms"
+        )
+    return load

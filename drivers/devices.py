@@ -1,0 +1,196 @@
+"""What jtqd asks of a drive (CiA 402) and of a torque sensor (CiA 404): identity, PDOs, scaling.
+
+Scaling is computed from the devices' own objects. An object a device does not have, or has wrong, is given
+by the configuration instead ("608Fh:1" -> number); no factor is a constant of this code.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from drivers.boot_error import label, mismatch
+from drivers.pdo import MappedObject, PdoMap
+
+JTQD_NODE = 0x20
+SYNC_COB_ID = 0x080
+
+Key = tuple[int, int]
+
+# Objects that scale a drive's numbers, with the largest value that makes sense. All must be at least 1.
+DRIVE_SCALING_OBJECTS: dict[Key, tuple[str, int]] = {
+    (0x608F, 1): ("position encoder increments", 2**31),
+    (0x608F, 2): ("position encoder motor revolutions", 2**31),
+    (0x6090, 1): ("velocity encoder increments per second", 2**31),
+    (0x6090, 2): ("velocity encoder motor revolutions per second", 2**31),
+    (0x60E6, 1): ("additional encoder increments", 2**31),
+    (0x60EB, 1): ("additional encoder revolutions", 2**31),
+    (0x6091, 1): ("gear ratio motor shaft revolutions", 2**31),
+    (0x6091, 2): ("gear ratio driving shaft revolutions", 2**31),
+    (0x6075, 0): ("motor rated current in mA", 1_000_000),
+}
+UNIT_OBJECT, DECIMALS_OBJECT, OPERATING_MODE_OBJECT = 0x6131, 0x6132, 0x6112
+JOULE = 0x23  # CiA 303-2 code of J = Nm; the table has none of the newton metre that could be verified
+MAX_DECIMALS = 9
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Expected 1018h; None: not checked."""
+
+    vendor: int | None = None
+    product: int | None = None
+    revision: int | None = None
+    serial: int | None = None
+
+
+@dataclass(frozen=True)
+class DriveProfile:
+    """A CiA 402 drive as jtqd wants it. `given` replaces scaling objects that are then not read."""
+
+    node_id: int
+    identity: Identity = Identity()
+    given: Mapping[Key, int] = field(default_factory=dict)
+    profile_number = 402
+
+    @property
+    def tpdos(self) -> tuple[PdoMap, ...]:
+        """TPDO1 and TPDO2."""
+        return drive_tpdo1(self.node_id), drive_tpdo2(self.node_id)
+
+    @property
+    def scaling_objects(self) -> tuple[Key, ...]:
+        """What boot must read."""
+        return tuple(key for key in DRIVE_SCALING_OBJECTS if key not in self.given)
+
+
+@dataclass(frozen=True)
+class SensorProfile:
+    """A CiA 404 torque sensor with the channels that are used, 1 or (1, 2).
+
+    `unit_words` names a vendor's own 6131h words in Nm per unit.
+    """
+
+    node_id: int
+    identity: Identity = Identity()
+    channels: tuple[int, ...] = (1,)
+    given: Mapping[Key, int] = field(default_factory=dict)
+    unit_words: Mapping[int, float] = field(default_factory=dict)
+    profile_number = 404
+
+    def __post_init__(self) -> None:
+        if self.channels not in ((1,), (1, 2)):
+            raise ValueError(f"sensor node {self.node_id}: channels {self.channels}, expected (1,) or (1, 2)")
+
+    @property
+    def tpdos(self) -> tuple[PdoMap, ...]:
+        """TPDO1, and TPDO2 when the second channel is used."""
+        both = sensor_tpdo1(self.node_id), sensor_tpdo2(self.node_id)
+        return both[: len(self.channels)]
+
+    @property
+    def scaling_objects(self) -> tuple[Key, ...]:
+        """What boot must read."""
+        keys = [(index, channel) for channel in self.channels for index in (UNIT_OBJECT, DECIMALS_OBJECT)]
+        return tuple(key for key in keys if key not in self.given)
+
+
+@dataclass(frozen=True)
+class DriveScaling:
+    """Factors from a drive's numbers to SI: 6064h, 606Ch (motor side), 60E4h:1 (joint side), 6078h."""
+
+    motor_rad_per_count: float
+    motor_rad_s_per_unit: float
+    link_rad_per_count: float
+    ampere_per_unit: float
+
+
+@dataclass(frozen=True)
+class SensorScaling:
+    """Nm per unit of 9130h/7130h, by channel."""
+
+    nm_per_unit: Mapping[int, float]
+
+
+def drive_tpdo1(node: int) -> PdoMap:
+    """180h+n: motor position, link position."""
+    motor = MappedObject(0x6064, 0, 32, True, "motor_position")
+    return PdoMap(0x180 + node, (motor, MappedObject(0x60E4, 1, 32, True, "link_position")))
+
+
+def drive_tpdo2(node: int) -> PdoMap:
+    """280h+n: motor velocity, current, statusword."""
+    velocity = MappedObject(0x606C, 0, 32, True, "motor_velocity")
+    current = MappedObject(0x6078, 0, 16, True, "current")
+    return PdoMap(0x280 + node, (velocity, current, MappedObject(0x6041, 0, 16, False, "statusword")))
+
+
+def sensor_tpdo1(node: int) -> PdoMap:
+    """180h+n: first channel, 32 bits, and its status."""
+    torque = MappedObject(0x9130, 1, 32, True, "torque_1")
+    return PdoMap(0x180 + node, (torque, MappedObject(0x6150, 1, 8, False, "torque_status_1")))
+
+
+def sensor_tpdo2(node: int) -> PdoMap:
+    """280h+n: second channel in 16 bits (so that the bus stays below 95 %), and its status."""
+    torque = MappedObject(0x7130, 2, 16, True, "torque_2")
+    return PdoMap(0x280 + node, (torque, MappedObject(0x6150, 2, 8, False, "torque_status_2")))
+
+
+def estimate_tpdo(node: int = JTQD_NODE) -> PdoMap:
+    """180h+20h: what jtqd publishes (2100h..2103h of jtqd.eds)."""
+    torques = [MappedObject(0x2100, joint, 16, True, f"torque_{joint}") for joint in (1, 2)]
+    sigmas = [MappedObject(0x2101, joint, 8, False, f"sigma_{joint}") for joint in (1, 2)]
+    status = MappedObject(0x2102, 0, 8, False, "status")
+    return PdoMap(0x180 + node, (*torques, *sigmas, status, MappedObject(0x2103, 0, 8, False, "sequence")))
+
+
+def drive_scaling(profile: DriveProfile, read: Mapping[Key, int]) -> tuple[DriveScaling, float]:
+    """(scaling, gear ratio) from the objects read and given. BootError for a value that cannot be."""
+    values = {**read, **profile.given}
+    for key, (name, highest) in DRIVE_SCALING_OBJECTS.items():
+        if not 1 <= values[key] <= highest:
+            raise mismatch(profile.node_id, key, name, expected=f"1..{highest}", found=str(values[key]))
+    turn = 2.0 * math.pi
+    scaling = DriveScaling(
+        motor_rad_per_count=turn * values[0x608F, 2] / values[0x608F, 1],
+        motor_rad_s_per_unit=turn * values[0x6090, 2] / values[0x6090, 1],
+        link_rad_per_count=turn * values[0x60EB, 1] / values[0x60E6, 1],
+        ampere_per_unit=values[0x6075, 0] * 1e-3 * 1e-3,  # 6078h is 1/1000 of 6075h, which is in mA
+    )
+    return scaling, values[0x6091, 1] / values[0x6091, 2]
+
+
+def sensor_scaling(profile: SensorProfile, read: Mapping[Key, int]) -> SensorScaling:
+    """Nm per unit of each used channel: unit word (CiA 303-2) and decimal digits. BootError as above."""
+    values = {**read, **profile.given}
+    factors = {}
+    for channel in profile.channels:
+        decimals = values[DECIMALS_OBJECT, channel]
+        if not 0 <= decimals <= MAX_DECIMALS:
+            key, expected = (DECIMALS_OBJECT, channel), f"0..{MAX_DECIMALS}"
+            raise mismatch(profile.node_id, key, "decimal digits", expected=expected, found=str(decimals))
+        factors[channel] = _nm_of_unit(profile, channel, values[UNIT_OBJECT, channel]) / 10**decimals
+    return SensorScaling(factors)
+
+
+def _nm_of_unit(profile: SensorProfile, channel: int, word: int) -> float:
+    """6131h: prefix exponent (signed byte), numerator, denominator, 0."""
+    if word in profile.unit_words:
+        return profile.unit_words[word]
+    if word & 0x00FF_FFFF != JOULE << 16:
+        expected = "0xXX230000 (J = Nm) or a word given in the configuration"
+        key = UNIT_OBJECT, channel
+        raise mismatch(profile.node_id, key, "physical unit", expected=expected, found=f"0x{word:08X}")
+    exponent = int.from_bytes([word >> 24], signed=True)
+    return 10.0**exponent
+
+
+def parse_key(text: str) -> Key:
+    """(index, sub-index) of "608Fh:1" or "6075h". ValueError otherwise."""
+    index, _, subindex = text.partition("h")
+    key = int(index, 16), int(subindex.removeprefix(":") or "0")
+    if text not in (label(*key), f"{key[0]:04X}h"):
+        raise ValueError(f"{text!r} is not an object like 608Fh:1")
+    return key

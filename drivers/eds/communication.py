@@ -1,0 +1,102 @@
+"""Objects of the communication profile (CiA 301, 1000h..1FFFh) that the data sheets share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from drivers.eds.schema import ARRAY, RECORD, TEXT, U8, U16, U32, Entries, Var, array, record
+
+NO_RTR = 0x4000_0000  # bit 30 of a TPDO's COB-ID
+SYNC_PRODUCER = 0x4000_0000  # bit 30 of 1005h
+
+
+def device(device_type: int, name: str, hardware: str, software: str) -> dict[int, Var | Entries]:
+    """Device type, error register, names."""
+    return {
+        0x1000: Var("Device type", U32, "ro", device_type),
+        0x1001: Var("Error register", U8, "ro", 0, pdo=True),
+        0x1008: Var("Manufacturer device name", TEXT, "const", name),
+        0x1009: Var("Manufacturer hardware version", TEXT, "const", hardware),
+        0x100A: Var("Manufacturer software version", TEXT, "const", software),
+    }
+
+
+def identity(vendor: int, product: int, revision: int) -> dict[int, Var | Entries]:
+    """1018h; the serial number is each device's own."""
+    members = [
+        ("Vendor-ID", vendor),
+        ("Product code", product),
+        ("Revision number", revision),
+        ("Serial number", 0),
+    ]
+    return {0x1018: record("Identity object", *(Var(name, U32, "ro", value) for name, value in members))}
+
+
+def errors() -> dict[int, Var | Entries]:
+    """Error history, EMCY and error behaviour."""
+    history = {i: Var(f"Standard error field {i}", U32, "ro", 0) for i in range(1, 9)}
+    return {
+        0x1003: Entries(
+            "Pre-defined error field", ARRAY, history, Var("Number of errors", U8, "rw", 0, low=0, high=8)
+        ),
+        0x1014: Var("COB-ID EMCY", U32, "const", "$NODEID+0x80"),
+        0x1015: Var("Inhibit time EMCY", U16, "rw", 0, comment="100 us"),
+        0x1029: array("Error behaviour", U8, "rw", [("Communication error", 0)]),
+    }
+
+
+def heartbeat(producer_ms: int = 0) -> dict[int, Var | Entries]:
+    """One heartbeat consumed (the master's), one produced."""
+    return {
+        0x1016: array("Consumer heartbeat time", U32, "rw", [("Consumer heartbeat time 1", 0)]),
+        0x1017: Var("Producer heartbeat time", U16, "rw", producer_ms, comment="ms"),
+    }
+
+
+def sync_consumer() -> dict[int, Var | Entries]:
+    """SYNC as its receiver sees it; 1019h says whether a counter byte is expected."""
+    return {
+        0x1005: Var("COB-ID SYNC message", U32, "const", 0x80),
+        0x1019: Var("Synchronous counter overflow value", U8, "rw", 0, low=0, high=240),
+    }
+
+
+def sdo_server() -> dict[int, Var | Entries]:
+    """The default SDO channel."""
+    to_server = Var("COB-ID client to server", U32, "ro", "$NODEID+0x600")
+    to_client = Var("COB-ID server to client", U32, "ro", "$NODEID+0x580")
+    return {0x1200: record("SDO server parameter", to_server, to_client)}
+
+
+def rpdo(number: int, base: int, mapping: Sequence[int]) -> dict[int, Var | Entries]:
+    """RPDO `number` (1..4), valid from power-on, event-driven."""
+    communication = record(
+        "RPDO communication parameter",
+        Var("COB-ID used by RPDO", U32, "rw", f"$NODEID+0x{base:X}"),
+        Var("Transmission type", U8, "rw", 255),
+    )
+    return {0x1400 + number - 1: communication, 0x1600 + number - 1: _mapping("RPDO", mapping, "rw")}
+
+
+def tpdo(
+    number: int, base: int, mapping: Sequence[int], transmission: int = 255, fixed: bool = False
+) -> dict[int, Var | Entries]:
+    """TPDO `number` (1..4), valid from power-on. Sub-index 4 is reserved and absent."""
+    access = "const" if fixed else "rw"
+    members = {
+        1: Var("COB-ID used by TPDO", U32, access, f"$NODEID+0x{NO_RTR + base:08X}"),
+        2: Var("Transmission type", U8, access, transmission),
+        3: Var("Inhibit time", U16, access, 0, comment="100 us"),
+        5: Var("Event timer", U16, access, 0, comment="ms"),
+        6: Var("SYNC start value", U8, access, 0, low=0, high=240),
+    }
+    communication = Entries("TPDO communication parameter", RECORD, members)
+    return {0x1800 + number - 1: communication, 0x1A00 + number - 1: _mapping("TPDO", mapping, access)}
+
+
+def _mapping(kind: str, mapping: Sequence[int], access: str) -> Entries:
+    present = len(mapping) if access == "const" else 8
+    words = [*mapping, *[0] * (present - len(mapping))]
+    entries = {i: Var(f"Mapping entry {i}", U32, access, word) for i, word in enumerate(words, 1)}
+    count = Var("Number of mapped objects", U8, access, len(mapping), low=0, high=8)
+    return Entries(f"{kind} mapping parameter", RECORD, entries, count)

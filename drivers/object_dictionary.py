@@ -1,0 +1,255 @@
+"""Object dictionary of a node: values by (index, sub-index), typed and guarded by its EDS (CiA 301, CiA 306).
+
+`read` and `write` are what a remote SDO client may do: access rights, lengths and limits hold, and a refusal
+is an `SdoAbort` with the code of CiA 301 table 22. `number`, `set_number`, `set_text` are the device's own
+hand on the same values and know no rights. Pure: no bus and no clock.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from canopen.objectdictionary import import_od
+
+from drivers.sdo_abort import (
+    LENGTH_MISMATCH,
+    LENGTH_TOO_HIGH,
+    LENGTH_TOO_LOW,
+    NO_OBJECT,
+    NO_SUBINDEX,
+    READ_OF_WRITE_ONLY,
+    VALUE_RANGE,
+    WRITE_OF_READ_ONLY,
+    SdoAbort,
+)
+
+# Data types of CiA 301 7.4.7 that are numbers, with their struct letters. A BOOLEAN takes a byte in an SDO.
+BOOLEAN, REAL32, VISIBLE_STRING, OCTET_STRING, DOMAIN, REAL64 = 0x01, 0x08, 0x09, 0x0A, 0x0F, 0x11
+_LETTERS = {
+    BOOLEAN: "B",
+    0x02: "b",
+    0x03: "h",
+    0x04: "i",
+    0x05: "B",
+    0x06: "H",
+    0x07: "I",
+    0x15: "q",
+    0x1B: "Q",
+}
+_FLOAT_LETTERS = {REAL32: "f", REAL64: "d"}
+_SIGNED = frozenset({0x02, 0x03, 0x04, 0x15})
+_FIRST_REAL_INDEX = 0x1000  # below: dummy entries of [DummyUsage], which are types and not objects
+
+ReadHook = Callable[[], "bytes | int"]
+WriteHook = Callable[[bytes], None]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One (index, sub-index) of the EDS. `access` is one of ro, wo, rw, rwr, rww, const (CiA 306 4.6.3)."""
+
+    index: int
+    subindex: int
+    name: str
+    data_type: int
+    access: str
+    mappable: bool
+    low: int | None
+    high: int | None
+    default: bytes
+    layout: struct.Struct | None
+
+    @property
+    def readable(self) -> bool:
+        """A client may upload it."""
+        return self.access != "wo"
+
+    @property
+    def writable(self) -> bool:
+        """A client may download it."""
+        return self.access in ("wo", "rw", "rwr", "rww")
+
+    @property
+    def is_integer(self) -> bool:
+        """A whole number of 8..64 bits: what a PDO may map."""
+        return self.data_type in _LETTERS and self.data_type != BOOLEAN
+
+    @property
+    def signed(self) -> bool:
+        """The number is a two's complement one."""
+        return self.data_type in _SIGNED
+
+    @property
+    def bits(self) -> int:
+        """Length of the object; 0 for strings and domains, which have none of their own."""
+        return self.layout.size * 8 if self.layout else 0
+
+
+class ObjectStore:
+    """Values of one node. SdoAbort refuses a client; ValueError says a number does not fit its object."""
+
+    def __init__(self, eds: Path | str, node_id: int) -> None:
+        if not 1 <= node_id <= 127:
+            raise ValueError(f"node id {node_id}, expected 1..127")
+        self.node_id = node_id
+        self.entries: dict[tuple[int, int], Entry] = {}
+        self._indices: set[int] = set()
+        for variable in _variables(import_od(str(eds), node_id)):
+            entry = _entry(variable)
+            self.entries[entry.index, entry.subindex] = entry
+            self._indices.add(entry.index)
+        self._values = {key: entry.default for key, entry in self.entries.items()}
+        self._on_read: dict[tuple[int, int], ReadHook] = {}
+        self._on_write: dict[tuple[int, int], WriteHook] = {}
+
+    # What a remote client may do ----------------------------------------------------------------------
+
+    def entry(self, index: int, subindex: int) -> Entry:
+        """Description of an object; SdoAbort 06020000h or 06090011h when there is none."""
+        found = self.entries.get((index, subindex))
+        if found is None:
+            raise SdoAbort(NO_SUBINDEX if index in self._indices else NO_OBJECT)
+        return found
+
+    def read(self, index: int, subindex: int) -> bytes:
+        """Value as it goes into an SDO upload; SdoAbort when absent or write-only."""
+        entry = self.entry(index, subindex)
+        if not entry.readable:
+            raise SdoAbort(READ_OF_WRITE_ONLY)
+        return self._value(entry)
+
+    def write(self, index: int, subindex: int, data: bytes) -> None:
+        """SDO download: rights, length, limits, then the hook (may refuse by SdoAbort), then it is stored."""
+        entry = self.check_write(index, subindex, len(data))
+        if entry.layout is not None and (entry.low is not None or entry.high is not None):
+            (value,) = entry.layout.unpack(data)
+            if (entry.low is not None and value < entry.low) or (
+                entry.high is not None and value > entry.high
+            ):
+                raise SdoAbort(VALUE_RANGE)
+        hook = self._on_write.get((index, subindex))
+        if hook is not None:
+            hook(data)
+        self._values[index, subindex] = data
+
+    def check_write(self, index: int, subindex: int, length: int | None) -> Entry:
+        """What can be refused before the data: absent, not writable, wrong length (None: not announced)."""
+        entry = self.entry(index, subindex)
+        if not entry.writable:
+            raise SdoAbort(WRITE_OF_READ_ONLY)
+        if entry.layout is not None and length is not None and length != entry.layout.size:
+            if length == 0:
+                raise SdoAbort(LENGTH_MISMATCH)
+            raise SdoAbort(LENGTH_TOO_HIGH if length > entry.layout.size else LENGTH_TOO_LOW)
+        return entry
+
+    # What the device itself does ----------------------------------------------------------------------
+
+    def number(self, index: int, subindex: int = 0) -> int:
+        """Integer value, rights not asked; the read hook is."""
+        entry = self.entry(index, subindex)
+        if entry.data_type not in _LETTERS or entry.layout is None:
+            raise ValueError(f"{index:04X}h:{subindex} is not an integer")
+        (value,) = entry.layout.unpack(self._value(entry))
+        return int(value)
+
+    def set_number(self, index: int, subindex: int, value: float) -> None:
+        """Set a number (integer or REAL32/64); ValueError when it does not fit. No hook is called."""
+        entry = self.entry(index, subindex)
+        if entry.layout is None:
+            raise ValueError(f"{index:04X}h:{subindex} is not a number")
+        try:
+            self._values[index, subindex] = entry.layout.pack(value)
+        except (struct.error, OverflowError) as error:
+            raise ValueError(
+                f"{index:04X}h:{subindex} {entry.name}: {value!r} does not fit: {error}"
+            ) from error
+
+    def set_text(self, index: int, subindex: int, text: str) -> None:
+        """Set a VISIBLE_STRING."""
+        entry = self.entry(index, subindex)
+        if entry.data_type != VISIBLE_STRING:
+            raise ValueError(f"{index:04X}h:{subindex} {entry.name} is not a string")
+        self._values[index, subindex] = text.encode("ascii")
+
+    def on_read(self, index: int, subindex: int, hook: ReadHook) -> None:
+        """`hook()` gives the value at each read: bytes, or a number that is packed to the object's type."""
+        self._on_read[self._key(index, subindex)] = hook
+
+    def on_write(self, index: int, subindex: int, hook: WriteHook) -> None:
+        """`hook(data)` is called before a download is stored; an SdoAbort from it refuses the value."""
+        self._on_write[self._key(index, subindex)] = hook
+
+    def has(self, index: int, subindex: int = 0) -> bool:
+        """The object exists."""
+        return (index, subindex) in self.entries
+
+    def restore(self, first: int = _FIRST_REAL_INDEX, last: int = 0xFFFF) -> None:
+        """Power-on values: 1000h..1FFFh at NMT reset communication, all at reset node (CiA 301, 7.3.2.2)."""
+        for key, entry in self.entries.items():
+            if first <= entry.index <= last:
+                self._values[key] = entry.default
+
+    def keep_as_default(self, index: int, subindex: int) -> None:
+        """The present value (a serial number, say) becomes the power-on value."""
+        entry = self.entry(index, subindex)
+        fields = {**entry.__dict__, "default": self._values[index, subindex]}
+        self.entries[index, subindex] = Entry(**fields)
+
+    def _key(self, index: int, subindex: int) -> tuple[int, int]:
+        self.entry(index, subindex)
+        return index, subindex
+
+    def _value(self, entry: Entry) -> bytes:
+        hook = self._on_read.get((entry.index, entry.subindex))
+        if hook is None:
+            return self._values[entry.index, entry.subindex]
+        value = hook()
+        if isinstance(value, bytes):
+            return value
+        if entry.layout is None:
+            raise ValueError(
+                f"{entry.index:04X}h:{entry.subindex} {entry.name}: hook gave a number for a string"
+            )
+        return entry.layout.pack(value)
+
+
+def _variables(dictionary: Any) -> list[Any]:
+    """Every variable of a parsed EDS: plain ones, and the members of arrays and records."""
+    variables: list[Any] = []
+    for parsed in dictionary.values():
+        if parsed.index < _FIRST_REAL_INDEX:
+            continue
+        variables.extend(parsed.subindices.values() if hasattr(parsed, "subindices") else [parsed])
+    return variables
+
+
+def _entry(variable: Any) -> Entry:
+    data_type = int(variable.data_type)
+    letter = _LETTERS.get(data_type) or _FLOAT_LETTERS.get(data_type)
+    layout = struct.Struct("<" + letter) if letter else None
+    name = variable.name if variable.subindex == 0 else f"{variable.parent.name}: {variable.name}"
+    return Entry(
+        index=variable.index,
+        subindex=variable.subindex,
+        name=name,
+        data_type=data_type,
+        access=variable.access_type,
+        mappable=bool(variable.pdo_mappable),
+        low=variable.min,
+        high=variable.max,
+        default=_default_bytes(variable.default, layout),
+        layout=layout,
+    )
+
+
+def _default_bytes(default: Any, layout: struct.Struct | None) -> bytes:
+    if layout is not None:
+        return layout.pack(default if default is not None else 0)
+    if default is None:
+        return b""
+    return default if isinstance(default, bytes) else str(default).encode("ascii")

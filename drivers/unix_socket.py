@@ -1,0 +1,41 @@
+"""Opening a client socket of a unix bus: AF_UNIX SOCK_SEQPACKET, one 16-byte frame per message."""
+
+import socket
+import struct
+from collections.abc import Sequence
+
+from drivers import bpf
+from drivers.can_filter import CanFilter
+from drivers.errors import BusError
+from drivers.receive import SO_TIMESTAMPNS
+
+PREFIX = "unix:"
+BUFFER_BYTES = 1 << 20  # the kernel cuts it to net.core.wmem_max
+_CONNECT_TIMEOUT = struct.Struct("@ll").pack(2, 0)  # struct timeval
+
+
+def open_unix(path: str, filters: Sequence[CanFilter], error_frames: bool) -> socket.socket:
+    """Return a non-blocking socket connected to the hub at `path`; its filters are on before it connects.
+
+    Raises BusError: nobody there, something else than a hub there, a hub that does not answer within 2 s.
+    """
+    bus = PREFIX + path
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    try:
+        bpf.attach(sock, filters, error_frames)
+        sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
+        # Bounds connect() when the hub hangs with a full backlog; a non-blocking connect would fail at once.
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _CONNECT_TIMEOUT)
+        sock.connect(path)
+        sock.setblocking(False)
+    except (FileNotFoundError, ConnectionRefusedError):
+        sock.close()
+        raise BusError(f"no bus at {bus}: start one with `jtq sim --bus {bus}`") from None
+    except BlockingIOError:
+        sock.close()
+        raise BusError(f"{bus}: the hub does not answer") from None
+    except OSError as error:
+        sock.close()
+        raise BusError(f"{bus}: not a frame hub: {error.strerror or error}") from None
+    return sock

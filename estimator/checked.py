@@ -1,0 +1,201 @@
+"""Checked reading of plain mappings (from YAML or JSON): every error names file, key, found and expected."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any, Final
+
+
+class Required:
+    """Type of the mark REQUIRED."""
+
+
+REQUIRED: Final = Required()
+"""Default of every reading method: the key must be there."""
+
+
+class ConfigError(ValueError):
+    """What an operator wrote cannot be used; the message is one line: where, what, and what instead."""
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _number_text(value: object) -> str:
+    """Explain a number that arrived as text: YAML 1.1 needs a point and a signed exponent."""
+    if isinstance(value, str):
+        try:
+            float(value)
+        except ValueError:
+            return ""
+        return " (YAML reads this as text: write 7.0e-5, not 7e-5, and no quotes)"
+    return ""
+
+
+class Section:
+    """One mapping of a configuration; each key is read once with its type, unit and range.
+
+    mapping: what the parser gave; `where`: file name for the messages; `path`: dotted key of this mapping.
+    Raises ConfigError from every reading method. `finish()` refuses the keys that nobody asked for.
+    """
+
+    def __init__(self, mapping: object, where: str, path: str = "") -> None:
+        self.where: Final = where
+        self.path: Final = path
+        if not isinstance(mapping, Mapping):
+            at = f"key '{path}': " if path else ""
+            raise ConfigError(f"{where}: {at}found {_shown(mapping)}, expected a mapping of keys to values")
+        for key in mapping:
+            if not isinstance(key, str):
+                raise ConfigError(
+                    f"{where}: {self._at(str(key))}: found the key {key!r}, expected a text key"
+                )
+        self._mapping: Final[Mapping[str, Any]] = mapping
+        self._known: Final[dict[str, None]] = {}
+
+    def _at(self, key: str) -> str:
+        return f"key '{self.path}.{key}'" if self.path else f"key '{key}'"
+
+    def error(self, key: str, found: object, expected: str) -> ConfigError:
+        """Return (not raise) the error of one key, for checks that this class does not know."""
+        return ConfigError(f"{self.where}: {self._at(key)}: found {_shown(found)}, expected {expected}")
+
+    def _take(self, key: str, default: object, expected: str) -> Any:
+        self._known[key] = None
+        if key in self._mapping:
+            return self._mapping[key]
+        if isinstance(default, Required):
+            raise ConfigError(f"{self.where}: {self._at(key)}: missing, expected {expected}")
+        return default
+
+    def has(self, key: str) -> bool:
+        """Whether the key is present (does not count as reading it)."""
+        return key in self._mapping
+
+    def keys(self) -> tuple[str, ...]:
+        """All keys that are present, in file order."""
+        return tuple(self._mapping)
+
+    names = keys  # for loops: linters take `.keys()` for a dict's
+
+    def raw(self, key: str, default: Any = REQUIRED) -> Any:
+        """Return the value as parsed, marking the key as known."""
+        return self._take(key, default, "a value")
+
+    def number(
+        self,
+        key: str,
+        unit: str = "",
+        low: float | None = None,
+        high: float | None = None,
+        default: Any = REQUIRED,
+        *,
+        above: float | None = None,
+    ) -> float:
+        """Return a finite float in [low, high], and > `above`; bool, text, NaN and infinity are refused."""
+        expected = _range_text("a number" + (f" in {unit}" if unit else ""), low, high, above)
+        value = self._take(key, default, expected)
+        if key not in self._mapping:
+            return value  # type: ignore[no-any-return]  # the caller's own default, None included
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise self.error(key, value, expected + _number_text(value))
+        try:
+            number = float(value)
+        except OverflowError:
+            raise self.error(key, value, expected) from None
+        if not math.isfinite(number) or not _in_range(number, low, high, above):
+            raise self.error(key, value, expected)
+        return number
+
+    def integer(
+        self,
+        key: str,
+        unit: str = "",
+        low: int | None = None,
+        high: int | None = None,
+        default: Any = REQUIRED,
+    ) -> int:
+        """Return a whole number in [low, high]; 3.0, bool and text are refused."""
+        expected = _range_text("a whole number" + (f" in {unit}" if unit else ""), low, high, None)
+        value = self._take(key, default, expected)
+        if key not in self._mapping:
+            return value  # type: ignore[no-any-return]
+        if isinstance(value, bool) or not isinstance(value, int) or not _in_range(value, low, high, None):
+            raise self.error(key, value, expected)
+        return value
+
+    def text(
+        self,
+        key: str,
+        choices: Iterable[str] | None = None,
+        default: Any = REQUIRED,
+    ) -> str:
+        """Return a non-empty text, one of `choices` where given."""
+        allowed = None if choices is None else tuple(choices)
+        expected = "a text" if allowed is None else "one of " + ", ".join(repr(c) for c in allowed)
+        value = self._take(key, default, expected)
+        if key not in self._mapping:
+            return value  # type: ignore[no-any-return]
+        if not isinstance(value, str) or not value.strip() or (allowed is not None and value not in allowed):
+            raise self.error(key, value, expected)
+        return value
+
+    def boolean(self, key: str, default: Any = REQUIRED) -> bool:
+        """Return true or false; 0, 1 and texts are refused."""
+        value = self._take(key, default, "true or false")
+        if key not in self._mapping:
+            return value  # type: ignore[no-any-return]
+        if not isinstance(value, bool):
+            raise self.error(key, value, "true or false")
+        return value
+
+    def section(self, key: str, optional: bool = False) -> Section | None:
+        """Return the mapping under `key`; None when it is optional and missing (or empty in the file)."""
+        value = self._take(key, None if optional else REQUIRED, "a mapping of keys to values")
+        if value is None and optional:
+            return None
+        return Section(value, self.where, self._child(key))
+
+    def required(self, key: str) -> Section:
+        """Return the mapping under `key`, which must be there."""
+        return Section(self._take(key, REQUIRED, "a mapping of keys to values"), self.where, self._child(key))
+
+    def sections(self, key: str) -> list[Section]:
+        """Return the list of mappings under `key`; a missing key or null is an empty list."""
+        value = self._take(key, None, "a list of mappings")
+        if value is None:
+            return []
+        if not isinstance(value, list | tuple):
+            raise self.error(key, value, "a list of mappings")
+        return [Section(item, self.where, f"{self._child(key)}[{n}]") for n, item in enumerate(value)]
+
+    def _child(self, key: str) -> str:
+        return f"{self.path}.{key}" if self.path else key
+
+    def finish(self) -> None:
+        """Refuse keys that were never read, naming the nearest known one."""
+        for key in self._mapping:
+            if key not in self._known:
+                near = difflib.get_close_matches(key, self._known, n=1)
+                hint = f"did you mean '{near[0]}'?" if near else "known keys: " + ", ".join(self._known)
+                raise ConfigError(f"{self.where}: {self._at(key)}: unknown key, {hint}")
+
+
+def _in_range(value: float, low: float | None, high: float | None, above: float | None) -> bool:
+    return (
+        (low is None or value >= low) and (high is None or value <= high) and (above is None or value > above)
+    )
+
+
+def _range_text(kind: str, low: float | None, high: float | None, above: float | None) -> str:
+    if low is not None and high is not None:
+        return f"{kind} from {low:g} to {high:g}"
+    if low is not None:
+        return f"{kind} >= {low:g}"
+    if above is not None:
+        return f"{kind} > {above:g}" + (f" and <= {high:g}" if high is not None else "")
+    return f"{kind} <= {high:g}" if high is not None else kind

@@ -1,0 +1,161 @@
+"""The estimate of one joint, sample by sample: observer, loss, network, validity, in this order.
+
+    tau_raw, tau_tob, v, r  <- observer (Eqs. 4, 7)
+    i_eff      = tau_raw/(G Kt)                      current without the part that accelerates the rotor
+    efficiency = tau_raw - loss(i_eff, v)            inside a quadrant tau_raw eta(i_eff, v): Eq. (7) for
+    Table I's eta network    = N(i, theta_m, omega_m, theta_l, omega_l, efficiency)
+
+Everything that enters the loss went through the same filter, so the physics estimate as a whole is 1/g old.
+"""
+
+from __future__ import annotations
+
+from math import nan
+from typing import Final, NamedTuple
+
+from estimator.losses import LossModel
+from estimator.network_use import NetworkModel, checked_network, trust_of
+from estimator.parameters import Joint
+from estimator.settings import METHODS, EstimatorSettings
+from estimator.status import DEGRADED, INVALID, OFF, STANDSTILL, STARTING
+from estimator.tracking import Tracker
+from estimator.validity import Uncertainty
+from estimator.whole_run import EstimateRun, estimate_run
+
+__all__ = [
+    "METHODS",
+    "OFF_ESTIMATE",
+    "Estimate",
+    "EstimateRun",
+    "EstimatorSettings",
+    "JointEstimator",
+    "estimate_run",
+]
+
+
+class Estimate(NamedTuple):
+    """One step's result [Nm, joint side]; NaN where not computed or not to be published.
+
+    torque_nm, sigma_nm are numbers with status VALID, DEGRADED and STANDSTILL only; tob_nm, efficiency_nm and
+    network_nm are the methods' own values, for the record.
+    """
+
+    torque_nm: float
+    sigma_nm: float
+    status: int
+    tob_nm: float
+    efficiency_nm: float
+    network_nm: float
+
+
+_STARTING: Final = Estimate(nan, nan, STARTING, nan, nan, nan)
+_INVALID: Final = Estimate(nan, nan, INVALID, nan, nan, nan)
+OFF_ESTIMATE: Final = Estimate(nan, nan, OFF, nan, nan, nan)
+"""What a joint that is not estimated shows."""
+
+_new: Final = tuple.__new__
+
+
+class JointEstimator:
+    """Estimator of one joint. Raises ConfigError for effects it cannot apply and for another joint's network.
+
+    joint: parameters; settings: method and thresholds; network: needed by method "network" only. A joint
+    without efficiency may use methods "tob" and "network" (the loss is then its additive friction).
+    """
+
+    __slots__ = (
+        "_inverse_gain",
+        "_limit",
+        "_loss",
+        "_moving",
+        "_network_sigma",
+        "_run_network",
+        "_standing",
+        "_tracker",
+        "_weight",
+        "_with_efficiency",
+        "joint",
+        "settings",
+    )
+
+    def __init__(
+        self, joint: Joint, settings: EstimatorSettings, network: NetworkModel | None = None
+    ) -> None:
+        used = checked_network(joint, settings, network)
+        losses = LossModel(joint)
+        uncertainty = Uncertainty(joint, settings, losses)
+        self.joint: Final = joint
+        self.settings: Final = settings
+        self._tracker: Final = Tracker(joint, settings)
+        self._with_efficiency: Final = settings.method != "tob"
+        self._inverse_gain: Final = 1.0 / losses.torque_per_ampere
+        self._loss: Final = losses.loss
+        self._moving: Final = uncertainty.moving
+        self._standing: Final = uncertainty.standing
+        self._limit: Final = settings.torque_limit * joint.rated_torque_nm
+        self._run_network: Final = None if used is None else used.run_one
+        self._network_sigma: Final = 0.0 if used is None else used.sigma_nm
+        self._weight: Final = None if used is None else trust_of(joint, settings, used).weight
+
+    def reset(self) -> None:
+        """Forget the past: the next step starts."""
+        self._tracker.reset()
+
+    def step(
+        self,
+        dt_s: float,
+        current_a: float,
+        motor_position_rad: float,
+        motor_velocity_rad_s: float,
+        link_position_rad: float,
+    ) -> Estimate:
+        """Return the estimate at this sample, dt_s [s] after the one before; never raises on any float."""
+        tracker = self._tracker
+        seen = tracker.step(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
+        status = tracker.status
+        if seen is None:
+            return _STARTING if status == STARTING else _INVALID
+        raw, tob, v, link_velocity = seen
+        i = raw * self._inverse_gain
+        efficiency = network = nan
+        physics = tob
+        if self._with_efficiency:
+            physics = efficiency = raw - self._loss(i, v)
+        weight = 0.0
+        run_network = self._run_network
+        if run_network is not None:
+            network = run_network(
+                current_a,
+                motor_position_rad,
+                motor_velocity_rad_s,
+                link_position_rad,
+                link_velocity,
+                efficiency,
+            )
+            assert self._weight is not None
+            difference = network - physics
+            weight = self._weight(
+                current_a,
+                motor_position_rad,
+                motor_velocity_rad_s,
+                link_position_rad,
+                link_velocity,
+                efficiency,
+                difference,
+            )
+        if status == STANDSTILL:
+            torque, sigma = self._standing(raw, i)
+        elif weight == 1.0:
+            torque, sigma = network, self._network_sigma
+        elif weight > 0.0:
+            sigma = self._moving(raw, i, v)
+            torque = physics + weight * (network - physics)
+            sigma += weight * (self._network_sigma - sigma)
+        else:
+            torque, sigma = physics, self._moving(raw, i, v)
+            if run_network is not None:
+                status = DEGRADED
+        if not -self._limit <= torque <= self._limit:
+            torque = sigma = nan
+            status = INVALID
+        return _new(Estimate, (torque, sigma, status, tob, efficiency, network))

@@ -1,0 +1,28 @@
+"""Status codes of an estimate, as published on the bus (low or high nibble of the estimate PDO)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+OFF: Final = 0
+STARTING: Final = 1
+VALID: Final = 2
+DEGRADED: Final = 3  # outside the network's envelope or refused by its plausibility check: physics only
+STALE: Final = 4  # an input of this cycle is missing (set by the loop, never by the estimator)
+DRIVE_FAULT: Final = 5  # set by the loop, never by the estimator
+STANDSTILL: Final = 6  # known to an interval only; sigma is its half width
+INVALID: Final = 15
+
+NAMES: Final = {
+    OFF: "off",
+    STARTING: "starting",
+    VALID: "valid",
+    DEGRADED: "degraded",
+    STALE: "stale",
+    DRIVE_FAULT: "drive_fault",
+    STANDSTILL: "standstill",
+    INVALID: "invalid",
+}
+
+PUBLISHED: Final = frozenset((VALID, DEGRADED, STANDSTILL))
+"""Only with these may a torque number leave the estimator."""

@@ -1,0 +1,68 @@
+"""Reading of joint files and other YAML: checked values out; errors are one-line ConfigErrors."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+
+from estimator.checked import ConfigError
+from estimator.parameters import Joint
+
+_SHIPPED: Final = Path(__file__).resolve().parent
+
+
+class _Loader(yaml.SafeLoader):
+    """SafeLoader that refuses a key given twice: YAML says unique, PyYAML would silently keep the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[str] = set()
+        for key_node, _ in node.value:
+            key = key_node.value
+            if isinstance(key, str) and key_node.tag != "tag:yaml.org,2002:merge":
+                if key in seen:
+                    raise yaml.constructor.ConstructorError(
+                        None, None, f"the key '{key}' is given twice", key_node.start_mark
+                    )
+                seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+def load_yaml(path: str | os.PathLike[str]) -> tuple[dict[str, Any], str]:
+    """Return the root mapping of a YAML file and the SHA-256 of its bytes (hex). Raises ConfigError."""
+    name = os.fspath(path)
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{name}: cannot be read: {error.strerror or error}") from None
+    try:
+        content = yaml.load(data, Loader=_Loader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        at = f" line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        raise ConfigError(f"{name}:{at} not YAML: {error.problem or error.context}") from None
+    except (yaml.YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ConfigError(f"{name}: not YAML: {reason}") from None
+    if not isinstance(content, dict):
+        kind = "an empty file" if content is None else type(content).__name__
+        raise ConfigError(f"{name}: found {kind}, expected a mapping of keys to values")
+    return content, hashlib.sha256(data).hexdigest()
+
+
+def load_joint(path: str | os.PathLike[str]) -> Joint:
+    """Return the joint of a joint file. Raises ConfigError naming file, key, found and expected."""
+    mapping, _ = load_yaml(path)
+    return Joint.from_mapping(mapping, os.fspath(path))
+
+
+def shipped(name: str) -> Path:
+    """Return the path of a file that ships in models/, e.g. "joint1.yaml"; ConfigError lists what ships."""
+    path = (_SHIPPED / name).resolve()
+    if not path.is_relative_to(_SHIPPED) or not path.is_file():
+        known = sorted(p.name for p in _SHIPPED.iterdir() if p.suffix in {".yaml", ".onnx"})
+        raise ConfigError(f"{name}: does not ship with jtqd, which has: {', '.join(known)}")
+    return path

@@ -1,0 +1,1 @@
+"""The emulated bench: plant of two joints and one sensor, and its CANopen nodes on a bus."""

@@ -1,0 +1,141 @@
+"""The emulated bench: two drives and a torque sensor around one source. Frames and times in, frames out; no
+socket, no clock.
+"""
+
+from drivers.can_filter import CanFilter, exact
+from drivers.devices import JTQD_NODE, SYNC_COB_ID
+from sim_can.canopen_node import CanopenNode
+from sim_can.cia402 import OPERATION_ENABLED
+from sim_can.drive_node import DriveNode
+from sim_can.profile import targets
+from sim_can.sensor_node import SENSOR_NODE, SensorNode
+from sim_can.source import OFF, VELOCITY, Source
+
+LONGEST_STEP_NS = 50_000_000  # a source never jumps further than this, however long SYNC was away
+IDLE_STEP_NS = 10_000_000  # step of powered drives once SYNC has been away for LONGEST_STEP_NS
+
+
+def bench_filters() -> tuple[CanFilter, ...]:
+    """What the bench listens to: NMT, SYNC, SDO requests, RPDOs 1 and 2 of the drives, the master's
+    heartbeat.
+    """
+    ids = [0x000, SYNC_COB_ID, 0x700 + JTQD_NODE]
+    ids += [0x600 + node for node in (1, 2, SENSOR_NODE)]
+    ids += [base + node for base in (0x200, 0x300) for node in (1, 2)]
+    return tuple(exact(can_id) for can_id in ids)
+
+
+class Bench:
+    """Nodes 1, 2, 3. `over` turns True when a recorded run has ended.
+
+    The source's time is the measured time between SYNCs, beginning with 0 at the first one: equal stamps give
+    equal values.
+    """
+
+    def __init__(self, source: Source, profile: str = "demo") -> None:
+        self.source = source
+        self.over = False
+        self.drives = tuple(DriveNode(source, number, self._master_came) for number in (0, 1))
+        self.sensor = SensorNode(source)
+        self.nodes: tuple[CanopenNode, ...] = (*self.drives, self.sensor)
+        self.sync_count = 0
+        self._profile = profile
+        self._profile_s = 0.0
+        self._gear = [rating.gear_ratio for rating in source.ratings]
+        self._last_stamp_ns = 0
+        self._last_steady_ns = 0  # steady clock at the last step, for idle steps
+        self._idle_ns = 0  # source time spent in idle steps since the last SYNC
+
+    @property
+    def due_ns(self) -> int:
+        """Steady time of the next thing that `tick` has to do."""
+        due = min(node.due_ns for node in self.nodes)
+        return min(due, self._idle_due_ns()) if self._moving() else due
+
+    def on_frame(self, can_id: int, data: bytes, stamp_ns: int, now_ns: int) -> list[bytes]:
+        """One frame from the bus. stamp_ns: when it was received (kernel); now_ns: steady clock. Frames to
+        send.
+        """
+        if can_id == SYNC_COB_ID:
+            return self._on_sync(data, stamp_ns, now_ns)
+        frames: list[bytes] = []
+        for node in self.nodes:
+            frames += node.on_frame(can_id, data, now_ns)
+        return frames
+
+    def tick(self, now_ns: int) -> list[bytes]:
+        """Heartbeats and timers; moves powered drives on when there is no SYNC."""
+        frames: list[bytes] = []
+        for node in self.nodes:
+            if now_ns >= node.due_ns:
+                frames += node.tick(now_ns)
+        if self._moving() and now_ns >= self._idle_due_ns():
+            step_ns = min(now_ns - self._last_steady_ns, LONGEST_STEP_NS)
+            self._last_steady_ns = now_ns
+            self._idle_ns += step_ns
+            frames += self._advance(step_ns * 1e-9)
+        return frames
+
+    def _on_sync(self, data: bytes, stamp_ns: int, now_ns: int) -> list[bytes]:
+        step_ns = 0
+        if self.sync_count:
+            # a clock that was stepped back must not stop the bench, nor may time that idle steps covered
+            # count twice
+            step_ns = min(max(stamp_ns - self._last_stamp_ns - self._idle_ns, 0), LONGEST_STEP_NS)
+        self.sync_count += 1
+        self._last_stamp_ns = stamp_ns
+        self._last_steady_ns = now_ns
+        self._idle_ns = 0
+        frames = self._advance(step_ns * 1e-9)
+        if self.over:
+            return frames
+        for node in self.nodes:
+            frames += node.on_sync(data)
+        return frames
+
+    def _advance(self, dt_s: float) -> list[bytes]:
+        if not self.source.advance(dt_s):
+            self.over = True
+            return []
+        one, two = self.drives
+        frames = one.watch() + two.watch()
+        if not one.commanded:
+            frames += self._by_itself(dt_s)
+        return frames
+
+    def _by_itself(self, dt_s: float) -> list[bytes]:
+        """Drives that no master commands: a recorded run says "enabled", or the built-in motion runs."""
+        one, two = self.drives
+        signals = self.source.drives
+        if signals[0].enabled or signals[1].enabled:
+            frames: list[bytes] = []
+            for drive, signal in zip(self.drives, signals, strict=True):
+                if signal.enabled:
+                    frames += drive.run_by_itself(OFF, 0.0)
+            return frames
+        if one.machine.state == two.machine.state == OPERATION_ENABLED:
+            self._profile_s += dt_s
+        else:
+            self._profile_s = 0.0  # begin, or begin again after a stop, from rest
+        wanted = targets(self._profile, self._profile_s)
+        if wanted is None:
+            return []
+        frames = []
+        for drive, gear, target in zip(self.drives, self._gear, wanted, strict=True):
+            value = target.target * gear if target.mode == VELOCITY else target.target
+            frames += drive.run_by_itself(target.mode, value)
+        return frames
+
+    def _master_came(self) -> None:
+        for drive in self.drives:
+            drive.hand_over()
+
+    def _idle_due_ns(self) -> int:
+        return self._last_steady_ns + (IDLE_STEP_NS if self._idle_ns else LONGEST_STEP_NS)
+
+    def _moving(self) -> bool:
+        """Powered plant drives go on without SYNC; a recorded run does not: its time is that of the SYNCs."""
+        one, two = self.drives
+        if not self.sync_count or self.source.drives[0].enabled or self.source.drives[1].enabled:
+            return False
+        return one.machine.powered or two.machine.powered

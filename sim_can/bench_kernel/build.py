@@ -1,0 +1,232 @@
+"""Build the bench kernel once and keep it in the user's cache, outside the checkout."""
+
+import fcntl
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+from sim_can.bench_kernel import packages
+
+CONFIG_FILE = Path(__file__).with_name("bench_kernel.config")
+OVERRIDE = "JTQD_BENCH_KERNEL"
+"""Environment variable: path of a ready-made kernel binary, used as it is."""
+
+_MAKE_ARCH = ("ARCH=um", "SUBARCH=x86_64")
+_PROGRESS_INTERVAL_S = 30.0
+
+
+class BuildError(RuntimeError):
+    """The kernel could not be built; the message names the log."""
+
+
+def cache_root() -> Path:
+    """The directory that holds every cached kernel: ${XDG_CACHE_HOME:-~/.cache}/jtqd."""
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    return Path(base) / "jtqd"
+
+
+def cache_key(config: bytes, source_version: str) -> str:
+    """Name of a build: changes with every byte of the configuration and with the source package's version."""
+    return hashlib.sha256(config + b"\0" + source_version.encode()).hexdigest()[:16]
+
+
+def config_key(config: bytes) -> str:
+    """Name of a configuration alone; finds a cached kernel where the source package is not installed."""
+    return hashlib.sha256(config).hexdigest()[:16]
+
+
+def wanted_options(config: str) -> list[str]:
+    """The lines `CONFIG_X=y` of a configuration (fragment or full)."""
+    return [
+        line.strip() for line in config.splitlines() if line.startswith("CONFIG_") and line.endswith("=y")
+    ]
+
+
+def cached(config: bytes, source_version: str | None, root: Path) -> Path | None:
+    """The cached binary of this configuration and source version, or None.
+
+    Without an installed source package (version None) the newest cached kernel of this configuration serves.
+    """
+    if source_version is not None:
+        binary = root / f"bench-kernel-{cache_key(config, source_version)}" / "linux"
+        return binary if binary.exists() else None
+    same = [
+        mark.with_name("linux")
+        for mark in root.glob("bench-kernel-*/config.key")
+        if mark.read_text().strip() == config_key(config) and mark.with_name("linux").exists()
+    ]
+    return max(same, key=lambda binary: binary.stat().st_mtime, default=None)
+
+
+def find() -> Path | None:
+    """Path of the ready kernel binary, or None when it has to be built first.
+
+    Raises BuildError when the environment variable JTQD_BENCH_KERNEL names no executable file.
+    """
+    override = os.environ.get(OVERRIDE)
+    if override is None:
+        return cached(CONFIG_FILE.read_bytes(), _source_version(), cache_root())
+    if not os.access(override, os.X_OK):
+        raise BuildError(f"{OVERRIDE}={override}: no such executable file")
+    return Path(override)
+
+
+def ensure(*, install: bool = True) -> Path:
+    """Path of the kernel binary; built first when it is not in the cache (2 to 5 minutes).
+
+    Raises packages.MissingPackagesError naming what is missing and may not be installed, BuildError when the
+    build fails.
+    """
+    ready = find()
+    if ready is not None:
+        packages.require(packages.GUEST, install=install)
+        return ready
+    if platform.machine() != "x86_64":
+        raise BuildError(f"the bench kernel is built for x86_64 only, this machine is {platform.machine()}")
+    packages.require((*packages.BUILD, *packages.GUEST), install=install)
+    version = _source_version()
+    if version is None:
+        raise BuildError(
+            f"{packages.SOURCE_ARCHIVE} is there but dpkg knows no package {packages.SOURCE_PACKAGE}"
+        )
+    config, root = CONFIG_FILE.read_bytes(), cache_root()
+    root.mkdir(parents=True, exist_ok=True)
+    with _only_builder(root):
+        ready = cached(config, version, root)  # another builder may have finished while this one waited
+        return ready if ready is not None else _build(config, version, root)
+
+
+def _source_version() -> str | None:
+    """Installed version of the kernel source package, or None."""
+    if packages.find_program("dpkg-query") is None:
+        return None
+    done = subprocess.run(
+        ["dpkg-query", "-W", "-f", "${db:Status-Status} ${Version}", packages.SOURCE_PACKAGE],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    status, _, version = done.stdout.strip().partition(" ")
+    return version if done.returncode == 0 and status == "installed" else None
+
+
+@contextmanager
+def _only_builder(root: Path) -> Iterator[None]:
+    with open(root / "bench-kernel.lock", "w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            _say("another build is running, waiting for it")
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def _build(config: bytes, version: str, root: Path) -> Path:
+    """Build in a temporary directory beside the final one and move the result in by one rename."""
+    final = root / f"bench-kernel-{cache_key(config, version)}"
+    work = Path(tempfile.mkdtemp(prefix="building-", dir=root))
+    log = work / "build.log"
+    started = time.monotonic()
+    try:
+        with open(log, "w") as out:
+            tree = _unpack(work, version, out)
+            _configure(tree, config, out)
+            _compile(tree, log, out)
+        done = work / "done"
+        done.mkdir()
+        shutil.copy2(tree / "linux", done / "linux")
+        shutil.copy2(tree / ".config", done / "config")
+        shutil.copy2(log, done / "build.log")
+        (done / "config.key").write_text(config_key(config) + "\n")
+        shutil.rmtree(final, ignore_errors=True)
+        done.rename(final)
+    except subprocess.CalledProcessError as error:
+        kept = root / f"{final.name}.failed.log"
+        shutil.copy2(log, kept)
+        last = "\n".join(kept.read_text(errors="replace").splitlines()[-10:])
+        command = " ".join(map(str, error.cmd))
+        raise BuildError(f"`{command}` failed with status {error.returncode}; log: {kept}\n{last}") from error
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    _say(f"built in {time.monotonic() - started:.0f} s: {final / 'linux'}")
+    return final / "linux"
+
+
+def _unpack(work: Path, version: str, out: IO[str]) -> Path:
+    _say(f"unpacking {packages.SOURCE_ARCHIVE} ({version})")
+    subprocess.run(
+        ["tar", "-xJf", packages.SOURCE_ARCHIVE, "-C", str(work)],
+        stdout=out,
+        stderr=subprocess.STDOUT,
+        check=True,
+    )
+    return work / packages.SOURCE_PACKAGE
+
+
+def _configure(tree: Path, config: bytes, out: IO[str]) -> None:
+    _say("configuring")
+    fragment = tree.parent / "fragment.config"
+    fragment.write_bytes(config)
+    subprocess.run(
+        ["make", *_MAKE_ARCH, "allnoconfig", f"KCONFIG_ALLCONFIG={fragment}"],
+        cwd=tree,
+        env=_clean_environment(),
+        stdout=out,
+        stderr=subprocess.STDOUT,
+        check=True,
+    )
+    arrived = set(wanted_options((tree / ".config").read_text()))
+    refused = [option for option in wanted_options(config.decode()) if option not in arrived]
+    if refused:
+        raise BuildError(f"this kernel source refuses options of {CONFIG_FILE.name}: {' '.join(refused)}")
+
+
+def _compile(tree: Path, log: Path, out: IO[str]) -> None:
+    jobs = len(os.sched_getaffinity(0))
+    _say(f"compiling with {jobs} jobs (2 to 5 minutes, once); log: {log}")
+    command = ["make", *_MAKE_ARCH, f"-j{jobs}", "linux"]
+    started = time.monotonic()
+    process = subprocess.Popen(
+        command, cwd=tree, env=_clean_environment(), stdout=out, stderr=subprocess.STDOUT
+    )
+    try:
+        while process.poll() is None:
+            try:
+                process.wait(_PROGRESS_INTERVAL_S)
+            except subprocess.TimeoutExpired:
+                compiled = log.read_text(errors="replace").count("  CC ")
+                _say(f"{time.monotonic() - started:.0f} s, {compiled} files compiled")
+    finally:
+        if process.poll() is None:
+            process.terminate()
+            process.wait()
+    if process.returncode != 0:
+        raise subprocess.CalledProcessError(process.returncode, command)
+
+
+def _clean_environment() -> dict[str, str]:
+    """The environment without what a calling `make` or a shell could leak into the kernel's makefiles."""
+    leaks = (
+        "MAKEFLAGS",
+        "MFLAGS",
+        "MAKELEVEL",
+        "MAKEOVERRIDES",
+        "CFLAGS",
+        "LDFLAGS",
+        "ARCH",
+        "CROSS_COMPILE",
+    )
+    return {name: value for name, value in os.environ.items() if name not in leaks}
+
+
+def _say(text: str) -> None:
+    print(f"bench kernel: {text}", file=sys.stderr, flush=True)

@@ -1,0 +1,328 @@
+"""One emulated CANopen device: NMT, heartbeat, EMCY, SDO, PDOs (CiA 301). Frames and times in, frames out: no
+socket, no clock.
+
+Times are integer nanoseconds of one steady clock. Every method that may say something on the bus returns a
+list of 16-byte frames. What frames arrive is nobody's promise: wrong lengths and foreign identifiers are
+ignored or answered as CiA 301 says, never raised.
+"""
+
+import struct
+from collections.abc import Callable
+
+from drivers.error_history import ErrorHistory
+from drivers.frame import pack
+from drivers.object_dictionary import ObjectStore
+from drivers.pdo import LAST_SYNC_TYPE, PdoMap
+from drivers.pdo_parameters import PdoParameters
+from drivers.sdo_abort import SdoAbort
+from drivers.sdo_server import SdoServer
+from sim_can.transmit_pdo import NEVER_NS, Getter, TransmitPdo
+
+STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0x04, 0x05, 0x7F
+_START, _STOP, _ENTER_PRE_OPERATIONAL, _RESET_NODE, _RESET_COMMUNICATION = 1, 2, 128, 129, 130
+_EMCY = struct.Struct("<HB5s")
+HEARTBEAT_LOST = 0x8130
+PDO_TOO_SHORT = 0x8210
+SYNC_LENGTH = 0x8240
+_MS = 1_000_000
+
+Handler = Callable[[int], None]
+
+
+class CanopenNode:
+    """Common part of the bench's devices. A device adds getters of its process objects and handlers of its
+    commands.
+
+    `getters[(index, subindex)]` gives the value an object has now; SDO and TPDO read it. `handlers[(index,
+    subindex)]` is told each value that an SDO or an RPDO writes; it may refuse an SDO by raising SdoAbort.
+    `due_ns` says when `tick` has something to do.
+    """
+
+    def __init__(self, store: ObjectStore) -> None:
+        self.store = store
+        self.node_id = store.node_id
+        self.state = PRE_OPERATIONAL
+        self.due_ns = 0
+        self.getters: dict[tuple[int, int], Getter] = {}
+        self.handlers: dict[tuple[int, int], Handler] = {}
+        self._pdos = PdoParameters(store)
+        self._history = ErrorHistory(store)
+        self._sdo = SdoServer(store)
+        self._errors: dict[int, int] = {}  # present errors: EMCY code -> bits of the error register
+        self._generation = -1
+        self._transmit: list[TransmitPdo] = []
+        self._receive: dict[int, PdoMap] = {}
+        self._waiting: dict[int, bytes] = {}  # synchronous RPDOs received since the last SYNC
+        self._bootup_pending = True
+        self._heartbeat_due_ns = NEVER_NS
+        self._heartbeat_ns = 0
+        self._master_due_ns = NEVER_NS
+        self._sync_error_told = False
+
+    # For the devices ----------------------------------------------------------------------------------------
+
+    def connect(self) -> None:
+        """Tie getters and handlers to the object dictionary; called once by the device when all are there."""
+        for (index, subindex), getter in self.getters.items():
+            self.store.on_read(index, subindex, getter)
+        for (index, subindex), handler in self.handlers.items():
+            entry = self.store.entry(index, subindex)
+            layout = entry.layout
+            if layout is None:
+                raise ValueError(f"{index:04X}h:{subindex} is not a number")
+
+            def on_write(
+                data: bytes, unpack: Callable[[bytes], tuple[int]] = layout.unpack, tell: Handler = handler
+            ) -> None:
+                tell(unpack(data)[0])
+
+            self.store.on_write(index, subindex, on_write)
+
+    def on_reset(self) -> None:
+        """NMT reset node: the device goes to its power-on state."""
+
+    def on_heartbeat_lost(self) -> list[bytes]:
+        """The master's heartbeat stopped; EMCY and 1029h are the base's matter."""
+        return []
+
+    def raise_error(self, code: int, register: int, detail: bytes = b"\0\0\0\0\0") -> list[bytes]:
+        """EMCY for a new error: 1001h, 1003h and the message. An error that is already present is not told
+        again.
+        """
+        if code in self._errors:
+            return []
+        self._errors[code] = register | 1
+        self._history.push(code)
+        return self._emcy(code, detail)
+
+    def clear_error(self, *codes: int) -> list[bytes]:
+        """These errors are gone; EMCY 0000h with what is left in the error register, when one of them was
+        present.
+        """
+        gone = [code for code in codes if self._errors.pop(code, None) is not None]
+        return self._emcy(0, b"\0\0\0\0\0") if gone else []
+
+    def _emcy(self, code: int, detail: bytes) -> list[bytes]:
+        register = 0
+        for bits in self._errors.values():
+            register |= bits
+        self.store.set_number(0x1001, 0, register)
+        if self.state == STOPPED:
+            return []
+        return [pack(0x080 + self.node_id, _EMCY.pack(code, register, detail))]
+
+    def event(self) -> list[bytes]:
+        """Send the event-driven TPDOs (types 254, 255) whose values have changed."""
+        frames: list[bytes] = []
+        if self.state == OPERATIONAL:
+            for transmit in self._pdo_maps():
+                if transmit.type > LAST_SYNC_TYPE:
+                    frame = transmit.frame()
+                    if frame != transmit.last:
+                        transmit.last = frame
+                        frames.append(frame)
+        return frames
+
+    # From the bus -------------------------------------------------------------------------------------------
+
+    def on_frame(self, can_id: int, data: bytes, t_ns: int) -> list[bytes]:
+        """Any frame but SYNC: NMT, SDO request, RPDO, the master's heartbeat; others are ignored."""
+        if can_id == 0x600 + self.node_id:
+            if self.state == STOPPED:
+                return []
+            return self._on_sdo(data, t_ns)
+        if can_id == 0:
+            return self._on_nmt(data, t_ns)
+        if 0x701 <= can_id <= 0x77F:
+            return self._on_heartbeat(can_id - 0x700, data, t_ns)
+        if self.state == OPERATIONAL:
+            self._pdo_maps()
+            pdo = self._receive.get(can_id)
+            if pdo is not None:
+                return self._on_rpdo(pdo, data)
+        return []
+
+    def on_sync(self, data: bytes) -> list[bytes]:
+        """SYNC: apply the synchronous RPDOs received before it, then send the TPDOs that are due."""
+        if self.state != OPERATIONAL:
+            return []
+        frames: list[bytes] = []
+        counter = data[0] if len(data) == 1 else 0
+        if len(data) > 1 and not self._sync_error_told:
+            self._sync_error_told = True
+            frames += self.raise_error(SYNC_LENGTH, 0x10)
+        transmits = self._pdo_maps()
+        if self._waiting:
+            self._apply_waiting()
+            frames += self.after_command()
+        for transmit in transmits:
+            kind = transmit.type
+            if kind > LAST_SYNC_TYPE:
+                continue
+            if transmit.start and counter:
+                if counter != transmit.start:
+                    continue
+                transmit.start = 0
+                transmit.count = kind - 1
+            transmit.count += 1
+            if transmit.count < kind:
+                continue
+            transmit.count = 0
+            frame = transmit.frame()
+            if kind or frame != transmit.last:  # type 0: synchronous, but only after a change
+                frames.append(frame)
+            transmit.last = frame
+        return frames
+
+    def tick(self, t_ns: int) -> list[bytes]:
+        """Boot-up message, heartbeat, event timers, master's heartbeat; sets `due_ns` to the next time it
+        wants to be called.
+        """
+        frames: list[bytes] = []
+        if self._bootup_pending:
+            self._bootup_pending = False
+            frames.append(pack(0x700 + self.node_id, b"\0"))
+            self._plan_heartbeat(t_ns)
+        if t_ns >= self._heartbeat_due_ns:
+            frames.append(pack(0x700 + self.node_id, bytes([self.state])))
+            missed = (t_ns - self._heartbeat_due_ns) // self._heartbeat_ns
+            self._heartbeat_due_ns += (missed + 1) * self._heartbeat_ns
+        if t_ns >= self._master_due_ns:
+            self._master_due_ns = NEVER_NS
+            frames += self._on_master_lost()
+        due = min(self._heartbeat_due_ns, self._master_due_ns)
+        if self.state == OPERATIONAL:
+            for transmit in self._pdo_maps():
+                if transmit.type > LAST_SYNC_TYPE and transmit.period_ns:
+                    if t_ns >= transmit.due_ns:
+                        frames.append(transmit.frame())
+                        transmit.due_ns = NEVER_NS
+                    if transmit.due_ns == NEVER_NS:
+                        transmit.due_ns = t_ns + transmit.period_ns
+                    due = min(due, transmit.due_ns)
+        self.due_ns = due
+        return frames
+
+    # Services -----------------------------------------------------------------------------------------------
+
+    def _on_sdo(self, data: bytes, t_ns: int) -> list[bytes]:
+        before = self.store.number(0x1017)
+        reply = self._sdo.handle(data)
+        if self.store.number(0x1017) != before:
+            self._plan_heartbeat(t_ns)
+        self.due_ns = 0  # whatever was written, let the next tick look at its times again
+        frames = [] if reply is None else [pack(0x580 + self.node_id, reply)]
+        return frames + self.after_command()
+
+    def after_command(self) -> list[bytes]:
+        """What a device has to say after an SDO or RPDO wrote to it (EMCY, event-driven TPDOs)."""
+        return []
+
+    def _on_nmt(self, data: bytes, t_ns: int) -> list[bytes]:
+        if len(data) != 2 or data[1] not in (0, self.node_id):
+            return []
+        command = data[0]
+        self.due_ns = 0
+        if command == _START:
+            if self.state != OPERATIONAL:
+                self.state = OPERATIONAL
+                self._generation = -1
+                return self.event()  # event-driven TPDOs are sent once on entering
+        elif command == _STOP:
+            self.state = STOPPED
+        elif command == _ENTER_PRE_OPERATIONAL:
+            self.state = PRE_OPERATIONAL
+        elif command in (_RESET_NODE, _RESET_COMMUNICATION):
+            self._reset(command == _RESET_NODE)
+            return self.tick(t_ns)
+        return []
+
+    def _reset(self, whole: bool) -> None:
+        """Power-on values of the communication parameters (mapping too), or of everything; then the boot-up
+        message.
+        """
+        self.store.restore(0x1000, 0xFFFF if whole else 0x1FFF)
+        if whole:
+            self.on_reset()
+        self.state = PRE_OPERATIONAL
+        self._sdo = SdoServer(self.store)
+        self._errors.clear()
+        self._generation = -1
+        self._waiting.clear()
+        self._sync_error_told = False
+        self._bootup_pending = True
+        self._heartbeat_due_ns = self._master_due_ns = NEVER_NS
+
+    def _plan_heartbeat(self, t_ns: int) -> None:
+        self._heartbeat_ns = self.store.number(0x1017) * _MS
+        self._heartbeat_due_ns = t_ns + self._heartbeat_ns if self._heartbeat_ns else NEVER_NS
+
+    def _on_heartbeat(self, node: int, data: bytes, t_ns: int) -> list[bytes]:
+        """Heartbeat consumer 1016h:1 (node in bits 16..22, time in ms in bits 0..15); watching starts with
+        the first one.
+        """
+        consumer = self.store.number(0x1016, 1)
+        period_ns = (consumer & 0xFFFF) * _MS
+        if len(data) != 1 or consumer >> 16 & 0x7F != node or not period_ns:
+            return []
+        self._master_due_ns = t_ns + period_ns
+        self.due_ns = min(self.due_ns, self._master_due_ns)
+        return self.clear_error(HEARTBEAT_LOST) if HEARTBEAT_LOST in self._errors else []
+
+    def _on_master_lost(self) -> list[bytes]:
+        frames = self.raise_error(HEARTBEAT_LOST, 0x10)
+        frames += self.on_heartbeat_lost()
+        behaviour = self.store.number(0x1029, 1)
+        if behaviour == 0 and self.state == OPERATIONAL:
+            self.state = PRE_OPERATIONAL
+        elif behaviour == 2:
+            self.state = STOPPED
+        return frames
+
+    def _on_rpdo(self, pdo: PdoMap, data: bytes) -> list[bytes]:
+        if len(data) < pdo.length:
+            return self.raise_error(PDO_TOO_SHORT, 0x10)
+        if pdo.transmission_type <= LAST_SYNC_TYPE:
+            self._waiting[pdo.cob_id] = data
+            return []
+        self._apply(pdo, data)
+        return self.clear_error(PDO_TOO_SHORT) + self.after_command()
+
+    def _apply_waiting(self) -> None:
+        for cob_id, data in self._waiting.items():
+            pdo = self._receive.get(cob_id)
+            if pdo is not None:
+                self._apply(pdo, data)
+        self._waiting.clear()
+
+    def _apply(self, pdo: PdoMap, data: bytes) -> None:
+        for mapped, value in zip(pdo.objects, pdo.layout.unpack_from(data), strict=True):
+            try:
+                self.store.write(
+                    mapped.index,
+                    mapped.subindex,
+                    value.to_bytes(mapped.bits // 8, "little", signed=mapped.signed),
+                )
+            except SdoAbort:
+                continue  # a value out of range is not applied; an RPDO has nobody to tell
+
+    def _pdo_maps(self) -> list[TransmitPdo]:
+        """Active TPDOs; made anew after a change of the PDO parameters. Also refreshes the RPDOs."""
+        if self._generation != self._pdos.generation:
+            self._generation = self._pdos.generation
+            self._receive = {pdo.cob_id: pdo for pdo in self._pdos.rpdos()}
+            self._transmit = []
+            for index in self._pdos.tpdo_indices:
+                pdo = self._pdos.active_map(index)
+                if pdo is not None:
+                    start, period = self.store.number(index, 6), self.store.number(index, 5)
+                    self._transmit.append(
+                        TransmitPdo(
+                            pdo, tuple(self._getter(m.index, m.subindex) for m in pdo.objects), start, period
+                        )
+                    )
+        return self._transmit
+
+    def _getter(self, index: int, subindex: int) -> Getter:
+        found = self.getters.get((index, subindex))
+        return found if found is not None else lambda: self.store.number(index, subindex)

@@ -1,0 +1,163 @@
+"""`jtq sim`: the emulated bench on a bus."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from estimator.checked import ConfigError
+from sim_can.plant_parameters import PROFILES
+from sim_can.source import Source
+
+EXAMPLES = """examples:
+  jtq sim --bus vcan0                              two joints and a sensor on SocketCAN
+  jtq sim --bus unix:/tmp/bench --bitrate 1000000  the same on a unix bus with the wire modelled
+  jtq sim --bus vcan0 --play run.csv --columns columns.yaml --joints 2,4
+  jtq sim --cost                                   CPU time of one cycle on this machine
+"""
+
+
+def _joints(text: str) -> tuple[int, int]:
+    try:
+        first, second = (int(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not two joint numbers like 2,4") from None
+    return first, second
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return value
+
+
+def _positive_int(text: str) -> int:
+    value = int(text)
+    if value <= 0:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive whole number")
+    return value
+
+
+def _natural(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text} is not a whole number >= 0")
+    return value
+
+
+def parser() -> argparse.ArgumentParser:
+    """Options of `jtq sim`."""
+    made = argparse.ArgumentParser(
+        prog="jtq sim",
+        description="Emulated bench: two drives (nodes 1, 2) and a torque sensor (node 3) on a CAN bus.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    made.add_argument(
+        "--bus", help="SocketCAN interface (vcan0) or unix:PATH; a unix bus without a hub gets one"
+    )
+    made.add_argument(
+        "--plant", type=Path, metavar="FILE", help="plant.yaml, or a joint.yaml for two ideal joints"
+    )
+    made.add_argument("--seed", type=_natural, default=0, metavar="N", help="seed of the noise (default 0)")
+    made.add_argument(
+        "--profile", choices=PROFILES, help="motion while no master commands (default: the plant file's)"
+    )
+    made.add_argument("--play", type=Path, metavar="RUN", help="play a measured run instead of the plant")
+    made.add_argument("--columns", type=Path, metavar="FILE", help="column map of the run")
+    made.add_argument(
+        "--joints", type=_joints, metavar="A,B", help="joints of the run for drives 1, 2 (default 1,2)"
+    )
+    made.add_argument(
+        "--bitrate", type=_positive_int, metavar="B", help="model the wire of an own hub, bit/s"
+    )
+    made.add_argument("--duration", type=_positive, metavar="S", help="end after so many seconds")
+    made.add_argument("--cost", action="store_true", help="measure the CPU time of one cycle and leave")
+    made.add_argument("--json", action="store_true", help="with --cost: result as JSON")
+    return made
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run `jtq sim`. Returns 0 done, 1 failure, 2 usage; bad input is one line on stderr."""
+    from drivers.errors import BusError
+
+    try:
+        options = parser().parse_args(argv)
+    except SystemExit as leave:
+        return int(leave.code or 0)
+    problem = _usage(options)
+    if problem:
+        print(f"jtq sim: {problem}", file=sys.stderr)
+        return 2
+    try:
+        return _run(options)
+    except (ConfigError, BusError) as error:
+        print(f"jtq sim: {error}", file=sys.stderr)
+        return 1
+    except OSError as error:
+        print(f"jtq sim: {error.filename or options.bus}: {error.strerror or error}", file=sys.stderr)
+        return 1
+
+
+def _usage(options: argparse.Namespace) -> str:
+    """What is wrong with the combination of options; empty when nothing is."""
+    if options.cost:
+        return ""
+    if options.bus is None:
+        return "--bus is missing, for example --bus vcan0 or --bus unix:/tmp/bench"
+    if options.play is None:
+        if options.columns is not None or options.joints is not None:
+            return "--columns and --joints belong to --play RUN"
+    elif options.plant is not None or options.profile is not None:
+        return "--plant and --profile belong to the emulated plant, not to --play RUN"
+    return ""
+
+
+def _run(options: argparse.Namespace) -> int:
+    from models.files import shipped
+    from sim_can.plant_parameters import load_plant
+
+    if options.play is not None:
+        return _serve(options, _played(options), "rest")
+    parameters = load_plant(options.plant or shipped("plant.yaml"))
+    if options.cost:
+        return _print_cost(options, parameters)
+    from sim_can.plant_source import PlantSource
+
+    return _serve(options, PlantSource(parameters, options.seed), options.profile or parameters.profile)
+
+
+def _played(options: argparse.Namespace) -> Source:
+    from sim_can.play import open_play
+
+    source = open_play(options.play, options.columns, options.joints or (1, 2))
+    for note in getattr(source, "notes", ()):
+        print(f"jtq sim: {note}", file=sys.stderr)
+    return source
+
+
+def _serve(options: argparse.Namespace, source: Source, profile: str) -> int:
+    from sim_can.bench import Bench
+    from sim_can.bench_loop import run
+
+    return run(options.bus, Bench(source, profile), options.bitrate, options.duration)
+
+
+def _print_cost(options: argparse.Namespace, parameters: object) -> int:
+    from sim_can.cost import measure
+    from sim_can.plant_parameters import PlantParameters
+
+    assert isinstance(parameters, PlantParameters)
+    cost = measure(parameters)
+    if options.json:
+        print(json.dumps(cost.as_json()))
+        return 0
+    print(
+        f"plant step of 1 ms, two joints and their drives' loops ({cost.substeps} substeps)  {cost.plant_step_us:7.1f} us"
+    )
+    print(
+        f"  and encoders, noise, sensor                                             {cost.source_us:7.1f} us"
+    )
+    print(f"whole SYNC: the above, state machines, five TPDOs packed                  {cost.sync_us:7.1f} us")
+    return 0

@@ -1,0 +1,224 @@
+"""Emulated CiA 402 drive: object dictionary, state machine and PDOs around one drive of a `Source`. Pure."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import drivers.eds
+from drivers.object_dictionary import ObjectStore
+from drivers.sdo_abort import VALUE_RANGE, SdoAbort
+from sim_can.canopen_node import HEARTBEAT_LOST, CanopenNode
+from sim_can.cia402 import FAULT, FAULT_REACTION, OPERATION_ENABLED, QUICK_STOP, StateMachine
+from sim_can.source import CURRENT, OFF, VELOCITY, DriveRatings, DriveSignals, Source
+
+EDS_FOLDER = Path(drivers.eds.__file__).parent
+OVERCURRENT = 0x2310
+STANDSTILL_RAD_S = 0.01  # joint side: a quick stop has ended below this
+HALT = 0x0100
+_I16 = 0x7FFF
+_I32 = 0x7FFF_FFFF
+
+
+def wrapped(value: int) -> int:
+    """A position counter of 32 bits runs over at its ends."""
+    return (value + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000
+
+
+def limited(value: int, limit: int) -> int:
+    """Anything but a position stays at the end of its range."""
+    return -limit if value < -limit else limit if value > limit else value
+
+
+class DriveNode(CanopenNode):
+    """Drive `number` (0, 1) of the source as CANopen node number + 1.
+
+    While no master has written 6040h or 6060h (`commanded` False) the bench may run the drive itself:
+    `run_by_itself`.
+    """
+
+    def __init__(self, source: Source, number: int, on_master: Callable[[], None]) -> None:
+        super().__init__(ObjectStore(EDS_FOLDER / "drive.eds", number + 1))
+        self.machine = StateMachine()
+        self.commanded = False
+        self._source, self._number, self._on_master = source, number, on_master
+        self._signals: DriveSignals = source.drives[number]
+        self._ratings: DriveRatings = source.ratings[number]
+        self._mode = 0
+        self._own_target = 0.0
+        self._sent = (OFF, 0.0)
+        ratings = self._ratings
+        self._motor_units = ratings.motor_counts_per_rev / (2.0 * math.pi)
+        self._link_units = ratings.link_counts_per_rev / (2.0 * math.pi)
+        self._still_rad_s = STANDSTILL_RAD_S * ratings.gear_ratio
+        self._current_units = 0.0
+        self._rate()
+        self.getters = {
+            (0x603F, 0): lambda: self._error_code,
+            (0x6041, 0): self._statusword,
+            (0x6061, 0): lambda: self._mode,
+            (0x6064, 0): self._motor_position,
+            (0x606C, 0): self._motor_velocity,
+            (
+                0x6077,
+                0,
+            ): self._current,  # torque in 1/1000 of rated torque = current in 1/1000 of rated current
+            (0x6078, 0): self._current,
+            (0x60E4, 1): self._link_position,
+        }
+        self.handlers = {(0x6040, 0): self._controlword, (0x6060, 0): self._mode_of_operation}
+        self._error_code = 0
+        self._messages: list[bytes] = []
+        self.connect()
+
+    def _rate(self) -> None:
+        """Put the source's ratings into the object dictionary, as power-on values."""
+        ratings = self._ratings
+        numerator, denominator = _ratio(ratings.gear_ratio)
+        values = {
+            (0x1018, 4): 0x1000 + self.node_id,
+            (0x6075, 0): max(1, round(1000.0 * ratings.rated_current_a)),
+            (0x6076, 0): max(1, round(1000.0 * ratings.rated_torque_nm)),
+            (0x608F, 1): ratings.motor_counts_per_rev,
+            (0x6090, 1): ratings.motor_counts_per_rev,
+            (0x60E6, 1): ratings.link_counts_per_rev,
+            (0x6091, 1): numerator,
+            (0x6091, 2): denominator,
+        }
+        for key, value in values.items():
+            self.store.set_number(*key, value)
+            self.store.keep_as_default(*key)
+        # what 6075h says is what 6078h is scaled by, to the mA
+        self._current_units = 1000.0 / (self.store.number(0x6075) * 1e-3)
+
+    # Process objects ----------------------------------------------------------------------------------------
+
+    def _motor_position(self) -> int:
+        return wrapped(round(self._signals.motor_position_rad * self._motor_units))
+
+    def _motor_velocity(self) -> int:
+        return limited(round(self._signals.motor_velocity_rad_s * self._motor_units), _I32)
+
+    def _link_position(self) -> int:
+        return wrapped(round(self._signals.link_position_rad * self._link_units))
+
+    def _current(self) -> int:
+        return limited(round(self._signals.current_a * self._current_units), _I16)
+
+    def _statusword(self) -> int:
+        return self.machine.statusword
+
+    # Commands -----------------------------------------------------------------------------------------------
+
+    def _controlword(self, word: int) -> None:
+        self._take_over()
+        if self.machine.controlword(word):
+            self._error_code = 0
+            self._messages += self.clear_error(OVERCURRENT, HEARTBEAT_LOST)
+
+    def _mode_of_operation(self, mode: int) -> None:
+        if mode not in (0, VELOCITY, CURRENT):
+            raise SdoAbort(VALUE_RANGE)
+        self._take_over()
+        self._mode = mode
+
+    def _take_over(self) -> None:
+        """A master is there: from now on only it commands, and both drives, as the demo motion needs both."""
+        if not self.commanded:
+            self._on_master()
+
+    def hand_over(self) -> None:
+        """The built-in motion ends for this drive."""
+        if not self.commanded:
+            self.commanded = True
+            self.machine.release()
+            self._mode = 0
+
+    def run_by_itself(self, mode: int, target: float) -> list[bytes]:
+        """Built-in motion or play-back: operation enabled, with a target in the units of `Source.command`."""
+        machine = self.machine
+        if self.commanded or machine.state in (FAULT, FAULT_REACTION):
+            return []
+        self._mode = mode
+        self._own_target = target
+        if machine.state == OPERATION_ENABLED:
+            self._send_command()
+            return []
+        machine.enable_by_itself()
+        self._send_command()
+        return self.event()
+
+    def after_command(self) -> list[bytes]:
+        """EMCY of a fault reset, statusword as an event-driven TPDO."""
+        self._send_command()
+        frames = self._messages + self.event()
+        self._messages = []
+        return frames
+
+    def _send_command(self) -> None:
+        """Tell the source what this drive's power stage does now."""
+        command = self._command()
+        if command != self._sent:
+            self._sent = command
+            self._source.command(self._number, *command)
+
+    def _command(self) -> tuple[int, float]:
+        state = self.machine.state
+        if state in (QUICK_STOP, FAULT_REACTION):
+            return VELOCITY, 0.0
+        if state != OPERATION_ENABLED:
+            return OFF, 0.0
+        if not self.commanded:
+            return self._mode, self._own_target
+        halted = bool(self.store.number(0x6040) & HALT)
+        if self._mode == VELOCITY:
+            return VELOCITY, 0.0 if halted else self.store.number(0x60FF) / self._motor_units
+        if self._mode == CURRENT:
+            return CURRENT, 0.0 if halted else self.store.number(
+                0x6071
+            ) * self._ratings.rated_current_a / 1000.0
+        return CURRENT, 0.0
+
+    # Once per SYNC ------------------------------------------------------------------------------------------
+
+    def watch(self) -> list[bytes]:
+        """After the source went on: overcurrent, end of a quick stop or of a fault reaction."""
+        current = self._signals.current_a
+        trip = self._ratings.trip_current_a
+        machine = self.machine
+        if machine.powered and not -trip <= current <= trip:
+            machine.fault()
+            machine.stopped()  # no ramp: the power stage is off at once
+            self._error_code = OVERCURRENT
+            self._send_command()
+            return self.raise_error(OVERCURRENT, 0x02) + self.event()
+        stopping = machine.state in (QUICK_STOP, FAULT_REACTION)
+        if stopping and abs(self._signals.motor_velocity_rad_s) < self._still_rad_s:
+            machine.stopped()
+            self._send_command()
+            return self.event()
+        return []
+
+    def on_heartbeat_lost(self) -> list[bytes]:
+        """A commanded drive stops and keeps the fault until it is reset; one that runs by itself is released."""
+        if self.commanded:
+            self.machine.fault()
+            self._error_code = HEARTBEAT_LOST
+        else:
+            self.machine.release()
+            self._mode = 0
+        self._send_command()
+        return self.event()
+
+    def on_reset(self) -> None:
+        """Power-on state: power stage off, no mode, no fault."""
+        self.machine.release()
+        self._mode = 0
+        self._error_code = 0
+        self._send_command()
+
+
+def _ratio(gear_ratio: float) -> tuple[int, int]:
+    from fractions import Fraction
+
+    found = Fraction(gear_ratio).limit_denominator(10_000)
+    return found.numerator, found.denominator

@@ -1,0 +1,134 @@
+"""Emulated runs without a bus, for training and tests: plant, drives and quantised measurement at 1 kHz.
+Pure.
+
+A run holds exactly what a controller would have read from the PDOs, in SI units: the same `PlantSource`,
+rounded to the drives' and the sensor's units as the nodes round it.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.run import JointColumns, RunTable
+from sim_can.plant_parameters import PlantParameters
+from sim_can.plant_source import PlantSource
+from sim_can.source import CURRENT, OFF, VELOCITY, DriveRatings
+
+SENSOR_NM_PER_UNIT = 0.001  # 6132h:1 = 3 decimal digits
+_SIGNALS = 4
+
+TimeFunction = Callable[[float], float]
+
+
+class JointCommand(NamedTuple):
+    """What one drive does: mode OFF, VELOCITY (rad/s, joint side) or CURRENT (A), and its target over time in
+    seconds.
+    """
+
+    mode: int
+    target: TimeFunction
+
+    @classmethod
+    def velocity(cls, target: TimeFunction) -> "JointCommand":
+        """Velocity mode; target(t) in rad/s of the joint side."""
+        return cls(VELOCITY, target)
+
+    @classmethod
+    def current(cls, target: TimeFunction) -> "JointCommand":
+        """Current mode; target(t) in A."""
+        return cls(CURRENT, target)
+
+    @classmethod
+    def off(cls) -> "JointCommand":
+        """Power stage off."""
+        return cls(OFF, _zero)
+
+
+def _zero(_time_s: float) -> float:
+    return 0.0
+
+
+def emulate_run(
+    plant: PlantParameters,
+    commands: tuple[JointCommand, JointCommand],
+    duration_s: float,
+    seed: int = 0,
+    period_s: float = 0.001,
+) -> RunTable:
+    """Run both joints from rest for duration_s and return what was measured every period_s.
+
+    Args:
+        plant: the bench. commands: of joint 1 and joint 2; targets are asked once per period, at its
+        beginning.
+        seed: of the measurement noise; the same arguments give the same table bit by bit.
+
+    Returns:
+        RunTable with joints 1 and 2, n = round(duration_s / period_s) rows from time 0; link_velocity and
+        temperature are None (a drive does not measure them), torque_nm is the one sensor's in both joints.
+
+    Raises:
+        ValueError: duration or period not positive and finite.
+    """
+    if not (0.0 < period_s < math.inf and period_s <= duration_s < math.inf):
+        raise ValueError(f"a run of {duration_s} s in steps of {period_s} s")
+    count = round(duration_s / period_s)
+    source = PlantSource(plant, seed)
+    rows = np.empty((count, 2 * _SIGNALS + 1))
+    # velocity targets are joint side here, motor side in the drives
+    scale = [
+        side.joint.gear_ratio if c.mode == VELOCITY else 1.0
+        for side, c in zip(plant.joints, commands, strict=True)
+    ]
+    one, two = source.drives
+    channel = source.channels[0]
+    (mode_1, target_1), (mode_2, target_2) = commands
+    source.advance(0.0)
+    for k in range(count):
+        rows[k] = (
+            one.current_a,
+            one.motor_position_rad,
+            one.motor_velocity_rad_s,
+            one.link_position_rad,
+            two.current_a,
+            two.motor_position_rad,
+            two.motor_velocity_rad_s,
+            two.link_position_rad,
+            channel.torque_nm,
+        )
+        time_s = k * period_s
+        source.command(0, mode_1, scale[0] * target_1(time_s))
+        source.command(1, mode_2, scale[1] * target_2(time_s))
+        source.advance(period_s)
+    torque = np.round(rows[:, -1] / SENSOR_NM_PER_UNIT) * SENSOR_NM_PER_UNIT
+    joints = {
+        number: _columns(
+            rows[:, _SIGNALS * (number - 1) : _SIGNALS * number], torque, source.ratings[number - 1]
+        )
+        for number in (1, 2)
+    }
+    return RunTable(time_s=np.arange(count) * period_s, joints=joints)
+
+
+def _columns(
+    signals: NDArray[np.float64], torque: NDArray[np.float64], ratings: DriveRatings
+) -> JointColumns:
+    """Rounded to the units of 6078h, 6064h, 606Ch and 60E4h."""
+    motor = 2.0 * math.pi / ratings.motor_counts_per_rev
+    link = 2.0 * math.pi / ratings.link_counts_per_rev
+    current = ratings.rated_current_a / 1000.0
+    units = (current, motor, motor, link)
+    i, motor_position, motor_velocity, link_position = (
+        np.round(signals[:, k] / unit) * unit for k, unit in enumerate(units)
+    )
+    return JointColumns(
+        current_a=i,
+        motor_position_rad=motor_position,
+        motor_velocity_rad_s=motor_velocity,
+        link_position_rad=link_position,
+        link_velocity_rad_s=None,
+        torque_nm=torque,
+        temperature_c=None,
+    )

@@ -1,0 +1,156 @@
+"""A measured run as the source of the bench's nodes: plays its rows as PDO values, faithfully in time.
+
+Run time advances by the measured step from SYNC to SYNC. The value of a SYNC is the row nearest to its
+time, never an interpolation, so that what is on the bus is what was measured. Nearest, not previous: rows
+are 1 ms apart like SYNCs, and with "previous" a SYNC that comes a microsecond early would repeat a row and
+the next one skip one; with "nearest" row and SYNC stay half a row apart from that. A SYNC that was missed
+skips its row, as it would with the live joint.
+
+When the run is over `advance` returns False for good. The nodes then stop answering: a frozen value is
+never sent as a measured one.
+"""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.parameters import Joint
+from estimator.run import RunTableError
+from models.files import load_joint, shipped
+from sim_can.run_files import ColumnMap, RunError, RunFile, read_run
+from sim_can.source import ChannelSignal, DriveRatings, DriveSignals
+
+
+class PlaySource:
+    """Source (sim_can/source.py) of two recorded joints, each with a torque sensor channel of its own."""
+
+    def __init__(
+        self, run: RunFile, joints: tuple[int, int], ratings: tuple[DriveRatings, DriveRatings]
+    ) -> None:
+        time_s = run.table.time_s
+        self.notes = run.notes
+        self._ratings = ratings
+        self._rows = _rows(run, joints, ratings)
+        # Row k is the nearest one from _change[k-1] on; the last entry is the end of the run.
+        middles = 0.5 * (time_s[1:] + time_s[:-1]) - time_s[0]
+        half_last_step = 0.5 * float(time_s[-1] - time_s[-2])
+        self._change = [*middles.tolist(), float(time_s[-1] - time_s[0]) + half_last_step]
+        self._time_s = 0.0
+        self._row = 0
+        self._drives = (DriveSignals(), DriveSignals())
+        self._channels = (ChannelSignal(), ChannelSignal())
+        for drive in self._drives:
+            drive.enabled = True
+        for channel, joint in zip(self._channels, joints, strict=True):
+            channel.valid = run.table.joints[joint].torque_nm is not None
+        self._show(0)
+
+    @property
+    def ratings(self) -> Sequence[DriveRatings]:
+        """Scaling of the two played drives."""
+        return self._ratings
+
+    @property
+    def drives(self) -> Sequence[DriveSignals]:
+        """The two drives; the same objects every time."""
+        return self._drives
+
+    @property
+    def channels(self) -> Sequence[ChannelSignal]:
+        """The two torque channels; the same objects every time. A dead or missing channel is never valid."""
+        return self._channels
+
+    @property
+    def row(self) -> int:
+        """Row of the run that the signals show, from 0."""
+        return self._row
+
+    def advance(self, dt_s: float) -> bool:
+        """Go on by dt_s >= 0 [s]; False when the run is over (signals then stay). Raises ValueError."""
+        if not 0.0 <= dt_s < math.inf:
+            raise ValueError(f"play: found a time step of {dt_s} s, expected a finite one >= 0")
+        self._time_s += dt_s
+        time_s, row, change = self._time_s, self._row, self._change
+        while time_s >= change[row]:
+            if row + 1 == len(change):
+                return False
+            row += 1
+        if row != self._row:
+            self._show(row)
+        return True
+
+    def command(self, drive: int, mode: int, target: float) -> None:
+        """Ignored: what was measured cannot be commanded."""
+
+    def _show(self, row: int) -> None:
+        self._row = row
+        first, second = self._drives
+        (
+            first.current_a,
+            first.motor_position_rad,
+            first.motor_velocity_rad_s,
+            first.link_position_rad,
+            self._channels[0].torque_nm,
+            second.current_a,
+            second.motor_position_rad,
+            second.motor_velocity_rad_s,
+            second.link_position_rad,
+            self._channels[1].torque_nm,
+        ) = self._rows[row]
+
+
+def open_play(
+    run_path: Path | str,
+    columns_path: Path | str | None = None,
+    joints: tuple[int, int] = (2, 4),
+    joint_files: tuple[Path, Path] | None = None,
+) -> PlaySource:
+    """Play joints `joints` of a run as drives 0 and 1 of the bench.
+
+    The drives' ratings come from `joint_files`, else from the column map's `jN.joint_file`, else from the
+    bench's nominal joints. Raises RunError (run file) or ConfigError (column map, joint file).
+    """
+    columns = ColumnMap.load(Path(columns_path)) if columns_path is not None else None
+    if len(joints) != 2 or joints[0] == joints[1]:
+        raise RunError(f"{run_path}: found joints {joints}, expected two different joints of the run")
+    run = read_run(run_path, columns)
+    for joint in joints:
+        if joint not in run.table.joints:
+            present = ", ".join(str(number) for number in sorted(run.table.joints))
+            raise RunError(f"{run_path}: found no joint {joint}, expected one of {present}")
+    files = joint_files or _files_of(columns, joints)
+    first, second = (_ratings(load_joint(path)) for path in files)
+    return PlaySource(run, joints, (first, second))
+
+
+def _files_of(columns: ColumnMap | None, joints: tuple[int, int]) -> tuple[Path, Path]:
+    given = columns.joint_files if columns is not None else {}
+    first, second = joints
+    return given.get(first, shipped("joint1.yaml")), given.get(second, shipped("joint2.yaml"))
+
+
+def _ratings(joint: Joint) -> DriveRatings:
+    """Ratings whose rated current gives the joint's rated torque: i_rated = tau_rated/(G Kt). Never trips."""
+    rated_current_a = joint.rated_torque_nm / (joint.gear_ratio * joint.torque_constant_nm_per_a)
+    return DriveRatings(
+        gear_ratio=joint.gear_ratio,
+        rated_current_a=rated_current_a,
+        rated_torque_nm=joint.torque_constant_nm_per_a * rated_current_a,
+        trip_current_a=math.inf,
+    )
+
+
+def _rows(run: RunFile, joints: Sequence[int], ratings: Sequence[DriveRatings]) -> list[tuple[float, ...]]:
+    """One tuple of floats per row, ready to be assigned: four quantities and the torque of each joint."""
+    columns: list[NDArray[np.float64]] = []
+    for joint, rating in zip(joints, ratings, strict=True):
+        try:
+            _, *inputs = run.table.estimator_inputs(joint, rating.gear_ratio)
+        except RunTableError as error:
+            raise RunError(f"run to play: {error}") from None
+        torque = run.table.joints[joint].torque_nm
+        columns += [*inputs, torque if torque is not None else np.zeros(len(run.table.time_s))]
+    return list(zip(*(column.tolist() for column in columns), strict=True))

@@ -1,0 +1,89 @@
+"""Where the bench's nodes get their measurements from: the plant, or a recorded run.
+
+The bench calls `advance(dt_s)` once per SYNC (dt_s = 0.0 at the first one: that is time zero of the source)
+and then reads `drives` and `channels`, which the source updates in place. All quantities are SI, already with
+the noise and delays of the measurement but not yet rounded to PDO units: that is the nodes' job, with the
+scaling of their own objects (`DriveRatings`).
+
+Signs (design): each drive's quantities are positive in its own positive direction; a torque is positive along
+the own positive current of both joints. Sensor channel 0 is the bench's sensor. A second channel exists only
+where each joint has a sensor of its own (measured runs): then channel 0 belongs to drive 0 and channel 1 to
+drive 1.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+# Modes of operation a source is commanded with (CiA 402 object 6061h; OFF: power stage off).
+OFF = 0
+VELOCITY = 9  # cyclic synchronous velocity; target: motor velocity in rad/s
+CURRENT = 10  # cyclic synchronous torque; target: motor current in A
+
+
+@dataclass(frozen=True)
+class DriveRatings:
+    """What a drive tells about itself by SDO, and the rounding of its PDOs."""
+
+    gear_ratio: float
+    rated_current_a: float  # 6075h; 6078h is 1/1000 of it
+    rated_torque_nm: float  # 6076h, motor side: torque constant the drive believes in times rated current
+    trip_current_a: float  # overcurrent fault above this magnitude; math.inf: never
+    motor_counts_per_rev: int = 65536  # 608Fh, 6090h
+    link_counts_per_rev: int = 524288  # 60E6h/60EBh
+
+
+class DriveSignals:
+    """Measured quantities of one drive; mutable, read once per SYNC.
+
+    `enabled` says that the source itself has the drive in operation (a recorded run). The node then reports
+    "operation enabled" although no master sent a controlword. The plant leaves it False: its drives are
+    enabled by a master or by the demo profile.
+    """
+
+    __slots__ = ("current_a", "enabled", "link_position_rad", "motor_position_rad", "motor_velocity_rad_s")
+
+    def __init__(self) -> None:
+        self.motor_position_rad = 0.0  # motor side, multi-turn
+        self.motor_velocity_rad_s = 0.0  # motor side
+        self.link_position_rad = 0.0  # joint side
+        self.current_a = 0.0
+        self.enabled = False
+
+
+class ChannelSignal:
+    """Measured torque of one sensor channel; `valid` False sets bit 0 of 6150h."""
+
+    __slots__ = ("torque_nm", "valid")
+
+    def __init__(self) -> None:
+        self.torque_nm = 0.0
+        self.valid = True
+
+
+class Source(Protocol):
+    """Measurements of two drives and one or two torque channels. Pure: time comes in as dt_s, nothing here
+    reads a clock.
+    """
+
+    @property
+    def ratings(self) -> Sequence[DriveRatings]:
+        """Two entries, fixed for the life of the source."""
+
+    @property
+    def drives(self) -> Sequence[DriveSignals]:
+        """Two entries; the same objects every time, updated by `advance`."""
+
+    @property
+    def channels(self) -> Sequence[ChannelSignal]:
+        """One or two entries; the same objects every time, updated by `advance`."""
+
+    def advance(self, dt_s: float) -> bool:
+        """Go on by dt_s >= 0 and sample. False: the run is over (signals keep their last value); the bench
+        then ends.
+        """
+
+    def command(self, drive: int, mode: int, target: float) -> None:
+        """Command for drive 0 or 1 from now on: OFF, VELOCITY (rad/s, motor side) or CURRENT (A). A recorded
+        run ignores it.
+        """

@@ -1,0 +1,1 @@
+"""Identification: emulated and measured runs, fits, training, reports."""

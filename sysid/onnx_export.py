@@ -1,0 +1,109 @@
+"""Writes a trained network as ONNX: normalisation inside the graph, float64, metadata attached.
+
+    y = mean_y + std_y (W_n h_n + b_n),  h_(k+1) = sigma(h_k W_k + b_k),  h_0 = (x - mean_x)/std_x
+
+with the paper's activation sigma(x) = (1 - e^-x)/(1 + e^-x) = tanh(x/2), Eq. (9). Exporting the weights to
+a plain tanh would change the output without any error, so the factor 1/2 is a node of its own.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+Layer = tuple[FloatArray, FloatArray]
+
+OPSET: Final = 17
+IR_VERSION: Final = 9  # what the oldest supported onnxruntime reads
+
+
+def _checked(
+    weights: Sequence[Layer], input_mean: FloatArray, input_std: FloatArray, output_std: float
+) -> list[Layer]:
+    layers = [(np.asarray(w, np.float64), np.asarray(b, np.float64)) for w, b in weights]
+    width = len(input_mean)
+    for n, (w, b) in enumerate(layers):
+        if w.ndim != 2 or w.shape[0] != width or b.shape != (w.shape[1],):
+            raise ValueError(
+                f"layer {n}: found W {w.shape} and b {b.shape}, expected W ({width}, m) and b (m,)"
+            )
+        width = w.shape[1]
+    if not layers or width != 1:
+        raise ValueError(f"found {width} outputs, expected 1")
+    if len(input_std) != len(input_mean) or not (np.all(np.asarray(input_std) > 0.0) and output_std > 0.0):
+        raise ValueError("found a standard deviation that is not > 0, or not one per input")
+    return layers
+
+
+def export_network(  # noqa: PLR0917 - the quantities of the equation, in its order
+    weights: Sequence[Layer],
+    input_mean: FloatArray,
+    input_std: FloatArray,
+    output_mean: float,
+    output_std: float,
+    metadata: Mapping[str, Any],
+) -> bytes:
+    """Return the ONNX file of a fully connected network.
+
+    weights: (W [inputs, outputs], b [outputs]) per layer, the last one without activation; means and standard
+    deviations of the inputs [n] and of the output; metadata: key to JSON-able value (see
+    estimator/network.py). Raises ValueError when shapes do not fit. Needs the package onnx (extra `train`).
+    """
+    from onnx import TensorProto, helper, numpy_helper
+
+    layers = _checked(weights, input_mean, input_std, output_std)
+    constants = {
+        "input_mean": np.asarray(input_mean, np.float64),
+        "input_std": np.asarray(input_std, np.float64),
+        "half": np.array(0.5),
+        "output_mean": np.array(float(output_mean)),
+        "output_std": np.array(float(output_std)),
+    }
+    nodes = [
+        helper.make_node("Sub", ["x", "input_mean"], ["centred"]),
+        helper.make_node("Div", ["centred", "input_std"], ["h0"]),
+    ]
+    for n, (w, b) in enumerate(layers):
+        constants[f"W{n}"], constants[f"b{n}"] = w, b
+        nodes.append(helper.make_node("Gemm", [f"h{n}", f"W{n}", f"b{n}"], [f"g{n}"]))
+        if n < len(layers) - 1:
+            nodes.append(helper.make_node("Mul", [f"g{n}", "half"], [f"half{n}"]))
+            nodes.append(helper.make_node("Tanh", [f"half{n}"], [f"h{n + 1}"]))
+    nodes.append(helper.make_node("Mul", [f"g{len(layers) - 1}", "output_std"], ["scaled"]))
+    nodes.append(helper.make_node("Add", ["scaled", "output_mean"], ["torque_nm"]))
+    graph = helper.make_graph(
+        nodes,
+        "joint_torque",
+        [helper.make_tensor_value_info("x", TensorProto.DOUBLE, ["N", len(input_mean)])],
+        [helper.make_tensor_value_info("torque_nm", TensorProto.DOUBLE, ["N", 1])],
+        [numpy_helper.from_array(value, name) for name, value in constants.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="jtqd")
+    model.ir_version = IR_VERSION
+    helper.set_model_props(model, {key: json.dumps(value) for key, value in metadata.items()})
+    data: bytes = model.SerializeToString()
+    return data
+
+
+def forward(  # noqa: PLR0917 - twin of export_network
+    weights: Sequence[Layer],
+    input_mean: FloatArray,
+    input_std: FloatArray,
+    output_mean: float,
+    output_std: float,
+    x: FloatArray,
+) -> FloatArray:
+    """Return the output [n] for x [n, inputs] in numpy: what the exported graph must equal."""
+    layers = _checked(weights, input_mean, input_std, output_std)
+    h: FloatArray = (x - input_mean) / input_std
+    for n, (w, b) in enumerate(layers):
+        h = h @ w + b
+        if n < len(layers) - 1:
+            h = (1.0 - np.exp(-h)) / (1.0 + np.exp(-h))
+    result: FloatArray = output_mean + output_std * h[:, 0]
+    return result

@@ -1,0 +1,96 @@
+"""A contender is a process that makes everything ready, and then runs one round for each line "run CYCLES" on its standard input."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@dataclass(frozen=True)
+class Task:
+    """Where to run: bus, directory of the fixture, CPU (None: any) and SCHED_FIFO priority to ask for."""
+
+    bus: str
+    directory: Path
+    cpu: int | None
+    priority: int = 80
+
+    def to_json(self) -> str:
+        """As an argument of the process."""
+        return json.dumps(asdict(self) | {"directory": str(self.directory)})
+
+
+class Runner(Protocol):
+    """What a contender's process holds."""
+
+    def run(self, cycles: int) -> dict[str, Any]:
+        """Run one round and return `CycleMeter.result`."""
+
+
+def serve(make: Callable[[Task], Runner]) -> int:
+    """Main of a Python contender."""
+    content = json.loads(sys.argv[1])
+    runner = make(Task(content["bus"], Path(content["directory"]), content["cpu"], content["priority"]))
+    print("ready", flush=True)
+    for line in sys.stdin:
+        print(json.dumps(runner.run(int(line.split()[1]))), flush=True)
+    return 0
+
+
+class Process:
+    """A contender or helper process as the benchmark sees it."""
+
+    def __init__(self, command: list[str], name: str) -> None:
+        self.name = name
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT, env=environment
+        )
+        self.pid = self._process.pid
+        self._line()
+
+    def _line(self) -> str:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            raise RuntimeError(f"{self.name} ended with exit status {self._process.wait()}")
+        return line
+
+    def start(self, cycles: int) -> None:
+        """Begin a round."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"run {cycles}\n")
+        self._process.stdin.flush()
+
+    def result(self) -> dict[str, Any]:
+        """Wait for the end of the round."""
+        content: dict[str, Any] = json.loads(self._line())
+        return content
+
+    def run(self, cycles: int) -> dict[str, Any]:
+        """One round."""
+        self.start(cycles)
+        return self.result()
+
+    def end(self) -> None:
+        """Close its input and wait; a process that does not end is terminated."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        try:
+            self._process.wait(2.0)
+        except subprocess.TimeoutExpired:
+            self._process.terminate()
+            self._process.wait()
+
+
+def python(module: str, *arguments: str) -> list[str]:
+    """Command of a module of this package."""
+    return [sys.executable, "-P", "-m", f"tests.benchmarks.{module}", *arguments]

@@ -1,0 +1,92 @@
+"""Contender: jtqd's own loop, the code of daemon.loop and daemon.cycle as it ships."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from daemon import loop, realtime
+from daemon.config import Config, load_config
+from daemon.cycle import Cycle
+from daemon.cycle_record import FLAG_PUBLISHED
+from daemon.grid import Grid
+from drivers.frame_socket import FrameSocket, open_frame_socket
+from estimator.joint_estimator import JointEstimator
+from estimator.status import PUBLISHED
+from tests.benchmarks.contender import Task, serve
+from tests.benchmarks.fixture import Fixture
+from tests.benchmarks.measure import CycleMeter
+
+
+class JtqdLoop:
+    """Configuration and estimators, made once; `connect` makes what the loop process makes after the boot."""
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        fixture = Fixture(task.directory)
+        self.config: Config = load_config(fixture.config)
+        self.estimators: list[JointEstimator] = [
+            loop.build_estimator(self.config, joint) for joint in self.config.joints
+        ]
+        loop.warm_up(self.estimators)
+        real = self.config.realtime
+        self.refused = realtime.prepare(real.priority, task.cpu, real.lock_memory)
+        realtime.freeze()
+
+    def connect(self) -> tuple[Cycle, Grid, FrameSocket]:
+        """A cycle on the bus, as `daemon.loop.serve` builds it."""
+        request = {
+            "ring": str(self.task.directory / "jtqd.ring"),
+            "snapshot": str(self.task.directory / "jtqd.snapshot"),
+            "worst_load": 0.0,
+        }
+        pdos = loop.input_pdos(self.config)
+        nodes = [1, 2, 3]
+        socket = open_frame_socket(self.task.bus, loop.loop_filters(pdos, nodes), receive_own=True)
+        for estimator in self.estimators:
+            estimator.reset()
+        report = Fixture(self.task.directory).report
+        cycle, grid = loop._build(self.config, request, report, socket, self.estimators)
+        return cycle, grid, socket
+
+    def run(self, cycles: int) -> dict[str, Any]:
+        """One round of `cycles` slots."""
+        cycle, grid, socket = self.connect()
+        meter = CycleMeter()
+        measured(cycle, meter)
+        loop_start(grid)
+        loop.run(cycle, grid, _never, cycles * grid.period_ns * 1e-9)
+        socket.close()
+        return meter.result(grid.missed)
+
+
+def loop_start(grid: Grid) -> None:
+    """Put the first slot two periods ahead, as daemon.loop does."""
+    import time
+
+    grid.slot_ns = time.monotonic_ns() + 2 * grid.period_ns
+
+
+def measured(cycle: Cycle, meter: CycleMeter) -> None:
+    """Read the clocks after `publish` and `record`, from outside."""
+    publish, record, states = cycle.publish, cycle.record, cycle._joints
+
+    def timed_publish() -> None:
+        publish()
+        meter.sent(cycle._sync_ns)
+        if cycle._flags & FLAG_PUBLISHED and states[0].status in PUBLISHED and states[1].status in PUBLISHED:
+            meter.published += 1
+
+    def timed_record() -> None:
+        record()
+        meter.cycle_done()
+
+    cycle.publish, cycle.record = timed_publish, timed_record  # type: ignore[method-assign]
+
+
+def _never() -> bool:
+    return False
+
+
+if __name__ == "__main__":
+    sys.exit(serve(lambda task: JtqdLoop(task)))

@@ -1,0 +1,90 @@
+"""The traffic of the bench, the same for every contender: five TPDOs per SYNC with values that vary like a robot's.
+
+`python -m tests.benchmarks.traffic PATH [CPU]` runs it: a hub on a unix socket with one lean node that answers each SYNC with the
+next cycle of a table of finished frames. It does no arithmetic while it runs, so that it is ready long before the inputs are due.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import struct
+import sys
+from math import cos, pi, sin
+from types import FrameType
+
+from drivers.frame import pack
+from drivers.hub import Hub
+
+CYCLES = 4000
+"""Cycles of the table; its end joins its beginning without a jump."""
+SCALING = {
+    "motor_rad_per_count": 2.0 * pi / 65536,
+    "motor_rad_s_per_unit": 2.0 * pi / 65536,
+    "link_rad_per_count": 2.0 * pi / 524288,
+    "ampere_per_unit": 0.01,
+}
+SENSOR_NM_PER_UNIT = 1e-3
+GEAR_RATIO = 100.0
+_OPERATION_ENABLED = 0x0027
+_POSITION, _MOTION, _SENSOR = struct.Struct("<ii"), struct.Struct("<ihH"), struct.Struct("<iB")
+_PR_SET_TIMERSLACK = 29
+
+
+def cycle_frames(cycle: int) -> list[bytes]:
+    """The five TPDOs of one cycle as `struct can_frame`, in the order of their identifiers.
+
+    Both joints swing through all four quadrants and through standstill, sometimes beyond the network's envelope.
+    """
+    phase = 2.0 * pi * (cycle % CYCLES) / CYCLES
+    omega = 2.0 * pi / (CYCLES * 1e-3)
+    velocity = 1.2 * cos(phase) + 0.3 * cos(3.0 * phase)  # joint side [rad/s]
+    angle = (1.2 * sin(phase) + 0.1 * sin(3.0 * phase)) / omega
+    torque = 9.0 * sin(2.0 * phase + 0.4) + 2.0 * sin(7.0 * phase)
+    current = 3.0 * sin(2.0 * phase + 0.4) + 1.5 * cos(phase) + 0.2 * sin(11.0 * phase)
+    twist = torque / 12000.0
+    positions, motions = [], []
+    for node, side in ((1, 1.0), (2, -1.0)):
+        motor_counts = round(side * angle * GEAR_RATIO / SCALING["motor_rad_per_count"])
+        link_counts = round(side * (angle - twist) / SCALING["link_rad_per_count"])
+        units = round(side * velocity * GEAR_RATIO / SCALING["motor_rad_s_per_unit"])
+        amperes = round((current if node == 1 else 0.8 * current + 0.5) / SCALING["ampere_per_unit"])
+        positions.append(pack(0x180 + node, _POSITION.pack(motor_counts, link_counts)))
+        motions.append(pack(0x280 + node, _MOTION.pack(units, amperes, _OPERATION_ENABLED)))
+    sensor = pack(0x183, _SENSOR.pack(round(torque / SENSOR_NM_PER_UNIT), 0))
+    return [positions[0], positions[1], sensor, motions[0], motions[1]]
+
+
+def serve(path: str, cpu: int | None) -> None:
+    """Answer every SYNC on the hub at `path` until SIGTERM; prints one line when it is ready."""
+    if cpu is not None:
+        os.sched_setaffinity(0, {cpu})
+    ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0)
+    table = [cycle_frames(cycle) for cycle in range(CYCLES)]
+    hub = Hub(path)
+    step = 0
+
+    def on_frame(frame16: bytes, _stamp_ns: int) -> None:
+        nonlocal step
+        if frame16[0] == 0x80 and frame16[1] == 0:
+            for frame in table[step]:
+                port.send(frame)
+            step = (step + 1) % CYCLES
+
+    port = hub.attach(on_frame)
+    stop = False
+
+    def end(_number: int, _frame: FrameType | None) -> None:
+        nonlocal stop
+        stop = True
+
+    signal.signal(signal.SIGTERM, end)
+    print("ready", flush=True)
+    while not stop:
+        hub.run_once(0.5)
+    hub.close()
+
+
+if __name__ == "__main__":
+    serve(sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else None)

@@ -1,0 +1,235 @@
+"""Stages of a cycle against a scripted socket: what goes out is what came in, scaled, dated and in time."""
+
+import math
+import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from daemon import cycle_record as cr
+from daemon.cycle import Cycle, JointInputs
+from daemon.estimate_pdo import decode
+from daemon.grid import Grid
+from daemon.intake import InputPdo, Intake
+from daemon.ring import Ring, RingReader
+from daemon.snapshot import Snapshot, SnapshotReader
+from drivers.errors import BusDown
+from estimator.joint_estimator import EstimatorSettings, JointEstimator
+from models.files import load_joint, shipped
+
+I32 = struct.Struct("<ii")
+MOTION = struct.Struct("<ihH")
+SENSOR = struct.Struct("<iB")
+PDOS = [
+    InputPdo(0x181, 8, I32, 1, "181h"),
+    InputPdo(0x281, 8, MOTION, 1, "281h"),
+    InputPdo(0x182, 8, I32, 2, "182h"),
+    InputPdo(0x282, 8, MOTION, 2, "282h"),
+    InputPdo(0x183, 5, SENSOR, 3, "183h"),
+]
+SCALE = {
+    "motor_rad_per_count": 1e-4,
+    "motor_rad_s_per_unit": 1e-3,
+    "link_rad_per_count": 1e-5,
+    "ampere_per_unit": 0.01,
+    "sensor_nm_per_unit": 0.001,
+}
+ENABLED = 0x27
+
+
+def frame(can_id: int, data: bytes) -> bytes:
+    return struct.pack("<IB3x8s", can_id, len(data), data)
+
+
+class ScriptedSocket:
+    """Answers each SYNC with what the script gives; stands in for the bus where exact timing does not matter."""
+
+    def __init__(self, script: Callable[[int], list[bytes]]) -> None:
+        self.script = script
+        self.frames = bytearray(16 * 32)
+        self.stamps_ns: list[int] = []
+        self.own: list[bool] = []
+        self.sent: list[bytes] = []
+        self.tx_dropped = self.rx_dropped = 0
+        self.pending: list[tuple[bytes, bool]] = []
+        self.syncs = 0
+        self.down = False
+
+    def send(self, data: bytes) -> bool:
+        if self.down:
+            raise BusDown("down")
+        self.sent.append(bytes(data))
+        if struct.unpack_from("<I", data)[0] == 0x080:
+            self.syncs += 1
+            self.pending = [(bytes(data), True)] + [(f, False) for f in self.script(self.syncs)]
+        return True
+
+    def receive(self) -> int:
+        if self.down:
+            raise BusDown("down")
+        batch, self.pending = self.pending, []
+        for n, (data, _) in enumerate(batch):
+            self.frames[16 * n : 16 * n + 16] = data
+        now = time.time_ns()
+        self.stamps_ns = [now + n for n in range(len(batch))]
+        self.own = [own for _, own in batch]
+        return len(batch)
+
+    def wait(self, timeout_s: float) -> bool:
+        return False
+
+
+def inputs(velocity: int = 5000, current: int = 200, status: int = ENABLED, torque: int = 9000) -> list[bytes]:
+    return [
+        frame(0x181, I32.pack(1000, 2000)),
+        frame(0x281, MOTION.pack(velocity, current, status)),
+        frame(0x182, I32.pack(-1000, -2000)),
+        frame(0x282, MOTION.pack(-velocity, current, ENABLED)),
+        frame(0x183, SENSOR.pack(torque, 0)),
+    ]
+
+
+def make(tmp_path: Path, script: Callable[[int], list[bytes]]) -> tuple[Cycle, ScriptedSocket, RingReader]:
+    socket = ScriptedSocket(script)
+    settings = EstimatorSettings(method="efficiency")
+    joints = [
+        (JointInputs(2 * n, 2 * n + 1, 4, **SCALE), JointEstimator(load_joint(shipped(f"joint{n + 1}.yaml")), settings))
+        for n in range(2)
+    ]
+    cycle = Cycle(
+        socket,  # type: ignore[arg-type]
+        Intake(PDOS),
+        joints,
+        Ring(tmp_path / "ring", 64, cr.RECORD_SIZE),
+        Snapshot(tmp_path / "snapshot", 1e-3, 0.8),
+        node_id=0x20,
+        counter_overflow=240,
+        wait_ns=0,
+        deadline_ns=100_000,
+        heartbeat_cycles=100,
+        grid=Grid(time.monotonic_ns(), 10_000_000),
+    )
+    return cycle, socket, RingReader(tmp_path / "ring", cr.RECORD_SIZE)
+
+
+def turn(cycle: Cycle, count: int = 1) -> None:
+    for _ in range(count):
+        cycle.begin()
+        cycle.gather()
+        cycle.observe()
+        cycle.publish()
+        cycle.record()
+        cycle.grid.slot_ns = time.monotonic_ns()
+
+
+def estimates(socket: ScriptedSocket) -> list[bytes]:
+    return [data[8:16] for data in socket.sent if struct.unpack_from("<I", data)[0] == 0x1A0]
+
+
+def test_each_sync_gets_one_estimate_with_its_counter(tmp_path: Path) -> None:
+    cycle, socket, _ = make(tmp_path, lambda n: inputs())
+    turn(cycle, 250)
+    counters = [data[8] for data in socket.sent if struct.unpack_from("<I", data)[0] == 0x080]
+    assert counters == [n % 240 + 1 for n in range(250)]
+    assert [decode(data).sequence for data in estimates(socket)] == counters
+
+
+def test_the_first_cycles_are_published_as_starting(tmp_path: Path) -> None:
+    cycle, socket, _ = make(tmp_path, lambda n: inputs())
+    turn(cycle, 30)
+    statuses = [decode(data).status for data in estimates(socket)]
+    assert statuses[:20] == [(1, 1)] * 20
+    assert statuses[20:] == [(2, 2)] * 10
+    assert decode(estimates(socket)[0]).torque_nm == (None, None)
+
+
+def test_inputs_are_scaled_and_recorded(tmp_path: Path) -> None:
+    cycle, _, reader = make(tmp_path, lambda n: inputs())
+    turn(cycle, 3)
+    record = reader.read().records[2]
+    joint = cr.joint_of(record, 1)
+    assert joint.motor_position_rad == pytest.approx(0.1)
+    assert joint.link_position_rad == pytest.approx(0.02)
+    assert joint.motor_velocity_rad_s == pytest.approx(5.0)
+    assert joint.current_a == pytest.approx(2.0)
+    assert joint.sensor_torque_nm == pytest.approx(9.0)
+    assert cr.joint_of(record, 2).motor_position_rad == pytest.approx(-0.1)
+    assert joint.input_flags == 7
+    header = cr.header_of(record)
+    assert header.flags & (cr.FLAG_COMPLETE | cr.FLAG_PUBLISHED | cr.FLAG_SYNC_CONFIRMED) == 0x0B
+    ids = [struct.unpack_from("<I", data)[0] for data, _ in cr.frames_of(record)]
+    assert ids == [0x080, 0x181, 0x281, 0x182, 0x282, 0x183, 0x1A0]
+
+
+def test_a_missing_input_is_stale_for_its_joint_only(tmp_path: Path) -> None:
+    cycle, socket, reader = make(tmp_path, lambda n: inputs() if n != 40 else inputs()[1:])
+    turn(cycle, 45)
+    pdo = decode(estimates(socket)[39])
+    assert pdo.status == (4, 2)
+    assert pdo.torque_nm[0] is None
+    assert pdo.torque_nm[1] is not None
+    joint = cr.joint_of(reader.read(limit=64).records[39], 1)
+    assert math.isnan(joint.torque_nm)
+    assert joint.input_flags == 2 | 4
+
+
+def test_a_missing_sensor_does_not_touch_the_estimate(tmp_path: Path) -> None:
+    cycle, socket, _ = make(tmp_path, lambda n: inputs() if n < 30 else inputs()[:4])
+    turn(cycle, 40)
+    assert decode(estimates(socket)[35]).status == (2, 2)
+
+
+@pytest.mark.parametrize(("word", "status"), [(0x08, 5), (0x0F, 5), (0x40, 0), (0x21, 0), (0x23, 0), (0x07, 2)])
+def test_the_drive_state_decides(tmp_path: Path, word: int, status: int) -> None:
+    cycle, socket, _ = make(tmp_path, lambda n: inputs(status=word))
+    turn(cycle, 25)
+    pdo = decode(estimates(socket)[-1])
+    assert pdo.status[0] == status
+    assert (pdo.torque_nm[0] is None) == (status != 2)
+
+
+def test_an_invalid_sensor_is_no_reference(tmp_path: Path) -> None:
+    script = [*inputs()[:4], frame(0x183, SENSOR.pack(9000, 1))]
+    cycle, _, reader = make(tmp_path, lambda n: script)
+    turn(cycle, 30)
+    assert math.isnan(cr.joint_of(reader.read().records[-1], 1).sensor_torque_nm)
+    assert math.isnan(SnapshotReader(tmp_path / "snapshot").read().rmse_nm[0])
+
+
+def test_a_bus_that_is_down_is_stale_and_counted_and_comes_back(tmp_path: Path) -> None:
+    cycle, socket, reader = make(tmp_path, lambda n: inputs())
+    turn(cycle, 30)
+    socket.down = True
+    turn(cycle, 5)
+    socket.down = False
+    turn(cycle, 5)
+    records = reader.read().records
+    assert [cr.joint_of(record, 1).status for record in records[29:36]] == [2, 4, 4, 4, 4, 4, 2]
+    assert not cr.header_of(records[31]).flags & cr.FLAG_PUBLISHED
+
+
+def test_the_heartbeat_is_the_loops_own(tmp_path: Path) -> None:
+    cycle, socket, _ = make(tmp_path, lambda n: inputs())
+    turn(cycle, 201)
+    heartbeats = [data for data in socket.sent if struct.unpack_from("<I", data)[0] == 0x720]
+    assert heartbeats == [frame(0x720, b"\x05")] * 3
+
+
+def test_more_frames_than_a_record_holds_are_counted(tmp_path: Path) -> None:
+    flood = [frame(0x701, b"\x05")] * 20
+    cycle, _, reader = make(tmp_path, lambda n: inputs() + flood)
+    turn(cycle, 2)
+    header = cr.header_of(reader.read().records[1])
+    assert header.frame_count == cr.FRAME_CAPACITY
+    assert header.frames_left_out == 1 + 5 + 20 + 1 - cr.FRAME_CAPACITY
+
+
+def test_leaving_says_off(tmp_path: Path) -> None:
+    cycle, socket, _ = make(tmp_path, lambda n: inputs())
+    turn(cycle, 30)
+    cycle.leave()
+    pdo = decode(estimates(socket)[-1])
+    assert pdo.status == (0, 0)
+    assert pdo.torque_nm == (None, None)
