@@ -20,7 +20,9 @@ def main(argv: list[str]) -> int:
         description="Worst-case load of the bus by a configuration; jtqd refuses one above 95 %.",
         epilog="example: jtq bus-load --config /etc/jtqd/arm.yaml",
     )
-    parser.add_argument("--config", type=Path, metavar="FILE", help="configuration (default: the bench that ships)")
+    parser.add_argument(
+        "--config", type=Path, metavar="FILE", help="configuration (default: the bench that ships)"
+    )
     parser.add_argument("--json", action="store_true", help="print as JSON")
     arguments = parser.parse_args(argv)
     try:
@@ -31,7 +33,13 @@ def main(argv: list[str]) -> int:
     load = bus_load_of(config)
     fits = load.worst <= LIMIT
     if arguments.json:
-        content = {"worst": load.worst, "unstuffed": load.unstuffed, "limit": LIMIT, "fits": fits, "rows": load.table()}
+        content = {
+            "worst": load.worst,
+            "unstuffed": load.unstuffed,
+            "limit": LIMIT,
+            "fits": fits,
+            "rows": load.table(),
+        }
         print(json.dumps(content))
     else:
         print(f"{'COB-ID':<7} {'bytes':>5} {'per cycle':>9} {'worst bits':>10} {'share':>7}  who")
@@ -40,6 +48,8 @@ def main(argv: list[str]) -> int:
                 f"{row['cob_id']:<7} {row['bytes']:>5} {row['per_cycle']:>9.3g} {row['worst_bits']:>10.1f} "
                 f"{row['share']:>7.2%}  {row['who']}"
             )
-        print(f"worst case {load.worst:.1%}, without stuff bits {load.unstuffed:.1%}, limit {LIMIT:.0%}", end="")
+        print(
+            f"worst case {load.worst:.1%}, without stuff bits {load.unstuffed:.1%}, limit {LIMIT:.0%}", end=""
+        )
         print("" if fits else ": does not fit")
     return 0 if fits else 1

@@ -46,6 +46,12 @@ class Child:
         self._pending = b""
 
     @property
+    def output_fd(self) -> int:
+        """File descriptor of its standard output, for select."""
+        assert self.process.stdout is not None
+        return self.process.stdout.fileno()
+
+    @property
     def pid(self) -> int:
         """Process-ID."""
         return self.process.pid

@@ -1,4 +1,7 @@
-"""Configuration of jtqd: read once into frozen, validated objects. Unknown keys and wrong values name file, key and both sides."""
+"""Configuration of jtqd: read once into frozen, validated objects.
+
+Unknown keys and wrong values are errors of one line that name the file, the key, what was found and what was expected.
+"""
 
 from __future__ import annotations
 
@@ -104,7 +107,9 @@ def load_config(path: Path | None) -> Config:
     sync.finish()
     inputs = _section(top, "inputs")
     wait_us = inputs.number("wait_us", unit="us", low=50, high=period_us, default=0.5 * period_us)
-    deadline_us = inputs.number("deadline_us", unit="us", low=wait_us, high=0.95 * period_us, default=0.85 * period_us)
+    deadline_us = inputs.number(
+        "deadline_us", unit="us", low=wait_us, high=0.95 * period_us, default=0.85 * period_us
+    )
     inputs.finish()
     nodes = _section(top, "nodes")
     heartbeat_ms = nodes.integer("heartbeat_ms", low=10, high=10_000, default=100)
@@ -174,7 +179,11 @@ def _joint(top: Section, path: Path, number: int, method: str, sensor: SensorCon
     joint_path = _beside(path, section.text("file"))
     channel = section.integer("sensor_channel", low=1, high=2, default=None)
     if channel is not None and (sensor is None or channel not in sensor.channels):
-        expected = f"one of the sensor's channels {list(sensor.channels)}" if sensor else "no channel without a sensor"
+        expected = (
+            f"one of the sensor's channels {list(sensor.channels)}"
+            if sensor
+            else "no channel without a sensor"
+        )
         raise section.error("sensor_channel", channel, expected)
     network = _network(section.section("network", optional=True), path)
     section.finish()
@@ -184,8 +193,12 @@ def _joint(top: Section, path: Path, number: int, method: str, sensor: SensorCon
             f"{path}: key '{key}.network': missing, expected file and sha256 because estimator.method is network"
         )
     if method != "tob" and joint.efficiency is None:
-        raise ConfigError(f"{joint_path}: key 'efficiency': missing, expected because estimator.method is {method}")
-    return JointConfig(number, node, identity, joint_path, joint, network if method == "network" else None, channel)
+        raise ConfigError(
+            f"{joint_path}: key 'efficiency': missing, expected because estimator.method is {method}"
+        )
+    return JointConfig(
+        number, node, identity, joint_path, joint, network if method == "network" else None, channel
+    )
 
 
 def _network(section: Section | None, path: Path) -> NetworkFile | None:
@@ -217,12 +230,16 @@ def _beside(path: Path, name: str) -> Path:
     return path.parent / name
 
 
-def _check_node_ids(path: Path, own: int, joints: tuple[JointConfig, ...], sensor: SensorConfig | None) -> None:
+def _check_node_ids(
+    path: Path, own: int, joints: tuple[JointConfig, ...], sensor: SensorConfig | None
+) -> None:
     users: dict[int, str] = {own: "node_id"}
     named = [(f"joint_{joint.number}.node", joint.node_id) for joint in joints]
     if sensor is not None:
         named.append(("sensor.node", sensor.node_id))
     for key, node in named:
         if node in users:
-            raise ConfigError(f"{path}: key '{key}': found {node}, expected a node-ID not used by {users[node]}")
+            raise ConfigError(
+                f"{path}: key '{key}': found {node}, expected a node-ID not used by {users[node]}"
+            )
         users[node] = key

@@ -15,7 +15,7 @@ import struct
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import inf, nan
+from math import inf, isnan, nan
 
 from daemon import cycle_record as cr
 from daemon import estimate_pdo
@@ -32,6 +32,8 @@ from estimator.joint_estimator import Estimate, JointEstimator
 _STARTING_CYCLES = 20
 """Cycles at the start that are published as "starting": the arrival bands and the filters see their first inputs."""
 _SNAPSHOT_EVERY = 8
+_STAMP_ACCURACY_NS = 5_000
+"""Kernel software stamps differ by a few us from the time on the wire."""
 _POWERED = {0x27, 0x07}
 """Operation enabled and quick stop active (6041h masked with 6Fh): the states in which the motor carries current."""
 _FAULTS = {0x0F, 0x08}
@@ -118,7 +120,9 @@ class Cycle:
         self._heartbeat = pack(0x700 + node_id, b"\x05")
         self._heartbeat_cycles = heartbeat_cycles
         self._stamp_layouts = [struct.Struct(f"<{n}q") for n in range(cr.FRAME_CAPACITY + 1)]
-        self._bits_complete = worst_case_bits(1) + worst_case_bits(8) + sum(worst_case_bits(p.length) for p in intake.pdos)
+        self._bits_complete = (
+            worst_case_bits(1) + worst_case_bits(8) + sum(worst_case_bits(p.length) for p in intake.pdos)
+        )
         self._bits_of = [worst_case_bits(pdo.length) for pdo in intake.pdos]
         self.index = 0
         self.counter = 0
@@ -131,14 +135,17 @@ class Cycle:
         self._bus_errors = 0
         self._configured = bytes(snapshot.configured)
 
-    # Stages ------------------------------------------------------------------------------------------------------------
-
     def begin(self) -> None:
         """Drain what came after the last cycle was closed, then send SYNC."""
         intake, socket = self.intake, self.socket
         self._slot = self.ring.slot()
         self._frame_count = self._left_out = self._flags = 0
-        self._before = (intake.stale_inputs, intake.late_frames, intake.duplicate_frames, intake.rejected_frames)
+        self._before = (
+            intake.stale_inputs,
+            intake.late_frames,
+            intake.duplicate_frames,
+            intake.rejected_frames,
+        )
         count = self._receive()
         if count:
             intake.drain(socket.frames, socket.stamps_ns, socket.own, count)
@@ -231,7 +238,7 @@ class Cycle:
         self.ring.commit()
         self._count(work_ns)
         if self.index % _SNAPSHOT_EVERY == 0:
-            self.snapshot.write(self.index, self._sync_realtime_ns, (one.view, two.view))
+            self.snapshot.write(self.index, self.counter, self._sync_realtime_ns, (one.view, two.view))
         self.index += 1
 
     def skip(self, slots: int) -> None:
@@ -243,9 +250,9 @@ class Cycle:
         off = estimate_pdo.field(nan, inf, st.OFF)
         self._send(pack(self._estimate_id, estimate_pdo.encode(off, off, self.counter)))
         one, two = self._joints
-        self.snapshot.write(self.index, self._sync_realtime_ns, (one.view, two.view))
-
-    # Parts -------------------------------------------------------------------------------------------------------------
+        self._counters[_MISSED] = self.grid.missed
+        self._flush_counters()
+        self.snapshot.write(self.index, self.counter, self._sync_realtime_ns, (one.view, two.view))
 
     def _observe(self, joint: _JointState, sync_ns: int, number: int) -> None:
         inputs, states = joint.inputs, self._states
@@ -269,7 +276,11 @@ class Cycle:
         motor_position = motor_counts * inputs.motor_rad_per_count
         motor_velocity = velocity_units * inputs.motor_rad_s_per_unit
         link_position = link_counts * inputs.link_rad_per_count
-        dt = (sync_ns - joint.last_ns) * 1e-9 if joint.last_ns else 0.0
+        dt_ns = sync_ns - joint.last_ns if joint.last_ns else 0
+        # SYNC keeps an absolute grid: a deviation below the stamps' own accuracy is theirs, not time's.
+        if -_STAMP_ACCURACY_NS < dt_ns - self.grid.period_ns < _STAMP_ACCURACY_NS:
+            dt_ns = self.grid.period_ns
+        dt = dt_ns * 1e-9
         joint.last_ns = sync_ns
         estimate = joint.estimator.step(dt, current, motor_position, motor_velocity, link_position)
         status = estimate.status
@@ -277,7 +288,15 @@ class Cycle:
             status = st.STARTING
         if statusword & 0x6F not in _POWERED:
             status = st.DRIVE_FAULT if statusword & 0x4F in _FAULTS else st.OFF
-        torque, sigma, tob, efficiency, network = estimate[0], estimate[1], estimate[3], estimate[4], estimate[5]
+        if status == st.DEGRADED:
+            self._counters[_FALLBACKS] += 1
+        torque, sigma, tob, efficiency, network = (
+            estimate[0],
+            estimate[1],
+            estimate[3],
+            estimate[4],
+            estimate[5],
+        )
         joint.published = estimate_pdo.field(torque, sigma, status)
         joint.status = status
         joint.sample = (
@@ -298,7 +317,7 @@ class Cycle:
             flags,
         )
         joint.view = (torque, sigma, tob, efficiency, network, sensor_nm, statusword, status, sensor_status)
-        if sensor_nm == sensor_nm and status in (st.VALID, st.DEGRADED):
+        if status in (st.VALID, st.DEGRADED) and not isnan(sensor_nm):
             errors = self.snapshot.errors
             errors[2 * number] += (torque - sensor_nm) ** 2
             errors[2 * number + 1] += 1.0
@@ -360,36 +379,44 @@ class Cycle:
         self._configured = now
 
     def _count(self, work_ns: int) -> None:
-        counters, intake, flags = self._counters, self.intake, self._flags
-        counters[0] = self.index + 1
-        counters[1] = self.grid.missed
+        counters, flags = self._counters, self._flags
+        counters[_CYCLES] += 1
+        counters[_MISSED] = self.grid.missed
         bits = self._bits_complete
         if flags & cr.FLAG_COMPLETE:
-            counters[2] += 1
+            counters[_COMPLETE] += 1
         else:
             bits -= sum(b for b, state in zip(self._bits_of, self._states, strict=True) if not state.fresh)
         if flags & cr.FLAG_PUBLISHED:
-            counters[3] += 1
+            counters[_PUBLISHED] += 1
             if not flags & cr.FLAG_BEFORE_NEXT_SYNC:
-                counters[4] += 1
+                counters[_PUBLISHED_LATE] += 1
         counters[_BITS] += bits
         self.snapshot.work[min(work_ns // WORK_BIN_NS, WORK_BINS - 1)] += 1
         self.snapshot.late[min(max(self.late_ns, 0) // LATE_BIN_NS, LATE_BINS - 1)] += 1
         if self.index % _SNAPSHOT_EVERY == 0:
-            counters[5] = intake.stale_inputs
-            counters[6] = intake.late_frames
-            counters[7] = intake.duplicate_frames
-            counters[8] = intake.rejected_frames
-            counters[9] = intake.unknown_frames
-            counters[10] = intake.foreign_sync
-            counters[11] = intake.boot_ups
-            counters[12] = self.socket.tx_dropped
-            counters[13] = self.socket.rx_dropped
-            counters[14] = self._bus_errors
-            for node, state in intake.node_states.items():
-                self.snapshot.node_states[node] = state
+            self._flush_counters()
+
+    def _flush_counters(self) -> None:
+        """Counters that are kept elsewhere, copied where readers see them."""
+        counters, intake = self._counters, self.intake
+        counters[_INDEX["stale_inputs"]] = intake.stale_inputs
+        counters[_INDEX["late_frames"]] = intake.late_frames
+        counters[_INDEX["duplicate_frames"]] = intake.duplicate_frames
+        counters[_INDEX["rejected_frames"]] = intake.rejected_frames
+        counters[_INDEX["unknown_frames"]] = intake.unknown_frames
+        counters[_INDEX["foreign_sync"]] = intake.foreign_sync
+        counters[_INDEX["boot_ups"]] = intake.boot_ups
+        counters[_INDEX["tx_dropped"]] = self.socket.tx_dropped
+        counters[_INDEX["rx_dropped"]] = self.socket.rx_dropped
+        counters[_INDEX["bus_errors"]] = self._bus_errors
+        for node, state in intake.node_states.items():
+            self.snapshot.node_states[node] = state
 
 
+_CYCLES, _MISSED, _COMPLETE = _INDEX["cycles"], _INDEX["missed"], _INDEX["complete"]
+_PUBLISHED, _PUBLISHED_LATE = _INDEX["published"], _INDEX["published_late"]
 _BITS = _INDEX["bits_worst_case"]
+_FALLBACKS = _INDEX["network_fallbacks"]
 
 __all__ = ["BusError", "Cycle", "JointInputs"]

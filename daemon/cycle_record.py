@@ -41,9 +41,9 @@ FLAG_SYNC_CONFIRMED = 0x08
 
 
 class Header(NamedTuple):
-    """Times in integer ns; `index` counts cycles since the start, missed slots included."""
+    """Times in integer ns; `cycle` counts cycles since the start, missed slots included."""
 
-    index: int
+    cycle: int
     sync_monotonic_ns: int
     sync_realtime_ns: int
     flags: int
@@ -103,5 +103,6 @@ def frames_of(record: bytes | memoryview) -> list[tuple[bytes, int]]:
     stamps = struct.unpack_from(f"<{count}q", record, STAMPS_OFFSET)
     view = memoryview(record)
     return [
-        (bytes(view[FRAMES_OFFSET + 16 * n : FRAMES_OFFSET + 16 * n + 16]), stamp) for n, stamp in enumerate(stamps)
+        (bytes(view[FRAMES_OFFSET + 16 * n : FRAMES_OFFSET + 16 * n + 16]), stamp)
+        for n, stamp in enumerate(stamps)
     ]

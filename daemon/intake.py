@@ -155,7 +155,7 @@ class Intake:
             can_id, length = unpack_head(frames, offset)
             state = by_id.get(can_id)
             if state is None:
-                self._other(can_id, length, frames, offset, stamps_ns[n], own[n])
+                self._other(can_id, frames, offset, stamps_ns[n], own=own[n])
                 continue
             if length != state.length:
                 state.rejected += 1
@@ -169,7 +169,7 @@ class Intake:
             else:
                 state.fresh = True
                 state.values = state.unpack(frames, offset + 8)
-                state.data = frames[offset + 8 : offset + 16]
+                state.data = bytes(frames[offset + 8 : offset + 16])
                 state.stamp_ns = stamp
                 self._missing -= 1
         return self._missing == 0
@@ -206,7 +206,7 @@ class Intake:
             can_id, length = _HEAD.unpack_from(frames, 16 * n)
             state = self._by_id.get(can_id)
             if state is None:
-                self._other(can_id, length, frames, 16 * n, stamps_ns[n], own[n])
+                self._other(can_id, frames, 16 * n, stamps_ns[n], own=own[n])
             elif length != state.length:
                 state.rejected += 1
                 self.rejected_frames += 1
@@ -258,7 +258,7 @@ class Intake:
             state.debt -= 1
 
     def _second(self, state: _State, frames: bytearray, offset: int, stamp: int) -> None:
-        data = frames[offset + 8 : offset + 16]
+        data = bytes(frames[offset + 8 : offset + 16])
         if state.debt:
             self._late(state)
         else:
@@ -292,7 +292,7 @@ class Intake:
         else:
             state.band_high_ns -= int((state.band_high_ns - delay_ns) * _BAND_LEAK)
 
-    def _other(self, can_id: int, length: int, frames: bytearray, offset: int, stamp: int, own: bool) -> None:
+    def _other(self, can_id: int, frames: bytearray, offset: int, stamp: int, *, own: bool) -> None:
         if can_id == _SYNC_COB_ID:
             if own:
                 self.sync_stamp_ns = stamp
@@ -301,7 +301,7 @@ class Intake:
                 self._foreign_sync_now = True
             return
         node = self._heartbeats.get(can_id)
-        if node is not None and length == 1:
+        if node is not None and frames[offset + 4] == 1:
             state = frames[offset + 8]
             self.node_states[node] = state
             if state == 0:  # boot-up: the mapping is back to the device's default

@@ -9,7 +9,10 @@ import sys
 COMMANDS = {
     "sim": ("sim_can.cli", "emulate the bench on a bus, or play a measured run on it"),
     "bus-load": ("daemon.bus_load_command", "worst-case load of the bus by a configuration"),
-    "measured": ("sysid.measured", "estimate measured runs before and after fitting the joint file's friction"),
+    "measured": (
+        "sysid.measured",
+        "estimate measured runs before and after fitting the joint file's friction",
+    ),
 }
 """Subcommand -> (module with `main(argv) -> int`, one line of help)."""
 

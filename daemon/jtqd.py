@@ -25,16 +25,24 @@ def parser() -> argparse.ArgumentParser:
     """Arguments of `jtqd`."""
     result = argparse.ArgumentParser(
         prog="jtqd",
-        description="Estimate the torque of two harmonic-drive joints at 1 kHz as a CANopen master, without a torque sensor.",
+        description="Estimate the torque of two harmonic-drive joints at 1 kHz, as a CANopen master, without torque sensor.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    result.add_argument("--bus", required=True, help="SocketCAN interface, unix:PATH, or sim for the emulated bench")
-    result.add_argument("--config", type=Path, metavar="FILE", help="configuration (default: the bench that ships)")
     result.add_argument(
-        "--record", metavar="DIR", help="directory of the MCAP logs, or none (default: $LOGS_DIRECTORY or ./logs)"
+        "--bus", required=True, help="SocketCAN interface, unix:PATH, or sim for the emulated bench"
     )
-    result.add_argument("--duration", type=_seconds, metavar="S", help="end after S seconds (default: run until stopped)")
+    result.add_argument(
+        "--config", type=Path, metavar="FILE", help="configuration (default: the bench that ships)"
+    )
+    result.add_argument(
+        "--record",
+        metavar="DIR",
+        help="directory of the MCAP logs, or none (default: $LOGS_DIRECTORY or ./logs)",
+    )
+    result.add_argument(
+        "--duration", type=_seconds, metavar="S", help="end after S seconds (default: run until stopped)"
+    )
     result.add_argument("--json", action="store_true", help="print the final summary as JSON")
     return result
 

@@ -18,10 +18,12 @@ def bus_load(previous: View, now: View, bitrate: int) -> float:
     """Share of the bus that the frames between two views took with worst-case stuffing; NaN without time in between."""
     seconds = (now.sync_realtime_ns - previous.sync_realtime_ns) * 1e-9
     bits = now.counters["bits_worst_case"] - previous.counters["bits_worst_case"]
-    return bits / seconds / bitrate if seconds > 0 else float("nan")
+    return bits / seconds / bitrate if previous.sync_realtime_ns and seconds > 0 else float("nan")
 
 
-def live_table(reader: SnapshotReader, previous: View, view: View, bitrate: int, title: str) -> RenderableType:
+def live_table(
+    reader: SnapshotReader, previous: View, view: View, bitrate: int, title: str
+) -> RenderableType:
     """One picture of the running loop."""
     table = Table(title=title, title_justify="left", expand=False)
     for name, justify in (

@@ -144,7 +144,13 @@ def _answer(**content: Any) -> None:
     print(json.dumps(content), flush=True)
 
 
-def _build(config: Config, request: dict[str, Any], report: dict[str, Any], socket: FrameSocket, estimators: list[JointEstimator]) -> tuple[Cycle, Grid]:
+def _build(
+    config: Config,
+    request: dict[str, Any],
+    report: dict[str, Any],
+    socket: FrameSocket,
+    estimators: list[JointEstimator],
+) -> tuple[Cycle, Grid]:
     pdos = input_pdos(config)
     grid = Grid(0, config.period_ns)
     snapshot = Snapshot(Path(request["snapshot"]), config.period_ns * 1e-9, float(request["worst_load"]))

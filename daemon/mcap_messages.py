@@ -91,7 +91,7 @@ _JOINT_1_BLOCK = slice(cycle.HEADER.size, cycle.HEADER.size + cycle.JOINT.size)
 _JOINT_2_BLOCK = slice(cycle.HEADER.size + cycle.JOINT.size, cycle.FRAMES_OFFSET)
 
 _JOINT_CODE = f"4sII16s16s{cycle.JOINT.size}sBB"
-"""header.stamp, frame_id with its padding, cycle and sync_monotonic_ns, all of JointRecord, counter, flags."""
+"""header.stamp, frame_id with its padding, cycle, sync_monotonic_ns, all of JointRecord, counter, flags."""
 _FRAMES_CODE = (
     f"4sII8s16s{cycle.HEADER.size - 24}s{16 * cycle.FRAME_CAPACITY}s{8 * cycle.FRAME_CAPACITY}s"
     # `s` fills up with zeros what a cycle with fewer frames leaves empty.

@@ -40,8 +40,8 @@ from mcap.records import (
 
 MAGIC = b"\x89MCAP0\r\n"
 _COMPRESSION = "zstd"
-_LEVEL = 1
-"""At chunks of this size level 3 saves 2 % of the file and takes twice the time."""
+_LEVEL = 3
+"""On chunks of 500 cycles level 1 is 2 % larger for 0.08 % of a core less, 5 is 1 % smaller for 0.3 % more."""
 _REPEAT_CHANNELS_EVERY = 60
 _CHUNK = struct.Struct("<BQQQQII4sQ")
 _MESSAGE_INDEX = struct.Struct("<BQHI")

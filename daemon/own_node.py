@@ -1,14 +1,16 @@
-"""jtqd as a CANopen node (20h): object dictionary readable by any master, EMCY for what the estimate's users must know.
+"""jtqd as a CANopen node (20h): object dictionary readable by any master, EMCY when an input goes stale.
 
-The loop sends the node's PDO and heartbeat; this part answers SDO requests from the snapshot in shared memory and sends EMCY.
+The loop sends the node's PDO and heartbeat; this part answers SDO requests from the snapshot and sends EMCY.
 It runs in the supervisor, so that no SDO client can delay a cycle.
 """
 
 from __future__ import annotations
 
 import struct
+from functools import partial
 from math import isfinite
 
+from daemon.config import Config
 from daemon.estimate_pdo import field
 from daemon.snapshot import SnapshotReader
 from drivers.frame import FRAME, pack
@@ -30,6 +32,15 @@ COUNTER_OBJECTS = (
     "recorder_lost",
 )
 """Sub-indices 1.. of 2200h, in order."""
+PARAMETER_OBJECTS = (
+    "gear_ratio",
+    "torque_constant_nm_per_a",
+    "rotor_inertia_kgm2",
+    "stiffness_nm_per_rad",
+    "damping_nms_per_rad",
+    "rated_torque_nm",
+)
+"""Sub-indices 1.. of 2202h (joint 1) and 2203h (joint 2): fields of the joint file."""
 EMCY_INPUT_TIMEOUT = 0x8250
 EMCY_RESET = 0x0000
 _COMMUNICATION_ERROR = 0x11
@@ -43,19 +54,22 @@ class OwnNode:
     Args:
         socket: frame socket that receives SDO requests 600h + node_id.
         store: object dictionary from jtqd.eds.
-        node_id: own node-ID.
+        config: configuration in force; its joints' parameters are readable in 2202h and 2203h.
         reader: snapshot of the loop.
     """
 
-    def __init__(self, socket: FrameSocket, store: ObjectStore, node_id: int, reader: SnapshotReader) -> None:
+    def __init__(
+        self, socket: FrameSocket, store: ObjectStore, config: Config, reader: SnapshotReader
+    ) -> None:
         self.socket = socket
-        self._node_id = node_id
+        self._node_id = config.node_id
         self._reader = reader
         self._store = store
         self._server = SdoServer(store)
         self._stale = (False, False)
         self.recorder_lost = 0
         self._connect_objects()
+        self._set_parameters(config)
 
     def serve(self) -> None:
         """Answer every request that has arrived."""
@@ -75,24 +89,27 @@ class OwnNode:
             register = _COMMUNICATION_ERROR if any(stale) else 0
             which = sum(1 << n for n, is_stale in enumerate(stale) if is_stale)
             self._store.set_number(0x1001, 0, register)
-            self.socket.send(pack(0x080 + self._node_id, _EMCY.pack(code, register, bytes((which,)) + bytes(4))))
+            self.socket.send(
+                pack(0x080 + self._node_id, _EMCY.pack(code, register, bytes((which,)) + bytes(4)))
+            )
             self._stale = stale
 
     def _connect_objects(self) -> None:
         store = self._store
-        for n in (0, 1):
-            store.on_read(0x2100, n + 1, lambda n=n: self._field(n)[0])
-            store.on_read(0x2101, n + 1, lambda n=n: self._field(n)[1])
-        store.on_read(0x2102, 0, lambda: self._field(0)[2] | self._field(1)[2] << 4)
-        store.on_read(0x2103, 0, lambda: self._reader.read().index % 240)
+        for joint in (0, 1):
+            store.on_read(0x2100, joint + 1, partial(self._field, joint, 0))
+            store.on_read(0x2101, joint + 1, partial(self._field, joint, 1))
+        store.on_read(0x2102, 0, lambda: self._field(0, 2) | self._field(1, 2) << 4)
+        store.on_read(0x2103, 0, lambda: self._reader.read().sync_counter)
         for sub, name in enumerate(COUNTER_OBJECTS, start=1):
-            store.on_read(0x2200, sub, lambda name=name: self._counter(name))
+            store.on_read(0x2200, sub, partial(self._counter, name))
         for sub, share in enumerate((0.5, 0.99, 1.0), start=1):
-            store.on_read(0x2201, sub, lambda share=share: self._work_us(share))
+            store.on_read(0x2201, sub, partial(self._work_us, share))
 
-    def _field(self, joint: int) -> tuple[int, int, int]:
+    def _field(self, joint: int, part: int) -> int:
+        """Torque (0), sigma (1) or status (2) of a joint as on the bus."""
         view = self._reader.read().joints[joint]
-        return field(view.torque_nm, view.sigma_nm, view.status)
+        return field(view.torque_nm, view.sigma_nm, view.status)[part]
 
     def _counter(self, name: str) -> int:
         value = self.recorder_lost if name == "recorder_lost" else self._reader.read().counters[name]
@@ -101,3 +118,11 @@ class OwnNode:
     def _work_us(self, share: float) -> int:
         value = self._reader.work_us(share)[0]
         return round(value) if isfinite(value) else 0
+
+    def _set_parameters(self, config: Config) -> None:
+        self._store.set_number(0x1017, 0, config.heartbeat_ms)
+        self._store.set_number(0x1019, 0, config.counter_overflow)
+        self._store.set_text(0x2204, 0, config.sha256)
+        for index, joint in zip((0x2202, 0x2203), config.joints, strict=True):
+            for sub, name in enumerate(PARAMETER_OBJECTS, start=1):
+                self._store.set_number(index, sub, getattr(joint.joint, name))

@@ -35,7 +35,9 @@ def prepare(priority: int, cpu: int | None, lock_memory: bool) -> list[str]:
             refused.append(f"CPU {cpu}: {error.strerror}: the loop runs on any CPU")
     if lock_memory and libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) != 0:
         reason = os.strerror(ctypes.get_errno())
-        refused.append(f"memory lock: {reason}: a page fault may delay a cycle (LimitMEMLOCK=infinity grants it)")
+        refused.append(
+            f"memory lock: {reason}: a page fault may delay a cycle (LimitMEMLOCK=infinity grants it)"
+        )
     if priority:
         try:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
@@ -52,4 +54,3 @@ def freeze() -> None:
     gc.collect()
     gc.freeze()
     gc.disable()
-

@@ -37,7 +37,8 @@ _NICE = 5
 
 
 def _say(text: str) -> None:
-    print(f"recorder: {text}", file=sys.stderr, flush=True)
+    with suppress(OSError):
+        print(f"recorder: {text}", file=sys.stderr, flush=True)
 
 
 def definitions(metadata: dict[str, dict[str, str]] | None) -> tuple[list[Schema], list[Channel]]:
@@ -99,13 +100,31 @@ def _open_file(request: RecorderRequest, time_ns: int) -> tuple[McapFile | None,
     return file, final
 
 
-def _open_ring(request: RecorderRequest) -> RingReader:
+class _Stop:
+    """SIGTERM came, or the parent has gone."""
+
+    def __init__(self) -> None:
+        self._parent = os.getppid()
+        self._signalled = False
+        signal.signal(signal.SIGTERM, self._on_signal)
+        # Ctrl-C reaches every process of the terminal; the supervisor ends the loop, then sends SIGTERM.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def _on_signal(self, _number: int, _frame: object) -> None:
+        self._signalled = True
+
+    @property
+    def requested(self) -> bool:
+        return self._signalled or os.getppid() != self._parent
+
+
+def _open_ring(request: RecorderRequest, stop: _Stop) -> RingReader:
     deadline = time.monotonic() + request.wait_s
     while True:
         try:
             return RingReader(request.ring, cycle_record.RECORD_SIZE)
         except RingError:
-            if time.monotonic() >= deadline:
+            if time.monotonic() >= deadline or stop.requested:
                 raise
         time.sleep(POLL_S)
 
@@ -113,18 +132,11 @@ def _open_ring(request: RecorderRequest) -> RingReader:
 class Recorder:
     """The polling loop around one `Recording`."""
 
-    def __init__(self, reader: RingReader, recording: Recording, chunk_s: float) -> None:
+    def __init__(self, reader: RingReader, recording: Recording, chunk_s: float, stop: _Stop) -> None:
         self._reader = reader
         self._recording = recording
         self._chunk_s = chunk_s
-        self._parent = os.getppid()
-        self._stop = False
-        signal.signal(signal.SIGTERM, self._on_signal)
-        # Ctrl-C reaches every process of the terminal; the supervisor ends the loop, then sends SIGTERM.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    def _on_signal(self, _number: int, _frame: object) -> None:
-        self._stop = True
+        self._stop = stop
 
     def _take(self) -> int:
         """Everything that is in the ring now; returns how many cycles that were."""
@@ -156,7 +168,7 @@ class Recorder:
                 now - max(last_taken, asked) >= QUIET_S or now - asked >= DRAIN_LIMIT_S
             ):
                 return
-            if asked is None and (self._stop or os.getppid() != self._parent):
+            if asked is None and self._stop.requested:
                 asked = now
             if now - last_diagnosis >= 1.0:
                 used = time.process_time()
@@ -178,15 +190,16 @@ def record(request: RecorderRequest) -> int:
     Raises:
         RingError: no ring at that path within `wait_s`.
     """
+    stop = _Stop()
     with suppress(OSError):
         os.nice(_NICE)
-    reader = _open_ring(request)
+    reader = _open_ring(request, stop)
     started = time.time_ns()
     file, final = _open_file(request, started)
     overview = JointStateMessage(request.joint_names, request.gear_ratios)
     recording = Recording(file, overview, int(request.chunk_s * 1e9), _say)
     recording.note(schemas.RECORDER_STARTED, "recorder started", level=INFO, time_ns=started)
-    Recorder(reader, recording, request.chunk_s).run()
+    Recorder(reader, recording, request.chunk_s, stop).run()
     account = recording.account
     text = f"recorder stopped: {account.cycles} cycles seen, {account.lost} lost"
     recording.note(schemas.RECORDER_STOPPED, text, level=INFO, time_ns=time.time_ns())
@@ -210,7 +223,12 @@ def record(request: RecorderRequest) -> int:
         "lost_unwritten": account.unwritten,
         "bytes": 0 if path is None else path.stat().st_size,
     }
-    print(json.dumps(summary), flush=True)
+    try:
+        print(json.dumps(summary), flush=True)
+    except OSError:  # whoever read it has gone
+        os.dup2(
+            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
+        )  # else the interpreter says so at its end
     return 0 if complete and not account.lost else 3
 
 

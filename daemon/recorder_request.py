@@ -92,7 +92,7 @@ class RecorderRequest:
         return cls(**values)
 
     def load_attachments(self) -> tuple[list[NamedData], list[str]]:
-        """The attachments, and a line for each that cannot be read: a missing one must not end a recording."""
+        """Attachments, and a line for each that cannot be read: a missing one must not end a recording."""
         loaded, problems = [], []
         for item in self.attachments:
             media_type = item.get("media_type", "application/octet-stream")

@@ -30,9 +30,15 @@ def recording_request(
     attachments: list[dict[str, str]] = [
         {"name": "configuration.yaml", "media_type": "application/yaml", "text": config.text},
         {"name": "bus.dbc", "media_type": "text/plain", "text": dbc_text(config, report)},
-        {"name": "provenance.json", "media_type": "application/json", "text": json.dumps(_provenance(config, report))},
+        {
+            "name": "provenance.json",
+            "media_type": "application/json",
+            "text": json.dumps(_provenance(config, report)),
+        },
     ]
-    attachments += [_file(path, "application/yaml") for path in dict.fromkeys(j.joint_path for j in config.joints)]
+    attachments += [
+        _file(path, "application/yaml") for path in dict.fromkeys(j.joint_path for j in config.joints)
+    ]
     networks = dict.fromkeys(joint.network.path for joint in config.joints if joint.network)
     attachments += [_file(path, "application/octet-stream") for path in networks]
     attachments += [_file(path, "text/plain") for path in sorted(_EDS_DIRECTORY.glob("*.eds"))]

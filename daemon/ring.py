@@ -1,9 +1,9 @@
 """Ring of fixed-size records in shared memory: one writer that never waits, a reader that learns its losses.
 
-The file holds a header page and `slots` records. The writer fills the slot of record `n` and then stores `n +
-1` as the count; it overwrites the oldest record when the reader is slow or gone. The reader copies what lies
-between its own position and the count, reads the count again, and drops (and counts) whatever may have been
-overwritten meanwhile.
+The file holds a header page and `slots` records. The writer fills the slot of record `n` and then stores
+`n + 1` as the count; it overwrites the oldest record when the reader is slow or gone. The reader copies what
+lies between its own position and the count, reads the count again, and drops (and counts) whatever may have
+been overwritten meanwhile.
 
 Each record begins and ends with its index, 8 bytes, larger from record to record. Where stores become visible
 out of order (ARM) the count can be seen before the record: a copy whose two ends differ is torn, and one
@@ -20,10 +20,9 @@ from typing import NamedTuple
 
 _MAGIC = 0x4A54_5144_5249_4E47  # "JTQDRING"
 _HEADER_SIZE = 4096
-_COUNT_OFFSET = 64
-"""On a cache line of its own: the reader polls it while the writer fills records."""
+_COUNT_WORD = 8
+"""64-bit word of the count, on a cache line of its own: the reader polls it while records are written."""
 _LAYOUT = struct.Struct("<QQQ")
-_COUNT = struct.Struct("<Q")
 
 
 class RingError(Exception):
@@ -52,6 +51,8 @@ class Ring:
             self._view[_HEADER_SIZE + n * record_size : _HEADER_SIZE + (n + 1) * record_size]
             for n in range(slots)
         ]
+        # One 8-byte store. `struct.pack_into` writes zeros first: the reader would at times see a count of 0.
+        self._words = self._view[:_HEADER_SIZE].cast("Q")
         self._size = slots
         self.count = 0
 
@@ -62,7 +63,7 @@ class Ring:
     def commit(self) -> None:
         """Publish the record written into `slot()`."""
         self.count += 1
-        _COUNT.pack_into(self._memory, _COUNT_OFFSET, self.count)
+        self._words[_COUNT_WORD] = self.count
 
 
 class Batch(NamedTuple):
@@ -90,13 +91,14 @@ class RingReader:
         )
         if magic != _MAGIC or size != record_size or len(self._memory) != _HEADER_SIZE + slots * size:
             raise RingError(f"{path}: not a ring of {record_size}-byte records (found record size {size})")
+        self._words = memoryview(self._memory)[:_HEADER_SIZE].cast("Q")
         self._slots = slots
         self._record_size = record_size
         self._newest = -1
-        self.position = max(0, self._count() - slots)
+        self.position: int = max(0, self._count() - slots)
 
     def _count(self) -> int:
-        return int(_COUNT.unpack_from(self._memory, _COUNT_OFFSET)[0])
+        return self._words[_COUNT_WORD]
 
     @property
     def backlog(self) -> int:

@@ -1,7 +1,8 @@
-"""Live state of the loop in shared memory: counters, histograms and the last estimate, for status views and jtqd's own objects.
+"""Live state of the loop in shared memory: counters, histograms and the last estimate.
 
-The loop writes, anybody with access to the file reads; nothing a reader does can delay the loop. The counters are single
-64-bit words; the block of the last estimate is guarded by a sequence number that is odd while it is being written.
+For status views and for jtqd's own objects. The loop writes, anybody with access to the file reads; nothing a
+reader does can delay the loop. The counters are single 64-bit words; the block of the last estimate is
+guarded by a sequence number that is odd while it is being written.
 """
 
 from __future__ import annotations
@@ -38,8 +39,9 @@ LATE_BINS, LATE_BIN_NS = 250, 4_000
 _MAX_NODE = 128
 
 _MAGIC = 0x4A54_5144_5354_4101  # "JTQDSTA", layout 1
+_HEAD = struct.Struct("<QQdd")
 _JOINT = struct.Struct("<6d4xHBB")
-_ESTIMATE = struct.Struct("<qQqdd")
+_ESTIMATE = struct.Struct("<qQq")
 _COUNTERS_OFFSET = 64
 _SEQUENCE_OFFSET = _COUNTERS_OFFSET + 8 * len(COUNTERS)
 _ESTIMATE_OFFSET = _SEQUENCE_OFFSET + 8
@@ -74,7 +76,8 @@ class View(NamedTuple):
     """One consistent reading."""
 
     pid: int
-    index: int
+    cycle: int
+    sync_counter: int
     sync_realtime_ns: int
     period_s: float
     worst_load: float
@@ -102,7 +105,7 @@ class Snapshot:
             os.fchmod(file.fileno(), 0o600)
             file.truncate(SIZE)
             self._memory = mmap.mmap(file.fileno(), 0)
-        struct.pack_into("<QQdd", self._memory, 0, _MAGIC, os.getpid(), period_s, worst_load)
+        _HEAD.pack_into(self._memory, 0, _MAGIC, os.getpid(), period_s, worst_load)
         os.replace(temporary, path)
         view = memoryview(self._memory)
         self.counters = view[_COUNTERS_OFFSET:_SEQUENCE_OFFSET].cast("Q")
@@ -112,14 +115,18 @@ class Snapshot:
         self.node_states = view[_NODES_OFFSET:_CONFIGURED_OFFSET]
         self.configured = view[_CONFIGURED_OFFSET:SIZE]
         self._sequence = view[_SEQUENCE_OFFSET:_ESTIMATE_OFFSET].cast("Q")
-        self._period_s = period_s
-        self._worst_load = worst_load
 
-    def write(self, index: int, sync_realtime_ns: int, joints: tuple[tuple[float, ...], tuple[float, ...]]) -> None:
+    def write(
+        self,
+        index: int,
+        sync_counter: int,
+        sync_realtime_ns: int,
+        joints: tuple[tuple[float, ...], tuple[float, ...]],
+    ) -> None:
         """Publish the last estimate; `joints` are `JointView` tuples."""
         self._sequence[0] += 1
         memory = self._memory
-        _ESTIMATE.pack_into(memory, _ESTIMATE_OFFSET, index, 0, sync_realtime_ns, self._period_s, self._worst_load)
+        _ESTIMATE.pack_into(memory, _ESTIMATE_OFFSET, index, sync_counter, sync_realtime_ns)
         offset = _ESTIMATE_OFFSET + _ESTIMATE.size
         _JOINT.pack_into(memory, offset, *joints[0])
         _JOINT.pack_into(memory, offset + _JOINT.size, *joints[1])
@@ -146,22 +153,25 @@ class SnapshotReader:
     def read(self) -> View:
         """A consistent view; retries while the loop is writing and takes the last attempt if it never rests."""
         memory = self._memory
-        _, pid, period_s, worst_load = struct.unpack_from("<QQdd", memory, 0)
+        _, pid, period_s, worst_load = _HEAD.unpack_from(memory, 0)
         for _ in range(100):
             before = _WORD.unpack_from(memory, _SEQUENCE_OFFSET)[0]
             block = memory[_ESTIMATE_OFFSET:_ERRORS_OFFSET]
             if before % 2 == 0 and before == _WORD.unpack_from(memory, _SEQUENCE_OFFSET)[0]:
                 break
-        index, _, realtime_ns, _, _ = _ESTIMATE.unpack_from(block, 0)
+        index, sync_counter, realtime_ns = _ESTIMATE.unpack_from(block, 0)
         joints = tuple(
             JointView._make(_JOINT.unpack_from(block, _ESTIMATE.size + n * _JOINT.size)) for n in range(2)
         )
         words = struct.unpack_from(f"<{len(COUNTERS)}Q", memory, _COUNTERS_OFFSET)
         sums = struct.unpack_from("<4d", memory, _ERRORS_OFFSET)
-        rmse = tuple((sums[2 * n] / sums[2 * n + 1]) ** 0.5 if sums[2 * n + 1] else float("nan") for n in range(2))
+        rmse = tuple(
+            (sums[2 * n] / sums[2 * n + 1]) ** 0.5 if sums[2 * n + 1] else float("nan") for n in range(2)
+        )
         return View(
             pid,
             index,
+            sync_counter,
             realtime_ns,
             period_s,
             worst_load,

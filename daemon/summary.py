@@ -59,7 +59,14 @@ class Summary:
             lines.append(f"RMSE joint {joint}  {shown}")
         faults = [
             f"{name.replace('_', ' ')} {counters[name]}"
-            for name in ("late_frames", "duplicate_frames", "rejected_frames", "foreign_sync", "tx_dropped", "rx_dropped")
+            for name in (
+                "late_frames",
+                "duplicate_frames",
+                "rejected_frames",
+                "foreign_sync",
+                "tx_dropped",
+                "rx_dropped",
+            )
             if counters.get(name)
         ]
         if faults:
@@ -68,7 +75,9 @@ class Summary:
             lines.append("log           none")
         else:
             lost = self.recording.get("lost", 0)
-            lines.append(f"log           {self.recording.get('path')}" + (f", {lost} cycles lost" if lost else ""))
+            lines.append(
+                f"log           {self.recording.get('path')}" + (f", {lost} cycles lost" if lost else "")
+            )
         if self.error:
             lines.append(f"ended by      {self.error}")
         return "\n".join(lines)

@@ -1,6 +1,7 @@
-"""The supervisor: starts bench, loop, boot and recorder, shows how the loop is doing, serves the own node, ends all in order.
+"""The supervisor: starts bench, loop, boot and recorder, shows how the loop is doing, ends all in order.
 
-It has no thread and touches no frame of the cycle; if it is busy, or dies, no cycle is late for it.
+It also serves the own node. It has no thread and touches no frame of the cycle; if it is busy, or dies, no
+cycle is late for it.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from rich.live import Live
 
 from daemon.children import Child, ChildError
 from daemon.config import Config
-from daemon.load import bus_load_of
 from daemon.live_table import live_table, plain_line
+from daemon.load import bus_load_of
 from daemon.own_node import OwnNode
 from daemon.recording_request import recording_request
 from daemon.runtime_dir import instance_name, runtime_dir
@@ -32,13 +33,14 @@ from drivers.bus_load import BusLoad, BusLoadError, check_bus_load
 from drivers.errors import BusError
 from drivers.frame import pack
 from drivers.frame_socket import exact, open_frame_socket
-from drivers.object_dictionary import ObjectStore
+from drivers.object_dictionary import ObjectStore, entries_from_json
 
 _WARM_UP_TIMEOUT_S = 60.0
 """Generous: a controller that loads its libraries from a slow card may take its time; nothing is published meanwhile."""
 _TABLE_PERIOD_S = 0.2
 _LOG_PERIOD_S = 5.0
 _NMT_PRE_OPERATIONAL = 0x80
+_OWN_EDS = Path(__file__).resolve().parent.parent / "drivers" / "eds" / "jtqd.eds"
 
 
 class SupervisorError(Exception):
@@ -115,8 +117,8 @@ class Supervisor:
         reader = SnapshotReader(self._snapshot, supervisor=True)
         self._start_recorder(report)
         socket = open_frame_socket(self._bus, [exact(0x600 + self._config.node_id)])
-        store = ObjectStore(_eds("jtqd.eds"), self._config.node_id)
-        node = OwnNode(socket, store, self._config.node_id, reader)
+        store = ObjectStore(entries_from_json(report["own_entries"]), self._config.node_id)
+        node = OwnNode(socket, store, self._config, reader)
         result = self._watch(loop, node, reader, bench)
         self._leave(socket.send)
         self._end_recorder()
@@ -177,7 +179,9 @@ class Supervisor:
 
     # Run -----------------------------------------------------------------------------------------------------------------
 
-    def _watch(self, loop: Child, node: OwnNode, reader: SnapshotReader, bench: Child | None) -> dict[str, Any]:
+    def _watch(
+        self, loop: Child, node: OwnNode, reader: SnapshotReader, bench: Child | None
+    ) -> dict[str, Any]:
         """Until the loop ends: table, SDO requests, recorder. Returns the loop's last answer."""
         terminal = self._console.is_terminal
         title = f"jtqd on {self._instance}, node {self._config.node_id:02X}h, {self._config.estimator.method}"
@@ -186,7 +190,7 @@ class Supervisor:
         told = False
         with Live(console=self._console, auto_refresh=False, transient=False) as live:
             while True:
-                select.select([node.socket.fd, loop.process.stdout], [], [], 0.05)
+                select.select([node.socket.fd, loop.output_fd], [], [], 0.05)
                 node.serve()
                 node.watch()
                 answer = loop.poll_answer()
@@ -196,7 +200,10 @@ class Supervisor:
                     final = loop.poll_answer()
                     return final or {"error": f"the loop ended with exit status {loop.process.returncode}"}
                 if bench is not None and not bench.alive() and not told:
-                    print(f"jtqd: the emulated bench ended with exit status {bench.process.returncode}", file=sys.stderr)
+                    print(
+                        f"jtqd: the emulated bench ended with exit status {bench.process.returncode}",
+                        file=sys.stderr,
+                    )
                 if self._stop and not told:
                     loop.process.send_signal(signal.SIGTERM)
                     told = True
@@ -232,7 +239,11 @@ class Supervisor:
                 f"jtqd: the recorder ended with exit status {self._recorder.process.returncode}; the loop goes on",
                 file=sys.stderr,
             )
-            self._recording = self._recorder.poll_answer() or {"path": None, "lost": None, "error": "the recorder died"}
+            self._recording = self._recorder.poll_answer() or {
+                "path": None,
+                "lost": None,
+                "error": "the recorder died",
+            }
             self._recorder = None
 
     def _end_recorder(self) -> None:
@@ -261,7 +272,7 @@ class Supervisor:
         p50, p99, worst = reader.work_us(0.5, 0.99, 1.0)
         late50, late99, late_worst = reader.late_us(0.5, 0.99, 1.0)
         return Summary(
-            cycles=view.counters["cycles"] - view.counters["missed"],
+            cycles=view.counters["cycles"],
             missed=view.counters["missed"],
             stale_inputs=view.counters["stale_inputs"],
             work_us=(p50, p99, worst),
@@ -277,7 +288,8 @@ class Supervisor:
 def boot_request(config: Config, bus: str, only: frozenset[int] = frozenset()) -> dict[str, Any]:
     """Request for `python -m drivers.boot`; `only` limits it to some nodes."""
     nodes: list[dict[str, Any]] = [
-        {"node": joint.node_id, "kind": "drive", "identity": asdict(joint.identity)} for joint in config.joints
+        {"node": joint.node_id, "kind": "drive", "identity": asdict(joint.identity)}
+        for joint in config.joints
     ]
     if config.sensor is not None:
         sensor = config.sensor
@@ -293,6 +305,7 @@ def boot_request(config: Config, bus: str, only: frozenset[int] = frozenset()) -
         "bus": bus,
         "nodes": [node for node in nodes if not only or node["node"] in only],
         "master_node": config.node_id,
+        "own_eds": str(_OWN_EDS),
         "heartbeat_ms": config.heartbeat_ms,
         "answer_timeout_s": config.boot_timeout_s,
         "sync": {"counter_overflow": config.counter_overflow},
@@ -326,7 +339,3 @@ def _log_directory(record: str | None) -> Path | None:
     if record is None:
         record = os.environ.get("LOGS_DIRECTORY", "").split(":")[0] or "logs"
     return Path(record)
-
-
-def _eds(name: str) -> Path:
-    return Path(__file__).resolve().parent.parent / "drivers" / "eds" / name

@@ -23,6 +23,7 @@ from drivers.boot_error import BootError
 from drivers.boot_procedure import BootedNode, NodeBoot, reset_during_boot
 from drivers.boot_request import BootRequest, RequestError, node_report, parse_request
 from drivers.frame import CAN_RTR_FLAG, CAN_SFF_MASK
+from drivers.object_dictionary import entries_to_json, read_eds
 from drivers.sdo_client import NodeSdo
 
 NMT_START, NMT_PRE_OPERATIONAL = 0x01, 0x80
@@ -216,12 +217,18 @@ def main() -> int:
     logging.getLogger("canopen").setLevel(logging.CRITICAL)  # what it logs as error is in the report
     logging.getLogger("can").setLevel(logging.CRITICAL)
     try:
-        report = boot(parse_request(json.load(sys.stdin))).as_json()
+        request = parse_request(json.load(sys.stdin))
+        report = boot(request).as_json()
+        if request.own_eds is not None:
+            entries = read_eds(request.own_eds, request.settings.master_node)
+            report["own_entries"] = entries_to_json(entries)
     except BootError as error:
         report = {"ok": False, "error": error.report()}
     except (RequestError, json.JSONDecodeError) as error:
         wrong = BootError(None, "request", detail=f"boot request: {error}")
         report = {"ok": False, "error": wrong.report()}
+    except KeyboardInterrupt:
+        report = {"ok": False, "error": BootError(None, "boot", detail="boot interrupted").report()}
     except Exception as error:
         broken = BootError(None, "boot", detail=f"boot failed: {type(error).__name__}: {error}")
         report = {"ok": False, "error": broken.report()}

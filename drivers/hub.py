@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.frame import CAN_ERR_FLAG, ECHO_BIT, FRAME, FRAME_SIZE, MAX_LENGTH, is_valid_id
+from drivers.frame import CAN_ERR_FLAG, ECHO_BIT, FRAME_SIZE, is_frame
 from drivers.listen import listen
 from drivers.receive import NOTHING_YET, SO_TIMESTAMPNS, FrameReceiver
 from drivers.unix_socket import BUFFER_BYTES
@@ -151,9 +151,14 @@ class Hub:
         """Do what is ready; the same as `run_once`."""
         self.run_once(timeout_s)
 
+    @property
+    def clients(self) -> int:
+        """Connected sockets; local ports do not count."""
+        return len(self._clients)
+
     def submit(self, sender: LocalPort | _Client, frame16: bytes, stamp_ns: int) -> bool:
         """Put a frame sent at `stamp_ns` (CLOCK_REALTIME) on the bus; False when it was refused."""
-        if not _is_frame(frame16):
+        if not is_frame(frame16):
             self.counters.malformed += 1
             return False
         self.counters.frames += 1
@@ -248,11 +253,13 @@ class Hub:
         ended = wire.advance(now_ns)
         if ended:
             to_realtime = time.time_ns() - now_ns
-            for sender, frame16, end_ns in ended:
-                assert isinstance(sender, LocalPort | _Client)
-                self._answering_ns = end_ns
-                self._deliver(sender, frame16, end_ns + to_realtime)
-            self._answering_ns = None
+            try:
+                for sender, frame16, end_ns in ended:
+                    assert isinstance(sender, LocalPort | _Client)
+                    self._answering_ns = end_ns
+                    self._deliver(sender, frame16, end_ns + to_realtime)
+            finally:
+                self._answering_ns = None
 
     def _deliver(self, sender: LocalPort | _Client, frame16: bytes, stamp_ns: int) -> None:
         """Deliver a frame to all; one sent within a callback waits until all have the frame before it."""
@@ -282,13 +289,6 @@ class Hub:
 
 _ECHO_ONLY = bytes([ECHO_BIT, 0, 0])
 _ERROR_BYTE = CAN_ERR_FLAG >> 24
-
-
-def _is_frame(frame16: bytes) -> bool:
-    """Tell whether these bytes are a frame that a CAN controller could send, or an error message."""
-    if len(frame16) != FRAME_SIZE or frame16[4] > MAX_LENGTH:
-        return False
-    return is_valid_id(FRAME.unpack(frame16)[0])
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -8,12 +8,10 @@ hand on the same values and know no rights. Pure: no bus and no clock.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-
-from canopen.objectdictionary import import_od
 
 from drivers.sdo_abort import (
     LENGTH_MISMATCH,
@@ -61,7 +59,7 @@ class Entry:
     low: int | None
     high: int | None
     default: bytes
-    layout: struct.Struct | None
+    layout: struct.Struct | None = field(compare=False)
 
     @property
     def readable(self) -> bool:
@@ -92,16 +90,15 @@ class Entry:
 class ObjectStore:
     """Values of one node. SdoAbort refuses a client; ValueError says a number does not fit its object."""
 
-    def __init__(self, eds: Path | str, node_id: int) -> None:
+    def __init__(self, entries: Path | str | Iterable[Entry], node_id: int) -> None:
+        """Dictionary of an EDS file, or of entries that were read from one (see `read_eds`)."""
         if not 1 <= node_id <= 127:
             raise ValueError(f"node id {node_id}, expected 1..127")
         self.node_id = node_id
-        self.entries: dict[tuple[int, int], Entry] = {}
-        self._indices: set[int] = set()
-        for variable in _variables(import_od(str(eds), node_id)):
-            entry = _entry(variable)
-            self.entries[entry.index, entry.subindex] = entry
-            self._indices.add(entry.index)
+        if isinstance(entries, Path | str):
+            entries = read_eds(entries, node_id)
+        self.entries: dict[tuple[int, int], Entry] = {(each.index, each.subindex): each for each in entries}
+        self._indices: set[int] = {index for index, _ in self.entries}
         self._values = {key: entry.default for key, entry in self.entries.items()}
         self._on_read: dict[tuple[int, int], ReadHook] = {}
         self._on_write: dict[tuple[int, int], WriteHook] = {}
@@ -218,6 +215,40 @@ class ObjectStore:
         return entry.layout.pack(value)
 
 
+def read_eds(eds: Path | str, node_id: int) -> list[Entry]:
+    """Entries of an EDS file with $NODEID filled in.
+
+    The parser is canopen's. It is loaded here and not with this module: it takes 20 MB, and a process that is
+    handed its entries as JSON (`entries_to_json`, `entries_from_json`) does without.
+    """
+    from canopen.objectdictionary import import_od
+
+    return [_entry(variable) for variable in _variables(import_od(str(eds), node_id))]
+
+
+_JSON_FIELDS = ("index", "subindex", "name", "data_type", "access", "mappable", "low", "high")
+
+
+def entries_to_json(entries: Iterable[Entry]) -> list[list[Any]]:
+    """Entries as plain data."""
+    return [[*(getattr(each, name) for name in _JSON_FIELDS), each.default.hex()] for each in entries]
+
+
+def entries_from_json(rows: Iterable[list[Any]]) -> list[Entry]:
+    """Inverse of `entries_to_json`."""
+    result = []
+    for *values, default in rows:
+        fields = dict(zip(_JSON_FIELDS, values, strict=True))
+        layout = _layout(fields["data_type"])
+        result.append(Entry(**fields, default=bytes.fromhex(default), layout=layout))
+    return result
+
+
+def _layout(data_type: int) -> struct.Struct | None:
+    letter = _LETTERS.get(data_type) or _FLOAT_LETTERS.get(data_type)
+    return struct.Struct("<" + letter) if letter else None
+
+
 def _variables(dictionary: Any) -> list[Any]:
     """Every variable of a parsed EDS: plain ones, and the members of arrays and records."""
     variables: list[Any] = []
@@ -230,8 +261,7 @@ def _variables(dictionary: Any) -> list[Any]:
 
 def _entry(variable: Any) -> Entry:
     data_type = int(variable.data_type)
-    letter = _LETTERS.get(data_type) or _FLOAT_LETTERS.get(data_type)
-    layout = struct.Struct("<" + letter) if letter else None
+    layout = _layout(data_type)
     name = variable.name if variable.subindex == 0 else f"{variable.parent.name}: {variable.name}"
     return Entry(
         index=variable.index,

@@ -164,7 +164,7 @@ class FrameReceiver:
     def _walk(self, n: int, sizes: Sequence[int]) -> int:
         """Read control messages of any layout; return the number of messages before the end of the stream."""
         stamps = [0] * n
-        for i in range(n):
+        for i in range(n):  # the end of the stream fills every slot that is left
             if sizes[i] == 0 and self.lengths[i] == 0:
                 self.closed = True
                 n = i

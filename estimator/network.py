@@ -138,7 +138,10 @@ class TorqueNetwork:
         return str(outputs[0].name)
 
     def _metadata(self) -> dict[str, Any]:
-        raw = self._session.get_modelmeta().custom_metadata_map
+        try:
+            raw = self._session.get_modelmeta().custom_metadata_map
+        except UnicodeDecodeError as error:
+            raise self._error(f"metadata: found bytes that are not UTF-8 ({error.reason})") from None
         found: dict[str, Any] = {}
         for key in ("features", "envelope_low", "envelope_high", "sigma_nm", "joint", "data_sha256"):
             if key not in raw:

@@ -23,8 +23,8 @@ class RunTableError(ValueError):
 class JointColumns:
     """Columns [n] of one joint, None where the run has none; SI units.
 
-    Motor position and velocity are motor side, the rest is joint side. torque_nm is measured: what the joint exerts
-    on the coupling, positive along its own positive current.
+    Motor position and velocity are motor side, the rest is joint side. torque_nm is measured: what the
+    joint exerts on the coupling, positive along its own positive current.
     """
 
     current_a: FloatArray | None = None
@@ -44,9 +44,10 @@ class JointColumns:
     def derived(self, time_s: FloatArray, gear_ratio: float) -> JointColumns:
         """Return a copy in which missing positions and velocities are derived from what is there.
 
-        A velocity is the central difference of its own position (second order, also for uneven steps; it looks one
-        sample ahead, so it is for runs, not for the loop). Where one side of the gear has no encoder its position
-        and velocity are the other side's through gear_ratio, the torsion neglected. Nothing else is made up.
+        A velocity is the central difference of its own position (second order, also for uneven steps; it
+        looks one sample ahead, so it is for runs, not for the loop). Where one side of the gear has no
+        encoder its position and velocity are the other side's through gear_ratio, the torsion neglected.
+        Nothing else is made up.
         """
         q_m, w_m, q_l, w_l = (
             self.motor_position_rad,
@@ -83,8 +84,8 @@ COLUMN_NAMES: Final = tuple(item.name for item in fields(JointColumns))
 class RunTable:
     """One run: time_s [n], strictly increasing, and the columns of its joints (key: joint number).
 
-    Raises RunTableError for fewer than 2 samples, unequal lengths, time that does not increase, values that are not
-    finite; the message names the column and the first bad sample.
+    Raises RunTableError for fewer than 2 samples, unequal lengths, time that does not increase, values that
+    are not finite; the message names the column and the first bad sample.
     """
 
     time_s: FloatArray

@@ -128,9 +128,11 @@ class Trust:
         sides = self._sides
         weight = 1.0
         for n, inverse in enumerate(self._inverse_margin):
-            excess = max(sides[2 * n] - x[n], x[n] - sides[2 * n + 1])
-            weight = min(weight, 1.0 - excess * inverse)
-        return max(weight, 0.0)
+            part = 1.0 - max(sides[2 * n] - x[n], x[n] - sides[2 * n + 1]) * inverse
+            if not part > 0.0:  # NaN included
+                return 0.0
+            weight = min(weight, part)
+        return weight
 
     def weight_many(self, features: FloatArray, difference_nm: FloatArray) -> FloatArray:
         """Vectorised twin of `weight`: features [n, 6], difference [n] -> [n]."""
@@ -139,4 +141,5 @@ class Trust:
         weight = np.min(1.0 - excess * np.array(self._inverse_margin), axis=1)
         near = (self._limit - np.abs(difference_nm)) * self._inverse_fade
         result: FloatArray = np.clip(np.minimum(weight, near), 0.0, 1.0)
-        return np.where(np.isfinite(difference_nm), result, 0.0)
+        result[np.isnan(result)] = 0.0
+        return result

@@ -12,6 +12,9 @@ from sim_can.sensor_node import SENSOR_NODE, SensorNode
 from sim_can.source import OFF, VELOCITY, Source
 
 LONGEST_STEP_NS = 50_000_000  # a source never jumps further than this, however long SYNC was away
+RESOLUTION_NS = (
+    10_000  # a software stamp is no better; the plant then sees an exact grid wherever SYNC keeps one
+)
 IDLE_STEP_NS = 10_000_000  # step of powered drives once SYNC has been away for LONGEST_STEP_NS
 
 
@@ -25,11 +28,15 @@ def bench_filters() -> tuple[CanFilter, ...]:
     return tuple(exact(can_id) for can_id in ids)
 
 
+def _rounded(time_ns: int) -> int:
+    return (time_ns + RESOLUTION_NS // 2) // RESOLUTION_NS * RESOLUTION_NS
+
+
 class Bench:
     """Nodes 1, 2, 3. `over` turns True when a recorded run has ended.
 
-    The source's time is the measured time between SYNCs, beginning with 0 at the first one: equal stamps give
-    equal values.
+    The source's time is the measured time since the first SYNC, in steps of RESOLUTION_NS: equal stamps give
+    equal values, and so do stamps that differ by their own inaccuracy.
     """
 
     def __init__(self, source: Source, profile: str = "demo") -> None:
@@ -42,7 +49,8 @@ class Bench:
         self._profile = profile
         self._profile_s = 0.0
         self._gear = [rating.gear_ratio for rating in source.ratings]
-        self._last_stamp_ns = 0
+        self._first_stamp_ns = 0
+        self._last_time_ns = 0  # of the last SYNC, since the first one
         self._last_steady_ns = 0  # steady clock at the last step, for idle steps
         self._idle_ns = 0  # source time spent in idle steps since the last SYNC
 
@@ -81,9 +89,12 @@ class Bench:
         if self.sync_count:
             # a clock that was stepped back must not stop the bench, nor may time that idle steps covered
             # count twice
-            step_ns = min(max(stamp_ns - self._last_stamp_ns - self._idle_ns, 0), LONGEST_STEP_NS)
+            time_ns = _rounded(stamp_ns - self._first_stamp_ns)
+            step_ns = min(max(time_ns - self._last_time_ns - self._idle_ns, 0), LONGEST_STEP_NS)
+            self._last_time_ns = time_ns
+        else:
+            self._first_stamp_ns = stamp_ns
         self.sync_count += 1
-        self._last_stamp_ns = stamp_ns
         self._last_steady_ns = now_ns
         self._idle_ns = 0
         frames = self._advance(step_ns * 1e-9)

@@ -20,6 +20,7 @@ _PR_SET_TIMERSLACK = 29
 _RETRY_S = 0.2  # how often an interface that is down is looked at again
 _NOT_DATA = CAN_EFF_FLAG | CAN_RTR_FLAG | CAN_ERR_FLAG
 _LONGEST_WAIT_S = 1.0
+_LINGER_STEP_S = 0.05
 
 
 class _StopError(Exception):
@@ -39,12 +40,15 @@ class _Bus(Protocol):
     def serve(self, timeout_s: float) -> None:
         """Wait up to timeout_s for frames, give them to the bench, send its answers."""
 
+    def linger(self, end_ns: int | None) -> None:
+        """The bench is silent from now on: return when nobody needs the bus from it any more, or at end_ns."""
+
     def close(self) -> None:
         """Leave the bus."""
 
 
 class _EmbeddedHub:
-    """The bench makes the unix bus itself: the hub lives in this process and the bench is a local port of it."""
+    """The bench makes the unix bus itself: the hub lives in this process, the bench is a local port of it."""
 
     def __init__(self, path: str, bitrate: int | None, bench: Bench) -> None:
         self._hub = Hub(path, bitrate)
@@ -54,6 +58,14 @@ class _EmbeddedHub:
         self.send = self._port.send
         self.serve = self._hub.run_once
         self.close = self._hub.close
+
+    def linger(self, end_ns: int | None) -> None:
+        """The bus is ours: it stays for its other members, as a wire does when a node goes silent."""
+        self._port.detach()
+        if self._hub.clients:
+            print("bench: silent, the bus stays until its members have left", file=sys.stderr, flush=True)
+        while self._hub.clients and (end_ns is None or time.monotonic_ns() < end_ns):
+            self._hub.run_once(_LONGEST_WAIT_S if end_ns is None else _LINGER_STEP_S)
 
     def _on_frame(self, frame16: bytes, stamp_ns: int) -> None:
         can_id, length, data = FRAME.unpack(frame16)
@@ -70,6 +82,9 @@ class _Socket:
         self._bench = bench
         self._down = False
         self.close = self._socket.close
+
+    def linger(self, end_ns: int | None) -> None:
+        """The bus does not need us."""
 
     def send(self, frame16: bytes) -> bool:
         try:
@@ -171,3 +186,4 @@ def _loop(line: _Bus, bench: Bench, end_ns: int | None) -> None:
         wake_ns = due_ns if end_ns is None else min(due_ns, end_ns)
         line.serve(min(max(wake_ns - now_ns, 0) * 1e-9, _LONGEST_WAIT_S))
     print("bench: the run is over", file=sys.stderr, flush=True)
+    line.linger(end_ns)

@@ -6,21 +6,19 @@ list of 16-byte frames. What frames arrive is nobody's promise: wrong lengths an
 ignored or answered as CiA 301 says, never raised.
 """
 
-import struct
 from collections.abc import Callable
 
-from drivers.error_history import ErrorHistory
 from drivers.frame import pack
 from drivers.object_dictionary import ObjectStore
 from drivers.pdo import LAST_SYNC_TYPE, PdoMap
 from drivers.pdo_parameters import PdoParameters
 from drivers.sdo_abort import SdoAbort
 from drivers.sdo_server import SdoServer
-from sim_can.transmit_pdo import NEVER_NS, Getter, TransmitPdo
+from sim_can.emergency import COMMUNICATION, Emergency
+from sim_can.transmit_pdo import NEVER_NS, Getter, TransmitPdo, compile_tpdos
 
 STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0x04, 0x05, 0x7F
 _START, _STOP, _ENTER_PRE_OPERATIONAL, _RESET_NODE, _RESET_COMMUNICATION = 1, 2, 128, 129, 130
-_EMCY = struct.Struct("<HB5s")
 HEARTBEAT_LOST = 0x8130
 PDO_TOO_SHORT = 0x8210
 SYNC_LENGTH = 0x8240
@@ -46,9 +44,8 @@ class CanopenNode:
         self.getters: dict[tuple[int, int], Getter] = {}
         self.handlers: dict[tuple[int, int], Handler] = {}
         self._pdos = PdoParameters(store)
-        self._history = ErrorHistory(store)
+        self._emergency = Emergency(store)
         self._sdo = SdoServer(store)
-        self._errors: dict[int, int] = {}  # present errors: EMCY code -> bits of the error register
         self._generation = -1
         self._transmit: list[TransmitPdo] = []
         self._receive: dict[int, PdoMap] = {}
@@ -85,31 +82,15 @@ class CanopenNode:
         """The master's heartbeat stopped; EMCY and 1029h are the base's matter."""
         return []
 
-    def raise_error(self, code: int, register: int, detail: bytes = b"\0\0\0\0\0") -> list[bytes]:
-        """EMCY for a new error: 1001h, 1003h and the message. An error that is already present is not told
-        again.
-        """
-        if code in self._errors:
-            return []
-        self._errors[code] = register | 1
-        self._history.push(code)
-        return self._emcy(code, detail)
+    def raise_error(self, code: int, register: int) -> list[bytes]:
+        """A new error with its bits of 1001h; the EMCY, unless the node is stopped."""
+        frames = self._emergency.come(code, register)
+        return [] if self.state == STOPPED else frames
 
     def clear_error(self, *codes: int) -> list[bytes]:
-        """These errors are gone; EMCY 0000h with what is left in the error register, when one of them was
-        present.
-        """
-        gone = [code for code in codes if self._errors.pop(code, None) is not None]
-        return self._emcy(0, b"\0\0\0\0\0") if gone else []
-
-    def _emcy(self, code: int, detail: bytes) -> list[bytes]:
-        register = 0
-        for bits in self._errors.values():
-            register |= bits
-        self.store.set_number(0x1001, 0, register)
-        if self.state == STOPPED:
-            return []
-        return [pack(0x080 + self.node_id, _EMCY.pack(code, register, detail))]
+        """These errors are over; EMCY 0000h if one of them was present."""
+        frames = self._emergency.gone(*codes)
+        return [] if self.state == STOPPED else frames
 
     def event(self) -> list[bytes]:
         """Send the event-driven TPDOs (types 254, 255) whose values have changed."""
@@ -150,7 +131,7 @@ class CanopenNode:
         counter = data[0] if len(data) == 1 else 0
         if len(data) > 1 and not self._sync_error_told:
             self._sync_error_told = True
-            frames += self.raise_error(SYNC_LENGTH, 0x10)
+            frames += self.raise_error(SYNC_LENGTH, COMMUNICATION)
         transmits = self._pdo_maps()
         if self._waiting:
             self._apply_waiting()
@@ -246,7 +227,7 @@ class CanopenNode:
             self.on_reset()
         self.state = PRE_OPERATIONAL
         self._sdo = SdoServer(self.store)
-        self._errors.clear()
+        self._emergency.forget()
         self._generation = -1
         self._waiting.clear()
         self._sync_error_told = False
@@ -267,10 +248,10 @@ class CanopenNode:
             return []
         self._master_due_ns = t_ns + period_ns
         self.due_ns = min(self.due_ns, self._master_due_ns)
-        return self.clear_error(HEARTBEAT_LOST) if HEARTBEAT_LOST in self._errors else []
+        return self.clear_error(HEARTBEAT_LOST) if self._emergency.present(HEARTBEAT_LOST) else []
 
     def _on_master_lost(self) -> list[bytes]:
-        frames = self.raise_error(HEARTBEAT_LOST, 0x10)
+        frames = self.raise_error(HEARTBEAT_LOST, COMMUNICATION)
         frames += self.on_heartbeat_lost()
         behaviour = self.store.number(0x1029, 1)
         if behaviour == 0 and self.state == OPERATIONAL:
@@ -281,7 +262,7 @@ class CanopenNode:
 
     def _on_rpdo(self, pdo: PdoMap, data: bytes) -> list[bytes]:
         if len(data) < pdo.length:
-            return self.raise_error(PDO_TOO_SHORT, 0x10)
+            return self.raise_error(PDO_TOO_SHORT, COMMUNICATION)
         if pdo.transmission_type <= LAST_SYNC_TYPE:
             self._waiting[pdo.cob_id] = data
             return []
@@ -311,18 +292,5 @@ class CanopenNode:
         if self._generation != self._pdos.generation:
             self._generation = self._pdos.generation
             self._receive = {pdo.cob_id: pdo for pdo in self._pdos.rpdos()}
-            self._transmit = []
-            for index in self._pdos.tpdo_indices:
-                pdo = self._pdos.active_map(index)
-                if pdo is not None:
-                    start, period = self.store.number(index, 6), self.store.number(index, 5)
-                    self._transmit.append(
-                        TransmitPdo(
-                            pdo, tuple(self._getter(m.index, m.subindex) for m in pdo.objects), start, period
-                        )
-                    )
+            self._transmit = compile_tpdos(self.store, self._pdos, self.getters)
         return self._transmit
-
-    def _getter(self, index: int, subindex: int) -> Getter:
-        found = self.getters.get((index, subindex))
-        return found if found is not None else lambda: self.store.number(index, subindex)

@@ -6,13 +6,14 @@ import sys
 from pathlib import Path
 
 from estimator.checked import ConfigError
+from sim_can.eds_entries import EdsChild
 from sim_can.plant_parameters import PROFILES
 from sim_can.source import Source
 
 EXAMPLES = """examples:
   jtq sim --bus vcan0                              two joints and a sensor on SocketCAN
   jtq sim --bus unix:/tmp/bench --bitrate 1000000  the same on a unix bus with the wire modelled
-  jtq sim --bus vcan0 --play run.csv --columns columns.yaml --joints 2,4
+  jtq sim --bus vcan0 --play models/kinova_gen3/RunTrajectory1.csv.gz --joints 2,4
   jtq sim --cost                                   CPU time of one cycle on this machine
 """
 
@@ -65,9 +66,14 @@ def parser() -> argparse.ArgumentParser:
         "--profile", choices=PROFILES, help="motion while no master commands (default: the plant file's)"
     )
     made.add_argument("--play", type=Path, metavar="RUN", help="play a measured run instead of the plant")
-    made.add_argument("--columns", type=Path, metavar="FILE", help="column map of the run")
     made.add_argument(
-        "--joints", type=_joints, metavar="A,B", help="joints of the run for drives 1, 2 (default 1,2)"
+        "--columns", type=Path, metavar="FILE", help="column map of the run (default: columns.yaml beside it)"
+    )
+    made.add_argument(
+        "--joints",
+        type=_joints,
+        metavar="A,B",
+        help="joints of the run for drives 1, 2 (default: those with a joint file in the column map, else 1,2)",
     )
     made.add_argument(
         "--bitrate", type=_positive_int, metavar="B", help="model the wire of an own hub, bit/s"
@@ -118,20 +124,34 @@ def _run(options: argparse.Namespace) -> int:
     from models.files import shipped
     from sim_can.plant_parameters import load_plant
 
-    if options.play is not None:
-        return _serve(options, _played(options), "rest")
-    parameters = load_plant(options.plant or shipped("plant.yaml"))
     if options.cost:
-        return _print_cost(options, parameters)
-    from sim_can.plant_source import PlantSource
+        return _print_cost(options, load_plant(options.plant or shipped("plant.yaml")))
+    child = EdsChild()  # reads while this process loads numpy and makes the plant
+    try:
+        if options.play is not None:
+            source: Source = _played(options)
+            profile = "rest"
+        else:
+            from sim_can.plant_source import PlantSource
 
-    return _serve(options, PlantSource(parameters, options.seed), options.profile or parameters.profile)
+            parameters = load_plant(options.plant or shipped("plant.yaml"))
+            source = PlantSource(parameters, options.seed)
+            profile = options.profile or parameters.profile
+    except BaseException:
+        child.stop()
+        raise
+    child.take()
+    return _serve(options, source, profile)
 
 
 def _played(options: argparse.Namespace) -> Source:
-    from sim_can.play import open_play
+    from sim_can.play import columns_beside, open_play
+    from sim_can.run_files import RunError
 
-    source = open_play(options.play, options.columns, options.joints or (1, 2))
+    try:
+        source = open_play(options.play, options.columns or columns_beside(options.play), options.joints)
+    except RunError as error:
+        raise ConfigError(str(error)) from None
     for note in getattr(source, "notes", ()):
         print(f"jtq sim: {note}", file=sys.stderr)
     return source
@@ -153,11 +173,11 @@ def _print_cost(options: argparse.Namespace, parameters: object) -> int:
     if options.json:
         print(json.dumps(cost.as_json()))
         return 0
-    print(
-        f"plant step of 1 ms, two joints and their drives' loops ({cost.substeps} substeps)  {cost.plant_step_us:7.1f} us"
+    rows = (
+        (f"plant step of 1 ms: two joints, drives' loops, {cost.substeps} substeps", cost.plant_step_us),
+        ("  with encoders, noise and sensor", cost.source_us),
+        ("whole SYNC: the above, state machines, five TPDOs packed", cost.sync_us),
     )
-    print(
-        f"  and encoders, noise, sensor                                             {cost.source_us:7.1f} us"
-    )
-    print(f"whole SYNC: the above, state machines, five TPDOs packed                  {cost.sync_us:7.1f} us")
+    for text, microseconds in rows:
+        print(f"{text:66}{microseconds:7.1f} us")
     return 0

@@ -2,16 +2,15 @@
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 
-import drivers.eds
 from drivers.object_dictionary import ObjectStore
 from drivers.sdo_abort import VALUE_RANGE, SdoAbort
 from sim_can.canopen_node import HEARTBEAT_LOST, CanopenNode
 from sim_can.cia402 import FAULT, FAULT_REACTION, OPERATION_ENABLED, QUICK_STOP, StateMachine
+from sim_can.eds_entries import entries_of
+from sim_can.emergency import CURRENT as CURRENT_ERROR
 from sim_can.source import CURRENT, OFF, VELOCITY, DriveRatings, DriveSignals, Source
 
-EDS_FOLDER = Path(drivers.eds.__file__).parent
 OVERCURRENT = 0x2310
 STANDSTILL_RAD_S = 0.01  # joint side: a quick stop has ended below this
 HALT = 0x0100
@@ -37,7 +36,7 @@ class DriveNode(CanopenNode):
     """
 
     def __init__(self, source: Source, number: int, on_master: Callable[[], None]) -> None:
-        super().__init__(ObjectStore(EDS_FOLDER / "drive.eds", number + 1))
+        super().__init__(ObjectStore(entries_of(number + 1), number + 1))
         self.machine = StateMachine()
         self.commanded = False
         self._source, self._number, self._on_master = source, number, on_master
@@ -190,7 +189,7 @@ class DriveNode(CanopenNode):
             machine.stopped()  # no ramp: the power stage is off at once
             self._error_code = OVERCURRENT
             self._send_command()
-            return self.raise_error(OVERCURRENT, 0x02) + self.event()
+            return self.raise_error(OVERCURRENT, CURRENT_ERROR) + self.event()
         stopping = machine.state in (QUICK_STOP, FAULT_REACTION)
         if stopping and abs(self._signals.motor_velocity_rad_s) < self._still_rad_s:
             machine.stopped()
@@ -199,7 +198,7 @@ class DriveNode(CanopenNode):
         return []
 
     def on_heartbeat_lost(self) -> list[bytes]:
-        """A commanded drive stops and keeps the fault until it is reset; one that runs by itself is released."""
+        """A commanded drive stops and keeps the fault until reset; one that runs by itself is released."""
         if self.commanded:
             self.machine.fault()
             self._error_code = HEARTBEAT_LOST

@@ -109,7 +109,8 @@ def emulate_run(
         )
         for number in (1, 2)
     }
-    return RunTable(time_s=np.arange(count) * period_s, joints=joints)
+    time: NDArray[np.float64] = np.arange(count, dtype=np.float64) * period_s
+    return RunTable(time_s=time, joints=joints)
 
 
 def _columns(

@@ -1,20 +1,21 @@
 """Two harmonic-drive joints facing each other, coupled by a stiff torque sensor: the paper's Eqs. (1)-(3).
-Pure, no clock.
 
 Per joint j in its own frame (θ motor side m, link side l; w = dθ/dt):
 
-    Jm dwm/dt = Kt i - (τ + A cos(n θm + φ)) / G - friction          (1)
+    Jm dwm/dt = Kt i - (τ + A cos(n θm + φ) + friction) / G          (1)
     τ = K (θm/G - θl) + D (wm/G - wl)                                (3)
 
 Both links and the sensor are one rigid body, and the joints face each other, so θl2 = -θl1:
 
     (Jl1 + Jl2) dwl1/dt = τ1 - τ2                                    (2)
-    sensor = τ1 - Jl1 dwl1/dt = τ2 - Jl2 dwl2/dt                     positive along the positive current of
-    either joint
+    sensor = τ1 - Jl1 dwl1/dt = τ2 - Jl2 dwl2/dt
+
+The sensor's torque is positive along the positive current of either joint.
 
 Integration is semi-implicit Euler (velocities first, then positions with the new velocities). Friction is
 implicit: within a step its impulse can stop the motor but never turn it round, h F/(G Jm) against |w|. So a
-joint sticks at exactly zero velocity, does not creep, and no step size makes friction unstable.
+joint sticks at exactly zero velocity, does not creep, and no step size makes friction unstable. Pure: no
+clock.
 """
 
 import math
@@ -159,7 +160,7 @@ class Plant:
         return one - share * (one - two)
 
     def energy(self) -> float:
-        """Kinetic and elastic energy plus the ripple's potential, J. Without motor current it can only fall."""
+        """Kinetic and elastic energy and the ripple's potential, J. Without motor current it can only fall."""
         total = 0.5 * (self._link_inertia[0] + self._link_inertia[1]) * self.link_velocity**2
         for k, sign in ((0, 1.0), (1, -1.0)):
             c = self._joints[k]

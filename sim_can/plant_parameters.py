@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from estimator.checked import ConfigError, Section
+from estimator.checked import Section
 from estimator.parameters import Joint
 
 PROFILES = ("demo", "rest")
@@ -42,8 +42,8 @@ class DriveParameters:
     current_limit_a: float = 9.0
     trip_current_a: float = 12.0
     current_bandwidth_hz: float = 500.0
-    velocity_bandwidth_rad_s: float = 500.0  # of the proportional loop with the rotor's inertia alone
-    velocity_integral_time_s: float = 0.006
+    velocity_bandwidth_rad_s: float = 400.0  # of the proportional loop with the rotor's inertia alone
+    velocity_integral_time_s: float = 0.01
     acceleration_feedforward: float = 2.0  # in rotor inertias: a towing pair moves both rotors
     friction_feedforward_a: float = 0.0  # sign(reference velocity) times this
     acceleration_limit_rad_s2: float = 60.0  # joint side, of the velocity reference
@@ -121,9 +121,7 @@ def _deviations(section: Section | None) -> Deviations:
     }
     for key in ("torque_constant_scale", "stiffness_scale", "rotor_inertia_scale"):
         if values[key] < 0.05:
-            raise ConfigError(
-                f"{section.where}: key '{section.path}.{key}': found {values[key]:g}, expected a number >= 0.05"
-            )
+            raise section.error(key, values[key], "a number >= 0.05")
     ripple = section.section("ripple", optional=True)
     if ripple is not None:
         values["ripple_nm"] = ripple.number("amplitude_nm", unit="Nm", low=0.0)
@@ -251,7 +249,7 @@ def plant_from_mapping(mapping: Mapping[str, Any], where: str, joint_of: Any) ->
     section = Section(mapping, where)
     sides = []
     for key in ("joint_1", "joint_2"):
-        part = section.section(key)
+        part = section.required(key)
         joint = joint_of(part.text("joint"))
         sides.append(
             JointPlant(

@@ -23,6 +23,8 @@ from models.files import load_joint, shipped
 from sim_can.run_files import ColumnMap, RunError, RunFile, read_run
 from sim_can.source import ChannelSignal, DriveRatings, DriveSignals
 
+COLUMN_MAP_NAME = "columns.yaml"
+
 
 class PlaySource:
     """Source (sim_can/source.py) of two recorded joints, each with a torque sensor channel of its own."""
@@ -31,7 +33,8 @@ class PlaySource:
         self, run: RunFile, joints: tuple[int, int], ratings: tuple[DriveRatings, DriveRatings]
     ) -> None:
         time_s = run.table.time_s
-        self.notes = run.notes
+        unplayed = tuple(f"j{number}." for number in run.table.joints if number not in joints)
+        self.notes = tuple(note for note in run.notes if not note.startswith(unplayed))
         self._ratings = ratings
         self._rows = _rows(run, joints, ratings)
         # Row k is the nearest one from _change[k-1] on; the last entry is the end of the run.
@@ -102,18 +105,26 @@ class PlaySource:
         ) = self._rows[row]
 
 
+def columns_beside(run_path: Path | str) -> Path | None:
+    """The run's own column map: columns.yaml in its folder, where there is one."""
+    path = Path(run_path).parent / COLUMN_MAP_NAME
+    return path if path.is_file() else None
+
+
 def open_play(
     run_path: Path | str,
     columns_path: Path | str | None = None,
-    joints: tuple[int, int] = (2, 4),
+    joints: tuple[int, int] | None = None,
     joint_files: tuple[Path, Path] | None = None,
 ) -> PlaySource:
-    """Play joints `joints` of a run as drives 0 and 1 of the bench.
+    """Play two joints of a run as drives 0 and 1 of the bench.
 
-    The drives' ratings come from `joint_files`, else from the column map's `jN.joint_file`, else from the
-    bench's nominal joints. Raises RunError (run file) or ConfigError (column map, joint file).
+    Without `joints`: the two for which the column map names a joint file, else 1 and 2. The drives' ratings
+    come from `joint_files`, else from the column map's `jN.joint_file`, else from the bench's nominal joints.
+    Raises RunError (run file) or ConfigError (column map, joint file).
     """
     columns = ColumnMap.load(Path(columns_path)) if columns_path is not None else None
+    joints = joints or _joints_of(columns)
     if len(joints) != 2 or joints[0] == joints[1]:
         raise RunError(f"{run_path}: found joints {joints}, expected two different joints of the run")
     run = read_run(run_path, columns)
@@ -124,6 +135,11 @@ def open_play(
     files = joint_files or _files_of(columns, joints)
     first, second = (_ratings(load_joint(path)) for path in files)
     return PlaySource(run, joints, (first, second))
+
+
+def _joints_of(columns: ColumnMap | None) -> tuple[int, int]:
+    named = sorted(columns.joint_files) if columns is not None else []
+    return (named[0], named[1]) if len(named) == 2 else (1, 2)
 
 
 def _files_of(columns: ColumnMap | None, joints: tuple[int, int]) -> tuple[Path, Path]:

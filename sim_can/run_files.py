@@ -236,7 +236,8 @@ def _parse(
     if len(lines) < 2:
         raise RunError(f"{path}: found {len(lines)} samples below the header, expected at least 2")
     arrays = {name: np.array(column) for name, column in cells.items()}
-    values = {target: column.scale * arrays[column.name] + column.offset for target, column in wanted.items()}
+    with np.errstate(over="ignore"):  # the table refuses what is not finite
+        values = {target: c.scale * arrays[c.name] + c.offset for target, c in wanted.items()}
     return values, lines
 
 

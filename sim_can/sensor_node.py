@@ -5,7 +5,7 @@ from collections.abc import Callable
 from drivers.object_dictionary import ObjectStore
 from drivers.sdo_abort import VALUE_RANGE, SdoAbort
 from sim_can.canopen_node import CanopenNode
-from sim_can.drive_node import EDS_FOLDER
+from sim_can.eds_entries import entries_of
 from sim_can.source import ChannelSignal, Source
 
 AUTOZERO = 0x6F72_657A  # "zero" in 6125h
@@ -64,7 +64,7 @@ class SensorNode(CanopenNode):
     """
 
     def __init__(self, source: Source) -> None:
-        super().__init__(ObjectStore(EDS_FOLDER / "torque_sensor.eds", SENSOR_NODE))
+        super().__init__(ObjectStore(entries_of(SENSOR_NODE), SENSOR_NODE))
         self.store.set_number(0x1018, 4, 0x1000 + SENSOR_NODE)
         self.store.keep_as_default(0x1018, 4)
         self._channels: list[_Channel] = []

@@ -2,10 +2,12 @@
 `struct` call. Pure.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from drivers.frame import FRAME
+from drivers.object_dictionary import ObjectStore
 from drivers.pdo import PdoMap
+from drivers.pdo_parameters import PdoParameters
 
 NEVER_NS = 1 << 62
 
@@ -43,3 +45,20 @@ class TransmitPdo:
     def frame(self) -> bytes:
         """The PDO with its present values."""
         return FRAME.pack(self.cob_id, self.length, self.pack(*[get() for get in self.getters]))
+
+
+def compile_tpdos(
+    store: ObjectStore, pdos: PdoParameters, getters: Mapping[tuple[int, int], Getter]
+) -> list[TransmitPdo]:
+    """All TPDOs that exist and map something; objects without a getter are read from the store."""
+
+    def getter(index: int, subindex: int) -> Getter:
+        return getters.get((index, subindex)) or (lambda: store.number(index, subindex))
+
+    compiled = []
+    for index in pdos.tpdo_indices:
+        pdo = pdos.active_map(index)
+        if pdo is not None:
+            found = tuple(getter(mapped.index, mapped.subindex) for mapped in pdo.objects)
+            compiled.append(TransmitPdo(pdo, found, store.number(index, 6), store.number(index, 5)))
+    return compiled

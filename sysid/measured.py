@@ -52,7 +52,7 @@ class Score:
 class Case:
     """One joint in one run. Arrays [n]; `reference_nm` is the sensor through the observer's low-pass.
 
-    At standstill the estimate is the middle of an interval as wide as the friction, not a measurement of anything.
+    At standstill the estimate is the middle of an interval as wide as the friction, no more.
     """
 
     joint: int

@@ -81,7 +81,9 @@ class ScriptedSocket:
         return False
 
 
-def inputs(velocity: int = 5000, current: int = 200, status: int = ENABLED, torque: int = 9000) -> list[bytes]:
+def inputs(
+    velocity: int = 5000, current: int = 200, status: int = ENABLED, torque: int = 9000
+) -> list[bytes]:
     return [
         frame(0x181, I32.pack(1000, 2000)),
         frame(0x281, MOTION.pack(velocity, current, status)),
@@ -95,7 +97,10 @@ def make(tmp_path: Path, script: Callable[[int], list[bytes]]) -> tuple[Cycle, S
     socket = ScriptedSocket(script)
     settings = EstimatorSettings(method="efficiency")
     joints = [
-        (JointInputs(2 * n, 2 * n + 1, 4, **SCALE), JointEstimator(load_joint(shipped(f"joint{n + 1}.yaml")), settings))
+        (
+            JointInputs(2 * n, 2 * n + 1, 4, **SCALE),
+            JointEstimator(load_joint(shipped(f"joint{n + 1}.yaml")), settings),
+        )
         for n in range(2)
     ]
     cycle = Cycle(
@@ -181,7 +186,9 @@ def test_a_missing_sensor_does_not_touch_the_estimate(tmp_path: Path) -> None:
     assert decode(estimates(socket)[35]).status == (2, 2)
 
 
-@pytest.mark.parametrize(("word", "status"), [(0x08, 5), (0x0F, 5), (0x40, 0), (0x21, 0), (0x23, 0), (0x07, 2)])
+@pytest.mark.parametrize(
+    ("word", "status"), [(0x08, 5), (0x0F, 5), (0x40, 0), (0x21, 0), (0x23, 0), (0x07, 2)]
+)
 def test_the_drive_state_decides(tmp_path: Path, word: int, status: int) -> None:
     cycle, socket, _ = make(tmp_path, lambda n: inputs(status=word))
     turn(cycle, 25)

@@ -420,6 +420,23 @@ def test_receiver_reports_wrong_lengths_and_tells_empty_messages_from_the_end(st
     b.close()
 
 
+def test_receiver_sees_the_end_behind_an_empty_message_and_then_serves_another_socket():
+    receiver = FrameReceiver()
+    for full in (1, 3):  # the second one uses slots that the end of the first has written to
+        a, b = pair()
+        b.setsockopt(socket.SOL_SOCKET, 35, 1)
+        receiver.closed = False
+        a.send(b"")
+        for _ in range(full):
+            a.send(SYNC)
+        a.close()
+        assert receiver.receive(b.fileno()) == 1 + full
+        assert list(receiver.lengths[: 1 + full]) == [0] + [16] * full
+        assert receiver.closed
+        assert all(stamp > 0 for stamp in receiver.stamps_ns[: 1 + full])
+        b.close()
+
+
 def test_receiver_walks_control_messages_of_another_layout():
     """SO_PASSCRED adds a message of its own, so the stamp no longer fills the control data alone."""
     a, b = pair()

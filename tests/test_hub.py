@@ -297,7 +297,7 @@ def test_wire_is_exact_although_the_hub_reads_late(path):
 
 
 def test_answers_of_local_nodes_are_exact_on_the_wire_although_the_hub_reads_late(path):
-    """SYNC ends after 59 us; both nodes answer at that moment and arbitrate: exact, whatever the host does."""
+    """SYNC ends after 59 us; both nodes answer then and arbitrate: exact, whatever the host does."""
     hub = Hub(path, bitrate=1_000_000)
     a = connect(path)
     seen = []

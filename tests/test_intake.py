@@ -23,7 +23,9 @@ class Bus:
         self.intake = Intake([TPDO1, TPDO2])
         self.sync_ns = 0
 
-    def cycle(self, *arrivals: tuple[bytes, int], late: tuple[bytes, ...] = (), foreign_sync: bool = False) -> bool:
+    def cycle(
+        self, *arrivals: tuple[bytes, int], late: tuple[bytes, ...] = (), foreign_sync: bool = False
+    ) -> bool:
         self.sync_ns += MS
         intake = self.intake
         intake.begin()
@@ -31,10 +33,20 @@ class Bus:
         if foreign_sync:
             frames.append((frame(0x080), self.sync_ns + 1000, False))
         frames += [(data, self.sync_ns + delay, False) for data, delay in arrivals]
-        intake.take(bytearray(b"".join(f[0] for f in frames)), [f[1] for f in frames], [f[2] for f in frames], len(frames))
+        intake.take(
+            bytearray(b"".join(f[0] for f in frames)),
+            [f[1] for f in frames],
+            [f[2] for f in frames],
+            len(frames),
+        )
         complete = intake.close()
         if late:
-            intake.drain(bytearray(b"".join(late)), [self.sync_ns + 950_000] * len(late), [False] * len(late), len(late))
+            intake.drain(
+                bytearray(b"".join(late)),
+                [self.sync_ns + 950_000] * len(late),
+                [False] * len(late),
+                len(late),
+            )
         return complete
 
     def settle(self, cycles: int = 50) -> None:

@@ -1,10 +1,11 @@
+import json
 import struct
 
 import pytest
 from canopen_nodes import EDS, drive_store, sensor_store
 
 from drivers.error_history import ErrorHistory
-from drivers.object_dictionary import ObjectStore
+from drivers.object_dictionary import ObjectStore, entries_from_json, entries_to_json, read_eds
 from drivers.sdo_abort import SdoAbort
 
 
@@ -133,3 +134,13 @@ def test_error_history_is_bounded_newest_first_and_cleared_by_zero():
     assert store.number(0x1003, 0) == 8
     store.write(0x1003, 0, b"\x00")
     assert [store.number(0x1003, n) for n in (0, 1, 8)] == [0, 0, 0]
+
+
+def test_entries_survive_json():
+    for name, node in (("drive", 1), ("torque_sensor", 3), ("jtqd", 0x20)):
+        entries = read_eds(EDS / f"{name}.eds", node)
+        again = entries_from_json(json.loads(json.dumps(entries_to_json(entries))))
+        assert again == entries
+        assert [each.layout.format if each.layout else None for each in again] == [
+            each.layout.format if each.layout else None for each in entries
+        ]

@@ -14,12 +14,12 @@ TWO = (-2.0, 0.2, -2.1, -2.2, -2.3, math.nan, 0x0F, 5, 1)
 
 def test_round_trip(tmp_path: Path) -> None:
     snapshot = Snapshot(tmp_path / "s", 1e-3, 0.848)
-    snapshot.write(41, 1_700_000_000_123_456_789, (ONE, TWO))
+    snapshot.write(41, 17, 1_700_000_000_123_456_789, (ONE, TWO))
     for n in range(len(COUNTERS)):
         snapshot.counters[n] = n + 100
     snapshot.errors[0], snapshot.errors[1] = 8.0, 2.0
     view = SnapshotReader(tmp_path / "s").read()
-    assert (view.index, view.sync_realtime_ns) == (41, 1_700_000_000_123_456_789)
+    assert (view.cycle, view.sync_counter, view.sync_realtime_ns) == (41, 17, 1_700_000_000_123_456_789)
     assert view.joints[0][:4] == ONE[:4]
     assert math.isnan(view.joints[0].network_nm)
     assert tuple(view.joints[1])[6:] == (0x0F, 5, 1)
@@ -40,7 +40,7 @@ def test_quantiles_are_upper_edges_of_their_bins(tmp_path: Path) -> None:
 
 def test_an_odd_sequence_is_not_taken_for_a_whole_reading(tmp_path: Path) -> None:
     snapshot = Snapshot(tmp_path / "s", 1e-3, 0.5)
-    snapshot.write(1, 2, (ONE, TWO))
+    snapshot.write(1, 1, 2, (ONE, TWO))
     assert snapshot._sequence[0] == 2
 
 

@@ -159,7 +159,7 @@ COUNTERS = (
     "stale_inputs",
     "late_frames",
     "duplicate_frames",
-    "length_errors",
+    "rejected_frames",
     "foreign_sync",
     "tx_dropped",
     "rx_dropped",

@@ -133,6 +133,8 @@ def _only_builder(root: Path) -> Iterator[None]:
 def _build(config: bytes, version: str, root: Path) -> Path:
     """Build in a temporary directory beside the final one and move the result in by one rename."""
     final = root / f"bench-kernel-{cache_key(config, version)}"
+    for stale in root.glob("building-*"):  # of a builder that was killed: this one holds the lock
+        shutil.rmtree(stale, ignore_errors=True)
     work = Path(tempfile.mkdtemp(prefix="building-", dir=root))
     log = work / "build.log"
     started = time.monotonic()

@@ -20,28 +20,28 @@ give_up() {
 }
 
 if [ "$1" != inside ]; then
-    mount -t proc proc /proc || give_up "mount /proc"
-    mount -t tmpfs -o size=75% tmpfs /mnt || give_up "mount tmpfs on /mnt"
+    mount -n -t proc proc /proc || give_up "mount /proc"
+    mount -n -t tmpfs -o size=75% tmpfs /mnt || give_up "mount tmpfs on /mnt"
     mkdir /mnt/upper /mnt/work /mnt/root
-    mount -t overlay -o lowerdir=/,upperdir=/mnt/upper,workdir=/mnt/work overlay /mnt/root || give_up "mount overlay"
+    mount -n -t overlay -o lowerdir=/,upperdir=/mnt/upper,workdir=/mnt/work overlay /mnt/root || give_up "mount overlay"
     cd /mnt/root || give_up "cd"
-    mount -t proc proc proc && mount -t sysfs sysfs sys && mount -t devtmpfs devtmpfs dev &&
-        mount -t tmpfs tmpfs run || give_up "mount proc, sysfs, devtmpfs, run"
+    mount -n -t proc proc proc && mount -n -t sysfs sysfs sys && mount -n -t devtmpfs devtmpfs dev &&
+        mount -n -t tmpfs tmpfs run || give_up "mount proc, sysfs, devtmpfs, run"
     mkdir -p dev/shm dev/pts run/home run/lock
-    mount -t tmpfs tmpfs dev/shm
-    mount -t devpts devpts dev/pts
+    mount -n -t tmpfs tmpfs dev/shm
+    mount -n -t devpts devpts dev/pts
     ln -s /proc/self/fd dev/fd
     ln -s fd/0 dev/stdin
     ln -s fd/1 dev/stdout
     ln -s fd/2 dev/stderr
     # Option sync: a write is on the host when the system call returns, so that output can be followed.
     mkdir -p ".$JTQD_JOB"
-    mount -t hostfs -o "sync,$JTQD_JOB" none ".$JTQD_JOB" || give_up "mount $JTQD_JOB"
+    mount -n -t hostfs -o "sync,$JTQD_JOB" none ".$JTQD_JOB" || give_up "mount $JTQD_JOB"
     while IFS= read -r out; do
         mkdir -p ".$out"
-        mount --bind "$out" ".$out" || give_up "bind $out"
+        mount -n --bind "$out" ".$out" || give_up "bind $out"
     done <"$JTQD_JOB/out"
-    mount --move . / || give_up "move the root"
+    mount -n --move . / || give_up "move the root"
     exec chroot . /bin/sh "$0" inside
 fi
 

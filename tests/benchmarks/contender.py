@@ -81,14 +81,13 @@ class Process:
         return self.result()
 
     def end(self) -> None:
-        """Close its input and wait; a process that does not end is terminated."""
+        """Close its input, tell it to end, and wait."""
         assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.terminate()
+        self._process.wait()
         self._process.stdin.close()
-        try:
-            self._process.wait(2.0)
-        except subprocess.TimeoutExpired:
-            self._process.terminate()
-            self._process.wait()
+        self._process.stdout.close()
 
 
 def python(module: str, *arguments: str) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from typing import Any
 
 from daemon import loop, realtime
@@ -62,8 +63,6 @@ class JtqdLoop:
 
 def loop_start(grid: Grid) -> None:
     """Put the first slot two periods ahead, as daemon.loop does."""
-    import time
-
     grid.slot_ns = time.monotonic_ns() + 2 * grid.period_ns
 
 
@@ -79,6 +78,7 @@ def measured(cycle: Cycle, meter: CycleMeter) -> None:
 
     def timed_record() -> None:
         record()
+        meter.late_ns.append(cycle.late_ns)
         meter.cycle_done()
 
     cycle.publish, cycle.record = timed_publish, timed_record  # type: ignore[method-assign]

@@ -20,8 +20,9 @@ from sysid.onnx_export import FloatArray, Layer, export_network
 from tests.benchmarks.traffic import SCALING, SENSOR_NM_PER_UNIT
 
 _HIDDEN = (20, 40, 10)
-_LOW = np.array([-6.0, -250.0, -140.0, -2.5, -2.0, -40.0])
-_HIGH = np.array([6.0, 250.0, 140.0, 2.5, 2.0, 40.0])
+ENVELOPE_LOW = np.array([-6.0, -250.0, -130.0, -2.5, -2.0, -40.0])
+ENVELOPE_HIGH = np.array([6.0, 250.0, 130.0, 2.5, 2.0, 40.0])
+SIGMA_NM = 0.6
 _SEED = 20
 
 Report = dict[str, Any]
@@ -42,7 +43,7 @@ class Fixture:
     def report(self) -> Report:
         """Boot report: scaling of both drives and the sensor."""
         drive = {"scaling": SCALING}
-        sensor = {"scaling": {"nm_per_unit": [SENSOR_NM_PER_UNIT]}}
+        sensor = {"scaling": {"nm_per_unit": {"1": SENSOR_NM_PER_UNIT}}}
         return {"ok": True, "nodes": {"1": drive, "2": drive, "3": sensor}}
 
 
@@ -60,9 +61,9 @@ class SmallNetwork:
         """The same as an ONNX file for the joint of this name."""
         metadata = {
             "features": list(FEATURES),
-            "envelope_low": list(_LOW),
-            "envelope_high": list(_HIGH),
-            "sigma_nm": 0.6,
+            "envelope_low": list(ENVELOPE_LOW),
+            "envelope_high": list(ENVELOPE_HIGH),
+            "sigma_nm": SIGMA_NM,
             "joint": joint,
             "data_sha256": "0" * 64,
         }
@@ -86,7 +87,7 @@ def small_network(number: int) -> SmallNetwork:
     target = features[:, -1] + 0.02 * np.sin(3.0 * features[:, 1])
     solution = np.linalg.lstsq(np.column_stack([h, np.ones(len(h))]), target, rcond=None)[0]
     layers.append((solution[:-1, None], solution[-1:]))
-    return SmallNetwork(tuple(layers), (_LOW + _HIGH) / 2.0, (_HIGH - _LOW) / 2.0, 0.0, 40.0)
+    return SmallNetwork(tuple(layers), (ENVELOPE_LOW + ENVELOPE_HIGH) / 2.0, (ENVELOPE_HIGH - ENVELOPE_LOW) / 2.0, 0.0, 40.0)
 
 
 def make_fixture(directory: Path) -> Fixture:

@@ -31,6 +31,7 @@ class CycleMeter:
 
     cpu_ns: list[int] = field(default_factory=list)
     answer_ns: list[int] = field(default_factory=list)
+    late_ns: list[int] = field(default_factory=list)
     published: int = 0
 
     def __post_init__(self) -> None:
@@ -49,6 +50,7 @@ class CycleMeter:
         return {
             "cpu_ns": self.cpu_ns,
             "answer_ns": self.answer_ns,
+            "late_ns": self.late_ns,
             "published": self.published,
             "missed": missed,
             "switches": resource.getrusage(resource.RUSAGE_SELF).ru_nvcsw - self._switches,

@@ -6,8 +6,6 @@ next cycle of a table of finished frames. It does no arithmetic while it runs, s
 
 from __future__ import annotations
 
-import ctypes
-import os
 import signal
 import struct
 import sys
@@ -16,6 +14,7 @@ from types import FrameType
 
 from drivers.frame import pack
 from drivers.hub import Hub
+from tests.benchmarks.measure import punctual
 
 CYCLES = 4000
 """Cycles of the table; its end joins its beginning without a jump."""
@@ -29,7 +28,7 @@ SENSOR_NM_PER_UNIT = 1e-3
 GEAR_RATIO = 100.0
 _OPERATION_ENABLED = 0x0027
 _POSITION, _MOTION, _SENSOR = struct.Struct("<ii"), struct.Struct("<ihH"), struct.Struct("<iB")
-_PR_SET_TIMERSLACK = 29
+_PRIORITY = 50
 
 
 def cycle_frames(cycle: int) -> list[bytes]:
@@ -58,9 +57,7 @@ def cycle_frames(cycle: int) -> list[bytes]:
 
 def serve(path: str, cpu: int | None) -> None:
     """Answer every SYNC on the hub at `path` until SIGTERM; prints one line when it is ready."""
-    if cpu is not None:
-        os.sched_setaffinity(0, {cpu})
-    ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0)
+    punctual(cpu, _PRIORITY)  # drives answer in time whatever else runs on a controller
     table = [cycle_frames(cycle) for cycle in range(CYCLES)]
     hub = Hub(path)
     step = 0

@@ -1,0 +1,71 @@
+# make demo    set up and run the daemon for 20 s on the emulated bench
+# make test    set up, check the style, lint, type-check and run every test but the long ones; CI runs this
+# Variables: PYTHON (interpreter for the virtual environment), TORCH_INDEX (where a torch without CUDA comes from)
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+# The wheel on PyPI brings gigabytes of CUDA, so the CPU index is asked first.
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+TORCH := $(shell grep -o 'torch==[0-9.]*' pyproject.toml)
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help setup demo test test-all bench bench-kernel lint format clean
+
+help: ## this list
+	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
+
+setup: $(VENV)/.installed-dev ## .venv with the development tools
+
+demo: $(VENV)/.installed ## 20 s of jtqd on the emulated bench
+	$(BIN)/jtqd --bus sim --duration 20
+
+test: lint ## everything but the tests marked campaign
+	$(BIN)/python -m sim_can.bench_kernel build --unless-vcan
+	$(BIN)/python -m pytest -m "not campaign"
+
+test-all: lint ## everything
+	$(BIN)/python -m sim_can.bench_kernel build --unless-vcan
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/.installed-test ## ruff and mypy
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+format: $(VENV)/.installed-dev ## rewrite the sources in the project's style
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+bench: $(VENV)/.installed-dev ## measure the loop: ratios from one run
+	$(BIN)/python -m tests.benchmarks
+
+bench-kernel: $(VENV)/.installed ## build the kernel with SocketCAN into the cache, once
+	$(BIN)/python -m sim_can.bench_kernel build
+
+clean: ## remove what make made here; the cached bench kernel stays
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Three stages of one environment; each stamp is renewed when pyproject.toml changes.
+$(VENV)/.created:
+	@.ci/venv $(VENV)
+	@touch $@
+
+$(VENV)/.installed: pyproject.toml $(VENV)/.created
+	@echo "installing jtqd into $(VENV)"
+	@$(PIP) install -e .
+	@touch $@
+
+$(VENV)/.installed-dev: pyproject.toml $(VENV)/.installed
+	@echo "installing the development tools"
+	@$(PIP) install -e '.[dev]'
+	@touch $@
+
+$(VENV)/.installed-test: pyproject.toml $(VENV)/.installed-dev
+	@echo "installing $(TORCH) for training"
+	@$(PIP) install --retries 1 --index-url $(TORCH_INDEX) --no-deps $(TORCH) 2>/dev/null || \
+		echo "no $(TORCH) for the CPU alone at $(TORCH_INDEX): taking PyPI's"
+	@$(PIP) install -e '.[dev,train]'
+	@touch $@

@@ -1,0 +1,70 @@
+"""Object dictionary entries of the bench's nodes from their EDS files, read in a process of their own.
+
+canopen's EDS parser takes 20 MB that the bench would then carry for good; a child reads the files and hands
+the entries over as JSON, while this process loads everything else.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import drivers.eds
+from drivers.object_dictionary import Entry, entries_from_json, entries_to_json, read_eds
+
+FOLDER = Path(drivers.eds.__file__).parent
+FILES = {1: "drive.eds", 2: "drive.eds", 3: "torque_sensor.eds"}
+_ROOT = Path(__file__).resolve().parent.parent
+_CHILD_S = 20.0
+_cache: dict[int, list[Entry]] = {}
+
+
+def entries_of(node: int) -> list[Entry]:
+    """Entries of node 1, 2 or 3: those a child has read, else read here and kept."""
+    if node not in _cache:
+        _cache[node] = read_eds(FOLDER / FILES[node], node)
+    return _cache[node]
+
+
+class EdsChild:
+    """The child that reads; begin it early, `take` its result before the nodes are made."""
+
+    def __init__(self) -> None:
+        paths = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "sim_can.eds_entries"],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=environment,
+        )
+
+    def take(self) -> None:
+        """Put the child's entries where `entries_of` finds them; where it failed they are read in this
+        process.
+        """
+        try:
+            output, _ = self._process.communicate(timeout=_CHILD_S)
+        except subprocess.TimeoutExpired:
+            self.stop()
+            return
+        if self._process.returncode == 0:
+            for node, rows in json.loads(output).items():
+                _cache[int(node)] = entries_from_json(rows)
+
+    def stop(self) -> None:
+        """End the child without its result."""
+        self._process.kill()
+        self._process.communicate()
+
+
+def main() -> int:
+    """Print the entries of all nodes as one JSON object."""
+    print(json.dumps({node: entries_to_json(entries_of(node)) for node in FILES}))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,96 @@
+"""`cycle`: CPU per cycle of jtqd's loop, of the usual way and of plain C, alternating in rounds of one run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from tests.benchmarks import c_program, host
+from tests.benchmarks.contender import Process, Task, python
+from tests.benchmarks.fixture import Fixture
+from tests.benchmarks.measure import SETTLE_CYCLES, Samples
+from tests.benchmarks.table import mark, table
+
+JTQD, USUAL, C = "jtqd", "usual way", "C"
+MEDIAN_LIMIT_US, P99_LIMIT_US = 60.0, 150.0
+USUAL_RATIO, C_RATIO = 5.0, 4.0
+
+
+def run(fixture: Fixture, *, rounds: int, seconds: float, quiet: bool) -> dict[str, Any]:
+    """Measure; `quiet` holds the contenders' core (see host.py)."""
+    program = c_program.build(fixture)
+    where = host.cpus()
+    traffic = host.traffic(fixture.directory, where)
+    bus = fixture.directory / "bus"
+    task = Task(f"unix:{bus}", fixture.directory, where.loop)
+    contenders = {
+        JTQD: Process(python("contender_jtqd", task.to_json()), JTQD),
+        USUAL: Process(python("contender_canopen", task.to_json()), USUAL),
+        C: Process(_c_command(program, bus, task), C),
+    }
+    spinner = host.quiet_core(program, where) if quiet else None
+    samples = {name: Samples() for name in contenders}
+    load = host.OtherLoad()
+    try:
+        for _ in range(rounds):
+            for name, process in contenders.items():
+                samples[name].add(process.run(SETTLE_CYCLES + round(seconds * 1000)))
+        busy = load.cpus_busy()
+    finally:
+        for process in (*contenders.values(), traffic, *([spinner] if spinner else [])):
+            process.end()
+    figures = {name: each.figures() for name, each in samples.items()}
+    return {
+        "quiet_core": spinner is not None,
+        "rounds": rounds,
+        "seconds": seconds,
+        "cpus_busy": busy,
+        "contenders": figures,
+        "ratios": {
+            "usual_over_jtqd": figures[USUAL]["cpu_median_us"] / figures[JTQD]["cpu_median_us"],
+            "jtqd_over_c": figures[JTQD]["cpu_median_us"] / figures[C]["cpu_median_us"],
+        },
+    }
+
+
+def _c_command(program: Path, bus: Path, task: Task) -> list[str]:
+    cpu = -1 if task.cpu is None else task.cpu
+    return [str(program), "run", str(bus), str(cpu), str(task.priority), str(task.directory / "c.ring")]
+
+
+def text(result: dict[str, Any]) -> str:
+    """Table, targets and ratios."""
+    core = "quiet core" if result["quiet_core"] else "core shared with the system"
+    lines = [
+        f"CPU per cycle, {core}: {result['rounds']} rounds of {result['seconds']:g} s each, "
+        f"{result['cpus_busy']:.1f} CPUs busy",
+        "",
+    ]
+    rows = []
+    for name, f in result["contenders"].items():
+        rows.append(
+            [
+                name,
+                f"{f['cpu_median_us']:.1f}",
+                f"{f['cpu_p99_us']:.1f}",
+                f"{f['cpu_mean_us']:.1f}",
+                f"{f['round_median_low_us']:.1f}..{f['round_median_high_us']:.1f}",
+                f"{f['answer_median_us']:.0f}",
+                f"{f['answer_p99_us']:.0f}",
+                f"{f['switches_per_cycle']:.1f}",
+                f"{f['cycles']:.0f}",
+                f"{f['missed']:.0f}",
+                f"{100.0 * f['published'] / max(f['cycles'], 1):.1f} %",
+            ]
+        )
+    head = ["", "CPU median us", "p99", "mean", "rounds", "answer us", "p99", "sleeps", "cycles", "missed", "with torque"]
+    lines.append(table(head, rows))
+    own, ratios = result["contenders"][JTQD], result["ratios"]
+    lines += [
+        "",
+        f"jtqd median        {own['cpu_median_us']:6.1f} us  {mark(own['cpu_median_us'], MEDIAN_LIMIT_US)}",
+        f"jtqd p99           {own['cpu_p99_us']:6.1f} us  {mark(own['cpu_p99_us'], P99_LIMIT_US)}",
+        f"usual way / jtqd   {ratios['usual_over_jtqd']:6.2f}     {mark(ratios['usual_over_jtqd'], USUAL_RATIO, at_least=True)}",
+        f"jtqd / C           {ratios['jtqd_over_c']:6.2f}     {mark(ratios['jtqd_over_c'], C_RATIO)}",
+    ]
+    return "\n".join(lines)

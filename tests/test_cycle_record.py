@@ -1,0 +1,68 @@
+"""Layout of the cycle record, byte by byte: three programs share it through memory."""
+
+import math
+import struct
+
+from daemon import cycle_record as cr
+
+HEADER = (7, 1_000, 1_700_000_000_123_456_789, 0xF, 50_000, -3, 2, 240, 2, 255, 1, 2, 3, 4, 0)
+JOINT_1 = (*(0.5 + n for n in range(11)), 0x1237, 2, 0x80, 7)
+JOINT_2 = (*(-0.25 * n for n in range(10)), math.nan, 0x0250, 15, 0, 1)
+SYNC = bytes.fromhex("80000000 01 000000 f000000000000000")
+TPDO = bytes.fromhex("81010000 08 000000 0102030405060708")
+
+
+def sample():
+    record = bytearray(cr.RECORD_SIZE)
+    cr.HEAD.pack_into(record, 0, *HEADER, *JOINT_1, *JOINT_2)
+    record[cr.FRAMES_OFFSET : cr.FRAMES_OFFSET + 32] = SYNC + TPDO
+    struct.pack_into("<2q", record, cr.STAMPS_OFFSET, 11, 22)
+    cr.TAIL.pack_into(record, cr.TAIL_OFFSET, HEADER[0])
+    return bytes(record)
+
+
+def test_offsets():
+    """48 bytes of header, two joints of 96, 12 frames of 16, 12 stamps of 8, the index."""
+    assert cr.HEADER.size == 48
+    assert cr.JOINT.size == 96
+    assert cr.HEAD.size == 240 == cr.FRAMES_OFFSET
+    assert cr.STAMPS_OFFSET == 432
+    assert cr.TAIL_OFFSET == 528
+    assert cr.RECORD_SIZE == 536
+
+
+def test_bytes_of_the_header():
+    expected = (
+        (7).to_bytes(8, "little")
+        + (1_000).to_bytes(8, "little")
+        + (1_700_000_000_123_456_789).to_bytes(8, "little")
+        + bytes.fromhex("0f000000 50c30000 fdffffff 02000000")
+        + bytes.fromhex("f0 02 ff 01 02 03 04 00")
+    )
+    assert sample()[:48] == expected
+
+
+def test_joint_blocks_lie_at_48_and_144():
+    record = sample()
+    assert record[48:136] == struct.pack("<11d", *JOINT_1[:11])
+    assert record[136:144] == bytes.fromhex("3712 0200 8000 0700")
+    assert record[144:232] == struct.pack("<11d", *JOINT_2[:11])
+    assert record[232:240] == bytes.fromhex("5002 0f00 0000 0100")
+
+
+def test_fields_by_name():
+    record = sample()
+    header = cr.header_of(record)
+    assert (header.cycle, header.sync_monotonic_ns, header.sync_realtime_ns) == HEADER[:3]
+    assert (header.work_ns, header.late_ns, header.missed, header.sync_counter) == (50_000, -3, 2, 240)
+    assert (header.frame_count, header.frames_left_out, header.stale_inputs) == (2, 255, 1)
+    assert (header.late_frames, header.duplicate_frames, header.rejected_frames) == (2, 3, 4)
+    one, two = cr.joint_of(record, 1), cr.joint_of(record, 2)
+    assert (one.current_a, one.sensor_torque_nm, one.torque_nm, one.network_nm) == (0.5, 4.5, 5.5, 9.5)
+    assert (one.statusword, one.status, one.sensor_status, one.input_flags) == (0x1237, 2, 0x80, 7)
+    assert (two.motor_position_rad, two.status) == (-0.25, 15)
+    assert math.isnan(two.dt_s)
+
+
+def test_frames_in_order_with_stamps():
+    assert cr.frames_of(sample()) == [(SYNC, 11), (TPDO, 22)]

@@ -1,0 +1,260 @@
+"""The daemon from the outside: run as users run it, on the emulated bench over the unix frame socket."""
+
+import json
+import os
+import signal
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import canopen
+import pytest
+import yaml
+from mcap.reader import make_reader
+
+from daemon.estimate_pdo import decode
+from drivers.frame import pack
+from drivers.frame_socket import exact, open_frame_socket
+from drivers.python_can_unix import UnixBus
+from models.files import shipped
+
+JTQD = [sys.executable, "-m", "daemon.jtqd"]
+EDS = Path(__file__).parent.parent / "drivers" / "eds" / "jtqd.eds"
+
+
+@pytest.fixture
+def environment(tmp_path: Path) -> dict[str, str]:
+    """A runtime directory of its own, so that runs of other people do not meet ours."""
+    directory = tmp_path / "run"
+    directory.mkdir()
+    return {**os.environ, "RUNTIME_DIRECTORY": str(directory), "LOGS_DIRECTORY": ""}
+
+
+def run(*arguments: str, environment: dict[str, str], timeout: float = 60) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*JTQD, *arguments], env=environment, capture_output=True, text=True, timeout=timeout, check=False
+    )
+
+
+def no_traceback(result: subprocess.CompletedProcess[str]) -> str:
+    assert "Traceback" not in result.stderr, result.stderr
+    return result.stderr.strip()
+
+
+def test_a_run_on_the_emulated_bench(tmp_path: Path, environment: dict[str, str]) -> None:
+    result = run(
+        "--bus", "sim", "--duration", "3", "--record", str(tmp_path / "logs"), "--json", environment=environment
+    )
+    assert result.returncode == 0, result.stderr
+    no_traceback(result)
+    summary = json.loads(result.stdout)
+    assert summary["cycles"] + summary["missed"] == pytest.approx(3000, abs=2)
+    recording = summary["recording"]
+    assert recording["lost"] == 0
+    assert recording["cycles"] == summary["cycles"]
+    with open(recording["path"], "rb") as file:
+        reader = make_reader(file)
+        content = reader.get_summary()
+        assert content is not None
+        assert content.statistics is not None
+        counts = {
+            channel.topic: content.statistics.channel_message_counts[channel.id]
+            for channel in content.channels.values()
+        }
+        attachments = {attachment.name for attachment in reader.iter_attachments()}
+    assert counts["/joint/1/state"] == counts["/joint/2/state"] == counts["/can/frames"] == summary["cycles"]
+    assert {"configuration.yaml", "joint1.yaml", "joint2.yaml", "bus.dbc", "provenance.json", "drive.eds"} <= attachments
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[str]:
+    """The emulated bench as a process; the address of its bus."""
+    bus = f"unix:{tmp_path / 'bus'}"
+    process = subprocess.Popen([sys.executable, "-m", "sim_can", "--bus", bus])
+    while not (tmp_path / "bus").exists():
+        assert process.poll() is None
+        time.sleep(0.02)
+    yield bus
+    process.terminate()
+    process.wait(5)
+
+
+@pytest.fixture
+def daemon(bench: str, environment: dict[str, str]) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """jtqd on that bench, publishing."""
+    process = subprocess.Popen(
+        [*JTQD, "--bus", bench, "--record", "none", "--json"],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    socket = open_frame_socket(bench, [exact(0x1A0)])
+    deadline = time.monotonic() + 20
+    while not socket.wait(0.1):
+        assert process.poll() is None, process.stderr
+        assert time.monotonic() < deadline
+    socket.close()
+    yield bench, process
+    if process.poll() is None:
+        process.kill()
+        process.wait()
+
+
+def test_any_master_reads_its_object_dictionary(daemon: tuple[str, subprocess.Popen[str]]) -> None:
+    bus, _ = daemon
+    network = canopen.Network()
+    network.bus = UnixBus(channel=bus.removeprefix("unix:"))
+    network.connect()
+    try:
+        node = network.add_node(0x20, str(EDS))
+        assert "jtqd" in node.sdo[0x1008].raw
+        first = node.sdo[0x2200][1].raw
+        time.sleep(0.5)
+        assert node.sdo[0x2200][1].raw > first
+        assert node.sdo[0x2202][1].raw == pytest.approx(100.0)  # gear ratio of joint 1
+        assert len(node.sdo[0x2204].raw) == 64
+        with pytest.raises(canopen.SdoAbortedError):
+            node.sdo[0x2200][1].raw = 0
+    finally:
+        network.disconnect()
+
+
+def test_sigterm_ends_in_order(daemon: tuple[str, subprocess.Popen[str]]) -> None:
+    bus, process = daemon
+    socket = open_frame_socket(bus, [exact(0x1A0), exact(0x000)])
+    process.send_signal(signal.SIGTERM)
+    out, err = process.communicate(timeout=15)
+    assert process.returncode == 0, err
+    assert json.loads(out)["cycles"] > 0
+    estimates, nmt = [], []
+    while count := socket.receive():
+        for n in range(count):
+            can_id, _, data = struct.unpack_from("<IB3x8s", socket.frames, 16 * n)
+            (estimates if can_id == 0x1A0 else nmt).append(data)
+    assert decode(estimates[-1]).status == (0, 0), "the last estimate says off"
+    assert [bytes(data[:2]) for data in nmt] == [b"\x80\x01", b"\x80\x02", b"\x80\x03"]
+    socket.close()
+
+
+def test_garbage_on_the_bus_is_counted_and_changes_nothing(daemon: tuple[str, subprocess.Popen[str]]) -> None:
+    bus, process = daemon
+    socket = open_frame_socket(bus, [exact(0x1A0)])
+    for n in range(200):
+        socket.send(pack(0x181, bytes(n % 8)))  # too short
+        socket.send(pack(0x181 | 0x8000_0000, bytes(8)))  # 29-bit
+        socket.send(pack(0x7FF, bytes(8)))
+        time.sleep(0.001)
+    socket.close()
+    time.sleep(0.5)
+    process.send_signal(signal.SIGTERM)
+    out, err = process.communicate(timeout=15)
+    assert "Traceback" not in err
+    summary = json.loads(out)
+    assert summary["counters"]["rejected_frames"] == 400
+    assert summary["error"] is None
+
+
+def test_the_bus_that_ends_is_said(bench: str, environment: dict[str, str], tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [*JTQD, "--bus", bench, "--record", "none"], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    socket = open_frame_socket(bench, [exact(0x1A0)])
+    assert socket.wait(20)
+    for pid in Path("/proc").iterdir():
+        if pid.name.isdigit() and bench in (pid / "cmdline").read_bytes().decode(errors="replace"):
+            command = (pid / "cmdline").read_bytes()
+            if b"sim_can" in command:
+                os.kill(int(pid.name), signal.SIGKILL)
+    out, err = process.communicate(timeout=20)
+    assert process.returncode == 1
+    assert "Traceback" not in err
+    assert "the bus" in out + err
+
+
+def test_unknown_bus(environment: dict[str, str]) -> None:
+    for bus in ("can77", "unix:/nonexistent/bus", "unix:"):
+        result = run("--bus", bus, "--duration", "1", "--record", "none", environment=environment)
+        assert result.returncode == 1
+        message = no_traceback(result)
+        assert len(message.splitlines()) == 1, message
+        assert bus.removeprefix("unix:") in message
+
+
+@pytest.mark.parametrize("arguments", [[], ["--bus"], ["--bus", "sim", "--duration", "-1"], ["--bus", "sim", "--frob"]])
+def test_usage(arguments: list[str], environment: dict[str, str]) -> None:
+    result = run(*arguments, environment=environment)
+    assert result.returncode == 2
+    no_traceback(result)
+
+
+def configuration(directory: Path, **changes: object) -> str:
+    content = yaml.safe_load(shipped("bench.yaml").read_text())
+    for joint in ("joint_1", "joint_2"):
+        content[joint]["file"] = str(shipped(content[joint]["file"]))
+        if "network" in content[joint]:
+            content[joint]["network"]["file"] = str(shipped(content[joint]["network"]["file"]))
+    for key, value in changes.items():
+        section, _, name = key.partition("__")
+        if name:
+            content[section][name] = value
+        else:
+            content[section] = value
+    path = directory / "c.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"joint_2__node": 9}, ["node 9", "1000h"]),
+        ({"joint_1__identity": {"product": 0x1234}}, ["node 1", "1018h:2", "1234"]),
+        ({"sensor__node": 2, "joint_2__node": 3}, ["node", "1000h"]),
+        ({"estimator__method": "nonsense"}, ["estimator.method", "nonsense"]),
+        ({"bitrate": 500_000}, ["bus load", "95"]),
+    ],
+)
+def test_what_does_not_fit_is_named_and_nothing_is_published(
+    tmp_path: Path, environment: dict[str, str], bench: str, changes: dict[str, object], words: list[str]
+) -> None:
+    socket = open_frame_socket(bench, [exact(0x1A0)])
+    path = configuration(tmp_path, **changes)
+    result = run("--bus", bench, "--config", path, "--duration", "1", "--record", "none", environment=environment)
+    assert result.returncode == 1
+    lines = no_traceback(result).splitlines()
+    assert len(lines) == 1, lines
+    for word in words:
+        assert word in lines[0]
+    assert socket.receive() == 0
+    socket.close()
+
+
+def test_a_wrong_gear_ratio_is_refused(tmp_path: Path, environment: dict[str, str], bench: str) -> None:
+    joint = yaml.safe_load(shipped("joint1.yaml").read_text())
+    joint["gear_ratio"] = 120
+    (tmp_path / "other.yaml").write_text(yaml.safe_dump(joint))
+    path = configuration(tmp_path)
+    content = yaml.safe_load(Path(path).read_text())
+    content["joint_1"]["file"] = "other.yaml"
+    content["estimator"]["method"] = "efficiency"
+    Path(path).write_text(yaml.safe_dump(content))
+    result = run("--bus", bench, "--config", path, "--duration", "1", "--record", "none", environment=environment)
+    assert result.returncode == 1
+    assert "6091h gear ratio: expected 120" in no_traceback(result)
+
+
+def test_no_process_that_stays_loads_torch_or_scipy(daemon: tuple[str, subprocess.Popen[str]]) -> None:
+    """Training libraries are for training."""
+    _, process = daemon
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    for pid in [str(process.pid), *children]:
+        try:
+            maps = Path(f"/proc/{pid}/maps").read_text()
+        except FileNotFoundError:
+            continue
+        assert "libtorch" not in maps
+        assert "scipy/" not in maps
