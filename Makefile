@@ -1,13 +1,10 @@
 # make demo    set up and run the daemon for 20 s on the emulated bench
 # make test    set up, check the style, lint, type-check and run every test but the long ones; CI runs this
-# Variables: PYTHON (interpreter for the virtual environment), TORCH_INDEX (where a torch without CUDA comes from)
+# Variables: PYTHON (interpreter for the virtual environment)
 
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
-# The wheel on PyPI brings gigabytes of CUDA, so the CPU index is asked first.
-TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
-TORCH := $(shell grep -o 'torch==[0-9.]*' pyproject.toml)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
@@ -64,8 +61,6 @@ $(VENV)/.installed-dev: pyproject.toml $(VENV)/.installed
 	@touch $@
 
 $(VENV)/.installed-test: pyproject.toml $(VENV)/.installed-dev
-	@echo "installing $(TORCH) for training"
-	@$(PIP) install --retries 1 --index-url $(TORCH_INDEX) --no-deps $(TORCH) 2>/dev/null || \
-		echo "no $(TORCH) for the CPU alone at $(TORCH_INDEX): taking PyPI's"
+	@echo "installing torch for training"
 	@$(PIP) install -e '.[dev,train]'
 	@touch $@

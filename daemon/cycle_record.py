@@ -1,10 +1,10 @@
 """The record of one cycle as it lies in shared memory: one fixed-size struct, written by the loop, read by the recorder.
 
-Little endian, 536 bytes, no padding decided by a compiler:
+Little endian, 632 bytes, no padding decided by a compiler:
 
     header   index, times, flags and counters of the cycle
     joints   two blocks of the same layout: inputs in SI units and every stage of the estimate
-    frames   up to 12 frames as `struct can_frame` with their kernel stamps, in order of arrival
+    frames   up to 16 frames as `struct can_frame` with their kernel stamps, in order of arrival
     tail     the index again: a reader that finds head and tail different has met a half-written record
 
 Quantities are NaN where they are not known in that cycle (an input that did not come, a stage that was not computed).
@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 JOINT_FORMAT = "11d4H"
 HEADER_FORMAT = "QqqIIiI8B"
-FRAME_CAPACITY = 12
+FRAME_CAPACITY = 16
 
 HEADER = struct.Struct("<" + HEADER_FORMAT)
 JOINT = struct.Struct("<" + JOINT_FORMAT)

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from daemon.cycle_record import FRAME_CAPACITY
+
 STATUS_NAMES = {
     0: "OFF",
     1: "STARTING",
@@ -76,7 +78,7 @@ uint8 sync_counter              # 1..240, the sequence of the estimate PDO
 uint8 cycle_flags               # see the constants
 """
 
-_CAN_FRAMES = """\
+_CAN_FRAMES = f"""\
 # The frames of one cycle in order of arrival, and the cycle's timing.
 # Only the first `frame_count` entries of `frames` and `stamps_ns` are meant; the others are zero.
 
@@ -95,8 +97,8 @@ uint8 late_frames
 uint8 duplicate_frames
 uint8 rejected_frames           # our identifiers with a wrong length, or 29-bit or remote frames
 uint8 reserved
-jtqd_msgs/CanFrame[12] frames
-int64[12] stamps_ns             # [ns] receive time of each frame by the kernel, CLOCK_REALTIME
+jtqd_msgs/CanFrame[{FRAME_CAPACITY}] frames
+int64[{FRAME_CAPACITY}] stamps_ns             # [ns] receive time of each frame by the kernel, CLOCK_REALTIME
 """
 
 _CAN_FRAME = """\

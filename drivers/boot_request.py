@@ -1,6 +1,7 @@
 """The boot request as JSON, checked into frozen profiles, and the report as JSON.
 
-{"bus": "can0", "master_node": 32, "heartbeat_ms": 100, "master_timeout_ms": 500, "answer_timeout_s": 0.5, "own_eds": "jtqd.eds",
+{"bus": "can0", "master_node": 32, "heartbeat_ms": 100, "master_timeout_ms": 500, "answer_timeout_s": 0.5,
+ "own_eds": "jtqd.eds",
  "sync": {"cob_id": 128, "counter_overflow": 240, "check_foreign": true},
  "nodes": [{"node": 1, "kind": "drive", "identity": {"vendor": 1953, "product": 1026}},
            {"node": 2, "kind": "drive", "given": {"6091h:1": 100}},
@@ -18,7 +19,16 @@ from typing import Any
 from drivers.boot_procedure import BootedNode, BusSettings, Profile
 from drivers.devices import JTQD_NODE, SYNC_COB_ID, DriveProfile, Identity, SensorProfile, parse_key
 
-_TOP = {"bus", "nodes", "master_node", "own_eds", "sync", "heartbeat_ms", "master_timeout_ms", "answer_timeout_s"}
+_TOP = {
+    "bus",
+    "nodes",
+    "master_node",
+    "own_eds",
+    "sync",
+    "heartbeat_ms",
+    "master_timeout_ms",
+    "answer_timeout_s",
+}
 _NODE = {"node", "kind", "identity", "channels", "given", "unit_words"}
 _SYNC = {"cob_id", "counter_overflow", "check_foreign"}
 
@@ -74,7 +84,9 @@ def parse_request(raw: object) -> BootRequest:
     own_eds = top.get("own_eds")
     if own_eds is not None and not isinstance(own_eds, str):
         raise RequestError(f"own_eds: found {own_eds!r}, expected a path")
-    return BootRequest(bus, profiles, settings, bool(sync.get("check_foreign", True)), float(timeout), own_eds)
+    return BootRequest(
+        bus, profiles, settings, bool(sync.get("check_foreign", True)), float(timeout), own_eds
+    )
 
 
 def _profile(raw: object, where: str) -> Profile:

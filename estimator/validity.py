@@ -44,10 +44,9 @@ class Uncertainty:
 
     def moving(self, raw_nm: float, current_a: float, velocity_rad_s: float) -> float:
         """Return sigma of a moving joint; current_a is the acceleration-corrected current tau_raw/(G Kt)."""
+        load = self._load * raw_nm
         if self._with_efficiency:
             load = self._losses.rmse_torque(current_a, velocity_rad_s)
-        else:
-            load = self._load * raw_nm
         friction = self._u_friction * self._friction.torque(velocity_rad_s)
         return sqrt(load * load + friction * friction + self._floor * self._floor)
 
@@ -55,10 +54,9 @@ class Uncertainty:
         self, raw_nm: FloatArray, current_a: FloatArray, velocity_rad_s: FloatArray
     ) -> FloatArray:
         """Vectorised twin of `moving`."""
+        load = self._load * raw_nm
         if self._with_efficiency:
             load = self._losses.rmse_torque_many(current_a, velocity_rad_s)
-        else:
-            load = self._load * raw_nm
         friction = self._u_friction * self._friction.torque_many(velocity_rad_s)
         result: FloatArray = np.sqrt(load * load + friction * friction + self._floor * self._floor)
         return result

@@ -1,6 +1,7 @@
 """Judge the estimator on measured runs by the arm's own torque sensor, before and after fitting friction.
 
     python -m sysid.measured --out DIR [--json] [--joint-files DIR]
+    python -m sysid.measured --bus vcan0|unix:PATH --out DIR [--json]      jtqd itself: see sysid.measured_bus
 
 For each joint and each run the estimate is made three times: with the joint file that ships (before), with
 its friction fitted on the OTHER run (after), and with no friction at all, for scale. Nothing but friction
@@ -200,7 +201,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m sysid.measured",
         description="Score the torque observer on the Kinova Gen3 runs, before and after fitting friction.",
-        epilog="example: python -m sysid.measured --out /tmp/measured",
+        epilog="examples: jtq measured --out /tmp/measured   jtq measured --bus unix:/tmp/bus --out /tmp/measured",
+    )
+    parser.add_argument(
+        "--bus", help="play the runs on this bus (vcan0, unix:PATH) and score what jtqd publishes there"
     )
     parser.add_argument(
         "--out", type=Path, required=True, help="folder for measured_joint2.png and measured_joint4.png"
@@ -210,6 +214,12 @@ def main(arguments: list[str] | None = None) -> int:
         "--joint-files", type=Path, help="folder for the fitted joint files (default: the --out folder)"
     )
     options = parser.parse_args(arguments)
+    if options.bus is not None:
+        if options.joint_files is not None:
+            parser.error("--joint-files: nothing is fitted with --bus")
+        from sysid import measured_bus
+
+        return measured_bus.run(options.bus, options.out, options.json)
     try:
         options.out.mkdir(parents=True, exist_ok=True)
         cases, fits = evaluate(options.joint_files or options.out, dt.date.today().isoformat())

@@ -95,24 +95,24 @@ def record(bus: str, run: Path, config: Path, length_s: float, out: Path) -> tup
     command = [sys.executable, "-m", "daemon.jtqd", "--bus", bus, "--config", str(config)]
     command += ["--record", str(out), "--duration", f"{length_s + AFTER_END_S:.3f}", "--json"]
     with playing(bus, run, out / "play.log") as play:
-        done = subprocess.run(
-            command,
-            capture_output=True,
-            text=True,
-            stdin=subprocess.DEVNULL,
-            timeout=length_s + _END_S,
-            check=False,
-        )
-        (out / "jtqd.log").write_text(done.stderr)
-        if done.returncode not in (0, 3):
-            said = (done.stderr or done.stdout).strip().splitlines() or ["it said nothing"]
-            raise PlayError(f"jtqd ended with exit status {done.returncode}: {said[-1]}")
         try:
-            status = play.wait(_START_S)
-        except subprocess.TimeoutExpired:
-            raise PlayError("the play did not end with its run") from None
-        if status:
-            raise PlayError(f"the play ended with exit status {status}, see {out / 'play.log'}")
+            done = subprocess.run(
+                command,
+                capture_output=True,
+                text=True,
+                stdin=subprocess.DEVNULL,
+                timeout=length_s + _END_S,
+                check=False,
+            )
+            status = play.wait(_START_S) if done.returncode in (0, 3) else 0
+        except subprocess.TimeoutExpired as error:
+            raise PlayError(f"did not end in {error.timeout:.0f} s: {error.cmd}") from None
+    (out / "jtqd.log").write_text(done.stderr)
+    if done.returncode not in (0, 3):  # 3: done, with cycles missing in the log
+        said = (done.stderr or done.stdout).strip().splitlines() or ["it said nothing"]
+        raise PlayError(f"jtqd ended with exit status {done.returncode}, see {out / 'jtqd.log'}: {said[-1]}")
+    if status:
+        raise PlayError(f"the play ended with exit status {status}, see {out / 'play.log'}")
     summary = json.loads(done.stdout)
     path = (summary.get("recording") or {}).get("path")
     if not path:
@@ -168,23 +168,20 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder for the figures and jtqd's logs")
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
     options = parser.parse_args(arguments)
+    return run(options.bus, options.out, options.json)
+
+
+def run(bus: str | None, out: Path, as_json: bool) -> int:
+    """Play, score, draw and print; None is a unix bus of its own. Returns the exit status."""
     try:
-        options.out.mkdir(parents=True, exist_ok=True)
+        out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="jtqd-") as folder:
-            results = evaluate(options.bus or f"unix:{folder}/bus", options.out)
-        _draw(results, options.out)
-    except (
-        RunError,
-        RunTableError,
-        ConfigError,
-        LogError,
-        PlayError,
-        OSError,
-        subprocess.TimeoutExpired,
-    ) as error:
+            results = evaluate(bus or f"unix:{folder}/bus", out)
+        _draw(results, out)
+    except (RunError, RunTableError, ConfigError, LogError, PlayError, OSError) as error:
         print(f"measured: {error}", file=sys.stderr)
         return 1
-    if options.json:
+    if as_json:
         print(
             json.dumps({"schema": "jtq.measured_bus/1", "runs": [as_mapping(r) for r in results]}, indent=1)
         )

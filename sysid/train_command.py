@@ -155,7 +155,7 @@ def _rms(error: np.ndarray[Any, Any]) -> float:
     return float(np.sqrt(np.mean(error**2)))
 
 
-def _card(
+def _card(  # noqa: PLR0917 - what the card shows, in its order
     joint: Joint,
     score: Score,
     trained: Trained,

@@ -66,12 +66,20 @@ def emulated_blocks(
 
 
 def _block(seed: int, joint: Joint, dt: FloatArray, one: JointColumns) -> RunBlock:
-    columns = (one.current_a, one.motor_position_rad, one.motor_velocity_rad_s, one.link_position_rad, one.torque_nm)
+    columns = (
+        one.current_a,
+        one.motor_position_rad,
+        one.motor_velocity_rad_s,
+        one.link_position_rad,
+        one.torque_nm,
+    )
     known = [column for column in columns if column is not None]
     if len(known) != len(columns):
         raise ValueError(f"run {seed}: a column is missing")
     current, position, velocity, link, torque = known
-    run = estimate_run(joint, EstimatorSettings(method="efficiency"), None, dt, current, position, velocity, link)
+    run = estimate_run(
+        joint, EstimatorSettings(method="efficiency"), None, dt, current, position, velocity, link
+    )
     moving = run.status == VALID
     return RunBlock(seed, run.features[moving], torque[moving], run.efficiency_nm[moving])
 

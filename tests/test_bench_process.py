@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -189,3 +190,23 @@ def test_bad_usage_is_one_clear_line(arguments, status, message, tmp_path, monke
 def test_cost_is_printed(capsys):
     assert main(["--cost", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["sync_us"] > 0
+
+
+def test_child_reads_the_same_entries_as_the_parser_here():
+    from sim_can import eds_entries
+
+    here = {
+        node: eds_entries.read_eds(eds_entries.FOLDER / name, node)
+        for node, name in eds_entries.FILES.items()
+    }
+    eds_entries._cache.clear()
+    child = eds_entries.EdsChild()
+    child.take()
+    assert {node: eds_entries._cache[node] for node in here} == here
+
+
+def test_bench_process_does_without_the_eds_parser(running):
+    """Resident memory of the whole bench below 45 MB: canopen and python-can are not loaded."""
+    _, process = running
+    status = dict(line.split(":", 1) for line in Path(f"/proc/{process.pid}/status").read_text().splitlines())
+    assert int(status["VmRSS"].split()[0]) < 45_000

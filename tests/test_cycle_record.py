@@ -22,13 +22,13 @@ def sample():
 
 
 def test_offsets():
-    """48 bytes of header, two joints of 96, 12 frames of 16, 12 stamps of 8, the index."""
+    """48 bytes of header, two joints of 96, 16 frames of 16, 16 stamps of 8, the index."""
     assert cr.HEADER.size == 48
     assert cr.JOINT.size == 96
     assert cr.HEAD.size == 240 == cr.FRAMES_OFFSET
-    assert cr.STAMPS_OFFSET == 432
-    assert cr.TAIL_OFFSET == 528
-    assert cr.RECORD_SIZE == 536
+    assert cr.STAMPS_OFFSET == 496
+    assert cr.TAIL_OFFSET == 624
+    assert cr.RECORD_SIZE == 632
 
 
 def test_bytes_of_the_header():

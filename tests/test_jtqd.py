@@ -33,7 +33,9 @@ def environment(tmp_path: Path) -> dict[str, str]:
     return {**os.environ, "RUNTIME_DIRECTORY": str(directory), "LOGS_DIRECTORY": ""}
 
 
-def run(*arguments: str, environment: dict[str, str], timeout: float = 60) -> subprocess.CompletedProcess[str]:
+def run(
+    *arguments: str, environment: dict[str, str], timeout: float = 60
+) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [*JTQD, *arguments], env=environment, capture_output=True, text=True, timeout=timeout, check=False
     )
@@ -46,7 +48,14 @@ def no_traceback(result: subprocess.CompletedProcess[str]) -> str:
 
 def test_a_run_on_the_emulated_bench(tmp_path: Path, environment: dict[str, str]) -> None:
     result = run(
-        "--bus", "sim", "--duration", "3", "--record", str(tmp_path / "logs"), "--json", environment=environment
+        "--bus",
+        "sim",
+        "--duration",
+        "3",
+        "--record",
+        str(tmp_path / "logs"),
+        "--json",
+        environment=environment,
     )
     assert result.returncode == 0, result.stderr
     no_traceback(result)
@@ -66,7 +75,14 @@ def test_a_run_on_the_emulated_bench(tmp_path: Path, environment: dict[str, str]
         }
         attachments = {attachment.name for attachment in reader.iter_attachments()}
     assert counts["/joint/1/state"] == counts["/joint/2/state"] == counts["/can/frames"] == summary["cycles"]
-    assert {"configuration.yaml", "joint1.yaml", "joint2.yaml", "bus.dbc", "provenance.json", "drive.eds"} <= attachments
+    assert {
+        "configuration.yaml",
+        "joint1.yaml",
+        "joint2.yaml",
+        "bus.dbc",
+        "provenance.json",
+        "drive.eds",
+    } <= attachments
 
 
 @pytest.fixture
@@ -160,7 +176,11 @@ def test_garbage_on_the_bus_is_counted_and_changes_nothing(daemon: tuple[str, su
 
 def test_the_bus_that_ends_is_said(bench: str, environment: dict[str, str], tmp_path: Path) -> None:
     process = subprocess.Popen(
-        [*JTQD, "--bus", bench, "--record", "none"], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [*JTQD, "--bus", bench, "--record", "none"],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     socket = open_frame_socket(bench, [exact(0x1A0)])
     assert socket.wait(20)
@@ -184,7 +204,9 @@ def test_unknown_bus(environment: dict[str, str]) -> None:
         assert bus.removeprefix("unix:") in message
 
 
-@pytest.mark.parametrize("arguments", [[], ["--bus"], ["--bus", "sim", "--duration", "-1"], ["--bus", "sim", "--frob"]])
+@pytest.mark.parametrize(
+    "arguments", [[], ["--bus"], ["--bus", "sim", "--duration", "-1"], ["--bus", "sim", "--frob"]]
+)
 def test_usage(arguments: list[str], environment: dict[str, str]) -> None:
     result = run(*arguments, environment=environment)
     assert result.returncode == 2
@@ -223,7 +245,9 @@ def test_what_does_not_fit_is_named_and_nothing_is_published(
 ) -> None:
     socket = open_frame_socket(bench, [exact(0x1A0)])
     path = configuration(tmp_path, **changes)
-    result = run("--bus", bench, "--config", path, "--duration", "1", "--record", "none", environment=environment)
+    result = run(
+        "--bus", bench, "--config", path, "--duration", "1", "--record", "none", environment=environment
+    )
     assert result.returncode == 1
     lines = no_traceback(result).splitlines()
     assert len(lines) == 1, lines
@@ -242,7 +266,9 @@ def test_a_wrong_gear_ratio_is_refused(tmp_path: Path, environment: dict[str, st
     content["joint_1"]["file"] = "other.yaml"
     content["estimator"]["method"] = "efficiency"
     Path(path).write_text(yaml.safe_dump(content))
-    result = run("--bus", bench, "--config", path, "--duration", "1", "--record", "none", environment=environment)
+    result = run(
+        "--bus", bench, "--config", path, "--duration", "1", "--record", "none", environment=environment
+    )
     assert result.returncode == 1
     assert "6091h gear ratio: expected 120" in no_traceback(result)
 

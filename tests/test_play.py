@@ -7,7 +7,7 @@ import pytest
 
 from estimator.checked import ConfigError
 from models.files import shipped
-from sim_can.play import PlaySource, open_play
+from sim_can.play import PlaySource, columns_beside, open_play
 from sim_can.run_files import RunError
 
 KINOVA = shipped("kinova_gen3/columns.yaml").parent
@@ -161,3 +161,16 @@ def test_missing_columns_and_files_are_named(tmp_path: Path) -> None:
         open_play(path, None, (1, 2))
     with pytest.raises(ConfigError, match=r"none\.yaml"):
         open_play(path, tmp_path / "none.yaml", (1, 2))
+
+
+def test_defaults_come_from_the_column_map_beside_the_run(tmp_path: Path) -> None:
+    run = KINOVA / "RunTrajectory1.csv.gz"
+    assert columns_beside(run) == COLUMNS
+    assert columns_beside(tmp_path / "r.csv") is None
+    default, given = open_play(run, COLUMNS), open_play(run, COLUMNS, (2, 4))
+    for source in (default, given):
+        source.advance(0.0)
+        source.advance(0.4)
+    assert _shown(default) == _shown(given)
+    assert default.notes == ()  # the dead channel is joint 1's, which is not played
+    assert len(open_play(run, COLUMNS, (1, 2)).notes) == 1

@@ -75,7 +75,7 @@ def test_round_trip(recorder):
             assert tuple(message[name] for name in cr.JointRecord._fields) == joint_values(n, number)
     for n, (_, message) in enumerate(found["/can/frames"]):
         assert (message["cycle"], message["frame_count"], message["work_ns"]) == (n, 2, 50_000)
-        assert [frame["id"] for frame in message["frames"]] == [0x080, 0x181] + [0] * 10
+        assert [frame["id"] for frame in message["frames"]] == [0x080, 0x181] + [0] * 14
         assert message["frames"][1]["data"] == list(range(8))
         assert message["stamps_ns"][:2] == [START_NS + n * 1_000_000 + 1, START_NS + n * 1_000_000 + 2]
     assert len(found["/can/frames"]) == 1234

@@ -24,7 +24,9 @@ def run_once(directory: Path) -> tuple[dict[str, Any], list[tuple[float, int, by
     dump = directory / "dump.log"
     environment = {**os.environ, "RUNTIME_DIRECTORY": str(directory)}
     bench = subprocess.Popen(
-        [sys.executable, "-m", "sim_can", "--bus", INTERFACE, "--seed", "1"], stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", "sim_can", "--bus", INTERFACE, "--seed", "1"],
+        stderr=subprocess.PIPE,
+        text=True,
     )
     assert bench.stderr is not None
     assert "ready" in bench.stderr.readline()
@@ -90,17 +92,32 @@ def test_ten_thousand_cycles_without_a_miss_and_twice_the_same(tmp_path: Path) -
 @pytest.mark.socketcan
 def test_a_remote_frame_and_29_bit_twins_on_the_real_bus_are_only_counted(tmp_path: Path) -> None:
     environment = {**os.environ, "RUNTIME_DIRECTORY": str(tmp_path)}
-    bench = subprocess.Popen([sys.executable, "-m", "sim_can", "--bus", INTERFACE], stderr=subprocess.PIPE, text=True)
+    bench = subprocess.Popen(
+        [sys.executable, "-m", "sim_can", "--bus", INTERFACE], stderr=subprocess.PIPE, text=True
+    )
     assert bench.stderr is not None
     assert "ready" in bench.stderr.readline()
     daemon = subprocess.Popen(
-        [sys.executable, "-m", "daemon.jtqd", "--bus", INTERFACE, "--duration", "4", "--record", "none", "--json"],
+        [
+            sys.executable,
+            "-m",
+            "daemon.jtqd",
+            "--bus",
+            INTERFACE,
+            "--duration",
+            "4",
+            "--record",
+            "none",
+            "--json",
+        ],
         env=environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
     )
-    dump = subprocess.run(["candump", "-n", "200", f"{INTERFACE},1A0:7FF"], capture_output=True, timeout=120, check=True)
+    dump = subprocess.run(
+        ["candump", "-n", "200", f"{INTERFACE},1A0:7FF"], capture_output=True, timeout=120, check=True
+    )
     assert dump.stdout
     for frame in ("00000181#0011223344556677", "181#R", "181#00112233", "182#", "00000080#00"):
         subprocess.run(["cansend", INTERFACE, frame], check=True)

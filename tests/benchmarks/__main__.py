@@ -1,4 +1,4 @@
-"""Command line: `python -m tests.benchmarks [cycle] [stages] [grid] [start] [--quick] [--json]`; all four when none is named."""
+"""Command line: `python -m tests.benchmarks [cycle] [stages] [grid] [start] [--quick] [--json]`; no name means all."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from tests.benchmarks import cycle, host, long_run, stage_table, start
 from tests.benchmarks.fixture import make_fixture
 
 NAMES = ("cycle", "stages", "grid", "start")
+_BITRATE = 1_000_000
 _EXAMPLES = """examples:
   python -m tests.benchmarks                   everything, about 13 minutes
   python -m tests.benchmarks cycle stages      ratios and stages, about 2 minutes
@@ -24,7 +25,9 @@ Targets are marked PASS, over or under; the exit status is 0 either way, 1 when 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m tests.benchmarks", epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="python -m tests.benchmarks",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("what", nargs="*", metavar="|".join(NAMES), help="default: all")
     parser.add_argument("--quick", action="store_true", help="short runs")
@@ -77,12 +80,13 @@ def _measure(name: str, directory: Path, options: argparse.Namespace) -> tuple[A
     if name == "stages":
         result = stage_table.run(fixture, seconds=options.rounds * options.seconds / 2.0, quiet=True)
         return result, stage_table.text(result)
-    both = [
-        cycle.run(fixture, rounds=options.rounds, seconds=options.seconds, quiet=True),
-        cycle.run(fixture, rounds=max(1, options.rounds // 2), seconds=options.seconds, quiet=False),
-    ]
-    content = {"quiet_core": both[0], "shared_core": both[1]}
-    return content, "\n\n".join(cycle.text(each) for each in both)
+    few = max(1, options.rounds // 2)
+    content = {
+        "quiet_core": cycle.run(fixture, rounds=options.rounds, seconds=options.seconds, quiet=True),
+        "wire": cycle.run(fixture, rounds=few, seconds=options.seconds, quiet=True, bitrate=_BITRATE),
+        "shared_core": cycle.run(fixture, rounds=few, seconds=options.seconds, quiet=False),
+    }
+    return content, "\n\n".join(cycle.text(each) for each in content.values())
 
 
 if __name__ == "__main__":

@@ -15,7 +15,14 @@ from estimator.parameters import Joint
 from estimator.settings import EstimatorSettings
 from estimator.tracking import LINK_SPEED_LIMIT_RAD_S, RAW_LIMIT
 from estimator.validity import FADE_START
-from tests.benchmarks.fixture import ENVELOPE_HIGH, ENVELOPE_LOW, SIGMA_NM, Fixture, SmallNetwork, small_network
+from tests.benchmarks.fixture import (
+    ENVELOPE_HIGH,
+    ENVELOPE_LOW,
+    SIGMA_NM,
+    Fixture,
+    SmallNetwork,
+    small_network,
+)
 from tests.benchmarks.traffic import SCALING, SENSOR_NM_PER_UNIT
 
 _SOURCE = Path(__file__).resolve().parent
@@ -23,7 +30,7 @@ _COMPILE = ("gcc", "-std=gnu11", "-O2", "-Wall", "-Wextra")
 
 
 def build(fixture: Fixture) -> Path:
-    """Compile loop.c for this fixture; returns the program. Raises subprocess.CalledProcessError, FileNotFoundError (no gcc)."""
+    """Compile loop.c for this fixture; returns the program. Raises CalledProcessError, or FileNotFoundError without gcc."""
     (fixture.directory / "parameters.h").write_text(_header(load_config(fixture.config)), encoding="utf-8")
     program = fixture.directory / "loop"
     command = [*_COMPILE, f"-I{fixture.directory}", str(_SOURCE / "loop.c"), "-o", str(program), "-lm"]
@@ -45,10 +52,7 @@ def _header(config: Config) -> str:
         "NM_PER_UNIT": SENSOR_NM_PER_UNIT,
     }
     lines = [f"#define {name} {value!r}" for name, value in names.items()]
-    joints = [
-        _joint(each.joint, config.estimator, small_network(each.number))
-        for each in config.joints
-    ]
+    joints = [_joint(each.joint, config.estimator, small_network(each.number)) for each in config.joints]
     return "\n".join([*lines, f"static const joint_parameters parameters[2] = {{{', '.join(joints)}}};", ""])
 
 

@@ -1,4 +1,4 @@
-"""A contender is a process that makes everything ready, and then runs one round for each line "run CYCLES" on its standard input."""
+"""A contender is a process that makes everything ready, then runs one round per line "run CYCLES" on its input."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
-"""Contender: the usual way. canopen's Network with its Notifier thread, RemoteNodes from the EDS files, PDO callbacks, python-can to send.
+"""Contender: the usual way. canopen's Network with its Notifier thread, RemoteNodes from the EDS files, PDO callbacks.
 
-What a good engineer does is done: variables are looked up once, the callbacks only count, the loop thread sends the SYNC on an absolute
-grid and waits for all five PDOs on one condition, garbage collection is frozen, scheduling is that of jtqd. The arithmetic is the same
-JointEstimator. It keeps no log and checks neither lateness nor duplicates, so it does less than jtqd's loop.
+What a good engineer does is done: variables are looked up once, the callbacks only count, the loop thread sends the
+SYNC on an absolute grid and waits for all five PDOs on one condition, garbage collection is frozen, scheduling is that
+of jtqd. The arithmetic is the same JointEstimator, sending is python-can's. It keeps no log and checks neither lateness
+nor duplicates, so it does less than jtqd's loop.
 """
 
 from __future__ import annotations
@@ -145,4 +146,4 @@ class CanopenLoop:
 
 
 if __name__ == "__main__":
-    sys.exit(serve(lambda task: CanopenLoop(task)))
+    sys.exit(serve(CanopenLoop))

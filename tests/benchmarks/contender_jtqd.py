@@ -89,4 +89,4 @@ def _never() -> bool:
 
 
 if __name__ == "__main__":
-    sys.exit(serve(lambda task: JtqdLoop(task)))
+    sys.exit(serve(JtqdLoop))

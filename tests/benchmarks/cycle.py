@@ -16,11 +16,13 @@ MEDIAN_LIMIT_US, P99_LIMIT_US = 60.0, 150.0
 USUAL_RATIO, C_RATIO = 5.0, 4.0
 
 
-def run(fixture: Fixture, *, rounds: int, seconds: float, quiet: bool) -> dict[str, Any]:
-    """Measure; `quiet` holds the contenders' core (see host.py)."""
+def run(
+    fixture: Fixture, *, rounds: int, seconds: float, quiet: bool, bitrate: int | None = None
+) -> dict[str, Any]:
+    """Measure; `quiet` holds the contenders' core (see host.py), `bitrate` spaces the frames as a wire does."""
     program = c_program.build(fixture)
     where = host.cpus()
-    traffic = host.traffic(fixture.directory, where)
+    traffic = host.traffic(fixture.directory, where, bitrate)
     bus = fixture.directory / "bus"
     task = Task(f"unix:{bus}", fixture.directory, where.loop)
     contenders = {
@@ -42,6 +44,7 @@ def run(fixture: Fixture, *, rounds: int, seconds: float, quiet: bool) -> dict[s
     figures = {name: each.figures() for name, each in samples.items()}
     return {
         "quiet_core": spinner is not None,
+        "bitrate": bitrate,
         "rounds": rounds,
         "seconds": seconds,
         "cpus_busy": busy,
@@ -61,8 +64,9 @@ def _c_command(program: Path, bus: Path, task: Task) -> list[str]:
 def text(result: dict[str, Any]) -> str:
     """Table, targets and ratios."""
     core = "quiet core" if result["quiet_core"] else "core shared with the system"
+    spacing = f"frames at {result['bitrate']} bit/s" if result["bitrate"] else "frames at once"
     lines = [
-        f"CPU per cycle, {core}: {result['rounds']} rounds of {result['seconds']:g} s each, "
+        f"CPU per cycle, {core}, {spacing}: {result['rounds']} rounds of {result['seconds']:g} s each, "
         f"{result['cpus_busy']:.1f} CPUs busy",
         "",
     ]
@@ -83,14 +87,28 @@ def text(result: dict[str, Any]) -> str:
                 f"{100.0 * f['published'] / max(f['cycles'], 1):.1f} %",
             ]
         )
-    head = ["", "CPU median us", "p99", "mean", "rounds", "answer us", "p99", "sleeps", "cycles", "missed", "with torque"]
+    head = [
+        "",
+        "CPU median us",
+        "p99",
+        "mean",
+        "rounds",
+        "answer us",
+        "p99",
+        "sleeps",
+        "cycles",
+        "missed",
+        "with torque",
+    ]
     lines.append(table(head, rows))
     own, ratios = result["contenders"][JTQD], result["ratios"]
+    median, p99 = own["cpu_median_us"], own["cpu_p99_us"]
+    usual, c = ratios["usual_over_jtqd"], ratios["jtqd_over_c"]
     lines += [
         "",
-        f"jtqd median        {own['cpu_median_us']:6.1f} us  {mark(own['cpu_median_us'], MEDIAN_LIMIT_US)}",
-        f"jtqd p99           {own['cpu_p99_us']:6.1f} us  {mark(own['cpu_p99_us'], P99_LIMIT_US)}",
-        f"usual way / jtqd   {ratios['usual_over_jtqd']:6.2f}     {mark(ratios['usual_over_jtqd'], USUAL_RATIO, at_least=True)}",
-        f"jtqd / C           {ratios['jtqd_over_c']:6.2f}     {mark(ratios['jtqd_over_c'], C_RATIO)}",
+        f"jtqd median        {median:6.1f} us  {mark(median, MEDIAN_LIMIT_US)}",
+        f"jtqd p99           {p99:6.1f} us  {mark(p99, P99_LIMIT_US)}",
+        f"usual way / jtqd   {usual:6.2f}     {mark(usual, USUAL_RATIO, at_least=True)}",
+        f"jtqd / C           {c:6.2f}     {mark(c, C_RATIO)}",
     ]
     return "\n".join(lines)

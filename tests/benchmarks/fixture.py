@@ -1,13 +1,15 @@
 """What all contenders are given: configuration, networks, and the scaling that a boot would have read from the devices.
 
-The networks have the paper's size (6-20-40-10-1) and follow the efficiency torque: random hidden layers with a fixed seed, the last
-layer fitted. What a cycle costs depends on the size and not on the weights, and these do not change when the shipped ones do.
+The networks have the paper's size (6-20-40-10-1) and follow the efficiency torque: random hidden layers with a fixed
+seed, the last layer fitted. What a cycle costs depends on the size and not on the weights, and these do not change when
+the shipped ones do.
 """
 
 from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -79,15 +81,17 @@ def small_network(number: int) -> SmallNetwork:
     layers: list[Layer] = []
     features = rng.uniform(-1.0, 1.0, (4000, len(FEATURES)))
     h = features
-    for inputs, outputs in zip(sizes[:-1], sizes[1:], strict=True):
-        w = rng.normal(0.0, 1.0 / np.sqrt(inputs), (inputs, outputs))
-        b = rng.normal(0.0, 0.1, outputs)
+    for inputs, outputs in pairwise(sizes):
+        w: FloatArray = rng.normal(0.0, 1.0 / np.sqrt(inputs), (inputs, outputs))
+        b: FloatArray = rng.normal(0.0, 0.1, outputs)
         layers.append((w, b))
         h = np.tanh(0.5 * (h @ w + b))
     target = features[:, -1] + 0.02 * np.sin(3.0 * features[:, 1])
     solution = np.linalg.lstsq(np.column_stack([h, np.ones(len(h))]), target, rcond=None)[0]
     layers.append((solution[:-1, None], solution[-1:]))
-    return SmallNetwork(tuple(layers), (ENVELOPE_LOW + ENVELOPE_HIGH) / 2.0, (ENVELOPE_HIGH - ENVELOPE_LOW) / 2.0, 0.0, 40.0)
+    return SmallNetwork(
+        tuple(layers), (ENVELOPE_LOW + ENVELOPE_HIGH) / 2.0, (ENVELOPE_HIGH - ENVELOPE_LOW) / 2.0, 0.0, 40.0
+    )
 
 
 def make_fixture(directory: Path) -> Fixture:

@@ -1,9 +1,10 @@
 """The machine the benchmark runs on: which CPU does what, how much of it others use, and a core that is left alone.
 
-A virtual machine makes a sleeping process dear: the idle CPU is given back to the host, and waking it up goes through the hypervisor and
-finds cold caches. "Quiet core" here means what isolcpus and idle=poll give a real-time process: nobody else runs there, and it never goes
-idle. A spinner at the lowest real-time priority does both without any change to the system; the loop preempts it. The spinner's time is
-nobody's: only the CPU of the contender's own process is counted.
+A virtual machine makes sleeping dear: the idle CPU is given back to the host, waking it up goes through the hypervisor
+and finds cold caches. "Quiet core" here means what isolcpus and idle=poll give a real-time process: nobody else runs
+there, and it never goes idle. A spinner at the lowest real-time priority does both without any change to the system; the
+loop preempts it, and only the CPU of the contender's own process is counted. A core held like this starves what else
+wants to run on it, so the kernel takes it away for up to 5 % of each second: missed slots under it mean nothing.
 """
 
 from __future__ import annotations
@@ -37,9 +38,13 @@ def description() -> str:
         if line.startswith("model name"):
             model = line.partition(":")[2].strip()
             break
-    hypervisor = ", virtual machine" if "hypervisor" in Path("/proc/cpuinfo").read_text(encoding="utf-8") else ""
+    hypervisor = (
+        ", virtual machine" if "hypervisor" in Path("/proc/cpuinfo").read_text(encoding="utf-8") else ""
+    )
     count = len(os.sched_getaffinity(0))
-    return f"{model}, {count} CPUs{hypervisor}, Linux {platform.release()}, Python {platform.python_version()}"
+    return (
+        f"{model}, {count} CPUs{hypervisor}, Linux {platform.release()}, Python {platform.python_version()}"
+    )
 
 
 class OtherLoad:
@@ -56,15 +61,17 @@ class OtherLoad:
 
 
 def _ticks() -> tuple[int, int]:
-    fields = [int(each) for each in Path("/proc/stat").read_text(encoding="utf-8").split("\n")[0].split()[1:9]]
+    fields = [
+        int(each) for each in Path("/proc/stat").read_text(encoding="utf-8").split("\n")[0].split()[1:9]
+    ]
     idle = fields[3] + fields[4]
     return sum(fields) - idle, sum(fields)
 
 
-def traffic(directory: Path, where: Cpus) -> Process:
-    """Start the bench's traffic on `directory`/bus."""
-    arguments = [str(directory / "bus")] + ([str(where.traffic)] if where.traffic is not None else [])
-    return Process(python("traffic", *arguments), "the traffic source")
+def traffic(directory: Path, where: Cpus, bitrate: int | None = None) -> Process:
+    """Start the bench's traffic on `directory`/bus; with a bit rate its frames come as far apart as on a wire."""
+    arguments = ["" if each is None else str(each) for each in (where.traffic, bitrate)]
+    return Process(python("traffic", str(directory / "bus"), *arguments), "the traffic source")
 
 
 def quiet_core(program: Path, where: Cpus) -> Process | None:

@@ -1,4 +1,4 @@
-"""`grid`: jtqd's loop for minutes, a bare sleeping loop on the same core at the same time; missed slots of both side by side."""
+"""`grid`: jtqd's loop for minutes, a bare sleeping loop on the same core at the same time, missed slots of both."""
 
 from __future__ import annotations
 

@@ -7,6 +7,7 @@ import os
 import resource
 import time
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 SETTLE_CYCLES = 200
@@ -72,7 +73,7 @@ class Samples:
     def add(self, result: dict[str, Any]) -> None:
         """Take in one round."""
         ends = result["cpu_ns"][SETTLE_CYCLES:]
-        costs = [(after - before) * 1e-3 for before, after in zip(ends[:-1], ends[1:], strict=True)]
+        costs = [(after - before) * 1e-3 for before, after in pairwise(ends)]
         self.cpu_us += costs
         self.medians_us.append(quantile(costs, 0.5))
         self.answer_us += [value * 1e-3 for value in result["answer_ns"][SETTLE_CYCLES:]]

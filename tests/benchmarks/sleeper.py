@@ -44,4 +44,4 @@ class Sleeper:
 
 
 if __name__ == "__main__":
-    sys.exit(serve(lambda task: Sleeper(task)))
+    sys.exit(serve(Sleeper))

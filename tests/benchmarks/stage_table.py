@@ -33,13 +33,23 @@ def text(result: dict[str, Any]) -> str:
     """Stages, their sum, and what is left of the whole."""
     stages = result["stages"]
     rows = [
-        [name, f"{stages[name]['median_us']:.1f}", f"{stages[name]['p99_us']:.1f}", what] for name, what in STAGES.items()
+        [name, f"{stages[name]['median_us']:.1f}", f"{stages[name]['p99_us']:.1f}", what]
+        for name, what in STAGES.items()
     ]
     total = sum(stages[name]["median_us"] for name in STAGES if name != "sleep")
     whole = result["whole"]["cpu_median_us"]
     rows.append(["stages", f"{total:.1f}", "", "sum of the medians above, without sleep"])
-    rows.append(["rest", f"{whole - total:.1f}", "", "falling asleep and waking up twice, the loop around the stages"])
-    rows.append(["whole cycle", f"{whole:.1f}", f"{result['whole']['cpu_p99_us']:.1f}", "CPU of the process, no timers"])
+    rows.append(
+        ["rest", f"{whole - total:.1f}", "", "falling asleep and waking up twice, the loop around the stages"]
+    )
+    rows.append(
+        [
+            "whole cycle",
+            f"{whole:.1f}",
+            f"{result['whole']['cpu_p99_us']:.1f}",
+            "CPU of the process, no timers",
+        ]
+    )
     rows = [[row[0], row[1], row[2], "  " + row[3]] for row in rows]
     core = "quiet core" if result["quiet_core"] else "core shared with the system"
     width = max(len(row[3]) for row in rows)

@@ -1,21 +1,23 @@
 """`stages`: where the time of jtqd's cycle goes, by timing its stages from outside; product code is not changed.
 
-Every timed call costs two clock readings and a Python call itself; that is measured in the same process and taken off. What is no
-stage (sleeping and waking up twice, the loop between the stages) is the rest of a round of the same process without any timer.
+Every timed call costs two clock readings and a Python call itself; that is measured in the same process and taken off.
+What is no stage (sleeping and waking up twice, the loop between the stages) is the rest of a round of the same process
+without any timer.
 """
 
 from __future__ import annotations
 
+import importlib
 import sys
 import time
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
-from daemon import cycle as cycle_module
 from daemon import estimate_pdo, loop
 from estimator.joint_estimator import JointEstimator
-from tests.benchmarks.contender import Task, serve
+from estimator.network import TorqueNetwork
+from tests.benchmarks.contender import serve
 from tests.benchmarks.contender_jtqd import JtqdLoop, _never, loop_start, measured
 from tests.benchmarks.measure import SETTLE_CYCLES, CycleMeter, quantile
 
@@ -29,6 +31,10 @@ STAGES = {
     "hand over": "record of the cycle with its raw frames into the ring, counters",
     "sleep": "wall time asleep until the inputs are due (not part of the sum)",
 }
+
+
+cycle_module: Any = importlib.import_module("daemon.cycle")
+"""Its names `estimate_pdo` and `time` are exchanged for timed ones during a round."""
 
 
 class StageTimer:
@@ -65,14 +71,14 @@ class StageTimer:
         """(what a timer adds to its own stage, what it adds to the stage around it) [ns]."""
         self._cost_inside = self._cost_around = 0
         clock = time.perf_counter_ns
-        timed = self.timed("sleep", int)
+        timed = self.timed("sleep", _nothing)
         inside, around = [], []
         for _ in range(2000):
             self.now["sleep"] = 0
             start = clock()
             timed()
             middle = clock()
-            int()
+            _nothing()
             end = clock()
             plain = end - middle
             inside.append(self.now["sleep"] - plain)
@@ -91,12 +97,12 @@ class StagedLoop(JtqdLoop):
         timer = StageTimer()
         pdo, clock = cycle_module.estimate_pdo, cycle_module.time
         estimators = self.estimators
-        cycle_module.estimate_pdo = SimpleNamespace(  # type: ignore[assignment]
+        cycle_module.estimate_pdo = SimpleNamespace(
             field=timer.timed("encode", estimate_pdo.field),
             encode=timer.timed("encode", estimate_pdo.encode),
             PUBLISHED_STATUSES=estimate_pdo.PUBLISHED_STATUSES,
         )
-        cycle_module.time = SimpleNamespace(  # type: ignore[assignment]
+        cycle_module.time = SimpleNamespace(
             monotonic_ns=time.monotonic_ns, time_ns=time.time_ns, sleep=timer.timed("sleep", time.sleep)
         )
         self.estimators = [with_timed_network(self, number, timer) for number in (0, 1)]
@@ -138,6 +144,10 @@ class StagedLoop(JtqdLoop):
         socket.close()
 
 
+def _nothing() -> None:
+    """What the calibration times."""
+
+
 def wrap(target: Any, name: str, timed: Callable[..., Any], stage: str) -> None:
     """Put a timer around a method of one object."""
     setattr(target, name, timed(stage, getattr(target, name)))
@@ -147,7 +157,7 @@ def with_timed_network(staged: StagedLoop, number: int, timer: StageTimer) -> Jo
     """The estimator of one joint again, its network timed."""
     joint = staged.config.joints[number]
     assert joint.network is not None
-    network = loop.TorqueNetwork(joint.network.path, sha256=joint.network.sha256)
+    network = TorqueNetwork(joint.network.path, sha256=joint.network.sha256)
     network.run_one = timer.timed("network", network.run_one)  # type: ignore[method-assign]
     estimator = JointEstimator(joint.joint, staged.estimators[number].settings, network)
     loop.warm_up([estimator])
@@ -155,4 +165,4 @@ def with_timed_network(staged: StagedLoop, number: int, timer: StageTimer) -> Jo
 
 
 if __name__ == "__main__":
-    sys.exit(serve(lambda task: StagedLoop(task)))
+    sys.exit(serve(StagedLoop))

@@ -25,7 +25,7 @@ _SETTLE_S = 1.0
 
 
 def run(directory: Path, *, duration_s: float = 4.0) -> dict[str, Any]:
-    """Start the daemon once; `directory` holds its runtime files and its log. Raises RuntimeError when it does not come up."""
+    """Start the daemon once, its files in `directory`. Raises RuntimeError when it does not come up."""
     environment = {key: value for key, value in os.environ.items() if key != "RUNTIME_DIRECTORY"}
     environment |= {"XDG_RUNTIME_DIR": str(directory), "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-P", "-m", "daemon.jtqd", "--bus", "sim", "--duration", f"{duration_s:g}"]
@@ -33,7 +33,9 @@ def run(directory: Path, *, duration_s: float = 4.0) -> dict[str, Any]:
     path = directory / f"jtqd-{os.getuid()}-{instance_name('sim')}" / "bus"
     started = time.monotonic()
     with open(directory / "jtqd.err", "w+", encoding="utf-8") as errors:
-        daemon = subprocess.Popen(command, env=environment, cwd=directory, stdout=subprocess.PIPE, stderr=errors)
+        daemon = subprocess.Popen(
+            command, env=environment, cwd=directory, stdout=subprocess.PIPE, stderr=errors
+        )
         try:
             bus_s, first_s, estimate_s = _first_estimates(daemon, path, started)
             time.sleep(_SETTLE_S)
@@ -59,7 +61,9 @@ def run(directory: Path, *, duration_s: float = 4.0) -> dict[str, Any]:
     }
 
 
-def _first_estimates(daemon: subprocess.Popen[bytes], path: Path, started: float) -> tuple[float, float, float]:
+def _first_estimates(
+    daemon: subprocess.Popen[bytes], path: Path, started: float
+) -> tuple[float, float, float]:
     """Seconds from the start to the bus, to the first estimate PDO, and to the first with a torque for both joints."""
     socket = _listen(daemon, path, started)
     bus_s = time.monotonic() - started
@@ -139,8 +143,10 @@ def text(result: dict[str, Any]) -> str:
             f"first estimate PDO after        {result['first_pdo_s']:6.2f} s",
             f"first estimate with torque      {result['first_estimate_s']:6.2f} s   "
             + mark(result["first_estimate_s"], START_LIMIT_S),
-            f"resident memory, proportional   {result['pss_mb']:6.1f} MB  " + mark(result["pss_mb"], MEMORY_LIMIT_MB),
-            f"resident memory, plain sum      {result['rss_mb']:6.1f} MB  " + mark(result["rss_mb"], MEMORY_LIMIT_MB),
+            f"resident memory, proportional   {result['pss_mb']:6.1f} MB  "
+            + mark(result["pss_mb"], MEMORY_LIMIT_MB),
+            f"resident memory, plain sum      {result['rss_mb']:6.1f} MB  "
+            + mark(result["rss_mb"], MEMORY_LIMIT_MB),
             f"torch loaded                    {'yes: over' if result['torch'] else 'no: PASS'}",
         ]
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import isnan
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -11,7 +12,10 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     widths = [max(len(line[n]) for line in lines) for n in range(len(head))]
 
     def text(line: Sequence[str]) -> str:
-        cells = [cell.ljust(w) if n == 0 else cell.rjust(w) for n, (cell, w) in enumerate(zip(line, widths, strict=True))]
+        cells = [
+            cell.ljust(w) if n == 0 else cell.rjust(w)
+            for n, (cell, w) in enumerate(zip(line, widths, strict=True))
+        ]
         return "  ".join(cells).rstrip()
 
     return "\n".join([text(lines[0]), "  ".join("-" * w for w in widths), *map(text, lines[1:])])
@@ -19,7 +23,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def mark(value: float, limit: float, *, at_least: bool = False) -> str:
     """PASS or over (under), with the limit."""
-    if value != value:
+    if isnan(value):
         return "not measured"
     good = value >= limit if at_least else value <= limit
     wrong = "under" if at_least else "over"

@@ -1,7 +1,8 @@
 """The traffic of the bench, the same for every contender: five TPDOs per SYNC with values that vary like a robot's.
 
-`python -m tests.benchmarks.traffic PATH [CPU]` runs it: a hub on a unix socket with one lean node that answers each SYNC with the
-next cycle of a table of finished frames. It does no arithmetic while it runs, so that it is ready long before the inputs are due.
+`python -m tests.benchmarks.traffic PATH CPU BITRATE` (the last two may be empty) runs it: a hub on a unix socket with
+one lean node that answers each SYNC with the next cycle of a table of finished frames. It does no arithmetic while it
+runs, so that it has answered long before the inputs are due.
 """
 
 from __future__ import annotations
@@ -55,11 +56,11 @@ def cycle_frames(cycle: int) -> list[bytes]:
     return [positions[0], positions[1], sensor, motions[0], motions[1]]
 
 
-def serve(path: str, cpu: int | None) -> None:
+def serve(path: str, cpu: int | None, bitrate: int | None) -> None:
     """Answer every SYNC on the hub at `path` until SIGTERM; prints one line when it is ready."""
     punctual(cpu, _PRIORITY)  # drives answer in time whatever else runs on a controller
     table = [cycle_frames(cycle) for cycle in range(CYCLES)]
-    hub = Hub(path)
+    hub = Hub(path, bitrate)
     step = 0
 
     def on_frame(frame16: bytes, _stamp_ns: int) -> None:
@@ -84,4 +85,5 @@ def serve(path: str, cpu: int | None) -> None:
 
 
 if __name__ == "__main__":
-    serve(sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else None)
+    _, _path, _cpu, _bitrate = sys.argv
+    serve(_path, int(_cpu) if _cpu else None, int(_bitrate) if _bitrate else None)
