@@ -241,6 +241,18 @@ class Cycle:
             self.snapshot.write(self.index, self.counter, self._sync_realtime_ns, (one.view, two.view))
         self.index += 1
 
+    def hold_back(self) -> bool:
+        """True when this slot must pass without SYNC, so that late frames can be told from lost ones (see intake)."""
+        intake = self.intake
+        if not intake.gap_wanted:
+            return False
+        count = self._receive()
+        if count:
+            intake.drain(self.socket.frames, self.socket.stamps_ns, self.socket.own, count)
+        intake.gap()
+        self.index += 1
+        return True
+
     def skip(self, slots: int) -> None:
         """Slots that were missed: the index follows the grid, so that a gap in the log shows where they were."""
         self.index += slots
@@ -406,6 +418,7 @@ class Cycle:
         counters[_INDEX["rejected_frames"]] = intake.rejected_frames
         counters[_INDEX["unknown_frames"]] = intake.unknown_frames
         counters[_INDEX["foreign_sync"]] = intake.foreign_sync
+        counters[_INDEX["sync_gaps"]] = intake.gaps
         counters[_INDEX["boot_ups"]] = intake.boot_ups
         counters[_INDEX["tx_dropped"]] = self.socket.tx_dropped
         counters[_INDEX["rx_dropped"]] = self.socket.rx_dropped

@@ -5,10 +5,15 @@ the same PDO can still be under way:
 
 * a frame whose kernel stamp lies before the SYNC's own echo belongs to an earlier cycle: late, dropped, counted;
 * after a cycle without its frame the PDO has a *debt*: the missing frame was lost, or it is late and will be met in a later
-  cycle, looking just like that cycle's own. If two frames come in one cycle, the first paid the debt and the second
-  counts. If one comes, it counts only when its delay after the SYNC lies in the band seen while nothing was missing;
-  otherwise it is taken for the late one. A constant delay of more than one cycle thus never becomes valid;
-* two frames in one cycle without a debt are a duplicate: harmless with equal bytes, a conflict (two senders) with others:
+  cycle, looking just like that cycle's own. While there is a debt nothing is believed. It is paid by a surplus
+  frame (two in one cycle), or written off in one of two ways:
+  - the arrivals have been so regular that their delay tells: one frame came, in the usual band, and no other until the
+    next SYNC: the missing one was lost;
+  - otherwise the loop is asked for a *gap*: one slot without SYNC, in which only late frames can come. What has not come
+    by its end was lost, and the first cycle after it is not used yet.
+  A constant delay of more than one cycle thus never becomes valid, however irregular the arrivals are. This relies on the
+  frames of one PDO keeping their order, as they do in a CAN controller;
+* two frames in one cycle are harmless with equal bytes and a conflict with others (one is late, or there are two senders):
   then the input is not used in that cycle;
 * a wrong length, a 29-bit identifier or a remote frame under one of our identifiers is rejected and counted;
 * a SYNC that is not our own echo makes every input of the cycle doubtful: none is used;
@@ -31,6 +36,10 @@ _RTR_FLAG = 0x4000_0000
 _HEARTBEAT_BASE = 0x700
 _BAND_MARGIN_NS = 50_000
 """Allowance around the learned delays: one frame of 135 bits may have been in the way less than twice."""
+_NARROW_NS = 200_000
+"""A band wider than this cannot tell a late frame from one in time."""
+_GAP_PAUSE = 20
+"""Cycles between two gaps: a bus that loses frames all the time must not lose its SYNC as well."""
 _BAND_LEAK = 1.0 / 1024.0
 """The band shrinks towards what is seen now with a time constant of about a second at 1 kHz."""
 
@@ -69,6 +78,7 @@ class _State:
         "length",
         "lost",
         "pdo",
+        "probation",
         "rejected",
         "stamp_ns",
         "unpack",
@@ -84,6 +94,7 @@ class _State:
         self.fresh = False
         self.conflict = False
         self.debt = 0
+        self.probation = False
         self.stamp_ns = 0
         self.band_low_ns = 1 << 62
         self.band_high_ns = 0
@@ -94,7 +105,8 @@ class Intake:
     """Inputs of one cycle after the other.
 
     Use per cycle: `begin()` when the SYNC has been sent, `take(...)` for each batch of frames until it returns True or the
-    deadline has passed, `close()`, then read `values` and `fresh`; `drain(...)` for what arrives before the next SYNC.
+    deadline has passed, `close()`, then read `values` and `fresh`; `drain(...)` for what arrives before the next SYNC. Where
+    `gap_wanted` is then True, `gap()` takes the place of the next cycle, and no SYNC is sent in its slot.
 
     Args:
         pdos: the expected PDOs; results are indexed in this order.
@@ -113,6 +125,11 @@ class Intake:
         self._unconfigured: set[int] = set()
         self._missing = 0
         self._foreign_sync_now = False
+        self._after_gap = False
+        self._gap_pause = 0
+        self.gap_wanted = False
+        self.gaps = 0
+        """Slots without SYNC so far."""
         self.sync_stamp_ns = 0
         """CLOCK_REALTIME stamp of the own SYNC's echo, 0 while it has not been seen in this cycle."""
         self.foreign_sync = 0
@@ -130,7 +147,15 @@ class Intake:
             state.fresh = False
             state.conflict = False
             if state.debt:
-                indebted = True
+                if state.probation or self._after_gap:
+                    state.lost += state.debt
+                    state.debt = 0
+                    state.probation = self._after_gap
+                else:
+                    indebted = True
+        self._after_gap = False
+        if self._gap_pause:
+            self._gap_pause -= 1
         # With a debt one more frame may come: then only the deadline ends the wait.
         self._missing = len(self._states) + indebted
         self._foreign_sync_now = False
@@ -185,14 +210,20 @@ class Intake:
         for state in self._states:
             if state.fresh:
                 delay = state.stamp_ns - sync_ns if sync_ns else -1
-                if state.debt and not self._pays_its_own(state, delay):
+                if state.debt:
                     state.fresh = False
-                elif delay >= 0 and not state.debt:
+                    state.probation = self._usual(state, delay)
+                    if not state.probation and not self._gap_pause:
+                        self.gap_wanted = True
+                elif state.probation:
+                    state.fresh = state.probation = False
+                elif delay >= 0:
                     self._learn(state, delay)
                 if state.conflict:
                     state.fresh = False
             else:
                 state.debt += 1
+                state.probation = False
             if self._foreign_sync_now or (self._unconfigured and state.pdo.node_id in self._unconfigured):
                 state.fresh = False
             if not state.fresh:
@@ -212,9 +243,17 @@ class Intake:
                 self.rejected_frames += 1
             elif state.debt:
                 self._late(state)
+                state.probation = False
             else:
                 state.duplicates += 1
                 self.duplicate_frames += 1
+
+    def gap(self) -> None:
+        """This slot has no SYNC: what comes in it is late, what has not come by its end was lost."""
+        self.gaps += 1
+        self.gap_wanted = False
+        self._after_gap = True
+        self._gap_pause = _GAP_PAUSE
 
     def configured(self, node_id: int) -> None:
         """The node's mapping has been written and read back: its PDOs count again."""
@@ -264,22 +303,21 @@ class Intake:
         else:
             state.duplicates += 1
             self.duplicate_frames += 1
-            if data != state.data:
-                state.conflict = True
+        if data != state.data:
+            state.conflict = True
         state.values = state.unpack(data)
         state.data = data
         state.stamp_ns = stamp
 
-    def _pays_its_own(self, state: _State, delay_ns: int) -> bool:
-        """One frame came while an earlier one is missing: is it this cycle's own?"""
-        low, high = state.band_low_ns - _BAND_MARGIN_NS, state.band_high_ns + _BAND_MARGIN_NS
-        if delay_ns >= 0 and low <= delay_ns <= high:
-            state.lost += state.debt
-            state.debt = 0
-            return True
-        state.late += 1
-        self.late_frames += 1
-        return False
+    @staticmethod
+    def _usual(state: _State, delay_ns: int) -> bool:
+        """One frame came while an earlier one is missing: does its delay tell that it is this cycle's own?"""
+        low, high = state.band_low_ns, state.band_high_ns
+        return (
+            delay_ns >= 0
+            and high - low <= _NARROW_NS
+            and low - _BAND_MARGIN_NS <= delay_ns <= high + _BAND_MARGIN_NS
+        )
 
     @staticmethod
     def _learn(state: _State, delay_ns: int) -> None:

@@ -132,6 +132,9 @@ def run(cycle: Cycle, grid: Grid, stop: Callable[[], bool], duration_s: float | 
             continue
         if end_ns is not None and grid.slot_ns >= end_ns:
             break
+        if cycle.hold_back():
+            grid.advance(now)
+            continue
         cycle.begin()
         cycle.gather()
         cycle.observe()

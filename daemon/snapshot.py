@@ -25,6 +25,7 @@ COUNTERS = (
     "rejected_frames",
     "unknown_frames",
     "foreign_sync",
+    "sync_gaps",
     "boot_ups",
     "tx_dropped",
     "rx_dropped",

@@ -60,6 +60,7 @@ class Summary:
         faults = [
             f"{name.replace('_', ' ')} {counters[name]}"
             for name in (
+                "sync_gaps",
                 "late_frames",
                 "duplicate_frames",
                 "rejected_frames",

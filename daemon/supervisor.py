@@ -12,6 +12,7 @@ import select
 import signal
 import sys
 import time
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from types import FrameType
@@ -40,6 +41,7 @@ _WARM_UP_TIMEOUT_S = 60.0
 _TABLE_PERIOD_S = 0.2
 _LOG_PERIOD_S = 5.0
 _NMT_PRE_OPERATIONAL = 0x80
+_BENCH_PRIORITY = 40
 _OWN_EDS = Path(__file__).resolve().parent.parent / "drivers" / "eds" / "jtqd.eds"
 
 
@@ -140,6 +142,10 @@ class Supervisor:
             if time.monotonic() > deadline:
                 raise SupervisorError("the emulated bench did not open its bus")
             time.sleep(0.01)
+        if self._config.realtime.priority > _BENCH_PRIORITY:
+            # The emulated nodes stand for hardware: they come before everything but the loop.
+            with suppress(PermissionError):
+                os.sched_setscheduler(bench.pid, os.SCHED_FIFO, os.sched_param(_BENCH_PRIORITY))
         return bench
 
     def _loop_request(self) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from estimator.settings import EstimatorSettings
 from estimator.status import DEGRADED, STALE, STANDSTILL, VALID
 from estimator.whole_run import estimate_run
 from models.files import load_joint, load_yaml
+from sim_can.bench import LONGEST_STEP_NS
 from sysid.friction_fit import low_pass
 from sysid.joint_log import LogError, Records, read_topic
 
@@ -54,7 +55,7 @@ class BusRun:
     scored: int  # rows of both
     offline_difference_nm: float  # largest |published - offline|
     replay_difference_nm: float  # largest |logged - whole-run estimate of the logged inputs|
-    silent_after_end: bool  # every cycle after the run: status stale and no torque
+    silent_after_end: bool  # no cycle after the run published a torque, and the last status is stale
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,7 @@ def score_log(log: Path, index: int, played: Played) -> BusRun:
         scored=int(used.sum()),
         offline_difference_nm=float(np.max(np.abs(published - offline)[used])),
         replay_difference_nm=_replay(state, played),
-        silent_after_end=bool(np.all(state["status"][after] == STALE) and np.isnan(published[after]).all()),
+        silent_after_end=bool(np.isnan(published[after]).all() and state["status"][-1] == STALE),
     )
 
 
@@ -142,10 +143,14 @@ def _time(stamp: Records) -> Array:
 
 
 def _played_row(time_s: Array, run_s: Array) -> NDArray[np.intp]:
-    """Row of the run that a SYNC at time_s got: the nearest (sim_can.play); len(run_s) after the end."""
+    """Row of the run that a SYNC at time_s got: the nearest (sim_can.play); len(run_s) after the end.
+
+    As in the bench, a longer pause between two SYNCs than LONGEST_STEP_NS holds the run's time.
+    """
+    steps = np.minimum(np.diff(time_s, prepend=time_s[0]), LONGEST_STEP_NS * _NS)
     middles = 0.5 * (run_s[1:] + run_s[:-1]) - run_s[0]
     end = run_s[-1] - run_s[0] + 0.5 * (run_s[-1] - run_s[-2])
-    return np.searchsorted(np.append(middles, end), time_s, side="right")
+    return np.searchsorted(np.append(middles, end), np.cumsum(steps), side="right")
 
 
 def _offline(played: Played) -> Array:

@@ -65,7 +65,9 @@ class Bus:
 
 def python_estimates(fixture, tmp_path, monkeypatch, cycles):
     """Estimate PDOs of the real Cycle on the traffic of the benchmark, and the SYNC stamps it saw."""
-    bus = Bus([0, 700, -400, 250, -900])
+    bus = Bus(
+        [0, 700, -400, 250, -9000, 40_000]
+    )  # on both sides of what the loop takes for accuracy of a stamp
     clock = SimpleNamespace(monotonic_ns=bus.monotonic_ns, time_ns=bus.monotonic_ns, sleep=bus.sleep)
     monkeypatch.setattr(cycle_module, "time", clock)
     config = load_config(fixture.config)
@@ -101,10 +103,8 @@ def test_the_c_program_computes_what_the_python_loop_computes(tmp_path, monkeypa
         statuses |= {one[4] & 0x0F, one[4] >> 4}
     # starting, valid, degraded, standstill: every branch has been compared
     assert statuses == {1, 2, 3, 6}
-    DIFFS = [(n, estimate_pdo.LAYOUT.unpack(a), estimate_pdo.LAYOUT.unpack(b)) for n, (a, b) in enumerate(zip(expected, found, strict=True)) if a != b]
-    print(DIFFS[:10], [d[0] for d in DIFFS])
     equal = sum(a == b for a, b in zip(expected, found, strict=True))
-    assert equal > 0.99 * len(expected)
+    assert equal > 0.999 * len(expected)
 
 
 def test_traffic_closes_without_a_jump():

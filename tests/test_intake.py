@@ -1,6 +1,8 @@
 """Which frame belongs to which cycle: each scenario states what is sent and what must be believed."""
 
+import random
 import struct
+from collections.abc import Callable
 
 import pytest
 
@@ -82,13 +84,31 @@ def test_take_says_when_all_are_there() -> None:
     assert intake.take(bytearray(two(1)), [6], [False], 1)
 
 
-def test_a_lost_frame_makes_one_cycle_stale_and_is_counted_lost(bus: Bus) -> None:
+def test_a_lost_frame_is_written_off_once_the_next_one_has_come_alone_and_as_usual(bus: Bus) -> None:
     assert not bus.cycle((two(1), 300_000))
     assert not bus.intake.fresh(0)
     assert bus.intake.fresh(1)
-    assert bus.cycle((one(2), 210_000), (two(2), 300_000))
+    # This one could be the missing frame, late: it is not used, but as nothing else comes it settles the matter.
+    assert not bus.cycle((one(2), 210_000), (two(2), 300_000))
+    assert bus.cycle((one(3), 200_000), (two(3), 300_000))
+    assert bus.intake.values(0) == (3, -3)
     assert bus.intake.counters()["181h drive 1 TPDO1"]["lost"] == 1
-    assert bus.intake.stale_inputs == 1
+    assert bus.intake.stale_inputs == 2
+    assert not bus.intake.gap_wanted
+
+
+def test_where_arrivals_are_irregular_a_slot_without_sync_settles_it() -> None:
+    bus = Bus()
+    for n in range(50):
+        assert bus.cycle((one(n), 100_000 + 13_000 * n), (two(n), 300_000))  # a band of 0.6 ms tells nothing
+    assert not bus.cycle((two(1), 300_000))
+    assert not bus.cycle((one(2), 300_000), (two(2), 300_000))
+    assert bus.intake.gap_wanted
+    bus.intake.gap()
+    assert not bus.cycle((one(4), 300_000), (two(4), 300_000)), "the first cycle after a gap is not used yet"
+    assert bus.cycle((one(5), 300_000), (two(5), 300_000))
+    assert bus.intake.counters()["181h drive 1 TPDO1"]["lost"] == 1
+    assert bus.intake.gaps == 1
 
 
 def test_a_frame_after_the_deadline_is_late_and_never_used(bus: Bus) -> None:
@@ -99,21 +119,25 @@ def test_a_frame_after_the_deadline_is_late_and_never_used(bus: Bus) -> None:
     assert bus.intake.counters()["181h drive 1 TPDO1"]["lost"] == 0
 
 
-def test_a_frame_that_slips_into_the_next_cycle_is_not_that_cycles_own(bus: Bus) -> None:
+def test_a_frame_that_slips_into_the_next_cycle_spoils_that_one_and_pays(bus: Bus) -> None:
     assert not bus.cycle((two(1), 300_000))
-    # The frame of the cycle before arrives 20 us after SYNC, then this cycle's own: the later one counts.
-    assert bus.cycle((one(1), 20_000), (one(2), 200_000), (two(2), 300_000))
-    assert bus.intake.values(0) == (2, -2)
+    # The frame of the cycle before arrives 20 us after SYNC, then this cycle's own: nobody can say which is which.
+    assert not bus.cycle((one(1), 20_000), (one(2), 200_000), (two(2), 300_000))
     assert bus.intake.late_frames == 1
+    assert bus.cycle((one(3), 200_000), (two(3), 300_000))
+    assert bus.intake.values(0) == (3, -3)
 
 
 @pytest.mark.parametrize("delay_us", [1_300, 1_500, 1_900])
-def test_a_constant_delay_of_more_than_a_cycle_never_becomes_valid(bus: Bus, delay_us: int) -> None:
-    # Usual delay 200 us. From now on each frame comes `delay_us` after its own SYNC: one frame per cycle, always old.
-    assert not bus.cycle((two(0), 300_000))
-    for n in range(1, 200):
-        assert not bus.cycle((one(n - 1), (delay_us - 1000) * 1000), (two(n), 300_000))
-        assert not bus.intake.fresh(0)
+@pytest.mark.parametrize("spread_us", [20, 500])
+def test_a_constant_delay_of_more_than_a_cycle_never_becomes_valid(delay_us: int, spread_us: int) -> None:
+    """Usually 0.2 ms (plus up to `spread_us`); then each frame of TPDO1 comes `delay_us` after its own SYNC, for good."""
+    random_ = random.Random(delay_us + spread_us)
+    line = Timeline(lambda n: (200 + random_.randrange(spread_us), 300) if n < 100 else (delay_us, 300))
+    fresh = [line.slot() for _ in range(600)]
+    assert all(fresh[10:100])
+    assert not any(fresh[101:])
+    assert line.wrong == 0
 
 
 def test_a_frame_stamped_before_the_sync_is_of_an_earlier_cycle(bus: Bus) -> None:
@@ -173,31 +197,81 @@ def test_heartbeats_are_kept_by_node(bus: Bus) -> None:
     assert bus.intake.node_states == {1: 5}
 
 
-def test_random_faults_never_yield_an_input_of_another_cycle() -> None:
-    """Frames carry their cycle number; whatever is lost, late (by less than a cycle), doubled: fresh means this cycle."""
-    import random
+@pytest.mark.parametrize("spread_us", [20, 500])
+@pytest.mark.parametrize("seed", range(10))
+def test_whatever_is_lost_or_late_what_is_used_is_of_its_own_cycle(seed: int, spread_us: int) -> None:
+    """Frames carry the number of their SYNC. Lost, late by up to three cycles, in bursts: what is fresh carries this one."""
+    random_ = random.Random(seed)
 
-    for seed in range(20):
-        random_ = random.Random(seed)
-        bus = Bus()
-        bus.settle()
-        carried: list[bytes] = []
-        for n in range(300):
-            arrivals = [(data, random_.randrange(5_000, 100_000)) for data in carried]
-            carried, late = [], []
-            for make, usual in ((one, 200_000), (two, 300_000)):
-                kind = random_.random()
-                data = make(n)
-                if kind < 0.80:
-                    arrivals.append((data, usual + random_.randrange(-20_000, 20_000)))
-                    if kind < 0.05:
-                        arrivals.append((data, usual + 40_000))
-                elif kind < 0.87:
-                    late.append(data)
-                elif kind < 0.94:
-                    carried.append(data)
-            arrivals.sort(key=lambda arrival: arrival[1])
-            bus.cycle(*arrivals, late=tuple(late))
-            for index in (0, 1):
-                if bus.intake.fresh(index):
-                    assert bus.intake.values(index)[0] == n, f"seed {seed} cycle {n}"
+    def delays(n: int) -> tuple[int | None, int | None]:
+        result: list[int | None] = []
+        for usual in (200, 300):
+            kind = random_.random()
+            if kind < 0.90:
+                result.append(usual + random_.randrange(spread_us))
+            elif kind < 0.94:
+                result.append(None)
+            else:
+                # Not within the arrival band of a later cycle: that case is the limit stated in docs/safety.md.
+                result.append(random_.choice([850, 1600, 2700]) + random_.randrange(100))
+        return result[0], result[1]
+
+    line = Timeline(delays)
+    used = sum(line.slot() for _ in range(2000))
+    assert line.wrong == 0, f"seed {seed}"
+    assert used > 500, "and it still works"
+
+
+def test_a_node_that_stalls_and_then_answers_everything_at_once() -> None:
+    """20 SYNCs are answered in one burst; none of the old answers is taken for a new one."""
+    line = Timeline(
+        lambda n: (200, 300) if not 100 <= n < 120 else (200 + (120 - n) * 1000, 300 + (120 - n) * 1000)
+    )
+    used = [line.slot() for _ in range(300)]
+    assert line.wrong == 0
+    assert all(used[130:])
+
+
+class Timeline:
+    """A bus in time: answers of SYNC n come after `delays(n)` us (None: never); slots of 1 ms, deadline after 0.85 ms."""
+
+    def __init__(self, delays: Callable[[int], tuple[int | None, int | None]]) -> None:
+        self.intake = Intake([TPDO1, TPDO2])
+        self.delays = delays
+        self.now_us = 1_000_000
+        self.syncs = 0
+        self.pending: list[tuple[int, bytes]] = []
+        self.last = [0, 0]
+        self.wrong = 0
+
+    def _arrived(self, until_us: int) -> tuple[bytearray, list[int], list[bool], int]:
+        come = sorted((item for item in self.pending if item[0] < until_us), key=lambda item: item[0])
+        self.pending = [item for item in self.pending if item[0] >= until_us]
+        return (
+            bytearray(b"".join(d for _, d in come)),
+            [t * 1000 for t, _ in come],
+            [False] * len(come),
+            len(come),
+        )
+
+    def slot(self) -> bool:
+        """One slot; True when all inputs of its cycle were used (False in a gap)."""
+        intake, start = self.intake, self.now_us
+        self.now_us += 1000
+        intake.drain(*self._arrived(start))
+        if intake.gap_wanted:
+            intake.gap()
+            return False
+        for n, (delay, make) in enumerate(zip(self.delays(self.syncs), (one, two), strict=True)):
+            if delay is not None:
+                self.last[n] = max(
+                    start + delay, self.last[n] + 50
+                )  # a controller keeps the order of its queue
+                self.pending.append((self.last[n], make(self.syncs)))
+        intake.begin()
+        intake.take(bytearray(frame(0x080, b"\x01")), [start * 1000], [True], 1)
+        intake.take(*self._arrived(start + 850))
+        complete = intake.close()
+        self.wrong += sum(intake.fresh(n) and intake.values(n)[0] != self.syncs for n in (0, 1))
+        self.syncs += 1
+        return complete

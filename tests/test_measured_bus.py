@@ -1,11 +1,16 @@
 """The measured run over the bus: jtqd against a played run on vcan0, in exact time, scored from its own log."""
 
+import subprocess
+import sys
+import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from drivers.frame import FRAME, pack
+from drivers.frame_socket import open_frame_socket
 from estimator.status import STALE, STARTING
 from models.files import load_yaml, shipped
 from sim_can.run_files import ColumnMap, read_run
@@ -40,7 +45,12 @@ def test_a_played_run_on_vcan_is_the_offline_estimate_and_then_stale(tmp_path, m
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
     config, path = config_file(RUN, False), shipped(f"kinova_gen3/{RUN}.csv.gz")
     table = read_run(path, ColumnMap.load(shipped("kinova_gen3/columns.yaml"))).table
-    log, summary = record("vcan0", path, config, float(table.time_s[-1]), tmp_path)
+    dump = tmp_path / "dump.log"
+    with dump.open("w") as file:
+        candump = subprocess.Popen(["candump", "-L", "vcan0,1A0:7FF"], stdout=file)
+        log, summary = record("vcan0", path, config, float(table.time_s[-1]), tmp_path)
+        candump.terminate()
+        candump.wait()
     joints, settings = configured(config)
     assert summary["missed"] == 0
     assert summary["recording"]["lost"] == 0
@@ -67,6 +77,19 @@ def test_a_played_run_on_vcan_is_the_offline_estimate_and_then_stale(tmp_path, m
         assert other.offline_difference_nm > 1.0
 
     check_against_the_independent_decoder(log)
+    check_against_the_bus(dump, published_torque(frames, 0), published_torque(frames, 1))
+
+
+def check_against_the_bus(dump, *published) -> None:
+    """What the log says was published is what another node saw, and it ends with "off"."""
+    seen = [bytes.fromhex(line.rsplit("#", 1)[1]) for line in dump.read_text().splitlines()]
+    assert len(seen) == len(published[0]) + 1
+    torque = np.array([np.frombuffer(data[:4], "<i2") for data in seen])
+    for joint, values in enumerate(published):
+        expected = np.where(np.isnan(values), -0x8000, np.nan_to_num(values) * 100.0)
+        assert torque[:-1, joint] == pytest.approx(expected, abs=1e-6)
+    assert (torque[-1] == -0x8000).all()
+    assert seen[-1][6] == 0
 
 
 def check_against_the_independent_decoder(log) -> None:
@@ -109,3 +132,42 @@ def same(found, expected) -> None:
         assert found == expected.encode()
     else:
         assert found == expected or (np.isnan(found) and np.isnan(expected))
+
+
+def test_a_unix_bus_outlives_the_run_that_was_played_on_it(tmp_path) -> None:
+    rows = "".join(f"{k / 1000},1,{0.001 * k},1,{0.001 * k}\n" for k in range(30))
+    run = tmp_path / "run.csv"
+    run.write_text("time_s,j1.current_a,j1.link_position_rad,j2.current_a,j2.link_position_rad\n" + rows)
+    bus = f"unix:{tmp_path}/bus"
+    play = subprocess.Popen(
+        [sys.executable, "-m", "sim_can", "--bus", bus, "--play", str(run)], stderr=subprocess.PIPE, text=True
+    )
+    try:
+        assert play.stderr.readline() == f"bench ready on {bus}\n"
+        socket = open_frame_socket(bus, None)
+        socket.send(pack(0x000, bytes((1, 0))))
+        answers = [answered(socket, 0.05) for _ in range(30)]
+        assert answers[0] >= {0x181, 0x281, 0x182, 0x282, 0x183}
+        assert not any(answers[-3:])  # at 1 ms or more between SYNCs the run is over long before
+        assert play.poll() is None
+        socket.send(pack(0x601, bytes((0x40, 0x00, 0x10, 0, 0, 0, 0, 0))))
+        assert not socket.wait(0.1)  # silent means all services
+        socket.close()
+        assert play.wait(10) == 0
+        assert "the run is over" in play.stderr.read()
+    finally:
+        play.kill()
+        play.wait()
+        play.stderr.close()
+
+
+def answered(socket, wait_s) -> set[int]:
+    """Identifiers of what comes within wait_s of a SYNC."""
+    socket.send(pack(0x080, b"\x01"))
+    found: set[int] = set()
+    end = time.monotonic() + wait_s
+    while (left := end - time.monotonic()) > 0:
+        if socket.wait(left):
+            count = socket.receive()
+            found |= {FRAME.unpack_from(socket.frames, 16 * k)[0] for k in range(count)}
+    return found - {0x701, 0x702, 0x703}

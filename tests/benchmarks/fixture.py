@@ -82,13 +82,13 @@ def small_network(number: int) -> SmallNetwork:
     features = rng.uniform(-1.0, 1.0, (4000, len(FEATURES)))
     h = features
     for inputs, outputs in pairwise(sizes):
-        w: FloatArray = rng.normal(0.0, 1.0 / np.sqrt(inputs), (inputs, outputs))
-        b: FloatArray = rng.normal(0.0, 0.1, outputs)
-        layers.append((w, b))
+        w = rng.normal(0.0, 1.0 / np.sqrt(inputs), (inputs, outputs))
+        b = rng.normal(0.0, 0.1, outputs)
+        layers.append((np.asarray(w, np.float64), np.asarray(b, np.float64)))
         h = np.tanh(0.5 * (h @ w + b))
     target = features[:, -1] + 0.02 * np.sin(3.0 * features[:, 1])
     solution = np.linalg.lstsq(np.column_stack([h, np.ones(len(h))]), target, rcond=None)[0]
-    layers.append((solution[:-1, None], solution[-1:]))
+    layers.append((np.asarray(solution[:-1, None], np.float64), np.asarray(solution[-1:], np.float64)))
     return SmallNetwork(
         tuple(layers), (ENVELOPE_LOW + ENVELOPE_HIGH) / 2.0, (ENVELOPE_HIGH - ENVELOPE_LOW) / 2.0, 0.0, 40.0
     )

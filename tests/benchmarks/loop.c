@@ -200,7 +200,10 @@ static void observe(loop_state *s, int64_t sync, cycle_record *r, uint8_t pdo[8]
             j->motor_velocity = i32(motion->data) * MOTOR_RAD_S_PER_UNIT;
             j->current = i16(motion->data + 4) * AMPERE_PER_UNIT;
             j->statusword = u16(motion->data + 6);
-            j->dt = s->last_sync ? (sync - s->last_sync) * 1e-9 : 0.0;
+            int64_t dt = s->last_sync ? sync - s->last_sync : 0;
+            if (dt - PERIOD > -STAMP_ACCURACY_NS && dt - PERIOD < STAMP_ACCURACY_NS)
+                dt = PERIOD;
+            j->dt = dt * 1e-9;
             e = step(&parameters[n], &s->joints[n], j->dt, j->current, j->motor_position, j->motor_velocity, j->link_position);
             bool known = e.status == VALID || e.status == DEGRADED || e.status == STANDSTILL;
             if (s->index < STARTING_CYCLES && known)
