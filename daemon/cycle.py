@@ -244,11 +244,13 @@ class Cycle:
     def hold_back(self) -> bool:
         """True when this slot must pass without SYNC, so that late frames can be told from lost ones (see intake)."""
         intake = self.intake
-        if not intake.gap_wanted:
+        if not (intake.gap_wanted or intake.in_gap):
             return False
         count = self._receive()
         if count:
             intake.drain(self.socket.frames, self.socket.stamps_ns, self.socket.own, count)
+        if not intake.gap_wanted:
+            return False
         intake.gap()
         self.index += 1
         return True

@@ -9,8 +9,10 @@ the same PDO can still be under way:
   frame (two in one cycle), or written off in one of two ways:
   - the arrivals have been so regular that their delay tells: one frame came, in the usual band, and no other until the
     next SYNC: the missing one was lost;
-  - otherwise the loop is asked for a *gap*: one slot without SYNC, in which only late frames can come. What has not come
-    by its end was lost, and the first cycle after it is not used yet.
+  - otherwise the loop is asked for a *gap*: slots without SYNC, in which only late frames can come, until one passes
+    without any. What has not come by then was lost.
+* a surplus frame with other bytes, when no debt was left, shows that an account was closed too early; after that, and after
+  each gap, a PDO is used again only when some cycles in a row have brought exactly one frame each.
   A constant delay of more than one cycle thus never becomes valid, however irregular the arrivals are. This relies on the
   frames of one PDO keeping their order, as they do in a CAN controller;
 * two frames in one cycle are harmless with equal bytes and a conflict with others (one is late, or there are two senders):
@@ -38,6 +40,10 @@ _BAND_MARGIN_NS = 50_000
 """Allowance around the learned delays: one frame of 135 bits may have been in the way less than twice."""
 _NARROW_NS = 200_000
 """A band wider than this cannot tell a late frame from one in time."""
+_LONGEST_GAP = 10
+"""Slots; after that SYNC goes on and the debts stay."""
+_QUARANTINE = 5
+"""Cycles with exactly one frame each before a PDO is used again whose account was closed without its frame."""
 _GAP_PAUSE = 20
 """Cycles between two gaps: a bus that loses frames all the time must not lose its SYNC as well."""
 _BAND_LEAK = 1.0 / 1024.0
@@ -79,6 +85,7 @@ class _State:
         "lost",
         "pdo",
         "probation",
+        "quarantine",
         "rejected",
         "stamp_ns",
         "unpack",
@@ -95,6 +102,7 @@ class _State:
         self.conflict = False
         self.debt = 0
         self.probation = False
+        self.quarantine = 0
         self.stamp_ns = 0
         self.band_low_ns = 1 << 62
         self.band_high_ns = 0
@@ -127,6 +135,8 @@ class Intake:
         self._foreign_sync_now = False
         self._after_gap = False
         self._gap_pause = 0
+        self._gap_length = 0
+        self._gap_arrivals = 0
         self.gap_wanted = False
         self.gaps = 0
         """Slots without SYNC so far."""
@@ -147,13 +157,16 @@ class Intake:
             state.fresh = False
             state.conflict = False
             if state.debt:
-                if state.probation or self._after_gap:
+                if state.probation or (self._after_gap and not self._gap_arrivals):
                     state.lost += state.debt
                     state.debt = 0
-                    state.probation = self._after_gap
+                    state.probation = False
+                    if self._after_gap:
+                        state.quarantine = _QUARANTINE
                 else:
                     indebted = True
         self._after_gap = False
+        self._gap_length = 0
         if self._gap_pause:
             self._gap_pause -= 1
         # With a debt one more frame may come: then only the deadline ends the wait.
@@ -215,8 +228,9 @@ class Intake:
                     state.probation = self._usual(state, delay)
                     if not state.probation and not self._gap_pause:
                         self.gap_wanted = True
-                elif state.probation:
-                    state.fresh = state.probation = False
+                elif state.quarantine:
+                    state.quarantine -= 1
+                    state.fresh = False
                 elif delay >= 0:
                     self._learn(state, delay)
                 if state.conflict:
@@ -244,15 +258,22 @@ class Intake:
             elif state.debt:
                 self._late(state)
                 state.probation = False
+                self._gap_arrivals += 1
             else:
                 state.duplicates += 1
                 self.duplicate_frames += 1
+                if frames[16 * n + 8 : 16 * n + 16] != state.data:
+                    state.quarantine = _QUARANTINE
+        if self._after_gap and self._gap_arrivals and self._gap_length < _LONGEST_GAP:
+            self.gap_wanted = any(state.debt for state in self._states)
 
     def gap(self) -> None:
-        """This slot has no SYNC: what comes in it is late, what has not come by its end was lost."""
+        """This slot has no SYNC: what comes in it is late, what has not come by the end of a silent one was lost."""
         self.gaps += 1
         self.gap_wanted = False
         self._after_gap = True
+        self._gap_arrivals = 0
+        self._gap_length += 1
         self._gap_pause = _GAP_PAUSE
 
     def configured(self, node_id: int) -> None:
@@ -260,6 +281,11 @@ class Intake:
         self._unconfigured.discard(node_id)
         for state in self._of_node.get(node_id, ()):
             state.debt = 0
+
+    @property
+    def in_gap(self) -> bool:
+        """The last slot passed without SYNC."""
+        return self._after_gap
 
     @property
     def unconfigured(self) -> frozenset[int]:
@@ -303,6 +329,8 @@ class Intake:
         else:
             state.duplicates += 1
             self.duplicate_frames += 1
+            if data != state.data:
+                state.quarantine = _QUARANTINE
         if data != state.data:
             state.conflict = True
         state.values = state.unpack(data)

@@ -105,7 +105,8 @@ def test_where_arrivals_are_irregular_a_slot_without_sync_settles_it() -> None:
     assert not bus.cycle((one(2), 300_000), (two(2), 300_000))
     assert bus.intake.gap_wanted
     bus.intake.gap()
-    assert not bus.cycle((one(4), 300_000), (two(4), 300_000)), "the first cycle after a gap is not used yet"
+    for n in range(5):
+        assert not bus.cycle((one(n), 300_000), (two(n), 300_000)), "five regular cycles first"
     assert bus.cycle((one(5), 300_000), (two(5), 300_000))
     assert bus.intake.counters()["181h drive 1 TPDO1"]["lost"] == 1
     assert bus.intake.gaps == 1
@@ -152,9 +153,10 @@ def test_equal_duplicates_are_harmless_and_counted(bus: Bus) -> None:
 
 
 def test_two_senders_of_one_pdo_are_a_conflict(bus: Bus) -> None:
-    assert not bus.cycle((one(3), 200_000), (one(4), 220_000), (two(3), 300_000))
-    assert not bus.intake.fresh(0)
-    assert bus.intake.fresh(1)
+    for _ in range(100):
+        assert not bus.cycle((one(3), 200_000), (one(4), 220_000), (two(3), 300_000))
+        assert not bus.intake.fresh(0)
+        assert bus.intake.fresh(1)
 
 
 @pytest.mark.parametrize("length", [0, 1, 4, 7])
@@ -198,8 +200,11 @@ def test_heartbeats_are_kept_by_node(bus: Bus) -> None:
 
 
 @pytest.mark.parametrize("spread_us", [20, 500])
+@pytest.mark.parametrize(("bad", "enough"), [(0.03, 1000), (0.10, 200)])
 @pytest.mark.parametrize("seed", range(10))
-def test_whatever_is_lost_or_late_what_is_used_is_of_its_own_cycle(seed: int, spread_us: int) -> None:
+def test_whatever_is_lost_or_late_what_is_used_is_of_its_own_cycle(
+    seed: int, bad: float, enough: int, spread_us: int
+) -> None:
     """Frames carry the number of their SYNC. Lost, late by up to three cycles, in bursts: what is fresh carries this one."""
     random_ = random.Random(seed)
 
@@ -207,9 +212,9 @@ def test_whatever_is_lost_or_late_what_is_used_is_of_its_own_cycle(seed: int, sp
         result: list[int | None] = []
         for usual in (200, 300):
             kind = random_.random()
-            if kind < 0.90:
+            if kind > bad:
                 result.append(usual + random_.randrange(spread_us))
-            elif kind < 0.94:
+            elif kind < 0.4 * bad:
                 result.append(None)
             else:
                 # Not within the arrival band of a later cycle: that case is the limit stated in docs/safety.md.
@@ -219,23 +224,29 @@ def test_whatever_is_lost_or_late_what_is_used_is_of_its_own_cycle(seed: int, sp
     line = Timeline(delays)
     used = sum(line.slot() for _ in range(2000))
     assert line.wrong == 0, f"seed {seed}"
-    assert used > 500, "and it still works"
+    assert used > enough, "and it still works"
 
 
-def test_a_node_that_stalls_and_then_answers_everything_at_once() -> None:
-    """20 SYNCs are answered in one burst; none of the old answers is taken for a new one."""
-    line = Timeline(
-        lambda n: (200, 300) if not 100 <= n < 120 else (200 + (120 - n) * 1000, 300 + (120 - n) * 1000)
-    )
-    used = [line.slot() for _ in range(300)]
-    assert line.wrong == 0
-    assert all(used[130:])
+@pytest.mark.parametrize("spread_us", [20, 500])
+@pytest.mark.parametrize("seed", range(20))
+def test_a_node_that_stalls_and_then_answers_every_sync_late(seed: int, spread_us: int) -> None:
+    """Stalls of 0.5 to 30 ms; afterwards the queued SYNCs are answered one after the other. Old answers are never used."""
+    random_ = random.Random(100 + seed)
+    line = Timeline(lambda n: (200 + random_.randrange(spread_us), 300), service_us=120)
+    used = 0
+    for _ in range(4000):
+        if random_.random() < 0.01:
+            line.stall(random_.randrange(500, 30_000))
+        used += line.slot()
+    assert line.wrong == 0, f"seed {seed}"
+    assert used > 400, "and it still works"
 
 
 class Timeline:
     """A bus in time: answers of SYNC n come after `delays(n)` us (None: never); slots of 1 ms, deadline after 0.85 ms."""
 
-    def __init__(self, delays: Callable[[int], tuple[int | None, int | None]]) -> None:
+    def __init__(self, delays: Callable[[int], tuple[int | None, int | None]], service_us: int = 50) -> None:
+        self.service_us = service_us
         self.intake = Intake([TPDO1, TPDO2])
         self.delays = delays
         self.now_us = 1_000_000
@@ -253,6 +264,10 @@ class Timeline:
             [False] * len(come),
             len(come),
         )
+
+    def stall(self, duration_us: int) -> None:
+        """The node answers nothing for so long, then everything in order."""
+        self.last = [max(last, self.now_us + duration_us) for last in self.last]
 
     def slot(self) -> bool:
         """One slot; True when all inputs of its cycle were used (False in a gap)."""
