@@ -8,6 +8,8 @@ import sys
 
 COMMANDS = {
     "sim": ("sim_can.cli", "emulate the bench on a bus, or play a measured run on it"),
+    "train": ("sysid.train_command", "train the networks of both joints on emulated runs (extra: train)"),
+    "plot": ("sysid.plot_command", "draw a log: estimate beside the torque sensor"),
     "bus-load": ("daemon.bus_load_command", "worst-case load of the bus by a configuration"),
     "measured": (
         "sysid.measured",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 import sys
 import tempfile
 from pathlib import Path
@@ -50,6 +51,8 @@ def main(arguments: list[str] | None = None) -> int:
     results: dict[str, Any] = {"machine": host.description()}
     if not options.json:
         print(f"{results['machine']}\n")
+    # So that what was started is ended and what was written is removed.
+    signal.signal(signal.SIGTERM, lambda _number, _frame: sys.exit(1))
     failed = False
     # On a tmpfs, as the loop's shared memory is in service.
     shared = "/dev/shm" if Path("/dev/shm").is_dir() else None

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -45,6 +47,15 @@ def serve(make: Callable[[Task], Runner]) -> int:
     return 0
 
 
+_LIBC = ctypes.CDLL(None)
+_PR_SET_PDEATHSIG = 1
+
+
+def _die_with_parent() -> None:
+    """However the benchmark ends, no process of it goes on: some of them hold a core at a real-time priority."""
+    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+
+
 class Process:
     """A contender or helper process as the benchmark sees it."""
 
@@ -52,7 +63,13 @@ class Process:
         self.name = name
         environment = os.environ | {"PYTHONPATH": str(ROOT)}
         self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT, env=environment
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=ROOT,
+            env=environment,
+            preexec_fn=_die_with_parent,  # noqa: PLW1509 - the benchmark has no threads
         )
         self.pid = self._process.pid
         self._line()
@@ -81,10 +98,10 @@ class Process:
         return self.result()
 
     def end(self) -> None:
-        """Close its input, tell it to end, and wait."""
+        """End it; SIGKILL, because a shell may have made its children ignore SIGTERM, and nothing is to be saved."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        self._process.terminate()
+        self._process.kill()
         self._process.wait()
         self._process.stdin.close()
         self._process.stdout.close()

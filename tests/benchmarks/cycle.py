@@ -19,7 +19,7 @@ USUAL_RATIO, C_RATIO = 5.0, 4.0
 def run(
     fixture: Fixture, *, rounds: int, seconds: float, quiet: bool, bitrate: int | None = None
 ) -> dict[str, Any]:
-    """Measure; `quiet` holds the contenders' core (see host.py), `bitrate` spaces the frames as a wire does."""
+    """Measure; `quiet` keeps the contenders' core awake (see host.py), `bitrate` spaces the frames as a wire does."""
     program = c_program.build(fixture)
     where = host.cpus()
     traffic = host.traffic(fixture.directory, where, bitrate)

@@ -1,10 +1,9 @@
 """The machine the benchmark runs on: which CPU does what, how much of it others use, and a core that is left alone.
 
 A virtual machine makes sleeping dear: the idle CPU is given back to the host, waking it up goes through the hypervisor
-and finds cold caches. "Quiet core" here means what isolcpus and idle=poll give a real-time process: nobody else runs
-there, and it never goes idle. A spinner at the lowest real-time priority does both without any change to the system; the
-loop preempts it, and only the CPU of the contender's own process is counted. A core held like this starves what else
-wants to run on it, so the kernel takes it away for up to 5 % of each second: missed slots under it mean nothing.
+and finds cold caches. "Quiet core" here means a core that never goes idle, as with idle=poll on a real-time system: a
+spinner of class SCHED_IDLE runs there whenever nobody else does. Everything else preempts it at once, and only the CPU of
+the contender's own process is counted. It cannot keep others away: how busy the machine was is part of the result.
 """
 
 from __future__ import annotations
@@ -75,7 +74,7 @@ def traffic(directory: Path, where: Cpus, bitrate: int | None = None) -> Process
 
 
 def quiet_core(program: Path, where: Cpus) -> Process | None:
-    """Hold the contender's CPU; None when there is only one CPU, which the traffic needs too."""
+    """Keep the contender's CPU awake; None when there is only one CPU, which the traffic needs too."""
     if where.loop is None:
         return None
-    return Process([str(program), "hold", str(where.loop)], "the spinner")
+    return Process([str(program), "awake", str(where.loop)], "the spinner")

@@ -15,7 +15,7 @@ _ROUND_S = 60.0
 
 
 def run(fixture: Fixture, *, minutes: float) -> dict[str, Any]:
-    """Run both for `minutes`, as the machine is: no core is held."""
+    """Run both for `minutes`, as the machine is: no core is kept awake."""
     where = host.cpus()
     traffic = host.traffic(fixture.directory, where)
     task = Task(f"unix:{fixture.directory / 'bus'}", fixture.directory, where.loop)

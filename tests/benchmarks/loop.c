@@ -1,7 +1,7 @@
 /* Contender: the loop of jtqd as one would write it in C. Same frames, arithmetic, estimate PDO and cycle record.
 
    loop run BUS CPU PRIORITY RING    one round per line "run CYCLES" on standard input, one JSON line per round on standard output
-   loop hold CPU                     keeps a CPU busy at the lowest real-time priority, until killed: see host.py
+   loop awake CPU                    keeps a CPU from going idle, in whose time nobody else wants it: see host.py
    loop replay IN OUT                cycles from a file (SYNC stamp i64, then five frames of 16 bytes), eight bytes of estimate PDO each
 
    parameters.h is written by c_program.py from the same configuration and networks that the Python contenders read. */
@@ -10,7 +10,6 @@
 #include <fcntl.h>
 #include <poll.h>
 #include <sched.h>
-#include <signal.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -393,42 +392,43 @@ static int replay(const char *in, const char *out)
     return source && sink && fclose(sink) == 0 ? 0 : 1;
 }
 
-static void stay_on(int cpu, int priority)
+static void stay_on(int cpu)
 {
-    struct sched_param wanted = {priority};
     if (cpu >= 0) {
         cpu_set_t set;
         CPU_ZERO(&set);
         CPU_SET(cpu, &set);
         sched_setaffinity(0, sizeof set, &set);
     }
-    if (sched_setscheduler(0, SCHED_FIFO, &wanted) && priority == 1) {
-        wanted.sched_priority = 0;
-        sched_setscheduler(0, SCHED_IDLE, &wanted);
-    }
 }
 
-static void hold(int cpu)
+static void keep_awake(int cpu)
 {
-    prctl(PR_SET_PDEATHSIG, SIGTERM, 0, 0, 0);
-    stay_on(cpu, 1);
+    struct sched_param none = {0};
+    stay_on(cpu);
+    if (sched_setscheduler(0, SCHED_IDLE, &none))
+        exit(1);
     puts("ready");
     fflush(stdout);
-    for (;;)
-        __asm__ volatile("" ::: "memory");
+    while (getppid() != 1) /* the parent ends it by SIGKILL; without a parent it ends itself */
+        for (volatile int n = 0; n < 1000000; n++)
+            ;
+    exit(0);
 }
 
 int main(int argc, char **argv)
 {
-    if (argc == 3 && !strcmp(argv[1], "hold"))
-        hold(atoi(argv[2]));
+    if (argc == 3 && !strcmp(argv[1], "awake"))
+        keep_awake(atoi(argv[2]));
     if (argc == 4 && !strcmp(argv[1], "replay"))
         return replay(argv[2], argv[3]);
     if (argc != 6 || strcmp(argv[1], "run"))
         return 2;
     prctl(PR_SET_TIMERSLACK, 1UL, 0, 0, 0);
     mlockall(MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT);
-    stay_on(atoi(argv[3]), atoi(argv[4]));
+    struct sched_param priority = {atoi(argv[4])};
+    stay_on(atoi(argv[3]));
+    sched_setscheduler(0, SCHED_FIFO, &priority);
     puts("ready");
     fflush(stdout);
     long cycles;

@@ -7,11 +7,9 @@ runs, so that it has answered long before the inputs are due.
 
 from __future__ import annotations
 
-import signal
 import struct
 import sys
 from math import cos, pi, sin
-from types import FrameType
 
 from drivers.frame import pack
 from drivers.hub import Hub
@@ -57,7 +55,7 @@ def cycle_frames(cycle: int) -> list[bytes]:
 
 
 def serve(path: str, cpu: int | None, bitrate: int | None) -> None:
-    """Answer every SYNC on the hub at `path` until SIGTERM; prints one line when it is ready."""
+    """Answer every SYNC on the hub at `path` until it is killed; prints one line when it is ready."""
     punctual(cpu, _PRIORITY)  # drives answer in time whatever else runs on a controller
     table = [cycle_frames(cycle) for cycle in range(CYCLES)]
     hub = Hub(path, bitrate)
@@ -71,17 +69,9 @@ def serve(path: str, cpu: int | None, bitrate: int | None) -> None:
             step = (step + 1) % CYCLES
 
     port = hub.attach(on_frame)
-    stop = False
-
-    def end(_number: int, _frame: FrameType | None) -> None:
-        nonlocal stop
-        stop = True
-
-    signal.signal(signal.SIGTERM, end)
     print("ready", flush=True)
-    while not stop:
-        hub.run_once(0.5)
-    hub.close()
+    while True:
+        hub.run_once(None)
 
 
 if __name__ == "__main__":
