@@ -32,6 +32,9 @@ from estimator.joint_estimator import Estimate, JointEstimator
 _STARTING_CYCLES = 20
 """Cycles at the start that are published as "starting": the arrival bands and the filters see their first inputs."""
 _SNAPSHOT_EVERY = 8
+_WAIT_STEP_NS = 160
+_WAKE_MARGIN_NS = 10_000
+_SHORTEST_WAIT_NS = 50_000
 _STAMP_ACCURACY_NS = 5_000
 """Kernel software stamps differ by a few us from the time on the wire."""
 _POWERED = {0x27, 0x07}
@@ -89,7 +92,8 @@ class Cycle:
         ring, snapshot: shared memory towards recorder and viewers.
         node_id: own node-ID; the estimate PDO is 180h + node_id, the heartbeat 700h + node_id.
         counter_overflow: SYNC counter runs 1..overflow (1019h).
-        wait_ns, deadline_ns: see docs/architecture.md, from SYNC on.
+        wait_ns: from SYNC to the wake-up for the inputs at the start; it follows their arrival.
+        deadline_ns: from SYNC to the end of the wait for them.
         heartbeat_cycles: cycles between two heartbeats.
         grid: time grid; its slot is the current cycle's.
     """
@@ -180,6 +184,7 @@ class Cycle:
                 break
         if intake.close():
             self._flags |= cr.FLAG_COMPLETE
+            self._adapt_wait(intake.last_delay_ns)
         if intake.unconfigured:
             self._see_configured()
         if intake.sync_stamp_ns:
@@ -342,6 +347,13 @@ class Cycle:
         joint.status = st.STALE
         joint.sample = (nan,) * 4 + (sensor_nm,) + (nan,) * 6 + (0, st.STALE, sensor_status, flags)
         joint.view = (nan,) * 5 + (sensor_nm, 0, st.STALE, sensor_status)
+
+    def _adapt_wait(self, last_delay_ns: int) -> None:
+        """Wake up when 99 of 100 times everything has come: each frame waited for is a wake-up more."""
+        if last_delay_ns + _WAKE_MARGIN_NS > self._wait_ns:
+            self._wait_ns = min(self._wait_ns + 99 * _WAIT_STEP_NS, self._deadline_ns - _WAKE_MARGIN_NS)
+        else:
+            self._wait_ns = max(self._wait_ns - _WAIT_STEP_NS, _SHORTEST_WAIT_NS)
 
     def _receive(self) -> int:
         try:

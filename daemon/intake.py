@@ -140,6 +140,8 @@ class Intake:
         self.gap_wanted = False
         self.gaps = 0
         """Slots without SYNC so far."""
+        self.last_delay_ns = 0
+        """Delay of the last input after the SYNC, in the last cycle that had them all."""
         self.sync_stamp_ns = 0
         """CLOCK_REALTIME stamp of the own SYNC's echo, 0 while it has not been seen in this cycle."""
         self.foreign_sync = 0
@@ -220,6 +222,7 @@ class Intake:
         """
         sync_ns = self.sync_stamp_ns
         complete = True
+        last_ns = 0
         for state in self._states:
             if state.fresh:
                 delay = state.stamp_ns - sync_ns if sync_ns else -1
@@ -233,6 +236,7 @@ class Intake:
                     state.fresh = False
                 elif delay >= 0:
                     self._learn(state, delay)
+                    last_ns = max(last_ns, delay)
                 if state.conflict:
                     state.fresh = False
             else:
@@ -243,6 +247,8 @@ class Intake:
             if not state.fresh:
                 self.stale_inputs += 1
                 complete = False
+        if complete and last_ns:
+            self.last_delay_ns = last_ns
         return complete
 
     def drain(self, frames: bytearray, stamps_ns: Sequence[int], own: Sequence[bool], count: int) -> None:

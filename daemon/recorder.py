@@ -24,8 +24,9 @@ from daemon import cycle_record
 from daemon import mcap_schemas as schemas
 from daemon.mcap_messages import BLOCK_PARTS, JointStateMessage
 from daemon.mcap_writer import McapFile
+from daemon.recorder_progress import ProgressFile
 from daemon.recorder_request import RecorderRequest, RequestError
-from daemon.recording import INFO, Recording
+from daemon.recording import INFO, Account, Recording
 from daemon.ring import RingError, RingReader
 
 POLL_S = 0.05
@@ -132,8 +133,16 @@ def _open_ring(request: RecorderRequest, stop: _Stop) -> RingReader:
 class Recorder:
     """The polling loop around one `Recording`."""
 
-    def __init__(self, reader: RingReader, recording: Recording, chunk_s: float, stop: _Stop) -> None:
+    def __init__(
+        self,
+        reader: RingReader,
+        recording: Recording,
+        chunk_s: float,
+        stop: _Stop,
+        progress: ProgressFile | None,
+    ) -> None:
         self._reader = reader
+        self._progress = progress
         self._recording = recording
         self._chunk_s = chunk_s
         self._stop = stop
@@ -153,8 +162,11 @@ class Recorder:
 
     def run(self) -> None:
         """Record until told to end, then until the loop is quiet."""
-        if self._reader.position:
-            self._recording.lose(self._reader.position, time.time_ns())
+        settled = self._recording.account.cycles
+        if self._reader.position > settled:
+            self._recording.lose(self._reader.position - settled, time.time_ns())
+        else:
+            self._reader.position = settled
         now = time.monotonic()
         last_taken = last_flush = last_diagnosis = now
         cpu, asked = time.process_time(), None
@@ -181,7 +193,13 @@ class Recorder:
             elif now - last_flush >= self._chunk_s:
                 self._recording.flush()
                 last_flush = now
+            self.settle()
             time.sleep(POLL_S)
+
+    def settle(self) -> None:
+        """Leave word of how far we are."""
+        if self._progress is not None:
+            self._progress.store(self._recording.progress)
 
 
 def record(request: RecorderRequest) -> int:
@@ -197,13 +215,16 @@ def record(request: RecorderRequest) -> int:
     started = time.time_ns()
     file, final = _open_file(request, started)
     overview = JointStateMessage(request.joint_names, request.gear_ratios)
-    recording = Recording(file, overview, int(request.chunk_s * 1e9), _say)
+    progress = None if request.progress is None else ProgressFile(request.progress)
+    account = Account() if progress is None else Account.carried_on(progress.load())
+    recording = Recording(file, overview, int(request.chunk_s * 1e9), _say, account)
     recording.note(schemas.RECORDER_STARTED, "recorder started", level=INFO, time_ns=started)
-    Recorder(reader, recording, request.chunk_s, stop).run()
-    account = recording.account
+    recorder = Recorder(reader, recording, request.chunk_s, stop, progress)
+    recorder.run()
     text = f"recorder stopped: {account.cycles} cycles seen, {account.lost} lost"
     recording.note(schemas.RECORDER_STOPPED, text, level=INFO, time_ns=time.time_ns())
     complete = recording.finish()
+    recorder.settle()
     active = final.with_name(final.name + ".active")
     path: Path | None = active if active.exists() else None
     if complete:

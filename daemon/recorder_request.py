@@ -28,6 +28,7 @@ class RecorderRequest:
         chunk_s: length of a chunk [s]; a crash costs at most this and 0.1 s.
         wait_s: how long to wait for the ring to appear [s].
         attachments: each {"name", "media_type", and "path" or "text"}.
+        progress: file of `daemon.recorder_progress`; an older recorder's account in it is carried on. None: none.
         joint_names: of joint 1 and 2, for /joint_states.
         gear_ratios: of joint 1 and 2; null where not known.
         channel_metadata: topic -> {key: text}, e.g. the PDO map of /can/frames.
@@ -39,6 +40,7 @@ class RecorderRequest:
     chunk_s: float = DEFAULT_CHUNK_S
     wait_s: float = 10.0
     attachments: tuple[dict[str, str], ...] = ()
+    progress: Path | None = None
     joint_names: tuple[str, str] = ("joint_1", "joint_2")
     gear_ratios: tuple[float | None, float | None] = (None, None)
     channel_metadata: dict[str, dict[str, str]] | None = None
@@ -83,6 +85,8 @@ class RecorderRequest:
             if not isinstance(content.get(key), str):
                 raise RequestError(f"key {key!r}: expected a path")
         values = dict(content, ring=Path(content["ring"]), directory=Path(content["directory"]))
+        if values.get("progress") is not None:
+            values["progress"] = Path(values["progress"])
         for key in ("attachments", "joint_names", "gear_ratios"):
             if key in values:
                 values[key] = tuple(values[key])

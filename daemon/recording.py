@@ -14,6 +14,7 @@ from daemon import cycle_record as cycle
 from daemon import mcap_schemas as schemas
 from daemon.mcap_messages import JointStateMessage, cycle_block, diagnostics, event, log
 from daemon.mcap_writer import McapFile
+from daemon.recorder_progress import Progress
 
 OVERVIEW_PERIOD_NS = 20_000_000
 """/joint_states comes at 50 Hz."""
@@ -46,6 +47,11 @@ class Account:
         """Cycles that are in no file."""
         return self.overwritten + self.unwritten
 
+    @classmethod
+    def carried_on(cls, progress: Progress) -> Account:
+        """The account that another recorder of the same run left."""
+        return cls(progress.position, progress.written, progress.overwritten, progress.unwritten)
+
 
 class Recording:
     """One run of the loop on its way into one file.
@@ -55,12 +61,18 @@ class Recording:
         overview: makes /joint_states.
         chunk_ns: length of a chunk in recorded time [ns].
         report: called with one line when writing fails, once for a row of failures.
+        account: of an earlier recorder of the same run, None for a new one.
     """
 
     def __init__(
-        self, file: McapFile | None, overview: JointStateMessage, chunk_ns: int, report: Callable[[str], None]
+        self,
+        file: McapFile | None,
+        overview: JointStateMessage,
+        chunk_ns: int,
+        report: Callable[[str], None],
+        account: Account | None = None,
     ) -> None:
-        self.account = Account()
+        self.account = account or Account()
         self._file = file
         self._overview = overview
         self._chunk_ns = chunk_ns
@@ -113,6 +125,13 @@ class Recording:
             self._chunk_end_ns = monotonic + self._chunk_ns
         elif monotonic >= self._chunk_end_ns or file.pending >= MAX_CHUNK_BYTES:
             self.flush()
+
+    @property
+    def progress(self) -> Progress:
+        """What is settled: cycles that wait for the end of their chunk are not."""
+        account = self.account
+        settled = account.cycles - self._pending
+        return Progress(settled, account.written, account.overwritten, account.unwritten)
 
     def _status_events(self, statuses: tuple[int, int]) -> None:
         before, self._statuses = self._statuses, statuses

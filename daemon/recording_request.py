@@ -16,7 +16,7 @@ _PACKAGES = ("jtqd", "numpy", "onnxruntime", "python-can", "canopen", "mcap")
 
 
 def recording_request(
-    config: Config, directory: Path, ring: Path, instance: str, report: dict[str, Any]
+    config: Config, report: dict[str, Any], *, directory: Path, ring: Path, progress: Path, instance: str
 ) -> dict[str, Any]:
     """Request for `python -m daemon.recorder`: configuration, joint files, EDS, DBC, networks and versions attached.
 
@@ -24,6 +24,7 @@ def recording_request(
         config: configuration in force.
         directory: where logs go.
         ring: the loop's ring of cycle records.
+        progress: file in which the recorder says how far it is.
         instance: name of the bus as it can stand in a file name.
         report: boot report with the scaling read from the devices.
     """
@@ -44,6 +45,7 @@ def recording_request(
     attachments += [_file(path, "text/plain") for path in sorted(_EDS_DIRECTORY.glob("*.eds"))]
     return {
         "ring": str(ring),
+        "progress": str(progress),
         "directory": str(directory),
         "prefix": f"jtqd-{instance}",
         "attachments": attachments,

@@ -26,6 +26,7 @@ from daemon.config import Config
 from daemon.live_table import live_table, plain_line
 from daemon.load import bus_load_of
 from daemon.own_node import OwnNode
+from daemon.recorder_progress import Progress, ProgressFile
 from daemon.recording_request import recording_request
 from daemon.runtime_dir import instance_name, runtime_dir
 from daemon.snapshot import SnapshotReader, View
@@ -42,6 +43,7 @@ _TABLE_PERIOD_S = 0.2
 _LOG_PERIOD_S = 5.0
 _NMT_PRE_OPERATIONAL = 0x80
 _BENCH_PRIORITY = 40
+_RECORDER_STARTS = 5
 _OWN_EDS = Path(__file__).resolve().parent.parent / "drivers" / "eds" / "jtqd.eds"
 
 
@@ -78,8 +80,10 @@ class Supervisor:
         self._log_directory = _log_directory(record)
         self._ring = self._directory / "ring"
         self._snapshot = self._directory / "snapshot"
+        self._progress = self._directory / "recorded"
         self._children: list[Child] = []
         self._recorder: Child | None = None
+        self._recorder_starts: list[float] = []
         self._recording: dict[str, Any] | None = None
         self._console = Console(stderr=True)
 
@@ -234,32 +238,64 @@ class Supervisor:
     def _start_recorder(self, report: dict[str, Any]) -> None:
         if self._log_directory is None:
             return
-        request = recording_request(self._config, self._log_directory, self._ring, self._instance, report)
-        path = self._directory / "recorder.json"
-        path.write_text(json.dumps(request), encoding="utf-8")
-        self._recorder = self._child("daemon.recorder", [str(path)], "the recorder")
+        request = recording_request(
+            self._config,
+            report,
+            directory=self._log_directory,
+            ring=self._ring,
+            progress=self._progress,
+            instance=self._instance,
+        )
+        self._progress.unlink(missing_ok=True)
+        (self._directory / "recorder.json").write_text(json.dumps(request), encoding="utf-8")
+        self._run_recorder()
+
+    def _run_recorder(self) -> None:
+        self._recorder_starts.append(time.monotonic())
+        self._recorder = self._child(
+            "daemon.recorder", [str(self._directory / "recorder.json")], "the recorder"
+        )
 
     def _watch_recorder(self, node: OwnNode) -> None:
-        if self._recorder is not None and not self._recorder.alive():
+        """A recorder that died is started again and goes on where it was; at most once a second, and not for ever."""
+        if self._recorder is None:
+            return
+        if self._progress.exists():
+            node.recorder_lost = ProgressFile(self._progress).load().lost
+        if self._recorder.alive():
+            return
+        if len(self._recorder_starts) > _RECORDER_STARTS:
+            print("jtqd: the recorder died too often; the loop goes on without a log", file=sys.stderr)
+            self._recording, self._recorder = self._account("the recorder died too often"), None
+        elif time.monotonic() - self._recorder_starts[-1] > 1.0:
+            code = self._recorder.process.returncode
             print(
-                f"jtqd: the recorder ended with exit status {self._recorder.process.returncode}; the loop goes on",
+                f"jtqd: the recorder ended with exit status {code}; started again, the loop goes on",
                 file=sys.stderr,
             )
-            self._recording = self._recorder.poll_answer() or {
-                "path": None,
-                "lost": None,
-                "error": "the recorder died",
-            }
-            self._recorder = None
+            self._run_recorder()
+
+    def _account(self, error: str) -> dict[str, Any]:
+        """What the recorder left behind that could not say it itself; what nobody wrote counts as lost."""
+        settled = ProgressFile(self._progress).load() if self._progress.exists() else Progress()
+        cycles = SnapshotReader(self._snapshot).read().counters["cycles"]
+        return {
+            "path": None,
+            "cycles": cycles,
+            "written": settled.written,
+            "lost": cycles - settled.written,
+            "error": error,
+        }
 
     def _end_recorder(self) -> None:
         if self._recorder is None:
             return
         self._recorder.process.send_signal(signal.SIGTERM)
+        self._recorder.process.send_signal(signal.SIGCONT)  # a stopped one would sleep through it
         try:
             self._recording = self._recorder.answer(10.0)
         except ChildError as error:
-            self._recording = {"path": None, "lost": None, "error": str(error)}
+            self._recording = self._account(str(error))
 
     # End -----------------------------------------------------------------------------------------------------------------
 

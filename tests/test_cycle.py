@@ -241,3 +241,14 @@ def test_leaving_says_off(tmp_path: Path) -> None:
     pdo = decode(estimates(socket)[-1])
     assert pdo.status == (0, 0)
     assert pdo.torque_nm == (None, None)
+
+
+def test_the_wake_up_follows_the_arrival_of_the_inputs(tmp_path: Path) -> None:
+    cycle, _, _ = make(tmp_path, lambda n: inputs())
+    for _ in range(3000):
+        cycle._adapt_wait(60_000)
+    assert cycle._wait_ns == pytest.approx(70_000, abs=20_000)
+    for _ in range(30):
+        cycle._adapt_wait(90_000)
+    assert cycle._deadline_ns == 100_000
+    assert cycle._wait_ns <= 90_000, "never beyond the deadline"

@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import struct
 import subprocess
 import sys
@@ -134,3 +135,56 @@ def test_a_remote_frame_and_29_bit_twins_on_the_real_bus_are_only_counted(tmp_pa
 def test_layout_of_can_frame() -> None:
     """candump, the hub and AF_CAN agree on one struct; this is the host's byte order that all of it relies on."""
     assert struct.pack("<I", 0x181) == (0x181).to_bytes(4, sys.byteorder)
+
+
+@pytest.mark.socketcan
+@pytest.mark.parametrize("harm", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_recorder_that_dies_or_stalls_costs_the_loop_nothing(tmp_path: Path, harm: signal.Signals) -> None:
+    """Killed after 1.5 s: another one goes on where it was. Stopped for 6 s: the ring goes round, what is lost is counted."""
+    environment = {**os.environ, "RUNTIME_DIRECTORY": str(tmp_path)}
+    bench = subprocess.Popen(
+        [sys.executable, "-m", "sim_can", "--bus", INTERFACE], stderr=subprocess.PIPE, text=True
+    )
+    assert bench.stderr is not None
+    assert "ready" in bench.stderr.readline()
+    daemon = subprocess.Popen(
+        [
+            *(sys.executable, "-m", "daemon.jtqd", "--bus", INTERFACE, "--duration", "9", "--json"),
+            *("--record", str(tmp_path / "logs")),
+        ],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    subprocess.run(["candump", "-n", "1500", f"{INTERFACE},1A0:7FF"], stdout=subprocess.DEVNULL, check=True)
+    recorder = recorder_of(daemon.pid)
+    os.kill(recorder, harm)
+    if harm == signal.SIGSTOP:
+        time.sleep(6)
+        os.kill(recorder, signal.SIGCONT)
+    out, err = daemon.communicate(timeout=300)
+    bench.terminate()
+    bench.wait(10)
+    summary = json.loads(out)
+    if os.environ.get("JTQD_IN_BENCH_KERNEL"):
+        assert (summary["cycles"], summary["missed"], summary["stale_inputs"]) == (9000, 0, 0)
+    recording = summary["recording"]
+    assert recording["written"] + recording["lost"] == recording["cycles"] == summary["cycles"]
+    if harm == signal.SIGKILL:
+        assert daemon.returncode == 0, err
+        assert "started again" in err
+        assert recording["lost"] == 0
+        assert len(list((tmp_path / "logs").glob("*.active"))) == 1, "what the first one left"
+    else:
+        assert daemon.returncode == 3, err
+        assert recording["lost"] > 0
+
+
+def recorder_of(pid: int) -> int:
+    """Process-ID of the recorder among the daemon's children."""
+    for process in Path("/proc").glob("[0-9]*"):
+        parent = process.joinpath("stat").read_text().rpartition(")")[2].split()[1]
+        if int(parent) == pid and b"daemon.recorder" in process.joinpath("cmdline").read_bytes():
+            return int(process.name)
+    raise AssertionError("no recorder")
