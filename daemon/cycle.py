@@ -27,7 +27,7 @@ from drivers.errors import BusDown, BusError
 from drivers.frame import pack, worst_case_bits
 from drivers.frame_socket import FrameSocket
 from estimator import status as st
-from estimator.joint_estimator import Estimate, JointEstimator
+from estimator.joint_estimator import JointEstimator
 
 _STARTING_CYCLES = 20
 """Cycles at the start that are published as "starting": the arrival bands and the filters see their first inputs."""
@@ -41,7 +41,7 @@ _POWERED = {0x27, 0x07}
 """Operation enabled and quick stop active (6041h masked with 6Fh): the states in which the motor carries current."""
 _FAULTS = {0x0F, 0x08}
 """Fault reaction active and fault (6041h masked with 4Fh)."""
-_NO_ESTIMATE = Estimate(nan, inf, st.STARTING, nan, nan, nan)
+_HALF_RANGE, _FULL_RANGE = 1 << 31, 1 << 32
 _INDEX = {name: n for n, name in enumerate(COUNTERS)}
 
 
@@ -66,16 +66,34 @@ class JointInputs:
     sensor_nm_per_unit: float
 
 
+class Unwrap:
+    """Counts of a 32-bit position without its wrap at 2^31 (object 6064h is an INTEGER32 that rolls over)."""
+
+    __slots__ = ("_last", "_offset")
+
+    def __init__(self) -> None:
+        self._last = 0
+        self._offset = 0
+
+    def counts(self, raw: int) -> int:
+        """Continuous counts; right as long as two samples lie less than 2^31 counts apart."""
+        step = raw - self._last
+        if not -_HALF_RANGE <= step < _HALF_RANGE:
+            self._offset += -_FULL_RANGE if step > 0 else _FULL_RANGE
+        self._last = raw
+        return raw + self._offset
+
+
 class _JointState:
     """What the loop keeps of one joint from cycle to cycle."""
 
-    __slots__ = ("estimate", "estimator", "inputs", "last_ns", "published", "sample", "status", "view")
+    __slots__ = ("estimator", "inputs", "last_ns", "link", "motor", "published", "sample", "status", "view")
 
     def __init__(self, inputs: JointInputs, estimator: JointEstimator) -> None:
         self.inputs = inputs
         self.estimator = estimator
         self.last_ns = 0
-        self.estimate: Estimate = _NO_ESTIMATE
+        self.motor, self.link = Unwrap(), Unwrap()
         self.status = st.STARTING
         self.sample: tuple[float, ...] = (nan,) * 11 + (0, 0, 0, 0)
         self.view: tuple[float, ...] = (nan,) * 6 + (0, 0, 0)
@@ -292,9 +310,9 @@ class Cycle:
         motor_counts, link_counts = position.values
         velocity_units, current_units, statusword = motion.values
         current = current_units * inputs.ampere_per_unit
-        motor_position = motor_counts * inputs.motor_rad_per_count
+        motor_position = joint.motor.counts(motor_counts) * inputs.motor_rad_per_count
         motor_velocity = velocity_units * inputs.motor_rad_s_per_unit
-        link_position = link_counts * inputs.link_rad_per_count
+        link_position = joint.link.counts(link_counts) * inputs.link_rad_per_count
         dt_ns = sync_ns - joint.last_ns if joint.last_ns else 0
         # SYNC keeps an absolute grid: a deviation below the stamps' own accuracy is theirs, not time's.
         if -_STAMP_ACCURACY_NS < dt_ns - self.grid.period_ns < _STAMP_ACCURACY_NS:

@@ -1,5 +1,6 @@
 """Stages of a cycle against a scripted socket: what goes out is what came in, scaled, dated and in time."""
 
+import itertools
 import math
 import struct
 import time
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from daemon import cycle_record as cr
-from daemon.cycle import Cycle, JointInputs
+from daemon.cycle import Cycle, JointInputs, Unwrap
 from daemon.estimate_pdo import decode
 from daemon.grid import Grid
 from daemon.intake import InputPdo, Intake
@@ -252,3 +253,23 @@ def test_the_wake_up_follows_the_arrival_of_the_inputs(tmp_path: Path) -> None:
         cycle._adapt_wait(90_000)
     assert cycle._deadline_ns == 100_000
     assert cycle._wait_ns <= 90_000, "never beyond the deadline"
+
+
+def test_a_position_that_rolls_over_goes_on() -> None:
+    unwrap = Unwrap()
+    truth = [0, 2**31 - 5, 2**31 + 5, 2**32 - 7, 2**31 + 5, 2**31 - 5, 0, -(2**31) + 3, -(2**31) - 3, -5]
+    wire = [(value + 2**31) % 2**32 - 2**31 for value in truth]
+    assert [unwrap.counts(raw) for raw in wire] == truth
+
+
+def test_the_estimate_does_not_see_the_roll_over(tmp_path: Path) -> None:
+    def script(n: int) -> list[bytes]:
+        counts = (2**31 - 2000 + 40 * n + 2**31) % 2**32 - 2**31
+        return [frame(0x181, I32.pack(counts, 10 * n)), *inputs()[1:]]
+
+    cycle, socket, reader = make(tmp_path, script)
+    turn(cycle, 60)
+    assert {decode(data).status[0] for data in estimates(socket)[20:]} == {2}
+    positions = [cr.joint_of(record, 1).motor_position_rad for record in reader.read().records]
+    steps = [b - a for a, b in itertools.pairwise(positions)]
+    assert steps == pytest.approx([40e-4] * 59)
