@@ -28,7 +28,7 @@ from daemon.load import bus_load_of
 from daemon.own_node import OwnNode
 from daemon.recorder_progress import Progress, ProgressFile
 from daemon.recording_request import recording_request
-from daemon.runtime_dir import instance_name, runtime_dir
+from daemon.runtime_dir import instance_name, lock, runtime_dir
 from daemon.snapshot import SnapshotReader, View
 from daemon.summary import Summary
 from drivers.bus_load import BusLoad, BusLoadError, check_bus_load
@@ -72,6 +72,9 @@ class Supervisor:
         self._load = _checked_load(config)
         try:
             self._directory = runtime_dir(bus)
+            self._lock = lock(self._directory)
+        except BlockingIOError as error:
+            raise SupervisorError(f"{bus}: {error}: one jtqd per bus") from None
         except OSError as error:
             raise SupervisorError(f"no directory for shared memory: {error}") from None
         self._emulate = bus == "sim"

@@ -285,3 +285,15 @@ def test_no_process_that_stays_loads_torch_or_scipy(daemon: tuple[str, subproces
             continue
         assert "libtorch" not in maps
         assert "scipy/" not in maps
+
+
+def test_a_second_daemon_on_the_same_bus_is_refused(
+    daemon: tuple[str, subprocess.Popen[str]], environment: dict[str, str]
+) -> None:
+    bus, process = daemon
+    result = run("--bus", bus, "--duration", "1", "--record", "none", environment=environment)
+    assert result.returncode == 1
+    message = no_traceback(result)
+    assert len(message.splitlines()) == 1
+    assert str(process.pid) in message
+    assert process.poll() is None, "the first one goes on"
