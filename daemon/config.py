@@ -43,6 +43,8 @@ class JointConfig:
     number: int
     node_id: int
     identity: Identity
+    given: dict[str, int]
+    """Objects that the drive lacks and the boot shall take as read, e.g. {"6091h:1": 100}."""
     joint_path: Path
     joint: Joint
     network: NetworkFile | None
@@ -56,6 +58,9 @@ class SensorConfig:
     node_id: int
     identity: Identity
     channels: tuple[int, ...]
+    given: dict[str, int]
+    unit_words: dict[str, float]
+    """Values of 6131h that mean a torque, in Nm per unit, e.g. {"0x00560000": 1.0}: CiA 303-2 names none for Nm."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +156,18 @@ def _section(parent: Section, key: str) -> Section:
     return parent.section(key, optional=True) or Section({}, parent.where, key)
 
 
+def _numbers(parent: Section, key: str) -> dict[str, float]:
+    """A mapping of free names to numbers; what the names may be is checked by the boot."""
+    section = _section(parent, key)
+    values = {name: section.number(name, low=0.0) for name in section.names()}
+    section.finish()
+    return values
+
+
+def _whole(values: dict[str, float]) -> dict[str, int]:
+    return {name: int(value) for name, value in values.items()}
+
+
 def _identity(parent: Section) -> Identity:
     section = _section(parent, "identity")
     keys = ("vendor", "product", "revision", "serial")
@@ -166,8 +183,10 @@ def _sensor(top: Section) -> SensorConfig | None:
     node = section.integer("node", low=1, high=_MAX_NODE_ID)
     channels = section.integer("channels", low=1, high=2, default=1)
     identity = _identity(section)
+    given = _numbers(section, "given")
+    unit_words = _numbers(section, "unit_words")
     section.finish()
-    return SensorConfig(node, identity, tuple(range(1, channels + 1)))
+    return SensorConfig(node, identity, tuple(range(1, channels + 1)), _whole(given), unit_words)
 
 
 def _joint(top: Section, path: Path, number: int, method: str, sensor: SensorConfig | None) -> JointConfig:
@@ -176,6 +195,7 @@ def _joint(top: Section, path: Path, number: int, method: str, sensor: SensorCon
     assert section is not None
     node = section.integer("node", low=1, high=_MAX_NODE_ID)
     identity = _identity(section)
+    given = _whole(_numbers(section, "given"))
     joint_path = _beside(path, section.text("file"))
     channel = section.integer("sensor_channel", low=1, high=2, default=None)
     if channel is not None and (sensor is None or channel not in sensor.channels):
@@ -197,7 +217,7 @@ def _joint(top: Section, path: Path, number: int, method: str, sensor: SensorCon
             f"{joint_path}: key 'efficiency': missing, expected because estimator.method is {method}"
         )
     return JointConfig(
-        number, node, identity, joint_path, joint, network if method == "network" else None, channel
+        number, node, identity, given, joint_path, joint, network if method == "network" else None, channel
     )
 
 

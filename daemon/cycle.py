@@ -35,6 +35,8 @@ _SNAPSHOT_EVERY = 8
 _WAIT_STEP_NS = 160
 _WAKE_MARGIN_NS = 10_000
 _SHORTEST_WAIT_NS = 50_000
+_CLOCK_READING_NS = 20_000
+"""Both clocks are read within this, or their difference is not taken."""
 _STAMP_ACCURACY_NS = 5_000
 """Kernel software stamps differ by a few us from the time on the wire."""
 _POWERED = {0x27, 0x07}
@@ -99,6 +101,19 @@ class _JointState:
         self.view: tuple[float, ...] = (nan,) * 6 + (0, 0, 0)
         self.published = estimate_pdo.field(nan, inf, st.STARTING)
 
+    def begin_again(self) -> None:
+        """The drive restarted: its positions and the observer's past mean nothing any more."""
+        self.motor, self.link = Unwrap(), Unwrap()
+        self.last_ns = 0
+        self.estimator.reset()
+
+    def withdraw(self, status: int = st.STALE) -> None:
+        """Take the estimate back: nothing of it goes out or is logged as published."""
+        self.published = estimate_pdo.field(nan, inf, status)
+        self.status = status
+        self.sample = (*self.sample[:5], nan, nan, *self.sample[7:12], status, *self.sample[13:])
+        self.view = (nan, nan, *self.view[2:7], status, self.view[8])
+
 
 class Cycle:
     """State of the loop and its stages.
@@ -141,6 +156,7 @@ class Cycle:
         self._estimate_id = 0x180 + node_id
         self._heartbeat = pack(0x700 + node_id, b"\x05")
         self._heartbeat_cycles = heartbeat_cycles
+        self._heartbeat_due = 0
         self._stamp_layouts = [struct.Struct(f"<{n}q") for n in range(cr.FRAME_CAPACITY + 1)]
         self._bits_complete = (
             worst_case_bits(1) + worst_case_bits(8) + sum(worst_case_bits(p.length) for p in intake.pdos)
@@ -172,10 +188,13 @@ class Cycle:
         if count:
             intake.drain(socket.frames, socket.stamps_ns, socket.own, count)
             self._keep(count)
-        intake.begin()
         self.counter = self.counter % self._overflow + 1
+        intake.begin(self.counter)
+        before = time.monotonic_ns()
+        realtime = time.time_ns()
         now = time.monotonic_ns()
-        self._realtime_offset_ns = time.time_ns() - now
+        if now - before < _CLOCK_READING_NS or not self._realtime_offset_ns:
+            self._realtime_offset_ns = realtime - now  # else something came between: the last one is better
         self._send(self._sync_frames[self.counter])
         self._sync_ns = now
         self.late_ns = now - self.grid.slot_ns
@@ -218,8 +237,11 @@ class Cycle:
             self._observe(joint, sync_ns, number)
 
     def publish(self) -> None:
-        """Send the estimate PDO, and the heartbeat when it is due."""
+        """Send the estimate PDO, and the heartbeat when it is due. An estimate that is too late is none."""
         one, two = self._joints
+        if time.monotonic_ns() >= self.grid.slot_ns + self.grid.period_ns:
+            one.withdraw()
+            two.withdraw()
         data = estimate_pdo.encode(one.published, two.published, self.counter)
         frame = pack(self._estimate_id, data)
         if self._send(frame):
@@ -227,7 +249,8 @@ class Cycle:
             if time.monotonic_ns() < self.grid.slot_ns + self.grid.period_ns:
                 self._flags |= cr.FLAG_BEFORE_NEXT_SYNC
         self._keep_own(frame)
-        if self.index % self._heartbeat_cycles == 0:
+        if self.index >= self._heartbeat_due:
+            self._heartbeat_due = self.index + self._heartbeat_cycles
             self._send(self._heartbeat)
 
     def record(self) -> None:
@@ -243,9 +266,9 @@ class Cycle:
             self._sync_ns,
             self._sync_realtime_ns,
             self._flags,
-            work_ns,
-            self.late_ns,
-            self.grid.missed,
+            min(work_ns, 0xFFFF_FFFF),
+            min(self.late_ns, 0x7FFF_FFFF),
+            self.grid.missed & 0xFFFF_FFFF,
             self.counter,
             self._frame_count,
             min(self._left_out, 255),
@@ -284,9 +307,10 @@ class Cycle:
 
     def leave(self) -> None:
         """Last words on the bus: an estimate with status off, so that nobody holds on to the last number."""
-        off = estimate_pdo.field(nan, inf, st.OFF)
-        self._send(pack(self._estimate_id, estimate_pdo.encode(off, off, self.counter)))
         one, two = self._joints
+        one.withdraw(st.OFF)
+        two.withdraw(st.OFF)
+        self._send(pack(self._estimate_id, estimate_pdo.encode(one.published, two.published, self.counter)))
         self._counters[_MISSED] = self.grid.missed
         self._flush_counters()
         self.snapshot.write(self.index, self.counter, self._sync_realtime_ns, (one.view, two.view))
@@ -335,6 +359,9 @@ class Cycle:
             estimate[5],
         )
         joint.published = estimate_pdo.field(torque, sigma, status)
+        status = joint.published[2]  # 15 where the number does not fit the field: log and bus agree
+        if status not in estimate_pdo.PUBLISHED_STATUSES:
+            torque = sigma = nan
         joint.status = status
         joint.sample = (
             current,
@@ -420,6 +447,10 @@ class Cycle:
         for node in self.intake.unconfigured:
             if now[node] != self._configured[node]:
                 self.intake.configured(node)
+                self.snapshot.unconfigured[node] = 0
+                for joint in self._joints:
+                    if self.intake.pdos[joint.inputs.position].node_id == node:
+                        joint.begin_again()
         self._configured = now
 
     def _count(self, work_ns: int) -> None:
@@ -436,6 +467,8 @@ class Cycle:
             if not flags & cr.FLAG_BEFORE_NEXT_SYNC:
                 counters[_PUBLISHED_LATE] += 1
         counters[_BITS] += bits
+        counters[_WORK_MAX] = max(counters[_WORK_MAX], work_ns)
+        counters[_LATE_MAX] = max(counters[_LATE_MAX], self.late_ns, 0)
         self.snapshot.work[min(work_ns // WORK_BIN_NS, WORK_BINS - 1)] += 1
         self.snapshot.late[min(max(self.late_ns, 0) // LATE_BIN_NS, LATE_BINS - 1)] += 1
         if self.index % _SNAPSHOT_EVERY == 0:
@@ -450,6 +483,7 @@ class Cycle:
         counters[_INDEX["rejected_frames"]] = intake.rejected_frames
         counters[_INDEX["unknown_frames"]] = intake.unknown_frames
         counters[_INDEX["foreign_sync"]] = intake.foreign_sync
+        counters[_INDEX["sync_errors"]] = intake.sync_errors
         counters[_INDEX["sync_gaps"]] = intake.gaps
         counters[_INDEX["boot_ups"]] = intake.boot_ups
         counters[_INDEX["tx_dropped"]] = self.socket.tx_dropped
@@ -457,8 +491,11 @@ class Cycle:
         counters[_INDEX["bus_errors"]] = self._bus_errors
         for node, state in intake.node_states.items():
             self.snapshot.node_states[node] = state
+        for node in intake.unconfigured:
+            self.snapshot.unconfigured[node] = 1
 
 
+_WORK_MAX, _LATE_MAX = _INDEX["work_max_ns"], _INDEX["late_max_ns"]
 _CYCLES, _MISSED, _COMPLETE = _INDEX["cycles"], _INDEX["missed"], _INDEX["complete"]
 _PUBLISHED, _PUBLISHED_LATE = _INDEX["published"], _INDEX["published_late"]
 _BITS = _INDEX["bits_worst_case"]

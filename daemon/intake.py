@@ -3,7 +3,8 @@
 A TPDO carries no cycle number. It counts as an input of SYNC k only when it arrived after SYNC k and no earlier frame of
 the same PDO can still be under way:
 
-* a frame whose kernel stamp lies before the SYNC's own echo belongs to an earlier cycle: late, dropped, counted;
+* frames arrive in order: one before the echo of the cycle's own SYNC belongs to an earlier cycle: late, dropped, counted;
+  without that echo, or with the echo of an earlier SYNC (it waited in the transmit queue), nothing is used;
 * after a cycle without its frame the PDO has a *debt*: the missing frame was lost, or it is late and will be met in a later
   cycle, looking just like that cycle's own. While there is a debt nothing is believed. It is paid by a surplus
   frame (two in one cycle), or written off in one of two ways:
@@ -144,7 +145,10 @@ class Intake:
         """Delay of the last input after the SYNC, in the last cycle that had them all."""
         self.sync_stamp_ns = 0
         """CLOCK_REALTIME stamp of the own SYNC's echo, 0 while it has not been seen in this cycle."""
+        self._counter = 0
         self.foreign_sync = 0
+        self.sync_errors = 0
+        """Echoes of an earlier SYNC than the one of the cycle: the transmit queue holds it back."""
         self.unknown_frames = 0
         self.late_frames = self.duplicate_frames = self.rejected_frames = 0
         self.stale_inputs = 0
@@ -152,8 +156,9 @@ class Intake:
         self.node_states: dict[int, int] = {}
         """Last heartbeat state of each node (CiA 301: 4 stopped, 5 operational, 127 pre-operational)."""
 
-    def begin(self) -> None:
-        """A SYNC has just been sent: nothing is fresh any more."""
+    def begin(self, counter: int) -> None:
+        """SYNC number `counter` (1..240) has just been sent: nothing is fresh any more."""
+        self._counter = counter
         indebted = False
         for state in self._states:
             state.fresh = False
@@ -173,7 +178,6 @@ class Intake:
             self._gap_pause -= 1
         # With a debt one more frame may come: then only the deadline ends the wait.
         self._missing = len(self._states) + indebted
-        self._foreign_sync_now = False
         self.sync_stamp_ns = 0
 
     def take(self, frames: bytearray, stamps_ns: Sequence[int], own: Sequence[bool], count: int) -> bool:
@@ -202,9 +206,7 @@ class Intake:
                 self.rejected_frames += 1
                 continue
             stamp = stamps_ns[n]
-            if stamp < self.sync_stamp_ns:
-                self._late(state)
-            elif state.fresh:
+            if state.fresh:
                 self._second(state, frames, offset, stamp)
             else:
                 state.fresh = True
@@ -242,11 +244,16 @@ class Intake:
             else:
                 state.debt += 1
                 state.probation = False
-            if self._foreign_sync_now or (self._unconfigured and state.pdo.node_id in self._unconfigured):
+            if (
+                not sync_ns
+                or self._foreign_sync_now
+                or (self._unconfigured and state.pdo.node_id in self._unconfigured)
+            ):
                 state.fresh = False
             if not state.fresh:
                 self.stale_inputs += 1
                 complete = False
+        self._foreign_sync_now = False  # one that comes from here on belongs to the next cycle
         if complete and last_ns:
             self.last_delay_ns = last_ns
         return complete
@@ -328,6 +335,19 @@ class Intake:
         if state.debt:
             state.debt -= 1
 
+    def _own_sync(self, counter: int, stamp: int) -> None:
+        """The echo of our SYNC: what came before it, in order of arrival, answers an earlier one."""
+        if counter != self._counter:
+            self.sync_errors += 1
+            return
+        self.sync_stamp_ns = stamp
+        for state in self._states:
+            if state.fresh:
+                state.fresh = False
+                state.conflict = False
+                self._missing += 1
+                self._late(state)
+
     def _second(self, state: _State, frames: bytearray, offset: int, stamp: int) -> None:
         data = bytes(frames[offset + 8 : offset + 16])
         if state.debt:
@@ -367,7 +387,7 @@ class Intake:
     def _other(self, can_id: int, frames: bytearray, offset: int, stamp: int, *, own: bool) -> None:
         if can_id == _SYNC_COB_ID:
             if own:
-                self.sync_stamp_ns = stamp
+                self._own_sync(frames[offset + 8], stamp)
             else:
                 self.foreign_sync += 1
                 self._foreign_sync_now = True

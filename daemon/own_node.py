@@ -7,16 +7,20 @@ It runs in the supervisor, so that no SDO client can delay a cycle.
 from __future__ import annotations
 
 import struct
+import time
+from contextlib import suppress
 from functools import partial
-from math import isfinite
+from math import inf, isfinite, nan
 
 from daemon.config import Config
 from daemon.estimate_pdo import field
 from daemon.snapshot import SnapshotReader
+from drivers.errors import BusDown
 from drivers.frame import FRAME, pack
 from drivers.frame_socket import FrameSocket
 from drivers.object_dictionary import ObjectStore
 from drivers.sdo_server import SdoServer
+from estimator.status import STALE
 
 COUNTER_OBJECTS = (
     "cycles",
@@ -43,6 +47,8 @@ PARAMETER_OBJECTS = (
 """Sub-indices 1.. of 2202h (joint 1) and 2203h (joint 2): fields of the joint file."""
 EMCY_INPUT_TIMEOUT = 0x8250
 EMCY_RESET = 0x0000
+_STANDSTILL_S = 0.2
+"""A loop whose snapshot has not moved for so long is not running (it moves every 8 cycles)."""
 _COMMUNICATION_ERROR = 0x11
 """Error register 1001h: generic and communication bits."""
 _EMCY = struct.Struct("<HB5s")
@@ -67,12 +73,17 @@ class OwnNode:
         self._store = store
         self._server = SdoServer(store)
         self._stale = (False, False)
+        self._last_cycle, self._last_change = -1, time.monotonic()
         self.recorder_lost = 0
         self._connect_objects()
         self._set_parameters(config)
 
     def serve(self) -> None:
-        """Answer every request that has arrived."""
+        """Answer every request that has arrived; while the interface is down there is none."""
+        with suppress(BusDown):
+            self._serve()
+
+    def _serve(self) -> None:
         count = self.socket.receive()
         for n in range(count):
             _, length, data = FRAME.unpack_from(self.socket.frames, 16 * n)
@@ -82,8 +93,14 @@ class OwnNode:
 
     def watch(self) -> None:
         """Send EMCY 8250h when a joint's inputs go stale and 0000h when all are back; call about ten times a second."""
+        with suppress(BusDown):
+            self._watch()
+
+    def _watch(self) -> None:
         view = self._reader.read()
-        stale = (view.joints[0].status == 4, view.joints[1].status == 4)
+        if view.cycle != self._last_cycle:
+            self._last_cycle, self._last_change = view.cycle, time.monotonic()
+        stale = (view.joints[0].status == STALE, view.joints[1].status == STALE)
         if stale != self._stale:
             code = EMCY_INPUT_TIMEOUT if any(stale) else EMCY_RESET
             register = _COMMUNICATION_ERROR if any(stale) else 0
@@ -108,8 +125,11 @@ class OwnNode:
 
     def _field(self, joint: int, part: int) -> int:
         """Torque (0), sigma (1) or status (2) of a joint as on the bus."""
-        view = self._reader.read().joints[joint]
-        return field(view.torque_nm, view.sigma_nm, view.status)[part]
+        view = self._reader.read()
+        if view.cycle == self._last_cycle and time.monotonic() - self._last_change > _STANDSTILL_S:
+            return field(nan, inf, STALE)[part]  # the loop stands still: what it said last is old
+        last = view.joints[joint]
+        return field(last.torque_nm, last.sigma_nm, last.status)[part]
 
     def _counter(self, name: str) -> int:
         value = self.recorder_lost if name == "recorder_lost" else self._reader.read().counters[name]

@@ -25,6 +25,7 @@ COUNTERS = (
     "rejected_frames",
     "unknown_frames",
     "foreign_sync",
+    "sync_errors",
     "sync_gaps",
     "boot_ups",
     "tx_dropped",
@@ -32,6 +33,8 @@ COUNTERS = (
     "bus_errors",
     "network_fallbacks",
     "bits_worst_case",
+    "work_max_ns",
+    "late_max_ns",
 )
 """In the order of their words; docs/bus.md says what each one means."""
 
@@ -48,10 +51,11 @@ _SEQUENCE_OFFSET = _COUNTERS_OFFSET + 8 * len(COUNTERS)
 _ESTIMATE_OFFSET = _SEQUENCE_OFFSET + 8
 _ERRORS_OFFSET = _ESTIMATE_OFFSET + _ESTIMATE.size + 2 * _JOINT.size
 _WORK_OFFSET = _ERRORS_OFFSET + 4 * 8
-_LATE_OFFSET = _WORK_OFFSET + 4 * WORK_BINS
-_NODES_OFFSET = _LATE_OFFSET + 4 * LATE_BINS
+_LATE_OFFSET = _WORK_OFFSET + 8 * WORK_BINS
+_NODES_OFFSET = _LATE_OFFSET + 8 * LATE_BINS
 _CONFIGURED_OFFSET = _NODES_OFFSET + _MAX_NODE
-SIZE = _CONFIGURED_OFFSET + _MAX_NODE
+_UNCONFIGURED_OFFSET = _CONFIGURED_OFFSET + _MAX_NODE
+SIZE = _UNCONFIGURED_OFFSET + _MAX_NODE
 _WORD = struct.Struct("<Q")
 
 
@@ -86,6 +90,8 @@ class View(NamedTuple):
     counters: dict[str, int]
     rmse_nm: tuple[float, float]
     node_states: bytes
+    unconfigured: tuple[int, ...]
+    """Node-IDs that restarted and wait for their configuration."""
 
 
 class Snapshot:
@@ -98,6 +104,7 @@ class Snapshot:
         errors: sum of squared errors and number of samples of each joint: [sum 1, n 1, sum 2, n 2].
         node_states: last heartbeat state of each node-ID.
         configured: number of times each node-ID has been configured; written by the supervisor.
+        unconfigured: 1 for each node-ID that restarted and has not been configured since.
     """
 
     def __init__(self, path: Path, period_s: float, worst_load: float) -> None:
@@ -111,10 +118,11 @@ class Snapshot:
         view = memoryview(self._memory)
         self.counters = view[_COUNTERS_OFFSET:_SEQUENCE_OFFSET].cast("Q")
         self.errors = view[_ERRORS_OFFSET:_WORK_OFFSET].cast("d")
-        self.work = view[_WORK_OFFSET:_LATE_OFFSET].cast("I")
-        self.late = view[_LATE_OFFSET:_NODES_OFFSET].cast("I")
+        self.work = view[_WORK_OFFSET:_LATE_OFFSET].cast("Q")
+        self.late = view[_LATE_OFFSET:_NODES_OFFSET].cast("Q")
         self.node_states = view[_NODES_OFFSET:_CONFIGURED_OFFSET]
-        self.configured = view[_CONFIGURED_OFFSET:SIZE]
+        self.configured = view[_CONFIGURED_OFFSET:_UNCONFIGURED_OFFSET]
+        self.unconfigured = view[_UNCONFIGURED_OFFSET:SIZE]
         self._sequence = view[_SEQUENCE_OFFSET:_ESTIMATE_OFFSET].cast("Q")
 
     def write(
@@ -180,15 +188,18 @@ class SnapshotReader:
             dict(zip(COUNTERS, words, strict=True)),
             (rmse[0], rmse[1]),
             bytes(memory[_NODES_OFFSET:_CONFIGURED_OFFSET]),
+            tuple(node for node, flag in enumerate(memory[_UNCONFIGURED_OFFSET:SIZE]) if flag),
         )
 
     def work_us(self, *shares: float) -> list[float]:
-        """Quantiles of the work per cycle [us], upper edge of their bin; NaN without data."""
-        return _quantiles(self._histogram(_WORK_OFFSET, WORK_BINS), WORK_BIN_NS, shares)
+        """Quantiles of the work per cycle [us], upper edge of their bin (1.0: the true maximum); NaN without data."""
+        largest = self.read().counters["work_max_ns"]
+        return _quantiles(self._histogram(_WORK_OFFSET, WORK_BINS), WORK_BIN_NS, largest, shares)
 
     def late_us(self, *shares: float) -> list[float]:
-        """Quantiles of the SYNC's lateness [us], upper edge of their bin; NaN without data."""
-        return _quantiles(self._histogram(_LATE_OFFSET, LATE_BINS), LATE_BIN_NS, shares)
+        """Quantiles of the SYNC's lateness [us], upper edge of their bin (1.0: the true maximum); NaN without data."""
+        largest = self.read().counters["late_max_ns"]
+        return _quantiles(self._histogram(_LATE_OFFSET, LATE_BINS), LATE_BIN_NS, largest, shares)
 
     def note_configured(self, node_id: int) -> None:
         """Tell the loop that a node which had restarted has been configured again (supervisor only)."""
@@ -196,10 +207,10 @@ class SnapshotReader:
         self._memory[offset] = (self._memory[offset] + 1) % 256
 
     def _histogram(self, offset: int, bins: int) -> tuple[int, ...]:
-        return struct.unpack_from(f"<{bins}I", self._memory, offset)
+        return struct.unpack_from(f"<{bins}Q", self._memory, offset)
 
 
-def _quantiles(bins: tuple[int, ...], bin_ns: int, shares: tuple[float, ...]) -> list[float]:
+def _quantiles(bins: tuple[int, ...], bin_ns: int, largest_ns: int, shares: tuple[float, ...]) -> list[float]:
     total = sum(bins)
     result = []
     for share in shares:
@@ -207,7 +218,7 @@ def _quantiles(bins: tuple[int, ...], bin_ns: int, shares: tuple[float, ...]) ->
         for n, count in enumerate(bins):
             seen += count
             if total and seen >= wanted and count:
-                edge = (n + 1) * bin_ns / 1000.0
+                edge = (largest_ns if share >= 1.0 or n == len(bins) - 1 else (n + 1) * bin_ns) / 1000.0
                 break
         result.append(edge)
     return result

@@ -21,6 +21,8 @@ class Summary:
     refused: tuple[str, ...]
     recording: dict[str, Any] | None
     error: str | None
+    inputs: dict[str, dict[str, int]]
+    """Late, lost, duplicate and rejected frames of each PDO by its name."""
 
     @property
     def exit_status(self) -> int:
@@ -40,6 +42,7 @@ class Summary:
             "rmse_nm": {"joint_1": _json(self.rmse_nm[0]), "joint_2": _json(self.rmse_nm[1])},
             "counters": self.counters,
             "not_granted": list(self.refused),
+            "inputs": self.inputs,
             "recording": self.recording,
             "error": self.error,
         }
@@ -48,19 +51,20 @@ class Summary:
         """The same for people."""
         counters = self.counters
         lines = [
-            f"cycles        {self.cycles}, missed {self.missed}, with a stale input {self.stale_inputs}",
+            f"cycles        {self.cycles}, missed {self.missed}, stale inputs {self.stale_inputs}",
             "cycle work    p50 {:.0f} us, p99 {:.0f} us, max {:.0f} us (wake-up for the inputs to hand-over)".format(
                 *self.work_us
             ),
             "SYNC lateness p50 {:.0f} us, p99 {:.0f} us, max {:.0f} us".format(*self.late_us),
         ]
         for joint, rmse in enumerate(self.rmse_nm, start=1):
-            shown = f"{rmse:.3f} Nm against the sensor" if isfinite(rmse) else "no reference"
+            shown = f"{rmse:.3f} Nm against the sensor while it moves" if isfinite(rmse) else "no reference"
             lines.append(f"RMSE joint {joint}  {shown}")
         faults = [
             f"{name.replace('_', ' ')} {counters[name]}"
             for name in (
                 "sync_gaps",
+                "sync_errors",
                 "late_frames",
                 "duplicate_frames",
                 "rejected_frames",
@@ -72,6 +76,10 @@ class Summary:
         ]
         if faults:
             lines.append("bus           " + ", ".join(faults))
+        for name, counts in self.inputs.items():
+            shown = ", ".join(f"{kind} {count}" for kind, count in counts.items() if count)
+            if shown:
+                lines.append(f"  {name:<24} {shown}")
         if self.recording is None:
             lines.append("log           none")
         else:

@@ -13,7 +13,6 @@ import signal
 import sys
 import time
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -21,6 +20,7 @@ from typing import Any
 from rich.console import Console
 from rich.live import Live
 
+from daemon.boot_request import boot_request
 from daemon.children import Child, ChildError
 from daemon.config import Config
 from daemon.live_table import live_table, plain_line
@@ -28,6 +28,7 @@ from daemon.load import bus_load_of
 from daemon.own_node import OwnNode
 from daemon.recorder_progress import Progress, ProgressFile
 from daemon.recording_request import recording_request
+from daemon.returning_nodes import ReturningNodes
 from daemon.runtime_dir import instance_name, lock, runtime_dir
 from daemon.snapshot import SnapshotReader, View
 from daemon.summary import Summary
@@ -44,7 +45,6 @@ _LOG_PERIOD_S = 5.0
 _NMT_PRE_OPERATIONAL = 0x80
 _BENCH_PRIORITY = 40
 _RECORDER_STARTS = 5
-_OWN_EDS = Path(__file__).resolve().parent.parent / "drivers" / "eds" / "jtqd.eds"
 
 
 class SupervisorError(Exception):
@@ -124,6 +124,7 @@ class Supervisor:
         for line in running["refused"]:
             print(f"jtqd: not granted: {line}", file=sys.stderr)
         reader = SnapshotReader(self._snapshot, supervisor=True)
+        self._returning = ReturningNodes(self._config, self._bus, report, self._child)
         self._start_recorder(report)
         socket = open_frame_socket(self._bus, [exact(0x600 + self._config.node_id)])
         store = ObjectStore(entries_from_json(report["own_entries"]), self._config.node_id)
@@ -221,6 +222,7 @@ class Supervisor:
                     loop.process.send_signal(signal.SIGTERM)
                     told = True
                 self._watch_recorder(node)
+                self._returning.watch(reader.read().unconfigured, reader.note_configured)
                 now = time.monotonic()
                 if now - shown >= (_TABLE_PERIOD_S if terminal else _LOG_PERIOD_S):
                     previous, shown = self._show(live, terminal, reader, previous, title), now
@@ -254,7 +256,8 @@ class Supervisor:
         self._run_recorder()
 
     def _run_recorder(self) -> None:
-        self._recorder_starts.append(time.monotonic())
+        now = time.monotonic()
+        self._recorder_starts = [*(start for start in self._recorder_starts if now - start < 60.0), now]
         self._recorder = self._child(
             "daemon.recorder", [str(self._directory / "recorder.json")], "the recorder"
         )
@@ -327,34 +330,8 @@ class Supervisor:
             refused=tuple(refused),
             recording=self._recording,
             error=result.get("error") or result.get("failed"),
+            inputs=result.get("counters", {}),
         )
-
-
-def boot_request(config: Config, bus: str, only: frozenset[int] = frozenset()) -> dict[str, Any]:
-    """Request for `python -m drivers.boot`; `only` limits it to some nodes."""
-    nodes: list[dict[str, Any]] = [
-        {"node": joint.node_id, "kind": "drive", "identity": asdict(joint.identity)}
-        for joint in config.joints
-    ]
-    if config.sensor is not None:
-        sensor = config.sensor
-        nodes.append(
-            {
-                "node": sensor.node_id,
-                "kind": "sensor",
-                "identity": asdict(sensor.identity),
-                "channels": list(sensor.channels),
-            }
-        )
-    return {
-        "bus": bus,
-        "nodes": [node for node in nodes if not only or node["node"] in only],
-        "master_node": config.node_id,
-        "own_eds": str(_OWN_EDS),
-        "heartbeat_ms": config.heartbeat_ms,
-        "answer_timeout_s": config.boot_timeout_s,
-        "sync": {"counter_overflow": config.counter_overflow},
-    }
 
 
 def _checked_load(config: Config) -> BusLoad:

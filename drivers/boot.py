@@ -131,6 +131,8 @@ def _boot_nodes(network: canopen.Network, request: BootRequest) -> dict[int, Boo
     listening_since = time.monotonic()
     if request.check_foreign_sync:
         network.subscribe(request.settings.sync_cob_id, lambda _id, _data, stamp: syncs.append(stamp))
+    # Before anything is sent: a second daemon must not disturb the one that runs.
+    _require_no_sync(request, syncs, listening_since)
     booted = {}
     for profile in request.profiles:
         node = profile.node_id

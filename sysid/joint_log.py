@@ -6,6 +6,7 @@ that the layout of the first message is that of all, and a topic is one array wi
 """
 
 import re
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,7 @@ def read_topic(path: Path, topic: str) -> Records:
                     raise LogError(f"{path}: {topic}: found no ros2msg schema, expected one")
                 text = schema.data.decode()
                 payloads.append(message.data)
-    except McapError as error:
+    except (McapError, struct.error, EOFError, UnicodeDecodeError) as error:
         raise LogError(f"{path}: not a readable MCAP file: {error}") from None
     if not payloads:
         raise LogError(f"{path}: found no message on {topic}, expected one per cycle")

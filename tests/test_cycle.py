@@ -6,6 +6,7 @@ import struct
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -273,3 +274,51 @@ def test_the_estimate_does_not_see_the_roll_over(tmp_path: Path) -> None:
     positions = [cr.joint_of(record, 1).motor_position_rad for record in reader.read().records]
     steps = [b - a for a, b in itertools.pairwise(positions)]
     assert steps == pytest.approx([40e-4] * 59)
+
+
+def test_an_estimate_that_is_too_late_is_withdrawn(tmp_path: Path) -> None:
+    cycle, socket, reader = make(tmp_path, lambda n: inputs())
+    turn(cycle, 30)
+    cycle.begin()
+    cycle.gather()
+    cycle.observe()
+    cycle.grid.slot_ns -= 20_000_000  # the next SYNC was due 10 ms ago
+    cycle.publish()
+    cycle.record()
+    pdo = decode(estimates(socket)[-1])
+    assert pdo.status == (4, 4)
+    assert pdo.torque_nm == (None, None)
+    joint = cr.joint_of(reader.read().records[-1], 1)
+    assert joint.status == 4
+    assert math.isnan(joint.torque_nm)
+
+
+def test_a_stall_of_minutes_is_recorded_and_not_fatal(tmp_path: Path) -> None:
+    cycle, _, reader = make(tmp_path, lambda n: inputs())
+    turn(cycle, 3)
+    cycle.begin()
+    cycle.gather()
+    cycle.observe()
+    cycle.publish()
+    cycle.late_ns = 600_000_000_000
+    cycle._work_start_ns -= 600_000_000_000
+    cycle.record()
+    header = cr.header_of(reader.read().records[-1])
+    assert header.work_ns == 0xFFFF_FFFF
+    assert header.late_ns == 0x7FFF_FFFF
+
+
+def test_log_and_bus_agree_on_a_torque_that_does_not_fit_the_field(tmp_path: Path) -> None:
+    cycle, socket, reader = make(tmp_path, lambda n: inputs())
+    turn(cycle, 25)
+    huge = (
+        cycle._joints[0]
+        .estimator.step(1e-3, 1.0, 1.0, 1.0, 1.0)
+        ._replace(torque_nm=400.0, sigma_nm=1.0, status=2)
+    )
+    cycle._joints[0].estimator = SimpleNamespace(step=lambda *_: huge)  # type: ignore[assignment]
+    turn(cycle, 1)
+    assert decode(estimates(socket)[-1]).status[0] == 15
+    joint = cr.joint_of(reader.read().records[-1], 1)
+    assert joint.status == 15
+    assert math.isnan(joint.torque_nm)

@@ -24,14 +24,23 @@ class Bus:
     def __init__(self) -> None:
         self.intake = Intake([TPDO1, TPDO2])
         self.sync_ns = 0
+        self.counter = 0
 
     def cycle(
-        self, *arrivals: tuple[bytes, int], late: tuple[bytes, ...] = (), foreign_sync: bool = False
+        self,
+        *arrivals: tuple[bytes, int],
+        before: tuple[bytes, ...] = (),
+        late: tuple[bytes, ...] = (),
+        foreign_sync: bool = False,
+        sync: bool = True,
     ) -> bool:
+        """`before` arrives before the echo of SYNC, `late` after the deadline; without `sync` there is no echo."""
         self.sync_ns += MS
         intake = self.intake
-        intake.begin()
-        frames = [(frame(0x080, b"\x01"), self.sync_ns, True)]
+        self.counter = self.counter % 240 + 1
+        intake.begin(self.counter)
+        echo = [(frame(0x080, bytes((self.counter,))), self.sync_ns, True)] if sync else []
+        frames = [(data, self.sync_ns - 5_000, False) for data in before] + echo
         if foreign_sync:
             frames.append((frame(0x080), self.sync_ns + 1000, False))
         frames += [(data, self.sync_ns + delay, False) for data, delay in arrivals]
@@ -79,7 +88,7 @@ def test_inputs_of_the_cycle(bus: Bus) -> None:
 
 def test_take_says_when_all_are_there() -> None:
     intake = Intake([TPDO1, TPDO2])
-    intake.begin()
+    intake.begin(1)
     assert not intake.take(bytearray(one(1)), [5], [False], 1)
     assert intake.take(bytearray(two(1)), [6], [False], 1)
 
@@ -141,9 +150,44 @@ def test_a_constant_delay_of_more_than_a_cycle_never_becomes_valid(delay_us: int
     assert line.wrong == 0
 
 
-def test_a_frame_stamped_before_the_sync_is_of_an_earlier_cycle(bus: Bus) -> None:
-    assert not bus.cycle((one(1), -10_000), (two(1), 300_000))
+def test_a_frame_before_the_echo_of_sync_is_of_an_earlier_cycle(bus: Bus) -> None:
+    assert not bus.cycle((two(1), 300_000), before=(one(0),))
+    assert not bus.intake.fresh(0)
     assert bus.intake.late_frames == 1
+
+
+def test_a_frame_before_the_echo_does_not_spoil_the_one_after_it(bus: Bus) -> None:
+    assert bus.cycle((one(1), 200_000), (two(1), 300_000), before=(one(0),))
+    assert bus.intake.values(0) == (1, -1)
+
+
+def test_without_the_echo_of_sync_nothing_is_used(bus: Bus) -> None:
+    assert not bus.cycle((one(1), 200_000), (two(1), 300_000), sync=False)
+    assert not bus.intake.fresh(0)
+    assert not bus.intake.fresh(1)
+
+
+def test_a_sync_that_waited_in_the_transmit_queue_is_not_this_cycles(bus: Bus) -> None:
+    """The echo of SYNC k-1 and its answers come in cycle k: they would pass for those of k."""
+    bus.cycle(sync=False)
+    for _ in range(30):
+        bus.sync_ns += MS
+        bus.counter = bus.counter % 240 + 1
+        bus.intake.begin(bus.counter % 240 + 1)
+        batch = [frame(0x080, bytes((bus.counter,))), one(1), two(1)]
+        bus.intake.take(
+            bytearray(b"".join(batch)), [bus.sync_ns + n for n in range(3)], [True, False, False], 3
+        )
+        assert not bus.intake.close()
+        assert not bus.intake.fresh(0)
+    assert bus.intake.sync_errors == 30
+
+
+def test_a_foreign_sync_just_before_ours_counts_as_well(bus: Bus) -> None:
+    foreign = bytearray(frame(0x080))
+    bus.intake.drain(foreign, [bus.sync_ns + 970_000], [False], 1)
+    assert not bus.cycle((one(1), 200_000), (two(1), 300_000))
+    assert bus.cycle((one(2), 200_000), (two(2), 300_000))
 
 
 def test_equal_duplicates_are_harmless_and_counted(bus: Bus) -> None:
@@ -283,8 +327,8 @@ class Timeline:
                     start + delay, self.last[n] + 50
                 )  # a controller keeps the order of its queue
                 self.pending.append((self.last[n], make(self.syncs)))
-        intake.begin()
-        intake.take(bytearray(frame(0x080, b"\x01")), [start * 1000], [True], 1)
+        intake.begin(self.syncs % 240 + 1)
+        intake.take(bytearray(frame(0x080, bytes((self.syncs % 240 + 1,)))), [start * 1000], [True], 1)
         intake.take(*self._arrived(start + 850))
         complete = intake.close()
         self.wrong += sum(intake.fresh(n) and intake.values(n)[0] != self.syncs for n in (0, 1))

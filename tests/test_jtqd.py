@@ -175,6 +175,29 @@ def test_garbage_on_the_bus_is_counted_and_changes_nothing(daemon: tuple[str, su
     assert summary["error"] is None
 
 
+def test_a_node_that_restarts_is_configured_again_before_it_is_believed(
+    daemon: tuple[str, subprocess.Popen[str]],
+) -> None:
+    bus, process = daemon
+    socket = open_frame_socket(bus, [exact(0x1A0)])
+    time.sleep(0.5)
+    socket.send(pack(0x000, b"\x81\x01"))  # NMT reset node 1: its mapping is the device's default again
+    seen: list[int] = []
+    deadline = time.monotonic() + 15
+    back = False
+    while not back and time.monotonic() < deadline:
+        socket.wait(0.1)
+        frames, count = socket.frames, socket.receive()
+        seen += [decode(bytes(frames[16 * n + 8 : 16 * n + 16])).status[0] for n in range(count)]
+        back = seen.count(4) > 50 and 4 not in seen[-100:]
+    socket.close()
+    process.send_signal(signal.SIGTERM)
+    _, err = process.communicate(timeout=15)
+    assert back, err
+    assert "node 1 restarted and is configured again" in err
+    assert process.returncode == 0
+
+
 def test_the_bus_that_ends_is_said(bench: str, environment: dict[str, str], tmp_path: Path) -> None:
     process = subprocess.Popen(
         [*JTQD, "--bus", bench, "--record", "none"],

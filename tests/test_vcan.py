@@ -140,7 +140,7 @@ def test_layout_of_can_frame() -> None:
 @pytest.mark.socketcan
 @pytest.mark.parametrize("harm", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_recorder_that_dies_or_stalls_costs_the_loop_nothing(tmp_path: Path, harm: signal.Signals) -> None:
-    """Killed after 1.5 s: another one goes on where it was. Stopped for 6 s: the ring goes round, what is lost is counted."""
+    """Killed: another one goes on where it was. Stopped for 6 s: the ring goes round, and what is lost is counted."""
     environment = {**os.environ, "RUNTIME_DIRECTORY": str(tmp_path)}
     bench = subprocess.Popen(
         [sys.executable, "-m", "sim_can", "--bus", INTERFACE], stderr=subprocess.PIPE, text=True

@@ -1,0 +1,42 @@
+"""What the boot process is asked to do: `python -m drivers.boot` gets this as JSON."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from daemon.config import Config
+
+_OWN_EDS = Path(__file__).resolve().parent.parent / "drivers" / "eds" / "jtqd.eds"
+
+
+def boot_request(config: Config, bus: str, only: int | None = None) -> dict[str, Any]:
+    """Request for all nodes, or for the one that came back while our own SYNC is running."""
+    nodes: list[dict[str, Any]] = [
+        {"node": joint.node_id, "kind": "drive", "identity": asdict(joint.identity), "given": joint.given}
+        for joint in config.joints
+    ]
+    if config.sensor is not None:
+        sensor = config.sensor
+        nodes.append(
+            {
+                "node": sensor.node_id,
+                "kind": "sensor",
+                "identity": asdict(sensor.identity),
+                "channels": list(sensor.channels),
+                "given": sensor.given,
+                "unit_words": sensor.unit_words,
+            }
+        )
+    return {
+        "bus": bus,
+        "nodes": [node for node in nodes if only in (None, node["node"])],
+        "master_node": config.node_id,
+        "own_eds": str(_OWN_EDS),
+        "heartbeat_ms": config.heartbeat_ms,
+        # Drives that watch our heartbeat allow two to be lost.
+        "master_timeout_ms": min(max(500, 3 * config.heartbeat_ms), 0xFFFF),
+        "answer_timeout_s": config.boot_timeout_s,
+        "sync": {"counter_overflow": config.counter_overflow, "check_foreign": only is None},
+    }
