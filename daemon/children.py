@@ -22,6 +22,10 @@ _LIBC = ctypes.CDLL(None)
 _PR_SET_PDEATHSIG = 1
 
 
+_QUIET_LIBRARIES = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
+"""numpy's linear algebra would start a thread per CPU, and none of our processes needs one."""
+
+
 def _die_with_parent() -> None:
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
 
@@ -39,6 +43,9 @@ class Child:
             [sys.executable, "-P", "-m", module, *arguments],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
+            env={**_QUIET_LIBRARIES, **os.environ},
+            # Ctrl-C on a terminal is the supervisor's: it ends its children in order.
+            start_new_session=True,
             preexec_fn=_die_with_parent,  # noqa: PLW1509 - the supervisor has no threads
         )
         assert self.process.stdout is not None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import os
 import sys
 
 COMMANDS = {
@@ -40,7 +41,13 @@ def main(argv: list[str] | None = None) -> int:
         hint = f"; did you mean {near[0]!r}?" if near else ""
         print(f"jtq: no command {arguments[0]!r}{hint} (jtq --help lists them)", file=sys.stderr)
         return 2
-    status = importlib.import_module(command[0]).main(arguments[1:])
+    try:
+        status = importlib.import_module(command[0]).main(arguments[1:])
+        sys.stdout.flush()
+    except OSError as error:  # a full disk, a directory that is not there, a pipe that was closed
+        print(f"jtq {arguments[0]}: {error.filename or 'output'}: {error.strerror}", file=sys.stderr)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     return int(status or 0)
 
 

@@ -60,6 +60,8 @@ def _seconds(text: str) -> float:
 def main(argv: list[str] | None = None) -> int:
     """Run the daemon; returns the exit status."""
     arguments = parser().parse_args(argv)
+    if not arguments.bus:
+        parser().error("argument --bus: found '', expected an interface, unix:PATH or sim")
     try:
         config = load_config(arguments.config)
         supervisor = Supervisor(config, arguments.bus, arguments.config, arguments.record, arguments.duration)
@@ -69,10 +71,11 @@ def main(argv: list[str] | None = None) -> int:
         return 1
     if summary is None:
         return 0
-    if arguments.json:
-        print(json.dumps(summary.content()))
-    else:
-        print(summary.text())
+    try:
+        print(json.dumps(summary.content()) if arguments.json else summary.text(), flush=True)
+    except OSError as error:
+        print(f"jtqd: the summary could not be printed: {error.strerror}", file=sys.stderr)
+        return 1
     return summary.exit_status
 
 

@@ -8,6 +8,7 @@ line of results. It has no second thread, logs nothing while it runs, and shares
 from __future__ import annotations
 
 import json
+import os
 import select
 import signal
 import sys
@@ -144,7 +145,10 @@ def run(cycle: Cycle, grid: Grid, stop: Callable[[], bool], duration_s: float | 
 
 
 def _answer(**content: Any) -> None:
-    print(json.dumps(content), flush=True)
+    try:
+        print(json.dumps(content), flush=True)
+    except BrokenPipeError:  # the supervisor has gone, and we are about to
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _build(
@@ -215,6 +219,9 @@ def main(argv: list[str]) -> int:
         return serve(json.loads(argv[0]))
     except (ConfigError, NetworkError, BusError) as error:
         _answer(failed=str(error))
+        return 1
+    except OSError as error:
+        _answer(failed=f"shared memory: {error.strerror or error}")
         return 1
 
 

@@ -28,6 +28,7 @@ from daemon.recorder_progress import ProgressFile
 from daemon.recorder_request import RecorderRequest, RequestError
 from daemon.recording import INFO, Account, Recording
 from daemon.ring import RingError, RingReader
+from daemon.snapshot import SnapshotError, SnapshotReader
 
 POLL_S = 0.05
 QUIET_S = 0.15
@@ -133,16 +134,18 @@ def _open_ring(request: RecorderRequest, stop: _Stop) -> RingReader:
 class Recorder:
     """The polling loop around one `Recording`."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0917 - what it stands between
         self,
         reader: RingReader,
         recording: Recording,
         chunk_s: float,
         stop: _Stop,
         progress: ProgressFile | None,
+        snapshot: SnapshotReader | None,
     ) -> None:
         self._reader = reader
         self._progress = progress
+        self._snapshot = snapshot
         self._recording = recording
         self._chunk_s = chunk_s
         self._stop = stop
@@ -185,7 +188,8 @@ class Recorder:
             if now - last_diagnosis >= 1.0:
                 used = time.process_time()
                 percent = round(100.0 * (used - cpu) / (now - last_diagnosis), 2)
-                self._recording.diagnose(time.time_ns(), backlog, percent)
+                counters = {} if self._snapshot is None else self._snapshot.read().counters
+                self._recording.diagnose(time.time_ns(), backlog, percent, counters)
                 last_diagnosis, cpu = now, used
             # Chunks end by recorded time; this is for a loop that stands still.
             if taken:
@@ -219,7 +223,8 @@ def record(request: RecorderRequest) -> int:
     account = Account() if progress is None else Account.carried_on(progress.load())
     recording = Recording(file, overview, int(request.chunk_s * 1e9), _say, account)
     recording.note(schemas.RECORDER_STARTED, "recorder started", level=INFO, time_ns=started)
-    recorder = Recorder(reader, recording, request.chunk_s, stop, progress)
+    snapshot = None if request.snapshot is None else SnapshotReader(request.snapshot)
+    recorder = Recorder(reader, recording, request.chunk_s, stop, progress, snapshot)
     recorder.run()
     text = f"recorder stopped: {account.cycles} cycles seen, {account.lost} lost"
     recording.note(schemas.RECORDER_STOPPED, text, level=INFO, time_ns=time.time_ns())
@@ -264,7 +269,7 @@ def main(arguments: list[str] | None = None) -> int:
     except RequestError as error:
         _say(str(error))
         return 2
-    except RingError as error:
+    except (RingError, SnapshotError) as error:
         _say(str(error))
         return 1
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mmap
+import os
 import struct
 from pathlib import Path
 from typing import NamedTuple
@@ -35,7 +36,7 @@ class ProgressFile:
 
     def __init__(self, path: Path) -> None:
         with open(path, "a+b") as file:
-            file.truncate(_LAYOUT.size)
+            os.posix_fallocate(file.fileno(), 0, _LAYOUT.size)  # a full tmpfs refuses here, not by SIGBUS
             self._memory = mmap.mmap(file.fileno(), _LAYOUT.size)
 
     def load(self) -> Progress:

@@ -29,6 +29,7 @@ class RecorderRequest:
         wait_s: how long to wait for the ring to appear [s].
         attachments: each {"name", "media_type", and "path" or "text"}.
         progress: file of `daemon.recorder_progress`; an older recorder's account in it is carried on. None: none.
+        snapshot: the loop's `daemon.snapshot`, whose counters go to /diagnostics. None: without them.
         joint_names: of joint 1 and 2, for /joint_states.
         gear_ratios: of joint 1 and 2; null where not known.
         channel_metadata: topic -> {key: text}, e.g. the PDO map of /can/frames.
@@ -41,6 +42,7 @@ class RecorderRequest:
     wait_s: float = 10.0
     attachments: tuple[dict[str, str], ...] = ()
     progress: Path | None = None
+    snapshot: Path | None = None
     joint_names: tuple[str, str] = ("joint_1", "joint_2")
     gear_ratios: tuple[float | None, float | None] = (None, None)
     channel_metadata: dict[str, dict[str, str]] | None = None
@@ -85,8 +87,9 @@ class RecorderRequest:
             if not isinstance(content.get(key), str):
                 raise RequestError(f"key {key!r}: expected a path")
         values = dict(content, ring=Path(content["ring"]), directory=Path(content["directory"]))
-        if values.get("progress") is not None:
-            values["progress"] = Path(values["progress"])
+        for key in ("progress", "snapshot"):
+            if values.get(key) is not None:
+                values[key] = Path(values[key])
         for key in ("attachments", "joint_names", "gear_ratios"):
             if key in values:
                 values[key] = tuple(values[key])

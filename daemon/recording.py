@@ -7,8 +7,9 @@ disk that fails: the chunk is counted as not written, said once, and the next on
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 from daemon import cycle_record as cycle
 from daemon import mcap_schemas as schemas
@@ -189,8 +190,10 @@ class Recording:
         text = f"{count} cycles overwritten before the recorder read them"
         self.note(schemas.RECORDS_LOST, text, level=ERROR, time_ns=time_ns, count=count)
 
-    def diagnose(self, time_ns: int, backlog: int, cpu_percent: float) -> None:
-        """Write the once-per-second /diagnostics."""
+    def diagnose(
+        self, time_ns: int, backlog: int, cpu_percent: float, loop: Mapping[str, int] = MappingProxyType({})
+    ) -> None:
+        """Write the once-per-second /diagnostics; `loop` are the loop's own counters by name."""
         if self._file is None:
             return
         account, missed = self.account, self._missed or 0
@@ -210,6 +213,7 @@ class Recording:
             "recorder.chunks": self._file.chunks,
             "recorder.cpu_percent": cpu_percent,
             "loop.cycle": self._last[0],
+            **{f"loop.{name}": count for name, count in loop.items()},
             "loop.missed": missed,
         }
         self._file.add(schemas.DIAGNOSTICS.number, time_ns, diagnostics(time_ns, level, text, values))

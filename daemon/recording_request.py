@@ -16,7 +16,14 @@ _PACKAGES = ("jtqd", "numpy", "onnxruntime", "python-can", "canopen", "mcap")
 
 
 def recording_request(
-    config: Config, report: dict[str, Any], *, directory: Path, ring: Path, progress: Path, instance: str
+    config: Config,
+    report: dict[str, Any],
+    *,
+    directory: Path,
+    ring: Path,
+    progress: Path,
+    snapshot: Path,
+    instance: str,
 ) -> dict[str, Any]:
     """Request for `python -m daemon.recorder`: configuration, joint files, EDS, DBC, networks and versions attached.
 
@@ -24,6 +31,7 @@ def recording_request(
         config: configuration in force.
         directory: where logs go.
         ring: the loop's ring of cycle records.
+        snapshot: the loop's counters.
         progress: file in which the recorder says how far it is.
         instance: name of the bus as it can stand in a file name.
         report: boot report with the scaling read from the devices.
@@ -46,6 +54,7 @@ def recording_request(
     return {
         "ring": str(ring),
         "progress": str(progress),
+        "snapshot": str(snapshot),
         "directory": str(directory),
         "prefix": f"jtqd-{instance}",
         "attachments": attachments,

@@ -1,17 +1,20 @@
-"""Nodes that restart in service: configured again before their data is used, one after the other."""
+"""Nodes that restart or stop in service: configured again before their data is used, one after the other."""
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 from daemon.boot_request import boot_request
 from daemon.children import Child
 from daemon.config import Config
+from daemon.snapshot import View
 
-_RETRY_S = 2.0
+_RETRY_S = 0.5
+_NOT_OPERATIONAL = (4, 127)
+"""Heartbeat states stopped and pre-operational (CiA 301)."""
 
 
 class ReturningNodes:
@@ -38,8 +41,12 @@ class ReturningNodes:
         self._node = 0
         self._not_before = 0.0
 
-    def watch(self, unconfigured: Sequence[int], note_configured: Callable[[int], None]) -> None:
-        """Call often; `note_configured` tells the loop that a node may be believed again."""
+    def watch(self, view: View, note_configured: Callable[[int], None]) -> None:
+        """Call often; `note_configured` tells the loop that a node may be believed again.
+
+        A node that says by heartbeat that it is stopped or pre-operational is booted too: drives go there by themselves
+        when they miss the master's heartbeat (1029h), for instance while the bus was down.
+        """
         if self._child is not None:
             answer = self._child.poll_answer()
             if answer is None and self._child.alive():
@@ -48,8 +55,13 @@ class ReturningNodes:
             self._not_before = time.monotonic() + _RETRY_S
             if self._accepted(answer):
                 note_configured(self._node)
-        elif unconfigured and time.monotonic() >= self._not_before:
-            self._node = unconfigured[0]
+            return
+        idle = [
+            int(node) for node in self._report["nodes"] if view.node_states[int(node)] in _NOT_OPERATIONAL
+        ]
+        waiting = [*view.unconfigured, *idle]
+        if waiting and time.monotonic() >= self._not_before:
+            self._node = waiting[0]
             self._child = self._start_child("drivers.boot", [], f"the boot of node {self._node}")
             self._child.tell(boot_request(self._config, self._bus, only=self._node))
             self._child.end_of_input()
@@ -67,5 +79,5 @@ class ReturningNodes:
                     file=sys.stderr,
                 )
                 return False
-        print(f"jtqd: node {self._node} restarted and is configured again", file=sys.stderr)
+        print(f"jtqd: node {self._node} was away and is configured again", file=sys.stderr)
         return True

@@ -42,7 +42,8 @@ class Ring:
         temporary = path.with_name(path.name + ".new")
         with open(temporary, "w+b") as file:
             os.fchmod(file.fileno(), 0o600)
-            file.truncate(_HEADER_SIZE + slots * record_size)
+            # A full tmpfs refuses here, and not by SIGBUS in the middle of a cycle.
+            os.posix_fallocate(file.fileno(), 0, _HEADER_SIZE + slots * record_size)
             self._memory = mmap.mmap(file.fileno(), 0)
         _LAYOUT.pack_into(self._memory, 0, _MAGIC, slots, record_size)
         os.replace(temporary, path)

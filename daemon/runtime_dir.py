@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import os
 import re
 from pathlib import Path
@@ -42,5 +43,6 @@ def lock(directory: Path) -> int:
 
 
 def instance_name(bus: str) -> str:
-    """Name of the instance as it can stand in a file name, e.g. "vcan0" or "unix-tmp-bench"."""
-    return re.sub(r"[^A-Za-z0-9_.]+", "-", bus).strip("-")
+    """Name of the instance as it can stand in a file name: "vcan0", or "unix-tmp-bench-1f3a" with part of a hash."""
+    name = re.sub(r"[^A-Za-z0-9_.]+", "-", bus).strip("-")
+    return name if name == bus else f"{name}-{hashlib.sha256(bus.encode()).hexdigest()[:4]}"

@@ -111,7 +111,7 @@ class Snapshot:
         temporary = path.with_name(path.name + ".new")
         with open(temporary, "w+b") as file:
             os.fchmod(file.fileno(), 0o600)
-            file.truncate(SIZE)
+            os.posix_fallocate(file.fileno(), 0, SIZE)  # a full tmpfs refuses here, not by SIGBUS
             self._memory = mmap.mmap(file.fileno(), 0)
         _HEAD.pack_into(self._memory, 0, _MAGIC, os.getpid(), period_s, worst_load)
         os.replace(temporary, path)

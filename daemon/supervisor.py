@@ -45,6 +45,7 @@ _LOG_PERIOD_S = 5.0
 _NMT_PRE_OPERATIONAL = 0x80
 _BENCH_PRIORITY = 40
 _RECORDER_STARTS = 5
+_LOOP_END_S = 3.0
 
 
 class SupervisorError(Exception):
@@ -69,6 +70,7 @@ class Supervisor:
         self._config_path = config_path
         self._duration_s = duration_s
         self._stop = False
+        self._bus_gone = False
         self._load = _checked_load(config)
         try:
             self._directory = runtime_dir(bus)
@@ -110,6 +112,7 @@ class Supervisor:
 
     def _run(self) -> Summary | None:
         bench = self._start_bench() if self._emulate else None
+        socket = open_frame_socket(self._bus, [exact(0x600 + self._config.node_id)])
         loop = self._child("daemon.loop", [json.dumps(self._loop_request())], "the loop")
         report = self._boot()
         ready = self._wait(loop)
@@ -126,7 +129,6 @@ class Supervisor:
         reader = SnapshotReader(self._snapshot, supervisor=True)
         self._returning = ReturningNodes(self._config, self._bus, report, self._child)
         self._start_recorder(report)
-        socket = open_frame_socket(self._bus, [exact(0x600 + self._config.node_id)])
         store = ObjectStore(entries_from_json(report["own_entries"]), self._config.node_id)
         node = OwnNode(socket, store, self._config, reader)
         result = self._watch(loop, node, reader, bench)
@@ -201,31 +203,45 @@ class Supervisor:
         title = f"jtqd on {self._instance}, node {self._config.node_id:02X}h, {self._config.estimator.method}"
         previous = reader.read()
         shown = time.monotonic()
-        told = False
+        stopping = 0.0
         with Live(console=self._console, auto_refresh=False, transient=False) as live:
             while True:
-                select.select([node.socket.fd, loop.output_fd], [], [], 0.05)
-                node.serve()
-                node.watch()
+                select.select([loop.output_fd, *([] if self._bus_gone else [node.socket.fd])], [], [], 0.05)
+                self._serve(node)
                 answer = loop.poll_answer()
                 if answer is not None and answer.get("done"):
                     return answer
                 if not loop.alive():
                     final = loop.poll_answer()
                     return final or {"error": f"the loop ended with exit status {loop.process.returncode}"}
-                if bench is not None and not bench.alive() and not told:
+                if bench is not None and not bench.alive():
                     print(
                         f"jtqd: the emulated bench ended with exit status {bench.process.returncode}",
                         file=sys.stderr,
                     )
-                if self._stop and not told:
+                    bench = None
+                if self._stop and not stopping:
+                    stopping = time.monotonic()
                     loop.process.send_signal(signal.SIGTERM)
-                    told = True
+                    loop.process.send_signal(signal.SIGCONT)  # a stopped one would sleep through it
+                if stopping and time.monotonic() - stopping > _LOOP_END_S:
+                    loop.process.kill()
+                    return {"error": f"the loop did not end within {_LOOP_END_S:g} s"}
                 self._watch_recorder(node)
-                self._returning.watch(reader.read().unconfigured, reader.note_configured)
+                self._returning.watch(reader.read(), reader.note_configured)
                 now = time.monotonic()
                 if now - shown >= (_TABLE_PERIOD_S if terminal else _LOG_PERIOD_S):
                     previous, shown = self._show(live, terminal, reader, previous, title), now
+
+    def _serve(self, node: OwnNode) -> None:
+        """The own node's duties, for as long as there is a bus; what became of it the loop says."""
+        if self._bus_gone:
+            return
+        try:
+            node.serve()
+            node.watch()
+        except BusError:
+            self._bus_gone = True
 
     def _show(self, live: Live, terminal: bool, reader: SnapshotReader, previous: View, title: str) -> View:
         view = reader.read()
@@ -249,6 +265,7 @@ class Supervisor:
             directory=self._log_directory,
             ring=self._ring,
             progress=self._progress,
+            snapshot=self._snapshot,
             instance=self._instance,
         )
         self._progress.unlink(missing_ok=True)

@@ -28,7 +28,7 @@ from drivers.sdo_client import NodeSdo
 
 NMT_START, NMT_PRE_OPERATIONAL = 0x01, 0x80
 STATE_BOOT_UP, STATE_STOPPED, STATE_OPERATIONAL, STATE_PRE_OPERATIONAL = 0x00, 0x04, 0x05, 0x7F
-SYNC_LISTEN_S = 0.02  # 20 periods of the SYNC that would be there
+SYNC_LISTEN_S = 0.12  # a little more than the longest period that jtqd itself may have
 NOTIFIER_S = 0.01  # canopen's default of 1 s is what closing the network would wait for
 _UNIX = "unix:"
 _STATE_NAMES = {STATE_BOOT_UP: "boot-up", STATE_STOPPED: "stopped", STATE_PRE_OPERATIONAL: "pre-operational"}

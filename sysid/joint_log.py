@@ -14,6 +14,7 @@ import numpy as np
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from numpy.typing import NDArray
+from zstandard import ZstdError
 
 Records = NDArray[np.void]
 
@@ -44,13 +45,13 @@ def read_topic(path: Path, topic: str) -> Records:
     text = ""
     try:
         with path.open("rb") as file:
-            for schema, _, message in make_reader(file).iter_messages([topic]):
+            for schema, _, message in make_reader(file, validate_crcs=True).iter_messages([topic]):
                 if schema is None or schema.encoding != "ros2msg":
                     raise LogError(f"{path}: {topic}: found no ros2msg schema, expected one")
                 text = schema.data.decode()
                 payloads.append(message.data)
-    except (McapError, struct.error, EOFError, UnicodeDecodeError) as error:
-        raise LogError(f"{path}: not a readable MCAP file: {error}") from None
+    except (McapError, ZstdError, struct.error, EOFError, UnicodeDecodeError) as error:
+        raise LogError(f"{path}: not a readable MCAP file: {error or type(error).__name__}") from None
     if not payloads:
         raise LogError(f"{path}: found no message on {topic}, expected one per cycle")
     first = payloads[0]

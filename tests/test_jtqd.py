@@ -194,7 +194,7 @@ def test_a_node_that_restarts_is_configured_again_before_it_is_believed(
     process.send_signal(signal.SIGTERM)
     _, err = process.communicate(timeout=15)
     assert back, err
-    assert "node 1 restarted and is configured again" in err
+    assert "node 1 was away and is configured again" in err
     assert process.returncode == 0
 
 
@@ -320,3 +320,40 @@ def test_a_second_daemon_on_the_same_bus_is_refused(
     assert len(message.splitlines()) == 1
     assert str(process.pid) in message
     assert process.poll() is None, "the first one goes on"
+
+
+def test_ctrl_c_on_a_terminal_ends_in_order(environment: dict[str, str]) -> None:
+    """A terminal sends SIGINT to its whole foreground group; bench, loop and recorder must not die of it."""
+    process = subprocess.Popen(
+        [*JTQD, "--bus", "sim", "--record", "none", "--json"],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    time.sleep(3)
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=15)
+    assert process.returncode == 0, err
+    assert "Traceback" not in err
+    assert json.loads(out)["error"] is None
+
+
+def test_a_loop_that_hangs_does_not_keep_the_daemon(environment: dict[str, str]) -> None:
+    process = subprocess.Popen(
+        [*JTQD, "--bus", "sim", "--record", "none"],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    time.sleep(3)
+    for entry in Path("/proc").glob("[0-9]*"):
+        command = (entry / "cmdline").read_bytes() if (entry / "cmdline").exists() else b""
+        if b"daemon.loop" in command and environment["RUNTIME_DIRECTORY"].encode() in command:
+            os.kill(int(entry.name), signal.SIGKILL)
+    out, err = process.communicate(timeout=15)
+    assert process.returncode == 1
+    assert "the loop ended with exit status -9" in out
+    assert "Traceback" not in err

@@ -14,6 +14,7 @@ import pytest
 from mcap.reader import make_reader
 
 from daemon.estimate_pdo import decode
+from sysid.joint_log import read_topic
 
 INTERFACE = os.environ.get("JTQD_CAN_INTERFACE", "vcan0")
 CYCLES = 10_000
@@ -179,6 +180,43 @@ def test_a_recorder_that_dies_or_stalls_costs_the_loop_nothing(tmp_path: Path, h
     else:
         assert daemon.returncode == 3, err
         assert recording["lost"] > 0
+
+
+@pytest.mark.socketcan
+def test_a_bus_that_goes_down_for_a_second_and_comes_back(tmp_path: Path) -> None:
+    """The daemon stays, says stale while the interface is down, and is valid again without a hand."""
+    environment = {**os.environ, "RUNTIME_DIRECTORY": str(tmp_path)}
+    bench = subprocess.Popen(
+        [sys.executable, "-m", "sim_can", "--bus", INTERFACE], stderr=subprocess.PIPE, text=True
+    )
+    assert bench.stderr is not None
+    assert "ready" in bench.stderr.readline()
+    daemon = subprocess.Popen(
+        [
+            *(sys.executable, "-m", "daemon.jtqd", "--bus", INTERFACE, "--duration", "6", "--json"),
+            *("--record", str(tmp_path / "logs")),
+        ],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    subprocess.run(["candump", "-n", "2000", f"{INTERFACE},1A0:7FF"], stdout=subprocess.DEVNULL, check=True)
+    subprocess.run(["ip", "link", "set", INTERFACE, "down"], check=True)
+    time.sleep(1)
+    subprocess.run(["ip", "link", "set", INTERFACE, "up"], check=True)
+    out, err = daemon.communicate(timeout=300)
+    bench.terminate()
+    bench.wait(10)
+    assert daemon.returncode == 0, err
+    summary = json.loads(out)
+    assert summary["error"] is None
+    assert summary["counters"]["bus_errors"] > 0
+    log = read_topic(Path(summary["recording"]["path"]), "/joint/1/state")
+    time_s = (log["sync_monotonic_ns"] - log["sync_monotonic_ns"][0]) * 1e-9
+    down = (time_s > 2.3) & (time_s < 2.8)
+    assert set(log["status"][down]) == {4}
+    assert 4 not in log["status"][time_s > 4.5]
 
 
 def recorder_of(pid: int) -> int:
