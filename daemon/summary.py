@@ -83,10 +83,13 @@ class Summary:
         if self.recording is None:
             lines.append("log           none")
         else:
-            lost = self.recording.get("lost", 0)
-            lines.append(
-                f"log           {self.recording.get('path')}" + (f", {lost} cycles lost" if lost else "")
-            )
+            lost, path = self.recording.get("lost", 0), self.recording.get("path")
+            shown = path or f"none: {self.recording.get('error') or 'it could not be written'}"
+            lines.append(f"log           {shown}" + (f", {lost} cycles lost" if lost else ""))
+            lines += [
+                f"              {left} (left by a recorder that died)"
+                for left in self.recording.get("left", [])
+            ]
         if self.error:
             lines.append(f"ended by      {self.error}")
         return "\n".join(lines)

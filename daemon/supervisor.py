@@ -70,6 +70,7 @@ class Supervisor:
         self._config_path = config_path
         self._duration_s = duration_s
         self._stop = False
+        self._started = time.time()
         self._bus_gone = False
         self._load = _checked_load(config)
         try:
@@ -332,8 +333,17 @@ class Supervisor:
             except BusError:
                 return
 
+    def _leftovers(self) -> list[str]:
+        """Files of this run whose recorder died before it could end them."""
+        if self._log_directory is None or len(self._recorder_starts) < 2:
+            return []
+        files = self._log_directory.glob(f"jtqd-{self._instance}-*.mcap.active")
+        return sorted(str(file) for file in files if file.stat().st_mtime >= self._started)
+
     def _summary(self, reader: SnapshotReader, result: dict[str, Any], refused: list[str]) -> Summary:
         view = reader.read()
+        if self._recording is not None:
+            self._recording["left"] = self._leftovers()
         p50, p99, worst = reader.work_us(0.5, 0.99, 1.0)
         late50, late99, late_worst = reader.late_us(0.5, 0.99, 1.0)
         return Summary(

@@ -23,12 +23,18 @@ def _stop(_number: int, _frame: FrameType | None) -> None:
 
 def run(arguments: list[str] | None) -> int:
     """Run a hub until SIGINT or SIGTERM; exit status 0, or 1 when the bus cannot be made."""
-    parser = argparse.ArgumentParser(prog="python -m drivers.hub", description="CAN bus on a unix socket")
+    parser = argparse.ArgumentParser(
+        prog="python -m drivers.hub",
+        description="CAN bus on a unix socket",
+        epilog="example: python -m drivers.hub unix:/tmp/bus --bitrate 1000000",
+    )
     parser.add_argument("bus", help="unix:PATH")
     parser.add_argument(
         "--bitrate", type=int, help="model the wire at this many bit/s; default: pass at once"
     )
     options = parser.parse_args(arguments)
+    if not options.bus.startswith(PREFIX) or options.bus == PREFIX:
+        parser.error(f"found {options.bus!r}, expected unix:PATH")
     if options.bitrate is not None and options.bitrate <= 0:
         parser.error(f"--bitrate must be positive, not {options.bitrate}")
     signal.signal(signal.SIGTERM, _stop)

@@ -1,9 +1,9 @@
 """The estimate of one joint, sample by sample: observer, loss, network, validity, in this order.
 
-    tau_raw, tau_tob, v, r  <- observer (Eqs. 4, 7)
-    i_eff      = tau_raw/(G Kt)                      current without the part that accelerates the rotor
-    efficiency = tau_raw - loss(i_eff, v)            inside a quadrant tau_raw eta(i_eff, v): Eq. (7) for
-    Table I's eta network    = N(i, theta_m, omega_m, theta_l, omega_l, efficiency)
+    tau_raw, tau_tob, v, r  <-  observer (Eqs. 4, 7)
+    i_eff      = tau_raw/(G Kt)                current without the part that accelerates the rotor
+    efficiency = tau_raw - loss(i_eff, v)      inside a quadrant tau_raw eta(i_eff, v): Eq. (7) with Table I
+    network    = N(i, theta_m, omega_m, theta_l, omega_l, efficiency)
 
 Everything that enters the loss went through the same filter, so the physics estimate as a whole is 1/g old.
 """

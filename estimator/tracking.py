@@ -1,10 +1,12 @@
 """Observer with its guard: starts, gaps, garbage and standstill of one joint, sample by sample.
 
-not finite                         INVALID, and the next good sample starts again
-first sample, dt <= 0, dt too long STARTING: the observer is set to this sample, nothing is published
-implausible motor torque or speed  INVALID and start again, so that one absurd sample does not decay into
-the next |v| below the threshold            STANDSTILL, until it is above twice the threshold else
-VALID
+| sample | status and what follows |
+|---|---|
+| not finite | INVALID, and the next good sample starts again |
+| the first, dt <= 0, dt too long | STARTING: the observer is set to this sample, nothing is published |
+| implausible motor torque or speed | INVALID and start again: one absurd sample must not decay into the next |
+| abs(v) below the threshold | STANDSTILL, until it is above twice the threshold |
+| else | VALID |
 """
 
 from __future__ import annotations

@@ -2,13 +2,11 @@
 
 Everything exists twice: plain floats for the loop, arrays (suffix _many) for whole runs.
 
-    physics, moving   sigma^2 = load^2 + (u_f tau_f(v))^2 + floor^2      load: the efficiency table's RMSE
-    as a torque;
-                                                                        for the classical observer u_l
-                                                                        |tau_raw|
-    standstill        tau_j in [tau_raw - loss(+), tau_raw - loss(-)]    value: the middle; sigma: half the
-    width + floor network           weight w from the envelope and from its distance to physics; value and
-    sigma are blended by w
+    physics, moving   sigma^2 = load^2 + (u_f tau_f(v))^2 + floor^2
+                      load: the efficiency table's RMSE as a torque; for the classical observer u_l |tau_raw|
+    standstill        tau_j in [tau_raw - loss(+), tau_raw - loss(-)]
+                      value: the middle; sigma: half the width + floor
+    network           weight w from the envelope and from its distance to physics; value and sigma are blended by w
 """
 
 from __future__ import annotations

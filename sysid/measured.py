@@ -199,9 +199,10 @@ def _save(joint: Joint, path: Path) -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Command line; results on stdout, log on stderr. Exit status 0 done, 1 failure, 2 usage."""
     parser = argparse.ArgumentParser(
-        prog="python -m sysid.measured",
+        prog="jtq measured",
         description="Score the torque observer on the Kinova Gen3 runs, before and after fitting friction.",
-        epilog="examples: jtq measured --out /tmp/measured   jtq measured --bus unix:/tmp/bus --out /tmp/measured",
+        epilog="examples:\n  jtq measured --out measured\n  jtq measured --bus unix:/tmp/bus --out measured",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
         "--bus", help="play the runs on this bus (vcan0, unix:PATH) and score what jtqd publishes there"

@@ -176,7 +176,8 @@ def test_a_recorder_that_dies_or_stalls_costs_the_loop_nothing(tmp_path: Path, h
         assert daemon.returncode == 0, err
         assert "started again" in err
         assert recording["lost"] == 0
-        assert len(list((tmp_path / "logs").glob("*.active"))) == 1, "what the first one left"
+        assert [str(path) for path in (tmp_path / "logs").glob("*.active")] == recording["left"]
+        assert len(recording["left"]) == 1
     else:
         assert daemon.returncode == 3, err
         assert recording["lost"] > 0

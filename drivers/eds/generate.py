@@ -215,7 +215,13 @@ SHEETS = (drive, torque_sensor, jtqd)
 
 
 def main() -> int:
-    """Write the three files."""
+    """Write the three files; takes no argument."""
+    if len(sys.argv) > 1:
+        print(
+            "usage: python -m drivers.eds.generate   (writes the data sheets beside this file)",
+            file=sys.stderr,
+        )
+        return 0 if sys.argv[1] in ("-h", "--help") else 2
     for sheet in (make() for make in SHEETS):
         (FOLDER / sheet.file_name).write_text(render(sheet), encoding="ascii", newline="\n")
         print(FOLDER / sheet.file_name, file=sys.stderr)
