@@ -181,6 +181,8 @@ def serve(request: dict[str, Any]) -> int:
     """Build, say ready, wait for the boot report, run, say what happened. Returns the exit status."""
     stop = _Stop()
     config = load_config(Path(request["config"]) if request["config"] else None)
+    if config.sha256 != request["config_sha256"]:
+        raise ConfigError(f"{config.path}: it changed while jtqd was starting")
     estimators = [build_estimator(config, joint) for joint in config.joints]
     warm_up(estimators)
     _answer(ready=True)

@@ -19,7 +19,7 @@ def runtime_dir(bus: str) -> Path:
     root = Path(base) if base else Path("/dev/shm")
     path = root / f"jtqd-{os.getuid()}-{instance_name(bus)}"
     path.mkdir(mode=0o700, parents=True, exist_ok=True)
-    if path.stat().st_uid != os.getuid():
+    if path.lstat().st_uid != os.getuid():
         raise PermissionError(f"{path} belongs to another user")
     return path
 

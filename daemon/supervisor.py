@@ -162,6 +162,7 @@ class Supervisor:
     def _loop_request(self) -> dict[str, Any]:
         return {
             "config": str(self._config_path) if self._config_path else None,
+            "config_sha256": self._config.sha256,
             "bus": self._bus,
             "ring": str(self._ring),
             "snapshot": str(self._snapshot),
