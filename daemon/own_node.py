@@ -15,6 +15,7 @@ from math import inf, isfinite, nan
 from daemon.config import Config
 from daemon.estimate_pdo import field
 from daemon.snapshot import SnapshotReader
+from drivers.eds.own_objects import COUNTERS, JOINT_PARAMETERS
 from drivers.errors import BusDown
 from drivers.frame import FRAME, pack
 from drivers.frame_socket import FrameSocket
@@ -22,29 +23,6 @@ from drivers.object_dictionary import ObjectStore
 from drivers.sdo_server import SdoServer
 from estimator.status import STALE
 
-COUNTER_OBJECTS = (
-    "cycles",
-    "missed",
-    "stale_inputs",
-    "late_frames",
-    "duplicate_frames",
-    "rejected_frames",
-    "foreign_sync",
-    "tx_dropped",
-    "rx_dropped",
-    "network_fallbacks",
-    "recorder_lost",
-)
-"""Sub-indices 1.. of 2200h, in order."""
-PARAMETER_OBJECTS = (
-    "gear_ratio",
-    "torque_constant_nm_per_a",
-    "rotor_inertia_kgm2",
-    "stiffness_nm_per_rad",
-    "damping_nms_per_rad",
-    "rated_torque_nm",
-)
-"""Sub-indices 1.. of 2202h (joint 1) and 2203h (joint 2): fields of the joint file."""
 EMCY_INPUT_TIMEOUT = 0x8250
 EMCY_RESET = 0x0000
 _STANDSTILL_S = 0.2
@@ -118,7 +96,7 @@ class OwnNode:
             store.on_read(0x2101, joint + 1, partial(self._field, joint, 1))
         store.on_read(0x2102, 0, lambda: self._field(0, 2) | self._field(1, 2) << 4)
         store.on_read(0x2103, 0, lambda: self._reader.read().sync_counter)
-        for sub, name in enumerate(COUNTER_OBJECTS, start=1):
+        for sub, name in enumerate(COUNTERS, start=1):
             store.on_read(0x2200, sub, partial(self._counter, name))
         for sub, share in enumerate((0.5, 0.99, 1.0), start=1):
             store.on_read(0x2201, sub, partial(self._work_us, share))
@@ -144,5 +122,5 @@ class OwnNode:
         self._store.set_number(0x1019, 0, config.counter_overflow)
         self._store.set_text(0x2204, 0, config.sha256)
         for index, joint in zip((0x2202, 0x2203), config.joints, strict=True):
-            for sub, name in enumerate(PARAMETER_OBJECTS, start=1):
+            for sub, name in enumerate(JOINT_PARAMETERS, start=1):
                 self._store.set_number(index, sub, getattr(joint.joint, name))

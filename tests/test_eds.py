@@ -7,10 +7,9 @@ import pytest
 from canopen import import_od
 from canopen_nodes import EDS
 
-from daemon.own_node import COUNTER_OBJECTS, PARAMETER_OBJECTS
-from drivers.eds.generate import COUNTERS, SHEETS, drive, jtqd
+from drivers.eds.generate import SHEETS, drive, jtqd
+from drivers.eds.own_objects import COUNTERS
 from drivers.eds.schema import U8, Var, render
-from drivers.object_dictionary import read_eds
 
 FILES = ("drive.eds", "torque_sensor.eds", "jtqd.eds")
 TYPES = {0x02: 8, 0x03: 16, 0x04: 32, 0x05: 8, 0x06: 16, 0x07: 32, 0x08: 32, 0x09: 0}
@@ -282,14 +281,3 @@ def test_jtqd_publishes_the_estimate_and_its_counters():
     assert number(eds["1005"]["DefaultValue"]) == 0x40000080  # bit 30: producer
     assert number(eds["1019"]["DefaultValue"]) == 240
     assert jtqd().objects[0x2102].data_type == U8
-
-
-def test_jtqd_fills_its_objects_in_the_order_of_its_data_sheet():
-    """2200h and 2202h..2203h are filled by position: the names in the EDS are those of the daemon's lists."""
-    names = {
-        (each.index, each.subindex): each.name.split(": ")[-1] for each in read_eds(EDS / "jtqd.eds", 0x20)
-    }
-    assert [names[0x2200, sub] for sub in range(1, len(COUNTER_OBJECTS) + 1)] == list(COUNTER_OBJECTS)
-    for index in (0x2202, 0x2203):
-        assert [names[index, sub] for sub in range(1, len(PARAMETER_OBJECTS) + 1)] == list(PARAMETER_OBJECTS)
-    assert (0x2200, len(COUNTER_OBJECTS) + 1) not in names

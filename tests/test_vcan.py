@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -91,32 +92,35 @@ def test_ten_thousand_cycles_without_a_miss_and_twice_the_same(tmp_path: Path) -
         assert estimates == [data for _, can_id, data in again if can_id == 0x1A0], "byte-identical"
 
 
-@pytest.mark.socketcan
-def test_a_remote_frame_and_29_bit_twins_on_the_real_bus_are_only_counted(tmp_path: Path) -> None:
-    environment = {**os.environ, "RUNTIME_DIRECTORY": str(tmp_path)}
-    bench = subprocess.Popen(
+@pytest.fixture
+def bench() -> Iterator[None]:
+    """`jtq sim` on the interface."""
+    process = subprocess.Popen(
         [sys.executable, "-m", "sim_can", "--bus", INTERFACE], stderr=subprocess.PIPE, text=True
     )
-    assert bench.stderr is not None
-    assert "ready" in bench.stderr.readline()
-    daemon = subprocess.Popen(
-        [
-            sys.executable,
-            "-m",
-            "daemon.jtqd",
-            "--bus",
-            INTERFACE,
-            "--duration",
-            "4",
-            "--record",
-            "none",
-            "--json",
-        ],
-        env=environment,
+    assert process.stderr is not None
+    assert "ready" in process.stderr.readline()
+    yield
+    process.terminate()
+    process.wait(10)
+
+
+def start(tmp_path: Path, duration: str, record: str) -> subprocess.Popen[str]:
+    """jtqd on the interface, with a runtime directory of its own."""
+    arguments = ["--bus", INTERFACE, "--duration", duration, "--record", record, "--json"]
+    return subprocess.Popen(
+        [sys.executable, "-m", "daemon.jtqd", *arguments],
+        env={**os.environ, "RUNTIME_DIRECTORY": str(tmp_path)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
     )
+
+
+@pytest.mark.socketcan
+@pytest.mark.usefixtures("bench")
+def test_a_remote_frame_and_29_bit_twins_on_the_real_bus_are_only_counted(tmp_path: Path) -> None:
+    daemon = start(tmp_path, "4", "none")
     dump = subprocess.run(
         ["candump", "-n", "200", f"{INTERFACE},1A0:7FF"], capture_output=True, timeout=120, check=True
     )
@@ -124,8 +128,6 @@ def test_a_remote_frame_and_29_bit_twins_on_the_real_bus_are_only_counted(tmp_pa
     for frame in ("00000181#0011223344556677", "181#R", "181#00112233", "182#", "00000080#00"):
         subprocess.run(["cansend", INTERFACE, frame], check=True)
     out, err = daemon.communicate(timeout=120)
-    bench.terminate()
-    bench.wait(10)
     assert daemon.returncode == 0, err
     summary = json.loads(out)
     assert summary["counters"]["rejected_frames"] == 5
@@ -139,25 +141,11 @@ def test_layout_of_can_frame() -> None:
 
 
 @pytest.mark.socketcan
+@pytest.mark.usefixtures("bench")
 @pytest.mark.parametrize("harm", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_recorder_that_dies_or_stalls_costs_the_loop_nothing(tmp_path: Path, harm: signal.Signals) -> None:
     """Killed: another one goes on where it was. Stopped for 6 s: the ring goes round, and what is lost is counted."""
-    environment = {**os.environ, "RUNTIME_DIRECTORY": str(tmp_path)}
-    bench = subprocess.Popen(
-        [sys.executable, "-m", "sim_can", "--bus", INTERFACE], stderr=subprocess.PIPE, text=True
-    )
-    assert bench.stderr is not None
-    assert "ready" in bench.stderr.readline()
-    daemon = subprocess.Popen(
-        [
-            *(sys.executable, "-m", "daemon.jtqd", "--bus", INTERFACE, "--duration", "9", "--json"),
-            *("--record", str(tmp_path / "logs")),
-        ],
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    daemon = start(tmp_path, "9", str(tmp_path / "logs"))
     subprocess.run(["candump", "-n", "1500", f"{INTERFACE},1A0:7FF"], stdout=subprocess.DEVNULL, check=True)
     recorder = recorder_of(daemon.pid)
     os.kill(recorder, harm)
@@ -165,8 +153,6 @@ def test_a_recorder_that_dies_or_stalls_costs_the_loop_nothing(tmp_path: Path, h
         time.sleep(6)
         os.kill(recorder, signal.SIGCONT)
     out, err = daemon.communicate(timeout=300)
-    bench.terminate()
-    bench.wait(10)
     summary = json.loads(out)
     if os.environ.get("JTQD_IN_BENCH_KERNEL"):
         assert (summary["cycles"], summary["missed"], summary["stale_inputs"]) == (9000, 0, 0)
@@ -184,31 +170,15 @@ def test_a_recorder_that_dies_or_stalls_costs_the_loop_nothing(tmp_path: Path, h
 
 
 @pytest.mark.socketcan
+@pytest.mark.usefixtures("bench")
 def test_a_bus_that_goes_down_for_a_second_and_comes_back(tmp_path: Path) -> None:
     """The daemon stays, says stale while the interface is down, and is valid again without a hand."""
-    environment = {**os.environ, "RUNTIME_DIRECTORY": str(tmp_path)}
-    bench = subprocess.Popen(
-        [sys.executable, "-m", "sim_can", "--bus", INTERFACE], stderr=subprocess.PIPE, text=True
-    )
-    assert bench.stderr is not None
-    assert "ready" in bench.stderr.readline()
-    daemon = subprocess.Popen(
-        [
-            *(sys.executable, "-m", "daemon.jtqd", "--bus", INTERFACE, "--duration", "6", "--json"),
-            *("--record", str(tmp_path / "logs")),
-        ],
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    daemon = start(tmp_path, "6", str(tmp_path / "logs"))
     subprocess.run(["candump", "-n", "2000", f"{INTERFACE},1A0:7FF"], stdout=subprocess.DEVNULL, check=True)
     subprocess.run(["ip", "link", "set", INTERFACE, "down"], check=True)
     time.sleep(1)
     subprocess.run(["ip", "link", "set", INTERFACE, "up"], check=True)
     out, err = daemon.communicate(timeout=300)
-    bench.terminate()
-    bench.wait(10)
     assert daemon.returncode == 0, err
     summary = json.loads(out)
     assert summary["error"] is None

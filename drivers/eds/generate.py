@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 from drivers.eds import communication as comm
+from drivers.eds.own_objects import COUNTERS, JOINT_PARAMETERS
 from drivers.eds.schema import (
     ARRAY,
     I8,
@@ -151,29 +152,6 @@ def torque_sensor() -> Sheet:
         objects,
         [note],
     )
-
-
-COUNTERS = (
-    "cycles",
-    "missed",
-    "stale_inputs",
-    "late_frames",
-    "duplicate_frames",
-    "rejected_frames",
-    "foreign_sync",
-    "tx_dropped",
-    "rx_dropped",
-    "network_fallbacks",
-    "recorder_lost",
-)
-JOINT_PARAMETERS = (
-    "gear_ratio",
-    "torque_constant_nm_per_a",
-    "rotor_inertia_kgm2",
-    "stiffness_nm_per_rad",
-    "damping_nms_per_rad",
-    "rated_torque_nm",
-)
 
 
 def jtqd() -> Sheet:
