@@ -5,7 +5,7 @@ Everything exists twice: plain floats for the loop, arrays (suffix _many) for wh
     physics, moving   sigma^2 = load^2 + (u_f tau_f(v))^2 + floor^2
                       load: the efficiency table's RMSE as a torque; for the classical observer u_l |tau_raw|
     standstill        tau_j in [tau_raw - loss(+), tau_raw - loss(-)]
-                      value: the middle; sigma: half the width + floor
+                      value: the middle; sigma: half the width, wider by u_f, + floor
     network           weight w from the envelope and from its distance to physics; value and sigma are blended by w
 """
 
@@ -28,7 +28,16 @@ FADE_START: Final = 0.75
 class Uncertainty:
     """Standard deviations and standstill intervals of the physics estimates of one joint [Nm, joint side]."""
 
-    __slots__ = ("_floor", "_friction", "_load", "_losses", "_static", "_u_friction", "_with_efficiency")
+    __slots__ = (
+        "_floor",
+        "_friction",
+        "_load",
+        "_losses",
+        "_static",
+        "_u_friction",
+        "_widened",
+        "_with_efficiency",
+    )
 
     def __init__(self, joint: Joint, settings: EstimatorSettings, losses: LossModel) -> None:
         self._friction: Final = FrictionModel(joint.friction)
@@ -36,6 +45,8 @@ class Uncertainty:
         self._losses: Final = losses
         self._floor: Final = settings.sigma_floor * joint.rated_torque_nm
         self._u_friction: Final = settings.friction_uncertainty
+        # what friction can hold is itself known to that part only
+        self._widened: Final = 1.0 + settings.friction_uncertainty
         self._load: Final = settings.load_uncertainty
         # without an efficiency the physics is the classical observer's whatever the method
         self._with_efficiency: Final = settings.method != "tob" and losses.has_efficiency
@@ -62,16 +73,16 @@ class Uncertainty:
     def standing(self, raw_nm: float, current_a: float) -> tuple[float, float]:
         """Return (value, sigma) of a standing joint: middle and half width of what friction can hold."""
         if not self._with_efficiency:
-            return raw_nm, self._static + self._floor
+            return raw_nm, self._widened * self._static + self._floor
         forward, backward = self._losses.standstill_bounds(current_a)
-        return raw_nm - 0.5 * (forward + backward), 0.5 * (forward - backward) + self._floor
+        return raw_nm - 0.5 * (forward + backward), 0.5 * self._widened * (forward - backward) + self._floor
 
     def standing_many(self, raw_nm: FloatArray, current_a: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Vectorised twin of `standing`."""
         if not self._with_efficiency:
-            return raw_nm, np.full_like(raw_nm, self._static + self._floor)
+            return raw_nm, np.full_like(raw_nm, self._widened * self._static + self._floor)
         forward, backward = self._losses.standstill_bounds_many(current_a)
-        return raw_nm - 0.5 * (forward + backward), 0.5 * (forward - backward) + self._floor
+        return raw_nm - 0.5 * (forward + backward), 0.5 * self._widened * (forward - backward) + self._floor
 
 
 class Trust:

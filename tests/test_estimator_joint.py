@@ -255,13 +255,13 @@ def test_standstill_value_and_sigma() -> None:
     assert (got.status, got.torque_nm, got.sigma_nm) == (
         st.STANDSTILL,
         pytest.approx(6.2),
-        pytest.approx(4.0),
+        pytest.approx(1.15 * 3.8 + 0.2),
     )
     got = steady(estimator("network"), 0.0, 0.0)
     assert (got.status, got.torque_nm, got.sigma_nm) == (
         st.STANDSTILL,
         pytest.approx(0.0),
-        pytest.approx(4.0),
+        pytest.approx(1.15 * 3.8 + 0.2),
     )
 
 

@@ -43,13 +43,16 @@ def test_sigma_by_hand() -> None:
 
 
 def test_standstill_is_the_interval_that_friction_can_hold() -> None:
-    assert uncertainty("tob").standing(7.0, 7.0 / 6.2) == (7.0, 3.8 + 0.2)
-    assert uncertainty("efficiency").standing(0.0, 0.0) == pytest.approx((0.0, 4.0))
+    assert uncertainty("tob").standing(7.0, 7.0 / 6.2) == (7.0, pytest.approx(1.15 * 3.8 + 0.2))
+    assert uncertainty("efficiency").standing(0.0, 0.0) == pytest.approx((0.0, 1.15 * 3.8 + 0.2))
     joint = joint1()
     losses = LossModel(joint)
     for i in np.linspace(-6, 6, 49).tolist():
         raw = 6.2 * i
         value, sigma = uncertainty("efficiency").standing(raw, i)
+        # friction stronger than the file's by its uncertainty still holds the joint inside
+        stronger = [raw - 1.15 * losses.loss(i, v) for v in (-0.02, 0.02)]
+        assert all(value - sigma <= torque <= value + sigma for torque in stronger)
         # creeping either way at any speed below the threshold, the true torque stays inside
         for v in (-0.02, -0.01, -0.003, 0.0, 0.003, 0.01, 0.02):
             assert value - sigma <= raw - losses.loss(i, v) <= value + sigma
