@@ -82,7 +82,7 @@ static void standing(const joint_parameters *p, double raw, double i, double *to
     forward += weight * (p->static_friction - forward);
     backward = -(backward + weight * (p->static_friction - backward));
     *torque = raw - 0.5 * (forward + backward);
-    *sigma = 0.5 * (forward - backward) + p->floor;
+    *sigma = 0.5 * (1.0 + p->u_friction) * (forward - backward) + p->floor;
 }
 
 static double run_network(const network_weights *n, const double x[INPUTS])
