@@ -26,6 +26,10 @@ _QUIET_LIBRARIES = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MALLOC
 """numpy's linear algebra would start a thread per CPU, and none of our processes needs one."""
 
 
+_CLOSED_S = 0.005
+"""An output that was closed is always readable: whoever waits for its process to end must not spin on it."""
+
+
 def _die_with_parent() -> None:
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
 
@@ -90,6 +94,8 @@ class Child:
         chunk = self.process.stdout.read()
         if chunk:
             self._pending += chunk
+        elif chunk == b"":
+            time.sleep(_CLOSED_S)
         line, newline, rest = self._pending.partition(b"\n")
         if not newline:
             return None
