@@ -142,7 +142,8 @@ def test_layout_of_can_frame() -> None:
 
 @pytest.mark.socketcan
 @pytest.mark.usefixtures("bench")
-@pytest.mark.campaign  # in one session of eight the guest hung here, in another it stalled: not a gate until that is understood
+# In one session of eight the guest hung here, in another it stalled: not a gate until that is understood.
+@pytest.mark.campaign
 @pytest.mark.parametrize("harm", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_recorder_that_dies_or_stalls_costs_the_loop_nothing(tmp_path: Path, harm: signal.Signals) -> None:
     """Killed: another one goes on where it was. Stopped for 6 s: the ring goes round, and what is lost is counted.
