@@ -11,11 +11,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 
 class ChildError(Exception):
     """A child process ended or kept silent where an answer was due; the message is for the operator."""
+
+
+class ChildSilence(ChildError):  # noqa: N818  (not an error of this side)
+    """It runs and has said nothing yet."""
 
 
 _LIBC = ctypes.CDLL(None)
@@ -26,8 +31,8 @@ _QUIET_LIBRARIES = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MALLOC
 """numpy's linear algebra would start a thread per CPU, and none of our processes needs one."""
 
 
-_CLOSED_S = 0.005
-"""An output that was closed is always readable: whoever waits for its process to end must not spin on it."""
+_LONGEST_WAIT_S = 0.2
+"""How long `answer` waits at a stretch: a process may end without closing its output, if one of its own holds it."""
 
 
 def _die_with_parent() -> None:
@@ -55,12 +60,16 @@ class Child:
         assert self.process.stdout is not None
         os.set_blocking(self.process.stdout.fileno(), False)
         self._pending = b""
+        self._closed = False
 
     @property
-    def output_fd(self) -> int:
-        """File descriptor of its standard output, for select."""
+    def outputs(self) -> list[int]:
+        """File descriptor of its standard output, for select; none once it is closed.
+
+        A closed one is always readable: whoever waited on it for the process to end would spin.
+        """
         assert self.process.stdout is not None
-        return self.process.stdout.fileno()
+        return [] if self._closed else [self.process.stdout.fileno()]
 
     @property
     def pid(self) -> int:
@@ -94,8 +103,7 @@ class Child:
         chunk = self.process.stdout.read()
         if chunk:
             self._pending += chunk
-        elif chunk == b"":
-            time.sleep(_CLOSED_S)
+        self._closed = chunk == b""
         line, newline, rest = self._pending.partition(b"\n")
         if not newline:
             return None
@@ -109,25 +117,29 @@ class Child:
         """Wait for the next JSON line.
 
         Raises:
-            ChildError: the process ended or the time is up.
+            ChildSilence: the time is up.
+            ChildError: the process ended without one.
         """
-        assert self.process.stdout is not None
         deadline = time.monotonic() + timeout_s
         while True:
+            ended = not self.alive()  # asked first: what it said before its end is then in the pipe
             found = self.poll_answer()
             if found is not None:
                 return found
+            if ended:
+                raise ChildError(f"{self.name} ended with exit status {self.process.returncode}")
             left = deadline - time.monotonic()
             if left <= 0:
-                raise ChildError(f"{self.name} did not answer within {timeout_s:g} s")
-            if not self.alive() and not select.select([self.process.stdout], [], [], 0)[0]:
-                raise ChildError(f"{self.name} ended with exit status {self.process.returncode}")
-            select.select([self.process.stdout], [], [], min(left, 0.2))
-            if not self.alive():
-                found = self.poll_answer()
-                if found is not None:
-                    return found
-                raise ChildError(f"{self.name} ended with exit status {self.process.returncode}")
+                raise ChildSilence(f"{self.name} did not answer within {timeout_s:g} s")
+            self._rest(min(left, _LONGEST_WAIT_S))
+
+    def _rest(self, longest_s: float) -> None:
+        """Until there is output, or, where none can come any more, until the process has ended."""
+        if not self._closed:
+            select.select(self.outputs, [], [], longest_s)
+            return
+        with suppress(subprocess.TimeoutExpired):
+            self.process.wait(longest_s)
 
     def end(self, timeout_s: float = 5.0) -> int | None:
         """SIGTERM, wait, SIGKILL if it must be; returns the exit status (None if it had to be killed)."""

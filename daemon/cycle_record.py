@@ -12,7 +12,9 @@ Quantities are NaN where they are not known in that cycle (an input that did not
 
 from __future__ import annotations
 
+import re
 import struct
+from collections.abc import Collection
 from typing import NamedTuple
 
 JOINT_FORMAT = "11d4H"
@@ -77,7 +79,7 @@ class JointRecord(NamedTuple):
     torque_nm: float
     sigma_nm: float
     tob_nm: float
-    efficiency_nm: float
+    physics_nm: float
     network_nm: float
     dt_s: float
     statusword: int
@@ -85,6 +87,27 @@ class JointRecord(NamedTuple):
     sensor_status: int
     input_flags: int
     """Bit n set: input n of this joint (0 TPDO1, 1 TPDO2, 2 sensor) is of this cycle."""
+
+
+def selection(header: Collection[str], joint: Collection[str]) -> struct.Struct:
+    """Layout that unpacks only these fields, from the start of a record: those of the header, then of joint 1 and 2.
+
+    The values come in the order of the record. Raises ValueError for a field that the record does not have.
+    """
+    unknown = {*header} - {*Header._fields} | {*joint} - {*JointRecord._fields}
+    if unknown:
+        raise ValueError(f"found {', '.join(sorted(unknown))}, expected fields of Header and JointRecord")
+    one_joint = _selected(JOINT_FORMAT, JointRecord._fields, joint)
+    return struct.Struct("<" + _selected(HEADER_FORMAT, Header._fields, header) + 2 * one_joint)
+
+
+def _selected(layout: str, names: tuple[str, ...], wanted: Collection[str]) -> str:
+    """The same layout with padding in place of what is not wanted."""
+    codes = "".join(int(count or 1) * code for count, code in re.findall(r"(\d*)(\D)", layout))
+    return "".join(
+        code if name in wanted else f"{struct.calcsize('<' + code)}x"
+        for code, name in zip(codes, names, strict=True)
+    )
 
 
 def header_of(record: bytes | memoryview) -> Header:

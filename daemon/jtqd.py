@@ -10,6 +10,7 @@ from pathlib import Path
 from daemon.config import load_config
 from daemon.supervisor import Supervisor, SupervisorError
 from drivers.errors import BusError
+from estimator.arguments import seconds
 from estimator.checked import ConfigError
 
 _EXAMPLES = """examples:
@@ -41,20 +42,10 @@ def parser() -> argparse.ArgumentParser:
         help="directory of the MCAP logs, or none (default: $LOGS_DIRECTORY or ./logs)",
     )
     result.add_argument(
-        "--duration", type=_seconds, metavar="S", help="end after S seconds (default: run until stopped)"
+        "--duration", type=seconds, metavar="S", help="end after S seconds (default: run until stopped)"
     )
     result.add_argument("--json", action="store_true", help="print the final summary as JSON")
     return result
-
-
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0.0 < value < 1e9:
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected a time in seconds > 0")
-    return value
 
 
 def main(argv: list[str] | None = None) -> int:

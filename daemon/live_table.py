@@ -4,14 +4,27 @@ from __future__ import annotations
 
 from math import isfinite
 
-from rich.console import Group, RenderableType
+from rich.box import HEAVY_HEAD, Box
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-from daemon.snapshot import SnapshotReader, View
-from estimator.status import NAMES
+from daemon.snapshot import JointView, SnapshotReader, View
+from estimator.status import NAMES, PUBLISHED
 
 _COLOURS = {"valid": "green", "degraded": "yellow", "standstill": "cyan", "starting": "blue", "off": "dim"}
+
+_COLUMNS = {
+    "joint": 5,
+    "torque [Nm]": 10,
+    "sigma [Nm]": 10,
+    "sensor [Nm]": 10,
+    "error [Nm]": 10,
+    "status": max(map(len, NAMES.values())),
+}
+"""Heading and least width, so that the table does not jump when a value gets longer."""
+_DISPENSABLE = ("sensor [Nm]", "error [Nm]", "sigma [Nm]")
 
 
 def bus_load(previous: View, now: View, bitrate: int) -> float:
@@ -21,32 +34,57 @@ def bus_load(previous: View, now: View, bitrate: int) -> float:
     return bits / seconds / bitrate if previous.sync_realtime_ns and seconds > 0 else float("nan")
 
 
-def live_table(
-    reader: SnapshotReader, previous: View, view: View, bitrate: int, title: str
-) -> RenderableType:
-    """One picture of the running loop."""
-    table = Table(title=title, title_justify="left", expand=False)
-    for name, justify in (
-        ("joint", "left"),
-        ("torque [Nm]", "right"),
-        ("sigma [Nm]", "right"),
-        ("sensor [Nm]", "right"),
-        ("error [Nm]", "right"),
-        ("status", "left"),
-    ):
-        table.add_column(name, justify="left" if justify == "left" else "right", min_width=10)
-    for number, joint in enumerate(view.joints, start=1):
-        name = NAMES.get(joint.status, str(joint.status))
-        known = name in ("valid", "degraded", "standstill")
-        table.add_row(
-            str(number),
-            _number(joint.torque_nm) if known else "-",
-            _number(joint.sigma_nm) if known else "-",
-            _number(joint.sensor_nm),
-            _number(joint.torque_nm - joint.sensor_nm) if known else "-",
-            Text(name, style=_COLOURS.get(name, "bold red")),
+class LiveTable:
+    """One picture of the running loop, as wide as the terminal allows: the status is there at any width.
+
+    In a narrow terminal columns go in the order of `_DISPENSABLE`, then the frame, and in the end each joint is a line.
+    """
+
+    def __init__(self, reader: SnapshotReader, previous: View, view: View, bitrate: int, title: str) -> None:
+        self._title = title
+        self._line = loop_line(reader, previous, view, bitrate)
+        self._rows = [_cells(number, joint) for number, joint in enumerate(view.joints, start=1)]
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Called by rich with the width of the terminal."""
+        yield self._widest_that_fits(console, options)
+        yield Text(self._line)
+
+    def _widest_that_fits(self, console: Console, options: ConsoleOptions) -> RenderableType:
+        unlimited = options.update(max_width=1000)
+        for dropped in range(len(_DISPENSABLE) + 1):
+            for box in (HEAVY_HEAD, None) if dropped == len(_DISPENSABLE) else (HEAVY_HEAD,):
+                table = self._table([name for name in _COLUMNS if name not in _DISPENSABLE[:dropped]], box)
+                if Measurement.get(console, unlimited, table).maximum <= options.max_width:
+                    return table
+        lines = (
+            Text.assemble(f"{row['joint']}: {row['torque [Nm]']} Nm ", row["status"]) for row in self._rows
         )
-    return Group(table, Text(loop_line(reader, previous, view, bitrate)))
+        return Group(self._title, *lines)
+
+    def _table(self, names: list[str], box: Box | None) -> Table:
+        table = Table(title=self._title, title_justify="left", box=box, pad_edge=box is not None)
+        for name in names:
+            table.add_column(
+                name, justify="right" if "[Nm]" in name else "left", min_width=_COLUMNS[name], no_wrap=True
+            )
+        for row in self._rows:
+            table.add_row(*(row[name] for name in names))
+        return table
+
+
+def _cells(number: int, joint: JointView) -> dict[str, str | Text]:
+    """What stands in the columns for one joint."""
+    name = NAMES.get(joint.status, str(joint.status))
+    known = joint.status in PUBLISHED
+    return {
+        "joint": str(number),
+        "torque [Nm]": _number(joint.torque_nm) if known else "-",
+        "sigma [Nm]": _number(joint.sigma_nm) if known else "-",
+        "sensor [Nm]": _number(joint.sensor_nm),
+        "error [Nm]": _number(joint.torque_nm - joint.sensor_nm) if known else "-",
+        "status": Text(name, style=_COLOURS.get(name, "bold red")),
+    }
 
 
 def loop_line(reader: SnapshotReader, previous: View, view: View, bitrate: int) -> str:

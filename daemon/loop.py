@@ -20,17 +20,17 @@ from typing import Any
 
 from daemon import realtime
 from daemon.config import Config, JointConfig, load_config
-from daemon.cycle import Cycle, JointInputs
+from daemon.cycle import Cycle
 from daemon.cycle_record import RECORD_SIZE
 from daemon.grid import Grid
+from daemon.input_pdos import input_pdos, sensor_index
 from daemon.intake import InputPdo, Intake
+from daemon.joint_cycle import JointInputs
 from daemon.ring import Ring
 from daemon.snapshot import Snapshot
 from drivers.can_filter import CanFilter, look_alikes
-from drivers.devices import drive_tpdo1, drive_tpdo2, sensor_tpdo1, sensor_tpdo2
 from drivers.errors import BusError, BusGone
 from drivers.frame_socket import FrameSocket, open_frame_socket
-from drivers.pdo import PdoMap
 from estimator.checked import ConfigError
 from estimator.joint_estimator import JointEstimator
 from estimator.network import NetworkError, TorqueNetwork
@@ -50,24 +50,6 @@ class _Stop:
         self.requested = True
 
 
-def input_pdos(config: Config) -> list[InputPdo]:
-    """Expected PDOs: both TPDOs of each drive, then one per sensor channel in use."""
-
-    def pdo(pdo_map: PdoMap, node: int, what: str) -> InputPdo:
-        return InputPdo(pdo_map.cob_id, pdo_map.length, pdo_map.layout, node, f"{pdo_map.cob_id:03X}h {what}")
-
-    pdos = []
-    for joint in config.joints:
-        pdos.append(pdo(drive_tpdo1(joint.node_id), joint.node_id, f"drive {joint.node_id} TPDO1"))
-        pdos.append(pdo(drive_tpdo2(joint.node_id), joint.node_id, f"drive {joint.node_id} TPDO2"))
-    if config.sensor is not None:
-        node = config.sensor.node_id
-        for channel in config.sensor.channels:
-            pdo_map = sensor_tpdo1(node) if channel == 1 else sensor_tpdo2(node)
-            pdos.append(pdo(pdo_map, node, f"sensor {node} channel {channel}"))
-    return pdos
-
-
 def build_estimator(config: Config, joint: JointConfig) -> JointEstimator:
     """Estimator of one joint as configured; raises ConfigError or NetworkError."""
     network = None
@@ -81,16 +63,15 @@ def _joint_inputs(config: Config, report: dict[str, Any]) -> list[JointInputs]:
     result = []
     for number, joint in enumerate(config.joints):
         drive = report["nodes"][str(joint.node_id)]["scaling"]
-        sensor_index, sensor_nm = None, 0.0
+        sensor_nm = 0.0
         if joint.sensor_channel is not None and config.sensor is not None:
             scaling = report["nodes"][str(config.sensor.node_id)]["scaling"]
-            sensor_index = 4 + config.sensor.channels.index(joint.sensor_channel)
             sensor_nm = scaling["nm_per_unit"][str(joint.sensor_channel)]
         result.append(
             JointInputs(
                 position=2 * number,
                 motion=2 * number + 1,
-                sensor=sensor_index,
+                sensor=sensor_index(config, joint.sensor_channel),
                 motor_rad_per_count=drive["motor_rad_per_count"],
                 motor_rad_s_per_unit=drive["motor_rad_s_per_unit"],
                 link_rad_per_count=drive["link_rad_per_count"],

@@ -67,7 +67,7 @@ float64 sensor_torque_nm        # [Nm] torque sensor (reference)
 float64 torque_nm               # [Nm] the estimate that was published
 float64 sigma_nm                # [Nm] its standard deviation; half the interval at standstill
 float64 tob_nm                  # [Nm] stage: classical observer
-float64 efficiency_nm           # [Nm] stage: observer with efficiency
+float64 physics_nm              # [Nm] stage: physics: observer with losses, before any network
 float64 network_nm              # [Nm] stage: network
 float64 dt_s                    # [s] time step that the observer used
 uint16 statusword               # 6041h of the drive

@@ -24,9 +24,9 @@ from daemon import cycle_record
 from daemon import mcap_schemas as schemas
 from daemon.mcap_messages import BLOCK_PARTS, JointStateMessage
 from daemon.mcap_writer import McapFile
-from daemon.recorder_progress import ProgressFile
+from daemon.recorder_progress import Account, ProgressFile
 from daemon.recorder_request import RecorderRequest, RequestError
-from daemon.recording import INFO, Account, Recording
+from daemon.recording import INFO, Recording
 from daemon.ring import RingError, RingReader
 from daemon.snapshot import SnapshotError, SnapshotReader
 
@@ -220,7 +220,7 @@ def record(request: RecorderRequest) -> int:
     file, final = _open_file(request, started)
     overview = JointStateMessage(request.joint_names, request.gear_ratios)
     progress = None if request.progress is None else ProgressFile(request.progress)
-    account = Account() if progress is None else Account.carried_on(progress.load())
+    account = Account() if progress is None else progress.load()
     recording = Recording(file, overview, int(request.chunk_s * 1e9), _say, account)
     recording.note(schemas.RECORDER_STARTED, "recorder started", level=INFO, time_ns=started)
     snapshot = None if request.snapshot is None else SnapshotReader(request.snapshot)

@@ -5,25 +5,23 @@ from __future__ import annotations
 import mmap
 import os
 import struct
+from dataclasses import astuple, dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 _LAYOUT = struct.Struct("<QQQQ")
 
 
-class Progress(NamedTuple):
-    """Accounts up to a position of the ring: `written + overwritten + unwritten == position`.
+@dataclass
+class Account:
+    """Every cycle of the ring up to a position is either written or lost: `written + lost == cycles`."""
 
-    Attributes:
-        position: cycles of the ring that are settled: on the disk, or counted as lost.
-        written: cycles on the disk, in all files of this run.
-        overwritten, unwritten: cycles lost because the ring went round, or because the disk did not take them.
-    """
-
-    position: int = 0
+    cycles: int = 0
     written: int = 0
+    """On the disk, in all files of this run."""
     overwritten: int = 0
+    """Lost because the ring went round before they were read."""
     unwritten: int = 0
+    """Lost because the disk did not take them."""
 
     @property
     def lost(self) -> int:
@@ -32,17 +30,17 @@ class Progress(NamedTuple):
 
 
 class ProgressFile:
-    """The file that holds a `Progress`; made empty when it does not exist. Raises OSError."""
+    """The file that holds the `Account` of what is settled; made empty when it does not exist. Raises OSError."""
 
     def __init__(self, path: Path) -> None:
         with open(path, "a+b") as file:
             os.posix_fallocate(file.fileno(), 0, _LAYOUT.size)  # a full tmpfs refuses here, not by SIGBUS
             self._memory = mmap.mmap(file.fileno(), _LAYOUT.size)
 
-    def load(self) -> Progress:
+    def load(self) -> Account:
         """What was stored last."""
-        return Progress._make(_LAYOUT.unpack_from(self._memory, 0))
+        return Account(*_LAYOUT.unpack_from(self._memory, 0))
 
-    def store(self, progress: Progress) -> None:
+    def store(self, settled: Account) -> None:
         """Replace it."""
-        self._memory[:] = _LAYOUT.pack(*progress)
+        self._memory[:] = _LAYOUT.pack(*astuple(settled))

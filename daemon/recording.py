@@ -6,16 +6,14 @@ disk that fails: the chunk is counted as not written, said once, and the next on
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 
 from daemon import cycle_record as cycle
 from daemon import mcap_schemas as schemas
 from daemon.mcap_messages import JointStateMessage, cycle_block, diagnostics, event, log
 from daemon.mcap_writer import McapFile
-from daemon.recorder_progress import Progress
+from daemon.recorder_progress import Account
 
 OVERVIEW_PERIOD_NS = 20_000_000
 """/joint_states comes at 50 Hz."""
@@ -25,33 +23,10 @@ _EVENTS_PER_CHUNK = 50
 """A status that flaps every cycle must not fill the disk; what is left out is counted."""
 INFO, WARN, ERROR = 20, 30, 40
 
-_STATUS_AT = struct.calcsize("<11dH")
-_SCAN = struct.Struct(
-    f"<QqqI8xIBB{cycle.HEADER.size - 42 + _STATUS_AT}xH{cycle.JOINT.size - 2}xH"
-    # index, both times, flags, missed, SYNC counter, frame count; status of joint 1 and of joint 2
+_SCAN = cycle.selection(
+    ("cycle", "sync_monotonic_ns", "sync_realtime_ns", "flags", "missed", "sync_counter", "frame_count"),
+    ("status",),
 )
-
-
-@dataclass
-class Account:
-    """Every cycle the loop handed over is either written or lost: `written + lost == cycles`."""
-
-    cycles: int = 0
-    written: int = 0
-    overwritten: int = 0
-    """Lost because the ring went round before they were read."""
-    unwritten: int = 0
-    """Lost because the disk did not take them."""
-
-    @property
-    def lost(self) -> int:
-        """Cycles that are in no file."""
-        return self.overwritten + self.unwritten
-
-    @classmethod
-    def carried_on(cls, progress: Progress) -> Account:
-        """The account that another recorder of the same run left."""
-        return cls(progress.position, progress.written, progress.overwritten, progress.unwritten)
 
 
 class Recording:
@@ -128,11 +103,11 @@ class Recording:
             self.flush()
 
     @property
-    def progress(self) -> Progress:
+    def progress(self) -> Account:
         """What is settled: cycles that wait for the end of their chunk are not."""
         account = self.account
         settled = account.cycles - self._pending
-        return Progress(settled, account.written, account.overwritten, account.unwritten)
+        return Account(settled, account.written, account.overwritten, account.unwritten)
 
     def _status_events(self, statuses: tuple[int, int]) -> None:
         before, self._statuses = self._statuses, statuses

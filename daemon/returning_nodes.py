@@ -48,8 +48,9 @@ class ReturningNodes:
         when they miss the master's heartbeat (1029h), for instance while the bus was down.
         """
         if self._child is not None:
+            running = self._child.alive()  # asked first: what it said before its end is then there to be read
             answer = self._child.poll_answer()
-            if answer is None and self._child.alive():
+            if answer is None and running:
                 return
             self._child = None
             self._not_before = time.monotonic() + _RETRY_S

@@ -6,39 +6,75 @@ import fcntl
 import hashlib
 import os
 import re
+from contextlib import suppress
 from pathlib import Path
 
+_LOCK = "lock"
+_ATTEMPTS = 100
 
-def runtime_dir(bus: str) -> Path:
-    """Directory of the instance on `bus`, made if needed: under $RUNTIME_DIRECTORY (systemd), $XDG_RUNTIME_DIR or /dev/shm.
+
+def claim(bus: str) -> tuple[Path, int]:
+    """Make the directory of the instance on `bus` and claim it until this process ends, however it ends.
+
+    It lies under $RUNTIME_DIRECTORY (systemd), $XDG_RUNTIME_DIR or /dev/shm.
+
+    Returns:
+        The directory, and the descriptor that holds the claim.
 
     Raises:
+        BlockingIOError: another process holds it; the message names it.
         OSError: it cannot be made, or belongs to somebody else.
     """
     base = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0] or os.environ.get("XDG_RUNTIME_DIR", "")
     root = Path(base) if base else Path("/dev/shm")
-    path = root / f"jtqd-{os.getuid()}-{instance_name(bus)}"
-    path.mkdir(mode=0o700, parents=True, exist_ok=True)
-    if path.lstat().st_uid != os.getuid():
-        raise PermissionError(f"{path} belongs to another user")
-    return path
+    directory = root / f"jtqd-{os.getuid()}-{instance_name(bus)}"
+    for left in reversed(range(_ATTEMPTS)):
+        try:
+            descriptor = _locked(directory)
+            break
+        except FileNotFoundError:  # another process's `remove` came between: once more
+            if not left:
+                raise
+    os.truncate(descriptor, 0)
+    os.write(descriptor, f"{os.getpid()}\n".encode())
+    return directory, descriptor
 
 
-def lock(directory: Path) -> int:
-    """Claim the directory until this process ends, however it ends; returns the descriptor that holds the claim.
+def remove(directory: Path) -> None:
+    """Take away a directory that this process has claimed; what cannot be removed stays."""
+    with suppress(OSError):
+        for entry in directory.iterdir():
+            if entry.name != _LOCK:
+                entry.unlink(missing_ok=True)
+        # Last: from here on the name is free, and another process may make it anew.
+        (directory / _LOCK).unlink()
+        directory.rmdir()
 
-    Raises:
-        BlockingIOError: another process holds it; the message names it.
-    """
-    descriptor = os.open(directory / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+
+def _locked(directory: Path) -> int:
+    """Descriptor of the claim. Raises FileNotFoundError where the directory is removed meanwhile."""
+    try:
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except FileExistsError:
+        if directory.exists():
+            raise
+        raise FileNotFoundError(f"{directory} was removed") from None
+    if directory.lstat().st_uid != os.getuid():
+        raise PermissionError(f"{directory} belongs to another user")
+    path = directory / _LOCK
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        # A file that has lost its name would be locked for nobody but us.
+        if not os.path.samestat(os.fstat(descriptor), path.stat()):
+            raise FileNotFoundError(f"{path} was removed")
     except BlockingIOError:
         holder = os.read(descriptor, 32).decode(errors="replace").strip()
         os.close(descriptor)
         raise BlockingIOError(f"process {holder} is already running there") from None
-    os.truncate(descriptor, 0)
-    os.write(descriptor, f"{os.getpid()}\n".encode())
+    except FileNotFoundError:
+        os.close(descriptor)
+        raise
     return descriptor
 
 

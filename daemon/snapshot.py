@@ -42,9 +42,9 @@ WORK_BINS, WORK_BIN_NS = 500, 4_000
 LATE_BINS, LATE_BIN_NS = 250, 4_000
 _MAX_NODE = 128
 
-_MAGIC = 0x4A54_5144_5354_4101  # "JTQDSTA", layout 1
+_MAGIC = 0x4A54_5144_5354_4102  # "JTQDSTA", layout 2
 _HEAD = struct.Struct("<QQdd")
-_JOINT = struct.Struct("<6d4xHBB")
+_JOINT = struct.Struct("<6dHBBB3x")
 _ESTIMATE = struct.Struct("<qQq")
 _COUNTERS_OFFSET = 64
 _SEQUENCE_OFFSET = _COUNTERS_OFFSET + 8 * len(COUNTERS)
@@ -69,12 +69,14 @@ class JointView(NamedTuple):
     torque_nm: float
     sigma_nm: float
     tob_nm: float
-    efficiency_nm: float
+    physics_nm: float
     network_nm: float
     sensor_nm: float
     statusword: int
     status: int
     sensor_status: int
+    input_flags: int
+    """Inputs of that cycle, as in the cycle record (`daemon/joint_cycle.py`)."""
 
 
 class View(NamedTuple):

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Any
 
+from daemon.deviation_watch import FAR, LASTING_S
+
 
 @dataclass(frozen=True)
 class Summary:
@@ -23,6 +25,8 @@ class Summary:
     error: str | None
     inputs: dict[str, dict[str, int]]
     """Late, lost, duplicate and rejected frames of each PDO by its name."""
+    deviations: tuple[int, int]
+    """How often each joint's estimate stayed far from the sensor (`daemon/deviation_watch.py`)."""
 
     @property
     def exit_status(self) -> int:
@@ -40,6 +44,7 @@ class Summary:
             "work_us": dict(zip(("p50", "p99", "max"), map(_json, self.work_us), strict=True)),
             "late_us": dict(zip(("p50", "p99", "max"), map(_json, self.late_us), strict=True)),
             "rmse_nm": {"joint_1": _json(self.rmse_nm[0]), "joint_2": _json(self.rmse_nm[1])},
+            "deviations": {"joint_1": self.deviations[0], "joint_2": self.deviations[1]},
             "counters": self.counters,
             "not_granted": list(self.refused),
             "inputs": self.inputs,
@@ -60,6 +65,11 @@ class Summary:
         for joint, rmse in enumerate(self.rmse_nm, start=1):
             shown = f"{rmse:.3f} Nm against the sensor while it moves" if isfinite(rmse) else "no reference"
             lines.append(f"RMSE joint {joint}  {shown}")
+        lines += [
+            f"deviation     joint {joint}: {count} times more than {FAR:g} sigma from the sensor for {LASTING_S:g} s"
+            for joint, count in enumerate(self.deviations, start=1)
+            if count
+        ]
         faults = [
             f"{name.replace('_', ' ')} {counters[name]}"
             for name in (

@@ -21,15 +21,17 @@ from rich.console import Console
 from rich.live import Live
 
 from daemon.boot_request import boot_request
-from daemon.children import Child, ChildError
+from daemon.children import Child, ChildError, ChildSilence
 from daemon.config import Config
-from daemon.live_table import live_table, plain_line
+from daemon.deviation_watch import DeviationWatch
+from daemon.input_watch import InputWatch
+from daemon.live_table import LiveTable, plain_line
 from daemon.load import bus_load_of
 from daemon.own_node import OwnNode
-from daemon.recorder_progress import Progress, ProgressFile
+from daemon.recorder_progress import Account, ProgressFile
 from daemon.recording_request import recording_request
 from daemon.returning_nodes import ReturningNodes
-from daemon.runtime_dir import instance_name, lock, runtime_dir
+from daemon.runtime_dir import claim, instance_name, remove
 from daemon.snapshot import SnapshotReader, View
 from daemon.summary import Summary
 from drivers.bus_load import BusLoad, BusLoadError, check_bus_load
@@ -74,8 +76,7 @@ class Supervisor:
         self._bus_gone = False
         self._load = _checked_load(config)
         try:
-            self._directory = runtime_dir(bus)
-            self._lock = lock(self._directory)
+            self._directory, self._lock = claim(bus)
         except BlockingIOError as error:
             raise SupervisorError(f"{bus}: {error}: one jtqd per bus") from None
         except OSError as error:
@@ -91,6 +92,7 @@ class Supervisor:
         self._recorder: Child | None = None
         self._recorder_starts: list[float] = []
         self._recording: dict[str, Any] | None = None
+        self._inputs, self._deviation = InputWatch(config), DeviationWatch()
         self._console = Console(stderr=True)
 
     def run(self) -> Summary | None:
@@ -108,6 +110,7 @@ class Supervisor:
         finally:
             for child in reversed(self._children):
                 child.end()
+            remove(self._directory)
 
     # Start ---------------------------------------------------------------------------------------------------------------
 
@@ -190,8 +193,8 @@ class Supervisor:
         while not self._stop:
             try:
                 return child.answer(0.25)
-            except ChildError:
-                if not child.alive() or time.monotonic() > deadline:
+            except ChildSilence:
+                if time.monotonic() > deadline:
                     raise
         return None
 
@@ -208,7 +211,7 @@ class Supervisor:
         stopping = 0.0
         with Live(console=self._console, auto_refresh=False, transient=False) as live:
             while True:
-                select.select([loop.output_fd, *([] if self._bus_gone else [node.socket.fd])], [], [], 0.05)
+                select.select([*loop.outputs, *([] if self._bus_gone else [node.socket.fd])], [], [], 0.05)
                 self._serve(node)
                 answer = loop.poll_answer()
                 if answer is not None and answer.get("done"):
@@ -230,8 +233,10 @@ class Supervisor:
                     loop.process.kill()
                     return {"error": f"the loop did not end within {_LOOP_END_S:g} s"}
                 self._watch_recorder(node)
-                self._returning.watch(reader.read(), reader.note_configured)
-                now = time.monotonic()
+                view, now = reader.read(), time.monotonic()
+                self._returning.watch(view, reader.note_configured)
+                for line in (*self._inputs.lines(view, now), *self._deviation.lines(view, now)):
+                    print(f"jtqd: {line}", file=sys.stderr, flush=True)
                 if now - shown >= (_TABLE_PERIOD_S if terminal else _LOG_PERIOD_S):
                     previous, shown = self._show(live, terminal, reader, previous, title), now
 
@@ -248,7 +253,7 @@ class Supervisor:
     def _show(self, live: Live, terminal: bool, reader: SnapshotReader, previous: View, title: str) -> View:
         view = reader.read()
         if terminal:
-            live.update(live_table(reader, previous, view, self._config.bitrate, title), refresh=True)
+            live.update(LiveTable(reader, previous, view, self._config.bitrate, title), refresh=True)
         else:
             print(plain_line(reader, previous, view, self._config.bitrate), file=sys.stderr, flush=True)
         return view
@@ -302,7 +307,7 @@ class Supervisor:
 
     def _account(self, error: str) -> dict[str, Any]:
         """What the recorder left behind that could not say it itself; what nobody wrote counts as lost."""
-        settled = ProgressFile(self._progress).load() if self._progress.exists() else Progress()
+        settled = ProgressFile(self._progress).load() if self._progress.exists() else Account()
         cycles = SnapshotReader(self._snapshot).read().counters["cycles"]
         return {
             "path": None,
@@ -359,6 +364,7 @@ class Supervisor:
             recording=self._recording,
             error=result.get("error") or result.get("failed"),
             inputs=result.get("counters", {}),
+            deviations=(self._deviation.episodes[0], self._deviation.episodes[1]),
         )
 
 

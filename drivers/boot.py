@@ -150,7 +150,7 @@ def _boot_nodes(network: canopen.Network, request: BootRequest) -> dict[int, Boo
     for node in booted:
         network.send_message(0, [NMT_START, node])
     for node in booted:
-        _require_operational(heartbeats, node, wait_s)
+        _require_operational(network, heartbeats, node, wait_s)
     return booted
 
 
@@ -163,8 +163,16 @@ def _require_heartbeat(heartbeats: _Heartbeats, node: int, wait_s: float) -> Non
         raise reset_during_boot(node)
 
 
-def _require_operational(heartbeats: _Heartbeats, node: int, wait_s: float) -> None:
+def _require_operational(network: canopen.Network, heartbeats: _Heartbeats, node: int, wait_s: float) -> None:
+    """The node says operational, if need be after a second start.
+
+    A drive may still watch the heartbeat of a jtqd that ended a moment ago: not every device begins anew when 1016h is
+    written. When that runs out it leaves operational (1029h), rightly, as it had no master; but it does so once.
+    """
     state = heartbeats.wait(node, STATE_OPERATIONAL, wait_s)
+    if state == STATE_PRE_OPERATIONAL and not heartbeats.restarted(node):
+        network.send_message(0, [NMT_START, node])
+        state = heartbeats.wait(node, STATE_OPERATIONAL, wait_s)
     if heartbeats.restarted(node):
         raise reset_during_boot(node)
     if state != STATE_OPERATIONAL:

@@ -126,6 +126,17 @@ def drive_tpdo2(node: int) -> PdoMap:
     return PdoMap(0x280 + node, (velocity, current, MappedObject(0x6041, 0, 16, False, "statusword")))
 
 
+def drive_rpdo1(node: int) -> PdoMap:
+    """200h+n: controlword, target torque; taken when it arrives (transmission type 255)."""
+    control = MappedObject(0x6040, 0, 16, False, "controlword")
+    return PdoMap(0x200 + node, (control, MappedObject(0x6071, 0, 16, True, "target_torque")), 255)
+
+
+def drive_rpdo2(node: int) -> PdoMap:
+    """300h+n: target velocity; taken when it arrives (transmission type 255)."""
+    return PdoMap(0x300 + node, (MappedObject(0x60FF, 0, 32, True, "target_velocity"),), 255)
+
+
 def sensor_tpdo1(node: int) -> PdoMap:
     """180h+n: first channel, 32 bits, and its status."""
     torque = MappedObject(0x9130, 1, 32, True, "torque_1")

@@ -6,7 +6,7 @@ import socket
 import stat
 
 from drivers.errors import BusError
-from drivers.unix_socket import PREFIX
+from drivers.unix_socket import PREFIX, require_directory
 
 
 def listen(path: str, backlog: int) -> socket.socket:
@@ -32,6 +32,7 @@ def listen(path: str, backlog: int) -> socket.socket:
         raise
     except OSError as error:
         sock.close()
+        require_directory(path)
         raise BusError(f"{bus}: cannot make the bus: {error.strerror or error}") from None
     finally:
         os.umask(umask)

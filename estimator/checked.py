@@ -193,9 +193,14 @@ def _in_range(value: float, low: float | None, high: float | None, above: float 
 
 def _range_text(kind: str, low: float | None, high: float | None, above: float | None) -> str:
     if low is not None and high is not None:
-        return f"{kind} from {low:g} to {high:g}"
+        return f"{kind} from {_bound(low)} to {_bound(high)}"
     if low is not None:
-        return f"{kind} >= {low:g}"
+        return f"{kind} >= {_bound(low)}"
     if above is not None:
-        return f"{kind} > {above:g}" + (f" and <= {high:g}" if high is not None else "")
-    return f"{kind} <= {high:g}" if high is not None else kind
+        return f"{kind} > {_bound(above)}" + (f" and <= {_bound(high)}" if high is not None else "")
+    return f"{kind} <= {_bound(high)}" if high is not None else kind
+
+
+def _bound(value: float) -> str:
+    """Whole numbers in full: 1000000 and not 1e+06, where the operator counts bits or nodes."""
+    return str(value) if isinstance(value, int) else f"{value:g}"

@@ -11,13 +11,15 @@ Everything that enters the loss went through the same filter, so the physics est
 from __future__ import annotations
 
 from math import nan
-from typing import Final, NamedTuple
+from typing import Final
 
+from estimator.estimate import INVALID_ESTIMATE, OFF_ESTIMATE, STARTING_ESTIMATE, Estimate
 from estimator.losses import LossModel
 from estimator.network_use import NetworkModel, checked_network, trust_of
+from estimator.observer import Observer
 from estimator.parameters import Joint
 from estimator.settings import METHODS, EstimatorSettings
-from estimator.status import DEGRADED, INVALID, OFF, STANDSTILL, STARTING
+from estimator.status import DEGRADED, INVALID, STANDSTILL, STARTING
 from estimator.tracking import Tracker
 from estimator.validity import Uncertainty
 from estimator.whole_run import EstimateRun, estimate_run
@@ -32,26 +34,6 @@ __all__ = [
     "estimate_run",
 ]
 
-
-class Estimate(NamedTuple):
-    """One step's result [Nm, joint side]; NaN where not computed or not to be published.
-
-    torque_nm, sigma_nm are numbers with status VALID, DEGRADED and STANDSTILL only; tob_nm, efficiency_nm and
-    network_nm are the methods' own values, for the record.
-    """
-
-    torque_nm: float
-    sigma_nm: float
-    status: int
-    tob_nm: float
-    efficiency_nm: float
-    network_nm: float
-
-
-_STARTING: Final = Estimate(nan, nan, STARTING, nan, nan, nan)
-_INVALID: Final = Estimate(nan, nan, INVALID, nan, nan, nan)
-OFF_ESTIMATE: Final = Estimate(nan, nan, OFF, nan, nan, nan)
-"""What a joint that is not estimated shows."""
 
 _new: Final = tuple.__new__
 
@@ -86,7 +68,9 @@ class JointEstimator:
         uncertainty = Uncertainty(joint, settings, losses)
         self.joint: Final = joint
         self.settings: Final = settings
-        self._tracker: Final = Tracker(joint, settings)
+        self._tracker: Final = Tracker(
+            Observer(joint, settings.bandwidth_rad_s, settings.link_bandwidth_rad_s), joint, settings
+        )
         self._with_efficiency: Final = settings.method != "tob"
         self._inverse_gain: Final = 1.0 / losses.torque_per_ampere
         self._loss: Final = losses.loss
@@ -108,13 +92,14 @@ class JointEstimator:
         motor_position_rad: float,
         motor_velocity_rad_s: float,
         link_position_rad: float,
+        temperature_c: float = nan,  # noqa: ARG002 - the paper's methods know no temperature
     ) -> Estimate:
         """Return the estimate at this sample, dt_s [s] after the one before; never raises on any float."""
         tracker = self._tracker
         seen = tracker.step(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
         status = tracker.status
         if seen is None:
-            return _STARTING if status == STARTING else _INVALID
+            return STARTING_ESTIMATE if status == STARTING else INVALID_ESTIMATE
         raw, tob, v, link_velocity = seen
         i = raw * self._inverse_gain
         efficiency = network = nan

@@ -80,7 +80,13 @@ class Observer:
         self._u = self._z = self._v = self._z_v = self._friction_last = self._z_friction = 0.0
         self._link = self._link_velocity = 0.0
 
-    def start(self, current_a: float, motor_velocity_rad_s: float, link_position_rad: float) -> Observed:
+    def start(
+        self,
+        current_a: float,
+        motor_position_rad: float,  # noqa: ARG002 - every observer takes the whole sample
+        motor_velocity_rad_s: float,
+        link_position_rad: float,
+    ) -> Observed:
         """Set the states of a joint that has always moved at this speed, without acceleration."""
         v = motor_velocity_rad_s * self._inverse_gear
         u = current_a * self._kt + self._inertia_rate * motor_velocity_rad_s
@@ -93,7 +99,12 @@ class Observer:
         return Observed(raw, raw - self._z_friction, v, v)
 
     def step(
-        self, dt_s: float, current_a: float, motor_velocity_rad_s: float, link_position_rad: float
+        self,
+        dt_s: float,
+        current_a: float,
+        motor_position_rad: float,  # noqa: ARG002
+        motor_velocity_rad_s: float,
+        link_position_rad: float,
     ) -> Observed:
         """Advance by dt_s > 0 to the sample given and return the outputs at that sample."""
         x = self._rate * dt_s

@@ -12,6 +12,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from estimator.checked import ConfigError, Section
+from estimator.fused_parameters import Fused
 
 CONVENTIONS: Final = ("joint_over_motor", "motor_over_joint")
 """eta = tau_j/(G Kt i), as in the paper's Table I; or eta = G Kt i/tau_j, its Eq. (6)."""
@@ -194,6 +195,7 @@ class Joint:
     rated_torque_nm: float
     friction: Friction
     efficiency: Efficiency | None = None
+    fused: Fused | None = None
     effects: tuple[Effect, ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
@@ -222,6 +224,8 @@ class Joint:
         friction = Friction.from_section(section.required("friction"))
         inner = section.section("efficiency", optional=True)
         efficiency = None if inner is None else Efficiency.from_section(inner)
+        inner = section.section("fused", optional=True)
+        fused = None if inner is None else Fused.from_section(inner)
         effects = tuple(Effect.from_section(item) for item in section.sections("effects"))
         provenance = section.raw("provenance", None)
         if provenance is not None and not isinstance(provenance, Mapping):
@@ -231,6 +235,7 @@ class Joint:
             name=name,
             friction=friction,
             efficiency=efficiency,
+            fused=fused,
             effects=effects,
             provenance=provenance or {},
             **numbers,
@@ -248,6 +253,8 @@ class Joint:
                 }
                 for name in QUADRANTS
             }
+        if self.fused is not None:
+            out["fused"] = self.fused.to_mapping()
         out["effects"] = [{"name": e.name, "parameters": dict(e.parameters)} for e in self.effects]
         out["provenance"] = dict(self.provenance)
         return out

@@ -8,8 +8,8 @@ from typing import Any, Final
 
 from estimator.checked import ConfigError, Section
 
-METHODS: Final = ("tob", "efficiency", "network")
-"""tob: Eq. (4) with additive friction; efficiency: Eq. (7); network: the paper's section III on top."""
+METHODS: Final = ("tob", "efficiency", "network", "fused")
+"""tob: Eq. (4) with additive friction; efficiency: Eq. (7); network: the paper's section III on top; fused: ours."""
 
 # name -> unit, lowest, highest
 _RANGES: Final = {

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from estimator.friction import FloatArray
 from estimator.losses import LossModel
 from estimator.network_use import NetworkModel, checked_network, trust_of
+from estimator.observer import Observer
 from estimator.parameters import Joint
 from estimator.settings import EstimatorSettings
 from estimator.status import DEGRADED, INVALID, STANDSTILL, VALID
@@ -31,7 +32,7 @@ class EstimateRun:
     sigma_nm: FloatArray
     status: StatusArray
     tob_nm: FloatArray
-    efficiency_nm: FloatArray
+    physics_nm: FloatArray
     network_nm: FloatArray
     features: FloatArray
 
@@ -95,7 +96,9 @@ def _observe(
     joint: Joint, settings: EstimatorSettings, columns: list[FloatArray]
 ) -> tuple[StatusArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Run the tracker: status [n] and raw, tob, joint velocity, link velocity [n], NaN where it has none."""
-    tracker = Tracker(joint, settings)
+    tracker = Tracker(
+            Observer(joint, settings.bandwidth_rad_s, settings.link_bandwidth_rad_s), joint, settings
+        )
     step = tracker.step
     count = len(columns[0])
     status = np.empty(count, np.uint8)

@@ -11,6 +11,7 @@ from sim_can.profile import targets
 from sim_can.sensor_node import SENSOR_NODE, SensorNode
 from sim_can.source import OFF, VELOCITY, Source
 
+COMMANDER_NODE = 0x21  # who may command the drives beside jtqd, and is watched by 1016h:2
 LONGEST_STEP_NS = 50_000_000  # a source never jumps further than this, however long SYNC was away
 RESOLUTION_NS = (
     10_000  # a software stamp is no better; the plant then sees an exact grid wherever SYNC keeps one
@@ -19,10 +20,10 @@ IDLE_STEP_NS = 10_000_000  # step of powered drives once SYNC has been away for 
 
 
 def bench_filters() -> tuple[CanFilter, ...]:
-    """What the bench listens to: NMT, SYNC, SDO requests, RPDOs 1 and 2 of the drives, the master's
-    heartbeat.
+    """What the bench listens to: NMT, SYNC, SDO requests, RPDOs 1 and 2 of the drives, heartbeats of jtqd and
+    of the node that commands.
     """
-    ids = [0x000, SYNC_COB_ID, 0x700 + JTQD_NODE]
+    ids = [0x000, SYNC_COB_ID, 0x700 + JTQD_NODE, 0x700 + COMMANDER_NODE]
     ids += [0x600 + node for node in (1, 2, SENSOR_NODE)]
     ids += [base + node for base in (0x200, 0x300) for node in (1, 2)]
     return tuple(exact(can_id) for can_id in ids)

@@ -15,6 +15,7 @@ from drivers.pdo_parameters import PdoParameters
 from drivers.sdo_abort import SdoAbort
 from drivers.sdo_server import SdoServer
 from sim_can.emergency import COMMUNICATION, Emergency
+from sim_can.heartbeat_consumer import HeartbeatConsumer
 from sim_can.transmit_pdo import NEVER_NS, Getter, TransmitPdo, compile_tpdos
 
 STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0x04, 0x05, 0x7F
@@ -33,7 +34,7 @@ class CanopenNode:
 
     `getters[(index, subindex)]` gives the value an object has now; SDO and TPDO read it. `handlers[(index,
     subindex)]` is told each value that an SDO or an RPDO writes; it may refuse an SDO by raising SdoAbort.
-    `due_ns` says when `tick` has something to do.
+    A change of a `quiet` object is no event for a TPDO. `due_ns` says when `tick` has something to do.
     """
 
     def __init__(self, store: ObjectStore) -> None:
@@ -43,6 +44,7 @@ class CanopenNode:
         self.due_ns = 0
         self.getters: dict[tuple[int, int], Getter] = {}
         self.handlers: dict[tuple[int, int], Handler] = {}
+        self.quiet: frozenset[tuple[int, int]] = frozenset()
         self._pdos = PdoParameters(store)
         self._emergency = Emergency(store)
         self._sdo = SdoServer(store)
@@ -53,7 +55,7 @@ class CanopenNode:
         self._bootup_pending = True
         self._heartbeat_due_ns = NEVER_NS
         self._heartbeat_ns = 0
-        self._master_due_ns = NEVER_NS
+        self._consumer = HeartbeatConsumer(store)
         self._sync_error_told = False
 
     # For the devices ----------------------------------------------------------------------------------------
@@ -79,7 +81,7 @@ class CanopenNode:
         """NMT reset node: the device goes to its power-on state."""
 
     def on_heartbeat_lost(self) -> list[bytes]:
-        """The master's heartbeat stopped; EMCY and 1029h are the base's matter."""
+        """A watched heartbeat stopped; EMCY and 1029h are the base's matter."""
         return []
 
     def raise_error(self, code: int, register: int) -> list[bytes]:
@@ -93,11 +95,11 @@ class CanopenNode:
         return [] if self.state == STOPPED else frames
 
     def event(self) -> list[bytes]:
-        """Send the event-driven TPDOs (types 254, 255) whose values have changed."""
+        """Send the event-driven TPDOs (types 254, 255) whose values have changed, and those never sent."""
         frames: list[bytes] = []
         if self.state == OPERATIONAL:
             for transmit in self._pdo_maps():
-                if transmit.type > LAST_SYNC_TYPE:
+                if transmit.type > LAST_SYNC_TYPE and not (transmit.timed_only and transmit.last):
                     frame = transmit.frame()
                     if frame != transmit.last:
                         transmit.last = frame
@@ -107,7 +109,7 @@ class CanopenNode:
     # From the bus -------------------------------------------------------------------------------------------
 
     def on_frame(self, can_id: int, data: bytes, t_ns: int) -> list[bytes]:
-        """Any frame but SYNC: NMT, SDO request, RPDO, the master's heartbeat; others are ignored."""
+        """Any frame but SYNC: NMT, SDO request, RPDO, a watched heartbeat; others are ignored."""
         if can_id == 0x600 + self.node_id:
             if self.state == STOPPED:
                 return []
@@ -156,7 +158,7 @@ class CanopenNode:
         return frames
 
     def tick(self, t_ns: int) -> list[bytes]:
-        """Boot-up message, heartbeat, event timers, master's heartbeat; sets `due_ns` to the next time it
+        """Boot-up message, heartbeat, event timers, watched heartbeats; sets `due_ns` to the next time it
         wants to be called.
         """
         frames: list[bytes] = []
@@ -168,10 +170,9 @@ class CanopenNode:
             frames.append(pack(0x700 + self.node_id, bytes([self.state])))
             missed = (t_ns - self._heartbeat_due_ns) // self._heartbeat_ns
             self._heartbeat_due_ns += (missed + 1) * self._heartbeat_ns
-        if t_ns >= self._master_due_ns:
-            self._master_due_ns = NEVER_NS
+        if t_ns >= self._consumer.due_ns and self._consumer.lost(t_ns):
             frames += self._on_master_lost()
-        due = min(self._heartbeat_due_ns, self._master_due_ns)
+        due = min(self._heartbeat_due_ns, self._consumer.due_ns)
         if self.state == OPERATIONAL:
             for transmit in self._pdo_maps():
                 if transmit.type > LAST_SYNC_TYPE and transmit.period_ns:
@@ -232,22 +233,18 @@ class CanopenNode:
         self._waiting.clear()
         self._sync_error_told = False
         self._bootup_pending = True
-        self._heartbeat_due_ns = self._master_due_ns = NEVER_NS
+        self._heartbeat_due_ns = NEVER_NS
+        self._consumer.forget()
 
     def _plan_heartbeat(self, t_ns: int) -> None:
         self._heartbeat_ns = self.store.number(0x1017) * _MS
         self._heartbeat_due_ns = t_ns + self._heartbeat_ns if self._heartbeat_ns else NEVER_NS
 
     def _on_heartbeat(self, node: int, data: bytes, t_ns: int) -> list[bytes]:
-        """Heartbeat consumer 1016h:1 (node in bits 16..22, time in ms in bits 0..15); watching starts with
-        the first one.
-        """
-        consumer = self.store.number(0x1016, 1)
-        period_ns = (consumer & 0xFFFF) * _MS
-        if len(data) != 1 or consumer >> 16 & 0x7F != node or not period_ns:
+        """The error is over when every watched node is heard again."""
+        if len(data) != 1 or not self._consumer.heard(node, t_ns):
             return []
-        self._master_due_ns = t_ns + period_ns
-        self.due_ns = min(self.due_ns, self._master_due_ns)
+        self.due_ns = min(self.due_ns, self._consumer.due_ns)
         return self.clear_error(HEARTBEAT_LOST) if self._emergency.present(HEARTBEAT_LOST) else []
 
     def _on_master_lost(self) -> list[bytes]:
@@ -292,5 +289,5 @@ class CanopenNode:
         if self._generation != self._pdos.generation:
             self._generation = self._pdos.generation
             self._receive = {pdo.cob_id: pdo for pdo in self._pdos.rpdos()}
-            self._transmit = compile_tpdos(self.store, self._pdos, self.getters)
+            self._transmit = compile_tpdos(self.store, self._pdos, self.getters, self.quiet)
         return self._transmit

@@ -5,6 +5,7 @@ import json
 import sys
 from pathlib import Path
 
+from estimator.arguments import count, natural, seconds
 from estimator.checked import ConfigError
 from sim_can.eds_entries import EdsChild
 from sim_can.plant_parameters import PROFILES
@@ -26,27 +27,6 @@ def _joints(text: str) -> tuple[int, int]:
     return first, second
 
 
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
-    return value
-
-
-def _positive_int(text: str) -> int:
-    value = int(text)
-    if value <= 0:
-        raise argparse.ArgumentTypeError(f"{text} is not a positive whole number")
-    return value
-
-
-def _natural(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} is not a whole number >= 0")
-    return value
-
-
 def parser() -> argparse.ArgumentParser:
     """Options of `jtq sim`."""
     made = argparse.ArgumentParser(
@@ -61,7 +41,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         "--plant", type=Path, metavar="FILE", help="plant.yaml, or a joint.yaml for two ideal joints"
     )
-    made.add_argument("--seed", type=_natural, default=0, metavar="N", help="seed of the noise (default 0)")
+    made.add_argument("--seed", type=natural, default=0, metavar="N", help="seed of the noise (default 0)")
     made.add_argument(
         "--profile", choices=PROFILES, help="motion while no master commands (default: the plant file's)"
     )
@@ -75,10 +55,8 @@ def parser() -> argparse.ArgumentParser:
         metavar="A,B",
         help="joints of the run for drives 1, 2 (default: those with a joint file in the column map, else 1,2)",
     )
-    made.add_argument(
-        "--bitrate", type=_positive_int, metavar="B", help="model the wire of an own hub, bit/s"
-    )
-    made.add_argument("--duration", type=_positive, metavar="S", help="end after so many seconds")
+    made.add_argument("--bitrate", type=count, metavar="B", help="model the wire of an own hub, bit/s")
+    made.add_argument("--duration", type=seconds, metavar="S", help="end after so many seconds")
     made.add_argument("--cost", action="store_true", help="measure the CPU time of one cycle and leave")
     made.add_argument("--json", action="store_true", help="with --cost: result as JSON")
     return made

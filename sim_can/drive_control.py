@@ -14,7 +14,9 @@ class DriveControl:
     Current loop (closed): di/dt = 2π B (i_ref - i), discretised exactly, |i_ref| limited. With the power
     stage off the current decays with the same time constant. Velocity loop (mode 9, motor side): i_ref = kp e
     + ∫ kp/Ti e + (Jff α_ref + friction feedforward) / Kt, e = ω_ref - ω. ω_ref goes to a new target in a
-    straight line within one control cycle (linear interpolation of CSV), at most with the acceleration limit.
+    straight line (linear interpolation of CSV) within `interpolation_s` (60C2h), at least within one control
+    cycle, at most with the acceleration limit: a master that sends a target every 2 ms says so there, and the
+    feedforward sees the slope of its trajectory instead of a staircase.
     The integrator stands while the current is limited in the direction of the error. The drive's own velocity
     is taken as exact: its encoder interpolation is far finer than what it reports.
     """
@@ -32,8 +34,10 @@ class DriveControl:
         "_limit",
         "_slope_limit",
         "_smooth",
+        "_to_go_s",
         "current_a",
         "integral_a",
+        "interpolation_s",
         "mode",
         "reference_rad_s",
         "slope_rad_s2",
@@ -62,6 +66,8 @@ class DriveControl:
         self.integral_a = 0.0
         self.reference_rad_s = 0.0
         self.slope_rad_s2 = 0.0
+        self.interpolation_s = 0.0
+        self._to_go_s = 0.0
         self._feedforward = 0.0
         self._base = 0.0
         self._decay_step = -1.0
@@ -76,12 +82,16 @@ class DriveControl:
             self.reference_rad_s = motor_velocity_rad_s
             self.integral_a = self.current_a
         self.target = target
+        self._to_go_s = self.interpolation_s
 
     def plan(self, dt_s: float) -> None:
         """Reference and feedforward of the next control cycle of length dt_s > 0."""
         if self.mode == VELOCITY:
             limit = self._slope_limit
-            slope = (self.target - self.reference_rad_s) / dt_s
+            # whole cycles, at least one: SYNCs jitter, the line must end where a cycle ends
+            cycles = round(self._to_go_s / dt_s) if self._to_go_s > dt_s else 1
+            self._to_go_s -= dt_s
+            slope = (self.target - self.reference_rad_s) / (cycles * dt_s)
             self.slope_rad_s2 = slope = min(max(slope, -limit), limit)
             middle = self.reference_rad_s + 0.5 * slope * dt_s
             self._feedforward = self._inertia_a * slope + self._friction * middle / (

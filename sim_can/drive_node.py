@@ -14,6 +14,9 @@ from sim_can.source import CURRENT, OFF, VELOCITY, DriveRatings, DriveSignals, S
 OVERCURRENT = 0x2310
 STANDSTILL_RAD_S = 0.01  # joint side: a quick stop has ended below this
 HALT = 0x0100
+NOT_MEASURED = -0x8000  # 3001h of a source without temperature
+_INTERPOLATION_S = 0.001  # 60C2h after power-on
+_INTERPOLATION_UNITS = (-6, 0)  # 60C2h:2: microseconds to seconds
 _I16 = 0x7FFF
 _I32 = 0x7FFF_FFFF
 
@@ -45,6 +48,7 @@ class DriveNode(CanopenNode):
         self._mode = 0
         self._own_target = 0.0
         self._sent = (OFF, 0.0)
+        self._interpolation_s = _INTERPOLATION_S
         ratings = self._ratings
         self._motor_units = ratings.motor_counts_per_rev / (2.0 * math.pi)
         self._link_units = ratings.link_counts_per_rev / (2.0 * math.pi)
@@ -52,6 +56,7 @@ class DriveNode(CanopenNode):
         self._current_units = 0.0
         self._rate()
         self.getters = {
+            (0x3001, 0): self._temperature,
             (0x603F, 0): lambda: self._error_code,
             (0x6041, 0): self._statusword,
             (0x6061, 0): lambda: self._mode,
@@ -64,7 +69,13 @@ class DriveNode(CanopenNode):
             (0x6078, 0): self._current,
             (0x60E4, 1): self._link_position,
         }
-        self.handlers = {(0x6040, 0): self._controlword, (0x6060, 0): self._mode_of_operation}
+        self.quiet = frozenset({(0x3001, 0)})  # told every 500 ms, that is soon enough
+        self.handlers = {
+            (0x6040, 0): self._controlword,
+            (0x6060, 0): self._mode_of_operation,
+            (0x60C2, 1): self._interpolation_value,
+            (0x60C2, 2): self._interpolation_index,
+        }
         self._error_code = 0
         self._messages: list[bytes] = []
         self.connect()
@@ -103,6 +114,10 @@ class DriveNode(CanopenNode):
     def _current(self) -> int:
         return limited(round(self._signals.current_a * self._current_units), _I16)
 
+    def _temperature(self) -> int:
+        celsius = self._signals.temperature_c
+        return NOT_MEASURED if math.isnan(celsius) else limited(round(10.0 * celsius), _I16)
+
     def _statusword(self) -> int:
         return self.machine.statusword
 
@@ -119,6 +134,22 @@ class DriveNode(CanopenNode):
             raise SdoAbort(VALUE_RANGE)
         self._take_over()
         self._mode = mode
+
+    def _interpolation_value(self, value: int) -> None:
+        self._interpolate(value, self.store.number(0x60C2, 2))
+
+    def _interpolation_index(self, index: int) -> None:
+        low, high = _INTERPOLATION_UNITS
+        if not low <= index <= high:
+            raise SdoAbort(VALUE_RANGE)
+        self._interpolate(self.store.number(0x60C2, 1), index)
+
+    def _interpolate(self, value: int, index: int) -> None:
+        """60C2h: value * 10^index seconds from one target velocity to the next."""
+        period_s = value / 10**-index
+        if period_s != self._interpolation_s:
+            self._interpolation_s = period_s
+            self._source.interpolate(self._number, period_s)
 
     def _take_over(self) -> None:
         """A master is there: from now on only it commands, and both drives, as the demo motion needs both."""
@@ -213,6 +244,7 @@ class DriveNode(CanopenNode):
         self.machine.release()
         self._mode = 0
         self._error_code = 0
+        self._interpolate(self.store.number(0x60C2, 1), self.store.number(0x60C2, 2))
         self._send_command()
 
 

@@ -15,10 +15,13 @@ from numpy.typing import NDArray
 from estimator.run import JointColumns, RunTable
 from sim_can.plant_parameters import PlantParameters
 from sim_can.plant_source import PlantSource
+from sim_can.run_to_run import NOMINAL_DAY, Day
+from sim_can.run_to_run import day as day_of
 from sim_can.source import CURRENT, OFF, VELOCITY, DriveRatings
 
 SENSOR_NM_PER_UNIT = 0.001  # 6132h:1 = 3 decimal digits
-_SIGNALS = 4
+TEMPERATURE_C_PER_UNIT = 0.1  # 3001h
+_SIGNALS = 5
 
 TimeFunction = Callable[[float], float]
 
@@ -57,17 +60,21 @@ def emulate_run(
     duration_s: float,
     seed: int = 0,
     period_s: float = 0.001,
+    *,
+    day: int | Day | None = None,
 ) -> RunTable:
     """Run both joints from rest for duration_s and return what was measured every period_s.
 
     Args:
         plant: the bench. commands: of joint 1 and joint 2; targets are asked once per period, at its
         beginning.
-        seed: of the measurement noise; the same arguments give the same table bit by bit.
+        seed: of the measurement noise and of the days; the same arguments give the same table bit by bit.
+        day: number of the day of this seed (0, 1, 2, ...; each has noise of its own), whose values lie within
+        the plant's `run_to_run`; or the values themselves; None: the nominal day, without any drift.
 
     Returns:
-        RunTable with joints 1 and 2, n = round(duration_s / period_s) rows from time 0; link_velocity and
-        temperature are None (a drive does not measure them), torque_nm is the one sensor's in both joints.
+        RunTable with joints 1 and 2, n = round(duration_s / period_s) rows from time 0; link_velocity is None
+        (a drive does not measure it), torque_nm is the one sensor's in both joints.
 
     Raises:
         ValueError: duration or period not positive and finite.
@@ -75,7 +82,12 @@ def emulate_run(
     if not (0.0 < period_s < math.inf and period_s <= duration_s < math.inf):
         raise ValueError(f"a run of {duration_s} s in steps of {period_s} s")
     count = round(duration_s / period_s)
-    source = PlantSource(plant, seed)
+    if day is None or isinstance(day, Day):
+        source = PlantSource(plant, seed)
+        source.begin_day(NOMINAL_DAY if day is None else day)
+    else:
+        source = PlantSource(plant, seed, noise_seed=f"{seed} day {int(day)}")
+        source.begin_day(day_of(plant.run_to_run, seed, int(day)))
     rows = np.empty((count, 2 * _SIGNALS + 1))
     # velocity targets are joint side here, motor side in the drives
     scale = [
@@ -92,10 +104,12 @@ def emulate_run(
             one.motor_position_rad,
             one.motor_velocity_rad_s,
             one.link_position_rad,
+            one.temperature_c,
             two.current_a,
             two.motor_position_rad,
             two.motor_velocity_rad_s,
             two.link_position_rad,
+            two.temperature_c,
             channel.torque_nm,
         )
         time_s = k * period_s
@@ -116,12 +130,12 @@ def emulate_run(
 def _columns(
     signals: NDArray[np.float64], torque: NDArray[np.float64], ratings: DriveRatings
 ) -> JointColumns:
-    """Rounded to the units of 6078h, 6064h, 606Ch and 60E4h."""
+    """Rounded to the units of 6078h, 6064h, 606Ch, 60E4h and 3001h."""
     motor = 2.0 * math.pi / ratings.motor_counts_per_rev
     link = 2.0 * math.pi / ratings.link_counts_per_rev
     current = ratings.rated_current_a / 1000.0
-    units = (current, motor, motor, link)
-    i, motor_position, motor_velocity, link_position = (
+    units = (current, motor, motor, link, TEMPERATURE_C_PER_UNIT)
+    i, motor_position, motor_velocity, link_position, temperature = (
         np.round(signals[:, k] / unit) * unit for k, unit in enumerate(units)
     )
     return JointColumns(
@@ -131,5 +145,5 @@ def _columns(
         link_position_rad=link_position,
         link_velocity_rad_s=None,
         torque_nm=torque,
-        temperature_c=None,
+        temperature_c=temperature,
     )

@@ -45,13 +45,13 @@ class LossTable:
         highest_current_a: float,
     ) -> None:
         nm_per_a = gear_ratio * torque_constant_nm_per_a
-        self._torque_limit = nm_per_a * highest_current_a
-        self._per_torque_step = TORQUE_STEPS / (2.0 * self._torque_limit)
-        self._per_velocity_step = 1.0 / VELOCITY_STEP_RAD_S
-        self._last_row = round(HIGHEST_TABLE_VELOCITY_RAD_S / VELOCITY_STEP_RAD_S) - 1
-        grid = np.linspace(-self._torque_limit, self._torque_limit, TORQUE_STEPS + 1)
-        self._forward = self._rows(loss, nm_per_a, grid, highest_current_a, +1.0)
-        self._reverse = self._rows(loss, nm_per_a, grid, highest_current_a, -1.0)
+        self.torque_limit = nm_per_a * highest_current_a
+        self.per_torque_step = TORQUE_STEPS / (2.0 * self.torque_limit)
+        self.per_velocity_step = 1.0 / VELOCITY_STEP_RAD_S
+        self.last_row = round(HIGHEST_TABLE_VELOCITY_RAD_S / VELOCITY_STEP_RAD_S) - 1
+        grid = np.linspace(-self.torque_limit, self.torque_limit, TORQUE_STEPS + 1)
+        self.forward = self._rows(loss, nm_per_a, grid, highest_current_a, +1.0)
+        self.reverse = self._rows(loss, nm_per_a, grid, highest_current_a, -1.0)
 
     @staticmethod
     def _rows(
@@ -77,11 +77,85 @@ class LossTable:
 
     def magnitude(self, torque_nm: float, velocity_rad_s: float) -> float:
         """F(τ, v) in Nm, never negative; the sign of v selects the direction (v = 0 counts as forward)."""
+        rows = self.forward
+        if velocity_rad_s < 0.0:
+            rows = self.reverse
+            velocity_rad_s = -velocity_rad_s
+        x = velocity_rad_s * self.per_velocity_step
+        k = int(x)
+        if k > self.last_row:
+            k = self.last_row
+            x = k + 1.0
+        y = (torque_nm + self.torque_limit) * self.per_torque_step
+        if y < 0.0:
+            y = 0.0
+        elif y >= TORQUE_STEPS:
+            y = TORQUE_STEPS - 1e-9
+        m = int(y)
+        y -= m
+        low = rows[k]
+        high = rows[k + 1]
+        low_value = low[m] + y * (low[m + 1] - low[m])
+        return low_value + (x - k) * (high[m] + y * (high[m + 1] - high[m]) - low_value)
+
+
+class JointFriction:
+    """Friction magnitude of one true joint: scaled loss table, constant and viscous parts, Stribeck peak.
+
+    F(τ, v) = scale * table(τ, v) + c0 + c1 |v| + Fs exp(-(v / vs)²), never below zero. c0 and c1 are what the
+    joint's Coulomb and viscous friction differ from its file's (`differ`), with temperature and from day to
+    day. The Stribeck term is below 1e-6 Fs at 0.2 rad/s for vs <= 0.05 rad/s.
+    """
+
+    __slots__ = (
+        "_constant",
+        "_forward",
+        "_inverse_vs",
+        "_last_row",
+        "_per_torque_step",
+        "_per_velocity_step",
+        "_reach",
+        "_reverse",
+        "_scale",
+        "_stribeck",
+        "_torque_limit",
+        "_viscous",
+    )
+
+    def __init__(
+        self,
+        table: LossTable,
+        scale: float = 1.0,
+        viscous_nms_per_rad: float = 0.0,
+        stribeck_nm: float = 0.0,
+        stribeck_velocity_rad_s: float = 0.05,
+    ) -> None:
+        self._forward, self._reverse = table.forward, table.reverse
+        self._last_row = table.last_row
+        self._torque_limit = table.torque_limit
+        self._per_torque_step, self._per_velocity_step = table.per_torque_step, table.per_velocity_step
+        self._scale = scale
+        self._stribeck = stribeck_nm
+        self._inverse_vs = 1.0 / stribeck_velocity_rad_s
+        self._reach = 4.0 * stribeck_velocity_rad_s if stribeck_nm > 0.0 else -1.0
+        self.differ(0.0, viscous_nms_per_rad)
+
+    def differ(self, constant_nm: float, viscous_nms_per_rad: float) -> None:
+        """From now on so much Coulomb and viscous friction more (or less) than in the table."""
+        self._constant = constant_nm
+        self._viscous = viscous_nms_per_rad
+
+    def __call__(self, torque_nm: float, velocity_rad_s: float) -> float:
+        """Magnitude in Nm at transmitted torque τ and joint velocity v (its sign gives the direction).
+
+        Called 16 times per millisecond: `LossTable.magnitude` is written out here.
+        """
         rows = self._forward
+        speed = velocity_rad_s
         if velocity_rad_s < 0.0:
             rows = self._reverse
-            velocity_rad_s = -velocity_rad_s
-        x = velocity_rad_s * self._per_velocity_step
+            speed = -velocity_rad_s
+        x = speed * self._per_velocity_step
         k = int(x)
         if k > self._last_row:
             k = self._last_row
@@ -96,38 +170,8 @@ class LossTable:
         low = rows[k]
         high = rows[k + 1]
         low_value = low[m] + y * (low[m + 1] - low[m])
-        return low_value + (x - k) * (high[m] + y * (high[m + 1] - high[m]) - low_value)
-
-
-class JointFriction:
-    """Friction magnitude of one true joint: scaled loss table, additional viscous part and Stribeck peak.
-
-    F(τ, v) = scale * table(τ, v) + c |v| + Fs exp(-(v / vs)²). The Stribeck term is below 1e-6 Fs at 0.2
-    rad/s for vs <= 0.05 rad/s.
-    """
-
-    __slots__ = ("_inverse_vs", "_magnitude", "_reach", "_scale", "_stribeck", "_viscous")
-
-    def __init__(
-        self,
-        table: LossTable,
-        scale: float = 1.0,
-        viscous_nms_per_rad: float = 0.0,
-        stribeck_nm: float = 0.0,
-        stribeck_velocity_rad_s: float = 0.05,
-    ) -> None:
-        self._magnitude = table.magnitude
-        self._scale = scale
-        self._viscous = viscous_nms_per_rad
-        self._stribeck = stribeck_nm
-        self._inverse_vs = 1.0 / stribeck_velocity_rad_s
-        self._reach = 4.0 * stribeck_velocity_rad_s if stribeck_nm > 0.0 else -1.0
-
-    def __call__(self, torque_nm: float, velocity_rad_s: float) -> float:
-        """Magnitude in Nm at transmitted torque τ and joint velocity v (its sign gives the direction)."""
-        force = self._scale * self._magnitude(torque_nm, velocity_rad_s)
-        speed = velocity_rad_s if velocity_rad_s >= 0.0 else -velocity_rad_s
-        force += self._viscous * speed
+        table = low_value + (x - k) * (high[m] + y * (high[m + 1] - high[m]) - low_value)
+        force = self._scale * table + self._viscous * speed + self._constant
         if speed < self._reach:
             x = speed * self._inverse_vs
             force += self._stribeck * math.exp(-x * x)

@@ -8,7 +8,8 @@ from collections.abc import Callable
 
 from sim_can.plant import Plant
 from sim_can.plant_parameters import JointPlant, PlantParameters
-from sim_can.source import ChannelSignal, DriveRatings, DriveSignals
+from sim_can.run_to_run import NOMINAL_DAY, Day, day
+from sim_can.source import OFF, ChannelSignal, DriveRatings, DriveSignals
 
 _TWO_PI = 2.0 * math.pi
 
@@ -30,7 +31,7 @@ class _Encoders:
 
     The motor angle is rounded to counts. Its velocity is the difference of two samples through a first-order
     low pass of `velocity_filter_s`, so it lags by half a sample period plus that time. Noise is added to link
-    angle and current.
+    angle and current. `link_zero_rad` is the link encoder's zero error.
     """
 
     def __init__(self, side: JointPlant, normal: Callable[[], float]) -> None:
@@ -44,6 +45,7 @@ class _Encoders:
         self._count = 0
         self._share_dt = -1.0
         self._share = 1.0
+        self.link_zero_rad = 0.0
 
     def sample(
         self, signals: DriveSignals, dt_s: float, motor_rad: float, link_rad: float, current_a: float
@@ -58,23 +60,43 @@ class _Encoders:
             signals.motor_velocity_rad_s += self._share * (difference - signals.motor_velocity_rad_s)
         self._count = count
         signals.link_position_rad = link_rad + self._link_noise * self._normal()
+        if self.link_zero_rad:
+            signals.link_position_rad += self.link_zero_rad
         signals.current_a = current_a + self._current_offset + self._current_noise * self._normal()
 
 
 class PlantSource:
-    """`Source` of the emulated bench; the same seed and the same calls give the same signals bit by bit."""
+    """`Source` of the emulated bench; the same seed and the same calls give the same signals bit by bit.
 
-    def __init__(self, parameters: PlantParameters, seed: int = 0) -> None:
+    Where the plant file has `run_to_run`, the source begins in day 0 of its seed, and each time a drive is
+    enabled after both were off again it is another day. `noise_seed`: of the noise, where it is not `seed`.
+    """
+
+    def __init__(self, parameters: PlantParameters, seed: int = 0, noise_seed: str | None = None) -> None:
         self.plant = Plant(parameters)
         self.ratings = tuple(ratings_of(side) for side in parameters.joints)
         self.drives = (DriveSignals(), DriveSignals())
         self.channels = (ChannelSignal(),)
         # random, not numpy.random: five numbers per step cost 1 us, numpy.random 7 MB in a process that has
         # to stay small
-        normal = random.Random(seed).gauss
+        normal = random.Random(seed if noise_seed is None else noise_seed).gauss
         self._normal = normal
         self._encoders = tuple(_Encoders(side, normal) for side in parameters.joints)
         self._sensor = parameters.sensor
+        self._offset_nm = 0.0
+        self._widths = parameters.run_to_run
+        self._seed = seed
+        self._modes = [OFF, OFF]
+        self._ran = False
+        self.day_number = 0
+        self.begin_day(day(self._widths, seed, 0))
+
+    def begin_day(self, values: Day = NOMINAL_DAY) -> None:
+        """Another day: friction, temperature and zeros as given. The joints stay where they are."""
+        self.plant.begin_day(values)
+        for encoders, zero in zip(self._encoders, values.link_zero_rad, strict=True):
+            encoders.link_zero_rad = zero
+        self._offset_nm = self._sensor.offset_nm + values.sensor_zero_nm
 
     def advance(self, dt_s: float) -> bool:
         """Integrate by dt_s and sample everything. An emulated run has no end: always True."""
@@ -83,14 +105,29 @@ class PlantSource:
         one, two = plant.drives
         link = plant.link_position
         motor_1, motor_2 = plant.motor_position
-        self._encoders[0].sample(self.drives[0], dt_s, motor_1, link, one.current_a)
-        self._encoders[1].sample(self.drives[1], dt_s, motor_2, -link, two.current_a)
+        drive_1, drive_2 = self.drives
+        self._encoders[0].sample(drive_1, dt_s, motor_1, link, one.current_a)
+        self._encoders[1].sample(drive_2, dt_s, motor_2, -link, two.current_a)
+        warmth_1, warmth_2 = plant.temperatures
+        drive_1.temperature_c = warmth_1.celsius
+        drive_2.temperature_c = warmth_2.celsius
         sensor = self._sensor
         self.channels[0].torque_nm = (
-            sensor.gain * plant.sensor_torque() + sensor.offset_nm + sensor.noise_nm * self._normal()
+            sensor.gain * plant.sensor_torque() + self._offset_nm + sensor.noise_nm * self._normal()
         )
         return True
 
     def command(self, drive: int, mode: int, target: float) -> None:
         """Mode and target for the control loops of drive 0 or 1."""
+        modes = self._modes
+        if mode != modes[drive]:
+            if self._ran and modes == [OFF, OFF] and any(self._widths):
+                self.day_number += 1
+                self.begin_day(day(self._widths, self._seed, self.day_number))
+            modes[drive] = mode
+            self._ran = True
         self.plant.command(drive, mode, target)
+
+    def interpolate(self, drive: int, period_s: float) -> None:
+        """Time between two velocity targets of drive 0 or 1 [s]."""
+        self.plant.drives[drive].interpolation_s = period_s

@@ -88,6 +88,9 @@ class PlaySource:
     def command(self, drive: int, mode: int, target: float) -> None:
         """Ignored: what was measured cannot be commanded."""
 
+    def interpolate(self, drive: int, period_s: float) -> None:
+        """Ignored, as `command`."""
+
     def _show(self, row: int) -> None:
         self._row = row
         first, second = self._drives

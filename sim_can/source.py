@@ -11,6 +11,7 @@ where each joint has a sensor of its own (measured runs): then channel 0 belongs
 drive 1.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -41,13 +42,21 @@ class DriveSignals:
     enabled by a master or by the demo profile.
     """
 
-    __slots__ = ("current_a", "enabled", "link_position_rad", "motor_position_rad", "motor_velocity_rad_s")
+    __slots__ = (
+        "current_a",
+        "enabled",
+        "link_position_rad",
+        "motor_position_rad",
+        "motor_velocity_rad_s",
+        "temperature_c",
+    )
 
     def __init__(self) -> None:
         self.motor_position_rad = 0.0  # motor side, multi-turn
         self.motor_velocity_rad_s = 0.0  # motor side
         self.link_position_rad = 0.0  # joint side
         self.current_a = 0.0
+        self.temperature_c = math.nan  # of the joint; nan: nobody measures it
         self.enabled = False
 
 
@@ -86,4 +95,9 @@ class Source(Protocol):
     def command(self, drive: int, mode: int, target: float) -> None:
         """Command for drive 0 or 1 from now on: OFF, VELOCITY (rad/s, motor side) or CURRENT (A). A recorded
         run ignores it.
+        """
+
+    def interpolate(self, drive: int, period_s: float) -> None:
+        """Time between two targets of drive 0 or 1 [s] (60C2h): VELOCITY targets are approached in a straight
+        line of that length. Not called: one control cycle. A recorded run ignores it.
         """

@@ -2,7 +2,7 @@
 `struct` call. Pure.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 
 from drivers.frame import FRAME
 from drivers.object_dictionary import ObjectStore
@@ -27,10 +27,13 @@ class TransmitPdo:
         "pack",
         "period_ns",
         "start",
+        "timed_only",
         "type",
     )
 
-    def __init__(self, pdo: PdoMap, getters: tuple[Getter, ...], start: int, period_ms: int) -> None:
+    def __init__(
+        self, pdo: PdoMap, getters: tuple[Getter, ...], start: int, period_ms: int, timed_only: bool
+    ) -> None:
         self.cob_id = pdo.cob_id
         self.type = pdo.transmission_type
         self.length = pdo.length
@@ -40,6 +43,7 @@ class TransmitPdo:
         self.count = 0
         self.last = b""
         self.period_ns = period_ms * 1_000_000  # event timer, types 254 and 255
+        self.timed_only = timed_only  # no change of its values is an event
         self.due_ns = NEVER_NS
 
     def frame(self) -> bytes:
@@ -48,9 +52,15 @@ class TransmitPdo:
 
 
 def compile_tpdos(
-    store: ObjectStore, pdos: PdoParameters, getters: Mapping[tuple[int, int], Getter]
+    store: ObjectStore,
+    pdos: PdoParameters,
+    getters: Mapping[tuple[int, int], Getter],
+    quiet: Set[tuple[int, int]] = frozenset(),
 ) -> list[TransmitPdo]:
-    """All TPDOs that exist and map something; objects without a getter are read from the store."""
+    """All TPDOs that exist and map something; objects without a getter are read from the store.
+
+    quiet: objects whose change is no event; a TPDO that maps nothing else is sent by its event timer alone.
+    """
 
     def getter(index: int, subindex: int) -> Getter:
         return getters.get((index, subindex)) or (lambda: store.number(index, subindex))
@@ -60,5 +70,7 @@ def compile_tpdos(
         pdo = pdos.active_map(index)
         if pdo is not None:
             found = tuple(getter(mapped.index, mapped.subindex) for mapped in pdo.objects)
-            compiled.append(TransmitPdo(pdo, found, store.number(index, 6), store.number(index, 5)))
+            timed_only = all((mapped.index, mapped.subindex) in quiet for mapped in pdo.objects)
+            start, period_ms = store.number(index, 6), store.number(index, 5)
+            compiled.append(TransmitPdo(pdo, found, start, period_ms, timed_only))
     return compiled

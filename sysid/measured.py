@@ -14,6 +14,7 @@ import datetime as dt
 import json
 import math
 import sys
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -29,6 +30,7 @@ from estimator.status import STANDSTILL
 from estimator.whole_run import EstimateRun, estimate_run
 from models.files import load_joint, shipped
 from sim_can.run_files import ColumnMap, RunError, RunFile, read_run
+from sysid.figure_parts import draw_each_joint
 from sysid.friction_fit import FitError, FrictionFit, fit_friction, low_pass
 
 Array = NDArray[np.float64]
@@ -224,7 +226,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         options.out.mkdir(parents=True, exist_ok=True)
         cases, fits = evaluate(options.joint_files or options.out, dt.date.today().isoformat())
-        _draw(cases, options.out)
+        draw_each_joint(JOINTS, cases, options.out / "measured_joint{}.png", _draw_joint)
         if options.json:
             print(json.dumps(as_mapping(cases, fits), indent=1))
         else:
@@ -238,19 +240,10 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def _draw(cases: list[Case], out: Path) -> None:
-    try:
-        from sysid.measured_figures import draw_joint
-    except ImportError:
-        print(
-            "measured: no figures: matplotlib is not installed (it is in the extras 'dev' and 'train')",
-            file=sys.stderr,
-        )
-        return
-    for number in JOINTS:
-        path = out / f"measured_joint{number}.png"
-        draw_joint([case for case in cases if case.joint == number], path)
-        print(f"measured: wrote {path}", file=sys.stderr)
+def _draw_joint() -> Callable[[Sequence[Case], Path], None]:
+    from sysid.measured_figures import draw_joint
+
+    return draw_joint
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from estimator.checked import ConfigError
 from estimator.run import RunTableError
 from models.files import shipped
 from sim_can.run_files import ColumnMap, RunError, read_run
+from sysid.figure_parts import draw_each_joint
 from sysid.joint_log import LogError
 from sysid.measured import JOINTS, RUNS
 from sysid.measured_bus_score import BusRun, Played, as_mapping, configured, score_log
@@ -177,7 +178,7 @@ def run(bus: str | None, out: Path, as_json: bool) -> int:
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="jtqd-") as folder:
             results = evaluate(bus or f"unix:{folder}/bus", out)
-        _draw(results, out)
+        draw_each_joint(JOINTS, results, out / "measured_bus_joint{}.png", _draw_joint)
     except (RunError, RunTableError, ConfigError, LogError, PlayError, OSError) as error:
         print(f"measured: {error}", file=sys.stderr)
         return 1
@@ -191,19 +192,10 @@ def run(bus: str | None, out: Path, as_json: bool) -> int:
     return 0
 
 
-def _draw(results: list[BusRun], out: Path) -> None:
-    try:
-        from sysid.measured_bus_figures import draw_joint
-    except ImportError:
-        print(
-            "measured: no figures: matplotlib is not installed (it is in the extras 'dev' and 'train')",
-            file=sys.stderr,
-        )
-        return
-    for number in JOINTS:
-        path = out / f"measured_bus_joint{number}.png"
-        draw_joint([result for result in results if result.joint == number], path)
-        print(f"measured: wrote {path}", file=sys.stderr)
+def _draw_joint() -> Callable[[Sequence[BusRun], Path], None]:
+    from sysid.measured_bus_figures import draw_joint
+
+    return draw_joint
 
 
 if __name__ == "__main__":

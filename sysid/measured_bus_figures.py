@@ -5,21 +5,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
-import numpy as np
 
 mpl.use("Agg")  # files only; a display is not needed
 from matplotlib import pyplot as plt
 
 from estimator.status import STALE, STANDSTILL
-from sysid.measured_figures import AFTER, BEFORE, SENSOR, STANDING
+from sysid import figure_parts as parts
 
 if TYPE_CHECKING:
     from sysid.measured_bus_score import BusRun
 
 SILENT = "#d9d9e6"
 LABELS = {
-    "before": (BEFORE, "before: joint file as shipped"),
-    "after": (AFTER, "after: friction fitted on the other run"),
+    "before": (parts.BEFORE, "before: joint file as shipped"),
+    "after": (parts.AFTER, "after: friction fitted on the other run"),
 }
 
 
@@ -50,37 +49,18 @@ def _column(axes: Sequence[Any], results: Sequence["BusRun"]) -> None:
         middle.plot(time_s, values - result.reference_nm, color=colour, linewidth=0.9)
         below.plot(time_s, 1e3 * (values - result.offline_nm), color=colour, linewidth=0.6)
     last = results[-1]
-    above.plot(
-        last.time_s,
-        last.reference_nm,
-        color=SENSOR,
-        linewidth=1.4,
-        label="torque sensor, filtered like the estimate",
-    )
-    low, high = above.get_ylim()
-    above.set_ylim(low, high + 0.50 * (high - low))  # room for the legend above the curves
+    parts.sensor_line(above, last.time_s, last.reference_nm)
+    parts.room_for_legend(above, 0.50)
     above.set_title(f"joint {last.joint}, {last.run} on the bus", fontsize=10)
     below.set_xlabel("time since the first SYNC [s]")
-    middle.axhline(0.0, color=SENSOR, linewidth=0.8)
-    below.axhline(0.0, color=SENSOR, linewidth=0.8)
+    middle.axhline(0.0, color=parts.SENSOR, linewidth=0.8)
+    below.axhline(0.0, color=parts.SENSOR, linewidth=0.8)
     shades = (
-        (last.status == STANDSTILL, STANDING, "standstill: the estimate is the middle of an interval"),
+        (last.status == STANDSTILL, parts.STANDING, parts.STANDING_LABEL),
         (last.status == STALE, SILENT, "inputs missing: status stale, no torque published"),
     )
     for axis in axes:
         for where, colour, label in shades:
-            axis.fill_between(
-                last.time_s,
-                0.0,
-                1.0,
-                where=np.asarray(where),
-                transform=axis.get_xaxis_transform(),
-                color=colour,
-                linewidth=0.0,
-                label=label if axis is above and where.any() else None,
-            )
-        axis.grid(True, color="#dddddd", linewidth=0.6)
-        axis.set_axisbelow(True)
-        for side in ("top", "right"):
-            axis.spines[side].set_visible(False)
-    above.legend(loc="upper left", fontsize=8, framealpha=0.85, edgecolor="none")
+            parts.shade(axis, last.time_s, where, colour, label if axis is above and where.any() else None)
+        parts.plain(axis)
+    parts.legend(above)

@@ -9,11 +9,10 @@ import matplotlib as mpl
 mpl.use("Agg")  # files only; a display is not needed
 from matplotlib import pyplot as plt
 
+from sysid import figure_parts as parts
+
 if TYPE_CHECKING:
     from sysid.measured import Case
-
-SENSOR, BEFORE, AFTER = "#222222", "#c8702a", "#2a78b8"
-STANDING = "#e9e4da"
 
 
 def draw_joint(cases: Sequence["Case"], path: Path) -> None:
@@ -24,44 +23,31 @@ def draw_joint(cases: Sequence["Case"], path: Path) -> None:
     for (above, below), case in zip(axes.T, cases, strict=True):
         time_s = case.time_s - case.time_s[0]
         lines = (
-            (case.before_nm, BEFORE, f"before: joint file as shipped, RMSE {case.before.rmse_nm:.2f} Nm"),
+            (
+                case.before_nm,
+                parts.BEFORE,
+                f"before: joint file as shipped, RMSE {case.before.rmse_nm:.2f} Nm",
+            ),
             (
                 case.after_nm,
-                AFTER,
+                parts.AFTER,
                 f"after: friction fitted on {case.fitted_on}, RMSE {case.after.rmse_nm:.2f} Nm",
             ),
         )
         for values, colour, label in lines:
             above.plot(time_s, values, color=colour, linewidth=0.9, label=label)
             below.plot(time_s, values - case.reference_nm, color=colour, linewidth=0.9)
-        above.plot(
-            time_s,
-            case.reference_nm,
-            color=SENSOR,
-            linewidth=1.4,
-            label="torque sensor, filtered like the estimate",
-        )
-        low, high = above.get_ylim()
-        above.set_ylim(low, high + 0.40 * (high - low))  # room for the legend above the curves
+        parts.sensor_line(above, time_s, case.reference_nm)
+        parts.room_for_legend(above, 0.40)
         above.set_title(f"joint {case.joint}, {case.run}", fontsize=10)
-        below.axhline(0.0, color=SENSOR, linewidth=0.8)
+        below.axhline(0.0, color=parts.SENSOR, linewidth=0.8)
         below.set_xlabel("time [s]")
         for axis in (above, below):
-            axis.fill_between(
-                time_s,
-                0.0,
-                1.0,
-                where=case.standstill,
-                transform=axis.get_xaxis_transform(),
-                color=STANDING,
-                linewidth=0.0,
-                label="standstill: the estimate is the middle of an interval" if axis is above else None,
+            parts.shade(
+                axis, time_s, case.standstill, parts.STANDING, parts.STANDING_LABEL if axis is above else None
             )
-            axis.grid(True, color="#dddddd", linewidth=0.6)
-            axis.set_axisbelow(True)
-            for side in ("top", "right"):
-                axis.spines[side].set_visible(False)
-        above.legend(loc="upper left", fontsize=8, framealpha=0.85, edgecolor="none")
+            parts.plain(axis)
+        parts.legend(above)
     axes[0][0].set_ylabel("joint torque [Nm]")
     axes[1][0].set_ylabel("estimate - sensor [Nm]")
     figure.tight_layout()

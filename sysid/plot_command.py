@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import json
+import math
 import sys
 from pathlib import Path
 
 import numpy as np
 
 from estimator.status import DEGRADED, NAMES, STANDSTILL, VALID
+from sysid.figure_parts import shade
 from sysid.joint_log import LogError, Records, read_topic
 
 _SHADES = {STANDSTILL: "#dcecf2", DEGRADED: "#fbe8c8"}
@@ -27,21 +30,31 @@ def main(argv: list[str]) -> int:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="FILE", help="picture to write (png, svg, pdf)"
     )
+    parser.add_argument("--json", action="store_true", help="print the path and the RMSE as JSON")
     arguments = parser.parse_args(argv)
+    joint = arguments.joint
     try:
-        draw(read_topic(arguments.log, f"/joint/{arguments.joint}/state"), arguments.joint, arguments.out)
+        rmse = draw(read_topic(arguments.log, f"/joint/{joint}/state"), joint, arguments.out)
     except ImportError:
         print("jtq plot: matplotlib is not installed: pip install matplotlib", file=sys.stderr)
         return 1
     except (LogError, OSError, ValueError) as error:
         print(f"jtq plot: {error}", file=sys.stderr)
         return 1
-    print(arguments.out)
+    if arguments.json:
+        shown = None if math.isnan(rmse) else rmse
+        print(json.dumps({"paths": [str(arguments.out)], "rmse_nm": {f"joint_{joint}": shown}}))
+    else:
+        print(arguments.out)
     return 0
 
 
-def draw(log: Records, joint: int, path: Path) -> None:
-    """Two panels over time: torque and sensor, then their difference; shaded where the status is not valid."""
+def draw(log: Records, joint: int, path: Path) -> float:
+    """Two panels over time: torque and sensor, then their difference; shaded where the status is not valid.
+
+    Returns:
+        The RMSE in the title [Nm], over what was published while the joint moved and the sensor was valid; NaN without any.
+    """
     import matplotlib as mpl
 
     mpl.use("Agg")  # files only; a display is not needed
@@ -70,18 +83,10 @@ def draw(log: Records, joint: int, path: Path) -> None:
     for axis in (above, below):
         axis.margins(x=0)
         for code in np.unique(status[status != VALID]):
-            axis.fill_between(
-                time_s,
-                0,
-                1,
-                where=status == code,
-                transform=axis.get_xaxis_transform(),
-                color=_SHADES.get(int(code), _OTHER),
-                linewidth=0,
-                zorder=0,
-                label=NAMES.get(int(code), str(code)) if axis is above else None,
-            )
+            label = NAMES.get(int(code), str(code)) if axis is above else None
+            shade(axis, time_s, status == code, _SHADES.get(int(code), _OTHER), label)
     above.legend(loc="upper right", fontsize=8, ncols=3)
     figure.tight_layout()
     figure.savefig(path, dpi=110)
     plt.close(figure)
+    return rmse

@@ -6,12 +6,14 @@ import argparse
 import hashlib
 import json
 import sys
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from estimator.arguments import count, natural, seconds
 from estimator.checked import ConfigError
 from estimator.network import FEATURES
 from estimator.parameters import Joint
@@ -40,30 +42,56 @@ def main(argv: list[str]) -> int:
     """Train and write; exit status 0 done, 1 failure, 2 usage."""
     arguments = _parser().parse_args(argv)
     try:
+        plant = load_plant(arguments.plant or shipped("plant.yaml"))
+        joints = (load_joint(shipped("joint1.yaml")), load_joint(shipped("joint2.yaml")))
+        _require_writable(arguments.out)
+    except ConfigError as error:
+        print(f"jtq train: {error}", file=sys.stderr)
+        return 1
+    try:
         import torch
     except ImportError:
         print("jtq train: torch is not installed: pip install 'jtqd[train]'", file=sys.stderr)
         return 1
     torch.set_num_threads(2)
-    try:
-        plant = load_plant(arguments.plant or shipped("plant.yaml"))
-        joints = (load_joint(shipped("joint1.yaml")), load_joint(shipped("joint2.yaml")))
-    except ConfigError as error:
-        print(f"jtq train: {error}", file=sys.stderr)
-        return 1
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    count, held = arguments.runs, arguments.held_out
+    trained_on, held = arguments.runs, arguments.held_out
     pairs = []
-    for pair in emulated_blocks(plant, joints, range(count + held), arguments.seconds, viscous_drift=0.05):
+    for pair in emulated_blocks(
+        plant, joints, range(trained_on + held), arguments.seconds, viscous_drift=0.05
+    ):
         pairs.append(pair)
-        print(f"emulated run {len(pairs)} of {count + held}", file=sys.stderr)
+        print(f"emulated run {len(pairs)} of {trained_on + held}", file=sys.stderr)
+        if not all(len(block.features) for block in pair):
+            print(
+                f"jtq train: --seconds: found {arguments.seconds:g}, expected runs long enough for motion: "
+                f"run {len(pairs)} has none",
+                file=sys.stderr,
+            )
+            return 1
     result = {}
     for number, joint in enumerate(joints):
         blocks = [pair[number] for pair in pairs]
-        result[joint.name] = _train_joint(joint, number + 1, blocks[:count], blocks[count:], arguments)
+        result[joint.name] = _train_joint(
+            joint, number + 1, blocks[:trained_on], blocks[trained_on:], arguments
+        )
     if arguments.json:
         print(json.dumps(result))
     return 0
+
+
+def _require_writable(directory: Path) -> None:
+    """Make the directory and a file in it now: training takes minutes, and its result must not be lost for it.
+
+    Raises:
+        ConfigError: files cannot be made there.
+    """
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=directory):
+            pass
+    except OSError as error:
+        reason = "it is a file" if isinstance(error, FileExistsError) else error.strerror
+        raise ConfigError(f"--out {directory}: files cannot be made there: {reason}") from None
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -73,18 +101,22 @@ def _parser() -> argparse.ArgumentParser:
         epilog="example: jtq train --out models",
     )
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="where joint1.onnx, joint2.onnx and cards go"
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="where joint1.onnx, joint2.onnx and cards go; made if missing",
     )
     parser.add_argument(
         "--plant", type=Path, metavar="FILE", help="bench to emulate (default: the one that ships)"
     )
-    parser.add_argument("--runs", type=int, default=16, help="runs to train on (default 16)")
-    parser.add_argument("--held-out", type=int, default=4, help="further runs to score on (default 4)")
-    parser.add_argument("--seconds", type=float, default=30.0, help="length of a run (default 30)")
+    parser.add_argument("--runs", type=count, default=16, help="runs to train on (default 16)")
+    parser.add_argument("--held-out", type=count, default=4, help="further runs to score on (default 4)")
+    parser.add_argument("--seconds", type=seconds, default=30.0, help="length of a run (default 30)")
     parser.add_argument(
-        "--iterations", type=int, default=1000, help="full-batch steps (default 1000, as in the paper)"
+        "--iterations", type=count, default=1000, help="full-batch steps (default 1000, as in the paper)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the initial weights")
+    parser.add_argument("--seed", type=natural, default=0, help="of the initial weights")
     parser.add_argument("--json", action="store_true", help="print the scores as JSON")
     return parser
 

@@ -1,4 +1,4 @@
-"""Training of the paper's network (section III): 6-20-40-10-1, sigma(x) = tanh(x/2), on standardised data, with torch."""
+"""Training of fully connected networks with the paper's activation sigma(x) = tanh(x/2), on standardised data, with torch."""
 
 from __future__ import annotations
 
@@ -13,11 +13,15 @@ FloatArray = npt.NDArray[np.float64]
 Layer = tuple[FloatArray, FloatArray]
 
 HIDDEN = (20, 40, 10)
+"""Hidden layers of the paper's network (section III)."""
+
+BATCH = 4096
+_RATE = 0.01
 
 
 @dataclass(frozen=True)
 class Trained:
-    """Weights (W [inputs, outputs], b [outputs]) per layer, the standardisation, and the loss of each iteration [Nm^2]."""
+    """Weights (W [inputs, outputs], b [outputs]) per layer, the standardisation, and the mean loss of each pass [Nm^2]."""
 
     weights: list[Layer]
     input_mean: FloatArray
@@ -33,15 +37,19 @@ def train(
     *,
     iterations: int,
     seed: int,
+    hidden: tuple[int, ...] = HIDDEN,
+    weight_decay: float = 0.0,
     progress: Callable[[int, float], None] = lambda n, loss: None,
 ) -> Trained:
-    """Fit by Adam with a cosine schedule on the whole set; the same seed gives the same weights.
+    """Fit by Adam in random batches, the rate rising and falling once; the same seed gives the same weights.
 
     Args:
-        features: [n, 6], the estimator's features.
-        target_nm: [n], sensor torque.
-        iterations: full-batch steps.
+        features: [n, inputs].
+        target_nm: [n], sensor torque, or what the network is to add.
+        iterations: passes over the data.
         seed: of the initial weights.
+        hidden: widths of the hidden layers.
+        weight_decay: of AdamW; 0 is Adam.
         progress: called with iteration and loss [Nm^2].
     """
     import torch
@@ -52,18 +60,25 @@ def train(
     output_mean, output_std = float(target_nm.mean()), float(target_nm.std())
     x = torch.tensor((features - mean) / std, dtype=torch.float32)
     y = torch.tensor((target_nm - output_mean) / output_std, dtype=torch.float32)[:, None]
-    layers = _layers(features.shape[1])
+    layers = _layers((features.shape[1], *hidden, 1))
     parameters = [parameter for layer in layers for parameter in layer.parameters()]
-    optimiser = torch.optim.Adam(parameters, lr=0.01)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=1e-4)
+    optimiser = torch.optim.AdamW(parameters, lr=_RATE, weight_decay=weight_decay, fused=True)
+    batches = -(-len(x) // BATCH)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimiser, max_lr=_RATE, total_steps=iterations * batches, pct_start=0.1, final_div_factor=1e3
+    )
     losses = []
     for n in range(iterations):
-        optimiser.zero_grad()
-        loss = torch.mean((_forward(layers, x) - y) ** 2)
-        loss.backward()
-        optimiser.step()
-        schedule.step()
-        losses.append(float(loss.detach()) * output_std**2)
+        total = 0.0
+        order = torch.randperm(len(x))
+        for part in order.tensor_split(batches):
+            optimiser.zero_grad(set_to_none=True)
+            loss = torch.nn.functional.mse_loss(_forward(layers, x[part]), y[part])
+            loss.backward()
+            optimiser.step()
+            schedule.step()
+            total += loss.item() * len(part)
+        losses.append(total / len(x) * output_std**2)
         progress(n, losses[-1])
     weights = [
         (layer.weight.detach().numpy().T.astype(np.float64), layer.bias.detach().numpy().astype(np.float64))
@@ -72,10 +87,9 @@ def train(
     return Trained(weights, mean, std, output_mean, output_std, losses)
 
 
-def _layers(inputs: int) -> list:  # type: ignore[type-arg]  # torch is optional and untyped here
+def _layers(sizes: tuple[int, ...]) -> list:  # type: ignore[type-arg]  # torch is optional and untyped here
     import torch
 
-    sizes = (inputs, *HIDDEN, 1)
     layers = [torch.nn.Linear(a, b) for a, b in pairwise(sizes)]
     for layer in layers[:-1]:
         # tanh(x/2) has slope 1/2 at zero: Xavier's gain doubles (Glorot and Bengio 2010).

@@ -81,7 +81,7 @@ def _block(seed: int, joint: Joint, dt: FloatArray, one: JointColumns) -> RunBlo
         joint, EstimatorSettings(method="efficiency"), None, dt, current, position, velocity, link
     )
     moving = run.status == VALID
-    return RunBlock(seed, run.features[moving], torque[moving], run.efficiency_nm[moving])
+    return RunBlock(seed, run.features[moving], torque[moving], run.physics_nm[moving])
 
 
 def data_hash(blocks: list[RunBlock]) -> str:

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Self
 
 import can
 
@@ -64,53 +65,62 @@ class TestNode:
         return [(0x700 + self.node, bytes([self.state]))]
 
 
-class Responder:
-    """A thread that runs test nodes on a bus. Context manager."""
+class _Running:
+    """A thread that calls `turn` until the context ends, then `close`."""
 
-    def __init__(self, bus: can.BusABC, nodes: list[TestNode]) -> None:
-        self.bus, self.nodes = bus, nodes
-        self.extra: Callable[[], list[tuple[int, bytes]]] = list
+    def __init__(self) -> None:
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
-    def __enter__(self) -> Responder:
+    def __enter__(self) -> Self:
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._stop.set()
         self._thread.join(2.0)
-        self.bus.shutdown()
+        self.close()
 
     def _run(self) -> None:
         while not self._stop.is_set():
-            message = self.bus.recv(0.002)
-            out = self.extra()
-            for node in self.nodes:
-                if message is not None and not message.is_extended_id:
-                    out += node.frames(message.arbitration_id, bytes(message.data))
-                out += node.beat(time.monotonic())
-            for can_id, data in out:
-                self.bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+            self.turn()
+
+    def turn(self) -> None:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        raise NotImplementedError
 
 
-class HubResponder:
-    """The same nodes inside a hub on a unix socket, with its thread. Context manager."""
+class Responder(_Running):
+    """Test nodes on a python-can bus. Context manager."""
+
+    def __init__(self, bus: can.BusABC, nodes: list[TestNode]) -> None:
+        super().__init__()
+        self.bus, self.nodes = bus, nodes
+        self.extra: Callable[[], list[tuple[int, bytes]]] = list
+
+    def turn(self) -> None:
+        message = self.bus.recv(0.002)
+        out = self.extra()
+        for node in self.nodes:
+            if message is not None and not message.is_extended_id:
+                out += node.frames(message.arbitration_id, bytes(message.data))
+            out += node.beat(time.monotonic())
+        for can_id, data in out:
+            self.bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+
+    def close(self) -> None:
+        self.bus.shutdown()
+
+
+class HubResponder(_Running):
+    """The same nodes inside a hub on a unix socket. Context manager."""
 
     def __init__(self, path: str, nodes: list[TestNode]) -> None:
+        super().__init__()
         self.hub, self.nodes = Hub(path), nodes
         self._port = self.hub.attach(self._on_frame)
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-
-    def __enter__(self) -> HubResponder:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        self._thread.join(2.0)
-        self.hub.close()
 
     def _on_frame(self, frame16: bytes, _stamp_ns: int) -> None:
         can_id, length, data = FRAME.unpack(frame16)
@@ -118,9 +128,11 @@ class HubResponder:
             for reply_id, reply in node.frames(can_id, data[:length]):
                 self._port.send(pack(reply_id, reply))
 
-    def _run(self) -> None:
-        while not self._stop.is_set():
-            self.hub.run_once(0.002)
-            for node in self.nodes:
-                for can_id, data in node.beat(time.monotonic()):
-                    self._port.send(pack(can_id, data))
+    def turn(self) -> None:
+        self.hub.run_once(0.002)
+        for node in self.nodes:
+            for can_id, data in node.beat(time.monotonic()):
+                self._port.send(pack(can_id, data))
+
+    def close(self) -> None:
+        self.hub.close()

@@ -169,7 +169,11 @@ def test_bench_survives_an_interface_that_goes_down_and_up(running_on_vcan):
     ("arguments", "status", "message"),
     [
         ([], 2, "--bus is missing"),
-        (["--bus", "unix:/no/such/folder/x"], 1, "unix:/no/such/folder/x"),
+        (
+            ["--bus", "unix:/no/such/folder/x"],
+            1,
+            "jtq sim: unix:/no/such/folder/x: the directory /no/such/folder does not exist",
+        ),
         (["--bus", "nosuchcan9"], 1, "nosuchcan9"),
         (["--bus", "unix:x", "--joints", "1,2"], 2, "belong to --play"),
         (["--bus", "unix:x", "--joints", "1;2"], 2, "two joint numbers"),

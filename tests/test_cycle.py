@@ -11,12 +11,14 @@ from types import SimpleNamespace
 import pytest
 
 from daemon import cycle_record as cr
-from daemon.cycle import Cycle, JointInputs, Unwrap
+from daemon.cycle import Cycle
 from daemon.estimate_pdo import decode
 from daemon.grid import Grid
 from daemon.intake import InputPdo, Intake
+from daemon.joint_cycle import JointInputs
 from daemon.ring import Ring, RingReader
 from daemon.snapshot import Snapshot, SnapshotReader
+from daemon.unwrap import Unwrap
 from drivers.errors import BusDown
 from estimator.joint_estimator import EstimatorSettings, JointEstimator
 from models.files import load_joint, shipped
@@ -121,13 +123,12 @@ def make(tmp_path: Path, script: Callable[[int], list[bytes]]) -> tuple[Cycle, S
     return cycle, socket, RingReader(tmp_path / "ring", cr.RECORD_SIZE)
 
 
-def turn(cycle: Cycle, count: int = 1) -> None:
+def turn(cycle: Cycle, count: int = 1, **before: Callable[[], None]) -> None:
+    """Whole cycles; `before` names what happens just before a stage."""
     for _ in range(count):
-        cycle.begin()
-        cycle.gather()
-        cycle.observe()
-        cycle.publish()
-        cycle.record()
+        for stage in ("begin", "gather", "observe", "publish", "record"):
+            before.get(stage, lambda: None)()
+            getattr(cycle, stage)()
         cycle.grid.slot_ns = time.monotonic_ns()
 
 
@@ -180,6 +181,18 @@ def test_a_missing_input_is_stale_for_its_joint_only(tmp_path: Path) -> None:
     joint = cr.joint_of(reader.read(limit=64).records[39], 1)
     assert math.isnan(joint.torque_nm)
     assert joint.input_flags == 2 | 4
+
+
+@pytest.mark.parametrize(
+    ("missing", "flags"), [(0, (6, 7)), (1, (5, 7)), (3, (7, 5)), (4, (3, 3)), (5, (7, 7))]
+)
+def test_the_snapshot_says_which_inputs_a_joint_has(
+    tmp_path: Path, missing: int, flags: tuple[int, int]
+) -> None:
+    cycle, _, _ = make(tmp_path, lambda n: [*inputs()[:missing], *inputs()[missing + 1 :]])
+    turn(cycle)
+    one, two = SnapshotReader(tmp_path / "snapshot").read().joints
+    assert (one.input_flags, two.input_flags) == flags
 
 
 def test_a_missing_sensor_does_not_touch_the_estimate(tmp_path: Path) -> None:
@@ -279,12 +292,11 @@ def test_the_estimate_does_not_see_the_roll_over(tmp_path: Path) -> None:
 def test_an_estimate_that_is_too_late_is_withdrawn(tmp_path: Path) -> None:
     cycle, socket, reader = make(tmp_path, lambda n: inputs())
     turn(cycle, 30)
-    cycle.begin()
-    cycle.gather()
-    cycle.observe()
-    cycle.grid.slot_ns -= 20_000_000  # the next SYNC was due 10 ms ago
-    cycle.publish()
-    cycle.record()
+
+    def late() -> None:
+        cycle.grid.slot_ns -= 20_000_000  # the next SYNC was due 10 ms ago
+
+    turn(cycle, publish=late)
     pdo = decode(estimates(socket)[-1])
     assert pdo.status == (4, 4)
     assert pdo.torque_nm == (None, None)
@@ -296,13 +308,12 @@ def test_an_estimate_that_is_too_late_is_withdrawn(tmp_path: Path) -> None:
 def test_a_stall_of_minutes_is_recorded_and_not_fatal(tmp_path: Path) -> None:
     cycle, _, reader = make(tmp_path, lambda n: inputs())
     turn(cycle, 3)
-    cycle.begin()
-    cycle.gather()
-    cycle.observe()
-    cycle.publish()
-    cycle.late_ns = 600_000_000_000
-    cycle._work_start_ns -= 600_000_000_000
-    cycle.record()
+
+    def stall() -> None:
+        cycle.late_ns = 600_000_000_000
+        cycle._work_start_ns -= 600_000_000_000
+
+    turn(cycle, record=stall)
     header = cr.header_of(reader.read().records[-1])
     assert header.work_ns == 0xFFFF_FFFF
     assert header.late_ns == 0x7FFF_FFFF

@@ -3,6 +3,8 @@
 import math
 import struct
 
+import pytest
+
 from daemon import cycle_record as cr
 
 HEADER = (7, 1_000, 1_700_000_000_123_456_789, 0xF, 50_000, -3, 2, 240, 2, 255, 1, 2, 3, 4, 0)
@@ -62,6 +64,24 @@ def test_fields_by_name():
     assert (one.statusword, one.status, one.sensor_status, one.input_flags) == (0x1237, 2, 0x80, 7)
     assert (two.motor_position_rad, two.status) == (-0.25, 15)
     assert math.isnan(two.dt_s)
+
+
+def test_a_selection_of_fields_is_what_the_whole_record_says():
+    record = sample()
+    wanted = ("frame_count", "cycle", "late_ns")  # in any order: the record's own is kept
+    picked = cr.selection(wanted, ("status", "dt_s")).unpack_from(record)
+    header, one, two = cr.header_of(record), cr.joint_of(record, 1), cr.joint_of(record, 2)
+    assert picked[:5] == (header.cycle, header.late_ns, header.frame_count, one.dt_s, one.status)
+    assert math.isnan(picked[5])
+    assert picked[6:] == (two.status,)
+    everything = cr.selection(cr.Header._fields, cr.JointRecord._fields)
+    assert everything.size == cr.HEAD.size
+    assert everything.unpack_from(record)[:-5] == cr.HEAD.unpack_from(record)[:-5]
+
+
+def test_a_selection_refuses_fields_that_are_not_there():
+    with pytest.raises(ValueError, match="found nonsense, expected fields"):
+        cr.selection(("cycle", "nonsense"), ())
 
 
 def test_frames_in_order_with_stamps():

@@ -193,7 +193,7 @@ def test_every_file_keeps_cia_306(eds):
         ("6064", "PDOMapping", "0"),
         ("60C2sub2", "DefaultValue", "-200"),
         ("1A01sub1", "DefaultValue", "0x60640010"),
-        ("DeviceInfo", "NrOfTXPDO", "3"),
+        ("DeviceInfo", "NrOfTXPDO", "2"),
         ("6040", "AccessType", "readwrite"),
         ("6078", "DataType", "0x00FF"),
     ],
@@ -218,7 +218,7 @@ def test_identity_is_the_same_in_both_places(eds):
 
 
 def test_cob_ids_follow_the_predefined_connection_set(eds):
-    bases = {0x1400: 0x200, 0x1401: 0x300, 0x1800: 0x180, 0x1801: 0x280, 0x1200: 0x600}
+    bases = {0x1400: 0x200, 0x1401: 0x300, 0x1800: 0x180, 0x1801: 0x280, 0x1802: 0x380, 0x1200: 0x600}
     for index, base in bases.items():
         if f"{index:04X}sub1" in eds:
             text = eds[f"{index:04X}sub1"]["DefaultValue"]
@@ -271,6 +271,24 @@ def test_device_types_and_modes():
     assert modes.default == 1 << 8 | 1 << 9  # csv, cst
     period = parse((EDS / "drive.eds").read_text())
     assert (period["60C2sub1"]["DefaultValue"], period["60C2sub2"]["DefaultValue"]) == ("1", "-3")  # 1 ms
+
+
+def test_drive_tells_its_temperature_twice_a_second():
+    """TPDO3: 380h+n, event-driven, event timer 500 ms, 3001h alone (I16, 0.1 degC)."""
+    eds = parse((EDS / "drive.eds").read_text())
+    sub = {n: number(eds[f"1802sub{n}"]["DefaultValue"], node=2) for n in (1, 2, 3, 5, 6)}
+    assert sub == {1: 0x4000_0382, 2: 255, 3: 0, 5: 500, 6: 0}
+    assert number(eds["1A02sub0"]["DefaultValue"]) == 1
+    assert number(eds["1A02sub1"]["DefaultValue"]) == 0x3001_0010
+    assert (eds["3001"]["DataType"], eds["3001"]["AccessType"]) == ("0x0003", "ro")
+    assert [eds[f"{index}sub5"]["DefaultValue"] for index in ("1800", "1801")] == ["0", "0"]
+
+
+def test_drive_watches_two_masters_and_the_sensor_one():
+    for name, count in (("drive.eds", 2), ("torque_sensor.eds", 1)):
+        eds = parse((EDS / name).read_text())
+        assert number(eds["1016sub0"]["DefaultValue"]) == count
+        assert [eds[f"1016sub{n}"]["AccessType"] for n in range(1, count + 1)] == ["rw"] * count
 
 
 def test_jtqd_publishes_the_estimate_and_its_counters():

@@ -22,7 +22,7 @@ from estimator.parameters import Effect, Joint
 NETWORK = TorqueNetwork(small_network().data)
 # i, v, and Table I there: e.g. 0.2530 + 0.1493*3 - 0.0820 - 0.0117*9 + 0.0060*3 + 0.0066 = 0.5382
 TABLE_POINTS = ((3.0, 1.0, 0.5382), (-3.0, 1.0, 1.1272), (-3.0, -1.0, 0.5512), (3.0, -1.0, 1.1110))
-FIELDS = ("torque_nm", "sigma_nm", "status", "tob_nm", "efficiency_nm", "network_nm")
+FIELDS = ("torque_nm", "sigma_nm", "status", "tob_nm", "physics_nm", "network_nm")
 
 
 def estimator(method: str, joint: Joint | None = None, **settings: Any) -> JointEstimator:
@@ -68,12 +68,12 @@ def test_steady_state_is_equation_7_with_the_table() -> None:
     ):
         got = steady(estimator("efficiency"), i, v)
         assert got.status == st.VALID
-        assert got.torque_nm == got.efficiency_nm
+        assert got.torque_nm == got.physics_nm
         assert got.torque_nm == pytest.approx(eta * 6.2 * i, abs=1e-3 * 6.2 * 3)
         assert math.isnan(got.network_nm)
     got = steady(estimator("tob"), 3.0, 1.0)
     assert got.torque_nm == got.tob_nm == pytest.approx(18.6 - 5.0, abs=1e-9)
-    assert math.isnan(got.efficiency_nm)
+    assert math.isnan(got.physics_nm)
 
 
 def test_efficiency_estimate_is_equation_7_at_every_sample_of_a_quadrant() -> None:
@@ -91,7 +91,7 @@ def test_efficiency_estimate_is_equation_7_at_every_sample_of_a_quadrant() -> No
         got = e.step(0.001, i, 0.0, w, 0.0)
         if k:
             raw = 100.0 * (z - 7e-5 * 200.0 * w)
-            assert got.efficiency_nm == pytest.approx(raw * losses.eta(raw / 6.2, z_v), abs=2e-3 * abs(raw))
+            assert got.physics_nm == pytest.approx(raw * losses.eta(raw / 6.2, z_v), abs=2e-3 * abs(raw))
 
 
 def test_known_truth_with_reversals_is_recovered() -> None:
@@ -105,7 +105,7 @@ def test_known_truth_with_reversals_is_recovered() -> None:
     current = i_eff + 7e-5 * 100.0 * acceleration / 0.062
     delayed = np.interp(t - 1 / 200.0, t, truth)
     got = [
-        estimator_.step(0.001, a, 0.0, 100.0 * b, 0.0).efficiency_nm
+        estimator_.step(0.001, a, 0.0, 100.0 * b, 0.0).physics_nm
         for estimator_ in [estimator("efficiency")]
         for a, b in zip(current.tolist(), v.tolist(), strict=True)
     ]
@@ -118,7 +118,7 @@ def test_network_is_used_inside_its_envelope() -> None:
     assert got.status == st.VALID
     assert got.torque_nm == got.network_nm
     assert got.sigma_nm == 0.31
-    features = [[2.0, 4.9, 100.0, 0.049, 1.0, got.efficiency_nm]]
+    features = [[2.0, 4.9, 100.0, 0.049, 1.0, got.physics_nm]]
     assert got.network_nm == pytest.approx(float(NETWORK.run_many(np.array(features))[0]), abs=1e-9)
 
 
@@ -134,7 +134,7 @@ def test_outside_the_envelope_physics_serves_and_the_border_has_no_jump() -> Non
             seen.append(got.status)
             if i > 6.61:
                 assert got.status == st.DEGRADED
-                assert got.torque_nm == got.efficiency_nm
+                assert got.torque_nm == got.physics_nm
             elif i < 6.59:
                 assert got.status == st.VALID
     assert set(seen) == {st.VALID, st.DEGRADED}
@@ -152,11 +152,11 @@ def test_a_network_far_from_physics_is_refused_without_a_jump() -> None:
     ):
         got = steady(faked(lambda *x, offset=offset: x[5] + offset), 2.0, 1.0)
         assert got.status == status
-        assert got.torque_nm == pytest.approx(got.efficiency_nm + weight * offset)
+        assert got.torque_nm == pytest.approx(got.physics_nm + weight * offset)
     for nonsense in (math.nan, math.inf):
         got = steady(faked(lambda *x, answer=nonsense: answer), 2.0, 1.0)
         assert got.status == st.DEGRADED
-        assert got.torque_nm == got.efficiency_nm
+        assert got.torque_nm == got.physics_nm
 
 
 # ---- statuses
@@ -219,7 +219,7 @@ def test_absurd_numbers_never_reach_the_bus_and_leave_nothing() -> None:
         assert e.step(0.001, 2.0, 2.1, 100.0, 0.021).status == st.STARTING
         got = e.step(0.001, 2.0, 2.2, 100.0, 0.022)
         assert got.status == st.VALID
-        assert got.efficiency_nm == pytest.approx(
+        assert got.physics_nm == pytest.approx(
             steady(estimator("efficiency"), 2.0, 1.0).torque_nm, abs=1e-6
         )
 
@@ -287,7 +287,7 @@ def test_what_cannot_be_applied_is_refused() -> None:
 def test_without_efficiency_the_network_stands_on_friction() -> None:
     got = steady(estimator("network", replace(joint1(), efficiency=None)), 2.0, 1.0)
     friction = FrictionModel(joint1().friction)
-    assert got.efficiency_nm == pytest.approx(12.4 - friction.torque(1.0), abs=1e-9)
+    assert got.physics_nm == pytest.approx(12.4 - friction.torque(1.0), abs=1e-9)
 
 
 # ---- twin

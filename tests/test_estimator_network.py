@@ -62,7 +62,7 @@ def test_a_network_by_hand() -> None:
 def test_one_sample_and_many_agree() -> None:
     network = TorqueNetwork(small_network(4, noise=0.3).data)
     x = inputs(2000)
-    assert network._bound
+    assert network.bound
     many = network.run_many(x)
     assert np.max(np.abs(many - [network.run_one(*row) for row in x.tolist()])) < 1e-11
     assert network.run_many(np.zeros((0, 6))).shape == (0,)
@@ -76,7 +76,7 @@ def test_without_aliasing_it_falls_back_to_plain_run(monkeypatch: pytest.MonkeyP
     original = onnxruntime.OrtValue.ortvalue_from_numpy
     monkeypatch.setattr(onnxruntime.OrtValue, "ortvalue_from_numpy", lambda x: original(x.copy()))
     network = TorqueNetwork(small_network(4, noise=0.3).data)
-    assert not network._bound
+    assert not network.bound
     x = inputs(20)
     assert [network.run_one(*row) for row in x.tolist()] == pytest.approx(
         network.run_many(x).tolist(), abs=1e-11

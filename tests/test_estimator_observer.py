@@ -36,10 +36,10 @@ def test_no_start_transient() -> None:
     friction = FrictionModel(joint1().friction)
     for i, w in ((3.0, 150.0), (-1.0, 300.0), (0.0, 0.0), (2.0, -250.0)):
         o = observer()
-        first = o.start(i, w, 0.4)
+        first = o.start(i, 0.0, w, 0.4)
         assert first.raw_nm == pytest.approx(G * KT * i, abs=1e-9)
         for k in range(1, 200):
-            seen = o.step(0.001, i, w, 0.4 + w / G * 0.001 * k)
+            seen = o.step(0.001, i, 0.0, w, 0.4 + w / G * 0.001 * k)
             assert seen.raw_nm == pytest.approx(G * KT * i, abs=1e-9)
             assert seen.tob_nm == pytest.approx(G * KT * i - friction.torque(w / G), abs=1e-9)
             assert seen.joint_velocity_rad_s == pytest.approx(w / G, abs=1e-12)
@@ -52,12 +52,12 @@ def test_constant_acceleration_is_exact(uneven: bool) -> None:
     rng = np.random.default_rng(4)
     alpha = 900.0
     o = observer()
-    o.start(0.0, 0.0, 0.0)
+    o.start(0.0, 0.0, 0.0, 0.0)
     t = 0.0
     for _ in range(300):
         dt = rng.uniform(1e-5, 8e-3) if uneven else 1e-3
         t += dt
-        seen = o.step(dt, 0.0, alpha * t, 0.0)
+        seen = o.step(dt, 0.0, 0.0, alpha * t, 0.0)
         assert seen.raw_nm == pytest.approx(-G * J * alpha * (1 - math.exp(-RATE * t)), abs=1e-9)
 
 
@@ -66,19 +66,19 @@ def test_a_ramp_lags_by_exactly_one_over_g(rate: float) -> None:
     """Group delay at DC is 1/g for torque and velocity alike, uneven steps included."""
     rng = np.random.default_rng(5)
     o = observer(rate)
-    o.start(0.0, 0.0, 0.0)
+    o.start(0.0, 0.0, 0.0, 0.0)
     t, slope = 0.0, 7.0
     while t < 40.0 / rate:
         dt = rng.uniform(2e-4, 2e-3)
         t += dt
-        raw = o.step(dt, slope * t, 0.0, 0.0).raw_nm
+        raw = o.step(dt, slope * t, 0.0, 0.0, 0.0).raw_nm
     assert t - raw / (G * KT * slope) == pytest.approx(1.0 / rate, rel=1e-9)
-    o.start(0.0, 0.0, 0.0)
+    o.start(0.0, 0.0, 0.0, 0.0)
     t = 0.0
     while t < 40.0 / rate:
         dt = rng.uniform(2e-4, 2e-3)
         t += dt
-        v = o.step(dt, 0.0, slope * t, 0.0).joint_velocity_rad_s
+        v = o.step(dt, 0.0, 0.0, slope * t, 0.0).joint_velocity_rad_s
     assert t - v * G / slope == pytest.approx(1.0 / rate, rel=1e-9)
 
 
@@ -111,7 +111,7 @@ def test_uneven_steps_against_an_ode_solver() -> None:
     f_m = np.array([friction.torque(x / G) for x in w]) / G
     link_rate = 130.0
     o = observer(RATE, link_rate)
-    o.start(i[0], w[0], q[0])
+    o.start(i[0], 0.0, w[0], q[0])
     state = np.array([i[0] * KT + J * RATE * w[0] - f_m[0], i[0] * KT + J * RATE * w[0], w[0] / G, w[0] / G])
     for k in range(1, count):
 
@@ -130,7 +130,7 @@ def test_uneven_steps_against_an_ode_solver() -> None:
             ]
 
         state = solve_ivp(rates, (t[k - 1], t[k]), state, rtol=1e-11, atol=1e-12).y[:, -1]
-        seen = o.step(dt[k], i[k], w[k], q[k])
+        seen = o.step(dt[k], i[k], 0.0, w[k], q[k])
         expected = [
             (state[1] - J * RATE * w[k]) * G,
             (state[0] - J * RATE * w[k]) * G,
@@ -143,8 +143,8 @@ def test_uneven_steps_against_an_ode_solver() -> None:
 def test_a_long_run_is_fast_enough_for_replay() -> None:
     """60 000 samples (a minute of bus) in well under a second; generous for a loaded machine."""
     o = observer()
-    o.start(0.0, 0.0, 0.0)
+    o.start(0.0, 0.0, 0.0, 0.0)
     began = time.process_time()
     for _ in range(60_000):
-        o.step(0.001, 1.0, 10.0, 0.0)
+        o.step(0.001, 1.0, 0.0, 10.0, 0.0)
     assert time.process_time() - began < 1.0

@@ -1,4 +1,4 @@
-"""Frame sockets: one suite over both transports, then what only the unix bus has.
+"""Frame sockets: one suite over both transports.
 
 On AF_CAN the suite runs where JTQD_CAN_INTERFACE (default vcan0) exists; named in the environment it must.
 """
@@ -7,19 +7,14 @@ import errno
 import os
 import random
 import socket
-import struct
 import time
-from pathlib import Path
 
 import pytest
 
-from drivers.bpf import program
-from drivers.can_filter import checked
 from drivers.errors import BusDown, BusError, BusGone
 from drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, pack
 from drivers.frame_socket import CanFilter, exact, look_alikes, open_frame_socket
 from drivers.hub import Hub
-from drivers.receive import FrameReceiver
 
 SEED = 7
 SYNC = pack(0x080, b"\x01")
@@ -309,206 +304,3 @@ def test_enobufs_is_a_dropped_frame_not_an_error(bench):
     sock._send = fail
     assert [sock.send(SYNC) for _ in range(3)] == [False] * 3
     assert sock.tx_dropped == 3
-
-
-# --- unix bus only ---
-
-
-def test_missing_bus_is_one_line_that_says_what_to_do(tmp_path):
-    bus = f"unix:{tmp_path}/none"
-    with pytest.raises(BusError) as caught:
-        open_frame_socket(bus, None)
-    assert str(caught.value) == f"no bus at {bus}: start one with `jtq sim --bus {bus}`"
-
-
-def test_dead_socket_file_and_wrong_files_are_named(tmp_path):
-    dead = tmp_path / "dead"
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sock:
-        sock.bind(str(dead))
-    with pytest.raises(BusError, match="no bus at"):
-        open_frame_socket(f"unix:{dead}", None)
-    stream = tmp_path / "stream"
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
-        sock.bind(str(stream))
-        sock.listen()
-        with pytest.raises(BusError, match="not a frame hub"):
-            open_frame_socket(f"unix:{stream}", None)
-    with pytest.raises(BusError, match="not a frame hub"):
-        open_frame_socket(f"unix:{tmp_path}/{'x' * 200}", None)
-    with pytest.raises(BusError, match="path must follow"):
-        open_frame_socket("unix:", None)
-
-
-def test_end_of_the_hub_is_bus_gone_after_the_last_frame(tmp_path):
-    hub = Hub(str(tmp_path / "bus"))
-    a = open_frame_socket(f"unix:{tmp_path}/bus", None)
-    port = hub.attach(lambda _frame, _stamp: None)
-    hub.run_once(0)
-    port.send(SYNC)
-    hub.close()
-    assert a.wait(0.0)
-    assert received_until_gone(a) == [SYNC]
-    for _ in range(2):
-        with pytest.raises(BusGone):
-            a.receive()
-        with pytest.raises(BusGone):
-            a.send(SYNC)
-    a.close()
-    a.close()
-
-
-def received_until_gone(sock):
-    frames = []
-    try:
-        while n := sock.receive():
-            frames += [bytes(sock.frames[16 * i : 16 * i + 16]) for i in range(n)]
-    except BusGone:
-        return frames
-    raise AssertionError("the end was not seen")
-
-
-def test_full_transmit_queue_is_counted_not_waited_for(tmp_path):
-    hub = Hub(str(tmp_path / "bus"))
-    a = open_frame_socket(f"unix:{tmp_path}/bus", None)
-    b = open_frame_socket(f"unix:{tmp_path}/bus", None)
-    hub.run_once(0)
-    sent = sum(a.send(TPDO) for _ in range(5000))  # the hub does not run
-    assert 100 < sent < 5000
-    assert a.tx_dropped == 5000 - sent
-    got = 0
-    while True:
-        hub.run_once(0)
-        n = b.receive()
-        if not n:
-            break
-        got += n
-    assert got == sent
-    assert a.send(TPDO)
-    a.close()
-    b.close()
-    hub.close()
-
-
-def pair():
-    a, b = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    return a, b
-
-
-@pytest.mark.parametrize("stamps", [True, False])
-def test_receiver_reports_wrong_lengths_and_tells_empty_messages_from_the_end(stamps):
-    a, b = pair()
-    if stamps:
-        b.setsockopt(socket.SOL_SOCKET, 35, 1)
-    receiver = FrameReceiver(8)
-    for message in [SYNC, b"x" * 15, b"y" * 40, TPDO]:
-        a.send(message)
-    assert receiver.receive(b.fileno()) == 4
-    assert list(receiver.lengths) == [16, 15, 40, 16]
-    assert bytes(receiver.frames[:16]) == SYNC
-    assert bytes(receiver.frames[48:64]) == TPDO
-    assert [stamp > 0 for stamp in receiver.stamps_ns] == [stamps] * 4
-    if stamps:
-        a.send(b"")
-        a.send(SYNC)
-        assert receiver.receive(b.fileno()) == 2
-        assert list(receiver.lengths) == [0, 16]
-        assert not receiver.closed
-    a.send(TPDO)
-    a.close()
-    assert receiver.receive(b.fileno()) == 1
-    assert receiver.closed
-    b.close()
-
-
-def test_receiver_sees_the_end_behind_an_empty_message_and_then_serves_another_socket():
-    receiver = FrameReceiver()
-    for full in (1, 3):  # the second one uses slots that the end of the first has written to
-        a, b = pair()
-        b.setsockopt(socket.SOL_SOCKET, 35, 1)
-        receiver.closed = False
-        a.send(b"")
-        for _ in range(full):
-            a.send(SYNC)
-        a.close()
-        assert receiver.receive(b.fileno()) == 1 + full
-        assert list(receiver.lengths[: 1 + full]) == [0] + [16] * full
-        assert receiver.closed
-        assert all(stamp > 0 for stamp in receiver.stamps_ns[: 1 + full])
-        b.close()
-
-
-def test_receiver_walks_control_messages_of_another_layout():
-    """SO_PASSCRED adds a message of its own, so the stamp no longer fills the control data alone."""
-    a, b = pair()
-    b.setsockopt(socket.SOL_SOCKET, 35, 1)
-    b.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
-    receiver = FrameReceiver()
-    before = time.time_ns()
-    for _ in range(3):
-        a.send(SYNC)
-    assert receiver.receive(b.fileno()) == 3
-    assert all(before <= stamp <= time.time_ns() for stamp in receiver.stamps_ns)
-    assert not receiver.closed
-    a.close()
-    b.close()
-
-
-def test_lengths_other_than_16_are_stopped_by_the_filter_program():
-    from drivers import bpf
-
-    a, b = pair()
-    bpf.attach(b, checked(None), False)
-    for message in [b"x" * 15, SYNC, b"y" * 17, b""]:
-        a.send(message)
-    b.setblocking(False)
-    assert b.recv(64) == SYNC
-    with pytest.raises(BlockingIOError):
-        b.recv(64)
-    a.close()
-    b.close()
-
-
-def test_program_of_one_filter_by_hand():
-    """080h data frame: constants are byte-swapped on a little-endian host, jumps never exceed one."""
-    code = program([exact(0x80)], False)
-    swapped = struct.unpack(">I", struct.pack("=I", 0xC00007FF))[0]
-    assert code == [
-        (0x80, 0, 0, 0),  # A = length
-        (0x15, 1, 0, 16),
-        (0x06, 0, 0, 0),
-        (0x20, 0, 0, 0),  # A = can_id as the kernel loads it
-        (0x45, 0, 1, struct.unpack(">I", struct.pack("=I", CAN_ERR_FLAG))[0]),
-        (0x06, 0, 0, 0),
-        (0x07, 0, 0, 0),  # X = A
-        (0x87, 0, 0, 0),
-        (0x54, 0, 0, swapped),
-        (0x15, 0, 1, struct.unpack(">I", struct.pack("=I", 0x80))[0]),
-        (0x06, 0, 0, 16),
-        (0x06, 0, 0, 0),
-    ]
-
-
-def test_frames_sent_before_the_hub_ended_are_received_although_ours_were_unread(tmp_path):
-    """The unread frame makes the kernel say ECONNRESET first."""
-    hub = Hub(str(tmp_path / "bus"))
-    a = open_frame_socket(f"unix:{tmp_path}/bus", None)
-    hub.run_once(0)
-    hub.attach(lambda _frame, _stamp: None).send(SYNC)
-    a.send(TPDO)
-    hub.close()
-    assert a.receive() == 0
-    assert received_until_gone(a) == [SYNC]
-    a.close()
-
-
-def test_repeated_opening_leaks_no_descriptor(tmp_path):
-    hub = Hub(str(tmp_path / "bus"))
-    before = len(list(Path("/proc/self/fd").iterdir()))
-    for _ in range(50):
-        open_frame_socket(f"unix:{tmp_path}/bus", None).close()
-        hub.run_once(0)
-        hub.run_once(0)
-        with pytest.raises(BusError):
-            open_frame_socket(f"unix:{tmp_path}/none", None)
-    assert len(list(Path("/proc/self/fd").iterdir())) == before
-    hub.close()

@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from daemon.config import load_config
 from estimator.checked import ConfigError, Section
 from estimator.paper import TABLE_I
 from estimator.parameters import EFFECT_NAMES, Effect, Friction, Joint
 from models.files import load_joint, load_yaml, shipped
+from sim_can.plant_parameters import load_plant
 
 # Table I as printed: one row per coefficient, columns i>0 w>0 | i<0 w<0 | i<0 w>0 | i>0 w<0
 PRINTED = """
@@ -222,6 +224,35 @@ def test_files(tmp_path: Path) -> None:
     for bad in (tmp_path / "absent.yaml", tmp_path):
         with pytest.raises(ConfigError, match="cannot be read"):
             load_yaml(bad)
+
+
+def test_a_file_too_large_for_anything_written_by_hand_is_refused_without_reading_it_all(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "large.yaml"
+    path.write_bytes(b"a: 1\n#".ljust(1_000_000, b" "))
+    assert load_yaml(path)[0] == {"a": 1}
+    path.write_bytes(b"a: 1\n#".ljust(1_000_001, b" "))
+    for load in (load_yaml, load_joint, load_config, load_plant):
+        for large in (path, Path("/dev/zero")):
+            with pytest.raises(ConfigError) as caught:
+                load(large)
+            assert str(caught.value) == (
+                f"{large}: found more than 1000000 bytes, expected a YAML file written by hand"
+            )
+
+
+def test_whole_limits_are_told_as_whole_numbers() -> None:
+    def words(**limits: int) -> str:
+        with pytest.raises(ConfigError) as caught:
+            Section({"bits": "x"}, "c.yaml").integer("bits", "bit/s", **limits)
+        return str(caught.value).partition("expected ")[2]
+
+    assert words(low=10_000, high=1_000_000) == "a whole number in bit/s from 10000 to 1000000"
+    assert words(low=1_000_000) == "a whole number in bit/s >= 1000000"
+    assert words(high=0xFFFF_FFFF) == "a whole number in bit/s <= 4294967295"
+    with pytest.raises(ConfigError, match=r"a number in s from 0\.5 to 1e\+09$"):
+        Section({"x": -1}, "c.yaml").number("x", "s", 0.5, 1e9)
 
 
 def test_shipped_lists_what_ships() -> None:

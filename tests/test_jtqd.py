@@ -16,6 +16,7 @@ import yaml
 from mcap.reader import make_reader
 
 from daemon.estimate_pdo import decode
+from daemon.snapshot import SnapshotReader
 from drivers.frame import pack
 from drivers.frame_socket import exact, open_frame_socket
 from drivers.python_can_unix import UnixBus
@@ -39,6 +40,30 @@ def run(
     return subprocess.run(
         [*JTQD, *arguments], env=environment, capture_output=True, text=True, timeout=timeout, check=False
     )
+
+
+def started(*arguments: str, environment: dict[str, str], own_group: bool = False) -> subprocess.Popen[str]:
+    """jtqd without a log, running; both outputs are pipes."""
+    return subprocess.Popen(
+        [*JTQD, "--record", "none", *arguments],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=own_group,
+    )
+
+
+def until_it_publishes(process: subprocess.Popen[str], environment: dict[str, str]) -> None:
+    """Wait until the loop has counted cycles in its shared memory."""
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        assert process.poll() is None, "it ended before"
+        for path in Path(environment["RUNTIME_DIRECTORY"]).glob("*/snapshot"):
+            if SnapshotReader(path).read().counters["published"] > 100:
+                return
+        time.sleep(0.05)
+    raise AssertionError("no cycle within 60 s")
 
 
 def no_traceback(result: subprocess.CompletedProcess[str]) -> str:
@@ -102,13 +127,7 @@ def bench(tmp_path: Path) -> Iterator[str]:
 @pytest.fixture
 def daemon(bench: str, environment: dict[str, str]) -> Iterator[tuple[str, subprocess.Popen[str]]]:
     """jtqd on that bench, publishing."""
-    process = subprocess.Popen(
-        [*JTQD, "--bus", bench, "--record", "none", "--json"],
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = started("--bus", bench, "--json", environment=environment)
     socket = open_frame_socket(bench, [exact(0x1A0)])
     deadline = time.monotonic() + 20
     while not socket.wait(0.1):
@@ -140,13 +159,16 @@ def test_any_master_reads_its_object_dictionary(daemon: tuple[str, subprocess.Po
         network.disconnect()
 
 
-def test_sigterm_ends_in_order(daemon: tuple[str, subprocess.Popen[str]]) -> None:
+def test_sigterm_ends_in_order(
+    daemon: tuple[str, subprocess.Popen[str]], environment: dict[str, str]
+) -> None:
     bus, process = daemon
     socket = open_frame_socket(bus, [exact(0x1A0), exact(0x000)])
     process.send_signal(signal.SIGTERM)
     out, err = process.communicate(timeout=15)
     assert process.returncode == 0, err
     assert json.loads(out)["cycles"] > 0
+    assert list(Path(environment["RUNTIME_DIRECTORY"]).iterdir()) == [], "nothing is left behind"
     estimates, nmt = [], []
     while count := socket.receive():
         for n in range(count):
@@ -155,6 +177,28 @@ def test_sigterm_ends_in_order(daemon: tuple[str, subprocess.Popen[str]]) -> Non
     assert decode(estimates[-1]).status == (0, 0), "the last estimate says off"
     assert [bytes(data[:2]) for data in nmt] == [b"\x80\x01", b"\x80\x02", b"\x80\x03"]
     socket.close()
+
+
+@pytest.mark.parametrize("command", [0x02, 0x80, 0x81])  # stop, enter pre-operational, reset node
+def test_nmt_commands_to_the_own_node_are_ignored(
+    daemon: tuple[str, subprocess.Popen[str]], command: int
+) -> None:
+    bus, process = daemon
+    socket = open_frame_socket(bus, [exact(0x1A0), exact(0x720)])
+    socket.send(pack(0x000, bytes((command, 0x20))))
+    time.sleep(0.5)
+    estimates, states = 0, set()
+    while count := socket.receive():
+        for n in range(count):
+            can_id, _, data = struct.unpack_from("<IB3x8s", socket.frames, 16 * n)
+            if can_id == 0x1A0:
+                estimates += 1
+            else:
+                states.add(data[0])
+    socket.close()
+    assert estimates > 200
+    assert states == {5}
+    assert process.poll() is None
 
 
 def test_garbage_on_the_bus_is_counted_and_changes_nothing(daemon: tuple[str, subprocess.Popen[str]]) -> None:
@@ -195,17 +239,12 @@ def test_a_node_that_restarts_is_configured_again_before_it_is_believed(
     _, err = process.communicate(timeout=15)
     assert back, err
     assert "node 1 was away and is configured again" in err
+    assert "jtqd: joint 1: inputs lost: " in err
     assert process.returncode == 0
 
 
 def test_the_bus_that_ends_is_said(bench: str, environment: dict[str, str], tmp_path: Path) -> None:
-    process = subprocess.Popen(
-        [*JTQD, "--bus", bench, "--record", "none"],
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = started("--bus", bench, environment=environment)
     socket = open_frame_socket(bench, [exact(0x1A0)])
     assert socket.wait(20)
     for pid in Path("/proc").iterdir():
@@ -226,6 +265,7 @@ def test_unknown_bus(environment: dict[str, str]) -> None:
         message = no_traceback(result)
         assert len(message.splitlines()) == 1, message
         assert bus.removeprefix("unix:") in message
+    assert list(Path(environment["RUNTIME_DIRECTORY"]).iterdir()) == [], "nothing is left behind"
 
 
 @pytest.mark.parametrize(
@@ -281,20 +321,41 @@ def test_what_does_not_fit_is_named_and_nothing_is_published(
     socket.close()
 
 
-def test_a_wrong_gear_ratio_is_refused(tmp_path: Path, environment: dict[str, str], bench: str) -> None:
+def with_joint_1(directory: Path, joint_1: dict[str, object], **estimator: object) -> str:
+    """A configuration whose first joint file and estimator say something else."""
     joint = yaml.safe_load(shipped("joint1.yaml").read_text())
-    joint["gear_ratio"] = 120
-    (tmp_path / "other.yaml").write_text(yaml.safe_dump(joint))
-    path = configuration(tmp_path)
-    content = yaml.safe_load(Path(path).read_text())
-    content["joint_1"]["file"] = "other.yaml"
-    content["estimator"]["method"] = "efficiency"
-    Path(path).write_text(yaml.safe_dump(content))
+    (directory / "other.yaml").write_text(yaml.safe_dump({**joint, **joint_1}))
+    changes = {f"estimator__{key}": value for key, value in estimator.items()}
+    return configuration(directory, joint_1__file=str(directory / "other.yaml"), **changes)
+
+
+def test_a_wrong_gear_ratio_is_refused(tmp_path: Path, environment: dict[str, str], bench: str) -> None:
+    path = with_joint_1(tmp_path, {"gear_ratio": 120}, method="efficiency")
     result = run(
         "--bus", bench, "--config", path, "--duration", "1", "--record", "none", environment=environment
     )
     assert result.returncode == 1
     assert "6091h gear ratio: expected 120" in no_traceback(result)
+
+
+def test_an_estimate_far_from_the_sensor_is_said_once_and_counted(
+    tmp_path: Path, environment: dict[str, str], bench: str
+) -> None:
+    too_sure = {"load_uncertainty": 0.0, "friction_uncertainty": 0.0, "sigma_floor": 0.001}
+    path = with_joint_1(tmp_path, {"torque_constant_nm_per_a": 0.11}, method="tob", **too_sure)
+    process = started("--bus", bench, "--config", path, "--json", environment=environment)
+    assert process.stderr is not None
+    assert process.stdout is not None
+    warning = "jtqd: joint {}: the estimate has been more than 3 sigma away"
+    deadline, said = time.monotonic() + 60, ""
+    while warning.format(1) not in said and time.monotonic() < deadline:
+        said += process.stderr.readline()  # at least one comes every 5 s
+    process.send_signal(signal.SIGTERM)
+    said += process.stderr.read()
+    counted = json.loads(process.stdout.read())["deviations"]
+    assert process.wait(15) == 0
+    assert counted["joint_1"] >= 1
+    assert counted == {f"joint_{number}": said.count(warning.format(number)) for number in (1, 2)}
 
 
 def test_no_process_that_stays_loads_torch_or_scipy(daemon: tuple[str, subprocess.Popen[str]]) -> None:
@@ -320,19 +381,13 @@ def test_a_second_daemon_on_the_same_bus_is_refused(
     assert len(message.splitlines()) == 1
     assert str(process.pid) in message
     assert process.poll() is None, "the first one goes on"
+    assert len(list(Path(environment["RUNTIME_DIRECTORY"]).glob("*/ring"))) == 1, "and keeps its memory"
 
 
 def test_ctrl_c_on_a_terminal_ends_in_order(environment: dict[str, str]) -> None:
     """A terminal sends SIGINT to its whole foreground group; bench, loop and recorder must not die of it."""
-    process = subprocess.Popen(
-        [*JTQD, "--bus", "sim", "--record", "none", "--json"],
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    time.sleep(3)
+    process = started("--bus", "sim", "--json", environment=environment, own_group=True)
+    until_it_publishes(process, environment)
     os.killpg(process.pid, signal.SIGINT)
     out, err = process.communicate(timeout=15)
     assert process.returncode == 0, err
@@ -341,14 +396,8 @@ def test_ctrl_c_on_a_terminal_ends_in_order(environment: dict[str, str]) -> None
 
 
 def test_a_loop_that_hangs_does_not_keep_the_daemon(environment: dict[str, str]) -> None:
-    process = subprocess.Popen(
-        [*JTQD, "--bus", "sim", "--record", "none"],
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    time.sleep(3)
+    process = started("--bus", "sim", environment=environment)
+    until_it_publishes(process, environment)
     for entry in Path("/proc").glob("[0-9]*"):
         command = (entry / "cmdline").read_bytes() if (entry / "cmdline").exists() else b""
         if b"daemon.loop" in command and environment["RUNTIME_DIRECTORY"].encode() in command:

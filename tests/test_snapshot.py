@@ -8,8 +8,8 @@ import pytest
 
 from daemon.snapshot import COUNTERS, SIZE, Snapshot, SnapshotError, SnapshotReader
 
-ONE = (1.0, 0.1, 1.1, 1.2, math.nan, 0.9, 0x27, 2, 0)
-TWO = (-2.0, 0.2, -2.1, -2.2, -2.3, math.nan, 0x0F, 5, 1)
+ONE = (1.0, 0.1, 1.1, 1.2, math.nan, 0.9, 0x27, 2, 0, 7)
+TWO = (-2.0, 0.2, -2.1, -2.2, -2.3, math.nan, 0x0F, 5, 1, 3)
 
 
 def test_round_trip(tmp_path: Path) -> None:
@@ -22,7 +22,7 @@ def test_round_trip(tmp_path: Path) -> None:
     assert (view.cycle, view.sync_counter, view.sync_realtime_ns) == (41, 17, 1_700_000_000_123_456_789)
     assert view.joints[0][:4] == ONE[:4]
     assert math.isnan(view.joints[0].network_nm)
-    assert tuple(view.joints[1])[6:] == (0x0F, 5, 1)
+    assert tuple(view.joints[1])[6:] == (0x0F, 5, 1, 3)
     assert view.counters == {name: n + 100 for n, name in enumerate(COUNTERS)}
     assert view.rmse_nm[0] == 2.0
     assert math.isnan(view.rmse_nm[1])

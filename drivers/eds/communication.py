@@ -45,10 +45,11 @@ def errors() -> dict[int, Var | Entries]:
     }
 
 
-def heartbeat(producer_ms: int = 0) -> dict[int, Var | Entries]:
-    """One heartbeat consumed (the master's), one produced."""
+def heartbeat(producer_ms: int = 0, consumed: int = 1) -> dict[int, Var | Entries]:
+    """Heartbeats consumed (the master's first), one produced."""
+    watched = [(f"Consumer heartbeat time {n}", 0) for n in range(1, consumed + 1)]
     return {
-        0x1016: array("Consumer heartbeat time", U32, "rw", [("Consumer heartbeat time 1", 0)]),
+        0x1016: array("Consumer heartbeat time", U32, "rw", watched),
         0x1017: Var("Producer heartbeat time", U16, "rw", producer_ms, comment="ms"),
     }
 
@@ -79,7 +80,13 @@ def rpdo(number: int, base: int, mapping: Sequence[int]) -> dict[int, Var | Entr
 
 
 def tpdo(
-    number: int, base: int, mapping: Sequence[int], transmission: int = 255, fixed: bool = False
+    number: int,
+    base: int,
+    mapping: Sequence[int],
+    *,
+    transmission: int = 255,
+    fixed: bool = False,
+    event_ms: int = 0,
 ) -> dict[int, Var | Entries]:
     """TPDO `number` (1..4), valid from power-on. Sub-index 4 is reserved and absent."""
     access = "const" if fixed else "rw"
@@ -87,7 +94,7 @@ def tpdo(
         1: Var("COB-ID used by TPDO", U32, access, f"$NODEID+0x{NO_RTR + base:08X}"),
         2: Var("Transmission type", U8, access, transmission),
         3: Var("Inhibit time", U16, access, 0, comment="100 us"),
-        5: Var("Event timer", U16, access, 0, comment="ms"),
+        5: Var("Event timer", U16, access, event_ms, comment="ms"),
         6: Var("SYNC start value", U8, access, 0, low=0, high=240),
     }
     communication = Entries("TPDO communication parameter", RECORD, members)

@@ -40,7 +40,7 @@ def drive() -> Sheet:
     objects: dict[int, Var | Entries] = {
         **comm.device(0x0002_0192, "emulated joint drive", "1.0", "1.0"),
         **comm.errors(),
-        **comm.heartbeat(),
+        **comm.heartbeat(consumed=2),  # the master's, and that of a node which commands beside it
         **comm.identity(VENDOR, 0x402, REVISION),
         **comm.sync_consumer(),
         **comm.sdo_server(),
@@ -48,6 +48,8 @@ def drive() -> Sheet:
         **comm.rpdo(2, 0x300, [0x60FF_0020]),
         **comm.tpdo(1, 0x180, [0x6041_0010]),
         **comm.tpdo(2, 0x280, [0x6064_0020, 0x606C_0020]),
+        **comm.tpdo(3, 0x380, [0x3001_0010], event_ms=500),
+        0x3001: Var("Joint temperature", I16, "ro", 0, pdo=True, comment="0.1 degC; 8000h: not measured"),
         0x603F: Var("Error code", U16, "ro", 0, pdo=True),
         0x6040: Var("Controlword", U16, "rww", 0, pdo=True),
         0x6041: Var("Statusword", U16, "ro", 0, pdo=True),
@@ -95,7 +97,7 @@ def drive() -> Sheet:
         0x60FF: Var("Target velocity", I32, "rww", 0, pdo=True, comment="units of 6090h, motor side"),
         0x6502: Var("Supported drive modes", U32, "ro", 0x300, comment="csv (bit 8), cst (bit 9)"),
     }
-    note = "Default TPDOs are not those jtqd uses: it writes its own mapping at boot."
+    note = "Defaults of TPDO1 and TPDO2 are not those jtqd uses: it writes its own mapping at boot."
     return Sheet(
         "drive.eds",
         "CiA 402 joint drive",

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon import cycle, cycle_record
+from daemon import cycle_record, joint_cycle
 from daemon.config import Config, load_config
 from estimator.losses import BLEND_CURRENT_A, LossModel
 from estimator.parameters import Joint
@@ -43,7 +43,7 @@ def _header(config: Config) -> str:
         "RECORD_SIZE": cycle_record.RECORD_SIZE,
         "FRAME_CAPACITY": cycle_record.FRAME_CAPACITY,
         "RING_SLOTS": config.ring_cycles,
-        "STAMP_ACCURACY_NS": cycle._STAMP_ACCURACY_NS,
+        "STAMP_ACCURACY_NS": joint_cycle.STAMP_ACCURACY_NS,
         "WAIT_NS": config.input_wait_ns,
         "DEADLINE_NS": config.input_deadline_ns,
         "MOTOR_RAD_PER_COUNT": SCALING["motor_rad_per_count"],

@@ -11,6 +11,7 @@ from daemon.config import Config, load_config
 from daemon.cycle import Cycle
 from daemon.cycle_record import FLAG_PUBLISHED
 from daemon.grid import Grid
+from daemon.input_pdos import input_pdos
 from drivers.frame_socket import FrameSocket, open_frame_socket
 from estimator.joint_estimator import JointEstimator
 from estimator.status import PUBLISHED
@@ -41,7 +42,7 @@ class JtqdLoop:
             "snapshot": str(self.task.directory / "jtqd.snapshot"),
             "worst_load": 0.0,
         }
-        pdos = loop.input_pdos(self.config)
+        pdos = input_pdos(self.config)
         nodes = [1, 2, 3]
         socket = open_frame_socket(self.task.bus, loop.loop_filters(pdos, nodes), receive_own=True)
         for estimator in self.estimators:

@@ -34,7 +34,8 @@ STAGES = {
 
 
 cycle_module: Any = importlib.import_module("daemon.cycle")
-"""Its names `estimate_pdo` and `time` are exchanged for timed ones during a round."""
+joint_module: Any = importlib.import_module("daemon.joint_cycle")
+"""Their names `estimate_pdo` and `time` are exchanged for timed ones during a round."""
 
 
 class StageTimer:
@@ -97,7 +98,7 @@ class StagedLoop(JtqdLoop):
         timer = StageTimer()
         pdo, clock = cycle_module.estimate_pdo, cycle_module.time
         estimators = self.estimators
-        cycle_module.estimate_pdo = SimpleNamespace(
+        cycle_module.estimate_pdo = joint_module.estimate_pdo = SimpleNamespace(
             field=timer.timed("encode", estimate_pdo.field),
             encode=timer.timed("encode", estimate_pdo.encode),
             PUBLISHED_STATUSES=estimate_pdo.PUBLISHED_STATUSES,
@@ -109,7 +110,8 @@ class StagedLoop(JtqdLoop):
         try:
             self._timed_round(cycles, timer)
         finally:
-            cycle_module.estimate_pdo, cycle_module.time, self.estimators = pdo, clock, estimators
+            cycle_module.estimate_pdo = joint_module.estimate_pdo = pdo
+            cycle_module.time, self.estimators = clock, estimators
         kept = timer.cycles[SETTLE_CYCLES:]
         parts = {
             name: {
@@ -127,8 +129,8 @@ class StagedLoop(JtqdLoop):
         wrap(socket, "send", timed, "send")
         for name in ("begin", "take", "close", "drain"):
             wrap(intake, name, timed, "decode")
-        wrap(cycle, "_keep", timed, "hand over")
-        wrap(cycle, "_keep_own", timed, "hand over")
+        wrap(cycle._frames, "keep", timed, "hand over")
+        wrap(cycle._frames, "keep_own", timed, "hand over")
         wrap(cycle, "observe", timed, "observe")
         meter = CycleMeter()
         measured(cycle, meter)

@@ -1,0 +1,53 @@
+"""Frames of a cycle, copied into its record as they came: 16 bytes each beside their stamps."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+
+from daemon import cycle_record as cr
+
+
+class CycleFrames:
+    """Fills the frame part of one record after the other.
+
+    Attributes:
+        slot: record of the current cycle in the ring.
+        count: frames stored in it.
+        left_out: frames of the cycle that found no room.
+    """
+
+    def __init__(self, slot: memoryview) -> None:
+        self.slot = slot
+        self.count = self.left_out = 0
+        self._stamps = [struct.Struct(f"<{n}q") for n in range(cr.FRAME_CAPACITY + 1)]
+
+    def begin(self, slot: memoryview) -> None:
+        """The next frames belong to this record."""
+        self.slot = slot
+        self.count = self.left_out = 0
+
+    def keep(self, frames: bytearray, stamps_ns: Sequence[int], count: int) -> None:
+        """Copy `count` received frames; `stamps_ns` are CLOCK_REALTIME."""
+        stored = self.count
+        room = cr.FRAME_CAPACITY - stored
+        if count > room:
+            self.left_out += count - room
+            count = room
+        if count <= 0:
+            return
+        start = cr.FRAMES_OFFSET + 16 * stored
+        self.slot[start : start + 16 * count] = memoryview(frames)[: 16 * count]
+        self._stamps[count].pack_into(self.slot, cr.STAMPS_OFFSET + 8 * stored, *stamps_ns[:count])
+        self.count = stored + count
+
+    def keep_own(self, frame: bytes, stamp_ns: int) -> None:
+        """Copy a frame of our own that was handed to the socket at `stamp_ns` (CLOCK_REALTIME)."""
+        stored = self.count
+        if stored >= cr.FRAME_CAPACITY:
+            self.left_out += 1
+            return
+        start = cr.FRAMES_OFFSET + 16 * stored
+        self.slot[start : start + 16] = frame
+        self._stamps[1].pack_into(self.slot, cr.STAMPS_OFFSET + 8 * stored, stamp_ns)
+        self.count = stored + 1

@@ -1,0 +1,110 @@
+"""Lines for the operator when a joint's inputs or its torque sensor are lost and come back, with the cause.
+
+Pure: readings of the snapshot and times in, lines out. It runs in the supervisor, so that no line costs the loop anything.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import partial
+from math import isfinite
+
+from daemon.config import Config
+from daemon.input_pdos import input_pdos, sensor_index
+from daemon.joint_cycle import FLAG_MOTION, FLAG_POSITION, FLAG_SENSOR
+from daemon.presence import Presence
+from daemon.snapshot import JointView, View
+from estimator.status import STALE
+
+_STATES = {4: "stopped", 127: "pre-operational"}
+"""Heartbeat states in which a node sends no PDO (CiA 301)."""
+_ON_THE_BUS = (
+    ("bus_errors", "the bus is down"),
+    ("foreign_sync", "another SYNC is on the bus"),
+    ("sync_errors", "the own SYNC waits in the transmit queue"),
+)
+"""Counters whose rise makes every input of the bus doubtful, and what that means."""
+_ON_THE_PDO = (
+    ("late_frames", "late frames on the bus"),
+    ("rejected_frames", "frames of a wrong format on the bus"),
+)
+_SENSOR_STATUS = {1: "not valid", 2: "positive overload", 4: "negative overload"}
+"""6150h of CiA 404."""
+
+
+@dataclass
+class _Joint:
+    """One joint's PDOs by name, and the counters when it was last well."""
+
+    number: int
+    node: int
+    names: tuple[str, str]
+    sensor: str | None
+    well: dict[str, int] = field(default_factory=dict)
+    inputs: Presence = field(default_factory=Presence)
+    reference: Presence = field(default_factory=Presence)
+
+
+class InputWatch:
+    """Call `lines` with each reading of the snapshot, some twenty times a second."""
+
+    def __init__(self, config: Config) -> None:
+        names = [pdo.name for pdo in input_pdos(config)]
+        self._joints = []
+        for n, joint in enumerate(config.joints):
+            sensor = sensor_index(config, joint.sensor_channel)
+            own = (names[2 * n], names[2 * n + 1])
+            self._joints.append(
+                _Joint(joint.number, joint.node_id, own, None if sensor is None else names[sensor])
+            )
+
+    def lines(self, view: View, now_s: float) -> list[str]:
+        """What has to be told now (CLOCK_MONOTONIC)."""
+        said = []
+        for joint, seen in zip(self._joints, view.joints, strict=True):
+            stale = seen.status == STALE
+            if not stale or not joint.well:
+                joint.well = view.counters
+            line = joint.inputs.update(stale, now_s, partial(_cause, joint, seen, view))
+            if line:
+                said.append(f"joint {joint.number}: inputs {line}")
+            if joint.sensor is None:
+                continue
+            gone = not isfinite(seen.sensor_nm)
+            line = joint.reference.update(gone, now_s, partial(_sensor_cause, joint, seen))
+            if line:
+                said.append(f"joint {joint.number}: torque sensor {line}")
+        return said
+
+
+def _cause(joint: _Joint, seen: JointView, view: View) -> str:
+    """The likeliest cause first: what explains more comes before what explains less."""
+
+    def rose(name: str) -> bool:
+        return view.counters[name] > joint.well[name]
+
+    if joint.node in view.unconfigured:
+        return f"node {joint.node} has restarted and is not configured yet"
+    state = _STATES.get(view.node_states[joint.node])
+    if state:
+        return f"node {joint.node} is {state}"
+    for counter, meaning in _ON_THE_BUS:
+        if rose(counter):
+            return meaning
+    missing = [
+        name
+        for name, flag in zip(joint.names, (FLAG_POSITION, FLAG_MOTION), strict=True)
+        if not seen.input_flags & flag
+    ]
+    if not missing:
+        return "the estimate is not ready before the next SYNC"
+    what = f"{' and '.join(missing)} not received in time"
+    hints = [meaning for counter, meaning in _ON_THE_PDO if rose(counter)]
+    return f"{what} ({', '.join(hints)})" if hints else what
+
+
+def _sensor_cause(joint: _Joint, seen: JointView) -> str:
+    if not seen.input_flags & FLAG_SENSOR:
+        return f"{joint.sensor} not received in time"
+    reasons = [text for bit, text in _SENSOR_STATUS.items() if seen.sensor_status & bit]
+    return f"{joint.sensor} says {', '.join(reasons) or 'no number'}"

@@ -1,0 +1,145 @@
+"""Observer of the fused estimator: motor torque, velocity, torsion torque and ripple angles of one age.
+
+    tau_raw = G [ g/(s+g) (i Kt + J g w) - J g w ]       motor torque at the joint without any loss (observer.py)
+    tau_t   = g/(s+g) (K d + K3 d^3)                     d = theta_m/G - theta_l - zero - e(theta_m)
+    v       = g/(s+g) w/G
+    c_n, s_n = g/(s+g) cos(n theta_m), g/(s+g) sin(n theta_m)     n = RIPPLE_ORDERS
+
+All pass the same filter (first-order hold, measured step), so a torque ripple A cos(n theta_m + phi), which
+reaches tau_raw through that filter, is exactly linear in c_n and s_n at every speed.
+"""
+
+from __future__ import annotations
+
+from math import cos, expm1, sin
+from typing import Final, NamedTuple
+
+from estimator.fused_parameters import Torsion
+from estimator.parameters import Joint
+
+RIPPLE_ORDERS: Final = (2, 4)
+"""Per motor revolution: twice the wave generator's turn, and its first harmonic."""
+
+
+class FusedObserved(NamedTuple):
+    """Outputs of one step; torques [Nm, joint side], velocities [rad/s, joint side], angles as filtered cos and sin."""
+
+    raw_nm: float
+    joint_velocity_rad_s: float
+    link_velocity_rad_s: float
+    torsion_nm: float
+    cos2: float
+    sin2: float
+    cos4: float
+    sin4: float
+
+
+_new: Final = tuple.__new__
+
+
+class FusedObserver:
+    """Step-by-step observer of one joint; plain floats. torsion None: its torque is always 0."""
+
+    __slots__ = (
+        "_cubic",
+        "_gear",
+        "_inertia_rate",
+        "_inverse_gear",
+        "_kt",
+        "_last",
+        "_link",
+        "_link_rate",
+        "_link_velocity",
+        "_rate",
+        "_state",
+        "_stiffness",
+        "_waves",
+        "_zero",
+    )
+
+    def __init__(
+        self, joint: Joint, torsion: Torsion | None, bandwidth_rad_s: float, link_bandwidth_rad_s: float
+    ) -> None:
+        self._gear: Final = joint.gear_ratio
+        self._inverse_gear: Final = 1.0 / joint.gear_ratio
+        self._kt: Final = joint.torque_constant_nm_per_a
+        self._inertia_rate: Final = joint.rotor_inertia_kgm2 * bandwidth_rad_s
+        self._rate: Final = bandwidth_rad_s
+        self._link_rate: Final = link_bandwidth_rad_s
+        self._stiffness: Final = 0.0 if torsion is None else torsion.stiffness_nm_per_rad
+        self._cubic: Final = 0.0 if torsion is None else torsion.cubic_nm_per_rad3
+        self._zero: Final = 0.0 if torsion is None else torsion.zero_rad
+        waves: tuple[tuple[float, float, float], ...] = ()
+        if torsion is not None:
+            rows = zip(torsion.orders_per_motor_rev, torsion.cos_rad, torsion.sin_rad, strict=True)
+            waves = tuple(rows)
+        self._waves: Final = waves
+        self._last = self._state = (0.0,) * 7
+        self._link = self._link_velocity = 0.0
+
+    def _inputs(
+        self, current_a: float, motor_position_rad: float, motor_velocity_rad_s: float, link_position_rad: float
+    ) -> tuple[float, ...]:
+        """Return what the filter takes: u, v, torsion torque, cos 2, sin 2, cos 4, sin 4."""
+        angle = motor_position_rad
+        d = angle * self._inverse_gear - link_position_rad - self._zero
+        for order, c, s in self._waves:
+            a = order * angle
+            d -= c * cos(a) + s * sin(a)
+        c2 = cos(2.0 * angle)
+        s2 = sin(2.0 * angle)
+        return (
+            current_a * self._kt + self._inertia_rate * motor_velocity_rad_s,
+            motor_velocity_rad_s * self._inverse_gear,
+            d * (self._stiffness + self._cubic * d * d),
+            c2,
+            s2,
+            c2 * c2 - s2 * s2,
+            2.0 * c2 * s2,
+        )
+
+    def start(
+        self, current_a: float, motor_position_rad: float, motor_velocity_rad_s: float, link_position_rad: float
+    ) -> FusedObserved:
+        """Set the states of a joint that has always moved at this speed with this torsion."""
+        now = self._inputs(current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
+        self._last = self._state = now
+        self._link = link_position_rad
+        self._link_velocity = now[1]
+        raw = (now[0] - self._inertia_rate * motor_velocity_rad_s) * self._gear
+        return FusedObserved(raw, now[1], now[1], *now[2:])
+
+    def step(
+        self,
+        dt_s: float,
+        current_a: float,
+        motor_position_rad: float,
+        motor_velocity_rad_s: float,
+        link_position_rad: float,
+    ) -> FusedObserved:
+        """Advance by dt_s > 0 to the sample given and return the outputs at that sample."""
+        x = self._rate * dt_s
+        gone = -expm1(-x)
+        share = gone / x
+        a = 1.0 - gone
+        b0 = 1.0 - share
+        b1 = share - a
+        now = self._inputs(current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
+        u, v, t, c2, s2, c4, s4 = now
+        u_, v_, t_, c2_, s2_, c4_, s4_ = self._last
+        zu, zv, zt, zc2, zs2, zc4, zs4 = self._state
+        zu = a * zu + b0 * u + b1 * u_
+        zv = a * zv + b0 * v + b1 * v_
+        zt = a * zt + b0 * t + b1 * t_
+        zc2 = a * zc2 + b0 * c2 + b1 * c2_
+        zs2 = a * zs2 + b0 * s2 + b1 * s2_
+        zc4 = a * zc4 + b0 * c4 + b1 * c4_
+        zs4 = a * zs4 + b0 * s4 + b1 * s4_
+        self._last = now
+        self._state = (zu, zv, zt, zc2, zs2, zc4, zs4)
+        gone = -expm1(-self._link_rate * dt_s)
+        slope = (link_position_rad - self._link) / dt_s
+        self._link_velocity = r = self._link_velocity + gone * (slope - self._link_velocity)
+        self._link = link_position_rad
+        raw = (zu - self._inertia_rate * motor_velocity_rad_s) * self._gear
+        return _new(FusedObserved, (raw, zv, r, zt, zc2, zs2, zc4, zs4))

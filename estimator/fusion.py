@@ -1,0 +1,71 @@
+"""Two independent views of one torque, weighted by their variances: motor current less loss, and torsion.
+
+    tau_c = tau_raw - loss                 knows fast changes and any load; fails with friction
+    tau_t = K d + K3 d^3                   knows nothing of friction; fails with hysteresis and encoder errors
+    alpha = s_c^2/(s_c^2 + s_t^2)          physics = tau_c + alpha (tau_t - tau_c)
+    s_c^2 = a^2 + (b v)^2 + (c tau_raw)^2 + half^2        half: what friction leaves open near v = 0
+    s_t^2 = e^2 + (f tau_t)^2
+    sigma^2 = s_c^2 s_t^2/(s_c^2 + s_t^2) + reference^2
+
+Towards standstill `half` grows to the half width of the friction interval and the torsion takes over: continuous,
+and the value there no longer depends on which way friction happens to point.
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+from typing import Final
+
+import numpy as np
+
+from estimator.friction import FloatArray
+from estimator.fused_parameters import FusedSigma
+
+
+class Fusion:
+    """Value and standard deviation of the fused physics [Nm, joint side]."""
+
+    __slots__ = ("_current", "_load", "_reference", "_torsion", "_torsion_load", "_viscous", "_with_torsion")
+
+    def __init__(self, sigma: FusedSigma, with_torsion: bool) -> None:
+        self._current: Final = sigma.current_nm**2
+        self._viscous: Final = sigma.viscous_nms_per_rad**2
+        self._load: Final = sigma.load**2
+        self._torsion: Final = sigma.torsion_nm**2
+        self._torsion_load: Final = sigma.torsion_load**2
+        self._reference: Final = sigma.reference_nm**2
+        self._with_torsion: Final = with_torsion
+
+    def fuse(
+        self, raw_nm: float, loss_nm: float, half_nm: float, velocity_rad_s: float, torsion_nm: float
+    ) -> tuple[float, float]:
+        """Return (physics, sigma) [Nm]."""
+        c = (
+            self._current
+            + self._viscous * velocity_rad_s * velocity_rad_s
+            + self._load * raw_nm * raw_nm
+            + half_nm * half_nm
+        )
+        value = raw_nm - loss_nm
+        if not self._with_torsion:
+            return value, sqrt(c + self._reference)
+        t = self._torsion + self._torsion_load * torsion_nm * torsion_nm
+        alpha = c / (c + t)
+        return value + alpha * (torsion_nm - value), sqrt(alpha * t + self._reference)
+
+    def fuse_many(
+        self,
+        raw_nm: FloatArray,
+        loss_nm: FloatArray,
+        half_nm: FloatArray,
+        velocity_rad_s: FloatArray,
+        torsion_nm: FloatArray,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Vectorised twin of `fuse`, arrays [n]."""
+        c = self._current + self._viscous * velocity_rad_s**2 + self._load * raw_nm**2 + half_nm**2
+        value = raw_nm - loss_nm
+        if not self._with_torsion:
+            return value, np.sqrt(c + self._reference)
+        t = self._torsion + self._torsion_load * torsion_nm**2
+        alpha = c / (c + t)
+        return value + alpha * (torsion_nm - value), np.sqrt(alpha * t + self._reference)

@@ -1,0 +1,193 @@
+"""An ONNX graph run by ONNX Runtime: one thread, float64, checked before its first use. The only file that imports it.
+
+The graph takes "x" [N, n] (named features, SI units, normalisation inside) and gives [N, 1] torque [Nm]. What
+belongs to it travels in its metadata, each value JSON; who uses the graph says which keys it needs.
+
+A single sample goes through an I/O binding on two preallocated numpy buffers: no array is made per call.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import struct
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from estimator.friction import FloatArray
+
+_PROBES: Final = (0.25, -0.5)  # two different inputs: the binding must see the second one
+_WARM_UP: Final = 50
+
+
+class NetworkError(ValueError):
+    """The network file cannot be used; one line that names file, found and expected."""
+
+
+class OnnxGraph:
+    """A loaded graph with `features` inputs.
+
+    source: path of an ONNX file, or its bytes; sha256: expected hash of the bytes (hex), not checked when
+    None; features: names and order of the inputs, which the metadata must repeat; keys: metadata that must be
+    there. Raises NetworkError for an unreadable or corrupt file, another hash, shape, type or missing
+    metadata. Public: `name`, `sha256`, `metadata`, `bound` (samples go through the binding, not through run()).
+    """
+
+    def __init__(
+        self,
+        source: bytes | str | os.PathLike[str],
+        sha256: str | None,
+        features: tuple[str, ...],
+        keys: tuple[str, ...],
+    ) -> None:
+        self.name: Final = "network (bytes)" if isinstance(source, bytes) else os.fspath(source)
+        data = source if isinstance(source, bytes) else self._read(source)
+        self.sha256: Final = hashlib.sha256(data).hexdigest()
+        if sha256 is not None and sha256.lower() != self.sha256:
+            raise self.error(f"found SHA-256 {self.sha256}, expected {sha256}")
+        self._width: Final = len(features)
+        self._session: Final = self._open(data)
+        self._output: Final = self._check_graph()
+        self.metadata: Final = self._read_metadata(features, keys)
+        self._x: Final = np.zeros((1, self._width))
+        self._y: Final = np.zeros((1, 1))
+        self._x_bytes: Final[Any] = self._x.reshape(-1).view(np.uint8).data
+        self._y_view: Final[Any] = self._y.reshape(-1).data  # 3 times faster than numpy indexing
+        self._pack: Final = struct.Struct(f"={self._width}d").pack_into
+
+    def run_one(self, *x: float) -> float:
+        """Return the torque [Nm] of one sample; the arguments are the features in their order."""
+        self._pack(self._x_bytes, 0, *x)
+        if self.bound:
+            self._call(self._binding, None)
+            return self._y_view[0]  # type: ignore[no-any-return]
+        return float(self._session.run(None, {"x": self._x})[0][0, 0])
+
+    def run_many(self, features: FloatArray) -> FloatArray:
+        """Return torques [n] of samples [n, features]; equal to run_one to rounding."""
+        if features.ndim != 2 or features.shape[1] != self._width:
+            raise ValueError(f"found features of shape {features.shape}, expected [n, {self._width}]")
+        if len(features) == 0:
+            return np.zeros(0)
+        result: FloatArray = self._session.run(None, {"x": np.ascontiguousarray(features, np.float64)})[0]
+        return result[:, 0]
+
+    def prepare(self, low: FloatArray, high: FloatArray) -> None:
+        """Bind and warm up between `low` and `high` [features], where the graph must give finite torques."""
+        self._bind(low, high)
+        self._warm_up((low + high) / 2)
+
+    def error(self, text: str) -> NetworkError:
+        """Return the error to raise, with the file's name."""
+        return NetworkError(f"{self.name}: {text}")
+
+    def text(self, key: str) -> str:
+        """Return a text of the metadata."""
+        value = self.metadata[key]
+        if not isinstance(value, str) or not value:
+            raise self.error(f"metadata '{key}': found {value!r}, expected a text")
+        return value
+
+    def numbers(self, key: str, count: int) -> tuple[float, ...]:
+        """Return `count` finite numbers of the metadata."""
+        values = self.metadata[key]
+        if not (isinstance(values, list) and len(values) == count and all(map(finite, values))):
+            raise self.error(f"metadata '{key}': found {values!r}, expected {count} finite numbers")
+        return tuple(float(value) for value in values)
+
+    def _read(self, path: str | os.PathLike[str]) -> bytes:
+        try:
+            return Path(path).read_bytes()
+        except OSError as error:
+            raise self.error(f"cannot be read: {error.strerror or error}") from None
+
+    def _open(self, data: bytes) -> Any:
+        import onnxruntime as ort
+
+        options = ort.SessionOptions()
+        options.intra_op_num_threads = 1
+        options.inter_op_num_threads = 1
+        options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        options.log_severity_level = 4  # what is wrong comes as an exception; nothing else on stderr
+        try:
+            return ort.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime raises its own types, without a common base
+            lines = str(error).strip().splitlines()
+            reason = lines[0][:160] if lines else type(error).__name__
+            raise self.error(f"not a usable ONNX model: {reason}") from None
+
+    def _check_graph(self) -> str:
+        """Return the output's name when inputs and outputs are what this file says."""
+        inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
+        if [i.name for i in inputs] != ["x"]:
+            raise self.error(f"found inputs {[i.name for i in inputs]}, expected one, 'x'")
+        if len(outputs) != 1:
+            raise self.error(f"found {len(outputs)} outputs, expected one")
+        for what, node, width in (("input 'x'", inputs[0], self._width), ("output", outputs[0], 1)):
+            if node.type != "tensor(double)":
+                raise self.error(f"found {what} of type {node.type}, expected tensor(double)")
+            shape = list(node.shape)
+            if len(shape) != 2 or isinstance(shape[0], int) or shape[1] != width:
+                raise self.error(f"found {what} of shape {shape}, expected ['N', {width}]")
+        return str(outputs[0].name)
+
+    def _read_metadata(self, features: tuple[str, ...], keys: tuple[str, ...]) -> dict[str, Any]:
+        try:
+            raw = self._session.get_modelmeta().custom_metadata_map
+        except UnicodeDecodeError as error:
+            raise self.error(f"metadata: found bytes that are not UTF-8 ({error.reason})") from None
+        found: dict[str, Any] = {}
+        for key in ("features", *keys):
+            if key not in raw:
+                raise self.error(f"metadata '{key}': missing, found only {sorted(raw)}")
+            try:
+                found[key] = json.loads(raw[key])
+            except ValueError:
+                raise self.error(f"metadata '{key}': found {raw[key][:60]!r}, expected JSON") from None
+        if found["features"] != list(features):
+            raise self.error(f"metadata 'features': found {found['features']}, expected {list(features)}")
+        return found
+
+    def _bind(self, low: FloatArray, high: FloatArray) -> None:
+        """Bind the buffers and prove that they are used in place; otherwise plain run() serves."""
+        self.bound = False
+        try:
+            import onnxruntime as ort
+
+            self._held = ort.OrtValue.ortvalue_from_numpy(self._x), ort.OrtValue.ortvalue_from_numpy(self._y)
+            self._io = self._session.io_binding()
+            self._io.bind_ortvalue_input("x", self._held[0])
+            self._io.bind_ortvalue_output(self._output, self._held[1])
+            # the session's own method: the Python wrapper around it costs as much as a layer of the network
+            self._call = self._session._sess.run_with_iobinding
+            self._binding = self._io._iobinding
+            self.bound = all(self._aliases(probe, low, high) for probe in _PROBES)
+        except (AttributeError, TypeError, RuntimeError):
+            self.bound = False
+
+    def _aliases(self, probe: float, low: FloatArray, high: FloatArray) -> bool:
+        self._x[0] = (low + high) / 2 + probe * np.maximum(high - low, 1.0)
+        self._y[0, 0] = math.nan
+        self._call(self._binding, None)
+        expected = self._session.run(None, {"x": self._x.copy()})[0][0, 0]
+        return bool(self._y[0, 0] == expected or (math.isnan(expected) and math.isnan(self._y[0, 0])))
+
+    def _warm_up(self, middle: FloatArray) -> None:
+        """First calls allocate: they happen here, not in the loop. A network that fails to run is refused."""
+        sample = middle.tolist()
+        try:
+            values = [self.run_one(*sample) for _ in range(_WARM_UP)]
+        except Exception as error:  # as in _open
+            raise self.error(f"does not run: {str(error).strip().splitlines()[0][:160]}") from None
+        if not math.isfinite(values[-1]):
+            raise self.error(f"found {values[-1]} in the middle of its envelope, expected a finite torque")
+
+
+def finite(value: object) -> bool:
+    """Tell a finite number from everything else that JSON may hold."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -1,0 +1,71 @@
+"""What differs from one day to the next: friction, temperature and the zeros of link encoders and sensor. Pure.
+
+A fit that is tested on the day it was made on looks better than it is. So the emulated bench has days: the
+values of day n come from a Kronecker sequence, frac(s_j + n α_j), which is uniform and spreads evenly even
+over a handful of runs, where independent draws would clump (Niederreiter 1992, section 3.1). s_j come from
+the seed.
+"""
+
+import math
+import random
+from typing import NamedTuple
+
+from estimator.checked import Section
+
+# α_j = frac(sqrt(prime)). Not the first seven primes: with these the seven values of 6 to 40 days are the
+# least correlated with each other of all choices below 120.
+_PRIMES = (5, 7, 17, 29, 53, 67, 71)
+_STEPS = tuple(math.sqrt(prime) % 1.0 for prime in _PRIMES)
+
+# Day-to-day viscous changes must leave friction dissipative.
+_MOST_VISCOUS = 0.9
+
+
+class RunToRun(NamedTuple):
+    """Half widths of the uniform spread of each value over the days (`run_to_run` of a plant file)."""
+
+    viscous: float = 0.0  # share of the file's viscous friction
+    sensor_zero_nm: float = 0.0
+    temperature_k: float = 0.0  # ambient and start of the day against the joint's reference
+    link_zero_rad: float = 0.0
+
+    @classmethod
+    def from_section(cls, section: Section | None) -> "RunToRun":
+        """Checked widths; all zero where the file has no such section. Raises ConfigError."""
+        if section is None:
+            return cls()
+        widths = cls(
+            viscous=section.number("viscous", unit="1", low=0.0, high=_MOST_VISCOUS, default=0.0),
+            sensor_zero_nm=section.number("sensor_zero_nm", unit="Nm", low=0.0, default=0.0),
+            temperature_k=section.number("temperature_k", unit="K", low=0.0, high=100.0, default=0.0),
+            link_zero_rad=section.number("link_zero_rad", unit="rad", low=0.0, high=0.1, default=0.0),
+        )
+        section.finish()
+        return widths
+
+
+class Day(NamedTuple):
+    """One day; the defaults are the nominal day. Pairs are of joint 1 and joint 2."""
+
+    viscous: tuple[float, float] = (0.0, 0.0)  # viscous friction is 1 + this times the usual
+    temperature_k: tuple[float, float] = (0.0, 0.0)
+    link_zero_rad: tuple[float, float] = (0.0, 0.0)  # added to what the link encoder says
+    sensor_zero_nm: float = 0.0  # added to what the sensor says
+
+
+NOMINAL_DAY = Day()
+
+
+def day(widths: RunToRun, seed: int, n: int) -> Day:
+    """Day n = 0, 1, 2, ... of a bench with this seed; every value lies within its half width."""
+    if not any(widths):
+        return NOMINAL_DAY
+    # a text as seed: the noise generator of the same seed must not give the same numbers
+    start = random.Random(f"run to run {seed}")
+    u = [2.0 * ((start.random() + n * step) % 1.0) - 1.0 for step in _STEPS]
+    return Day(
+        viscous=(widths.viscous * u[0], widths.viscous * u[1]),
+        temperature_k=(widths.temperature_k * u[2], widths.temperature_k * u[3]),
+        link_zero_rad=(widths.link_zero_rad * u[4], widths.link_zero_rad * u[5]),
+        sensor_zero_nm=widths.sensor_zero_nm * u[6],
+    )

@@ -1,0 +1,1 @@
+"""Campaigns: runs planned, driven over the bus, recorded, checked and kept, so that they can be interrupted and resumed."""

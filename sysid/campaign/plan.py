@@ -1,0 +1,261 @@
+"""Plans of a campaign (schema jtq.plan/1): frozen, checked, to and from YAML. Pure but for `load_plan`.
+
+A plan says what both joints are told in every run. What that is millisecond by millisecond, and whether it keeps
+the plan's own limits, is the matter of `sysid.campaign.segments`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+
+from estimator.checked import ConfigError, Section
+from models.files import load_yaml
+from sysid.fourier import FourierSeries, FourierTrajectory
+from sysid.motion.limits import Limits
+
+SCHEMA: Final = "jtq.plan/1"
+DEFAULT_RAMP_S: Final = 0.5
+LONGEST_S: Final = 3600.0
+"""Of one segment. A run is one log and one table in memory."""
+
+DEFAULT_LIMITS: Final = Limits(
+    current_a=10.0, velocity_rad_s=3.3, torque_nm=60.0, travel_rad=60.0, temperature_c=70.0
+)
+_LIMIT_UNITS: Final = {
+    "current_a": "A",
+    "velocity_rad_s": "rad/s",
+    "torque_nm": "Nm",
+    "travel_rad": "rad",
+    "temperature_c": "degC",
+}
+_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]*")
+_RESERVED: Final = ("plan", "campaign")
+"""The campaign's own files beside those of the runs."""
+
+
+@dataclass(frozen=True)
+class Plateau:
+    """Both joints are taken to their targets within ramp_s and held there for hold_s.
+
+    Attributes:
+        velocity_rad_s: of the velocity joint, joint side, own frame. current_a: of the other joint, own frame.
+        hold_s, ramp_s: seconds.
+    """
+
+    velocity_rad_s: float
+    current_a: float
+    hold_s: float
+    ramp_s: float = DEFAULT_RAMP_S
+
+    @property
+    def duration_s(self) -> float:
+        """Ramp and hold."""
+        return self.ramp_s + self.hold_s
+
+    @property
+    def moving(self) -> bool:
+        """Whether velocity or current is other than zero at its end."""
+        return self.velocity_rad_s != 0.0 or self.current_a != 0.0
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Plain numbers, ready for YAML."""
+        return {"kind": "plateau", **{item.name: getattr(self, item.name) for item in fields(self)}}
+
+
+@dataclass(frozen=True)
+class Rest:
+    """Both targets are taken to zero within ramp_s and stay there for hold_s [s]."""
+
+    hold_s: float
+    ramp_s: float = DEFAULT_RAMP_S
+
+    @property
+    def duration_s(self) -> float:
+        """Ramp and hold."""
+        return self.ramp_s + self.hold_s
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Plain numbers, ready for YAML."""
+        return {"kind": "rest", "hold_s": self.hold_s, "ramp_s": self.ramp_s}
+
+
+@dataclass(frozen=True)
+class Fourier:
+    """Eq. (10) for the velocity joint and a Fourier series for the other joint's current; from rest to rest."""
+
+    velocity: FourierTrajectory
+    current: FourierSeries
+
+    @property
+    def duration_s(self) -> float:
+        """Of both series."""
+        return self.velocity.duration_s
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Plain numbers, ready for YAML."""
+        return {
+            "kind": "fourier",
+            "duration_s": self.duration_s,
+            "velocity": self.velocity.to_mapping(),
+            "current": self.current.to_mapping(),
+        }
+
+
+Segment = Plateau | Rest | Fourier
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run: its name (also that of its files), the joint in velocity mode, and its segments in order."""
+
+    name: str
+    velocity_joint: int
+    segments: tuple[Segment, ...]
+
+    @property
+    def duration_s(self) -> float:
+        """Sum over the segments."""
+        return sum(segment.duration_s for segment in self.segments)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Plain values, ready for YAML."""
+        return {
+            "name": self.name,
+            "velocity_joint": self.velocity_joint,
+            "segments": [segment.to_mapping() for segment in self.segments],
+        }
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A campaign: name, limits that hold in every run, and the runs in order."""
+
+    name: str
+    limits: Limits
+    runs: tuple[Run, ...]
+
+    @classmethod
+    def from_mapping(cls, mapping: object, where: str) -> Plan:
+        """Check a plan read from YAML; `where` is the file's name for the messages. Raises ConfigError."""
+        top = Section(mapping, where)
+        top.text("schema", (SCHEMA,))
+        name = top.text("name")
+        limits = _limits(top)
+        sections = top.sections("runs")
+        if not sections:
+            raise top.error("runs", top.raw("runs", None), "a list of at least one run")
+        runs = tuple(_run(section) for section in sections)
+        seen: set[str] = set()
+        for section, run in zip(sections, runs, strict=True):
+            if run.name in seen:
+                raise section.error("name", run.name, "a name that no other run has")
+            seen.add(run.name)
+        top.finish()
+        return cls(name, limits, runs)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Plain values, ready for YAML."""
+        return {
+            "schema": SCHEMA,
+            "name": self.name,
+            "limits": {name: _finite(getattr(self.limits, name)) for name in _LIMIT_UNITS},
+            "runs": [run.to_mapping() for run in self.runs],
+        }
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the content (hex), whatever the layout of the file: two plans are the same when this is."""
+        text = json.dumps(self.to_mapping(), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    @property
+    def duration_s(self) -> float:
+        """Sum over the runs, without what lies between them."""
+        return sum(run.duration_s for run in self.runs)
+
+    def to_yaml(self) -> str:
+        """The plan as a file; `from_mapping` of it gives the same plan."""
+        return yaml.safe_dump(self.to_mapping(), sort_keys=False, default_flow_style=None, width=120)
+
+
+def load_plan(path: Path) -> Plan:
+    """Read a plan file. Raises ConfigError."""
+    mapping, _ = load_yaml(path)
+    return Plan.from_mapping(mapping, str(path))
+
+
+def _limits(top: Section) -> Limits:
+    """`limits` of a plan; a key left out has its value in DEFAULT_LIMITS, temperature_c: null means no limit."""
+    section = top.section("limits", optional=True)
+    if section is None:
+        return DEFAULT_LIMITS
+    values = {
+        name: section.number(name, unit, above=0.0, default=getattr(DEFAULT_LIMITS, name))
+        for name, unit in _LIMIT_UNITS.items()
+        if name != "temperature_c" or section.raw(name, 0.0) is not None
+    }
+    section.finish()
+    return Limits(**values)
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _run(section: Section) -> Run:
+    name = section.text("name")
+    if not _NAME.fullmatch(name) or name in _RESERVED:
+        raise section.error(
+            "name",
+            name,
+            "letters, digits and . _ + -, beginning with a letter or digit, not 'plan' or 'campaign'",
+        )
+    joint = section.integer("velocity_joint", low=1, high=2)
+    inner = section.sections("segments")
+    if not inner:
+        raise section.error("segments", section.raw("segments", None), "a list of at least one segment")
+    segments = tuple(_segment(each) for each in inner)
+    for before, one, each in zip((None, *segments), segments, inner, strict=False):
+        if isinstance(one, Fourier) and isinstance(before, Plateau) and before.moving:
+            raise each.error("kind", "fourier", "a rest before it: the plateau before it ends in motion")
+    section.finish()
+    return Run(name, joint, segments)
+
+
+def _segment(section: Section) -> Segment:
+    kind = section.text("kind", ("plateau", "rest", "fourier"))
+    result: Segment
+    if kind == "fourier":
+        result = _fourier(section)
+    else:
+        hold_s = section.number("hold_s", "s", low=0.0, high=LONGEST_S)
+        ramp_s = section.number("ramp_s", "s", low=0.0, high=LONGEST_S, default=DEFAULT_RAMP_S)
+        if kind == "rest":
+            result = Rest(hold_s, ramp_s)
+        else:
+            result = Plateau(
+                section.number("velocity_rad_s", "rad/s"), section.number("current_a", "A"), hold_s, ramp_s
+            )
+    section.finish()
+    return result
+
+
+def _fourier(section: Section) -> Fourier:
+    duration_s = section.number("duration_s", "s", low=0.1, high=LONGEST_S)
+    try:
+        return Fourier(
+            FourierTrajectory.from_section(section.required("velocity"), duration_s),
+            FourierSeries.from_section(section.required("current"), duration_s),
+        )
+    except ConfigError as error:
+        if str(error).startswith(section.where):
+            raise
+        raise ConfigError(f"{section.where}: key '{section.path}': {error}") from None

@@ -1,0 +1,200 @@
+"""campaign.json: what has become of every run, written so that a campaign that was killed can go on (jtq.campaign/1).
+
+The directory belongs to one campaign at a time (a lock that ends with its process), and to one plan.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any, Final
+
+from estimator.checked import ConfigError, Section
+from sysid.campaign.plan import Plan, load_plan
+
+SCHEMA: Final = "jtq.campaign/1"
+STATE_FILE: Final = "campaign.json"
+PLAN_FILE: Final = "plan.yaml"
+LOCK_FILE: Final = ".lock"
+PARTS: Final = ".part"
+"""Suffix of a run's directory while the run is under way."""
+ENDINGS: Final = (".csv.gz", ".json", ".mcap")
+"""Files of a run that is done."""
+EVIDENCE: Final = (".stopped.mcap", ".failed.mcap", ".jtqd.log")
+"""What is left of an attempt that came to nothing, until the next attempt."""
+DONE, STOPPED, FAILED, PENDING = STATUSES = ("done", "stopped", "failed", "pending")
+
+
+class StateError(Exception):
+    """The directory cannot be used for this campaign; one line."""
+
+
+@dataclass(frozen=True)
+class RunState:
+    """What has become of one run.
+
+    Attributes:
+        status: done; stopped (a limit, or the bus); failed (nothing usable was recorded); pending.
+        reason: one line for stopped and failed. attempts: how often it was begun.
+        played_s: length of the set-points that were sent in the last attempt.
+        rows: of the run table. missed, incomplete: cycles that are no rows (see log_to_run).
+        findings: what the table looks wrong by, a line each. sha256: of NAME.csv.gz.
+    """
+
+    status: str = PENDING
+    reason: str = ""
+    attempts: int = 0
+    played_s: float = 0.0
+    rows: int = 0
+    missed: int = 0
+    incomplete: int = 0
+    incomplete_by: Mapping[str, int] = field(default_factory=dict)
+    findings: tuple[str, ...] = ()
+    sha256: str = ""
+
+
+class CampaignDirectory:
+    """A campaign's directory, locked for this process until `close`; the state in it is that of the last `put`.
+
+    Args:
+        path: made if missing.
+
+    Raises:
+        StateError: another campaign is at work there, or what is there is no campaign's.
+        OSError: it cannot be made or written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path: Final = path
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except FileExistsError:
+            raise StateError(f"{path}: found a file, expected a directory or nothing") from None
+        self._lock = os.open(path / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(self._lock)
+            raise StateError(f"{path}: another campaign is at work in this directory") from None
+        self.name = ""
+        self.plan_sha256 = ""
+        self.recipe: Mapping[str, Any] = {}
+        self.runs: dict[str, RunState] = {}
+        try:
+            self._load()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def begun(self) -> bool:
+        """Whether a campaign has been begun here."""
+        return bool(self.plan_sha256)
+
+    def close(self) -> None:
+        """Give the directory up."""
+        os.close(self._lock)
+
+    def same_recipe(self, recipe: Mapping[str, Any]) -> Plan | None:
+        """The plan that was begun here from the same recipe: made once, so that it need not be designed again."""
+        if not self.begun or self.recipe != recipe:
+            return None
+        try:
+            plan = load_plan(self.path / PLAN_FILE)
+        except ConfigError:
+            return None
+        return plan if plan.sha256 == self.plan_sha256 else None
+
+    def begin(self, plan: Plan, recipe: Mapping[str, Any]) -> None:
+        """Begin, or go on: runs that are done stay done, everything half-written is removed.
+
+        Raises:
+            StateError: another plan was begun here.
+        """
+        if self.begun and self.plan_sha256 != plan.sha256:
+            raise StateError(
+                f"{self.path}: found campaign '{self.name}' of another plan ({self.plan_sha256[:8]}), expected "
+                f"'{plan.name}' ({plan.sha256[:8]}): give another --out, or the same campaign with the same options"
+            )
+        if not self.begun:
+            foreign = [
+                name for run in plan.runs for name in _files_of(run.name) if (self.path / name).exists()
+            ]
+            if foreign:
+                raise StateError(
+                    f"{self.path}: found {foreign[0]} and no {STATE_FILE}, expected a directory without runs"
+                )
+        self.name, self.plan_sha256, self.recipe = plan.name, plan.sha256, dict(recipe)
+        self.runs = {run.name: self._still_done(run.name) for run in plan.runs}
+        for name, state in self.runs.items():
+            shutil.rmtree(self.path / (name + PARTS), ignore_errors=True)
+            if state.status != DONE:
+                for file in _files_of(name):
+                    (self.path / file).unlink(missing_ok=True)
+        _write_whole(self.path / PLAN_FILE, plan.to_yaml())
+        self._save()
+
+    def put(self, name: str, state: RunState) -> None:
+        """Write the state of a run, whole or not at all."""
+        self.runs[name] = state
+        self._save()
+
+    def _still_done(self, name: str) -> RunState:
+        """The state of a run as recorded; pending again when it is not done, or its files have gone."""
+        state = self.runs.get(name, RunState())
+        if state.status == DONE and all((self.path / (name + ending)).is_file() for ending in ENDINGS):
+            return state
+        return RunState()
+
+    def _load(self) -> None:
+        path = self.path / STATE_FILE
+        try:
+            text = path.read_text(encoding="utf-8")
+        except FileNotFoundError:
+            return
+        try:
+            top = Section(json.loads(text), str(path))
+            top.text("schema", (SCHEMA,))
+            self.name, sha256 = top.text("name"), top.text("plan_sha256")
+            self.recipe = top.raw("recipe")
+            self.runs = {section.text("name"): _run_state(section) for section in top.sections("runs")}
+        except (ValueError, ConfigError) as error:  # ConfigError names the file itself
+            said = str(error) if isinstance(error, ConfigError) else f"{path}: not JSON: {error}"
+            raise StateError(said) from None
+        self.plan_sha256 = sha256
+
+    def _save(self) -> None:
+        content = {
+            "schema": SCHEMA,
+            "name": self.name,
+            "plan_sha256": self.plan_sha256,
+            "recipe": self.recipe,
+            "runs": [{"name": name, **asdict(state)} for name, state in self.runs.items()],
+        }
+        _write_whole(self.path / STATE_FILE, json.dumps(content, indent=1) + "\n")
+
+
+def _run_state(section: Section) -> RunState:
+    section.text("status", STATUSES)
+    values = {item.name: section.raw(item.name) for item in fields(RunState)}
+    values["findings"] = tuple(values["findings"])
+    return RunState(**values)
+
+
+def _files_of(name: str) -> list[str]:
+    return [name + ending for ending in (*ENDINGS, *EVIDENCE)]
+
+
+def _write_whole(path: Path, text: str) -> None:
+    """Replace a file so that whoever reads it, also after a crash, finds the old or the new one, never a part."""
+    temporary = path.with_name(f".{path.name}.new")
+    with temporary.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)

@@ -1,0 +1,251 @@
+"""The commander: a pure state machine, frames and stamps in, frames out. No socket, no clock.
+
+    waiting ──> enabling ──> playing ──> ramping ──> braking ──> disabling ──> over
+       └── refused: nothing has moved        └── any violation: ramping, or braking at once ──┘
+
+In every cycle one RPDO is sent, to one drive after the other, so that each gets a set-point every second SYNC and the bus
+never carries more than one more frame. All times are CLOCK_MONOTONIC in ns, of frames as of calls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from drivers.devices import SYNC_COB_ID
+from sysid.motion.cia402_client import (
+    QUICK_STOP_WORD,
+    State,
+    describe,
+    enabling_word,
+    fast_state,
+)
+from sysid.motion.commands import Commands, Heartbeat
+from sysid.motion.drive_setup import DriveUnits, SensorUnits
+from sysid.motion.inputs import Inputs
+from sysid.motion.limits import Limits, Monitor
+from sysid.motion.pace import Pace
+from sysid.motion.result import COMMANDER_NODE, MotionResult, Timing, Violation
+from sysid.motion.setpoints import PERIOD_S, Setpoints
+from sysid.motion.stopping import Phase, Stopping
+from sysid.motion.supervision import Supervision
+
+FULL_QUEUE_FRAMES: Final = 5
+
+Frame = tuple[int, bytes, int]
+"""COB-ID, data, time of reception."""
+
+
+class Commander:
+    """Leads both drives through one motion. `drives` are joints 1 and 2, set up already (`drive_setup`).
+
+    Call `on_frames` with what has arrived, at best at `wake_ns`, and by `due_ns` at the latest; send what it returns.
+    `refusal` says why nothing was begun; otherwise `result` holds once `over`.
+    """
+
+    def __init__(
+        self,
+        setpoints: Setpoints,
+        limits: Limits,
+        drives: tuple[DriveUnits, DriveUnits],
+        sensor: SensorUnits | None,
+        *,
+        now_ns: int,
+        timing: Timing | None = None,
+    ) -> None:
+        self.timing = timing = timing or Timing()
+        self.inputs = Inputs(drives, sensor, COMMANDER_NODE)
+        self.phase = Phase.WAITING
+        self.refusal: str | None = None
+        self._reason = ""
+        self._takers = self.inputs.takers
+        self._pace = Pace(timing, now_ns)
+        self._heartbeat = Heartbeat(timing.own_heartbeat_s, now_ns)
+        self._monitor = Monitor(limits)
+        self._supervision = Supervision(self.inputs, timing)
+        self._setpoints = setpoints
+        self._commands = Commands(setpoints, drives)
+        self._turn = 0
+        self._index = -1  # of the set-point in force
+        self._stopping: Stopping | None = None
+        self._now_ns = self._since_ns = self._still_since_ns = now_ns
+        self._full = 0
+
+    # For the shell ------------------------------------------------------------------------------------------
+
+    @property
+    def over(self) -> bool:
+        """Nothing more will be sent."""
+        return self.phase is Phase.OVER
+
+    @property
+    def played_s(self) -> float:
+        """Length of the set-points that have been in force."""
+        return (self._index + 1) * PERIOD_S
+
+    @property
+    def total_s(self) -> float:
+        """Length of all set-points."""
+        return self._setpoints.duration_s
+
+    @property
+    def result(self) -> MotionResult:
+        """How it ended."""
+        return MotionResult("stopped" if self._reason else "done", self._reason, self.played_s)
+
+    @property
+    def wake_ns(self) -> int:
+        """Sleep until then, whatever comes: one wake-up takes a whole cycle; 0: wake up with the next frame."""
+        return self._pace.wake_ns
+
+    @property
+    def due_ns(self) -> int:
+        """Call `on_frames` by then even when nothing has come."""
+        return self._pace.due_ns if self.silent else min(self._pace.due_ns, self._heartbeat.due_ns)
+
+    @property
+    def silent(self) -> bool:
+        """Our heartbeat has ended on purpose: a drive does not obey, and stops when it misses it."""
+        return self._stopping is not None and self._stopping.silent
+
+    def stop(self, reason: str) -> None:
+        """Lead both joints to a stop; asked for a second time, they brake at once."""
+        self._stop(Violation(reason, self.phase is Phase.RAMPING))
+
+    def frame_refused(self, refused: bool) -> None:
+        """The transmit queue took a frame, or was full; several times in a row means that nobody hears us."""
+        self._full = self._full + 1 if refused else 0
+        if self._full == FULL_QUEUE_FRAMES:
+            self._stop(Violation(f"bus: transmit queue full for {FULL_QUEUE_FRAMES} frames in a row", True))
+
+    def on_frames(self, frames: Sequence[Frame], now_ns: int) -> list[bytes]:
+        """Take what has arrived, in order; return what is to be sent now."""
+        self._now_ns = now_ns
+        takers = self._takers
+        for can_id, data, t_ns in frames:
+            take = takers.get(can_id)
+            if take is not None:
+                take(data, t_ns)
+            elif can_id == SYNC_COB_ID:
+                if self._pace.pending:
+                    self._examine()  # several cycles have come at once: none goes unseen
+                self._unpaced(self._pace.on_sync(t_ns, now_ns))
+                self.inputs.cycle += 1
+        self._unpaced(self._pace.watch(now_ns))
+        if self.phase is Phase.OVER:
+            return []
+        out = [] if self.silent else self._heartbeat.frames(now_ns)
+        if self._pace.ready(now_ns):
+            self._examine()
+            frame = self._step(self._pace.served(now_ns))
+            if frame is not None:
+                out.append(frame)
+        return out
+
+    # Violations ---------------------------------------------------------------------------------------------
+
+    def _unpaced(self, violation: Violation | None) -> None:
+        """SYNC or we are late: stop, unless nothing has been begun; then the wait begins anew."""
+        if violation is None:
+            return
+        if self.phase is Phase.WAITING:
+            self._still_since_ns = self._now_ns
+        else:
+            self._stop(violation)
+
+    def _examine(self) -> None:
+        """Limits and supervision of the newest values. On the stop ramp only what makes it impossible counts."""
+        phase = self.phase
+        if phase is Phase.PLAYING or phase is Phase.ENABLING:
+            reason = self._monitor.check(self.inputs.sample())
+            if reason is not None:
+                self._stop(Violation(reason, False))
+                return
+        elif phase is not Phase.RAMPING:
+            return
+        violation = self._supervision.check(self._now_ns, enabled=phase is not Phase.ENABLING)
+        if violation is not None and (violation.hard or phase is not Phase.RAMPING):
+            self._stop(violation)
+
+    def _stop(self, violation: Violation) -> None:
+        """Begin to stop, or go on to the harder way. The first reason is the one that is told."""
+        if self.over:
+            return
+        self._reason = self._reason or violation.reason
+        if self.phase is Phase.WAITING:
+            self.phase = Phase.OVER
+        elif self._stopping is None:
+            self._begin_stop(hard=violation.hard or self.phase is Phase.ENABLING)
+        elif violation.hard:
+            self._stopping.brake(self._now_ns)
+            self.phase = self._stopping.phase
+
+    def _begin_stop(self, *, hard: bool) -> None:
+        start = (0.0, 0.0)
+        if self._index >= 0:
+            setpoints = self._setpoints
+            start = float(setpoints.velocity_rad_s[self._index]), float(setpoints.current_a[self._index])
+        self._stopping = Stopping(
+            self._supervision, self._commands, self.timing, start, hard=hard, now_ns=self._now_ns
+        )
+        self.phase = self._stopping.phase
+
+    # Phases -------------------------------------------------------------------------------------------------
+
+    def _enter(self, phase: Phase) -> None:
+        self.phase = phase
+        self._since_ns = self._still_since_ns = self._now_ns
+
+    def _phase_s(self) -> float:
+        return (self._now_ns - self._since_ns) * 1e-9
+
+    def _step(self, advance: int) -> bytes | None:
+        """One cycle of the present phase: the RPDO for the drive whose turn it is."""
+        self._turn = turn = 1 - self._turn
+        if self.phase is Phase.PLAYING:
+            self._index += advance
+            if self._index < len(self._setpoints):
+                return self._commands.setpoint(turn, self._index)
+            self._index = len(self._setpoints) - 1
+            self._begin_stop(hard=False)
+        if self.phase is Phase.WAITING:
+            self._waiting()
+            return None
+        if self.phase is Phase.ENABLING:
+            return self._enabling(turn)
+        stopping = self._stopping
+        assert stopping is not None
+        frame = stopping.step(turn, advance, self._now_ns, synced=self._pace.synced)
+        self.phase = stopping.phase
+        return frame
+
+    def _waiting(self) -> None:
+        """Until SYNC, every input and standstill have been there long enough; refused when they do not come in time."""
+        missing: str | None = "no SYNC: is jtqd running on this bus?"
+        if self._pace.synced:
+            missing = self._supervision.missing(self._now_ns)
+            missing = missing or self._monitor.check(self.inputs.sample()) or self._supervision.moving()
+        if missing is not None:
+            self._still_since_ns = self._now_ns
+            if self._phase_s() > self.timing.ready_s:
+                self.refusal = missing
+                self.phase = Phase.OVER
+        elif self._now_ns - self._still_since_ns >= self.timing.still_s * 1e9:
+            for drive in self.inputs.drives:
+                drive.begin_travel()
+            self._enter(Phase.ENABLING)
+
+    def _enabling(self, turn: int) -> bytes | None:
+        """6040h 6, 7, 15, each after the statusword has confirmed the one before."""
+        states = [fast_state(drive.statusword) for drive in self.inputs.drives]
+        if all(state is State.OPERATION_ENABLED for state in states):
+            self._enter(Phase.PLAYING)
+        elif self._phase_s() > self.timing.enable_s:
+            drive = self.inputs.drives[states[0] is State.OPERATION_ENABLED]
+            text = (
+                f"{describe(drive.statusword)} after {self.timing.enable_s:g} s, expected operation enabled"
+            )
+            self._stop(Violation(f"{drive.who}: {text}", True))
+            return self._commands.control(turn, QUICK_STOP_WORD)
+        word = enabling_word(states[turn])
+        return None if word is None else self._commands.control(turn, word)

@@ -1,0 +1,69 @@
+"""The frames that the commander sends: RPDOs to both drives, and its own heartbeat. Pure."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from drivers.devices import drive_rpdo1, drive_rpdo2
+from drivers.frame import FRAME, pack
+from sysid.motion.cia402_client import ENABLE_OPERATION, QUICK_STOP_WORD
+from sysid.motion.drive_setup import DriveUnits
+from sysid.motion.result import COMMANDER_NODE
+from sysid.motion.setpoints import Setpoints
+
+_COMMAND, _VELOCITY = drive_rpdo1(1).layout, drive_rpdo2(1).layout
+_BOOT_UP: Final = b"\x00"
+_OPERATIONAL: Final = b"\x05"
+
+
+class Commands:
+    """RPDOs for drive 0 or 1 (`turn`); set-points are scaled to the drives' units once, beforehand."""
+
+    def __init__(self, setpoints: Setpoints, drives: tuple[DriveUnits, DriveUnits]) -> None:
+        self._leader = setpoints.velocity_joint - 1  # the drive in velocity mode
+        self._lead, self._follow = drives[self._leader], drives[1 - self._leader]
+        self._velocities = [self._lead.velocity_units(v) for v in setpoints.velocity_rad_s.tolist()]
+        self._currents = [self._follow.current_units(i) for i in setpoints.current_a.tolist()]
+        self._nodes = [drive.node for drive in drives]
+        self._rpdo1 = [drive_rpdo1(drive.node).cob_id for drive in drives]
+        self._rpdo2 = [drive_rpdo2(drive.node).cob_id for drive in drives]
+
+    def control(self, turn: int, word: int) -> bytes:
+        """RPDO1: controlword, no torque."""
+        return FRAME.pack(self._rpdo1[turn], _COMMAND.size, _COMMAND.pack(word, 0))
+
+    def quick_stop_by_sdo(self, turn: int) -> bytes:
+        """Expedited download of 6040h = 2; nobody waits for the answer."""
+        return pack(0x600 + self._nodes[turn], b"\x2b\x40\x60\x00" + QUICK_STOP_WORD.to_bytes(4, "little"))
+
+    def setpoint(self, turn: int, index: int) -> bytes:
+        """Set-point number `index`."""
+        return self._target(turn, self._velocities[index], self._currents[index])
+
+    def target(self, turn: int, velocity_rad_s: float, current_a: float) -> bytes:
+        """Any other set-point."""
+        velocity, current = self._lead.velocity_units(velocity_rad_s), self._follow.current_units(current_a)
+        return self._target(turn, velocity, current)
+
+    def _target(self, turn: int, velocity: int, current: int) -> bytes:
+        """RPDO2 to the drive in velocity mode, RPDO1 to the other."""
+        if turn == self._leader:
+            return FRAME.pack(self._rpdo2[turn], _VELOCITY.size, _VELOCITY.pack(velocity))
+        return FRAME.pack(self._rpdo1[turn], _COMMAND.size, _COMMAND.pack(ENABLE_OPERATION, current))
+
+
+class Heartbeat:
+    """Our heartbeat (node 21h) on its own grid; the first one is the boot-up message. `due_ns`: when the next one is due."""
+
+    def __init__(self, period_s: float, now_ns: int) -> None:
+        self.due_ns = now_ns
+        self._period_ns = round(period_s * 1e9)
+        self._state = _BOOT_UP
+
+    def frames(self, now_ns: int) -> list[bytes]:
+        """The heartbeat if it is due."""
+        if now_ns < self.due_ns:
+            return []
+        self.due_ns += self._period_ns * (1 + (now_ns - self.due_ns) // self._period_ns)
+        state, self._state = self._state, _OPERATIONAL
+        return [pack(0x700 + COMMANDER_NODE, state)]

@@ -1,0 +1,198 @@
+"""What the bus says about both joints: frames and stamps in, measured values with their age out. Pure.
+
+All times are CLOCK_MONOTONIC in ns and come as arguments. A frame of another length than its PDO is not taken: the PDO then
+grows stale.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+from drivers.devices import SYNC_COB_ID, drive_tpdo1, drive_tpdo2, sensor_tpdo1, sensor_tpdo2
+from sysid.motion.drive_setup import TEMPERATURE_TPDO, DriveUnits, SensorUnits
+from sysid.motion.limits import JointSample, Sample
+
+_MOTION: Final = drive_tpdo2(1).layout
+_POSITION: Final = drive_tpdo1(1).layout
+_SENSOR: Final = (sensor_tpdo1(3).layout, sensor_tpdo2(3).layout)
+_TEMPERATURE: Final = struct.Struct("<h")
+_NOT_MEASURED: Final = -0x8000
+_EMERGENCY: Final = struct.Struct("<HB")
+NEVER_NS: Final = -(1 << 62)
+NO_STATUSWORD: Final = 0x7FFF  # decodes to no state
+
+Take = Callable[[bytes, int], None]
+
+
+class Emergency(NamedTuple):
+    """An EMCY that is present: code and error register (1001h)."""
+
+    code: int
+    register: int
+
+
+class NodeInput:
+    """Heartbeat and EMCY of one node. `who` is "joint 1", "joint 2" or "sensor"."""
+
+    def __init__(self, who: str, node: int, heartbeat_ms: int) -> None:
+        self.who, self.node = who, node
+        self.heartbeat_ns = heartbeat_ms * 1_000_000
+        self.beat_ns = NEVER_NS
+        self.nmt_state = -1
+        self.emergency: Emergency | None = None
+
+    def on_heartbeat(self, data: bytes, t_ns: int) -> None:
+        """700h+n: NMT state; 0 is the boot-up message."""
+        if len(data) == 1:
+            self.nmt_state = data[0] & 0x7F
+            self.beat_ns = t_ns
+
+    def on_emergency(self, data: bytes, t_ns: int) -> None:
+        """080h+n: an error code, or 0000h when all errors are over."""
+        if len(data) == 8:
+            code, register = _EMERGENCY.unpack_from(data)
+            self.emergency = Emergency(code, register) if code else None
+
+
+class DriveInput(NodeInput):
+    """Values of one drive in SI units, joint side; `cycle_1`, `cycle_2`: SYNCs seen when its TPDOs came last.
+
+    `told_by_sdo`: it has confirmed an SDO that wrote its controlword.
+    """
+
+    def __init__(self, number: int, units: DriveUnits, inputs: Inputs) -> None:
+        super().__init__(f"joint {number}", units.node, units.heartbeat_ms)
+        self.units = units
+        self.statusword = NO_STATUSWORD
+        self.current_a = self.velocity_rad_s = self.travel_rad = 0.0
+        self.temperature_c = math.nan
+        self.temperature_ns = NEVER_NS
+        self.cycle_1 = self.cycle_2 = 0
+        self.told_by_sdo = False
+        self._inputs = inputs
+        self._velocity = units.scaling.motor_rad_s_per_unit / units.gear_ratio
+        self._motor = units.scaling.motor_rad_per_count / units.gear_ratio
+        self._link = units.scaling.link_rad_per_count
+        self._ampere = units.scaling.ampere_per_unit
+        self._counts: tuple[int, int] | None = None
+        self._motor_counts = self._link_counts = 0  # since `begin_travel`
+
+    def begin_travel(self) -> None:
+        """Travel counts from here."""
+        self._motor_counts = self._link_counts = 0
+        self.travel_rad = 0.0
+
+    def on_position(self, data: bytes, t_ns: int) -> None:
+        """TPDO1. The counters roll over, so differences are taken modulo 2^32; the larger travel of both encoders counts."""
+        if len(data) != _POSITION.size:
+            return
+        motor, link = counts = _POSITION.unpack(data)
+        if self._counts is not None:
+            self._motor_counts += _difference(motor - self._counts[0])
+            self._link_counts += _difference(link - self._counts[1])
+            one, other = self._motor_counts * self._motor, self._link_counts * self._link
+            self.travel_rad = one if abs(one) > abs(other) else other
+        self._counts = counts
+        self.cycle_1 = self._inputs.cycle
+
+    def on_motion(self, data: bytes, t_ns: int) -> None:
+        """TPDO2."""
+        if len(data) == _MOTION.size:
+            velocity, current, self.statusword = _MOTION.unpack(data)
+            self.velocity_rad_s = velocity * self._velocity
+            self.current_a = current * self._ampere
+            self.cycle_2 = self._inputs.cycle
+
+    def on_temperature(self, data: bytes, t_ns: int) -> None:
+        """TPDO3, 0.1 °C, 8000h: not measured; more may follow behind it."""
+        if len(data) >= _TEMPERATURE.size:
+            units = _TEMPERATURE.unpack_from(data)[0]
+            if units != _NOT_MEASURED:
+                self.temperature_c = units * 0.1
+                self.temperature_ns = t_ns
+
+    def on_sdo(self, data: bytes, t_ns: int) -> None:
+        """580h+n: the answer to a download of 6040h."""
+        if data[:4] == b"\x60\x40\x60\x00":
+            self.told_by_sdo = True
+
+    def sample(self) -> JointSample:
+        """What was measured last."""
+        return JointSample(self.current_a, self.velocity_rad_s, self.travel_rad, self.temperature_c)
+
+
+class ChannelInput:
+    """One channel of the torque sensor."""
+
+    def __init__(self, channel: int, nm_per_unit: float, inputs: Inputs) -> None:
+        self.channel = channel
+        self.torque_nm = 0.0
+        self.status = 0
+        self.cycle = 0
+        self._layout, self._nm, self._inputs = _SENSOR[channel - 1], nm_per_unit, inputs
+
+    def on_torque(self, data: bytes, t_ns: int) -> None:
+        """TPDO1 or TPDO2 of the sensor."""
+        if len(data) == self._layout.size:
+            units, self.status = self._layout.unpack(data)
+            self.torque_nm = units * self._nm
+            self.cycle = self._inputs.cycle
+
+
+class Inputs:
+    """Everything that is listened to but SYNC. `cycle` is the number of SYNCs so far, kept by the commander.
+
+    `foreign` is True once somebody else has spoken with the heartbeat of `own_node`.
+    """
+
+    def __init__(
+        self, drives: tuple[DriveUnits, DriveUnits], sensor: SensorUnits | None, own_node: int
+    ) -> None:
+        self.cycle = 0
+        self.foreign = False
+        one, two = drives
+        self.drives = (DriveInput(1, one, self), DriveInput(2, two, self))
+        self.sensor = None if sensor is None else NodeInput("sensor", sensor.node, sensor.heartbeat_ms)
+        factors = () if sensor is None else sensor.nm_per_unit
+        self.channels = tuple(ChannelInput(n, nm, self) for n, nm in enumerate(factors, 1))
+        self.nodes: tuple[NodeInput, ...] = (
+            self.drives if self.sensor is None else (*self.drives, self.sensor)
+        )
+        self.takers = self._takers(own_node)
+
+    def _takers(self, own_node: int) -> dict[int, Take]:
+        takers: dict[int, Take] = {0x700 + own_node: self._on_own_node}
+        for node in self.nodes:
+            takers[0x700 + node.node] = node.on_heartbeat
+            takers[0x080 + node.node] = node.on_emergency
+        for drive in self.drives:
+            takers[0x180 + drive.node] = drive.on_position
+            takers[0x280 + drive.node] = drive.on_motion
+            takers[0x580 + drive.node] = drive.on_sdo
+            if drive.units.temperature:
+                takers[TEMPERATURE_TPDO + drive.node] = drive.on_temperature
+        if self.sensor is not None:
+            for channel in self.channels:
+                takers[0x080 + 0x100 * channel.channel + self.sensor.node] = channel.on_torque
+        return takers
+
+    @property
+    def identifiers(self) -> tuple[int, ...]:
+        """COB-IDs to be received: SYNC and all that `takers` take."""
+        return (SYNC_COB_ID, *self.takers)
+
+    def sample(self) -> Sample:
+        """What was measured last, of everything."""
+        one, two = self.drives
+        return Sample(one.sample(), two.sample(), tuple([channel.torque_nm for channel in self.channels]))
+
+    def _on_own_node(self, data: bytes, t_ns: int) -> None:
+        self.foreign = True
+
+
+def _difference(counts: int) -> int:
+    """Difference of two counters of 32 bits, the shorter way round."""
+    return (counts + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000

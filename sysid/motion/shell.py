@@ -1,0 +1,167 @@
+"""Plays set-points on a bus: socket, clock and signals around `commander.Commander`.
+
+One wake-up per cycle: it sleeps until the frames of the cycle should have crossed the wire, takes them by one system call,
+and sends one frame. It sleeps in select when none came, and never polls a clock.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from types import FrameType
+from typing import Final
+
+from drivers.devices import DriveProfile, SensorProfile
+from drivers.errors import BusError
+from drivers.frame import FRAME, FRAME_SIZE
+from drivers.frame_socket import CAPACITY, FrameSocket, exact, open_frame_socket
+from sysid.motion.bench_setup import BenchSetup
+from sysid.motion.commander import Commander, Frame
+from sysid.motion.limits import Limits, check_setpoints
+from sysid.motion.result import MotionError, MotionResult, Timing
+from sysid.motion.setpoints import Setpoints
+
+Progress = Callable[[float, float], None]
+"""Called with (played, total) seconds a few times per second, between two cycles: it must return at once."""
+
+DRIVES: Final = (DriveProfile(1), DriveProfile(2))
+SENSOR: Final = SensorProfile(3)
+PROGRESS_NS: Final = 250_000_000
+_PR_SET_TIMERSLACK, _PR_GET_TIMERSLACK = 29, 30
+_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
+
+
+def play(
+    bus: str,
+    setpoints: Setpoints,
+    limits: Limits,
+    *,
+    on_progress: Progress | None = None,
+    drives: tuple[DriveProfile, DriveProfile] = DRIVES,
+    sensor: SensorProfile | None = SENSOR,
+    timing: Timing | None = None,
+) -> MotionResult:
+    """Move both joints as `setpoints` say, within `limits`, on a bus on which jtqd runs; both are disabled afterwards.
+
+    SIGINT and SIGTERM stop the joints, a second one makes them brake at once; the handlers that were there before are
+    back when this returns. `drives` are joints 1 and 2. Without `sensor` the torque is not supervised.
+    Raises MotionError, one line, when the motion was refused and nothing has moved.
+    """
+    timing = timing or Timing()
+    check_setpoints(setpoints, limits)
+    with _signals() as taken, _on_time():
+        try:
+            setup = BenchSetup(bus, drives, sensor, timing)
+        except BusError as refused:
+            raise MotionError(str(refused)) from None
+        with closing(setup):
+            units = setup.prepare(setpoints, limits)
+            commander = Commander(setpoints, limits, *units, now_ns=time.monotonic_ns(), timing=timing)
+            error = left = ""
+            try:
+                error = _run(bus, commander, taken, on_progress)
+            finally:
+                left = setup.release(beating=not commander.silent)
+    if commander.refusal is not None:
+        raise MotionError("; ".join(reason for reason in (commander.refusal, left) if reason))
+    result = commander.result
+    reasons = [reason for reason in (result.reason, error, left) if reason]
+    return result._replace(status="stopped" if reasons else "done", reason="; ".join(reasons))
+
+
+def _run(bus: str, commander: Commander, taken: list[str], on_progress: Progress | None) -> str:
+    """Until the commander is over; "" or why the bus could not be used any more. Raises MotionError when it never could."""
+    try:
+        socket = open_frame_socket(bus, [exact(can_id) for can_id in commander.inputs.identifiers])
+    except BusError as refused:
+        raise MotionError(str(refused)) from None
+    with closing(socket):
+        try:
+            _loop(socket, commander, taken, on_progress)
+        except BusError as error:
+            timeout = commander.timing.drive_timeout_s
+            return f"{error}; the drives stop by themselves {timeout:g} s after our last heartbeat (1016h:2)"
+    return ""
+
+
+def _loop(socket: FrameSocket, commander: Commander, taken: list[str], on_progress: Progress | None) -> None:
+    monotonic_ns, sleep = time.monotonic_ns, time.sleep
+    asked = 0
+    progress_ns = monotonic_ns()
+    while not commander.over:
+        pause_ns = commander.wake_ns - monotonic_ns()
+        if pause_ns > 0:
+            sleep(pause_ns * 1e-9)
+        frames = _take(socket)
+        if not frames:
+            socket.wait((commander.due_ns - monotonic_ns()) * 1e-9)
+            frames = _take(socket)
+        while asked < len(taken):
+            commander.stop(taken[asked])
+            asked += 1
+        now_ns = monotonic_ns()
+        for frame in commander.on_frames(frames, now_ns):
+            commander.frame_refused(not socket.send(frame))
+        if on_progress is not None and now_ns >= progress_ns:
+            progress_ns = now_ns + PROGRESS_NS
+            on_progress(commander.played_s, commander.total_s)
+
+
+def _take(socket: FrameSocket) -> list[Frame]:
+    """All frames that have arrived, their stamps on CLOCK_MONOTONIC.
+
+    The stamps are of CLOCK_REALTIME; a frame waits for a millisecond at most, so only a clock that is stepped within that
+    moment makes one wrong, and that looks like lateness.
+    """
+    frames: list[Frame] = []
+    count = CAPACITY
+    while count == CAPACITY:
+        count = socket.receive()
+        now_ns = time.monotonic_ns()
+        offset_ns = now_ns - time.time_ns()
+        content = FRAME.iter_unpack(bytes(socket.frames[: count * FRAME_SIZE]))
+        for (can_id, length, data), stamp_ns in zip(content, socket.stamps_ns, strict=False):
+            received_ns = min(stamp_ns + offset_ns, now_ns) if stamp_ns else now_ns
+            frames.append((can_id, data[:length], received_ns))
+    return frames
+
+
+@contextmanager
+def _signals() -> Iterator[list[str]]:
+    """SIGINT and SIGTERM only write their names into the list while this lasts (in the main thread)."""
+    taken: list[str] = []
+
+    def take(number: int, frame: FrameType | None) -> None:
+        taken.append(signal.Signals(number).name)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield taken
+        return
+    before = {number: signal.signal(number, take) for number in _SIGNALS}
+    try:
+        yield taken
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _on_time() -> Iterator[None]:
+    """No garbage collection, and timers without their usual slack of 50 us, while this lasts."""
+    prctl = ctypes.CDLL(None).prctl
+    slack = prctl(_PR_GET_TIMERSLACK, 0, 0, 0, 0)
+    collecting = gc.isenabled()
+    gc.collect()
+    gc.disable()
+    prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0)
+    try:
+        yield
+    finally:
+        prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(slack), 0, 0, 0)
+        if collecting:
+            gc.enable()

@@ -1,0 +1,141 @@
+"""How both joints are brought to rest and made powerless, at the end of a motion or before it. Pure.
+
+    ramping      the velocity along a ramp to zero, the current faster than that; then until both joints stand
+    braking      quick stop (6040h 2): each drive brakes by itself
+    disabling    power off (6040h 0), until both statuswords say so
+
+A drive that does not obey the RPDO is told by SDO, which a node that is pre-operational still answers. If that does not help
+either, our heartbeat ends: the drives then stop by 1016h:2.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Final
+
+from sysid.motion.cia402_client import DISABLE_VOLTAGE, QUICK_STOP_WORD
+from sysid.motion.commands import Commands
+from sysid.motion.result import Timing
+from sysid.motion.setpoints import PERIOD_S
+from sysid.motion.supervision import Supervision
+
+DECELERATION_RAD_S2: Final = 10.0
+"""Joint side. From 3.3 rad/s the joint stands after 0.33 s."""
+UNLOAD_S: Final = 0.1
+"""Time in which the current goes to zero: long against the joint's torsional period, short against the ramp."""
+SETTLE_S: Final = 0.3
+"""After the ramp: time for both joints to stand, before they are braked anyway."""
+SETTLED_S: Final = 0.02
+"""Both joints must have stood for so long before the next step."""
+OFF_S: Final = 0.01
+"""Each drive is told several times to be off."""
+BY_SDO_S: Final = 0.01
+"""A drive that has not left operation enabled by then is told by SDO."""
+SILENT_S: Final = 0.2
+"""A drive that has not left operation enabled by then hears no more heartbeat of ours."""
+
+
+class Phase(Enum):
+    """What the commander is doing."""
+
+    WAITING = "waiting"
+    ENABLING = "enabling"
+    PLAYING = "playing"
+    RAMPING = "ramping"
+    BRAKING = "braking"
+    DISABLING = "disabling"
+    OVER = "over"
+
+
+class StopRamp:
+    """Set-points from (velocity_rad_s, current_a) to (0, 0); `duration_s` is when both have arrived."""
+
+    __slots__ = ("_current_a", "_velocity_rad_s", "duration_s")
+
+    def __init__(self, velocity_rad_s: float, current_a: float) -> None:
+        self._velocity_rad_s = velocity_rad_s
+        self._current_a = current_a
+        self.duration_s = max(abs(velocity_rad_s) / DECELERATION_RAD_S2, UNLOAD_S if current_a else 0.0)
+
+    def at(self, elapsed_s: float) -> tuple[float, float]:
+        """Velocity [rad/s] and current [A], elapsed_s after the beginning of the stop."""
+        velocity = self._velocity_rad_s
+        left = max(0.0, abs(velocity) - DECELERATION_RAD_S2 * elapsed_s)
+        share = max(0.0, 1.0 - elapsed_s / UNLOAD_S)
+        return (left if velocity > 0.0 else -left), self._current_a * share
+
+
+class Stopping:
+    """One stop, from the set-point in force; `hard` leaves out the ramp. `silent`: our heartbeat must end."""
+
+    def __init__(
+        self,
+        supervision: Supervision,
+        commands: Commands,
+        timing: Timing,
+        start: tuple[float, float],
+        *,
+        hard: bool,
+        now_ns: int,
+    ) -> None:
+        self.silent = False
+        self.phase = Phase.BRAKING if hard else Phase.RAMPING
+        self._supervision, self._commands, self._timing = supervision, commands, timing
+        self._ramp = StopRamp(*start)
+        self._ramp_s = 0.0
+        self._told = [False, False]  # by SDO
+        self._since_ns = self._moved_ns = now_ns
+
+    def brake(self, now_ns: int) -> None:
+        """Go on without the ramp."""
+        if self.phase is Phase.RAMPING:
+            self._enter(Phase.BRAKING, now_ns)
+
+    def step(self, turn: int, advance: int, now_ns: int, *, synced: bool) -> bytes | None:
+        """One cycle: the frame for drive `turn`. Without SYNC nothing is measured, and the time alone counts."""
+        if not synced or self._supervision.moving() is not None:
+            self._moved_ns = now_ns
+        if self.phase is Phase.RAMPING:
+            return self._ramping(turn, advance, now_ns)
+        if self.phase is Phase.BRAKING:
+            return self._braking(turn, now_ns, synced)
+        return self._disabling(turn, now_ns, synced)
+
+    def _enter(self, phase: Phase, now_ns: int) -> None:
+        self.phase = phase
+        self._since_ns = self._moved_ns = now_ns
+
+    def _settled(self, now_ns: int) -> bool:
+        return (now_ns - self._moved_ns) * 1e-9 >= SETTLED_S
+
+    def _ramping(self, turn: int, advance: int, now_ns: int) -> bytes:
+        self._ramp_s += advance * PERIOD_S
+        duration_s = self._ramp.duration_s
+        if self._ramp_s <= duration_s:
+            self._moved_ns = now_ns
+        if self._settled(now_ns) or self._ramp_s > duration_s + SETTLE_S:
+            self._enter(Phase.BRAKING, now_ns)
+            return self._commands.control(turn, QUICK_STOP_WORD)
+        return self._commands.target(turn, *self._ramp.at(self._ramp_s))
+
+    def _braking(self, turn: int, now_ns: int, synced: bool) -> bytes:
+        elapsed_s = (now_ns - self._since_ns) * 1e-9
+        if self._settled(now_ns) or elapsed_s > self._timing.quick_stop_s:
+            self._enter(Phase.DISABLING, now_ns)
+            return self._commands.control(turn, DISABLE_VOLTAGE)
+        obeyed = synced and self._supervision.obeyed(turn)
+        if not obeyed and synced and elapsed_s > SILENT_S:
+            self.silent = True
+        if not obeyed and elapsed_s > BY_SDO_S and not self._told[turn]:
+            self._told[turn] = True
+            return self._commands.quick_stop_by_sdo(turn)
+        return self._commands.control(turn, QUICK_STOP_WORD)
+
+    def _disabling(self, turn: int, now_ns: int, synced: bool) -> bytes | None:
+        """What SYNC does not bring any more, the shell asks by SDO."""
+        elapsed_s = (now_ns - self._since_ns) * 1e-9
+        off = synced and elapsed_s > OFF_S and self._supervision.both_off()
+        if off or elapsed_s > self._timing.disable_s:
+            self.phase = Phase.OVER
+            return None
+        return self._commands.control(turn, DISABLE_VOLTAGE)

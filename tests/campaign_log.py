@@ -1,0 +1,76 @@
+"""Logs of jtqd with known content, for the tests of campaigns: written by the recorder's own code, cycle by cycle."""
+
+import math
+import struct
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from daemon import cycle_record as cr
+from daemon.mcap_messages import BLOCK_PARTS, JointStateMessage
+from daemon.mcap_writer import McapFile
+from daemon.recorder import definitions
+from daemon.recording import Recording
+
+START_NS = 1_700_000_000_000_000_000
+ENABLED, OFF = 0x1237, 0x1250
+
+
+class Joint(NamedTuple):
+    """What one joint's block of a cycle holds."""
+
+    current_a: float = 1.0
+    motor_position_rad: float = 2.0
+    motor_velocity_rad_s: float = 3.0
+    link_position_rad: float = 4.0
+    sensor_nm: float = 5.0
+    statusword: int = ENABLED
+    input_flags: int = 7
+
+
+class Cycle(NamedTuple):
+    """One cycle: its number, when its SYNC was sent, both joints, and what came as (COB-ID, data)."""
+
+    index: int
+    time_ns: int
+    joints: tuple[Joint, Joint]
+    frames: Sequence[tuple[int, bytes]] = ()
+
+
+def write_log(path: Path, cycles: Sequence[Cycle]) -> Path:
+    """An MCAP file of these cycles."""
+    schemas, channels = definitions(None)
+    file = McapFile(
+        path, schemas=schemas, channels=channels, attachments=[], block_parts=BLOCK_PARTS, time_ns=1
+    )
+    recording = Recording(file, JointStateMessage(("a", "b"), (1.0, 1.0)), 500_000_000, print)
+    for cycle in cycles:
+        recording.add(_record(cycle))
+    assert recording.finish()
+    return path
+
+
+def regular(count: int, joints: Callable[[int], tuple[Joint, Joint]], start: int = 100) -> list[Cycle]:
+    """`count` cycles, 1 ms apart, the first numbered `start`."""
+    return [Cycle(start + n, 7_000_000_000 + n * 1_000_000, joints(n)) for n in range(count)]
+
+
+def temperature(node: int, celsius: float) -> tuple[int, bytes]:
+    """TPDO3 of a drive."""
+    return 0x380 + node, struct.pack("<h", round(10 * celsius))
+
+
+def _record(cycle: Cycle) -> bytes:
+    record = bytearray(cr.RECORD_SIZE)
+    nan = math.nan
+    blocks: list[float] = []
+    for joint in cycle.joints:
+        blocks += [*joint[:5], nan, nan, nan, nan, nan, 1e-3, joint.statusword, 0, 0, joint.input_flags]
+    counts = (cycle.index % 240 + 1, len(cycle.frames), 0, 0, 0, 0, 0, 0)
+    cr.HEAD.pack_into(
+        record, 0, cycle.index, cycle.time_ns, START_NS + cycle.time_ns, 15, 0, 0, 0, *counts, *blocks
+    )
+    for n, (can_id, data) in enumerate(cycle.frames):
+        struct.pack_into("<IB3x8s", record, cr.FRAMES_OFFSET + 16 * n, can_id, len(data), data)
+    cr.TAIL.pack_into(record, cr.TAIL_OFFSET, cycle.index)
+    return bytes(record)

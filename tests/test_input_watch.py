@@ -1,0 +1,86 @@
+"""Which joint lost its inputs, and why: one line, from the snapshot alone."""
+
+import pytest
+
+from daemon.config import load_config
+from daemon.input_watch import InputWatch
+from estimator.status import OFF, STALE
+from tests.watch_views import NAN, WELL, view
+
+STALE_NO_MOTION = WELL._replace(torque_nm=NAN, status=STALE, input_flags=1 | 4)
+
+
+def told(lost, before=None, seconds=0.5):
+    """Lines of a loss that follows healthy readings."""
+    watch = InputWatch(load_config(None))
+    lines = watch.lines(before or view(0), 0.0)
+    for n in range(1, round(seconds / 0.05) + 1):
+        lines += watch.lines(lost, 0.05 * n)
+    return lines
+
+
+def test_healthy_and_switched_off_joints_are_no_news():
+    assert told(view(8, two=WELL._replace(status=OFF, torque_nm=NAN)), seconds=10) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "cause"),
+    [
+        ({}, "281h drive 1 TPDO2 not received in time"),
+        ({"late_frames": 9}, "281h drive 1 TPDO2 not received in time (late frames on the bus)"),
+        (
+            {"rejected_frames": 9},
+            "281h drive 1 TPDO2 not received in time (frames of a wrong format on the bus)",
+        ),
+        ({"foreign_sync": 1}, "another SYNC is on the bus"),
+        ({"sync_errors": 1}, "the own SYNC waits in the transmit queue"),
+        ({"bus_errors": 1, "late_frames": 3}, "the bus is down"),
+        ({"states": {1: 4}}, "node 1 is stopped"),
+        ({"states": {1: 127}, "bus_errors": 1}, "node 1 is pre-operational"),
+        ({"unconfigured": (1,), "states": {1: 127}}, "node 1 has restarted and is not configured yet"),
+        ({"unconfigured": (2, 3)}, "281h drive 1 TPDO2 not received in time"),
+    ],
+)
+def test_joint_and_likeliest_cause_are_named(options, cause):
+    assert told(view(8, STALE_NO_MOTION, **options)) == [f"joint 1: inputs lost: {cause}"]
+
+
+def test_counters_that_rose_before_the_loss_are_no_cause():
+    before = view(0, foreign_sync=5, late_frames=7)
+    lost = view(8, STALE_NO_MOTION, foreign_sync=5, late_frames=7)
+    assert told(lost, before) == ["joint 1: inputs lost: 281h drive 1 TPDO2 not received in time"]
+
+
+def test_every_missing_pdo_is_named_and_a_late_estimate_is_not_blamed_on_them():
+    nothing = STALE_NO_MOTION._replace(input_flags=4)
+    both = "182h drive 2 TPDO1 and 282h drive 2 TPDO2 not received in time"
+    assert told(view(8, two=nothing)) == [f"joint 2: inputs lost: {both}"]
+    late = STALE_NO_MOTION._replace(input_flags=7)
+    assert told(view(8, two=late)) == ["joint 2: inputs lost: the estimate is not ready before the next SYNC"]
+
+
+def test_inputs_that_are_missing_from_the_first_cycle_on_are_told():
+    assert told(view(8, STALE_NO_MOTION), before=view(0, STALE_NO_MOTION)) != []
+
+
+@pytest.mark.parametrize(
+    ("flags", "status", "cause"),
+    [
+        (3, 0, "not received in time"),
+        (7, 1, "says not valid"),
+        (7, 2, "says positive overload"),
+        (7, 5, "says not valid, negative overload"),
+    ],
+)
+def test_the_sensor_has_its_own_line(flags, status, cause):
+    joint = WELL._replace(sensor_nm=NAN, sensor_status=status, input_flags=flags)
+    assert told(view(8, joint)) == [f"joint 1: torque sensor lost: 183h sensor 3 channel 1 {cause}"]
+
+
+def test_the_end_is_told():
+    watch = InputWatch(load_config(None))
+    lines = []
+    for n in range(100):
+        lost = 20 <= n < 60
+        lines += watch.lines(view(8 * n, STALE_NO_MOTION if lost else WELL), 0.05 * n)
+    assert lines[1:] == ["joint 1: inputs back after 2.0 s"]
