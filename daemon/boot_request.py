@@ -14,7 +14,13 @@ _OWN_EDS = Path(__file__).resolve().parent.parent / "drivers" / "eds" / "jtqd.ed
 def boot_request(config: Config, bus: str, only: int | None = None) -> dict[str, Any]:
     """Request for all nodes, or for the one that came back while our own SYNC is running."""
     nodes: list[dict[str, Any]] = [
-        {"node": joint.node_id, "kind": "drive", "identity": asdict(joint.identity), "given": joint.given}
+        {
+            "node": joint.node_id,
+            "kind": "drive",
+            "identity": asdict(joint.identity),
+            "given": joint.given,
+            "temperature": joint.temperature,
+        }
         for joint in config.joints
     ]
     if config.sensor is not None:

@@ -16,6 +16,10 @@ from models.files import load_joint, load_yaml, shipped
 
 DEFAULT_CONFIG = "bench.yaml"
 _MAX_NODE_ID = 127
+_NEEDED = {"tob": (), "efficiency": ("efficiency",), "network": ("efficiency",), "fused": ("fused",)}
+"""Sections of a joint file that a method cannot do without."""
+_WITH_NETWORK = ("network", "fused")
+"""Methods that use one; `fused` is its physics alone without."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,8 @@ class JointConfig:
     joint: Joint
     network: NetworkFile | None
     sensor_channel: int | None
+    temperature: bool
+    """The drive tells the joint's temperature (3001h by TPDO3)."""
 
 
 @dataclass(frozen=True)
@@ -205,6 +211,7 @@ def _joint(top: Section, path: Path, number: int, method: str, sensor: SensorCon
             else "no channel without a sensor"
         )
         raise section.error("sensor_channel", channel, expected)
+    temperature = section.boolean("temperature", default=False)
     network = _network(section.section("network", optional=True), path)
     section.finish()
     joint = load_joint(joint_path)
@@ -212,13 +219,14 @@ def _joint(top: Section, path: Path, number: int, method: str, sensor: SensorCon
         raise ConfigError(
             f"{path}: key '{key}.network': missing, expected file and sha256 because estimator.method is network"
         )
-    if method != "tob" and joint.efficiency is None:
-        raise ConfigError(
-            f"{joint_path}: key 'efficiency': missing, expected because estimator.method is {method}"
-        )
-    return JointConfig(
-        number, node, identity, given, joint_path, joint, network if method == "network" else None, channel
-    )
+    for needed in _NEEDED[method]:
+        if getattr(joint, needed) is None:
+            raise ConfigError(
+                f"{joint_path}: key '{needed}': missing, expected because estimator.method is {method}"
+            )
+    if method not in _WITH_NETWORK:
+        network = None
+    return JointConfig(number, node, identity, given, joint_path, joint, network, channel, temperature)
 
 
 def _network(section: Section | None, path: Path) -> NetworkFile | None:

@@ -27,7 +27,7 @@ from drivers.errors import BusDown
 from drivers.frame import pack
 from drivers.frame_socket import FrameSocket
 from estimator import status as st
-from estimator.joint_estimator import JointEstimator
+from estimator.methods import AnyEstimator
 
 _STARTING_CYCLES = 20
 """Cycles at the start that are published as "starting": the arrival bands and the filters see their first inputs."""
@@ -59,7 +59,7 @@ class Cycle:
         self,
         socket: FrameSocket,
         intake: Intake,
-        joints: Sequence[tuple[JointInputs, JointEstimator]],
+        joints: Sequence[tuple[JointInputs, AnyEstimator]],
         ring: Ring,
         snapshot: Snapshot,
         *,
@@ -75,6 +75,8 @@ class Cycle:
             JointCycle(number, inputs, estimator, intake=intake, snapshot=snapshot, period_ns=grid.period_ns)
             for number, (inputs, estimator) in enumerate(joints)
         ]
+        self._temperatures = intake.temperatures
+        self._temperature_ids = frozenset(each.cob_id for each in intake.temperatures)
         self._frames = CycleFrames(ring.slot())
         self._counters = LoopCounters(snapshot, intake, socket)
         self._overflow = counter_overflow
@@ -141,6 +143,8 @@ class Cycle:
         if intake.close():
             self._flags |= cr.FLAG_COMPLETE
             self._adapt_wait(intake.last_delay_ns)
+        for temperature in self._temperatures:
+            temperature.at(self.index)
         if intake.unconfigured:
             self._see_configured()
         if intake.sync_stamp_ns:
@@ -168,7 +172,7 @@ class Cycle:
             self._flags |= cr.FLAG_PUBLISHED
             if time.monotonic_ns() < self.grid.slot_ns + self.grid.period_ns:
                 self._flags |= cr.FLAG_BEFORE_NEXT_SYNC
-        self._frames.keep_own(frame, time.monotonic_ns() + self._realtime_offset_ns)
+        self._frames.keep_one(frame, time.monotonic_ns() + self._realtime_offset_ns)
         if self.index >= self._heartbeat_due:
             self._heartbeat_due = self.index + self._heartbeat_cycles
             self._send(self._heartbeat)
@@ -217,6 +221,7 @@ class Cycle:
         count = self._receive()
         if count:
             intake.drain(self.socket.frames, self.socket.stamps_ns, self.socket.own, count)
+            self._frames.hold(self.socket.frames, self.socket.stamps_ns, count, self._temperature_ids)
         if not intake.gap_wanted:
             return False
         intake.gap()

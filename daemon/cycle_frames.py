@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from daemon import cycle_record as cr
 
@@ -20,12 +20,26 @@ class CycleFrames:
     def __init__(self, slot: memoryview) -> None:
         self.slot = slot
         self.count = self.left_out = 0
+        self._held: list[tuple[bytes, int]] = []
         self._stamps = [struct.Struct(f"<{n}q") for n in range(cr.FRAME_CAPACITY + 1)]
 
     def begin(self, slot: memoryview) -> None:
         """The next frames belong to this record."""
         self.slot = slot
         self.count = self.left_out = 0
+        if self._held:
+            for frame, stamp_ns in self._held:
+                self.keep_one(frame, stamp_ns)
+            self._held.clear()
+
+    def hold(
+        self, frames: bytearray, stamps_ns: Sequence[int], count: int, identifiers: Collection[int]
+    ) -> None:
+        """Keep frames of a slot without a record for the next one that has one: those with these identifiers."""
+        for n in range(count):
+            frame = bytes(frames[16 * n : 16 * n + 16])
+            if int.from_bytes(frame[:4], "little") in identifiers:
+                self._held.append((frame, stamps_ns[n]))
 
     def keep(self, frames: bytearray, stamps_ns: Sequence[int], count: int) -> None:
         """Copy `count` received frames; `stamps_ns` are CLOCK_REALTIME."""
@@ -41,8 +55,8 @@ class CycleFrames:
         self._stamps[count].pack_into(self.slot, cr.STAMPS_OFFSET + 8 * stored, *stamps_ns[:count])
         self.count = stored + count
 
-    def keep_own(self, frame: bytes, stamp_ns: int) -> None:
-        """Copy a frame of our own that was handed to the socket at `stamp_ns` (CLOCK_REALTIME)."""
+    def keep_one(self, frame: bytes, stamp_ns: int) -> None:
+        """Copy one frame; of our own, `stamp_ns` (CLOCK_REALTIME) is when it was handed to the socket."""
         stored = self.count
         if stored >= cr.FRAME_CAPACITY:
             self.left_out += 1

@@ -1,6 +1,6 @@
 """The record of one cycle as it lies in shared memory: one fixed-size struct, written by the loop, read by the recorder.
 
-Little endian, 632 bytes, no padding decided by a compiler:
+Little endian, 648 bytes, no padding decided by a compiler:
 
     header   index, times, flags and counters of the cycle
     joints   two blocks of the same layout: inputs in SI units and every stage of the estimate
@@ -17,7 +17,7 @@ import struct
 from collections.abc import Collection
 from typing import NamedTuple
 
-JOINT_FORMAT = "11d4H"
+JOINT_FORMAT = "12d4H"
 HEADER_FORMAT = "QqqIIiI8B"
 FRAME_CAPACITY = 16
 
@@ -76,6 +76,8 @@ class JointRecord(NamedTuple):
     motor_velocity_rad_s: float
     link_position_rad: float
     sensor_torque_nm: float
+    temperature_c: float
+    """Of the joint, as its drive told last; NaN where it told none for 2 s."""
     torque_nm: float
     sigma_nm: float
     tob_nm: float
@@ -86,7 +88,7 @@ class JointRecord(NamedTuple):
     status: int
     sensor_status: int
     input_flags: int
-    """Bit n set: input n of this joint (0 TPDO1, 1 TPDO2, 2 sensor) is of this cycle."""
+    """Bit n set: input n of this joint (0 TPDO1, 1 TPDO2, 2 sensor) is of this cycle; bit 3: temperature_c is known."""
 
 
 def selection(header: Collection[str], joint: Collection[str]) -> struct.Struct:

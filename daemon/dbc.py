@@ -11,7 +11,17 @@ from typing import TYPE_CHECKING, Any
 
 from daemon.estimate_pdo import NO_TORQUE, SIGMA_UNIT_NM, SIGMA_UNKNOWN, TORQUE_UNIT_NM
 from daemon.mcap_schemas import STATUS_NAMES
-from drivers.devices import drive_tpdo1, drive_tpdo2, estimate_tpdo, sensor_tpdo1, sensor_tpdo2
+from drivers.devices import (
+    NOT_MEASURED,
+    TEMPERATURE,
+    TEMPERATURE_C_PER_UNIT,
+    drive_tpdo1,
+    drive_tpdo2,
+    drive_tpdo3,
+    estimate_tpdo,
+    sensor_tpdo1,
+    sensor_tpdo2,
+)
 from drivers.pdo import PdoMap
 
 if TYPE_CHECKING:
@@ -163,6 +173,11 @@ def dbc_text(config: Config, report: Mapping[str, Any]) -> str:
             (motion.cob_id, 0x606C, 0): Quantity(scaling["motor_rad_s_per_unit"], "rad/s"),
             (motion.cob_id, 0x6078, 0): Quantity(scaling["ampere_per_unit"], "A"),
         }
+        if joint.temperature:
+            pdo3 = drive_tpdo3(node)
+            maps.append(pdo3)
+            degrees = Quantity(TEMPERATURE_C_PER_UNIT, "degC", {NOT_MEASURED: "not_measured"})
+            quantities[pdo3.cob_id, *TEMPERATURE] = degrees
     if config.sensor is not None:
         node = config.sensor.node_id
         names[node] = "torque_sensor"

@@ -1,10 +1,11 @@
-"""The PDOs that the loop waits for, by configuration."""
+"""The PDOs that the loop waits for, and those that it takes when they come, by configuration."""
 
 from __future__ import annotations
 
 from daemon.config import Config
 from daemon.intake import InputPdo
-from drivers.devices import drive_tpdo1, drive_tpdo2, sensor_tpdo1, sensor_tpdo2
+from daemon.temperature import LIFE_S, JointTemperature
+from drivers.devices import drive_tpdo1, drive_tpdo2, drive_tpdo3, sensor_tpdo1, sensor_tpdo2
 from drivers.pdo import PdoMap
 
 
@@ -31,3 +32,14 @@ def sensor_index(config: Config, channel: int | None) -> int | None:
     if channel is None or config.sensor is None:
         return None
     return 2 * len(config.joints) + config.sensor.channels.index(channel)
+
+
+def joint_temperatures(config: Config) -> list[JointTemperature]:
+    """Temperature of each joint whose drive tells one, in the order of the joints; all unknown yet."""
+    life = round(LIFE_S * 1e9 / config.period_ns)
+    return [
+        JointTemperature(cob_id, node, f"{cob_id:03X}h drive {node} TPDO3", life)
+        for node, cob_id in (
+            (j.node_id, drive_tpdo3(j.node_id).cob_id) for j in config.joints if j.temperature
+        )
+    ]

@@ -1,4 +1,4 @@
-"""Lines for the operator when a joint's inputs or its torque sensor are lost and come back, with the cause.
+"""Lines for the operator when a joint's inputs, torque sensor or temperature are lost and come back, with the cause.
 
 Pure: readings of the snapshot and times in, lines out. It runs in the supervisor, so that no line costs the loop anything.
 """
@@ -10,10 +10,11 @@ from functools import partial
 from math import isfinite
 
 from daemon.config import Config
-from daemon.input_pdos import input_pdos, sensor_index
-from daemon.joint_cycle import FLAG_MOTION, FLAG_POSITION, FLAG_SENSOR
+from daemon.input_pdos import input_pdos, joint_temperatures, sensor_index
+from daemon.joint_cycle import FLAG_MOTION, FLAG_POSITION, FLAG_SENSOR, FLAG_TEMPERATURE
 from daemon.presence import Presence
 from daemon.snapshot import JointView, View
+from daemon.temperature import LIFE_S
 from estimator.status import STALE
 
 _STATES = {4: "stopped", 127: "pre-operational"}
@@ -40,9 +41,11 @@ class _Joint:
     node: int
     names: tuple[str, str]
     sensor: str | None
+    temperature: str | None
     well: dict[str, int] = field(default_factory=dict)
     inputs: Presence = field(default_factory=Presence)
     reference: Presence = field(default_factory=Presence)
+    warmth: Presence = field(default_factory=Presence)
 
 
 class InputWatch:
@@ -50,12 +53,14 @@ class InputWatch:
 
     def __init__(self, config: Config) -> None:
         names = [pdo.name for pdo in input_pdos(config)]
+        temperatures = {each.node_id: each.name for each in joint_temperatures(config)}
         self._joints = []
         for n, joint in enumerate(config.joints):
             sensor = sensor_index(config, joint.sensor_channel)
             own = (names[2 * n], names[2 * n + 1])
+            reference = None if sensor is None else names[sensor]
             self._joints.append(
-                _Joint(joint.number, joint.node_id, own, None if sensor is None else names[sensor])
+                _Joint(joint.number, joint.node_id, own, reference, temperatures.get(joint.node_id))
             )
 
     def lines(self, view: View, now_s: float) -> list[str]:
@@ -68,12 +73,18 @@ class InputWatch:
             line = joint.inputs.update(stale, now_s, partial(_cause, joint, seen, view))
             if line:
                 said.append(f"joint {joint.number}: inputs {line}")
-            if joint.sensor is None:
-                continue
-            gone = not isfinite(seen.sensor_nm)
-            line = joint.reference.update(gone, now_s, partial(_sensor_cause, joint, seen))
-            if line:
-                said.append(f"joint {joint.number}: torque sensor {line}")
+            if joint.sensor is not None:
+                gone = not isfinite(seen.sensor_nm)
+                line = joint.reference.update(gone, now_s, partial(_sensor_cause, joint, seen))
+                if line:
+                    said.append(f"joint {joint.number}: torque sensor {line}")
+            if joint.temperature is not None:
+                # It comes twice a second: at the start nobody can have it yet.
+                gone = not seen.input_flags & FLAG_TEMPERATURE and view.cycle * view.period_s > LIFE_S
+                cause = f"{joint.temperature} not received for {LIFE_S:g} s, or it says not measured"
+                line = joint.warmth.update(gone, now_s, partial(str, cause))
+                if line:
+                    said.append(f"joint {joint.number}: temperature {line}")
         return said
 
 

@@ -22,6 +22,9 @@ the same PDO can still be under way:
 * a SYNC that is not our own echo makes every input of the cycle doubtful: none is used;
 * a node that sent its boot-up message has lost its PDO mapping: its PDOs are not used until it is configured again.
 
+A joint's temperature (TPDO3) is not bound to SYNC: it belongs to no cycle, nobody waits for it, and none of the above but
+the last two rules concerns it (`daemon/temperature.py`).
+
 Pure: bytes and stamps in, values and counters out; no clock, no socket.
 """
 
@@ -30,6 +33,8 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+
+from daemon.temperature import JointTemperature
 
 _HEAD = struct.Struct("<IB")
 _SYNC_COB_ID = 0x080
@@ -119,13 +124,16 @@ class Intake:
 
     Args:
         pdos: the expected PDOs; results are indexed in this order.
+        temperatures: joint temperatures that may come at any time.
     """
 
-    def __init__(self, pdos: Sequence[InputPdo]) -> None:
+    def __init__(self, pdos: Sequence[InputPdo], temperatures: Sequence[JointTemperature] = ()) -> None:
         self.pdos = tuple(pdos)
+        self.temperatures = tuple(temperatures)
+        self._temperature_by_id = {temperature.cob_id: temperature for temperature in temperatures}
         self._states = [_State(pdo) for pdo in pdos]
         self._by_id = {state.pdo.cob_id: state for state in self._states}
-        if len(self._by_id) != len(self._states):
+        if len({*self._by_id, *self._temperature_by_id}) != len(self._states) + len(self.temperatures):
             raise ValueError("two inputs share a COB-ID")
         self._of_node: dict[int, list[_State]] = {}
         for state in self._states:
@@ -318,8 +326,8 @@ class Intake:
         return self._states
 
     def counters(self) -> dict[str, dict[str, int]]:
-        """Late, lost, duplicate and rejected frames by the PDO's name."""
-        return {
+        """Late, lost, duplicate and rejected frames by the PDO's name; of a temperature, how often it became unknown."""
+        counts = {
             state.pdo.name: {
                 "late": state.late,
                 "lost": state.lost,
@@ -328,6 +336,9 @@ class Intake:
             }
             for state in self._states
         }
+        for each in self.temperatures:
+            counts[each.name] = {"late": 0, "lost": each.lost, "duplicate": 0, "rejected": each.rejected}
+        return counts
 
     def _late(self, state: _State) -> None:
         state.late += 1
@@ -400,8 +411,13 @@ class Intake:
                 self.boot_ups += 1
                 self._unconfigured.add(node)
             return
+        temperature = self._temperature_by_id.get(can_id)
+        if temperature is not None:
+            if temperature.node_id not in self._unconfigured and not temperature.receive(frames, offset):
+                self.rejected_frames += 1
+            return
         identifier = can_id & _IDENTIFIER_MASK
-        named = self._by_id.get(identifier)
+        named = self._by_id.get(identifier) or self._temperature_by_id.get(identifier)
         if named is not None and can_id & (_EFF_FLAG | _RTR_FLAG):
             named.rejected += 1
             self.rejected_frames += 1

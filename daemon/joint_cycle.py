@@ -8,14 +8,15 @@ from math import inf, isnan, nan
 from daemon import estimate_pdo
 from daemon.intake import Intake
 from daemon.snapshot import COUNTERS, Snapshot
+from daemon.temperature import UNKNOWN
 from daemon.unwrap import Unwrap
 from estimator import status as st
-from estimator.joint_estimator import JointEstimator
+from estimator.methods import AnyEstimator
 
 STAMP_ACCURACY_NS = 5_000
 """Kernel software stamps differ by a few us from the time on the wire."""
-FLAG_POSITION, FLAG_MOTION, FLAG_SENSOR = 1, 2, 4
-"""`input_flags` of record and snapshot: TPDO1, TPDO2 and the sensor's PDO are of this cycle."""
+FLAG_POSITION, FLAG_MOTION, FLAG_SENSOR, FLAG_TEMPERATURE = 1, 2, 4, 8
+"""`input_flags` of record and snapshot: TPDO1, TPDO2 and the sensor's PDO are of this cycle; the temperature is known."""
 _POWERED = {0x27, 0x07}
 """Operation enabled and quick stop active (6041h masked with 6Fh): the states in which the motor carries current."""
 _FAULTS = {0x0F, 0x08}
@@ -31,6 +32,7 @@ class JointInputs:
         position: index of TPDO1 (motor position, link position).
         motion: index of TPDO2 (motor velocity, current, statusword).
         sensor: index of the sensor's PDO, None without reference.
+        temperature: index among the intake's temperatures, None where the drive tells none.
         motor_rad_per_count, motor_rad_s_per_unit, link_rad_per_count, ampere_per_unit, sensor_nm_per_unit: scaling, SI.
     """
 
@@ -42,6 +44,7 @@ class JointInputs:
     link_rad_per_count: float
     ampere_per_unit: float
     sensor_nm_per_unit: float
+    temperature: int | None = None
 
 
 class JointCycle:
@@ -73,6 +76,7 @@ class JointCycle:
         "_period_ns",
         "_position",
         "_sensor",
+        "_temperature",
         "estimator",
         "inputs",
         "published",
@@ -85,7 +89,7 @@ class JointCycle:
         self,
         number: int,
         inputs: JointInputs,
-        estimator: JointEstimator,
+        estimator: AnyEstimator,
         *,
         intake: Intake,
         snapshot: Snapshot,
@@ -95,13 +99,14 @@ class JointCycle:
         states = intake.views()
         self._position, self._motion = states[inputs.position], states[inputs.motion]
         self._sensor = None if inputs.sensor is None else states[inputs.sensor]
+        self._temperature = UNKNOWN if inputs.temperature is None else intake.temperatures[inputs.temperature]
         self._number = number
         self._counters, self._errors = snapshot.counters, snapshot.errors
         self._period_ns = period_ns
         self._last_ns = 0
         self._motor, self._link = Unwrap(), Unwrap()
         self.status = st.STARTING
-        self.sample: tuple[float, ...] = (nan,) * 11 + (0, 0, 0, 0)
+        self.sample: tuple[float, ...] = (nan,) * 12 + (0, 0, 0, 0)
         self.view: tuple[float, ...] = (nan,) * 6 + (0, 0, 0, 0)
         self.published = estimate_pdo.field(nan, inf, st.STARTING)
 
@@ -115,7 +120,7 @@ class JointCycle:
         """Take the estimate back: nothing of it goes out or is logged as published."""
         self.published = estimate_pdo.field(nan, inf, status)
         self.status = status
-        self.sample = (*self.sample[:5], nan, nan, *self.sample[7:12], status, *self.sample[13:])
+        self.sample = (*self.sample[:6], nan, nan, *self.sample[8:13], status, *self.sample[14:])
         self.view = (nan, nan, *self.view[2:7], status, *self.view[8:])
 
     def observe(self, sync_ns: int, starting: bool) -> None:
@@ -131,9 +136,12 @@ class JointCycle:
             raw, sensor_status = sensor.values
             if not sensor_status & 0x07:  # 6150h: not valid, positive or negative overload
                 sensor_nm = raw * inputs.sensor_nm_per_unit
+        temperature = self._temperature.celsius
+        if not isnan(temperature):
+            flags |= FLAG_TEMPERATURE
         if not (position.fresh and motion.fresh):
             flags |= position.fresh | motion.fresh << 1
-            self._stale(sensor_nm, sensor_status, flags)
+            self._stale(sensor_nm, temperature, sensor_status, flags)
             return
         flags |= FLAG_POSITION | FLAG_MOTION
         motor_counts, link_counts = position.values
@@ -148,7 +156,9 @@ class JointCycle:
             dt_ns = self._period_ns
         dt = dt_ns * 1e-9
         self._last_ns = sync_ns
-        estimate = self.estimator.step(dt, current, motor_position, motor_velocity, link_position)
+        estimate = self.estimator.step(
+            dt, current, motor_position, motor_velocity, link_position, temperature
+        )
         status = estimate.status
         if starting and status in estimate_pdo.PUBLISHED_STATUSES:
             status = st.STARTING
@@ -174,6 +184,7 @@ class JointCycle:
             motor_velocity,
             link_position,
             sensor_nm,
+            temperature,
             torque,
             sigma,
             tob,
@@ -202,9 +213,9 @@ class JointCycle:
             errors[2 * number] += (torque - sensor_nm) ** 2
             errors[2 * number + 1] += 1.0
 
-    def _stale(self, sensor_nm: float, sensor_status: int, flags: int) -> None:
+    def _stale(self, sensor_nm: float, temperature: float, sensor_status: int, flags: int) -> None:
         """An input of this cycle is missing: the observer keeps its state (the next dt is longer), nothing is published."""
         self.published = estimate_pdo.field(nan, inf, st.STALE)
         self.status = st.STALE
-        self.sample = (nan,) * 4 + (sensor_nm,) + (nan,) * 6 + (0, st.STALE, sensor_status, flags)
+        self.sample = (nan,) * 4 + (sensor_nm, temperature) + (nan,) * 6 + (0, st.STALE, sensor_status, flags)
         self.view = (nan,) * 5 + (sensor_nm, 0, st.STALE, sensor_status, flags)

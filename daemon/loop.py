@@ -23,17 +23,18 @@ from daemon.config import Config, JointConfig, load_config
 from daemon.cycle import Cycle
 from daemon.cycle_record import RECORD_SIZE
 from daemon.grid import Grid
-from daemon.input_pdos import input_pdos, sensor_index
-from daemon.intake import InputPdo, Intake
+from daemon.input_pdos import input_pdos, joint_temperatures, sensor_index
+from daemon.intake import Intake
 from daemon.joint_cycle import JointInputs
 from daemon.ring import Ring
 from daemon.snapshot import Snapshot
 from drivers.can_filter import CanFilter, look_alikes
+from drivers.devices import SYNC_COB_ID
 from drivers.errors import BusError, BusGone
 from drivers.frame_socket import FrameSocket, open_frame_socket
 from estimator.checked import ConfigError
-from estimator.joint_estimator import JointEstimator
-from estimator.network import NetworkError, TorqueNetwork
+from estimator.methods import AnyEstimator, load_network, make_estimator
+from estimator.network import NetworkError
 
 _WARM_UP_STEPS = 300
 
@@ -50,17 +51,22 @@ class _Stop:
         self.requested = True
 
 
-def build_estimator(config: Config, joint: JointConfig) -> JointEstimator:
+def build_estimator(config: Config, joint: JointConfig) -> AnyEstimator:
     """Estimator of one joint as configured; raises ConfigError or NetworkError."""
-    network = None
-    if joint.network is not None:
-        network = TorqueNetwork(joint.network.path, sha256=joint.network.sha256)
-    return JointEstimator(joint.joint, config.estimator, network)
+    method, network = config.estimator.method, None
+    try:
+        if joint.network is not None:
+            network = load_network(method, str(joint.network.path), joint.network.sha256)
+        return make_estimator(joint.joint, config.estimator, network)
+    except (ConfigError, NetworkError) as error:
+        key = f"joint_{joint.number}"
+        raise type(error)(f"{error} ({config.path}: '{key}', estimator.method is {method})") from None
 
 
 def _joint_inputs(config: Config, report: dict[str, Any]) -> list[JointInputs]:
     """Indices into `input_pdos` and the scaling that the boot read from the devices."""
     result = []
+    told = [joint.number for joint in config.joints if joint.temperature]
     for number, joint in enumerate(config.joints):
         drive = report["nodes"][str(joint.node_id)]["scaling"]
         sensor_nm = 0.0
@@ -77,25 +83,28 @@ def _joint_inputs(config: Config, report: dict[str, Any]) -> list[JointInputs]:
                 link_rad_per_count=drive["link_rad_per_count"],
                 ampere_per_unit=drive["ampere_per_unit"],
                 sensor_nm_per_unit=sensor_nm,
+                temperature=told.index(joint.number) if joint.temperature else None,
             )
         )
     return result
 
 
-def loop_filters(pdos: list[InputPdo], nodes: list[int]) -> list[CanFilter]:
-    """SYNC (own echo and foreign ones), the inputs, the nodes' heartbeats: nothing else wakes the loop.
+def loop_filters(config: Config) -> list[CanFilter]:
+    """SYNC (own echo and foreign ones), the inputs, temperatures, the nodes' heartbeats: nothing else wakes the loop.
 
     Each in every frame format, so that 29-bit and remote frames under our identifiers are seen and counted.
     """
-    wanted = [0x080, *(pdo.cob_id for pdo in pdos), *(0x700 + node for node in nodes)]
-    return [look_alikes(cob_id) for cob_id in wanted]
+    inputs = input_pdos(config)
+    pdos = [*(pdo.cob_id for pdo in inputs), *(each.cob_id for each in joint_temperatures(config))]
+    nodes = dict.fromkeys(pdo.node_id for pdo in inputs)
+    return [look_alikes(cob_id) for cob_id in (SYNC_COB_ID, *pdos, *(0x700 + node for node in nodes))]
 
 
-def warm_up(estimators: list[JointEstimator]) -> None:
+def warm_up(estimators: list[AnyEstimator]) -> None:
     """Run every estimator often enough that caches, allocators and the interpreter's specialisation have settled."""
     for estimator in estimators:
         for n in range(_WARM_UP_STEPS):
-            estimator.step(1e-3, 1.0 + 0.01 * (n % 7), 0.1 * n, 100.0, 0.001 * n)
+            estimator.step(1e-3, 1.0 + 0.01 * (n % 7), 0.1 * n, 100.0, 0.001 * n, 25.0)
         estimator.reset()
 
 
@@ -137,14 +146,13 @@ def _build(
     request: dict[str, Any],
     report: dict[str, Any],
     socket: FrameSocket,
-    estimators: list[JointEstimator],
+    estimators: list[AnyEstimator],
 ) -> tuple[Cycle, Grid]:
-    pdos = input_pdos(config)
     grid = Grid(0, config.period_ns)
     snapshot = Snapshot(Path(request["snapshot"]), config.period_ns * 1e-9, float(request["worst_load"]))
     cycle = Cycle(
         socket,
-        Intake(pdos),
+        Intake(input_pdos(config), joint_temperatures(config)),
         list(zip(_joint_inputs(config, report), estimators, strict=True)),
         Ring(Path(request["ring"]), config.ring_cycles, RECORD_SIZE),
         snapshot,
@@ -170,9 +178,7 @@ def serve(request: dict[str, Any]) -> int:
     line = _read_line(stop)
     if line is None:
         return 0
-    pdos = input_pdos(config)
-    nodes = [joint.node_id for joint in config.joints] + ([config.sensor.node_id] if config.sensor else [])
-    socket = open_frame_socket(request["bus"], loop_filters(pdos, nodes), receive_own=True)
+    socket = open_frame_socket(request["bus"], loop_filters(config), receive_own=True)
     cycle, grid = _build(config, request, json.loads(line), socket, estimators)
     refused = realtime.prepare(config.realtime.priority, config.realtime.cpu, config.realtime.lock_memory)
     realtime.freeze()

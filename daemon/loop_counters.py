@@ -67,6 +67,7 @@ class LoopCounters:
         counters[_INDEX["sync_errors"]] = intake.sync_errors
         counters[_INDEX["sync_gaps"]] = intake.gaps
         counters[_INDEX["boot_ups"]] = intake.boot_ups
+        counters[_INDEX["temperatures_lost"]] = sum(each.lost for each in intake.temperatures)
         counters[_INDEX["tx_dropped"]] = socket.tx_dropped
         counters[_INDEX["rx_dropped"]] = socket.rx_dropped
         counters[_INDEX["bus_errors"]] = self.bus_errors

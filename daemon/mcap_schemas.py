@@ -49,6 +49,7 @@ _JOINT_ESTIMATE = f"""\
 uint16 INPUT_TPDO1=1
 uint16 INPUT_TPDO2=2
 uint16 INPUT_SENSOR=4
+uint16 INPUT_TEMPERATURE=8  # not of this cycle: it was told at most 2 s ago
 
 # Bits of `cycle_flags`
 uint8 COMPLETE=1           # every expected input came before its deadline
@@ -64,6 +65,7 @@ float64 motor_position_rad      # [rad] motor side of the gear
 float64 motor_velocity_rad_s    # [rad/s] motor side of the gear
 float64 link_position_rad       # [rad] joint side of the gear
 float64 sensor_torque_nm        # [Nm] torque sensor (reference)
+float64 temperature_c           # [degC] joint temperature that the estimator was given; NaN where it is not known
 float64 torque_nm               # [Nm] the estimate that was published
 float64 sigma_nm                # [Nm] its standard deviation; half the interval at standstill
 float64 tob_nm                  # [Nm] stage: classical observer

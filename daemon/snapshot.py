@@ -28,6 +28,7 @@ COUNTERS = (
     "sync_errors",
     "sync_gaps",
     "boot_ups",
+    "temperatures_lost",
     "tx_dropped",
     "rx_dropped",
     "bus_errors",
@@ -42,7 +43,7 @@ WORK_BINS, WORK_BIN_NS = 500, 4_000
 LATE_BINS, LATE_BIN_NS = 250, 4_000
 _MAX_NODE = 128
 
-_MAGIC = 0x4A54_5144_5354_4102  # "JTQDSTA", layout 2
+_MAGIC = 0x4A54_5144_5354_4103  # "JTQDSTA", layout 3
 _HEAD = struct.Struct("<QQdd")
 _JOINT = struct.Struct("<6dHBBB3x")
 _ESTIMATE = struct.Struct("<qQq")

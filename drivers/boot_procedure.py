@@ -12,7 +12,10 @@ from typing import Protocol
 
 from drivers.boot_error import BootError, mismatch, no_answer, refused
 from drivers.devices import (
+    EVENT_DRIVEN,
+    EVENT_MS,
     OPERATING_MODE_OBJECT,
+    TEMPERATURE,
     DriveProfile,
     DriveScaling,
     Key,
@@ -34,6 +37,7 @@ _IDENTITY = (
 )
 _TPDO_COUNT = 4  # TPDOs of the predefined connection set: those not used are switched off
 _ABSENT = (NO_OBJECT, NO_SUBINDEX)
+_INHIBIT_TIME, _EVENT_TIMER = 3, 5  # sub-indices of a PDO's communication parameter
 
 
 class SdoSilence(Exception):  # noqa: N818  (not an error of this side)
@@ -90,6 +94,7 @@ class NodeBoot:
     def run(self, device_type: int) -> BootedNode:
         """All steps between `check_device_type`, whose result it takes, and error control and NMT start."""
         serial = self.check_identity()
+        self.check_temperature()
         self.configure_pdos()
         self.configure_sync()
         self.configure_heartbeat()
@@ -135,6 +140,16 @@ class NodeBoot:
             self._found[0x1018, subindex] = serial = found
         return serial
 
+    def check_temperature(self) -> None:
+        """3001h of a drive that shall tell its joint's temperature; the value does not matter here."""
+        profile = self._profile
+        if isinstance(profile, DriveProfile) and profile.temperature and self._optional(TEMPERATURE) is None:
+            expected = "a value (the configuration asks for it)"
+            what = "joint temperature"
+            raise mismatch(
+                self._node, TEMPERATURE, what, expected=expected, found="no such object", letter="J"
+            )
+
     def configure_pdos(self) -> None:
         """The profile's TPDOs, each written in the order of CiA 301; other TPDOs of 1..4 are switched off."""
         wanted = {(pdo.cob_id - 0x80) // 0x100: pdo for pdo in self._profile.tpdos}
@@ -163,6 +178,8 @@ class NodeBoot:
             self._write((mapping, entry), word, 4)
         self._write((mapping, 0), len(pdo.words), 1)
         self._write((communication, 2), pdo.transmission_type, 1)
+        if pdo.transmission_type in EVENT_DRIVEN:
+            self._configure_timer(communication)
         # the device's own RTR bit is kept: some accept one value only
         enabled = cob_id & NO_RTR | pdo.cob_id & CAN_ID
         self._write((communication, 1), enabled, 4)
@@ -172,6 +189,12 @@ class NodeBoot:
             self._compare((mapping, entry), word, 4, "mapping entry")
         self._compare((communication, 2), pdo.transmission_type, 1, "transmission type")
         self._compare((communication, 1), enabled, 4, "COB-ID")
+
+    def _configure_timer(self, communication: int) -> None:
+        """Event timer, and inhibit time where the node has one: a value that flickers must not fill the bus."""
+        if self._optional((communication, _INHIBIT_TIME)) is not None:
+            self._put((communication, _INHIBIT_TIME), 10 * EVENT_MS, 2, "inhibit time in 100 us")
+        self._put((communication, _EVENT_TIMER), EVENT_MS, 2, "event timer in ms")
 
     def configure_sync(self) -> None:
         """1005h must be the SYNC that jtqd sends; 1019h tells a node that has it of the counter byte."""

@@ -4,10 +4,11 @@
  "own_eds": "jtqd.eds",
  "sync": {"cob_id": 128, "counter_overflow": 240, "check_foreign": true},
  "nodes": [{"node": 1, "kind": "drive", "identity": {"vendor": 1953, "product": 1026}},
-           {"node": 2, "kind": "drive", "given": {"6091h:1": 100}},
+           {"node": 2, "kind": "drive", "given": {"6091h:1": 100}, "temperature": true},
            {"node": 3, "kind": "sensor", "channels": [1], "unit_words": {"0x00560000": 1.0}}]}
 
-Only "bus" and "nodes" with "node" and "kind" are needed. `given` replaces objects that are then not read.
+Only "bus" and "nodes" with "node" and "kind" are needed. `given` replaces objects that are then not read;
+`temperature` of a drive asks for TPDO3 with 3001h.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _TOP = {
     "master_timeout_ms",
     "answer_timeout_s",
 }
-_NODE = {"node", "kind", "identity", "channels", "given", "unit_words"}
+_NODE = {"node", "kind", "identity", "channels", "given", "unit_words", "temperature"}
 _SYNC = {"cob_id", "counter_overflow", "check_foreign"}
 
 
@@ -101,7 +102,10 @@ def _profile(raw: object, where: str) -> Profile:
         raise RequestError(f"{where}.given: {error}") from error
     kind = node.get("kind")
     if kind == "drive":
-        return DriveProfile(number, identity, given)
+        temperature = node.get("temperature", False)
+        if not isinstance(temperature, bool):
+            raise RequestError(f"{where}.temperature: found {temperature!r}, expected true or false")
+        return DriveProfile(number, identity, given, temperature)
     if kind != "sensor":
         raise RequestError(f"{where}.kind: found {kind!r}, expected 'drive' or 'sensor'")
     channels = node.get("channels", [1])

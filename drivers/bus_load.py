@@ -10,10 +10,12 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from drivers.devices import (
+    EVENT_MS,
     JTQD_NODE,
     SYNC_COB_ID,
     drive_tpdo1,
     drive_tpdo2,
+    drive_tpdo3,
     estimate_tpdo,
     sensor_tpdo1,
     sensor_tpdo2,
@@ -104,6 +106,12 @@ def pdo_row(who: str, pdo: PdoMap) -> Row:
     return Row(pdo.cob_id, who, pdo.length, 1.0 / pdo.transmission_type)
 
 
+def temperature_row(node: int, period_s: float = PERIOD_S) -> Row:
+    """TPDO3 of a drive: the boot's event timer and inhibit time let one come in EVENT_MS."""
+    pdo = drive_tpdo3(node)
+    return Row(pdo.cob_id, f"drive {node} TPDO3", pdo.length, period_s * 1e3 / EVENT_MS)
+
+
 def heartbeat_row(who: str, node: int, heartbeat_ms: int, period_s: float = PERIOD_S) -> Row:
     """Heartbeat of one node."""
     if heartbeat_ms < 1:
@@ -116,19 +124,24 @@ def configured_load(
     sensors: Mapping[int, tuple[int, ...]],
     *,
     sync_counter: bool = True,
+    temperatures: Iterable[int] = (),
     heartbeat_ms: int = 100,
     master: int = JTQD_NODE,
     extra: Iterable[Row] = (),
     bitrate: int = BITRATE,
     period_s: float = PERIOD_S,
 ) -> BusLoad:
-    """Load of drives (node numbers), sensors (node -> channels), SYNC, estimate, heartbeats and `extra`."""
+    """Load of drives (node numbers), sensors (node -> channels), SYNC, estimate, heartbeats and `extra`.
+
+    `temperatures`: nodes among the drives that tell their joint's temperature.
+    """
     rows = [sync_row(sync_counter), pdo_row("jtqd estimate", estimate_tpdo(master))]
     rows.append(heartbeat_row("jtqd", master, heartbeat_ms, period_s))
     for node in drives:
         rows.append(pdo_row(f"drive {node} TPDO1", drive_tpdo1(node)))
         rows.append(pdo_row(f"drive {node} TPDO2", drive_tpdo2(node)))
         rows.append(heartbeat_row(f"drive {node}", node, heartbeat_ms, period_s))
+    rows += [temperature_row(node, period_s) for node in temperatures]
     for node, channels in sensors.items():
         pdos = sensor_tpdo1(node), sensor_tpdo2(node)
         rows += [pdo_row(f"sensor {node} channel {channel}", pdos[channel - 1]) for channel in channels]

@@ -14,6 +14,8 @@ from drivers.boot_error import label, mismatch
 from drivers.pdo import MappedObject, PdoMap
 
 JTQD_NODE = 0x20
+COMMANDER_NODE = 0x21
+"""Who may command the drives beside jtqd; they watch its heartbeat by 1016h:2."""
 SYNC_COB_ID = 0x080
 
 Key = tuple[int, int]
@@ -34,6 +36,16 @@ UNIT_OBJECT, DECIMALS_OBJECT, OPERATING_MODE_OBJECT = 0x6131, 0x6132, 0x6112
 JOULE = 0x23  # CiA 303-2 code of J = Nm; the table has none of the newton metre that could be verified
 MAX_DECIMALS = 9
 
+TEMPERATURE: Key = (0x3001, 0)
+"""Joint temperature of a drive, I16."""
+TEMPERATURE_C_PER_UNIT = 0.1
+NOT_MEASURED = -0x8000
+"""3001h of a drive that has the object and no sensor behind it."""
+EVENT_MS = 500
+"""Event timer and inhibit time of an event-driven TPDO: at least, and at most, one in this time."""
+EVENT_DRIVEN = (254, 255)
+"""Transmission types of a PDO that its producer sends by itself."""
+
 
 @dataclass(frozen=True)
 class Identity:
@@ -47,17 +59,22 @@ class Identity:
 
 @dataclass(frozen=True)
 class DriveProfile:
-    """A CiA 402 drive as jtqd wants it. `given` replaces scaling objects that are then not read."""
+    """A CiA 402 drive as jtqd wants it. `given` replaces scaling objects that are then not read.
+
+    temperature: it has 3001h, and shall send it by TPDO3.
+    """
 
     node_id: int
     identity: Identity = Identity()
     given: Mapping[Key, int] = field(default_factory=dict)
+    temperature: bool = False
     profile_number = 402
 
     @property
     def tpdos(self) -> tuple[PdoMap, ...]:
-        """TPDO1 and TPDO2."""
-        return drive_tpdo1(self.node_id), drive_tpdo2(self.node_id)
+        """TPDO1 and TPDO2, and TPDO3 with the temperature."""
+        every = drive_tpdo1(self.node_id), drive_tpdo2(self.node_id), drive_tpdo3(self.node_id)
+        return every if self.temperature else every[:2]
 
     @property
     def scaling_objects(self) -> tuple[Key, ...]:
@@ -124,6 +141,11 @@ def drive_tpdo2(node: int) -> PdoMap:
     velocity = MappedObject(0x606C, 0, 32, True, "motor_velocity")
     current = MappedObject(0x6078, 0, 16, True, "current")
     return PdoMap(0x280 + node, (velocity, current, MappedObject(0x6041, 0, 16, False, "statusword")))
+
+
+def drive_tpdo3(node: int) -> PdoMap:
+    """380h+n: joint temperature, not bound to SYNC: when the event timer runs out (transmission type 255)."""
+    return PdoMap(0x380 + node, (MappedObject(*TEMPERATURE, 16, True, "temperature"),), 255)
 
 
 def drive_rpdo1(node: int) -> PdoMap:

@@ -14,7 +14,7 @@ result is the middle of what friction can hold, [tau_raw - L_+, tau_raw + L_-], 
 from __future__ import annotations
 
 from bisect import bisect_right
-from math import exp, tanh
+from math import exp, expm1, isnan, tanh
 from typing import Final
 
 import numpy as np
@@ -22,42 +22,42 @@ import numpy as np
 from estimator.friction import DIRECTION_VELOCITY_RAD_S, FloatArray
 from estimator.fused_parameters import AdditiveLoss, LossSide
 
-_ONE_SIDED: Final = 0.9999
-"""|s| from which the other direction no longer counts: |v| > 0.1 rad/s."""
+ONE_SIDED_RAD_S: Final = 20.0 * DIRECTION_VELOCITY_RAD_S
+"""|v| from which the other direction does not count at all: tanh(20) is 1 in float64."""
+
+_FARTHEST_K: Final = 40.0
+"""Temperatures farther from the fit's count as so far: no fit reaches beyond."""
+
+# load of a node, and c, f, q there, each with its slope per Nm to the next node
+_Row = tuple[float, float, float, float, float, float, float]
+
+
+def _rows(nodes: tuple[float, ...], side: LossSide) -> tuple[_Row, ...]:
+    """Return one line per interval of the load; row n ends at node n, rows 0 and len(nodes) lie outside."""
+    last = len(nodes) - 1
+    rows = []
+    for n in range(last + 2):
+        k = min(max(n - 1, 0), last - 1)  # the interval whose slope counts
+        start = last if n > last else k
+        inside = 0 < n <= last
+        width = nodes[k + 1] - nodes[k]
+        c, f, q = side.constant_nm, side.viscous_nms_per_rad, side.quadratic_nms2_per_rad2
+        slope_c, slope_f, slope_q = ((values[k + 1] - values[k]) / width for values in (c, f, q))
+        if not inside:
+            slope_f = slope_q = 0.0
+        rows.append((nodes[start], c[start], slope_c, f[start], slope_f, q[start], slope_q))
+    return tuple(rows)
 
 
 class _Side:
     """L_d of one direction as lines between nodes; beyond the outer nodes c goes on, f and q are held."""
 
-    __slots__ = ("_nodes", "_rows", "_stribeck", "constant", "quadratic", "viscous")
+    __slots__ = ("_nodes", "_rows", "_stribeck")
 
     def __init__(self, nodes: tuple[float, ...], side: LossSide) -> None:
-        c, f, q = side.constant_nm, side.viscous_nms_per_rad, side.quadratic_nms2_per_rad2
         self._nodes: Final = nodes
+        self._rows: Final = _rows(nodes, side)
         self._stribeck: Final = side.stribeck_nm
-        self.constant: Final = np.array(c)
-        self.viscous: Final = np.array(f)
-        self.quadratic: Final = np.array(q)
-        # index n: the interval that ends at node n; 0 and len(nodes) lie outside
-        rows = []
-        last = len(nodes) - 1
-        for n in range(len(nodes) + 1):
-            k = min(max(n - 1, 0), last - 1)
-            inside = 0 < n <= last
-            width = nodes[k + 1] - nodes[k]
-            start = k if n <= last else last
-            rows.append(
-                (
-                    nodes[start],
-                    c[start],
-                    (c[k + 1] - c[k]) / width,
-                    f[start],
-                    (f[k + 1] - f[k]) / width if inside else 0.0,
-                    q[start],
-                    (q[k + 1] - q[k]) / width if inside else 0.0,
-                )
-            )
-        self._rows: Final = tuple(rows)
 
     def value(self, load_nm: float, speed_rad_s: float, stribeck: float, thermal: float) -> float:
         """Return L_d [Nm]; stribeck: exp(-(a/vs)^2); thermal: h(T) [Nms/rad]."""
@@ -75,16 +75,10 @@ class _Side:
         self, load: FloatArray, speed: FloatArray, stribeck: FloatArray, thermal: FloatArray
     ) -> FloatArray:
         """Vectorised twin of `value`."""
-        nodes = np.array(self._nodes)
-        n = np.searchsorted(nodes, load, side="right")
-        rows = np.array(self._rows)[n]
-        x = load - rows[:, 0]
-        loss = (
-            rows[:, 1]
-            + rows[:, 2] * x
-            + self._stribeck * stribeck
-            + speed * (rows[:, 3] + rows[:, 4] * x + thermal + speed * (rows[:, 5] + rows[:, 6] * x))
-        )
+        n = np.searchsorted(self._nodes, load, side="right")
+        node, c, dc, f, df, q, dq = np.array(self._rows)[n].T
+        x = load - node
+        loss = c + dc * x + self._stribeck * stribeck + speed * (f + df * x + thermal + speed * (q + dq * x))
         result: FloatArray = np.maximum(loss, 0.0)
         return result
 
@@ -105,24 +99,25 @@ class AdditiveLossModel:
         self._viscous: Final = loss.thermal_viscous_nms_per_rad
 
     def thermal(self, temperature_c: float) -> float:
-        """Return h(T) [Nms/rad]; 0 for NaN. Bounded to 40 K either way: no fit reaches further."""
+        """Return h(T) [Nms/rad]; 0 for a temperature that is not known (NaN)."""
         difference = temperature_c - self._t0
-        if difference != difference:  # NaN: not known
+        if isnan(difference):
             return 0.0
-        return self._viscous * (exp(-self._per_k * min(max(difference, -40.0), 40.0)) - 1.0)
+        return self._viscous * expm1(-self._per_k * min(max(difference, -_FARTHEST_K), _FARTHEST_K))
 
     def loss(self, raw_nm: float, velocity_rad_s: float, thermal: float) -> tuple[float, float]:
         """Return (loss, half) [Nm]: the loss, and half the width that friction leaves open at this speed."""
         v = velocity_rad_s
         a = v if v >= 0.0 else -v
-        a = min(a, self._vmax)
-        s = tanh(v * self._inverse_w0)
+        if a > self._vmax:
+            a = self._vmax
         y = a * self._inverse_vs
         stribeck = exp(-y * y)
-        if s > _ONE_SIDED:
+        if v >= ONE_SIDED_RAD_S:
             return self._positive.value(raw_nm, a, stribeck, thermal), 0.0
-        if s < -_ONE_SIDED:
+        if v <= -ONE_SIDED_RAD_S:
             return -self._negative.value(-raw_nm, a, stribeck, thermal), 0.0
+        s = tanh(v * self._inverse_w0)
         p = 0.5 * self._positive.value(raw_nm, a, stribeck, thermal)
         n = 0.5 * self._negative.value(-raw_nm, a, stribeck, thermal)
         return (1.0 + s) * p - (1.0 - s) * n, (p + n) * (1.0 - s * s)
@@ -130,16 +125,13 @@ class AdditiveLossModel:
     def loss_many(
         self, raw_nm: FloatArray, velocity_rad_s: FloatArray, temperature_c: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Vectorised twin of `loss` [n], temperature instead of its factor."""
+        """Vectorised twin of `loss`, arrays [n]; temperature_c in place of h(T), NaN where not known."""
         v = velocity_rad_s
         a = np.minimum(np.abs(v), self._vmax)
         s = np.tanh(v * self._inverse_w0)
         stribeck = np.exp(-((a * self._inverse_vs) ** 2))
-        difference = np.clip(temperature_c - self._t0, -40.0, 40.0)
+        difference = np.clip(temperature_c - self._t0, -_FARTHEST_K, _FARTHEST_K)
         thermal = self._viscous * np.expm1(-self._per_k * np.where(np.isnan(difference), 0.0, difference))
-        p = self._positive.value_many(raw_nm, a, stribeck, thermal)
-        n = self._negative.value_many(-raw_nm, a, stribeck, thermal)
-        both = 0.5 * ((1.0 + s) * p - (1.0 - s) * n)
-        loss = np.where(s > _ONE_SIDED, p, np.where(s < -_ONE_SIDED, -n, both))
-        half = np.where(np.abs(s) > _ONE_SIDED, 0.0, 0.5 * (p + n) * (1.0 - s * s))
-        return loss, half
+        p = 0.5 * self._positive.value_many(raw_nm, a, stribeck, thermal)
+        n = 0.5 * self._negative.value_many(-raw_nm, a, stribeck, thermal)
+        return (1.0 + s) * p - (1.0 - s) * n, (p + n) * (1.0 - s * s)

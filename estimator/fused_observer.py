@@ -11,18 +11,22 @@ reaches tau_raw through that filter, is exactly linear in c_n and s_n at every s
 
 from __future__ import annotations
 
-from math import cos, expm1, sin
+from math import cos, expm1, isinf, nan, sin
 from typing import Final, NamedTuple
 
 from estimator.fused_parameters import Torsion
 from estimator.parameters import Joint
+from estimator.tracking import RAW_LIMIT
 
 RIPPLE_ORDERS: Final = (2, 4)
 """Per motor revolution: twice the wave generator's turn, and its first harmonic."""
 
 
 class FusedObserved(NamedTuple):
-    """Outputs of one step; torques [Nm, joint side], velocities [rad/s, joint side], angles as filtered cos and sin."""
+    """Outputs of one step; torques [Nm, joint side], velocities [rad/s, joint side], angles as filtered cos and sin.
+
+    raw_nm is NaN where the torsion is impossible: the guard then starts again, as for an impossible motor torque.
+    """
 
     raw_nm: float
     joint_velocity_rad_s: float
@@ -36,11 +40,16 @@ class FusedObserved(NamedTuple):
 
 _new: Final = tuple.__new__
 
+_Inputs = tuple[float, float, float, float, float, float, float]
+"""What the filter takes: u = i Kt + J g w, v, torsion torque, cos 2, sin 2, cos 4, sin 4."""
+
 
 class FusedObserver:
     """Step-by-step observer of one joint; plain floats. torsion None: its torque is always 0."""
 
     __slots__ = (
+        "_cos2",
+        "_cos4",
         "_cubic",
         "_gear",
         "_inertia_rate",
@@ -50,10 +59,13 @@ class FusedObserver:
         "_link",
         "_link_rate",
         "_link_velocity",
+        "_others",
         "_rate",
+        "_sin2",
+        "_sin4",
         "_state",
         "_stiffness",
-        "_waves",
+        "_torsion_limit",
         "_zero",
     )
 
@@ -69,34 +81,60 @@ class FusedObserver:
         self._stiffness: Final = 0.0 if torsion is None else torsion.stiffness_nm_per_rad
         self._cubic: Final = 0.0 if torsion is None else torsion.cubic_nm_per_rad3
         self._zero: Final = 0.0 if torsion is None else torsion.zero_rad
-        waves: tuple[tuple[float, float, float], ...] = ()
-        if torsion is not None:
-            rows = zip(torsion.orders_per_motor_rev, torsion.cos_rad, torsion.sin_rad, strict=True)
-            waves = tuple(rows)
-        self._waves: Final = waves
-        self._last = self._state = (0.0,) * 7
+        self._torsion_limit: Final = RAW_LIMIT * joint.rated_torque_nm
+        waves = [] if torsion is None else _waves(torsion)
+        # the ripple angles are there anyway: a kinematic error of their orders costs no further cos and sin
+        two = [wave for wave in waves if wave[0] == RIPPLE_ORDERS[0]]
+        four = [wave for wave in waves if wave[0] == RIPPLE_ORDERS[1]]
+        self._cos2: Final = sum(c for _, c, _ in two)
+        self._sin2: Final = sum(s for _, _, s in two)
+        self._cos4: Final = sum(c for _, c, _ in four)
+        self._sin4: Final = sum(s for _, _, s in four)
+        self._others: Final = tuple(wave for wave in waves if wave[0] not in RIPPLE_ORDERS)
+        self._last: _Inputs = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        self._state: _Inputs = self._last
         self._link = self._link_velocity = 0.0
 
     def _inputs(
         self, current_a: float, motor_position_rad: float, motor_velocity_rad_s: float, link_position_rad: float
-    ) -> tuple[float, ...]:
-        """Return what the filter takes: u, v, torsion torque, cos 2, sin 2, cos 4, sin 4."""
+    ) -> _Inputs:
         angle = motor_position_rad
-        d = angle * self._inverse_gear - link_position_rad - self._zero
-        for order, c, s in self._waves:
-            a = order * angle
-            d -= c * cos(a) + s * sin(a)
-        c2 = cos(2.0 * angle)
-        s2 = sin(2.0 * angle)
+        c = cos(angle)  # of the angle itself: a multiple of a finite angle need not be finite
+        s = sin(angle)
+        c2 = c * c - s * s
+        s2 = 2.0 * c * s
+        c4 = c2 * c2 - s2 * s2
+        s4 = 2.0 * c2 * s2
+        d = (
+            angle * self._inverse_gear
+            - link_position_rad
+            - self._zero
+            - self._cos2 * c2
+            - self._sin2 * s2
+            - self._cos4 * c4
+            - self._sin4 * s4
+        )
+        if self._others:
+            d -= self._other_waves(angle)
         return (
             current_a * self._kt + self._inertia_rate * motor_velocity_rad_s,
             motor_velocity_rad_s * self._inverse_gear,
             d * (self._stiffness + self._cubic * d * d),
             c2,
             s2,
-            c2 * c2 - s2 * s2,
-            2.0 * c2 * s2,
+            c4,
+            s4,
         )
+
+    def _other_waves(self, angle: float) -> float:
+        """Return the part [rad] of the kinematic error whose orders are not RIPPLE_ORDERS."""
+        error = 0.0
+        for order, c, s in self._others:
+            a = order * angle
+            if isinf(a):
+                return nan
+            error += c * cos(a) + s * sin(a)
+        return error
 
     def start(
         self, current_a: float, motor_position_rad: float, motor_velocity_rad_s: float, link_position_rad: float
@@ -142,4 +180,11 @@ class FusedObserver:
         self._link_velocity = r = self._link_velocity + gone * (slope - self._link_velocity)
         self._link = link_position_rad
         raw = (zu - self._inertia_rate * motor_velocity_rad_s) * self._gear
+        if not -self._torsion_limit <= zt <= self._torsion_limit:  # NaN included
+            raw = nan
         return _new(FusedObserved, (raw, zv, r, zt, zc2, zs2, zc4, zs4))
+
+
+def _waves(torsion: Torsion) -> list[tuple[float, float, float]]:
+    """Return (order, cos, sin) of the kinematic error."""
+    return list(zip(torsion.orders_per_motor_rev, torsion.cos_rad, torsion.sin_rad, strict=True))

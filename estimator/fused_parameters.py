@@ -16,19 +16,24 @@ from estimator.checked import ConfigError, Section
 MAX_NODES: Final = 64
 
 
-def _numbers(section: Section, key: str, unit: str, count: int | None = None) -> tuple[float, ...]:
-    """Return a list of finite numbers; of length `count` where given."""
-    expected = f"a list of {'' if count is None else f'{count} '}finite numbers in {unit}"
+def _numbers(section: Section, key: str, unit: str, least: int, most: int) -> tuple[float, ...]:
+    """Return a list of `least` to `most` finite numbers."""
+    count = str(least) if least == most else f"{least} to {most}"
+    expected = f"a list of {count} finite numbers in {unit}"
     values = section.raw(key)
     if not isinstance(values, list) or not all(_finite(value) for value in values):
         raise section.error(key, values, expected)
-    if (count is not None and len(values) != count) or not 2 <= len(values) <= MAX_NODES:
+    if not least <= len(values) <= most:
         raise section.error(key, f"{len(values)} numbers", expected)
     return tuple(float(value) for value in values)
 
 
 def _finite(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _rising(values: tuple[float, ...]) -> bool:
+    return all(a < b for a, b in pairwise(values))
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,11 +47,11 @@ class LossSide:
 
     @classmethod
     def from_section(cls, section: Section, nodes: int) -> LossSide:
-        """Read the mapping `positive` or `negative` of `fused.loss`."""
+        """Read the mapping `positive` or `negative` of `fused.loss`; `nodes`: length of its lists."""
         side = cls(
-            constant_nm=_numbers(section, "constant_nm", "Nm", nodes),
-            viscous_nms_per_rad=_numbers(section, "viscous_nms_per_rad", "Nms/rad", nodes),
-            quadratic_nms2_per_rad2=_numbers(section, "quadratic_nms2_per_rad2", "Nms2/rad2", nodes),
+            constant_nm=_numbers(section, "constant_nm", "Nm", nodes, nodes),
+            viscous_nms_per_rad=_numbers(section, "viscous_nms_per_rad", "Nms/rad", nodes, nodes),
+            quadratic_nms2_per_rad2=_numbers(section, "quadratic_nms2_per_rad2", "Nms2/rad2", nodes, nodes),
             stribeck_nm=section.number("stribeck_nm", "Nm"),
         )
         section.finish()
@@ -57,8 +62,9 @@ class LossSide:
 class AdditiveLoss:
     """Loss as a function of load, speed, direction and temperature; piecewise linear in load, quadratic in speed.
 
-    load_nodes_nm: increasing; velocity_max_rad_s: fastest measured, faster counts as this; temperature_c: of
-    the fit; thermal_viscous_nms_per_rad: friction that falls as exp(-viscous_per_k (T - temperature_c)).
+    load_nodes_nm: increasing, the lists of both sides as long as it (else ConfigError); velocity_max_rad_s:
+    fastest measured, faster counts as this; temperature_c: of the fit; thermal_viscous_nms_per_rad: friction
+    that falls as exp(-viscous_per_k (T - temperature_c)).
     """
 
     load_nodes_nm: tuple[float, ...]
@@ -71,13 +77,21 @@ class AdditiveLoss:
     viscous_per_k: float
 
     def __post_init__(self) -> None:
-        if any(b <= a for a, b in pairwise(self.load_nodes_nm)):
-            raise ConfigError(f"fused.loss.load_nodes_nm: found {self.load_nodes_nm}, expected rising numbers")
+        nodes = self.load_nodes_nm
+        if len(nodes) < 2 or not _rising(nodes):
+            raise ConfigError(f"fused.loss.load_nodes_nm: found {nodes}, expected at least 2 rising numbers")
+        for side in (self.positive, self.negative):
+            lists = (side.constant_nm, side.viscous_nms_per_rad, side.quadratic_nms2_per_rad2)
+            if any(len(values) != len(nodes) for values in lists):
+                found = ", ".join(str(len(values)) for values in lists)
+                raise ConfigError(f"fused.loss: found lists of {found} numbers, expected {len(nodes)} as nodes")
 
     @classmethod
     def from_section(cls, section: Section) -> AdditiveLoss:
         """Read the mapping `fused.loss`."""
-        nodes = _numbers(section, "load_nodes_nm", "Nm")
+        nodes = _numbers(section, "load_nodes_nm", "Nm", 2, MAX_NODES)
+        if not _rising(nodes):
+            raise section.error("load_nodes_nm", list(nodes), "rising numbers")
         loss = cls(
             load_nodes_nm=nodes,
             positive=LossSide.from_section(section.required("positive"), len(nodes)),
@@ -109,20 +123,29 @@ class Torsion:
     @classmethod
     def from_section(cls, section: Section) -> Torsion:
         """Read the mapping `fused.torsion`."""
-        orders = _numbers(section, "orders_per_motor_rev", "1/rev")
+        orders = _numbers(section, "orders_per_motor_rev", "1/rev", 1, MAX_NODES)
         torsion = cls(
             stiffness_nm_per_rad=section.number("stiffness_nm_per_rad", "Nm/rad", above=0.0),
             cubic_nm_per_rad3=section.number("cubic_nm_per_rad3", "Nm/rad3"),
             zero_rad=section.number("zero_rad", "rad"),
             orders_per_motor_rev=orders,
-            cos_rad=_numbers(section, "cos_rad", "rad", len(orders)),
-            sin_rad=_numbers(section, "sin_rad", "rad", len(orders)),
+            cos_rad=_numbers(section, "cos_rad", "rad", len(orders), len(orders)),
+            sin_rad=_numbers(section, "sin_rad", "rad", len(orders), len(orders)),
         )
         section.finish()
         return torsion
 
 
-_SIGMAS: Final = ("current_nm", "viscous_nms_per_rad", "load", "torsion_nm", "torsion_load", "reference_nm")
+_SIGMA_UNITS: Final = {
+    "current_nm": "Nm",
+    "viscous_nms_per_rad": "Nms/rad",
+    "load": "1",
+    "torsion_nm": "Nm",
+    "torsion_load": "1",
+    "reference_nm": "Nm",
+}
+_FLOORS: Final = ("current_nm", "torsion_nm")
+"""Must be > 0: two paths that are both exact have no weights (0/0)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +155,7 @@ class FusedSigma:
     current path: current_nm, viscous_nms_per_rad |v|, load |tau_raw|, added as squares; torsion path:
     torsion_nm, torsion_load |tau|; reference_nm: of the torque sensor's zero from run to run, which every
     comparison contains. scale: factor per quadrant (QUADRANTS' order) so that the 90 % interval covers 90 %.
+    current_nm, torsion_nm and scale must be > 0 (else ConfigError).
     """
 
     current_nm: float
@@ -142,11 +166,23 @@ class FusedSigma:
     reference_nm: float
     scale: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
 
+    def __post_init__(self) -> None:
+        for key in _FLOORS:
+            if not getattr(self, key) > 0.0:
+                raise ConfigError(f"fused.sigma.{key}: found {getattr(self, key)!r}, expected a number > 0")
+        if not min(self.scale) > 0.0:
+            raise ConfigError(f"fused.sigma.scale: found {self.scale}, expected numbers > 0")
+
     @classmethod
     def from_section(cls, section: Section) -> FusedSigma:
         """Read the mapping `fused.sigma`."""
-        values = {key: section.number(key, low=0.0) for key in _SIGMAS}
-        a, b, c, d = _numbers(section, "scale", "1", 4)
+        values = {
+            key: section.number(key, unit, **({"above": 0.0} if key in _FLOORS else {"low": 0.0}))
+            for key, unit in _SIGMA_UNITS.items()
+        }
+        a, b, c, d = _numbers(section, "scale", "1", 4, 4)
+        if min(a, b, c, d) <= 0.0:
+            raise section.error("scale", [a, b, c, d], "4 numbers > 0")
         section.finish()
         return cls(**values, scale=(a, b, c, d))
 

@@ -3,7 +3,7 @@ socket, no clock.
 """
 
 from drivers.can_filter import CanFilter, exact
-from drivers.devices import JTQD_NODE, SYNC_COB_ID
+from drivers.devices import COMMANDER_NODE, JTQD_NODE, SYNC_COB_ID
 from sim_can.canopen_node import CanopenNode
 from sim_can.cia402 import OPERATION_ENABLED
 from sim_can.drive_node import DriveNode
@@ -11,7 +11,6 @@ from sim_can.profile import targets
 from sim_can.sensor_node import SENSOR_NODE, SensorNode
 from sim_can.source import OFF, VELOCITY, Source
 
-COMMANDER_NODE = 0x21  # who may command the drives beside jtqd, and is watched by 1016h:2
 LONGEST_STEP_NS = 50_000_000  # a source never jumps further than this, however long SYNC was away
 RESOLUTION_NS = (
     10_000  # a software stamp is no better; the plant then sees an exact grid wherever SYNC keeps one

@@ -19,21 +19,22 @@ UPDATE_S = 0.1  # of the temperature; with time constants of at least 10 s a ste
 class Thermal(NamedTuple):
     """Thermal behaviour of a joint (`thermal` of a plant file); the defaults are one that stays as it is."""
 
-    reference_c: float = REFERENCE_C  # where the joint file's friction holds; ambient of the nominal day
+    reference_c: float = REFERENCE_C  # where the joint file's friction holds
     viscous_per_k: float = 0.0
     coulomb_per_k: float = 0.0
     kelvin_per_w: float = 0.0
     time_constant_s: float = 600.0
+    ambient_c: float = REFERENCE_C  # surroundings of the nominal day
 
     @classmethod
     def from_section(cls, section: Section | None) -> "Thermal":
         """Checked values; a joint without this section keeps its temperature. Raises ConfigError."""
         if section is None:
             return cls()
+        reference_c = section.number("reference_c", unit="degC", low=-40.0, high=100.0, default=REFERENCE_C)
         thermal = cls(
-            reference_c=section.number(
-                "reference_c", unit="degC", low=-40.0, high=100.0, default=REFERENCE_C
-            ),
+            reference_c=reference_c,
+            ambient_c=section.number("ambient_c", unit="degC", low=-40.0, high=100.0, default=reference_c),
             viscous_per_k=section.number("viscous_per_k", unit="1/K", low=0.0, high=0.1, default=0.0),
             coulomb_per_k=section.number("coulomb_per_k", unit="1/K", low=0.0, high=0.1, default=0.0),
             kelvin_per_w=section.number("kelvin_per_w", unit="K/W", low=0.0, high=20.0, default=0.0),
@@ -55,10 +56,10 @@ class JointTemperature:
         self.start(0.0)
 
     def start(self, difference_k: float) -> None:
-        """Begin a day in surroundings of `difference_k` above the reference, with the joint as warm as
+        """Begin a day in surroundings of `difference_k` above the usual ones, with the joint as warm as
         these.
         """
-        self._ambient = self.celsius = self._thermal.reference_c + difference_k
+        self._ambient = self.celsius = self._thermal.ambient_c + difference_k
         self._heat_j = self._time_s = 0.0
         self._factors()
 

@@ -226,7 +226,9 @@ def _held(
         return []
     value = max(held, key=lambda v: held[v])
     extreme = value in (float(np.min(channel)), float(np.max(channel)))
-    comes_back = bool(np.any(channel[first[value] :] != value))  # what never moves again has not reached a limit
+    comes_back = bool(
+        np.any(channel[first[value] :] != value)
+    )  # what never moves again has not reached a limit
     saturated = extreme and comes_back
     quantity = name.rsplit(".", 1)[-1]
     unit = "Nm" if quantity == "torque_nm" else "A"

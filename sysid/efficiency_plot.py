@@ -35,7 +35,7 @@ def draw_fit(points: Sequence[EtaPoint], fit: EfficiencyFit, title: str, path: P
     for letter, name, axis in zip("abcd", QUADRANTS, axes.flat, strict=True):
         own = [point for point in points if point.quadrant == name]
         _panel(axis, own, fit, name, lambda speed: colours(norm(speed)))
-        axis.set_title(f"({letter}) {_panel_title(fit, name, len(own))}", fontsize=11, loc="left")
+        axis.set_title(f"({letter}) {_panel_title(fit, name, len(own))}", fontsize=10, loc="left")
         plain(axis)
     for axis in axes[1]:
         axis.set_xlabel("motor current i [A]")
@@ -56,6 +56,7 @@ def _panel(axis: Any, points: Sequence[EtaPoint], fit: EfficiencyFit, name: str,
     """Points with error bars of two standard errors; curves over the currents measured at each velocity."""
     if not points:
         axis.text(0.5, 0.5, "no plateau", transform=axis.transAxes, ha="center", va="center", color="#777777")
+        axis.set(xticks=[], yticks=[])
         return
     speeds = _groups([abs(point.plateau.velocity.value) for point in points])
     chosen = speeds

@@ -1,4 +1,4 @@
-"""`jtq excitation`: designs excitation runs and writes them as a plan, or compares the ways to design them."""
+"""`jtq excitation`: designs excitation runs and writes them as a plan, or compares the ways to get them."""
 
 from __future__ import annotations
 
@@ -9,99 +9,30 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, fields
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from estimator.arguments import count, natural, seconds
 from estimator.checked import ConfigError
 from estimator.parameters import Joint
 from models.files import load_joint, shipped
+from sim_can.plant_parameters import load_plant
 from sysid.campaign.plan import DEFAULT_LIMITS, Fourier, Plan, Rest, Run
 from sysid.campaign.segments import check_plan
 from sysid.excitation_compare import Row, compare, deviation_ratio, table_lines
 from sysid.excitation_design import FINAL_RATE_HZ, STARTS, Design, design
 from sysid.excitation_model import Bench, ExcitationLimits
+from sysid.excitation_options import COMPARED_EVALUATIONS, EVALUATIONS, LIMIT_OPTIONS, parser, problem_of
+from sysid.excitation_trial import HEADING, JUDGES, trial
 
-EVALUATIONS: Final = 2000
-COMPARED_EVALUATIONS: Final = 4000
 REST_S: Final = 1.0
 """Before and after each motion; two in a row make the 2 s at rest of the paper's section III."""
-_HELP: Final = {
-    "velocity_rad_s": ("--velocity", "rad/s", "peak velocity, joint side"),
-    "acceleration_rad_s2": ("--acceleration", "rad/s2", "peak acceleration, joint side"),
-    "travel_rad": ("--travel", "rad", "largest distance from the start"),
-    "current_a": ("--current", "A", "peak current of the driving joint"),
-    "joint_current_a": ("--joint-current", "A", "peak current that the velocity joint may need"),
-    "torque_nm": ("--torque", "Nm", "peak torque between the joints"),
-}
-_EXAMPLES: Final = """examples:
-  jtq excitation --out excitation.plan.yaml     then: jtq campaign excitation.plan.yaml --bus sim --out DIR
-  jtq excitation --count 4 --velocity 0.3 --seed 1 --json
-  jtq excitation --compare"""
-
-
-def parser() -> argparse.ArgumentParser:
-    """Options of `jtq excitation`."""
-    made = argparse.ArgumentParser(
-        prog="jtq excitation",
-        description="Design Fourier trajectories of velocity and driving current that tell the losses of a joint best "
-        "(genetic algorithm, D-optimality); --compare sets it beside other ways to find them.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    made.add_argument("--count", type=count, metavar="N", help="runs (default 8; --compare 1)")
-    made.add_argument(
-        "--duration", type=seconds, default=20.0, metavar="S", help="length of a run (default 20)"
-    )
-    made.add_argument("--harmonics", type=count, default=5, metavar="N", help="of each series (default 5)")
-    made.add_argument("--seed", type=natural, default=0, metavar="N", help="same seed, same runs (default 0)")
-    made.add_argument(
-        "--evaluations",
-        type=count,
-        metavar="N",
-        help=f"motions a search tries (default {EVALUATIONS}; --compare {COMPARED_EVALUATIONS})",
-    )
-    made.add_argument(
-        "--starts", type=count, metavar="N", help=f"searches per run, the best counts (default {STARTS})"
-    )
-    made.add_argument(
-        "--joints",
-        type=Path,
-        nargs=2,
-        metavar="FILE",
-        help="joint files of velocity joint and driving joint (default: those that ship)",
-    )
-    made.add_argument(
-        "--velocity-joint", type=int, choices=(1, 2), default=1, help="joint in velocity mode (default 1)"
-    )
-    made.add_argument(
-        "--compare", action="store_true", help="table of genetic algorithm, scipy's DE and random"
-    )
-    made.add_argument("--seeds", type=count, metavar="N", help="with --compare: seeds to try (default 5)")
-    made.add_argument(
-        "--out", type=Path, metavar="FILE", help="write the runs as a plan (jtq.plan/1) to this file"
-    )
-    made.add_argument("--json", action="store_true", help="print the result as JSON")
-    group = made.add_argument_group("limits that no run exceeds")
-    for one in fields(ExcitationLimits):
-        option, unit, text = _HELP[one.name]
-        group.add_argument(
-            option,
-            dest=one.name,
-            type=_positive,
-            default=one.default,
-            metavar="X",
-            help=f"{text} [{unit}] (default {one.default:g})",
-        )
-    return made
 
 
 def main(argv: list[str]) -> int:
     """Design or compare; exit status 0 done, 1 failure, 2 usage."""
     options = parser().parse_args(argv)
-    problem = _usage(options)
+    problem = problem_of(options)
     if problem:
         print(f"jtq excitation: {problem}", file=sys.stderr)
         return 2
@@ -112,6 +43,8 @@ def main(argv: list[str]) -> int:
         joints = _joints(options)
         if options.compare:
             return _compare(options, limits, joints)
+        if options.trial:
+            return _trial(options, limits, joints)
         return _design(options, limits, joints)
     except ConfigError as error:
         print(f"jtq excitation: {error}", file=sys.stderr)
@@ -120,27 +53,6 @@ def main(argv: list[str]) -> int:
     except OSError as error:
         print(f"jtq excitation: {error.filename or options.out}: {error.strerror or error}", file=sys.stderr)
     return 1
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected a number > 0")
-    return value
-
-
-def _usage(options: argparse.Namespace) -> str:
-    """What is wrong with the combination of options; empty when nothing is."""
-    if options.compare:
-        for name in ("out", "starts"):
-            if getattr(options, name) is not None:
-                return f"--{name} does not go with --compare"
-    elif options.seeds is not None:
-        return "--seeds belongs to --compare"
-    return ""
 
 
 def _joints(options: argparse.Namespace) -> tuple[Joint, Joint]:
@@ -175,7 +87,7 @@ def _compare(options: argparse.Namespace, limits: ExcitationLimits, joints: tupl
     print(
         f"-log det of the scaled information of {runs} of {options.duration:g} s: median, best, worst of {seeds} "
         "seeds; lower is better.\nCondition of the scaled regressor; standard deviation of the coefficients "
-        "against the first row; seconds per design."
+        "against the first row; processor seconds per design."
     )
     print("\n".join(table_lines(rows)))
     return 0
@@ -194,6 +106,33 @@ def _rows_mapping(
             for row in rows
         ],
     }
+
+
+def _trial(options: argparse.Namespace, limits: ExcitationLimits, joints: tuple[Joint, Joint]) -> int:
+    number, seeds = options.count or 4, options.seeds or 5
+    with _progress("emulated runs", JUDGES + 2 * seeds * number) as advance:
+        trials, floor_nm = trial(
+            limits,
+            load_plant(shipped("plant.yaml")),
+            joints,
+            count=number,
+            duration_s=options.duration,
+            harmonics=options.harmonics,
+            seed=options.seed,
+            seeds=seeds,
+            evaluations=options.evaluations or EVALUATIONS,
+            on_progress=advance,
+        )
+    if options.json:
+        content = {"schema": "jtq.excitation_trial/1", "floor_nm": floor_nm}
+        print(json.dumps({**content, "trials": [asdict(one) for one in trials]}))
+        return 0
+    print(
+        f"error [Nm] of the loss on {JUDGES} drawn runs after a fit to so many others; median and worst of {seeds} "
+        f"seeds\n(fitted to the judging runs themselves: {floor_nm:.2f})"
+    )
+    print("\n".join([HEADING, *(one.line() for one in trials)]))
+    return 0
 
 
 def _design(options: argparse.Namespace, limits: ExcitationLimits, joints: tuple[Joint, Joint]) -> int:
@@ -236,12 +175,12 @@ def _design(options: argparse.Namespace, limits: ExcitationLimits, joints: tuple
 
 def _require_within_campaign(limits: ExcitationLimits) -> None:
     """A plan stops the bench at the limits that it holds: no run in it may be allowed more. Raises ConfigError."""
-    for name in _HELP:
+    for name in LIMIT_OPTIONS:
         shared = "current_a" if name == "joint_current_a" else name
         highest = getattr(DEFAULT_LIMITS, shared, math.inf)
         if getattr(limits, name) > highest:
             raise ConfigError(
-                f"{_HELP[name][0]}: found {getattr(limits, name):g}, expected at most {highest:g} in a plan: "
+                f"{LIMIT_OPTIONS[name][0]}: found {getattr(limits, name):g}, expected at most {highest:g} in a plan: "
                 "beyond it a campaign stops"
             )
 

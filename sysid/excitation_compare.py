@@ -30,7 +30,7 @@ class Row:
 
     Attributes:
         method: its name. negative_log_det: one per seed, of all runs together; lower is better.
-        condition: median condition number of the scaled regressor. seconds: median time of a design.
+        condition: median condition number of the scaled regressor. seconds: median processor time of a design.
         evaluations: motions tried per run.
     """
 
@@ -85,9 +85,9 @@ def compare(
     for name, search, number in methods:
         values, conditions, times = [], [], []
         for each in range(seed, seed + seeds):
-            begin = time.perf_counter()
+            begin = time.process_time()
             designs, information = sequence(problem, search, count=count, seed=each, evaluations=number)
-            times.append(time.perf_counter() - begin)
+            times.append(time.process_time() - begin)
             values.append(-designs[-1].information_log_det)
             conditions.append(condition(information))
         rows.append(Row(name, tuple(values), median(conditions), median(times), number))

@@ -24,19 +24,26 @@ _UNITS: Final = (
 )
 
 
-class _OneLine(dict[str, Any]):
+class _Row(dict[str, Any]):
     """A mapping that is written as {key: value, ...}."""
 
 
+class _Numbers(list[Any]):
+    """A list that is written as [1.0, 2.0, ...]."""
+
+
 class _Dumper(yaml.SafeDumper):
-    """SafeDumper with indented lists, and short mappings of numbers on one line."""
+    """SafeDumper with indented lists; rows and lists of numbers on one line."""
 
     def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:
         super().increase_indent(flow, False)
 
 
 _Dumper.add_representer(
-    _OneLine, lambda dumper, value: dumper.represent_mapping("tag:yaml.org,2002:map", value, flow_style=True)
+    _Row, lambda dumper, value: dumper.represent_mapping("tag:yaml.org,2002:map", value, flow_style=True)
+)
+_Dumper.add_representer(
+    _Numbers, lambda dumper, value: dumper.represent_sequence("tag:yaml.org,2002:seq", value, flow_style=True)
 )
 
 
@@ -98,15 +105,19 @@ def write_joint(path: Path | str, joint: Joint, title: str) -> None:
 
 
 def _short(value: Any) -> Any:
-    """Mappings of a section's second level that hold plain numbers, on one line each: a quadrant is a row."""
+    """A section with what is below it laid out: lists of numbers, and mappings of numbers below the first level."""
     if isinstance(value, list):
-        return [_short(item) for item in value]
+        return _Numbers(value) if all(map(_number, value)) else [_short(item) for item in value]
+    if not isinstance(value, dict):
+        return value
     return {
-        key: _OneLine(item)
-        if isinstance(item, dict) and all(isinstance(number, int | float) for number in item.values())
-        else item
+        key: _Row(item) if isinstance(item, dict) and all(map(_number, item.values())) else _short(item)
         for key, item in value.items()
     }
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, int | float)
 
 
 def _dump(mapping: Mapping[str, Any]) -> str:

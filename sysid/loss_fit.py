@@ -69,12 +69,10 @@ def hat_values(load_nm: FloatArray) -> FloatArray:
     return out
 
 
-def _columns(
-    run: RunSignals, stribeck_velocity: float, warmer_k: float
-) -> tuple[FloatArray, FloatArray]:
+def _columns(run: RunSignals, stribeck_velocity: float, warmer_k: float) -> tuple[FloatArray, FloatArray]:
     """Return columns [n, _COMMON + 2] and target [n] of a run's moving samples."""
     keep = run.moving & (np.abs(run.seen.velocity_rad_s) > _MIN_SPEED_RAD_S)
-    keep &= (np.abs(run.seen.raw_nm) < 60.0)
+    keep &= np.abs(run.seen.raw_nm) < 60.0
     index = np.flatnonzero(keep)[::_EVERY]
     raw, v = run.seen.raw_nm[index], run.seen.velocity_rad_s[index]
     s, a = np.tanh(v / 0.02), np.abs(v)

@@ -47,7 +47,9 @@ class RunSignals:
 def same_age(sensor_nm: FloatArray, dt_s: FloatArray, bandwidth_rad_s: float) -> FloatArray:
     """Return the sensor through g/(s+g), first-order hold with the measured steps: as old as the estimate."""
     steps, index = np.unique(np.round(dt_s[1:], 7), return_inverse=True)
-    table = [first_order_hold(bandwidth_rad_s, float(step)) if step > 0 else (0.0, 1.0, 0.0) for step in steps]
+    table = [
+        first_order_hold(bandwidth_rad_s, float(step)) if step > 0 else (0.0, 1.0, 0.0) for step in steps
+    ]
     out = np.empty_like(sensor_nm)
     z = last = float(sensor_nm[0])
     out[0] = z
@@ -65,14 +67,22 @@ def run_signals(
     """Observe one joint of a run. Raises ValueError for a column that is missing or a sensor with NaN."""
     needed = {
         key: getattr(columns, key)
-        for key in ("current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad", "torque_nm")
+        for key in (
+            "current_a",
+            "motor_position_rad",
+            "motor_velocity_rad_s",
+            "link_position_rad",
+            "torque_nm",
+        )
     }
     missing = [key for key, column in needed.items() if column is None]
     if missing:
         raise ValueError(f"{name}: joint {joint.name}: the run has no {', '.join(missing)}")
     sensor = np.asarray(needed.pop("torque_nm"), np.float64)
     if not np.isfinite(sensor).all():
-        raise ValueError(f"{name}: joint {joint.name}: torque_nm has {int((~np.isfinite(sensor)).sum())} gaps")
+        raise ValueError(
+            f"{name}: joint {joint.name}: torque_nm has {int((~np.isfinite(sensor)).sum())} gaps"
+        )
     dt = np.diff(time_s, prepend=time_s[0])
     seen = observe_run(joint, settings, UNIT_TORSION, dt, *needed.values(), columns.temperature_c)
     settled = time_s - time_s[0] >= _SETTLE_S

@@ -1,10 +1,10 @@
 """Standard deviations of the fused estimator's paths and their calibration, from residuals on unseen runs. Pure.
 
-    e_c = tau_raw - loss - sensor,  e_t = tau_t - sensor         (each from a fit that had not seen the run)
-    reference^2 = covariance of the two paths' run means: what both share is the sensor's zero
-    e_c^2 - reference^2 ~ current^2 + (viscous v)^2 + (load tau_raw)^2,  e_t^2 - reference^2 ~ torsion^2 + (load tau_t)^2
-    scale_q = 90 % quantile of |error|/sigma in quadrant q, over 1.645: split conformal prediction by runs
-              (Vovk et al. 2005; Lei et al. 2018), every run weighted alike
+e_c = tau_raw - loss - sensor,  e_t = tau_t - sensor         (each from a fit that had not seen the run)
+reference^2 = covariance of the two paths' run means: what both share is the sensor's zero
+e_c^2 - reference^2 ~ current^2 + (viscous v)^2 + (load tau_raw)^2,  e_t^2 - reference^2 ~ torsion^2 + (load tau_t)^2
+scale_q = 90 % quantile of |error|/sigma in quadrant q, over 1.645: split conformal prediction by runs
+          (Vovk et al. 2005; Lei et al. 2018), every run weighted alike
 """
 
 from __future__ import annotations

@@ -74,6 +74,10 @@ def torsion_torque(torsion: Torsion, run: RunSignals) -> FloatArray:
     """Return tau_t [n] of observed signals, as FusedObserver gives it but for the order of filter and cube."""
     d = run.seen.torsion_nm - torsion.zero_rad
     for k in range(2):
-        d = d - torsion.cos_rad[k] * run.seen.waves[:, 2 * k] - torsion.sin_rad[k] * run.seen.waves[:, 2 * k + 1]
+        d = (
+            d
+            - torsion.cos_rad[k] * run.seen.waves[:, 2 * k]
+            - torsion.sin_rad[k] * run.seen.waves[:, 2 * k + 1]
+        )
     result: FloatArray = d * (torsion.stiffness_nm_per_rad + torsion.cubic_nm_per_rad3 * d * d)
     return result

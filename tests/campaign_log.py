@@ -65,7 +65,8 @@ def _record(cycle: Cycle) -> bytes:
     nan = math.nan
     blocks: list[float] = []
     for joint in cycle.joints:
-        blocks += [*joint[:5], nan, nan, nan, nan, nan, 1e-3, joint.statusword, 0, 0, joint.input_flags]
+        numbers = [*joint[:5], nan, nan, nan, nan, nan, nan, 1e-3]  # no temperature, no stage of an estimate
+        blocks += [*numbers, joint.statusword, 0, 0, joint.input_flags]
     counts = (cycle.index % 240 + 1, len(cycle.frames), 0, 0, 0, 0, 0, 0)
     cr.HEAD.pack_into(
         record, 0, cycle.index, cycle.time_ns, START_NS + cycle.time_ns, 15, 0, 0, 0, *counts, *blocks

@@ -9,8 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from drivers.devices import COMMANDER_NODE
 from models.files import shipped
-from sim_can.bench import COMMANDER_NODE, bench_filters
+from sim_can.bench import bench_filters
 from sim_can.drive_control import DriveControl
 from sim_can.plant_parameters import load_plant
 from sim_can.plant_source import PlantSource

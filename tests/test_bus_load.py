@@ -26,6 +26,15 @@ def test_the_bench_by_hand():
     assert check_bus_load(load) is load
 
 
+def test_a_temperature_is_a_frame_of_75_bits_in_500_ms():
+    without, load = configured_load((1, 2), {}), configured_load((1, 2), {}, temperatures=(2,))
+    assert load.worst - without.worst == pytest.approx(75 / 500 / 1000)
+    (row,) = (row for row in load.rows if row not in without.rows)
+    assert (row.cob_id, row.who, row.length, row.worst_bits * 500) == (0x382, "drive 2 TPDO3", 2, 75)
+    slower = configured_load((1, 2), {}, temperatures=(2,), period_s=5e-3)
+    assert max(slower.rows, key=lambda row: row.cob_id * (row.cob_id < 0x700)).per_cycle == 0.01
+
+
 def test_second_channel_fits_and_two_rpdos_do_not():
     load = configured_load((1, 2), {3: (1, 2)})
     assert load.worst == pytest.approx(0.8476 + 0.085)

@@ -178,6 +178,7 @@ def test_the_same_directory_takes_no_other_plan(
         [plan],
         ["validate", "--quick", "--seed", "4"],
         ["validate", "--quick", "--seed", "3", "--runs", "5"],
+        ["validate", "--quick", "--seed", "3", "--limit", "torque_nm=9"],
     ):
         assert main([*other, "--bus", "unix:/nonexistent/bus", "--out", str(out)]) == 1
         said = capsys.readouterr().err

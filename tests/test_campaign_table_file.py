@@ -48,6 +48,7 @@ def test_the_same_table_is_the_same_file(tmp_path: Path) -> None:
     one, two = (write_run(tmp_path / name, table) for name in ("a.csv.gz", "b.csv.gz"))
     assert one == two
     assert (tmp_path / "a.csv.gz").read_bytes() == (tmp_path / "b.csv.gz").read_bytes()
+    assert (tmp_path / "a.csv.gz").read_bytes()[4:8] == bytes(4), "no time of writing in the gzip header"
     header = gzip.decompress((tmp_path / "a.csv.gz").read_bytes()).decode().splitlines()[0].split(",")
     assert header[0] == "time_s"
     assert [name.split(".")[0] for name in header[1:]] == sorted(name.split(".")[0] for name in header[1:])

@@ -8,8 +8,8 @@ import pytest
 from daemon import cycle_record as cr
 
 HEADER = (7, 1_000, 1_700_000_000_123_456_789, 0xF, 50_000, -3, 2, 240, 2, 255, 1, 2, 3, 4, 0)
-JOINT_1 = (*(0.5 + n for n in range(11)), 0x1237, 2, 0x80, 7)
-JOINT_2 = (*(-0.25 * n for n in range(10)), math.nan, 0x0250, 15, 0, 1)
+JOINT_1 = (*(0.5 + n for n in range(12)), 0x1237, 2, 0x80, 7)
+JOINT_2 = (*(-0.25 * n for n in range(11)), math.nan, 0x0250, 15, 0, 1)
 SYNC = bytes.fromhex("80000000 01 000000 f000000000000000")
 TPDO = bytes.fromhex("81010000 08 000000 0102030405060708")
 
@@ -24,13 +24,13 @@ def sample():
 
 
 def test_offsets():
-    """48 bytes of header, two joints of 96, 16 frames of 16, 16 stamps of 8, the index."""
+    """48 bytes of header, two joints of 104, 16 frames of 16, 16 stamps of 8, the index."""
     assert cr.HEADER.size == 48
-    assert cr.JOINT.size == 96
-    assert cr.HEAD.size == 240 == cr.FRAMES_OFFSET
-    assert cr.STAMPS_OFFSET == 496
-    assert cr.TAIL_OFFSET == 624
-    assert cr.RECORD_SIZE == 632
+    assert cr.JOINT.size == 104
+    assert cr.HEAD.size == 256 == cr.FRAMES_OFFSET
+    assert cr.STAMPS_OFFSET == 512
+    assert cr.TAIL_OFFSET == 640
+    assert cr.RECORD_SIZE == 648
 
 
 def test_bytes_of_the_header():
@@ -44,12 +44,12 @@ def test_bytes_of_the_header():
     assert sample()[:48] == expected
 
 
-def test_joint_blocks_lie_at_48_and_144():
+def test_joint_blocks_lie_at_48_and_152():
     record = sample()
-    assert record[48:136] == struct.pack("<11d", *JOINT_1[:11])
-    assert record[136:144] == bytes.fromhex("3712 0200 8000 0700")
-    assert record[144:232] == struct.pack("<11d", *JOINT_2[:11])
-    assert record[232:240] == bytes.fromhex("5002 0f00 0000 0100")
+    assert record[48:144] == struct.pack("<12d", *JOINT_1[:12])
+    assert record[144:152] == bytes.fromhex("3712 0200 8000 0700")
+    assert record[152:248] == struct.pack("<12d", *JOINT_2[:12])
+    assert record[248:256] == bytes.fromhex("5002 0f00 0000 0100")
 
 
 def test_fields_by_name():
@@ -60,7 +60,8 @@ def test_fields_by_name():
     assert (header.frame_count, header.frames_left_out, header.stale_inputs) == (2, 255, 1)
     assert (header.late_frames, header.duplicate_frames, header.rejected_frames) == (2, 3, 4)
     one, two = cr.joint_of(record, 1), cr.joint_of(record, 2)
-    assert (one.current_a, one.sensor_torque_nm, one.torque_nm, one.network_nm) == (0.5, 4.5, 5.5, 9.5)
+    assert (one.current_a, one.sensor_torque_nm, one.temperature_c) == (0.5, 4.5, 5.5)
+    assert (one.torque_nm, one.network_nm, one.dt_s) == (6.5, 10.5, 11.5)
     assert (one.statusword, one.status, one.sensor_status, one.input_flags) == (0x1237, 2, 0x80, 7)
     assert (two.motor_position_rad, two.status) == (-0.25, 15)
     assert math.isnan(two.dt_s)

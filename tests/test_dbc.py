@@ -21,7 +21,7 @@ SCALING = {
 
 @pytest.fixture(scope="module")
 def database():
-    joints = tuple(SimpleNamespace(number=n, node_id=n) for n in (1, 2))
+    joints = tuple(SimpleNamespace(number=n, node_id=n, temperature=n == 2) for n in (1, 2))
     config = SimpleNamespace(node_id=0x20, joints=joints, sensor=SimpleNamespace(node_id=3, channels=(1, 2)))
     nodes = {"1": {"scaling": SCALING}, "2": {"scaling": SCALING | {"ampere_per_unit": 0.002}}}
     nodes["3"] = {"scaling": {"nm_per_unit": {"1": 0.001, "2": 0.01}}}
@@ -36,6 +36,7 @@ def decode(database, line):
 
 def test_every_frame_of_the_bus_is_there(database):
     expected = {0x080: 1, 0x181: 8, 0x281: 8, 0x182: 8, 0x282: 8, 0x183: 5, 0x283: 3, 0x1A0: 8}
+    expected[0x382] = 2  # the second drive alone tells a temperature
     for node in (1, 2, 3, 0x20):
         expected |= {0x080 + node: 8, 0x700 + node: 1}
     assert {message.frame_id: message.length for message in database.messages} == expected
@@ -57,6 +58,12 @@ def test_drive_motion(database):
     assert values["current"] == pytest.approx(-0.43)
     assert values["statusword"] == 0x1237
     assert decode(database, "282#00000000" + "9CFF" + "3712")["current"] == pytest.approx(-0.2)
+
+
+def test_temperature(database):
+    assert decode(database, "382#0501") == {"temperature": pytest.approx(26.1)}
+    assert decode(database, "382#F6FF") == {"temperature": pytest.approx(-1.0)}
+    assert decode(database, "382#0080") == {"temperature": "not_measured"}
 
 
 def test_sensor(database):
@@ -84,7 +91,7 @@ def test_services(database):
 
 
 def test_without_a_sensor():
-    joints = tuple(SimpleNamespace(number=n, node_id=n) for n in (1, 2))
+    joints = tuple(SimpleNamespace(number=n, node_id=n, temperature=False) for n in (1, 2))
     config = SimpleNamespace(node_id=0x20, joints=joints, sensor=None)
     text = dbc_text(config, {"nodes": {"1": {"scaling": SCALING}, "2": {"scaling": SCALING}}})
     assert "torque_sensor" not in text

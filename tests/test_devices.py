@@ -9,6 +9,7 @@ from drivers.devices import (
     drive_scaling,
     drive_tpdo1,
     drive_tpdo2,
+    drive_tpdo3,
     estimate_tpdo,
     parse_key,
     sensor_scaling,
@@ -35,6 +36,12 @@ def test_maps_are_those_of_the_bus_layout():
     assert (drive_tpdo2(1).cob_id, drive_tpdo2(1).words) == (0x281, (0x606C0020, 0x60780010, 0x60410010))
     assert (sensor_tpdo1(3).cob_id, sensor_tpdo1(3).words) == (0x183, (0x91300120, 0x61500108))
     assert (sensor_tpdo2(3).cob_id, sensor_tpdo2(3).words) == (0x283, (0x71300210, 0x61500208))
+    temperature = drive_tpdo3(2)
+    assert (temperature.cob_id, temperature.words, temperature.transmission_type) == (
+        0x382,
+        (0x30010010,),
+        255,
+    )
     lengths = [drive_tpdo1(1).length, drive_tpdo2(1).length, sensor_tpdo1(3).length, sensor_tpdo2(3).length]
     assert lengths == [8, 8, 5, 3]
 

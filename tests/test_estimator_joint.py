@@ -219,9 +219,7 @@ def test_absurd_numbers_never_reach_the_bus_and_leave_nothing() -> None:
         assert e.step(0.001, 2.0, 2.1, 100.0, 0.021).status == st.STARTING
         got = e.step(0.001, 2.0, 2.2, 100.0, 0.022)
         assert got.status == st.VALID
-        assert got.physics_nm == pytest.approx(
-            steady(estimator("efficiency"), 2.0, 1.0).torque_nm, abs=1e-6
-        )
+        assert got.physics_nm == pytest.approx(steady(estimator("efficiency"), 2.0, 1.0).torque_nm, abs=1e-6)
 
 
 def test_more_than_three_times_rated_is_invalid() -> None:

@@ -170,7 +170,7 @@ def test_emulated_bench_stays_within_the_limits_of_a_loaded_design():
     steady = np.abs(velocity[:-1]) > 0.5
     error = (table.joints[1].torque_nm - predicted)[steady]
     assert np.sqrt(np.mean(error**2)) < 1.5
-    assert 0.8 < np.abs(table.joints[1].current_a).max() / LIMITS.joint_current_a < 1.1
+    assert 0.7 < np.abs(table.joints[1].current_a).max() / LIMITS.joint_current_a < 1.1
     assert np.abs(table.joints[1].torque_nm).max() < LIMITS.torque_nm
 
 
@@ -275,7 +275,15 @@ def test_search_without_evaluations_is_refused():
 
 
 def small(**changes):
-    return {"count": 2, "duration_s": 10.0, "harmonics": 3, "seed": 3, "evaluations": 200, **changes}
+    return {
+        "count": 2,
+        "duration_s": 10.0,
+        "harmonics": 3,
+        "seed": 3,
+        "evaluations": 120,
+        "starts": 1,
+        **changes,
+    }
 
 
 def test_same_seed_same_runs_and_more_runs_begin_alike():
@@ -320,10 +328,10 @@ def test_search_beats_drawing_and_more_starts_do_not_lose():
     drawn = [-draw(LIMITS, count=1, duration_s=10.0, seed=s)[0].information_log_det for s in range(5)]
     one, three = (
         [
-            -design(LIMITS, count=1, duration_s=10.0, seed=s, evaluations=600, starts=starts)[
+            -design(LIMITS, count=1, duration_s=10.0, seed=s, evaluations=400, starts=starts)[
                 0
             ].information_log_det
-            for s in range(3)
+            for s in range(2)
         ]
         for starts in (1, STARTS)
     )
@@ -340,7 +348,7 @@ def test_velocity_and_current_never_repeat_together():
 def test_progress_counts_every_evaluation():
     seen = []
     design(LIMITS, **small(starts=2), on_progress=seen.append)
-    assert sum(seen) == 2 * 2 * 200
+    assert sum(seen) == 2 * 2 * 120
 
 
 @pytest.mark.parametrize(
@@ -434,16 +442,38 @@ def test_command_compares(capsys):
     assert "genetic algorithm" in capsys.readouterr().out
 
 
+def test_trial_judges_both_kinds_on_other_runs(capsys):
+    arguments = [
+        "--trial",
+        "--count",
+        "2",
+        "--duration",
+        "3",
+        "--evaluations",
+        "40",
+        "--seeds",
+        "1",
+        "--json",
+    ]
+    assert excitation_command.main(arguments) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert [one["runs"] for one in result["trials"]] == [1, 2]
+    for one in result["trials"]:  # nothing fits the judging runs better than a fit to them
+        assert min(one["designed_nm"] + one["drawn_nm"]) > result["floor_nm"] > 0.1
+
+
 @pytest.mark.parametrize(
     ("arguments", "status", "message"),
     [
         (["--duration", "0.5"], 1, "duration_s: found 0.5, expected 1 to 600"),
-        (["--velocity", "5", "--out", "plan.yaml"], 1, "--velocity: found 5, expected at most 3.3 in a plan"),
-        (["--joint-current", "10", "--out", "plan.yaml"], 1, "--joint-current: found 10, expected at most 9"),
+        (["--velocity", "99", "--out", "plan.yaml"], 1, "--velocity: found 99, expected at most"),
+        (["--joint-current", "99", "--out", "plan.yaml"], 1, "--joint-current: found 99, expected at most"),
         (["--joints", "none1.yaml", "none2.yaml"], 1, "none1.yaml: cannot be read"),
         (["--compare", "--out", "plan.yaml"], 2, "--out does not go with --compare"),
         (["--compare", "--starts", "2"], 2, "--starts does not go with --compare"),
-        (["--seeds", "2"], 2, "--seeds belongs to --compare"),
+        (["--compare", "--trial"], 2, "--trial does not go with --compare"),
+        (["--trial", "--out", "plan.yaml"], 2, "--out does not go with --trial"),
+        (["--seeds", "2"], 2, "--seeds belongs to --compare and --trial"),
         (["--compare", "--evaluations", "20"], 1, "--evaluations: found 20, expected >= 252"),
     ],
 )

@@ -8,12 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
 from estimator.checked import ConfigError
+from estimator.fused_parameters import AdditiveLoss, Fused, FusedSigma, LossSide, Torsion
 from estimator.parameters import Effect, Friction, Joint, QuadrantPolynomial
 from models.files import load_joint, shipped
 from sysid import joint_writer
@@ -48,6 +50,20 @@ def test_every_section_comes_back_with_effects_and_any_provenance(tmp_path: Path
     )
     write_joint(tmp_path / "j.yaml", joint, "title")
     assert load_joint(tmp_path / "j.yaml") == joint
+
+
+def test_the_fused_section_comes_back_with_a_row_per_list(tmp_path: Path) -> None:
+    nodes = tuple(np.linspace(-36.0, 50.0, 25).tolist())
+    side = LossSide(nodes, nodes, nodes, 0.7)
+    loss = AdditiveLoss(nodes, side, side, 0.05, 3.0, 25.0, 2.0, 0.02)
+    torsion = Torsion(12000.0, 1e9, -1.2e-5, (1.0, 2.0), (1e-5, 2e-5), (-1e-5, 0.1 + 0.2))
+    fused = Fused(loss, torsion, FusedSigma(0.1, 0.2, 0.03, 0.4, 0.05, 0.3, (1.0, 1.1, 1.2, 1.3)))
+    joint = replace(joint1(), fused=fused)
+    write_joint(tmp_path / "j.yaml", joint, "title")
+    assert load_joint(tmp_path / "j.yaml") == joint
+    text = (tmp_path / "j.yaml").read_text()
+    assert "    orders_per_motor_rev: [1.0, 2.0]\n" in text
+    assert len(text.splitlines()) < 100
 
 
 def test_a_joint_without_efficiency_gets_none(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import pytest
 from cdr_decoder import Definition
 
 from daemon import cycle_record as cr
+from daemon import joint_cycle
 from daemon import mcap_messages as messages
 from daemon import mcap_schemas as schemas
 
@@ -35,7 +36,7 @@ def random_record(seed):
         *(rng.getrandbits(8) for _ in range(6)),
     )
     joints = [
-        (*(rng.gauss(0, 100) for _ in range(11)), *(rng.getrandbits(16) for _ in range(4))) for _ in "12"
+        (*(rng.gauss(0, 100) for _ in range(12)), *(rng.getrandbits(16) for _ in range(4))) for _ in "12"
     ]
     record = bytearray(rng.randbytes(cr.RECORD_SIZE))  # what an earlier lap left behind counts as random
     cr.HEAD.pack_into(record, 0, *header, *joints[0], *joints[1])
@@ -98,9 +99,9 @@ def test_cycle_block_decodes_to_the_record(seed):
 
 def test_sizes_are_constant_and_as_stated():
     sizes = {tuple(len(part[4]) for part in split(block_of(*random_record(seed)[:2]))) for seed in range(20)}
-    assert sizes == {(142, 142, 444)}
-    assert (messages.JOINT_ESTIMATE_SIZE, messages.CAN_FRAMES_SIZE, messages.BLOCK_SIZE) == (142, 444, 821)
-    assert messages.BLOCK_PARTS == ((1, 0), (2, 173), (3, 346))
+    assert sizes == {(150, 150, 444)}
+    assert (messages.JOINT_ESTIMATE_SIZE, messages.CAN_FRAMES_SIZE, messages.BLOCK_SIZE) == (150, 444, 837)
+    assert messages.BLOCK_PARTS == ((1, 0), (2, 181), (3, 362))
 
 
 def test_joint_message_literally():
@@ -188,6 +189,9 @@ def test_status_constants_are_those_of_the_pdo():
     assert expected.items() <= JOINT.constants.items()
     flags = {"COMPLETE": cr.FLAG_COMPLETE, "PUBLISHED": cr.FLAG_PUBLISHED}
     flags |= {"BEFORE_NEXT_SYNC": cr.FLAG_BEFORE_NEXT_SYNC, "SYNC_CONFIRMED": cr.FLAG_SYNC_CONFIRMED}
+    inputs = ("POSITION", "MOTION", "SENSOR", "TEMPERATURE")
+    names = ("INPUT_TPDO1", "INPUT_TPDO2", "INPUT_SENSOR", "INPUT_TEMPERATURE")
+    flags |= {name: getattr(joint_cycle, f"FLAG_{part}") for name, part in zip(names, inputs, strict=True)}
     assert flags.items() <= JOINT.constants.items()
 
 

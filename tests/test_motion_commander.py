@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim_can import cia402
-from sysid.motion.result import MotionResult
+from sysid.motion.result import MotionError, MotionResult
 from sysid.motion.setpoints import Setpoints
 from sysid.motion.stopping import Phase
 from tests.motion_helpers import MS, WARM, LockStep, plateau
@@ -234,6 +234,14 @@ def test_the_travel_begins_where_the_motion_begins_and_counters_roll_over(lock: 
     assert one.travel_rad == pytest.approx(true, abs=1e-3)
     assert two.travel_rad == pytest.approx(-true, abs=1e-3)
     assert motion.result.status == "done"
+
+
+def test_setpoints_beyond_what_an_rpdo_holds_are_refused(lock: LockStep) -> None:
+    """300 A of an 8 A drive are 37500 in 1/1000 of rated torque; 16 bits end at 32767."""
+    with pytest.raises(
+        MotionError, match="plan: current of joint 2 is -37500 in units of the drive, limit 32767"
+    ):
+        lock.commander(plateau(1.0, -300.0))
 
 
 def test_setpoints_that_end_in_motion_are_led_to_rest(lock: LockStep) -> None:

@@ -69,15 +69,6 @@ def test_a_limit_is_a_positive_number(name: str, value: object) -> None:
             Limits(**{**values, name: math.inf})
 
 
-def test_limits_from_a_mapping_know_their_names() -> None:
-    mapping = {"current_a": 9, "velocity_rad_s": 3.3, "torque_nm": 60, "travel_rad": 50, "temperature_c": 70}
-    assert Limits.from_mapping(mapping) == LIMITS
-    with pytest.raises(ValueError, match=r"limits\.speed: unknown key"):
-        Limits.from_mapping({**mapping, "speed": 1.0})
-    with pytest.raises(ValueError, match=r"limits\.torque_nm: missing"):
-        Limits.from_mapping({key: value for key, value in mapping.items() if key != "torque_nm"})
-
-
 # Plans ------------------------------------------------------------------------------------------------------
 
 

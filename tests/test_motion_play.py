@@ -15,9 +15,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+import yaml
 
 from drivers.frame import FRAME
 from drivers.frame_socket import exact, open_frame_socket
+from models.files import shipped
 from sysid.motion.limits import Limits
 from sysid.motion.result import MotionError, Timing
 from sysid.motion.shell import play
@@ -27,6 +29,19 @@ LIMITS = Limits(current_a=20.0, velocity_rad_s=3.3, torque_nm=100.0, travel_rad=
 PATIENT = Timing(
     sync_lost_s=1.0, late_s=1.0, stale_cycles=500, heartbeats_missing=20, drive_timeout_s=3.0, ready_s=10.0
 )
+
+
+def patient_config(directory: Path) -> Path:
+    """The shipped bench without networks, whose nodes wait 1.5 s for jtqd before they leave operational."""
+    content = yaml.safe_load(shipped("bench.yaml").read_text())
+    content["nodes"]["heartbeat_ms"] = 500
+    content["estimator"]["method"] = "tob"
+    for joint in ("joint_1", "joint_2"):
+        del content[joint]["network"]
+        content[joint]["file"] = str(shipped(content[joint]["file"]))
+    path = directory / "bench.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +55,10 @@ def bus(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     assert bench.stderr is not None
     assert "ready" in bench.stderr.readline()
     jtqd = subprocess.Popen(
-        [sys.executable, "-m", "daemon.jtqd", "--bus", address, "--record", "none", "--json"],
+        [
+            *(sys.executable, "-m", "daemon.jtqd", "--bus", address, "--record", "none", "--json"),
+            *("--config", str(patient_config(directory))),
+        ],
         env={**os.environ, "RUNTIME_DIRECTORY": str(directory)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

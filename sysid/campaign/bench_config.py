@@ -8,11 +8,11 @@ from typing import Any, Final
 
 from drivers.boot_request import RequestError, parse_request
 from drivers.bus_load import BusLoad, BusLoadError, Row, check_bus_load, configured_load, heartbeat_row
-from drivers.devices import DriveProfile, SensorProfile
+from drivers.devices import COMMANDER_NODE, DriveProfile, SensorProfile
 from estimator.checked import ConfigError, Section
 from estimator.parameters import Joint
 from models.files import load_joint, load_yaml, shipped
-from sysid.motion.result import COMMANDER_NODE, Timing
+from sysid.motion.result import Timing
 
 DEFAULT_CONFIG: Final = "bench.yaml"
 PERIOD_US: Final = 1000

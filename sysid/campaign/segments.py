@@ -37,9 +37,8 @@ def expand(run: Run) -> Setpoints:
             velocities.append(segment.velocity.velocity(time_s))
             currents.append(segment.current.value(time_s))
             marks.append(Mark("fourier", count * PERIOD_S, (count + n) * PERIOD_S))
-            velocity = current = 0.0
             count += n
-            continue
+            continue  # from rest to rest
         target = (segment.velocity_rad_s, segment.current_a) if isinstance(segment, Plateau) else (0.0, 0.0)
         ramp, hold = samples(segment.ramp_s), samples(segment.hold_s)
         if (velocity, current) == target:  # nothing to ramp: all of it is held

@@ -7,7 +7,7 @@ import math
 import time
 
 from drivers.boot_error import BootError
-from drivers.devices import SYNC_COB_ID, DriveProfile, SensorProfile
+from drivers.devices import COMMANDER_NODE, SYNC_COB_ID, DriveProfile, SensorProfile
 from drivers.errors import BusError
 from drivers.frame import FRAME, FRAME_SIZE, pack
 from drivers.frame_sdo import FrameSdo
@@ -24,7 +24,7 @@ from sysid.motion.drive_setup import (
     switch_off,
 )
 from sysid.motion.limits import Limits
-from sysid.motion.result import COMMANDER_NODE, MotionError, Timing
+from sysid.motion.result import MotionError, Timing
 from sysid.motion.setpoints import Setpoints
 
 _HEARTBEAT = pack(0x700 + COMMANDER_NODE, b"\x05")

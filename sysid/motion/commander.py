@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from drivers.devices import SYNC_COB_ID
+from drivers.devices import COMMANDER_NODE, SYNC_COB_ID
 from sysid.motion.cia402_client import (
     QUICK_STOP_WORD,
     State,
@@ -25,7 +25,7 @@ from sysid.motion.drive_setup import DriveUnits, SensorUnits
 from sysid.motion.inputs import Inputs
 from sysid.motion.limits import Limits, Monitor
 from sysid.motion.pace import Pace
-from sysid.motion.result import COMMANDER_NODE, MotionResult, Timing, Violation
+from sysid.motion.result import MotionResult, Timing, Violation
 from sysid.motion.setpoints import PERIOD_S, Setpoints
 from sysid.motion.stopping import Phase, Stopping
 from sysid.motion.supervision import Supervision

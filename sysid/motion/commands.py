@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import Final
 
-from drivers.devices import drive_rpdo1, drive_rpdo2
+from drivers.devices import COMMANDER_NODE, MotionError, drive_rpdo1, drive_rpdo2
 from drivers.frame import FRAME, pack
 from sysid.motion.cia402_client import ENABLE_OPERATION, QUICK_STOP_WORD
 from sysid.motion.drive_setup import DriveUnits
-from sysid.motion.result import COMMANDER_NODE
 from sysid.motion.setpoints import Setpoints
 
 _COMMAND, _VELOCITY = drive_rpdo1(1).layout, drive_rpdo2(1).layout
@@ -17,13 +16,23 @@ _OPERATIONAL: Final = b"\x05"
 
 
 class Commands:
-    """RPDOs for drive 0 or 1 (`turn`); set-points are scaled to the drives' units once, beforehand."""
+    """RPDOs for drive 0 or 1 (`turn`); set-points are scaled to the drives' units once, beforehand.
+
+    Raises MotionError for set-points that 60FFh (32 bits) or 6071h (16 bits) cannot hold.
+    """
 
     def __init__(self, setpoints: Setpoints, drives: tuple[DriveUnits, DriveUnits]) -> None:
         self._leader = setpoints.velocity_joint - 1  # the drive in velocity mode
         self._lead, self._follow = drives[self._leader], drives[1 - self._leader]
         self._velocities = [self._lead.velocity_units(v) for v in setpoints.velocity_rad_s.tolist()]
         self._currents = [self._follow.current_units(i) for i in setpoints.current_a.tolist()]
+        for what, units, largest in (
+            (f"velocity of joint {setpoints.velocity_joint}", self._velocities, 0x7FFF_FFFF),
+            (f"current of joint {setpoints.current_joint}", self._currents, 0x7FFF),
+        ):
+            found = max(units, key=abs)
+            if abs(found) > largest:
+                raise MotionError(f"plan: {what} is {found} in units of the drive, limit {largest}")
         self._nodes = [drive.node for drive in drives]
         self._rpdo1 = [drive_rpdo1(drive.node).cob_id for drive in drives]
         self._rpdo2 = [drive_rpdo2(drive.node).cob_id for drive in drives]

@@ -14,6 +14,7 @@ from typing import Final
 from drivers.boot_error import BootError, mismatch
 from drivers.boot_procedure import BusSettings, NodeBoot, SdoAccess
 from drivers.devices import (
+    COMMANDER_NODE,
     JTQD_NODE,
     DriveProfile,
     DriveScaling,
@@ -34,7 +35,6 @@ from sysid.motion.cia402_client import (
     state_of,
 )
 from sysid.motion.node_sdo import Key, NodeSdo
-from sysid.motion.result import COMMANDER_NODE
 
 INTERPOLATION_MS: Final = 2
 """60C2h: each drive gets every second set-point."""

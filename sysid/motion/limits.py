@@ -6,9 +6,8 @@ Every refusal is one line that names joint, quantity, what was found, and the li
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -46,18 +45,6 @@ class Limits:
             number = isinstance(value, int | float) and not isinstance(value, bool)
             if not number or not value > 0 or (math.isinf(value) and item.name != "temperature_c"):
                 raise ValueError(f"limits.{item.name}: found {value!r}, expected a positive number")
-
-    @classmethod
-    def from_mapping(cls, mapping: Mapping[str, Any]) -> Limits:
-        """Limits by the names above; ValueError for a missing or unknown one."""
-        names = [item.name for item in fields(cls)]
-        for name in mapping:
-            if name not in names:
-                raise ValueError(f"limits.{name}: unknown key, expected one of {', '.join(names)}")
-        for name in names[:-1]:
-            if name not in mapping:
-                raise ValueError(f"limits.{name}: missing")
-        return cls(**mapping)
 
 
 class JointSample(NamedTuple):

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Final, Literal, NamedTuple
-
-COMMANDER_NODE: Final = 0x21
-"""Node number of the commander; jtqd is 20h."""
+from typing import Literal, NamedTuple
 
 
 class MotionError(Exception):

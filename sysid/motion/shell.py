@@ -61,12 +61,15 @@ def play(
             raise MotionError(str(refused)) from None
         with closing(setup):
             units = setup.prepare(setpoints, limits)
-            commander = Commander(setpoints, limits, *units, now_ns=time.monotonic_ns(), timing=timing)
             error = left = ""
+            beating = False
             try:
+                commander = Commander(setpoints, limits, *units, now_ns=time.monotonic_ns(), timing=timing)
+                beating = True
                 error = _run(bus, commander, taken, on_progress)
+                beating = not commander.silent
             finally:
-                left = setup.release(beating=not commander.silent)
+                left = setup.release(beating=beating)
     if commander.refusal is not None:
         raise MotionError("; ".join(reason for reason in (commander.refusal, left) if reason))
     result = commander.result

@@ -11,9 +11,8 @@ from daemon.config import Config, load_config
 from daemon.cycle import Cycle
 from daemon.cycle_record import FLAG_PUBLISHED
 from daemon.grid import Grid
-from daemon.input_pdos import input_pdos
 from drivers.frame_socket import FrameSocket, open_frame_socket
-from estimator.joint_estimator import JointEstimator
+from estimator.methods import AnyEstimator
 from estimator.status import PUBLISHED
 from tests.benchmarks.contender import Task, serve
 from tests.benchmarks.fixture import Fixture
@@ -27,7 +26,7 @@ class JtqdLoop:
         self.task = task
         fixture = Fixture(task.directory)
         self.config: Config = load_config(fixture.config)
-        self.estimators: list[JointEstimator] = [
+        self.estimators: list[AnyEstimator] = [
             loop.build_estimator(self.config, joint) for joint in self.config.joints
         ]
         loop.warm_up(self.estimators)
@@ -42,9 +41,7 @@ class JtqdLoop:
             "snapshot": str(self.task.directory / "jtqd.snapshot"),
             "worst_load": 0.0,
         }
-        pdos = input_pdos(self.config)
-        nodes = [1, 2, 3]
-        socket = open_frame_socket(self.task.bus, loop.loop_filters(pdos, nodes), receive_own=True)
+        socket = open_frame_socket(self.task.bus, loop.loop_filters(self.config), receive_own=True)
         for estimator in self.estimators:
             estimator.reset()
         report = Fixture(self.task.directory).report

@@ -12,15 +12,22 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent.parent))
+sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from estimator_helpers import joint1, motion, small_network
-
-from estimator.joint_estimator import METHODS, EstimatorSettings, JointEstimator, estimate_run
+from estimator.joint_estimator import METHODS, EstimatorSettings, estimate_run
 from estimator.losses import LossModel
+from estimator.methods import load_network, make_estimator
 from estimator.network import TorqueNetwork
+from tests.benchmarks.table import mark
+from tests.estimator_helpers import joint1, motion, small_network
+from tests.fused_helpers import fused_joint, fused_network
 
 SAMPLES = 60_000
+JOINTS = 2
+FUSED_LIMIT_US = 15.0
+"""What method `fused` may cost more than the others, both joints together."""
+_ROUNDS = 15
+_STEP = (0.001, 2.0, 1.0, 100.0, 0.01, 25.0)
 
 
 def best_us(call: Callable[[], object], number: int = 2000, rounds: int = 9) -> float:
@@ -36,6 +43,23 @@ def best_us(call: Callable[[], object], number: int = 2000, rounds: int = 9) -> 
     return best
 
 
+def step_costs_us() -> dict[str, float]:
+    """Cost of one step by method [us], networks included; the methods take turns, so that a busy machine hurts all alike."""
+    networks = {"network": small_network().data, "fused": fused_network()}
+    steps = {}
+    for method in METHODS:
+        data = networks.get(method)
+        joint = fused_joint() if method == "fused" else joint1()
+        network = None if data is None else load_network(method, data)
+        steps[method] = make_estimator(joint, EstimatorSettings(method=method), network).step
+        steps[method](*_STEP)
+    rounds = [
+        {method: best_us(lambda step=step: step(*_STEP), rounds=1) for method, step in steps.items()}
+        for _ in range(_ROUNDS)
+    ]
+    return {method: min(each[method] for each in rounds) for method in METHODS}
+
+
 def costs_us() -> dict[str, float]:
     """Cost of each part by name [us]."""
     network = TorqueNetwork(small_network().data)
@@ -44,10 +68,7 @@ def costs_us() -> dict[str, float]:
         "loss": best_us(lambda: losses.loss(0.5, 1.0)),
         "network, one sample": best_us(lambda: network.run_one(1.0, 2.0, 3.0, 0.1, 0.2, 5.0)),
     }
-    for method in METHODS:
-        step = JointEstimator(joint1(), EstimatorSettings(method=method), network).step
-        step(0.001, 2.0, 1.0, 100.0, 0.01)
-        costs[f"step, {method}"] = best_us(lambda step=step: step(0.001, 2.0, 1.0, 100.0, 0.01))
+    costs |= {f"step, {method}": cost for method, cost in step_costs_us().items()}
     run = motion(1, SAMPLES).arrays()
     began = time.process_time()
     estimate_run(joint1(), EstimatorSettings(), network, *run)
@@ -56,5 +77,9 @@ def costs_us() -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    for name, cost in costs_us().items():
-        print(f"{name:24s} {cost:6.2f} us")
+    costs = costs_us()
+    for name, cost in costs.items():
+        print(f"{name:40s} {cost:6.2f} us")
+    for method in ("network", "tob"):
+        more = JOINTS * (costs["step, fused"] - costs[f"step, {method}"])
+        print(f"{f'fused over {method}, both joints':40s} {more:6.2f} us  {mark(more, FUSED_LIMIT_US)}")

@@ -15,8 +15,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from daemon import estimate_pdo, loop
-from estimator.joint_estimator import JointEstimator
-from estimator.network import TorqueNetwork
+from estimator.methods import AnyEstimator, load_network, make_estimator
 from tests.benchmarks.contender import serve
 from tests.benchmarks.contender_jtqd import JtqdLoop, _never, loop_start, measured
 from tests.benchmarks.measure import SETTLE_CYCLES, CycleMeter, quantile
@@ -130,7 +129,7 @@ class StagedLoop(JtqdLoop):
         for name in ("begin", "take", "close", "drain"):
             wrap(intake, name, timed, "decode")
         wrap(cycle._frames, "keep", timed, "hand over")
-        wrap(cycle._frames, "keep_own", timed, "hand over")
+        wrap(cycle._frames, "keep_one", timed, "hand over")
         wrap(cycle, "observe", timed, "observe")
         meter = CycleMeter()
         measured(cycle, meter)
@@ -155,13 +154,14 @@ def wrap(target: Any, name: str, timed: Callable[..., Any], stage: str) -> None:
     setattr(target, name, timed(stage, getattr(target, name)))
 
 
-def with_timed_network(staged: StagedLoop, number: int, timer: StageTimer) -> JointEstimator:
+def with_timed_network(staged: StagedLoop, number: int, timer: StageTimer) -> AnyEstimator:
     """The estimator of one joint again, its network timed."""
     joint = staged.config.joints[number]
     assert joint.network is not None
-    network = TorqueNetwork(joint.network.path, sha256=joint.network.sha256)
+    settings = staged.config.estimator
+    network = load_network(settings.method, str(joint.network.path), joint.network.sha256)
     network.run_one = timer.timed("network", network.run_one)  # type: ignore[method-assign]
-    estimator = JointEstimator(joint.joint, staged.estimators[number].settings, network)
+    estimator = make_estimator(joint.joint, settings, network)
     loop.warm_up([estimator])
     return estimator
 

@@ -1,0 +1,148 @@
+"""Our network trained on runs: a correction to the fused physics, its envelope, and its calibrated sigma. Pure.
+
+The mean residual of each run is taken out of the target: it holds that run's zeros of sensor and encoders, which no
+feature can tell. sigma_scale comes from runs that neither the physics nor the network of their fold had seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from estimator.additive_loss import AdditiveLossModel
+from estimator.friction import FloatArray
+from estimator.fused_network import FUSED_FEATURES
+from estimator.fused_parameters import AdditiveLoss, FusedSigma, Torsion
+from estimator.fused_run import network_features, quadrant_many
+from estimator.fused_trust import Envelope
+from estimator.fusion import Fusion
+from estimator.parameters import Joint
+from sysid.fused_fit import folds
+from sysid.loss_fit import fit_loss
+from sysid.paper_network import TrainedNetwork, digest_of, exported, network_output, thinned
+from sysid.run_signals import RunSignals
+from sysid.sigma_fit import conformal_scale
+from sysid.torsion_fit import fit_torsion, torsion_torque
+from sysid.training import Trained, train
+
+Table = np.ndarray[tuple[int, int], np.dtype[np.bool_]]
+
+HIDDEN: Final = (16, 16)
+_WEIGHT_DECAY: Final = 0.05
+_VELOCITY_STEP_RAD_S: Final = 0.25
+_TORQUE_STEP_NM: Final = 3.0
+_VISITS: Final = 20
+"""Samples at 1 kHz in a cell that make it known."""
+
+
+class Seen:
+    """A run through physics with given parameters: features [n, 9], physics and sigma [n], all of moving samples."""
+
+    def __init__(self, run: RunSignals, loss: AdditiveLoss, torsion: Torsion, sigma: FusedSigma) -> None:
+        keep = run.moving
+        seen = replace(run.seen, torsion_nm=torsion_torque(torsion, run))
+        value, half = AdditiveLossModel(loss).loss_many(seen.raw_nm, seen.velocity_rad_s, seen.temperature_c)
+        physics, spread = Fusion(sigma, True).fuse_many(
+            seen.raw_nm, value, half, seen.velocity_rad_s, seen.torsion_nm
+        )
+        self.name = run.name
+        self.features: FloatArray = network_features(seen, seen.raw_nm - value)[keep]
+        self.residual_nm: FloatArray = (run.sensor_nm - physics)[keep]
+        self.sigma_nm: FloatArray = spread[keep]
+        self.quadrant = quadrant_many(seen.raw_nm[keep], seen.velocity_rad_s[keep])
+
+
+def train_fused(
+    runs: Sequence[RunSignals],
+    joint: Joint,
+    hashes: dict[str, str],
+    *,
+    iterations: int,
+    seed: int,
+    progress: Callable[[int, float], None],
+) -> TrainedNetwork:
+    """Train our network of a joint that has section `fused` with torsion; at least 8 runs (ValueError)."""
+    fused = joint.fused
+    if fused is None or fused.torsion is None:
+        raise ValueError(
+            f"joint {joint.name}: found no section 'fused' with torsion; 'jtq fit losses' makes one"
+        )
+    if len(runs) < 8:
+        raise ValueError(f"found {len(runs)} runs, expected at least 8: standard deviations need unseen runs")
+    errors, sigmas, quadrants, scores = [], [], [], {}
+    for known, judged in folds(runs):
+        loss, torsion = fit_loss(known, joint.friction).loss, fit_torsion(known)
+        trained = _train([Seen(run, loss, torsion, fused.sigma) for run in known], iterations, seed, progress)
+        for n in judged:
+            one = Seen(runs[n], loss, torsion, fused.sigma)
+            error = one.residual_nm - network_output(trained, one.features)
+            errors.append(error)
+            sigmas.append(one.sigma_nm)
+            quadrants.append(one.quadrant)
+            scores[one.name] = (float(np.mean(error**2)), float(np.mean(one.residual_nm**2)))
+    blocks = [Seen(run, fused.loss, fused.torsion, fused.sigma) for run in runs]
+    trained = _train(blocks, iterations, seed, progress)
+    features = np.concatenate([block.features for block in blocks])
+    low, high = np.quantile(features, [1e-4, 1.0 - 1e-4], axis=0)
+    metadata = {
+        "features": list(FUSED_FEATURES),
+        "envelope": envelope_of(blocks, runs).to_mapping(),
+        "sigma_scale": list(conformal_scale(errors, sigmas, quadrants)),
+        "input_low": low.tolist(),
+        "input_high": high.tolist(),
+        "joint": joint.name,
+        "data_sha256": digest_of(hashes),
+        "runs": hashes,
+    }
+    return TrainedNetwork(exported(trained, metadata), trained, metadata, scores)
+
+
+def _train(blocks: Sequence[Seen], iterations: int, seed: int, progress: Callable[[int, float], None]) -> Trained:
+    return train(
+        thinned([block.features for block in blocks]),
+        thinned([block.residual_nm - block.residual_nm.mean() for block in blocks]),
+        iterations=iterations,
+        seed=seed,
+        hidden=HIDDEN,
+        weight_decay=_WEIGHT_DECAY,
+        progress=progress,
+    )
+
+
+def envelope_of(blocks: Sequence[Seen], runs: Sequence[RunSignals]) -> Envelope:
+    """Return what the data covered: cells of (v, tau_raw) with enough samples, and cells between such cells."""
+    v = np.concatenate([block.features[:, 0] for block in blocks])
+    raw = np.concatenate([block.features[:, 1] for block in blocks])
+    rows = int(np.ceil(np.abs(v).max() / _VELOCITY_STEP_RAD_S)) + 1
+    columns = int(np.ceil(np.abs(raw).max() / _TORQUE_STEP_NM)) + 1
+    counts = np.zeros((2 * rows + 1, 2 * columns + 1), np.int64)
+    at = (
+        np.rint(v / _VELOCITY_STEP_RAD_S).astype(int) + rows,
+        np.rint(raw / _TORQUE_STEP_NM).astype(int) + columns,
+    )
+    np.add.at(counts, at, 1)
+    known = _filled(counts >= _VISITS)
+    temperatures = [run.temperature_c for run in runs if np.isfinite(run.temperature_c)]
+    distance = float(np.quantile(np.abs(np.concatenate([block.features[:, 2] for block in blocks])), 0.999))
+    return Envelope(
+        _VELOCITY_STEP_RAD_S,
+        _TORQUE_STEP_NM,
+        tuple(tuple(int(cell) for cell in row) for row in known),
+        1.25 * distance,
+        (min(temperatures) - 0.5, max(temperatures) + 0.5) if temperatures else None,
+    )
+
+
+def _filled(known: Table) -> Table:
+    """Also call a cell known that lies between known cells in both directions: a hole, not an edge."""
+
+    def between(axis: int) -> Table:
+        before = np.maximum.accumulate(known, axis=axis)
+        after = np.flip(np.maximum.accumulate(np.flip(known, axis), axis=axis), axis)
+        return np.logical_and(before, after)
+
+    result: Table = known | (between(0) & between(1))
+    return result
