@@ -10,11 +10,12 @@ import sys
 COMMANDS = {
     "sim": ("sim_can.cli", "emulate the bench on a bus, or play a measured run on it"),
     "campaign": ("sysid.campaign.command", "drive both joints through a campaign of runs, and keep them"),
+    "excitation": ("sysid.excitation_command", "design excitation runs, or compare the ways to get them"),
     "fit": (
         "sysid.fit_command",
         "fit a section of a joint file to measured runs: efficiency, friction, losses",
     ),
-    "train": ("sysid.train_command", "train the networks of both joints on emulated runs (extra: train)"),
+    "train": ("sysid.train_command", "train networks on recorded runs (extra: train)"),
     "plot": ("sysid.plot_command", "draw a log: estimate beside the torque sensor"),
     "bus-load": ("daemon.bus_load_command", "worst-case load of the bus by a configuration"),
     "measured": (

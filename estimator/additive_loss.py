@@ -4,11 +4,15 @@
     L_d(x, a) = c_d(x) + Fs_d exp(-(a/vs)^2) + f_d(x) a + q_d(x) a^2 + h(T) a >= 0
                 d = sign(v), a = |v|, x = d tau_raw (load along the motion)
     h(T) = Fv (exp(-b (T - T0)) - 1)                       the lubricant's viscosity against that of the fit
-    loss = (1+s)/2 L_+ - (1-s)/2 L_-,   s = tanh(v/w0)
+    loss = (1+s)/2 L_+ - (1-s)/2 L_-,   s = tanh(v/w0), or the observer's: the same through the filter of tau_raw
 
 c, f and q are linear between load nodes. In contrast to a quotient eta = tau_j/tau_raw nothing is singular at zero
 current, and the value is continuous over all quadrants: in the load by its nodes, in the direction by s. At v = 0 the
 result is the middle of what friction can hold, [tau_raw - L_+, tau_raw + L_-], and (L_+ + L_-)/2 is half its width.
+
+At a fast reversal friction turns within a millisecond, tau_raw follows through the observer's filter, and the filtered
+v crosses zero later still. A direction that took its sign from that v would be wrong by twice the friction meanwhile;
+the direction at the motor, through the same filter as tau_raw, is not.
 """
 
 from __future__ import annotations
@@ -22,8 +26,8 @@ import numpy as np
 from estimator.friction import DIRECTION_VELOCITY_RAD_S, FloatArray
 from estimator.fused_parameters import AdditiveLoss, LossSide
 
-ONE_SIDED_RAD_S: Final = 20.0 * DIRECTION_VELOCITY_RAD_S
-"""|v| from which the other direction does not count at all: tanh(20) is 1 in float64."""
+_ONE_SIDED: Final = 1.0 - 1e-9
+"""|s| from which the other direction no longer counts: a step of 1e-9 of the loss, 0.1 s after a reversal."""
 
 _FARTHEST_K: Final = 40.0
 """Temperatures farther from the fit's count as so far: no fit reaches beyond."""
@@ -105,30 +109,38 @@ class AdditiveLossModel:
             return 0.0
         return self._viscous * expm1(-self._per_k * min(max(difference, -_FARTHEST_K), _FARTHEST_K))
 
-    def loss(self, raw_nm: float, velocity_rad_s: float, thermal: float) -> tuple[float, float]:
-        """Return (loss, half) [Nm]: the loss, and half the width that friction leaves open at this speed."""
+    def loss(
+        self, raw_nm: float, velocity_rad_s: float, thermal: float, direction: float | None = None
+    ) -> tuple[float, float]:
+        """Return (loss, half) [Nm]: the loss, and half the width that friction leaves open at this speed.
+
+        thermal: h(T) [Nms/rad]; direction: s, -1 to 1, None for tanh(v/w0).
+        """
         v = velocity_rad_s
-        a = v if v >= 0.0 else -v
-        if a > self._vmax:
-            a = self._vmax
+        a = min(v if v >= 0.0 else -v, self._vmax)
         y = a * self._inverse_vs
         stribeck = exp(-y * y)
-        if v >= ONE_SIDED_RAD_S:
+        s = tanh(v * self._inverse_w0) if direction is None else direction
+        if s > _ONE_SIDED:
             return self._positive.value(raw_nm, a, stribeck, thermal), 0.0
-        if v <= -ONE_SIDED_RAD_S:
+        if s < -_ONE_SIDED:
             return -self._negative.value(-raw_nm, a, stribeck, thermal), 0.0
-        s = tanh(v * self._inverse_w0)
         p = 0.5 * self._positive.value(raw_nm, a, stribeck, thermal)
         n = 0.5 * self._negative.value(-raw_nm, a, stribeck, thermal)
         return (1.0 + s) * p - (1.0 - s) * n, (p + n) * (1.0 - s * s)
 
     def loss_many(
-        self, raw_nm: FloatArray, velocity_rad_s: FloatArray, temperature_c: FloatArray
+        self,
+        raw_nm: FloatArray,
+        velocity_rad_s: FloatArray,
+        temperature_c: FloatArray,
+        direction: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray]:
         """Vectorised twin of `loss`, arrays [n]; temperature_c in place of h(T), NaN where not known."""
         v = velocity_rad_s
         a = np.minimum(np.abs(v), self._vmax)
-        s = np.tanh(v * self._inverse_w0)
+        s = np.tanh(v * self._inverse_w0) if direction is None else direction
+        s = np.where(np.abs(s) > _ONE_SIDED, np.sign(s), s)
         stribeck = np.exp(-((a * self._inverse_vs) ** 2))
         difference = np.clip(temperature_c - self._t0, -_FARTHEST_K, _FARTHEST_K)
         thermal = self._viscous * np.expm1(-self._per_k * np.where(np.isnan(difference), 0.0, difference))

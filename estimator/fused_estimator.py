@@ -1,22 +1,22 @@
 """Our estimator of one joint, sample by sample: observer, additive loss, fusion with torsion, network, validity.
 
-    tau_raw, v, tau_t, ripple  <-  FusedObserver
-    physics = fusion of tau_raw - loss(tau_raw, v, T) and tau_t
-    torque  = physics + w tanh^2(v/w0) N(features)          w: trust of the network, fades at standstill
+    tau_raw, v, tau_t, ripple, s  <-  FusedObserver         s: direction, -1 to 1
+    physics = fusion of tau_raw - loss(tau_raw, v, s, T) and tau_t
+    torque  = physics + w s^2 N(features)                   w: trust of the network, which fades at standstill
 
-Status 2 inside the network's envelope, 3 outside of it (the value is then the physics, by the share of trust), 6 at
+w is 1 inside the network's envelope, falls continuously to 0 outside of it, and falls from 1 to 0 while |N| goes from
+75 % to 100 % of the limit. Status 2 where w = 1, 3 where it is less (at w = 0 the value is the physics alone), 6 at
 standstill. Everything has passed the same filter: the estimate as a whole is 1/g old.
 """
 
 from __future__ import annotations
 
-from math import cos, nan, sin, tanh
+from math import cos, nan, sin
 from typing import Final
 
 from estimator.additive_loss import AdditiveLossModel
 from estimator.checked import ConfigError
 from estimator.estimate import INVALID_ESTIMATE, STARTING_ESTIMATE, Estimate
-from estimator.friction import DIRECTION_VELOCITY_RAD_S
 from estimator.fused_network import FusedNetworkModel
 from estimator.fused_observer import FusedObserver
 from estimator.fused_parameters import Fused
@@ -26,6 +26,7 @@ from estimator.parameters import Joint
 from estimator.settings import EstimatorSettings
 from estimator.status import DEGRADED, INVALID, STANDSTILL, STARTING
 from estimator.tracking import Tracker
+from estimator.validity import FADE_START
 
 STANDSTILL_SIGMAS: Final = 3.0
 """Half width of the standstill interval in standard deviations, where torsion narrows what friction leaves open."""
@@ -36,7 +37,9 @@ _new: Final = tuple.__new__
 def fused_parts(
     joint: Joint, settings: EstimatorSettings, network: FusedNetworkModel | None
 ) -> tuple[Fused, FusedNetworkModel | None]:
-    """Return section `fused` and the network, checked against each other; ConfigError when they do not fit."""
+    """Return section `fused` and the network, checked; ConfigError when joint, method and network do not fit."""
+    if settings.method != "fused":
+        raise ConfigError(f"joint {joint.name}: found method '{settings.method}', expected 'fused'")
     if joint.effects:
         names = ", ".join(effect.name for effect in joint.effects)
         raise ConfigError(
@@ -44,7 +47,7 @@ def fused_parts(
         )
     if joint.fused is None:
         raise ConfigError(
-            f"joint {joint.name}: found no section 'fused', which method '{settings.method}' needs; "
+            f"joint {joint.name}: found no section 'fused', which method 'fused' needs; "
             "'jtq fit losses' makes one, methods 'tob' and 'efficiency' work without"
         )
     if network is not None and network.joint != joint.name:
@@ -54,15 +57,21 @@ def fused_parts(
     return joint.fused, network
 
 
+def _no_trust(*_: float) -> float:
+    return 0.0
+
+
 class FusedEstimator:
     """Estimator of one joint by method `fused`; without a network its physics alone, status valid.
 
-    Raises ConfigError for a joint without section `fused`, effects it cannot apply, or another joint's network.
+    Raises ConfigError for a joint without section `fused`, effects it cannot apply, another joint's network, or
+    settings of another method.
     """
 
     __slots__ = (
+        "_fade",
         "_fuse",
-        "_inverse_w0",
+        "_inverse_fade",
         "_limit",
         "_loss",
         "_network_limit",
@@ -73,6 +82,7 @@ class FusedEstimator:
         "_stand_share",
         "_temperature",
         "_thermal",
+        "_thermal_of",
         "_tracker",
         "_weight",
         "joint",
@@ -90,17 +100,19 @@ class FusedEstimator:
             joint, fused.torsion, settings.bandwidth_rad_s, settings.link_bandwidth_rad_s
         )
         self._tracker: Final = Tracker(observer, joint, settings)
-        self._loss: Final = loss
+        self._loss: Final = loss.loss
+        self._thermal_of: Final = loss.thermal
         self._fuse: Final = Fusion(fused.sigma, fused.torsion is not None).fuse
         self._physics_scale: Final = fused.sigma.scale
-        self._inverse_w0: Final = 1.0 / DIRECTION_VELOCITY_RAD_S
         self._stand_share: Final = 1.0 + settings.friction_uncertainty
         self._stand_floor: Final = settings.sigma_floor * joint.rated_torque_nm
         self._limit: Final = settings.torque_limit * joint.rated_torque_nm
         self._network_limit: Final = settings.network_limit * joint.rated_torque_nm
+        self._fade: Final = FADE_START * self._network_limit
+        self._inverse_fade: Final = 1.0 / max(self._network_limit - self._fade, 1e-12)
         self._run_network: Final = None if used is None else used.run_one
         self._network_scale: Final = fused.sigma.scale if used is None else used.sigma_scale
-        self._weight: Final = None if used is None else FusedTrust(used.envelope).weight
+        self._weight: Final = _no_trust if used is None else FusedTrust(used.envelope).weight
         self._temperature = nan
         self._thermal = 0.0
 
@@ -126,11 +138,11 @@ class FusedEstimator:
         status = tracker.status
         if seen is None:
             return STARTING_ESTIMATE if status == STARTING else INVALID_ESTIMATE
-        raw, v, _, torsion, c2, s2, c4, s4 = seen
-        if temperature_c != self._temperature:  # changes twice a second at most; NaN each time, cheaply
+        raw, v, _, torsion, c2, s2, c4, s4, s = seen
+        if temperature_c is not self._temperature:  # a joint reports it twice a second
             self._temperature = temperature_c
-            self._thermal = self._loss.thermal(temperature_c)
-        loss, half = self._loss.loss(raw, v, self._thermal)
+            self._thermal = self._thermal_of(temperature_c)
+        loss, half = self._loss(raw, v, self._thermal, s)
         physics, sigma = self._fuse(raw, loss, half, v, torsion)
         quadrant = (0 if raw >= 0.0 else 2) if v >= 0.0 else (3 if raw >= 0.0 else 1)
         torque, network = physics, nan
@@ -138,23 +150,15 @@ class FusedEstimator:
         run_network = self._run_network
         if run_network is not None:
             distance = torsion - (raw - loss)
-            correction = run_network(
-                v,
-                raw,
-                distance,
-                c2,
-                s2,
-                c4,
-                s4,
-                cos(link_position_rad),
-                sin(link_position_rad),
-            )
+            link = link_position_rad
+            correction = run_network(v, raw, distance, c2, s2, c4, s4, cos(link), sin(link))
             network = physics + correction
             weight = 0.0
-            if -self._network_limit <= correction <= self._network_limit:  # not so for NaN
-                assert self._weight is not None
+            size = correction if correction >= 0.0 else -correction
+            if size <= self._network_limit:  # not so for NaN
                 weight = self._weight(v, raw, distance, temperature_c)
-                s = tanh(v * self._inverse_w0)
+                if size > self._fade:
+                    weight = min(weight, (self._network_limit - size) * self._inverse_fade)
                 torque += weight * s * s * correction
                 scale += weight * (self._network_scale[quadrant] - scale)
             if weight < 1.0 and status != STANDSTILL:

@@ -55,7 +55,11 @@ class FusedNetworkModel(Protocol):
 
 
 class FusedNetwork:
-    """A loaded and checked network; arguments and errors as `estimator.network.TorqueNetwork`."""
+    """A loaded and checked network; arguments and errors as `estimator.network.TorqueNetwork`.
+
+    Public: `name`, `sha256`, `envelope`, `sigma_scale`, `joint`, `data_sha256`, `bound`; `run_one(x0..x8)` correction
+    of one sample [Nm], `run_many([n, 9])` of many.
+    """
 
     def __init__(self, source: bytes | str | os.PathLike[str], sha256: str | None = None) -> None:
         graph = OnnxGraph(source, sha256, FUSED_FEATURES, _KEYS)
@@ -73,9 +77,14 @@ class FusedNetwork:
         self.joint: Final = graph.text("joint")
         self.data_sha256: Final = graph.text("data_sha256")
         width = len(FUSED_FEATURES)
-        graph.prepare(
-            np.array(graph.numbers("input_low", width)), np.array(graph.numbers("input_high", width))
-        )
+        lows, highs = graph.numbers("input_low", width), graph.numbers("input_high", width)
+        for name, low, high in zip(FUSED_FEATURES, lows, highs, strict=True):
+            if low > high:
+                raise graph.error(
+                    f"metadata range of {name}: found input_low {low:g} above input_high {high:g}"
+                )
+        graph.prepare(np.array(lows), np.array(highs))
+        self.bound: Final = graph.bound
         self.run_one: Final = graph.run_one
 
     def run_many(self, features: FloatArray) -> FloatArray:

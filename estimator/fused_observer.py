@@ -4,16 +4,19 @@
     tau_t   = g/(s+g) (K d + K3 d^3)                     d = theta_m/G - theta_l - zero - e(theta_m)
     v       = g/(s+g) w/G
     c_n, s_n = g/(s+g) cos(n theta_m), g/(s+g) sin(n theta_m)     n = RIPPLE_ORDERS
+    direction = g/(s+g) tanh(w/(G w0))                   of friction, as tau_raw knows it
 
 All pass the same filter (first-order hold, measured step), so a torque ripple A cos(n theta_m + phi), which
-reaches tau_raw through that filter, is exactly linear in c_n and s_n at every speed.
+reaches tau_raw through that filter, is exactly linear in c_n and s_n at every speed, and friction that turns with
+the motion is linear in `direction`, however fast the reversal.
 """
 
 from __future__ import annotations
 
-from math import cos, expm1, isinf, nan, sin
+from math import cos, expm1, isinf, nan, sin, tanh
 from typing import Final, NamedTuple
 
+from estimator.friction import DIRECTION_VELOCITY_RAD_S
 from estimator.fused_parameters import Torsion
 from estimator.parameters import Joint
 from estimator.tracking import RAW_LIMIT
@@ -36,12 +39,16 @@ class FusedObserved(NamedTuple):
     sin2: float
     cos4: float
     sin4: float
+    direction: float
 
 
 _new: Final = tuple.__new__
 
-_Inputs = tuple[float, float, float, float, float, float, float]
-"""What the filter takes: u = i Kt + J g w, v, torsion torque, cos 2, sin 2, cos 4, sin 4."""
+_Inputs = tuple[float, float, float, float, float, float, float, float]
+"""What the filter takes: u = i Kt + J g w, v, torsion torque, cos 2, sin 2, cos 4, sin 4, direction."""
+
+_INVERSE_W0: Final = 1.0 / DIRECTION_VELOCITY_RAD_S
+_SETTLED_RAD_S: Final = 20.0 * DIRECTION_VELOCITY_RAD_S  # tanh(20) is 1 in float64
 
 
 class FusedObserver:
@@ -91,12 +98,16 @@ class FusedObserver:
         self._cos4: Final = sum(c for _, c, _ in four)
         self._sin4: Final = sum(s for _, _, s in four)
         self._others: Final = tuple(wave for wave in waves if wave[0] not in RIPPLE_ORDERS)
-        self._last: _Inputs = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        self._last: _Inputs = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         self._state: _Inputs = self._last
         self._link = self._link_velocity = 0.0
 
     def _inputs(
-        self, current_a: float, motor_position_rad: float, motor_velocity_rad_s: float, link_position_rad: float
+        self,
+        current_a: float,
+        motor_position_rad: float,
+        motor_velocity_rad_s: float,
+        link_position_rad: float,
     ) -> _Inputs:
         angle = motor_position_rad
         c = cos(angle)  # of the angle itself: a multiple of a finite angle need not be finite
@@ -116,14 +127,22 @@ class FusedObserver:
         )
         if self._others:
             d -= self._other_waves(angle)
+        v = motor_velocity_rad_s * self._inverse_gear
+        if v > _SETTLED_RAD_S:
+            direction = 1.0
+        elif v < -_SETTLED_RAD_S:
+            direction = -1.0
+        else:
+            direction = tanh(v * _INVERSE_W0)
         return (
             current_a * self._kt + self._inertia_rate * motor_velocity_rad_s,
-            motor_velocity_rad_s * self._inverse_gear,
+            v,
             d * (self._stiffness + self._cubic * d * d),
             c2,
             s2,
             c4,
             s4,
+            direction,
         )
 
     def _other_waves(self, angle: float) -> float:
@@ -137,7 +156,11 @@ class FusedObserver:
         return error
 
     def start(
-        self, current_a: float, motor_position_rad: float, motor_velocity_rad_s: float, link_position_rad: float
+        self,
+        current_a: float,
+        motor_position_rad: float,
+        motor_velocity_rad_s: float,
+        link_position_rad: float,
     ) -> FusedObserved:
         """Set the states of a joint that has always moved at this speed with this torsion."""
         now = self._inputs(current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
@@ -163,9 +186,9 @@ class FusedObserver:
         b0 = 1.0 - share
         b1 = share - a
         now = self._inputs(current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
-        u, v, t, c2, s2, c4, s4 = now
-        u_, v_, t_, c2_, s2_, c4_, s4_ = self._last
-        zu, zv, zt, zc2, zs2, zc4, zs4 = self._state
+        u, v, t, c2, s2, c4, s4, s = now
+        u_, v_, t_, c2_, s2_, c4_, s4_, s_ = self._last
+        zu, zv, zt, zc2, zs2, zc4, zs4, zs = self._state
         zu = a * zu + b0 * u + b1 * u_
         zv = a * zv + b0 * v + b1 * v_
         zt = a * zt + b0 * t + b1 * t_
@@ -173,16 +196,18 @@ class FusedObserver:
         zs2 = a * zs2 + b0 * s2 + b1 * s2_
         zc4 = a * zc4 + b0 * c4 + b1 * c4_
         zs4 = a * zs4 + b0 * s4 + b1 * s4_
+        zs = a * zs + b0 * s + b1 * s_
         self._last = now
-        self._state = (zu, zv, zt, zc2, zs2, zc4, zs4)
-        gone = -expm1(-self._link_rate * dt_s)
+        self._state = (zu, zv, zt, zc2, zs2, zc4, zs4, zs)
+        if self._link_rate != self._rate:
+            gone = -expm1(-self._link_rate * dt_s)
         slope = (link_position_rad - self._link) / dt_s
         self._link_velocity = r = self._link_velocity + gone * (slope - self._link_velocity)
         self._link = link_position_rad
         raw = (zu - self._inertia_rate * motor_velocity_rad_s) * self._gear
         if not -self._torsion_limit <= zt <= self._torsion_limit:  # NaN included
             raw = nan
-        return _new(FusedObserved, (raw, zv, r, zt, zc2, zs2, zc4, zs4))
+        return _new(FusedObserved, (raw, zv, r, zt, zc2, zs2, zc4, zs4, zs))
 
 
 def _waves(torsion: Torsion) -> list[tuple[float, float, float]]:

@@ -84,7 +84,9 @@ class AdditiveLoss:
             lists = (side.constant_nm, side.viscous_nms_per_rad, side.quadratic_nms2_per_rad2)
             if any(len(values) != len(nodes) for values in lists):
                 found = ", ".join(str(len(values)) for values in lists)
-                raise ConfigError(f"fused.loss: found lists of {found} numbers, expected {len(nodes)} as nodes")
+                raise ConfigError(
+                    f"fused.loss: found lists of {found} numbers, expected {len(nodes)} as nodes"
+                )
 
     @classmethod
     def from_section(cls, section: Section) -> AdditiveLoss:
@@ -209,7 +211,9 @@ class Fused:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain dicts and lists; `from_section` of it gives an equal value."""
-        return {f.name: _plain(getattr(self, f.name)) for f in fields(self) if getattr(self, f.name) is not None}
+        return {
+            f.name: _plain(getattr(self, f.name)) for f in fields(self) if getattr(self, f.name) is not None
+        }
 
 
 def _plain(value: Any) -> Any:

@@ -5,15 +5,15 @@ Also the way in for fits: `observe_run` gives what the additive loss, the fusion
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from estimator.additive_loss import AdditiveLossModel
-from estimator.friction import DIRECTION_VELOCITY_RAD_S, FloatArray
+from estimator.friction import FloatArray
 from estimator.fused_estimator import STANDSTILL_SIGMAS, fused_parts
 from estimator.fused_network import FusedNetworkModel
-from estimator.fused_observer import FusedObserver
+from estimator.fused_observer import FusedObserved, FusedObserver
 from estimator.fused_parameters import Torsion
 from estimator.fused_trust import FusedTrust
 from estimator.fusion import Fusion
@@ -21,7 +21,10 @@ from estimator.parameters import Joint
 from estimator.settings import EstimatorSettings
 from estimator.status import DEGRADED, INVALID, STANDSTILL, VALID
 from estimator.tracking import Tracker
+from estimator.validity import FADE_START
 from estimator.whole_run import EstimateRun, StatusArray
+
+QuadrantArray = np.ndarray[tuple[int], np.dtype[np.intp]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +32,7 @@ class ObservedRun:
     """Outputs of the fused observer over a run, arrays [n]; NaN where it was not running.
 
     Torques [Nm, joint side], velocity [rad/s, joint side]; waves [n, 4]: filtered cos and sin of 2 and 4 times
-    the motor angle; link [n]: link position [rad]; temperature [n], NaN where unknown.
+    the motor angle; link [n]: link position [rad]; temperature [n], NaN where unknown; direction [n], -1 to 1.
     """
 
     status: StatusArray
@@ -39,6 +42,7 @@ class ObservedRun:
     waves: FloatArray
     link_rad: FloatArray
     temperature_c: FloatArray
+    direction: FloatArray
 
 
 def observe_run(  # noqa: PLR0917 - as a sample, in arrays
@@ -52,7 +56,10 @@ def observe_run(  # noqa: PLR0917 - as a sample, in arrays
     link_position_rad: FloatArray,
     temperature_c: FloatArray | None = None,
 ) -> ObservedRun:
-    """Run observer and guard over a run; arrays [n]. Raises ValueError for arrays of different length."""
+    """Run observer and guard over a run; arrays [n], dt_s[k] is the time since sample k-1 (dt_s[0] is not used).
+
+    Raises ValueError for arrays of different length.
+    """
     columns = [
         np.ascontiguousarray(column, np.float64)
         for column in (dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
@@ -69,11 +76,11 @@ def observe_run(  # noqa: PLR0917 - as a sample, in arrays
     step = tracker.step
     status = np.empty(count, np.uint8)
     rows: list[tuple[float, ...]] = []
-    nothing = (np.nan,) * 8
+    nothing = (np.nan,) * len(FusedObserved._fields)
     for k, sample in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
         rows.append(step(*sample) or nothing)
         status[k] = tracker.status
-    seen = np.array(rows, np.float64).reshape(-1, 8)
+    seen = np.array(rows, np.float64).reshape(-1, len(nothing))
     return ObservedRun(
         status,
         seen[:, 0].copy(),
@@ -82,11 +89,12 @@ def observe_run(  # noqa: PLR0917 - as a sample, in arrays
         seen[:, 4:8].copy(),
         columns[4],
         np.asarray(temperature_c, np.float64),
+        seen[:, 8].copy(),
     )
 
 
 def network_features(seen: ObservedRun, current_path_nm: FloatArray) -> FloatArray:
-    """Return FUSED_FEATURES [n, 9]; current_path_nm [n]: motor torque less loss."""
+    """Return FUSED_FEATURES [n, 9]; current_path_nm [n]: motor torque less loss; link angles must be finite."""
     return np.column_stack(
         (
             seen.velocity_rad_s,
@@ -99,7 +107,7 @@ def network_features(seen: ObservedRun, current_path_nm: FloatArray) -> FloatArr
     )
 
 
-def quadrant_many(raw_nm: FloatArray, velocity_rad_s: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+def quadrant_many(raw_nm: FloatArray, velocity_rad_s: FloatArray) -> QuadrantArray:
     """Return the index into QUADRANTS [n] by the signs of motor torque and velocity."""
     positive = raw_nm >= 0.0
     return np.where(velocity_rad_s >= 0.0, np.where(positive, 0, 2), np.where(positive, 3, 1)).astype(np.intp)
@@ -108,41 +116,71 @@ def quadrant_many(raw_nm: FloatArray, velocity_rad_s: FloatArray) -> np.ndarray[
 def estimate_observed(
     joint: Joint, settings: EstimatorSettings, network: FusedNetworkModel | None, seen: ObservedRun
 ) -> EstimateRun:
-    """Return the estimates of an observed run (observed with the joint's own torsion)."""
+    """Return the estimates of an observed run (observed with the joint's own torsion); features are [n, 9].
+
+    Raises ConfigError as FusedEstimator does.
+    """
     fused, used = fused_parts(joint, settings, network)
     status = seen.status.copy()
-    raw, v = seen.raw_nm, seen.velocity_rad_s
-    running = (status != INVALID) & ~np.isnan(raw)
-    raw, v = np.where(running, raw, 0.0), np.where(running, v, 0.0)
-    torsion = np.where(running, seen.torsion_nm, 0.0)
-    loss, half = AdditiveLossModel(fused.loss).loss_many(raw, v, seen.temperature_c)
-    fusion = Fusion(fused.sigma, fused.torsion is not None)
-    physics, sigma = fusion.fuse_many(raw, loss, half, v, torsion)
-    quadrant = quadrant_many(raw, v)
-    scale = np.array(fused.sigma.scale)[quadrant]
-    torque = physics.copy()
-    answer = np.full_like(raw, np.nan)
-    features = network_features(seen, raw - loss)
-    features[~running] = np.nan
-    if used is not None:
-        correction = np.full_like(raw, np.nan)
-        correction[running] = used.run_many(features[running])
-        answer = physics + correction
-        with np.errstate(invalid="ignore"):
-            near = np.abs(correction) <= settings.network_limit * joint.rated_torque_nm
-        weight = FusedTrust(used.envelope).weight_many(v, raw, torsion - (raw - loss), seen.temperature_c)
-        weight = np.where(near, weight, 0.0)
-        fade = np.tanh(v / DIRECTION_VELOCITY_RAD_S) ** 2
-        torque += np.where(near, weight * fade * np.where(near, correction, 0.0), 0.0)
-        scale = scale + weight * (np.array(used.sigma_scale)[quadrant] - scale)
-        status[running & (weight < 1.0) & (status == VALID)] = DEGRADED
-    standing = status == STANDSTILL
-    open_nm = (1.0 + settings.friction_uncertainty) * half + settings.sigma_floor * joint.rated_torque_nm
-    sigma = np.where(standing, np.minimum(open_nm, STANDSTILL_SIGMAS * scale * sigma), sigma * scale)
-    with np.errstate(invalid="ignore"):
-        beyond = running & ~(np.abs(torque) <= settings.torque_limit * joint.rated_torque_nm)
-    status[beyond] = INVALID
-    for stage in (physics, answer):
-        stage[~running] = np.nan
-    torque[beyond | ~running] = sigma[beyond | ~running] = np.nan
-    return EstimateRun(torque, sigma, status, np.full_like(raw, np.nan), physics, answer, features)
+    running = (status != INVALID) & ~np.isnan(seen.raw_nm)
+    at = _running_only(seen, running)
+    raw, v, torsion = at.raw_nm, at.velocity_rad_s, at.torsion_nm
+    with np.errstate(invalid="ignore", over="ignore"):
+        loss, half = AdditiveLossModel(fused.loss).loss_many(raw, v, at.temperature_c, at.direction)
+        physics, sigma = Fusion(fused.sigma, fused.torsion is not None).fuse_many(raw, loss, half, v, torsion)
+        features = network_features(at, raw - loss)
+        features[~running] = np.nan
+        quadrant = quadrant_many(raw, v)
+        scale = np.array(fused.sigma.scale)[quadrant]
+        torque, answer = physics, np.full_like(raw, np.nan)
+        if used is not None:
+            correction = np.full_like(raw, np.nan)
+            correction[running] = used.run_many(features[running])
+            limit = settings.network_limit * joint.rated_torque_nm
+            weight = _weight(used, at, raw - loss, correction, limit)
+            answer = physics + correction
+            torque = physics + np.where(weight > 0.0, weight * at.direction**2 * correction, 0.0)
+            scale = scale + weight * (np.array(used.sigma_scale)[quadrant] - scale)
+            status[(status == VALID) & (weight < 1.0)] = DEGRADED
+        open_nm = (1.0 + settings.friction_uncertainty) * half + settings.sigma_floor * joint.rated_torque_nm
+        standing = np.minimum(open_nm, STANDSTILL_SIGMAS * scale * sigma)
+        sigma = np.where(status == STANDSTILL, standing, sigma * scale)
+        good = running & (np.abs(torque) <= settings.torque_limit * joint.rated_torque_nm)
+    status[running & ~good] = INVALID
+    empty = np.full_like(raw, np.nan)
+    return EstimateRun(
+        np.where(good, torque, np.nan),
+        np.where(good, sigma, np.nan),
+        status,
+        empty,
+        np.where(running, physics, np.nan),
+        answer,
+        features,
+    )
+
+
+def _running_only(seen: ObservedRun, running: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> ObservedRun:
+    """Return zeros where nothing was observed: the formulas then need no exceptions."""
+    return replace(
+        seen,
+        raw_nm=np.where(running, seen.raw_nm, 0.0),
+        velocity_rad_s=np.where(running, seen.velocity_rad_s, 0.0),
+        torsion_nm=np.where(running, seen.torsion_nm, 0.0),
+        link_rad=np.where(running, seen.link_rad, 0.0),
+        direction=np.where(running, seen.direction, 0.0),
+    )
+
+
+def _weight(
+    network: FusedNetworkModel,
+    seen: ObservedRun,
+    current_path_nm: FloatArray,
+    correction_nm: FloatArray,
+    limit_nm: float,
+) -> FloatArray:
+    """Return the network's share [n] without its fading at standstill; a correction of NaN gives 0."""
+    raw, v, distance = seen.raw_nm, seen.velocity_rad_s, seen.torsion_nm - current_path_nm
+    trust = FusedTrust(network.envelope).weight_many(v, raw, distance, seen.temperature_c)
+    size, fade = np.abs(correction_nm), FADE_START * limit_nm
+    near = np.where(size > fade, (limit_nm - size) / max(limit_nm - fade, 1e-12), 1.0)
+    return np.where(size <= limit_nm, np.minimum(trust, near), 0.0)

@@ -9,23 +9,33 @@ current, falling to 0 beside it. Outside of all this nothing of the network is l
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isnan
 from typing import Any, Final
 
 import numpy as np
 
 from estimator.friction import FloatArray
+from estimator.onnx_graph import finite
 
 TEMPERATURE_MARGIN_K: Final = 1.0
+"""Beside the range of temperatures over which trust is lost."""
+
 DISTANCE_MARGIN: Final = 0.25
 """Part of the range beyond which a larger distance between torsion and current counts as unknown."""
+
+
+_LEAST: Final = 1e-6
+_MOST: Final = 1e6
+"""Limits of steps and distance, far beyond any joint: their reciprocals stay numbers."""
 
 
 @dataclass(frozen=True, slots=True)
 class Envelope:
     """What the training data covered.
 
-    velocity_step_rad_s, torque_step_nm: cells; counts: [2 nv + 1][2 nt + 1] of 0 and 1, centred on zero; distance_nm:
-    largest |torsion - current path|; temperature_c: lowest and highest, None where the joint reports none.
+    velocity_step_rad_s, torque_step_nm: distance of cell centres; known: [2 nv + 1][2 nt + 1] of 0 and 1 over velocity
+    and motor torque, its middle cell at zero; distance_nm: largest |torsion - current path|; temperature_c: lowest
+    and highest, None where the joint reports none.
     """
 
     velocity_step_rad_s: float
@@ -37,29 +47,18 @@ class Envelope:
     @classmethod
     def from_mapping(cls, mapping: Any) -> Envelope:
         """Build from the network's metadata; raises ValueError with what was found and expected."""
-        keys = ["velocity_step_rad_s", "torque_step_nm", "known", "distance_nm", "temperature_c"]
-        if not isinstance(mapping, dict) or sorted(mapping) != sorted(keys):
+        keys = ("velocity_step_rad_s", "torque_step_nm", "known", "distance_nm", "temperature_c")
+        if not isinstance(mapping, dict) or set(mapping) != set(keys):
             raise ValueError(f"found {str(mapping)[:80]}, expected the keys {', '.join(keys)}")
-        steps = [mapping[key] for key in ("velocity_step_rad_s", "torque_step_nm", "distance_nm")]
-        if not all(isinstance(x, int | float) and 0.0 < x < 1e6 for x in steps):
-            raise ValueError(f"found steps and distance {steps}, expected numbers > 0")
-        known = mapping["known"]
-        good = isinstance(known, list) and known and all(isinstance(row, list) and row for row in known)
-        if not good or len({len(row) for row in known}) != 1 or len(known) % 2 == 0 or len(known[0]) % 2 == 0:
-            raise ValueError("found a map that is no table with odd numbers of rows and columns")
-        if not all(cell in (0, 1) for row in known for cell in row):
-            raise ValueError("found a map with other cells than 0 and 1")
-        t = mapping["temperature_c"]
-        if t is not None and not (
-            isinstance(t, list) and len(t) == 2 and all(isinstance(x, int | float) for x in t) and t[0] <= t[1]
-        ):
-            raise ValueError(f"found temperature_c {t}, expected null or two rising numbers")
+        for key in ("velocity_step_rad_s", "torque_step_nm", "distance_nm"):
+            if not finite(mapping[key]) or not _LEAST <= mapping[key] <= _MOST:
+                raise ValueError(f"{key}: found {mapping[key]!r}, expected {_LEAST:g} to {_MOST:g}")
         return cls(
-            float(steps[0]),
-            float(steps[1]),
-            tuple(tuple(int(cell) for cell in row) for row in known),
-            float(steps[2]),
-            None if t is None else (float(t[0]), float(t[1])),
+            float(mapping["velocity_step_rad_s"]),
+            float(mapping["torque_step_nm"]),
+            _checked_map(mapping["known"]),
+            float(mapping["distance_nm"]),
+            _checked_range(mapping["temperature_c"]),
         )
 
     def to_mapping(self) -> dict[str, Any]:
@@ -73,6 +72,28 @@ class Envelope:
         }
 
 
+def _checked_map(known: Any) -> tuple[tuple[int, ...], ...]:
+    """Return the map; ValueError unless it is a table with a middle cell, of 0 and 1."""
+    if not (isinstance(known, list) and known and all(isinstance(row, list) for row in known)):
+        raise ValueError(f"known: found {str(known)[:40]}, expected a list of rows")
+    widths = {len(row) for row in known}
+    if len(widths) != 1 or len(known) % 2 == 0 or min(widths) % 2 == 0:
+        found = f"{len(known)} rows of {', '.join(map(str, sorted(widths)))} cells"
+        raise ValueError(f"known: found {found}, expected odd numbers of rows and of cells in each row")
+    if not all(finite(cell) and cell in (0, 1) for row in known for cell in row):
+        raise ValueError("known: found other cells, expected 0 and 1")
+    return tuple(tuple(int(cell) for cell in row) for row in known)
+
+
+def _checked_range(value: Any) -> tuple[float, float] | None:
+    """Return the range of temperatures; ValueError unless it is None or two numbers that do not fall."""
+    if value is None:
+        return None
+    if isinstance(value, list) and len(value) == 2 and all(map(finite, value)) and value[0] <= value[1]:
+        return float(value[0]), float(value[1])
+    raise ValueError(f"temperature_c: found {str(value)[:40]}, expected null or [lowest, highest]")
+
+
 class FusedTrust:
     """Weight of the network in [0, 1], continuous in all arguments."""
 
@@ -80,7 +101,6 @@ class FusedTrust:
         "_distance",
         "_high",
         "_inverse_fade",
-        "_inverse_margin",
         "_inverse_torque",
         "_inverse_velocity",
         "_low",
@@ -90,6 +110,7 @@ class FusedTrust:
         "_torque_last",
         "_velocity_0",
         "_velocity_last",
+        "_with_temperature",
     )
 
     def __init__(self, envelope: Envelope) -> None:
@@ -97,20 +118,22 @@ class FusedTrust:
         self._inverse_torque: Final = 1.0 / envelope.torque_step_nm
         # a frame of zeros: the interpolation needs no border, and beyond the map nothing is known
         self._table: Final = np.pad(np.array(envelope.known, np.float64), 1)
-        self._map: Final = tuple(tuple(row) for row in self._table.tolist())
-        self._velocity_0: Final = (self._table.shape[0] - 1) / 2
-        self._torque_0: Final = (self._table.shape[1] - 1) / 2
-        self._velocity_last: Final = self._table.shape[0] - 1
-        self._torque_last: Final = self._table.shape[1] - 1
+        rows: list[list[float]] = self._table.tolist()
+        self._map: Final = tuple(tuple(row) for row in rows)
+        self._velocity_last: Final = len(rows) - 1
+        self._torque_last: Final = len(rows[0]) - 1
+        self._velocity_0: Final = self._velocity_last / 2
+        self._torque_0: Final = self._torque_last / 2
         self._distance: Final = envelope.distance_nm
         self._inverse_fade: Final = 1.0 / (DISTANCE_MARGIN * envelope.distance_nm)
-        t = envelope.temperature_c
-        self._low: Final = -1e9 if t is None else t[0]
-        self._high: Final = 1e9 if t is None else t[1]
-        self._inverse_margin: Final = 0.0 if t is None else 1.0 / TEMPERATURE_MARGIN_K
+        self._with_temperature: Final = envelope.temperature_c is not None
+        self._low, self._high = envelope.temperature_c or (0.0, 0.0)
 
     def weight(self, velocity_rad_s: float, raw_nm: float, distance_nm: float, temperature_c: float) -> float:
-        """Return the share of trust; a temperature of NaN is unknown, hence 0 where the data had one."""
+        """Return the share of trust; a temperature of NaN is unknown, hence 0 where the data had one.
+
+        raw_nm: motor torque; distance_nm: torsion less current path; finite both, as is the velocity.
+        """
         x = velocity_rad_s * self._inverse_velocity + self._velocity_0
         y = raw_nm * self._inverse_torque + self._torque_0
         if not (0.0 <= x < self._velocity_last and 0.0 <= y < self._torque_last):
@@ -128,12 +151,12 @@ class FusedTrust:
         distance = distance_nm if distance_nm >= 0.0 else -distance_nm
         if distance > self._distance:
             weight *= max(0.0, 1.0 - (distance - self._distance) * self._inverse_fade)
-        if self._low <= temperature_c <= self._high:
+        if self._low <= temperature_c <= self._high or not self._with_temperature:
             return weight
+        if isnan(temperature_c):
+            return 0.0
         beyond = max(self._low - temperature_c, temperature_c - self._high)
-        if beyond != beyond:
-            return weight if self._inverse_margin == 0.0 else 0.0
-        return weight * max(0.0, 1.0 - beyond * self._inverse_margin)
+        return weight * max(0.0, 1.0 - beyond * (1.0 / TEMPERATURE_MARGIN_K))
 
     def weight_many(
         self, velocity: FloatArray, raw: FloatArray, distance: FloatArray, temperature: FloatArray
@@ -148,11 +171,12 @@ class FusedTrust:
         table = self._table
         a = table[m, n] + y * (table[m, n + 1] - table[m, n])
         b = table[m + 1, n] + y * (table[m + 1, n + 1] - table[m + 1, n])
-        weight = np.where(inside, a + x * (b - a), 0.0)
+        weight: FloatArray = np.where(inside, a + x * (b - a), 0.0)
         excess = np.maximum(np.abs(distance) - self._distance, 0.0)
         weight = weight * np.maximum(0.0, 1.0 - excess * self._inverse_fade)
+        if not self._with_temperature:
+            return weight
         beyond = np.maximum(np.maximum(self._low - temperature, temperature - self._high), 0.0)
-        share = np.maximum(0.0, 1.0 - beyond * self._inverse_margin)
-        unknown = 1.0 if self._inverse_margin == 0.0 else 0.0
-        result: FloatArray = weight * np.where(np.isnan(share), unknown, share)
+        share = np.maximum(0.0, 1.0 - beyond * (1.0 / TEMPERATURE_MARGIN_K))
+        result: FloatArray = weight * np.where(np.isnan(share), 0.0, share)
         return result

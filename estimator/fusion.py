@@ -23,7 +23,10 @@ from estimator.fused_parameters import FusedSigma
 
 
 class Fusion:
-    """Value and standard deviation of the fused physics [Nm, joint side]."""
+    """Value and standard deviation of the fused physics [Nm, joint side].
+
+    with_torsion False: the current path alone, whatever the torsion.
+    """
 
     __slots__ = ("_current", "_load", "_reference", "_torsion", "_torsion_load", "_viscous", "_with_torsion")
 
@@ -39,7 +42,7 @@ class Fusion:
     def fuse(
         self, raw_nm: float, loss_nm: float, half_nm: float, velocity_rad_s: float, torsion_nm: float
     ) -> tuple[float, float]:
-        """Return (physics, sigma) [Nm]."""
+        """Return (physics, sigma) [Nm]; half_nm: `AdditiveLossModel.loss`."""
         c = (
             self._current
             + self._viscous * velocity_rad_s * velocity_rad_s
@@ -62,10 +65,17 @@ class Fusion:
         torsion_nm: FloatArray,
     ) -> tuple[FloatArray, FloatArray]:
         """Vectorised twin of `fuse`, arrays [n]."""
-        c = self._current + self._viscous * velocity_rad_s**2 + self._load * raw_nm**2 + half_nm**2
+        alpha, sigma = self.weigh_many(raw_nm, half_nm, velocity_rad_s, torsion_nm)
         value = raw_nm - loss_nm
+        return value + alpha * (torsion_nm - value), sigma
+
+    def weigh_many(
+        self, raw_nm: FloatArray, half_nm: FloatArray, velocity_rad_s: FloatArray, torsion_nm: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return (alpha, sigma), arrays [n]: share of the torsion, and standard deviation of the fused value [Nm]."""
+        c = self._current + self._viscous * velocity_rad_s**2 + self._load * raw_nm**2 + half_nm**2
         if not self._with_torsion:
-            return value, np.sqrt(c + self._reference)
+            return np.zeros_like(c), np.sqrt(c + self._reference)
         t = self._torsion + self._torsion_load * torsion_nm**2
         alpha = c / (c + t)
-        return value + alpha * (torsion_nm - value), np.sqrt(alpha * t + self._reference)
+        return alpha, np.sqrt(alpha * t + self._reference)

@@ -6,7 +6,7 @@ import numpy as np
 
 from estimator.checked import ConfigError
 from estimator.friction import FloatArray
-from estimator.fused_estimator import FusedEstimator
+from estimator.fused_estimator import FusedEstimator, fused_parts
 from estimator.fused_network import FusedNetwork
 from estimator.fused_run import estimate_observed, observe_run
 from estimator.joint_estimator import JointEstimator
@@ -30,12 +30,8 @@ def make_estimator(
 ) -> AnyEstimator:
     """Return the step-by-step estimator of a joint. Raises ConfigError when joint, method and network do not fit."""
     if settings.method == "fused":
-        if isinstance(network, TorqueNetwork):
-            raise ConfigError(f"joint {joint.name}: found a network of method 'network', expected one of 'fused'")
-        return FusedEstimator(joint, settings, network)
-    if isinstance(network, FusedNetwork):
-        raise ConfigError(f"joint {joint.name}: found a network of method 'fused', expected one of 'network'")
-    return JointEstimator(joint, settings, network)
+        return FusedEstimator(joint, settings, _fused(joint, network))
+    return JointEstimator(joint, settings, _paper(joint, network))
 
 
 def estimate_columns(
@@ -45,8 +41,21 @@ def estimate_columns(
     time_s: FloatArray,
     columns: JointColumns,
 ) -> EstimateRun:
-    """Return the estimates of one joint of a run table; raises ConfigError, and ValueError for a missing column."""
+    """Return the estimates of one joint of a run table, time_s [n].
+
+    Raises ConfigError as `make_estimator` does, ValueError for a missing column.
+    """
     dt = np.diff(time_s, prepend=time_s[0])
+    inputs = _inputs(joint, columns)
+    if settings.method == "fused":
+        fused, used = fused_parts(joint, settings, _fused(joint, network))
+        seen = observe_run(joint, settings, fused.torsion, dt, *inputs, columns.temperature_c)
+        return estimate_observed(joint, settings, used, seen)
+    return estimate_run(joint, settings, _paper(joint, network), dt, *inputs)
+
+
+def _inputs(joint: Joint, columns: JointColumns) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return current, motor position, motor velocity and link position; ValueError for a missing column."""
     needed = {
         name: getattr(columns, name)
         for name in ("current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad")
@@ -54,12 +63,19 @@ def estimate_columns(
     missing = [name for name, column in needed.items() if column is None]
     if missing:
         raise ValueError(f"joint {joint.name}: the run has no {', '.join(missing)}")
-    if settings.method == "fused":
-        if isinstance(network, TorqueNetwork):
-            raise ConfigError(f"joint {joint.name}: found a network of method 'network', expected one of 'fused'")
-        torsion = None if joint.fused is None else joint.fused.torsion
-        seen = observe_run(joint, settings, torsion, dt, *needed.values(), columns.temperature_c)
-        return estimate_observed(joint, settings, network, seen)
+    current, motor, velocity, link = needed.values()
+    return current, motor, velocity, link
+
+
+def _fused(joint: Joint, network: AnyNetwork | None) -> FusedNetwork | None:
+    """Return the network when method `fused` can use it."""
+    if isinstance(network, TorqueNetwork):
+        raise ConfigError(f"joint {joint.name}: found a network of method 'network', expected one of 'fused'")
+    return network
+
+
+def _paper(joint: Joint, network: AnyNetwork | None) -> TorqueNetwork | None:
+    """Return the network when the paper's methods can use it."""
     if isinstance(network, FusedNetwork):
         raise ConfigError(f"joint {joint.name}: found a network of method 'fused', expected one of 'network'")
-    return estimate_run(joint, settings, network, dt, *needed.values())
+    return network

@@ -240,7 +240,7 @@ def _at_reversal(
     """Velocity to check the limits with, and the factor by which the torque must keep away from them; [m, n] each.
 
     When the driving joint turns from driving to being driven under load, its loss changes sides: the torque leaps by a
-    third and rings, since the velocity loop has to follow. Within REVERSAL_S of a reversal the check therefore takes the
+    half and rings, since the velocity loop has to follow. Within REVERSAL_S of a reversal the check therefore takes the
     side with the larger torque and leaves REVERSAL_OVERSHOOT for the ringing.
     """
     close = np.abs(velocity) < np.maximum(REVERSAL_RAD_S, REVERSAL_S * np.abs(acceleration))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
@@ -21,12 +22,15 @@ from sysid.run_signals import RunSignals
 from sysid.sigma_fit import PathResiduals, conformal_scale, fit_sigma, quadrants_of
 from sysid.torsion_fit import fit_torsion, torsion_torque
 
-FOLDS = 4
+FOLDS: Final = 4
+_LEAST_RUNS: Final = 6
 
 
 @dataclass(frozen=True)
 class FusedFit:
-    """fused: the section; loss: details of its fit; unseen_rmse_nm: of the physics on runs it had not seen, per run."""
+    """fused: the section; loss: details of its fit; unseen_rmse_nm: of the physics, one per run with motion, each run
+    judged by a fit that had not seen it.
+    """
 
     fused: Fused
     loss: LossFit
@@ -34,7 +38,7 @@ class FusedFit:
 
 
 def folds(runs: Sequence[RunSignals], count: int = FOLDS) -> Iterator[tuple[list[RunSignals], list[int]]]:
-    """Yield (runs to fit, indices of runs to judge); whole runs only, every run judged once."""
+    """Yield (runs to fit, indices of runs to judge); whole runs only, every run judged once and never fitted then."""
     for k in range(min(count, len(runs))):
         judged = [n for n in range(len(runs)) if n % count == k]
         yield [run for n, run in enumerate(runs) if n not in judged], judged
@@ -45,37 +49,42 @@ def fit_fused(runs: Sequence[RunSignals], friction: Friction) -> FusedFit:
 
     runs: at least 6 (ValueError); friction: of the joint file. Raises LossFitError, TorsionError.
     """
-    if len(runs) < 6:
-        raise ValueError(f"found {len(runs)} runs, expected at least 6: standard deviations need unseen runs")
-    residuals: list[PathResiduals | None] = [None] * len(runs)
-    for known, judged in folds(runs):
-        torsion, loss = fit_torsion(known), fit_loss(known, friction).loss
-        for n in judged:
-            residuals[n] = path_residuals(runs[n], loss, torsion)
-    unseen = [each for each in residuals if each is not None and len(each.raw_nm) > 0]
+    if len(runs) < _LEAST_RUNS:
+        raise ValueError(
+            f"found {len(runs)} runs, expected at least {_LEAST_RUNS}: standard deviations need unseen runs"
+        )
+    unseen = _unseen(runs, friction)
     sigma = fit_sigma(unseen)
-    errors, sigmas = zip(*(_fused_error(run, sigma) for run in unseen), strict=True)
+    errors, sigmas = zip(*(fused_error(run, sigma) for run in unseen), strict=True)
     sigma = replace(sigma, scale=conformal_scale(errors, sigmas, [quadrants_of(run) for run in unseen]))
     fit = fit_loss(runs, friction)
     rmse = tuple(float(np.sqrt(np.mean(e * e))) for e in errors)
     return FusedFit(Fused(fit.loss, fit_torsion(runs), sigma), fit, rmse)
 
 
+def _unseen(runs: Sequence[RunSignals], friction: Friction) -> list[PathResiduals]:
+    """Return the residuals of every run with motion, in order, from fits on the runs of the other folds."""
+    found: dict[int, PathResiduals] = {}
+    for known, judged in folds(runs):
+        torsion, loss = fit_torsion(known), fit_loss(known, friction).loss
+        found |= {n: path_residuals(runs[n], loss, torsion) for n in judged if runs[n].moving.any()}
+    return [found[n] for n in sorted(found)]
+
+
 def path_residuals(run: RunSignals, loss: AdditiveLoss, torsion: Torsion) -> PathResiduals:
-    """Return what both paths miss on a run's moving samples."""
+    """Return what both paths miss on a run's moving samples, with a loss and a torsion from elsewhere."""
     keep = run.moving
     raw, v, sensor = run.seen.raw_nm[keep], run.seen.velocity_rad_s[keep], run.sensor_nm[keep]
-    value, half = AdditiveLossModel(loss).loss_many(raw, v, run.seen.temperature_c[keep])
+    value, half = AdditiveLossModel(loss).loss_many(
+        raw, v, run.seen.temperature_c[keep], run.seen.direction[keep]
+    )
     tau = torsion_torque(torsion, run)[keep]
     return PathResiduals(raw, v, half, tau, raw - value - sensor, tau - sensor)
 
 
-def _fused_error(run: PathResiduals, sigma: FusedSigma) -> tuple[FloatArray, FloatArray]:
-    """Return error and standard deviation [n] of the fused physics; the sensor cancels out of the difference."""
-    zero = np.zeros_like(run.raw_nm)
-    sensor = run.torsion_nm - run.torsion_error_nm
-    loss = run.raw_nm - sensor - run.current_error_nm
-    value, spread = Fusion(sigma, True).fuse_many(
-        run.raw_nm, loss, run.half_nm, run.velocity_rad_s, run.torsion_nm
+def fused_error(run: PathResiduals, sigma: FusedSigma) -> tuple[FloatArray, FloatArray]:
+    """Return error and standard deviation [n] of the fused physics: its weights apply to the paths' errors alike."""
+    alpha, spread = Fusion(sigma, True).weigh_many(
+        run.raw_nm, run.half_nm, run.velocity_rad_s, run.torsion_nm
     )
-    return value - sensor + zero, spread
+    return run.current_error_nm + alpha * (run.torsion_error_nm - run.current_error_nm), spread

@@ -1,17 +1,19 @@
 """Fit of the additive loss: penalised least squares over runs, with what differs from run to run as nuisance. Pure.
 
-    tau_raw - sensor = L(x, v) - kappa (T_r - T0) v + zero_r + u_r v + ripple
+    tau_raw - sensor = (1+s)/2 L_+ - (1-s)/2 L_- + kappa g(T) v + zero_r + u_r v + ripple
 
-L is linear in its node values (estimator.additive_loss). zero_r (the sensor's zero) and u_r (viscous friction of that
-run against the mean) are random effects with a prior width, the ripple waves are columns without one: none of them
-enters the result, all of them would bias it. Curvature over the nodes is penalised, and where there are no data the
-nodes fall back on the joint file's friction. kappa/Fv is viscous_per_k, with a prior; T_r is the run's mean.
+s is the observer's direction; L_+ and L_- are linear in their node values (estimator.additive_loss). zero_r (the
+sensor's zero) and u_r (viscous friction of that run against the mean) are random effects with a prior width, the
+ripple waves have a wide one: none of them enters the result, all of them would bias it. Curvature over the nodes is
+penalised, and where there are no data the nodes fall back on the joint file's friction. g(T) is
+(exp(-b (T - T0)) - 1)/b with b = kappa/Fv, the viscous_per_k, found by repetition; it has a prior.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -26,21 +28,28 @@ LOAD_NODES_NM = (
 )  # fmt: skip
 """Closer near zero, where the loss changes its nature within one ampere."""
 
-_EVERY = 10
-_MIN_SPEED_RAD_S = 0.03  # below, the direction of friction is not settled
-_NODES = len(LOAD_NODES_NM)
-_ROWS = 3 * _NODES + 1  # one direction: c, f, q, Stribeck
-_RIPPLE = slice(2 * _ROWS, 2 * _ROWS + 4)
-_THERMAL = 2 * _ROWS + 4
-_COMMON = 2 * _ROWS + 5
+_EVERY: Final = 10
+_MIN_SPEED_RAD_S: Final = 0.03  # below, the direction of friction is not settled
+_MAX_LOAD_NM: Final = 60.0  # beyond, the outer nodes would have to reach too far
+_NODES: Final = len(LOAD_NODES_NM)
+_ROWS: Final = 3 * _NODES + 1  # one direction: c, f, q, Stribeck
+_RIPPLE: Final = slice(2 * _ROWS, 2 * _ROWS + 4)
+_THERMAL: Final = 2 * _ROWS + 4
+_COMMON: Final = 2 * _ROWS + 5  # what all runs share; zero_r and u_r of each run follow
 
 PER_K_PRIOR = (0.02, 0.012)  # 1/K: oil and grease lose 2 to 3.5 % of viscosity per kelvin
-_NOISE_NM = 0.3
-_COLOUR = 4.0  # neighbours at 10 ms still share their error: so many samples count as one
-_ZERO_SIGMA_NM = 0.3
-_VISCOUS_SIGMA = 0.3  # Nms/rad, of a run against the mean
+_PER_K_LIMIT: Final = 0.1  # what a joint file may hold
+_REPETITIONS: Final = 3
+_NOISE_NM: Final = 0.3
+_COLOUR: Final = 4.0  # neighbours at 10 ms still share their error: so many samples count as one
+_ZERO_SIGMA_NM: Final = 0.3
+_VISCOUS_SIGMA: Final = 0.3  # Nms/rad, of a run against the mean
+_RIPPLE_SIGMA_NM: Final = 2.0
+_NO_VISCOUS: Final = (
+    1e-6  # Nms/rad, in place of a joint file's 0: its loss has no part that falls with temperature
+)
 # (pull towards the joint file's friction, allowed second difference per step) of c, f, q
-_PRIOR = {"c": (6.0, 0.6), "f": (3.0, 0.35), "q": (0.6, 0.15)}
+_PRIOR: Final = {"c": (6.0, 0.6), "f": (3.0, 0.35), "q": (0.6, 0.15)}
 
 
 class LossFitError(ValueError):
@@ -49,7 +58,9 @@ class LossFitError(ValueError):
 
 @dataclass(frozen=True)
 class LossFit:
-    """Result: the loss; residual_nm: RMS of the fit with its nuisances; runs and samples used."""
+    """Result: the loss; residual_nm: RMS of the fit with its nuisances; viscous_per_k_sigma: standard deviation of
+    loss.viscous_per_k; samples: used, after thinning.
+    """
 
     loss: AdditiveLoss
     residual_nm: float
@@ -57,8 +68,18 @@ class LossFit:
     samples: int
 
 
+@dataclass(frozen=True)
+class _Block:
+    """Equations of one run: columns x [n, _COMMON + 2], target y [n]; v [n], warmer_k [n] against the reference."""
+
+    x: FloatArray
+    y: FloatArray
+    v: FloatArray
+    warmer_k: FloatArray
+
+
 def hat_values(load_nm: FloatArray) -> FloatArray:
-    """Return the hat functions [n, nodes] of LOAD_NODES_NM, linear beyond the outer nodes for the constant part."""
+    """Return the hat functions [n, nodes] of LOAD_NODES_NM; the outer ones go on as lines, as the constant part does."""
     nodes = np.array(LOAD_NODES_NM)
     k = np.clip(np.searchsorted(nodes, load_nm, side="right") - 1, 0, _NODES - 2)
     share = (load_nm - nodes[k]) / (nodes[k + 1] - nodes[k])
@@ -69,21 +90,22 @@ def hat_values(load_nm: FloatArray) -> FloatArray:
     return out
 
 
-def _columns(run: RunSignals, stribeck_velocity: float, warmer_k: float) -> tuple[FloatArray, FloatArray]:
-    """Return columns [n, _COMMON + 2] and target [n] of a run's moving samples."""
+def _block(run: RunSignals, stribeck_velocity: float, reference_c: float) -> _Block:
+    """Return the equations of a run's moving samples; the thermal column is still empty."""
     keep = run.moving & (np.abs(run.seen.velocity_rad_s) > _MIN_SPEED_RAD_S)
-    keep &= np.abs(run.seen.raw_nm) < 60.0
+    keep &= np.abs(run.seen.raw_nm) < _MAX_LOAD_NM
     index = np.flatnonzero(keep)[::_EVERY]
     raw, v = run.seen.raw_nm[index], run.seen.velocity_rad_s[index]
-    s, a = np.tanh(v / 0.02), np.abs(v)
-    positive = v > 0.0
+    s, a = run.seen.direction[index][:, None], np.abs(v)[:, None]
+    peak = np.exp(-((a / stribeck_velocity) ** 2))
     parts = []
-    for side in (positive, ~positive):
-        hats = hat_values(np.where(v > 0.0, raw, -raw)) * (s * side)[:, None]
-        peak = np.exp(-((a / stribeck_velocity) ** 2)) * s * side
-        parts += [hats, hats * a[:, None], hats * (a * a)[:, None], peak[:, None]]
-    x = np.column_stack((*parts, run.seen.waves[index], -warmer_k * v, np.ones(len(index)), v))
-    return x, raw - run.sensor_nm[index]
+    for load, share in ((raw, 0.5 * (1.0 + s)), (-raw, -0.5 * (1.0 - s))):
+        constant = hat_values(load) * share
+        held = hat_values(np.clip(load, LOAD_NODES_NM[0], LOAD_NODES_NM[-1])) * share
+        parts += [constant, held * a, held * a * a, peak * share]
+    x = np.column_stack((*parts, run.seen.waves[index], np.zeros(len(index)), np.ones(len(index)), v))
+    warmer = np.nan_to_num(run.seen.temperature_c[index] - reference_c, nan=0.0)
+    return _Block(x, raw - run.sensor_nm[index], v, warmer)
 
 
 def _prior(friction: Friction, runs: int) -> tuple[FloatArray, FloatArray]:
@@ -104,8 +126,8 @@ def _prior(friction: Friction, runs: int) -> tuple[FloatArray, FloatArray]:
         peak = side * _ROWS + 3 * _NODES
         precision[peak, peak] += 1.0
         mean[peak] += friction.stribeck_nm
-    precision[_RIPPLE, _RIPPLE] += np.eye(4) / 4.0
-    viscous = max(friction.viscous_nms_per_rad, 1e-6)
+    precision[_RIPPLE, _RIPPLE] += np.eye(4) / _RIPPLE_SIGMA_NM**2
+    viscous = _viscous(friction)
     precision[_THERMAL, _THERMAL] += 1.0 / (viscous * PER_K_PRIOR[1]) ** 2
     mean[_THERMAL] += PER_K_PRIOR[0] / (viscous * PER_K_PRIOR[1] ** 2)
     for r in range(runs):
@@ -114,65 +136,76 @@ def _prior(friction: Friction, runs: int) -> tuple[FloatArray, FloatArray]:
     return precision, mean
 
 
+def _viscous(friction: Friction) -> float:
+    return max(friction.viscous_nms_per_rad, _NO_VISCOUS)
+
+
 def fit_loss(runs: Sequence[RunSignals], friction: Friction) -> LossFit:
     """Fit the loss of one joint over runs; friction: the joint file's, used where there are no data.
 
-    Raises LossFitError when a direction of motion has no data.
+    Raises LossFitError when a direction of motion has no data, or for a viscous_per_k that no lubricant has.
     """
     temperatures = np.array([run.temperature_c for run in runs])
-    known = np.isfinite(temperatures)
-    reference = float(temperatures[known].mean()) if known.any() else 25.0
-    warmer = np.where(known, temperatures - reference, 0.0)
-    blocks = [
-        _columns(run, friction.stribeck_velocity_rad_s, float(k)) for run, k in zip(runs, warmer, strict=True)
-    ]
-    for side, name in ((0, "positive"), (1, "negative")):
-        if not any(np.any(x[:, side * _ROWS : side * _ROWS + _NODES]) for x, _ in blocks):
+    known = temperatures[np.isfinite(temperatures)]
+    reference = float(known.mean()) if len(known) else 25.0
+    blocks = [_block(run, friction.stribeck_velocity_rad_s, reference) for run in runs]
+    for sign, name in ((1.0, "positive"), (-1.0, "negative")):
+        if not any(np.any(sign * block.v > 0.0) for block in blocks):
             raise LossFitError(f"found no motion in {name} direction, expected both")
-    weight = 1.0 / (_NOISE_NM**2 * _COLOUR)
-    grams = [(weight * (x.T @ x), weight * (x.T @ y)) for x, y in blocks]
-    samples = sum(len(y) for _, y in blocks)
-    precision, mean = _prior(friction, len(runs))
-    w, covariance = _solve(grams, precision, mean)
-    viscous = max(friction.viscous_nms_per_rad, 1e-6)
-    per_k = float(w[_THERMAL]) / viscous
-    spread = float(np.sqrt(covariance[_THERMAL, _THERMAL])) / viscous
-    residual = _residual(blocks, w)
-    fastest = max(float(np.abs(run.seen.velocity_rad_s[run.moving]).max(initial=0.1)) for run in runs)
+    prior = _prior(friction, len(runs))
+    viscous = _viscous(friction)
+    per_k = PER_K_PRIOR[0]
+    for _ in range(_REPETITIONS):
+        _set_thermal(blocks, per_k)
+        w, covariance = _solve(blocks, *prior)
+        per_k = float(w[_THERMAL]) / viscous
+        if not abs(per_k) <= _PER_K_LIMIT:
+            raise LossFitError(
+                f"found viscous_per_k {per_k:.3g} 1/K, expected at most {_PER_K_LIMIT} either way"
+            )
+    speeds = (float(np.abs(run.seen.velocity_rad_s[run.moving]).max(initial=0.1)) for run in runs)
     loss = AdditiveLoss(
         LOAD_NODES_NM,
         _side(w[:_ROWS]),
         _side(w[_ROWS : 2 * _ROWS]),
         friction.stribeck_velocity_rad_s,
-        fastest,
+        max(speeds),
         reference,
         friction.viscous_nms_per_rad,
         per_k,
     )
-    return LossFit(loss, residual, spread, samples)
+    spread = float(np.sqrt(covariance[_THERMAL, _THERMAL])) / viscous
+    return LossFit(loss, _residual(blocks, w), spread, sum(len(block.y) for block in blocks))
+
+
+def _set_thermal(blocks: Sequence[_Block], per_k: float) -> None:
+    """Write kappa's column g(T) v for this b; its limit at b = 0 is -(T - T0) v."""
+    for block in blocks:
+        change = np.expm1(-per_k * block.warmer_k) / per_k if per_k else -block.warmer_k
+        block.x[:, _THERMAL] = change * block.v
+
+
+def _at(run: int) -> slice:
+    return slice(_COMMON + 2 * run, _COMMON + 2 * run + 2)
 
 
 def _solve(
-    grams: list[tuple[FloatArray, FloatArray]], precision: FloatArray, mean: FloatArray
+    blocks: Sequence[_Block], precision: FloatArray, mean: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return (most probable values, their covariance)."""
+    weight = 1.0 / (_NOISE_NM**2 * _COLOUR)
     left, right = precision.copy(), mean.copy()
-    for r, (gram, moment) in enumerate(grams):
-        at = np.concatenate((np.arange(_COMMON), [_COMMON + 2 * r, _COMMON + 2 * r + 1]))
-        left[np.ix_(at, at)] += gram
-        right[at] += moment
-    covariance = np.linalg.inv(left)
+    for r, block in enumerate(blocks):
+        at = np.r_[:_COMMON, _at(r)]
+        left[np.ix_(at, at)] += weight * (block.x.T @ block.x)
+        right[at] += weight * (block.x.T @ block.y)
+    covariance = np.asarray(np.linalg.inv(left), np.float64)
     return covariance @ right, covariance
 
 
-def _residual(blocks: list[tuple[FloatArray, FloatArray]], w: FloatArray) -> float:
-    total, count = 0.0, 0
-    for r, (x, y) in enumerate(blocks):
-        own = np.concatenate((w[:_COMMON], w[_COMMON + 2 * r : _COMMON + 2 * r + 2]))
-        e = y - x @ own
-        total += float(e @ e)
-        count += len(e)
-    return float(np.sqrt(total / max(count, 1)))
+def _residual(blocks: Sequence[_Block], w: FloatArray) -> float:
+    errors = [block.y - block.x @ np.r_[w[:_COMMON], w[_at(r)]] for r, block in enumerate(blocks)]
+    return float(np.sqrt(np.mean(np.square(np.concatenate(errors)))))
 
 
 def _side(w: FloatArray) -> LossSide:

@@ -75,28 +75,26 @@ def train_paper(
     seed: int,
     progress: Callable[[int, float], None],
 ) -> TrainedNetwork:
-    """Train on four of five runs, judge on the others. runs: name and SHA-256 of every run. ValueError: fewer than 5."""
+    """Train on four of five runs and judge on the others; the network that is written is trained on all runs alike.
+
+    runs: name and SHA-256 of every run. Raises ValueError for fewer than 5.
+    """
     if len(blocks) < _HELD_OUT:
         raise ValueError(
             f"found {len(blocks)} runs, expected at least {_HELD_OUT}: a network is judged on whole runs"
         )
     held = blocks[_HELD_OUT - 1 :: _HELD_OUT]
     known = [block for n, block in enumerate(blocks) if n % _HELD_OUT != _HELD_OUT - 1]
-    features = thinned([block.features for block in known])
-    trained = train(
-        features,
-        thinned([block.sensor_nm for block in known]),
-        iterations=iterations,
-        seed=seed,
-        progress=progress,
-    )
+    judged = _train(known, iterations, seed, progress)
     scores = {}
     for block in held:
-        error = network_output(trained, block.features) - block.sensor_nm
+        error = network_output(judged, block.features) - block.sensor_nm
         scores[block.name] = (
             float(np.mean(error**2)),
             float(np.mean((block.physics_nm - block.sensor_nm) ** 2)),
         )
+    trained = _train(blocks, iterations, seed, progress)
+    features = thinned([block.features for block in blocks])
     low, high = np.quantile(features, [_ENVELOPE_SHARE, 1.0 - _ENVELOPE_SHARE], axis=0)
     metadata = {
         "features": list(FEATURES),
@@ -108,6 +106,18 @@ def train_paper(
         "runs": runs,
     }
     return TrainedNetwork(exported(trained, metadata), trained, metadata, scores)
+
+
+def _train(
+    blocks: Sequence[PaperBlock], iterations: int, seed: int, progress: Callable[[int, float], None]
+) -> Trained:
+    return train(
+        thinned([block.features for block in blocks]),
+        thinned([block.sensor_nm for block in blocks]),
+        iterations=iterations,
+        seed=seed,
+        progress=progress,
+    )
 
 
 def network_output(trained: Trained, features: FloatArray) -> FloatArray:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from estimator.friction import FloatArray
+from estimator.fused_observer import RIPPLE_ORDERS
 from estimator.fused_parameters import Torsion
 from estimator.fused_run import ObservedRun, observe_run
 from estimator.observer import first_order_hold
@@ -15,11 +17,20 @@ from estimator.run import JointColumns
 from estimator.settings import EstimatorSettings
 from estimator.status import STANDSTILL, VALID
 
-UNIT_TORSION = Torsion(1.0, 0.0, 0.0, (2.0, 4.0), (0.0, 0.0), (0.0, 0.0))
+UNIT_TORSION: Final = Torsion(1.0, 0.0, 0.0, tuple(map(float, RIPPLE_ORDERS)), (0.0, 0.0), (0.0, 0.0))
 """With it the observer's torsion torque is the filtered torsion angle theta_m/G - theta_l itself [rad]."""
 
-_SETTLE_S = 0.1
-"""From the first sample on for so long the filters' starts are still in the data."""
+_SETTLE_S: Final = 0.1
+"""From each start of the observer on for so long the filters' starts are still in the data."""
+
+BoolArray = np.ndarray[tuple[int], np.dtype[np.bool_]]
+_COLUMNS: Final = (
+    "current_a",
+    "motor_position_rad",
+    "motor_velocity_rad_s",
+    "link_position_rad",
+    "torque_nm",
+)
 
 
 @dataclass(frozen=True)
@@ -34,8 +45,8 @@ class RunSignals:
     name: str
     seen: ObservedRun
     sensor_nm: FloatArray
-    moving: np.ndarray[tuple[int], np.dtype[np.bool_]]
-    standing: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    moving: BoolArray
+    standing: BoolArray
 
     @property
     def temperature_c(self) -> float:
@@ -45,7 +56,10 @@ class RunSignals:
 
 
 def same_age(sensor_nm: FloatArray, dt_s: FloatArray, bandwidth_rad_s: float) -> FloatArray:
-    """Return the sensor through g/(s+g), first-order hold with the measured steps: as old as the estimate."""
+    """Return the sensor through g/(s+g), first-order hold with the measured steps: as old as the estimate.
+
+    sensor_nm, dt_s [n], n > 0; steps are taken to 0.1 us, a step <= 0 passes its sample on unfiltered.
+    """
     steps, index = np.unique(np.round(dt_s[1:], 7), return_inverse=True)
     table = [
         first_order_hold(bandwidth_rad_s, float(step)) if step > 0 else (0.0, 1.0, 0.0) for step in steps
@@ -65,27 +79,22 @@ def run_signals(
     name: str, joint: Joint, settings: EstimatorSettings, time_s: FloatArray, columns: JointColumns
 ) -> RunSignals:
     """Observe one joint of a run. Raises ValueError for a column that is missing or a sensor with NaN."""
-    needed = {
-        key: getattr(columns, key)
-        for key in (
-            "current_a",
-            "motor_position_rad",
-            "motor_velocity_rad_s",
-            "link_position_rad",
-            "torque_nm",
-        )
-    }
+    needed = {key: getattr(columns, key) for key in _COLUMNS}
     missing = [key for key, column in needed.items() if column is None]
     if missing:
         raise ValueError(f"{name}: joint {joint.name}: the run has no {', '.join(missing)}")
-    sensor = np.asarray(needed.pop("torque_nm"), np.float64)
-    if not np.isfinite(sensor).all():
-        raise ValueError(
-            f"{name}: joint {joint.name}: torque_nm has {int((~np.isfinite(sensor)).sum())} gaps"
-        )
+    current, motor, velocity, link, torque = needed.values()
+    sensor = np.asarray(torque, np.float64)
+    gaps = int((~np.isfinite(sensor)).sum())
+    if gaps:
+        raise ValueError(f"{name}: joint {joint.name}: torque_nm: found {gaps} gaps, expected finite numbers")
     dt = np.diff(time_s, prepend=time_s[0])
-    seen = observe_run(joint, settings, UNIT_TORSION, dt, *needed.values(), columns.temperature_c)
-    settled = time_s - time_s[0] >= _SETTLE_S
+    seen = observe_run(
+        joint, settings, UNIT_TORSION, dt, current, motor, velocity, link, columns.temperature_c
+    )
+    running = (seen.status == VALID) | (seen.status == STANDSTILL)
+    started = np.maximum.accumulate(np.where(running, time_s[0], time_s))
+    settled = time_s - started >= _SETTLE_S
     return RunSignals(
         name,
         seen,

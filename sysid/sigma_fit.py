@@ -1,10 +1,12 @@
 """Standard deviations of the fused estimator's paths and their calibration, from residuals on unseen runs. Pure.
 
-e_c = tau_raw - loss - sensor,  e_t = tau_t - sensor         (each from a fit that had not seen the run)
-reference^2 = covariance of the two paths' run means: what both share is the sensor's zero
-e_c^2 - reference^2 ~ current^2 + (viscous v)^2 + (load tau_raw)^2,  e_t^2 - reference^2 ~ torsion^2 + (load tau_t)^2
-scale_q = 90 % quantile of |error|/sigma in quadrant q, over 1.645: split conformal prediction by runs
-          (Vovk et al. 2005; Lei et al. 2018), every run weighted alike
+Residuals e_c = tau_raw - loss - sensor and e_t = tau_t - sensor, each from a fit that had not seen the run:
+
+    reference^2 = covariance of the two paths' run means: what both share is the sensor's zero
+    e_c^2 - reference^2 ~ current^2 + (viscous v)^2 + (load tau_raw)^2
+    e_t^2 - reference^2 ~ torsion^2 + (load tau_t)^2
+    scale_q = 90 % quantile of |error|/sigma in quadrant q, over 1.645: split conformal prediction by runs
+              (Vovk et al. 2005; Lei et al. 2018), every run weighted alike
 """
 
 from __future__ import annotations
@@ -17,12 +19,17 @@ from scipy.optimize import nnls
 
 from estimator.friction import FloatArray
 from estimator.fused_parameters import FusedSigma
-from estimator.fused_run import quadrant_many
+from estimator.fused_run import QuadrantArray, quadrant_many
 
 COVERAGE: Final = 0.9
 GAUSS: Final = 1.6448536269514722
 """Half width of a normal distribution's 90 % interval in standard deviations: the interval is value +- GAUSS sigma."""
 _FLOOR_NM: Final = 0.02
+_FAST_RAD_S: Final = 0.1
+"""Slower samples do not count for sigma: near a reversal the loss is not settled, which `half` accounts for."""
+_FEWEST: Final = 50
+"""Samples of a run that a quadrant needs for the run to count there."""
+_LEAST_SCALE: Final = 0.05
 
 
 class PathResiduals(NamedTuple):
@@ -37,13 +44,19 @@ class PathResiduals(NamedTuple):
 
 
 def fit_sigma(runs: Sequence[PathResiduals]) -> FusedSigma:
-    """Return the standard deviations of both paths, scale 1; needs at least three runs (ValueError)."""
+    """Return the standard deviations of both paths, scale 1.
+
+    Raises ValueError for fewer than three runs with samples, or none above 0.1 rad/s.
+    """
+    runs = [run for run in runs if len(run.raw_nm)]
     if len(runs) < 3:
-        raise ValueError(f"found {len(runs)} unseen runs, expected at least 3")
+        raise ValueError(f"found {len(runs)} unseen runs with motion, expected at least 3")
     current = np.array([run.current_error_nm.mean() for run in runs])
     torsion = np.array([run.torsion_error_nm.mean() for run in runs])
     shared = max(float(np.mean((current - current.mean()) * (torsion - torsion.mean()))), _FLOOR_NM**2)
-    fast = [np.abs(run.velocity_rad_s) > 0.1 for run in runs]
+    fast = [np.abs(run.velocity_rad_s) > _FAST_RAD_S for run in runs]
+    if not any(map(np.any, fast)):
+        raise ValueError(f"found no unseen sample above {_FAST_RAD_S} rad/s, expected some")
     raw, v, e_c, e_t, t = (
         np.concatenate([getattr(run, name)[keep] for run, keep in zip(runs, fast, strict=True)])
         for name in ("raw_nm", "velocity_rad_s", "current_error_nm", "torsion_error_nm", "torsion_nm")
@@ -62,31 +75,35 @@ def fit_sigma(runs: Sequence[PathResiduals]) -> FusedSigma:
 
 
 def conformal_scale(
-    errors: Sequence[FloatArray], sigmas: Sequence[FloatArray], quadrants: Sequence[np.ndarray]
+    errors: Sequence[FloatArray], sigmas: Sequence[FloatArray], quadrants: Sequence[QuadrantArray]
 ) -> tuple[float, float, float, float]:
     """Return the factor per quadrant that makes value +- GAUSS sigma cover COVERAGE of unseen samples.
 
-    One array per run each; a quadrant without samples takes the factor of all. Runs count alike in a quadrant.
+    One array per run each. Runs count alike in a quadrant, whatever their length; a quadrant in which no run has 50
+    samples takes the factor of all. Raises ValueError where there are no samples at all.
     """
     ratios = [np.abs(e) / s for e, s in zip(errors, sigmas, strict=True)]
-    every = _weighted_quantile(ratios)
+    if not any(map(len, ratios)):
+        raise ValueError("found no samples to calibrate sigma with, expected some")
+    every = _quantile_by_runs(ratios)
     scales = []
     for q in range(4):
         inside = [ratio[quadrant == q] for ratio, quadrant in zip(ratios, quadrants, strict=True)]
-        inside = [part for part in inside if len(part) >= 50]
-        scales.append((_weighted_quantile(inside) if inside else every) / GAUSS)
-    a, b, c, d = (max(scale, 0.05) for scale in scales)
+        inside = [part for part in inside if len(part) >= _FEWEST]
+        scales.append((_quantile_by_runs(inside) if inside else every) / GAUSS)
+    a, b, c, d = (max(scale, _LEAST_SCALE) for scale in scales)
     return a, b, c, d
 
 
-def _weighted_quantile(parts: Sequence[FloatArray]) -> float:
+def _quantile_by_runs(parts: Sequence[FloatArray]) -> float:
+    """Return the COVERAGE quantile of the samples of all parts, each part with the same weight."""
     values = np.concatenate(parts)
-    weights = np.concatenate([np.full(len(part), 1.0) for part in parts])
+    weights = np.concatenate([np.full(len(part), 1.0 / max(len(part), 1)) for part in parts])
     order = np.argsort(values)
     share = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(share, COVERAGE * share[-1])])
 
 
-def quadrants_of(run: PathResiduals) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    """Return each sample's quadrant."""
+def quadrants_of(run: PathResiduals) -> QuadrantArray:
+    """Return each sample's index into QUADRANTS [n]."""
     return quadrant_many(run.raw_nm, run.velocity_rad_s)

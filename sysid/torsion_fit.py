@@ -9,17 +9,21 @@ encoder's cannot be told apart in one run; their mean over the runs is the torsi
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 
 from estimator.friction import FloatArray
+from estimator.fused_observer import RIPPLE_ORDERS
 from estimator.fused_parameters import Torsion
 from sysid.run_signals import RunSignals
 
-_EVERY = 5
-_ORDERS = (2.0, 4.0)
-_ZERO_SIGMA_NM = 0.5  # a priori, per run: far more than a good sensor drifts
-_CUBIC_SHARE = 0.5  # a priori sigma of K3 d^3 at the largest d, as a share of K d
+_EVERY: Final = 5
+_ORDERS: Final = tuple(float(order) for order in RIPPLE_ORDERS)
+_COMMON: Final = 7
+"""Columns that all runs share: d, d^3, the four waves, and the zero."""
+_ZERO_SIGMA_NM: Final = 0.5  # a priori, per run: far more than a good sensor drifts
+_CUBIC_SHARE: Final = 0.5  # a priori sigma of K3 d^3 at the largest d, as a share of the largest torque
 
 
 class TorsionError(ValueError):
@@ -28,29 +32,19 @@ class TorsionError(ValueError):
 
 def fit_torsion(runs: Sequence[RunSignals]) -> Torsion:
     """Return the torsion parameters by least squares over all moving samples; raises TorsionError."""
-    blocks: list[FloatArray] = []
-    targets: list[FloatArray] = []
-    largest = max(float(np.abs(run.seen.torsion_nm[run.moving]).max(initial=0.0)) for run in runs)
+    largest = max(
+        (float(np.abs(run.seen.torsion_nm[run.moving]).max(initial=0.0)) for run in runs), default=0.0
+    )
     if largest <= 0.0:
         raise TorsionError("found no torsion between motor and link encoder, expected some under load")
-    for n, run in enumerate(runs):
-        keep = np.flatnonzero(run.moving)[::_EVERY]
-        d = run.seen.torsion_nm[keep] / largest
-        zero = np.zeros((len(keep), len(runs)))
-        zero[:, n] = 1.0
-        common = np.ones((len(keep), 1))
-        blocks.append(np.column_stack((d, d**3, run.seen.waves[keep], common, zero)))
-        targets.append(run.sensor_nm[keep])
-    x, y = np.vstack(blocks), np.concatenate(targets)
+    x, y = _equations(runs, largest)
     if len(y) < 10 * x.shape[1]:
         raise TorsionError(f"found {len(y)} moving samples, expected at least {10 * x.shape[1]}")
-    gram, right = x.T @ x, x.T @ y
-    scale = float(np.sqrt(gram[0, 0] / len(y))) * float(np.abs(y).max())
     noise = _noise_of(x, y)
     prior = np.zeros(x.shape[1])
-    prior[1] = noise / max(_CUBIC_SHARE * scale, 1e-9) ** 2
-    prior[7:] = noise / _ZERO_SIGMA_NM**2
-    w = np.linalg.lstsq(gram + np.diag(prior), right, rcond=None)[0]
+    prior[1] = noise / max(_CUBIC_SHARE * float(np.abs(y).max()), 1e-9) ** 2
+    prior[_COMMON:] = noise / _ZERO_SIGMA_NM**2
+    w = np.linalg.lstsq(x.T @ x + np.diag(prior), x.T @ y, rcond=None)[0]
     stiffness = float(w[0]) / largest
     if not stiffness > 0.0:
         raise TorsionError(f"found a stiffness of {stiffness:.3g} Nm/rad, expected one > 0")
@@ -64,20 +58,34 @@ def fit_torsion(runs: Sequence[RunSignals]) -> Torsion:
     )
 
 
+def _equations(runs: Sequence[RunSignals], largest: float) -> tuple[FloatArray, FloatArray]:
+    """Return columns [n, _COMMON + runs] and sensor [n] of all moving samples, thinned; d in parts of `largest`."""
+    blocks: list[FloatArray] = []
+    targets: list[FloatArray] = []
+    for n, run in enumerate(runs):
+        keep = np.flatnonzero(run.moving)[::_EVERY]
+        d = run.seen.torsion_nm[keep] / largest
+        zero = np.zeros((len(keep), len(runs)))
+        zero[:, n] = 1.0
+        blocks.append(np.column_stack((d, d**3, run.seen.waves[keep], np.ones(len(keep)), zero)))
+        targets.append(run.sensor_nm[keep])
+    return np.vstack(blocks), np.concatenate(targets)
+
+
 def _noise_of(x: FloatArray, y: FloatArray) -> float:
-    """Return the residual variance of the plain straight line [Nm^2]."""
-    w = np.linalg.lstsq(x[:, :7], y, rcond=None)[0]
-    return float(np.mean((y - x[:, :7] @ w) ** 2))
+    """Return the residual variance with one zero for all runs [Nm^2]."""
+    w = np.linalg.lstsq(x[:, :_COMMON], y, rcond=None)[0]
+    return float(np.mean((y - x[:, :_COMMON] @ w) ** 2))
 
 
 def torsion_torque(torsion: Torsion, run: RunSignals) -> FloatArray:
-    """Return tau_t [n] of observed signals, as FusedObserver gives it but for the order of filter and cube."""
-    d = run.seen.torsion_nm - torsion.zero_rad
-    for k in range(2):
-        d = (
-            d
-            - torsion.cos_rad[k] * run.seen.waves[:, 2 * k]
-            - torsion.sin_rad[k] * run.seen.waves[:, 2 * k + 1]
-        )
+    """Return tau_t [n] of observed signals, as FusedObserver gives it but for the order of filter and cube.
+
+    Raises ValueError for a kinematic error of other orders than RIPPLE_ORDERS, whose waves the signals hold.
+    """
+    if torsion.orders_per_motor_rev != _ORDERS:
+        raise ValueError(f"found a torsion of orders {torsion.orders_per_motor_rev}, expected {_ORDERS}")
+    pairs = np.column_stack((torsion.cos_rad, torsion.sin_rad)).ravel()  # c2, s2, c4, s4 as the waves
+    d = run.seen.torsion_nm - torsion.zero_rad - run.seen.waves @ pairs
     result: FloatArray = d * (torsion.stiffness_nm_per_rad + torsion.cubic_nm_per_rad3 * d * d)
     return result

@@ -25,7 +25,7 @@ from sysid.model_card import write_card
 from sysid.paper_network import TrainedNetwork, paper_block, train_paper
 from sysid.torsion_fit import TorsionError
 
-_ITERATIONS = {"paper": 1000, "ours": 400}
+_ITERATIONS = {"paper": 1000, "ours": 200}
 _EXAMPLES = """examples:
   jtq train campaigns/excitation --joint joint1.yaml --joint joint2.yaml --network paper --out models
   jtq train campaigns/excitation --joint joint1.fused.yaml --network ours --out models
@@ -114,7 +114,7 @@ def _parser() -> argparse.ArgumentParser:
         "--out", type=Path, required=True, metavar="DIR", help="where networks and cards go; made if missing"
     )
     parser.add_argument(
-        "--iterations", type=count, help="default 1000 for the paper's (as in the paper), 400 for ours"
+        "--iterations", type=count, help="default 1000 for the paper's (as in the paper), 200 for ours"
     )
     parser.add_argument("--seed", type=natural, default=0, help="of weights and batches (default 0)")
     parser.add_argument(

@@ -1,69 +1,121 @@
-"""A joint with section `fused` and a small random network for it, for tests that need the method and not a good fit."""
+"""Parameters, networks and seeded motions for the tests of the fused estimator."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
+from estimator.friction import FloatArray
 from estimator.fused_network import FUSED_FEATURES
 from estimator.fused_parameters import AdditiveLoss, Fused, FusedSigma, LossSide, Torsion
 from estimator.fused_trust import Envelope
 from estimator.parameters import Joint
-from models.files import load_joint, shipped
-from sysid.onnx_export import export_network
+from tests.estimator_helpers import Motion, SmallNetwork, joint1, motion
 
-HIDDEN = (16, 16)
-"""As `jtq train` makes them."""
-_LOW = (-3.0, -60.0, -20.0, -1.0, -1.0, -1.0, -1.0, -1.0, -1.0)
-
-
-def fused_section() -> Fused:
-    """Losses near those of joint 1, stiffness as in its file, kinematic error of the campaign's plant."""
-    nodes = (-40.0, -24.0, -12.0, -4.0, 4.0, 12.0, 24.0, 40.0)
-    side = LossSide(
-        constant_nm=(7.0, 5.0, 3.6, 3.1, 3.1, 4.0, 6.0, 9.0),
-        viscous_nms_per_rad=(2.0,) * 8,
-        quadratic_nms2_per_rad2=(-0.1,) * 8,
-        stribeck_nm=0.8,
-    )
-    loss = AdditiveLoss(
-        load_nodes_nm=nodes,
-        positive=side,
-        negative=replace(side, stribeck_nm=0.7),
-        stribeck_velocity_rad_s=0.05,
-        velocity_max_rad_s=3.3,
-        temperature_c=25.0,
-        thermal_viscous_nms_per_rad=2.0,
-        viscous_per_k=0.025,
-    )
-    torsion = Torsion(12000.0, 0.0, 0.0, (2.0, 4.0), (3e-5, 1e-6), (2e-5, -1e-6))
-    sigma = FusedSigma(0.4, 0.2, 0.03, 0.5, 0.01, 0.3)
-    return Fused(loss, torsion, sigma)
+NODES = (-30.0, -12.0, -4.0, 0.0, 3.0, 9.0, 21.0, 40.0)
+SIZES = (9, 16, 16, 1)
+LOW = (-3.5, -50.0, -4.0, *([-1.0] * 6))
+HIGH = (3.5, 50.0, 4.0, *([1.0] * 6))
+TRAINED_C = (20.0, 32.0)
 
 
-def fused_joint(number: int = 1) -> Joint:
-    """Joint 1 or 2 of the bench with that section."""
-    return replace(load_joint(shipped(f"joint{number}.yaml")), fused=fused_section())
-
-
-def fused_network(
-    joint: str = "joint1", *, temperature_c: tuple[float, float] | None = (15.0, 45.0), seed: int = 1
-) -> bytes:
-    """An ONNX file: random weights, a correction of some tenths of Nm, known to 3.3 rad/s and 60 Nm."""
+def side(seed: int, nodes: tuple[float, ...] = NODES) -> LossSide:
+    """One direction: larger when driving, some of it near zero when back-driven, never negative."""
     rng = np.random.default_rng(seed)
-    sizes = (len(FUSED_FEATURES), *HIDDEN, 1)
-    layers = [(rng.normal(0.0, m**-0.5, (m, n)), rng.normal(0.0, 0.1, n)) for m, n in pairwise(sizes)]
-    envelope = Envelope(0.25, 3.0, ((1,) * 41,) * 29, 20.0, temperature_c)
-    metadata: dict[str, Any] = {
+    driving = np.maximum(np.array(nodes), 0.0)
+    c = 1.5 + 0.25 * driving + rng.uniform(0.0, 1.0, len(nodes))
+    f = rng.uniform(0.5, 2.5, len(nodes))
+    q = rng.uniform(0.0, 0.3, len(nodes))
+    return LossSide(tuple(c.tolist()), tuple(f.tolist()), tuple(q.tolist()), float(rng.uniform(0.2, 1.0)))
+
+
+def loss_of(seed: int, **changes: Any) -> AdditiveLoss:
+    loss = AdditiveLoss(NODES, side(seed), side(seed + 1000), 0.05, 3.0, 25.0, 2.0, 0.025)
+    return replace(loss, **changes)
+
+
+TORSION = Torsion(12000.0, 4.0e7, 2.0e-5, (2.0, 4.0), (3.0e-5, -4.0e-6), (-2.0e-5, 5.0e-6))
+SIGMA = FusedSigma(0.2, 0.1, 0.02, 0.35, 0.015, 0.15, (1.0, 1.2, 0.9, 1.4))
+
+
+def fused(seed: int = 1, torsion: Torsion | None = TORSION) -> Fused:
+    return Fused(loss_of(seed), torsion, SIGMA)
+
+
+def fused_joint(seed: int = 1, torsion: Torsion | None = TORSION) -> Joint:
+    return replace(joint1(), fused=fused(seed, torsion))
+
+
+def everywhere(
+    velocity: float = 4.0, torque: float = 60.0, temperature_c: tuple[float, float] | None = TRAINED_C
+) -> Envelope:
+    """Known from -velocity to velocity and -torque to torque; any distance up to 1000 Nm."""
+    rows, columns = 2 * round(velocity / 0.25) + 1, 2 * round(torque / 3.0) + 1
+    return Envelope(0.25, 3.0, ((1,) * columns,) * rows, 1000.0, temperature_c)
+
+
+def patches(seed: int, temperature_c: tuple[float, float] | None = TRAINED_C) -> Envelope:
+    """A map with holes, so that a motion runs in and out of what is known."""
+    known = np.random.default_rng(seed).random((13, 13)) < 0.7
+    table = tuple(tuple(int(cell) for cell in row) for row in known)
+    return Envelope(0.5, 6.0, table, 12.0, temperature_c)
+
+
+def fused_network(seed: int = 1, noise: float = 0.4, size_nm: float = 1.0, **metadata: Any) -> SmallNetwork:
+    """9-16-16-1 of random weights; `size_nm` scales its answer. Metadata `...` leaves a key out."""
+    rng = np.random.default_rng(seed)
+    layers = tuple((noise * rng.normal(size=(m, n)), noise * rng.normal(size=n)) for m, n in pairwise(SIZES))
+    values = {
         "features": list(FUSED_FEATURES),
-        "envelope": envelope.to_mapping(),
-        "sigma_scale": [0.6, 0.6, 0.8, 0.8],
-        "input_low": list(_LOW),
-        "input_high": [-low for low in _LOW],
-        "joint": joint,
+        "envelope": everywhere().to_mapping(),
+        "sigma_scale": [0.5, 0.6, 0.7, 0.8],
+        "input_low": list(LOW),
+        "input_high": list(HIGH),
+        "joint": "joint1",
         "data_sha256": "cd" * 32,
     }
-    return export_network(layers, np.zeros(len(_LOW)), -np.array(_LOW), 0.0, 0.5, metadata)
+    kept = {key: value for key, value in (values | metadata).items() if value is not ...}
+    return SmallNetwork(layers, np.zeros(9), np.array(HIGH), 0.0, size_nm, kept)
+
+
+class FakeNetwork:
+    """A network that says what the test wants."""
+
+    joint = "joint1"
+    sigma_scale = (0.5, 0.6, 0.7, 0.8)
+
+    def __init__(self, answer: Callable[..., float], envelope: Envelope | None = None) -> None:
+        self.answer = answer
+        self.envelope = envelope or everywhere()
+
+    def run_one(self, *x: float) -> float:
+        return float(self.answer(*x))
+
+    def run_many(self, features: FloatArray) -> FloatArray:
+        return np.array([self.run_one(*row) for row in features.tolist()])
+
+
+def twisted(seed: int, count: int = 3000) -> Motion:
+    """`motion` with a torsion of up to 25 Nm between its encoders."""
+    m = motion(seed, count)
+    rng = np.random.default_rng(seed + 500)
+    t = np.cumsum(m.dt_s)
+    torque = rng.uniform(5.0, 25.0) * np.sin(rng.uniform(1.0, 4.0) * t + rng.uniform(0.0, 6.0))
+    return replace(m, motor_position_rad=m.motor_position_rad + 100.0 * torque / 12000.0)
+
+
+def temperatures(kind: str, seed: int, count: int) -> FloatArray | None:
+    """A joint's temperature over a run: unknown, constant, or rising in steps, warm and with gaps."""
+    if kind == "none":
+        return None
+    rng = np.random.default_rng(seed + 900)
+    rising = np.round(np.linspace(rng.uniform(15.0, 26.0), rng.uniform(26.0, 45.0), count), 1)
+    if kind == "gaps":
+        rising[rng.random(count) < 0.1] = np.nan
+        rising[count // 2 : count // 2 + 100] = np.nan
+        rising[rng.integers(0, count, 3)] = (np.inf, -np.inf, 1e300)
+    return np.full(count, 27.0) if kind == "constant" else rising

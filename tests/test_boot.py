@@ -21,6 +21,7 @@ from drivers.devices import (
     SensorProfile,
     drive_tpdo1,
     drive_tpdo2,
+    drive_tpdo3,
     sensor_tpdo1,
     sensor_tpdo2,
 )
@@ -111,7 +112,7 @@ def test_mapping_is_written_in_the_order_of_cia_301():
             written.append((index, subindex, int.from_bytes(data, "little")))
             node.store.write(index, subindex, data)
 
-    NodeBoot(Access(), DriveProfile(1), BusSettings(0x20)).configure_pdos()
+    NodeBoot(Access(), DriveProfile(1, temperature=True), BusSettings(0x20)).configure_pdos()
     assert written[:7] == [
         (0x1800, 1, 0xC0000181),
         (0x1A00, 0, 0),
@@ -121,7 +122,38 @@ def test_mapping_is_written_in_the_order_of_cia_301():
         (0x1800, 2, 1),
         (0x1800, 1, 0x40000181),
     ]
-    assert PdoParameters(node.store).tpdos()[0] == drive_tpdo1(1)
+    assert PdoParameters(node.store).tpdos() == [drive_tpdo1(1), drive_tpdo2(1), drive_tpdo3(1)]
+    assert written[15:] == [
+        (0x1802, 1, 0xC0000381),
+        (0x1A02, 0, 0),
+        (0x1A02, 1, 0x30010010),
+        (0x1A02, 0, 1),
+        (0x1802, 2, 255),
+        (0x1802, 3, 5000),  # 100 us: a value that flickers sends no more than the timer does
+        (0x1802, 5, 500),
+        (0x1802, 1, 0x40000381),
+    ]
+
+
+def test_temperature_is_mapped_where_it_is_asked_for(bench):
+    bench.drive1.store.set_number(0x1802, 5, 0)  # left without its timer, and off, by somebody else
+    bench.drive1.store.set_number(0x1802, 1, 0xC0000381)
+    nodes = [{"node": 1, "kind": "drive", "temperature": True}, {"node": 2, "kind": "drive"}]
+    report = bench.boot(nodes=nodes)
+    one, two = bench.drive1.parameters, bench.drive2.parameters
+    assert one.tpdos() == [drive_tpdo1(1), drive_tpdo2(1), drive_tpdo3(1)]
+    assert two.tpdos() == [drive_tpdo1(2), drive_tpdo2(2)]
+    assert bench.drive1.store.number(0x1802, 5) == 500
+    assert report.nodes[1].tpdos == (drive_tpdo1(1), drive_tpdo2(1), drive_tpdo3(1))
+    cold = report.nodes[1].configuration_sha256
+    bench.drive1.store.set_number(0x3001, 0, 300)
+    assert bench.boot(nodes=nodes).nodes[1].configuration_sha256 == cold, "a value is no configuration"
+
+
+def test_a_node_without_an_inhibit_time_is_mapped_all_the_same(bench):
+    del bench.drive1.store.entries[0x1802, 3]
+    bench.boot(nodes=[{"node": 1, "kind": "drive", "temperature": True}])
+    assert bench.drive1.parameters.tpdos()[2] == drive_tpdo3(1)
 
 
 # What goes wrong --------------------------------------------------------------------------------------------
@@ -210,6 +242,33 @@ def test_mapping_that_reads_back_different(bench):
 def test_transmission_type_that_does_not_stick(bench):
     bench.drive1.store.on_read(0x1800, 2, lambda: 255)
     assert "1800h:2 transmission type read back: expected 0x01, found 0xFF" in str(bench.fails())
+
+
+def test_a_drive_without_the_temperature_that_is_asked_for(bench):
+    del bench.drive2.store.entries[0x3001, 0]
+    bench.drive2.store._indices.discard(0x3001)
+    error = bench.fails(nodes=[{"node": 2, "kind": "drive", "temperature": True}])
+    assert str(error) == (
+        "node 2: 3001h:0 joint temperature: expected a value (the configuration asks for it), "
+        "found no such object (status J)"
+    )
+    assert bench.drive2.store.number(0x1A00, 1) != drive_tpdo1(2).words[0], "found before anything is written"
+    bench.boot(nodes=[{"node": 2, "kind": "drive"}])
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "text"),
+    [
+        ((0x1A02, 1), 0x30010020, "1A02h:1 mapping entry read back: expected 0x30010010, found 0x30010020"),
+        ((0x1802, 2), 1, "1802h:2 transmission type read back: expected 0xFF, found 0x01"),
+        ((0x1802, 3), 0, "1802h:3 inhibit time in 100 us read back: expected 0x1388, found 0x0000"),
+        ((0x1802, 5), 0, "1802h:5 event timer in ms read back: expected 0x01F4, found 0x0000"),
+    ],
+)
+def test_a_temperature_that_is_not_taken_as_written(bench, key, value, text):
+    bench.drive1.store.on_read(*key, lambda: value)
+    error = bench.fails(nodes=[{"node": 1, "kind": "drive", "temperature": True}])
+    assert str(error) == f"node 1: {text} (status J)"
 
 
 def test_zero_gear_ratio_and_rated_current(bench):
@@ -305,6 +364,7 @@ def test_garbage_on_the_answer_identifiers_is_passed_over(bench):
         ({"nodes": [{"node": 1, "kind": "drive", "speed": 1}]}, "nodes[0]: unknown key 'speed'"),
         ({"nodes": [{"node": 1, "kind": "drive", "given": {"x": 1}}]}, "nodes[0].given"),
         ({"nodes": [{"node": 3, "kind": "sensor", "channels": [2]}]}, "nodes[0].channels: found [2]"),
+        ({"nodes": [{"node": 1, "kind": "drive", "temperature": 1}]}, "nodes[0].temperature: found 1"),
         ({"answer_timeout_s": 0}, "answer_timeout_s: found 0"),
         ({"heartbeat_ms": True}, "heartbeat_ms: found True"),
     ],

@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from models.files import shipped
+from sysid.campaign.bench_config import BenchConfig
 from sysid.campaign.command import main
 from sysid.campaign.options import parser, recipe, wanted_plan
 from sysid.campaign.state import DONE, CampaignDirectory, RunState
@@ -151,9 +152,10 @@ def test_a_plan_beyond_its_limits_is_refused(plan: str, capsys: pytest.CaptureFi
 def done_directory(path: Path, arguments: list[str]) -> None:
     """A campaign that is done, as it would be left."""
     options = parser().parse_args([*arguments, "--bus", "x", "--out", str(path)])
-    wanted = wanted_plan(options)
+    joints = BenchConfig.load(None).joints
+    wanted = wanted_plan(options, joints)
     directory = CampaignDirectory(path)
-    directory.begin(wanted, recipe(options))
+    directory.begin(wanted, recipe(options, joints))
     for run in wanted.runs:
         for ending in (".csv.gz", ".json", ".mcap"):
             (path / (run.name + ending)).write_text("x")

@@ -1,5 +1,7 @@
 """The campaigns that ship: the paper's points are in them, and on the plant they are the quadrants they are named for."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,11 +9,11 @@ from estimator.checked import ConfigError
 from models.files import load_joint, shipped
 from sim_can.emulated_run import JointCommand, emulate_run
 from sim_can.plant_parameters import load_plant
-from sysid.campaign.constant_velocity import efficiency_runs, slow_and_fast, validation_runs
+from sysid.campaign.constant_velocity import currents_of, efficiency_runs, slow_and_fast, validation_runs
 from sysid.campaign.fourier_runs import excitation_runs, seed_of, variable_runs
-from sysid.campaign.plan import DEFAULT_LIMITS, Fourier, Plateau, Run
+from sysid.campaign.plan import DEFAULT_LIMITS, Fourier, Plan, Plateau, Run
 from sysid.campaign.plans import KINDS, Scale, make_plan
-from sysid.campaign.segments import check_plan, expand
+from sysid.campaign.segments import check_plan, expand, travel_rad
 
 SECTION_II = [(v, i) for v in (0.2, 0.6, 1.0, 1.4, 1.8) for i in range(6)] + [
     (v, i) for v in (2.2, 2.6, 3.0) for i in range(5)
@@ -129,9 +131,9 @@ def test_no_trajectory_of_validation_is_one_of_training_whatever_the_seeds() -> 
         return {s.velocity.a for run in runs for s in run.segments if isinstance(s, Fourier)}
 
     trained = set().union(
-        *(series(excitation_runs(DEFAULT_LIMITS, 4, 12.0, seed, evaluations=1)) for seed in range(4))
+        *(series(excitation_runs(DEFAULT_LIMITS, 4, 12.0, seed=seed, evaluations=1)) for seed in range(4))
     )
-    judged = set().union(*(series(variable_runs(DEFAULT_LIMITS, 4, 12.0, seed)) for seed in range(4)))
+    judged = set().union(*(series(variable_runs(DEFAULT_LIMITS, 4, 12.0, seed=seed)) for seed in range(4)))
     assert len(trained) == 32
     assert len(judged) == 16
     assert not trained & judged
@@ -157,3 +159,23 @@ def test_runs_too_short_for_their_trajectories_are_refused() -> None:
         make_plan("excitation", Scale(seconds=7.0))
     with pytest.raises(ConfigError, match=r"--seconds: found 3, expected at least 4"):
         make_plan("validate", Scale(seconds=3.0))
+
+
+def test_a_run_of_one_direction_turns_back_before_it_goes_too_far() -> None:
+    """Long holds in a short space: every point is still there, in its direction, and the limit is kept."""
+    for travel in (7.0, 12.0, 25.0):
+        for run in efficiency_runs((0.6, 2.2), hold_s=2.1, travel_rad=travel):
+            points = expand(run)
+            assert travel_rad(points) <= travel
+            sign = 1.0 if "_p" in run.name else -1.0
+            there = [(v, i) for v, i in points_of(run) if v * sign > 0.0]
+            back = [(v, i) for v, i in points_of(run) if v * sign < 0.0]
+            assert [abs(i) for _, i in there] == list(currents_of(there[0][0]))
+            assert all(i == 0.0 for _, i in back)
+    free = efficiency_runs((2.2,), hold_s=2.1)
+    assert all(len(points_of(run)) == 5 for run in free)
+    assert efficiency_runs((2.2,), hold_s=2.1, travel_rad=60.0) == free
+    with pytest.raises(ConfigError, match="travel"):  # one point alone is too long
+        check_plan(
+            Plan("p", replace(DEFAULT_LIMITS, travel_rad=4.0), efficiency_runs((2.2,), travel_rad=4.0))
+        )

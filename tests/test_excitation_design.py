@@ -13,7 +13,7 @@ from estimator.losses import LossModel
 from models.files import load_joint, shipped
 from sim_can.emulated_run import JointCommand, emulate_run
 from sim_can.plant_parameters import load_plant
-from sysid import excitation_command
+from sysid import excitation_command, genetic
 from sysid.campaign.plan import Plan, load_plan
 from sysid.campaign.segments import expand
 from sysid.excitation_compare import compare, deviation_ratio, table_lines
@@ -258,15 +258,18 @@ def test_search_uses_its_evaluations_and_returns_the_best_of_them(evaluations):
     assert np.sum((found.genome - 0.3) ** 2) == found.value
 
 
-def test_search_finds_a_minimum_across_its_generations():
-    """30 times closer than the best of as many random points would be in six dimensions."""
-    values = [
-        minimise(
-            lambda g: np.sum((g - 0.3) ** 2, axis=1), 6, evaluations=2000, rng=np.random.default_rng(seed)
-        ).value
-        for seed in range(5)
-    ]
-    assert max(values) < 0.01
+def test_search_closes_in_on_a_minimum():
+    """Without mutation it freezes at 1e-2, without its fading at 2e-2; of random points 2000 come to 1."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        found = minimise(lambda g: np.sum((g - 0.3) ** 2, axis=1), 12, evaluations=2000, rng=rng)
+        assert found.value < 5e-4, f"seed {seed}"
+
+
+def test_better_parents_win_tournaments():
+    """The best of k out of values 0..999 has the mean 1000/(k + 1)."""
+    winners = genetic._winners(np.arange(1000.0), 20000, np.random.default_rng(0))
+    assert np.mean(winners) == pytest.approx(1000.0 / (genetic.TOURNAMENT + 1), rel=0.03)
 
 
 def test_search_without_evaluations_is_refused():
@@ -458,6 +461,9 @@ def test_trial_judges_both_kinds_on_other_runs(capsys):
     assert excitation_command.main(arguments) == 0
     result = json.loads(capsys.readouterr().out)
     assert [one["runs"] for one in result["trials"]] == [1, 2]
+    one, two = result["trials"]
+    assert one["drawn_nm"] != two["drawn_nm"]
+    assert one["designed_nm"] != one["drawn_nm"]
     for one in result["trials"]:  # nothing fits the judging runs better than a fit to them
         assert min(one["designed_nm"] + one["drawn_nm"]) > result["floor_nm"] > 0.1
 

@@ -5,6 +5,7 @@ import pytest
 from daemon.config import load_config
 from daemon.input_watch import InputWatch
 from estimator.status import OFF, STALE
+from models.files import shipped
 from tests.watch_views import NAN, WELL, view
 
 STALE_NO_MOTION = WELL._replace(torque_nm=NAN, status=STALE, input_flags=1 | 4)
@@ -75,6 +76,39 @@ def test_inputs_that_are_missing_from_the_first_cycle_on_are_told():
 def test_the_sensor_has_its_own_line(flags, status, cause):
     joint = WELL._replace(sensor_nm=NAN, sensor_status=status, input_flags=flags)
     assert told(view(8, joint)) == [f"joint 1: torque sensor lost: 183h sensor 3 channel 1 {cause}"]
+
+
+def warmth(known, *, seconds, start_s=100.0):
+    """Lines while joint 1's temperature is known or not (one flag per 50 ms); the loop has run for `start_s`."""
+    watch = InputWatch(load_config(None))
+    lines = []
+    for n in range(round(seconds / 0.05)):
+        joint = WELL if known(0.05 * n) else WELL._replace(input_flags=7)
+        lines += watch.lines(view(round(1000 * (start_s + 0.05 * n)), joint), 0.05 * n)
+    return lines
+
+
+def test_a_temperature_that_is_lost_and_comes_back_has_its_own_lines():
+    lines = warmth(lambda t: not 1.0 <= t < 3.0, seconds=5.0)
+    assert lines == [
+        "joint 1: temperature lost: 381h drive 1 TPDO3 not received for 2 s, or it says not measured",
+        "joint 1: temperature back after 2.0 s",
+    ]
+
+
+def test_a_temperature_is_not_missed_before_it_can_be_there():
+    assert warmth(lambda t: t > 1.5, seconds=4.0, start_s=0.0) == []
+    assert len(warmth(lambda t: False, seconds=4.0, start_s=0.0)) == 1
+
+
+def test_joints_without_a_temperature_are_not_told_of(tmp_path):
+    text = shipped("bench.yaml").read_text().replace("temperature: true", "temperature: false")
+    path = shipped("bench.yaml").parent
+    config = tmp_path / "c.yaml"
+    config.write_text(text.replace("file: ", f"file: {path}/"))
+    watch = InputWatch(load_config(config))
+    cold = WELL._replace(input_flags=7)
+    assert not any(watch.lines(view(100_000 + 50 * n, cold, cold), 0.05 * n) for n in range(200))
 
 
 def test_the_end_is_told():

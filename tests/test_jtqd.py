@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import canopen
+import numpy as np
 import pytest
 import yaml
 from mcap.reader import make_reader
@@ -21,6 +22,8 @@ from drivers.frame import pack
 from drivers.frame_socket import exact, open_frame_socket
 from drivers.python_can_unix import UnixBus
 from models.files import shipped
+from sysid.joint_log import read_topic
+from tests.fused_helpers import configured, fused_networks
 
 JTQD = [sys.executable, "-m", "daemon.jtqd"]
 EDS = Path(__file__).parent.parent / "drivers" / "eds" / "jtqd.eds"
@@ -99,7 +102,8 @@ def test_a_run_on_the_emulated_bench(tmp_path: Path, environment: dict[str, str]
             channel.topic: content.statistics.channel_message_counts[channel.id]
             for channel in content.channels.values()
         }
-        attachments = {attachment.name for attachment in reader.iter_attachments()}
+        attached = {attachment.name: attachment.data for attachment in reader.iter_attachments()}
+        attachments, dbc = attached.keys(), attached["bus.dbc"].decode()
     assert counts["/joint/1/state"] == counts["/joint/2/state"] == counts["/can/frames"] == summary["cycles"]
     assert {
         "configuration.yaml",
@@ -109,6 +113,44 @@ def test_a_run_on_the_emulated_bench(tmp_path: Path, environment: dict[str, str]
         "provenance.json",
         "drive.eds",
     } <= attachments
+    for number in (1, 2):
+        # of the shipped plant, told within half a second; the frames are in the log beside the value
+        state = read_topic(Path(recording["path"]), f"/joint/{number}/state")
+        assert (state["temperature_c"][-500:] == 25.0).all()
+        assert (state["input_flags"][-500:] & 8 == 8).all()
+        frames = read_topic(Path(recording["path"]), "/can/frames")
+        assert 4 <= (frames["frames"]["id"] == 0x380 + number).sum() <= 7
+        assert f"drive_{number}_TPDO3: 2 drive_{number}" in dbc
+
+
+def test_method_fused_on_the_emulated_bench(tmp_path: Path, environment: dict[str, str]) -> None:
+    """With random networks: it is the daemon that is tried here."""
+    config = str(configured(tmp_path, "fused", fused_networks(), temperature=True))
+    options = ["--bus", "sim", "--config", config, "--duration", "2", "--record", str(tmp_path), "--json"]
+    result = run(*options, environment=environment)
+    assert result.returncode == 0, result.stderr
+    assert "lost" not in no_traceback(result)
+    recording = json.loads(result.stdout)["recording"]
+    for number in (1, 2):
+        state = read_topic(Path(recording["path"]), f"/joint/{number}/state")[-1000:]
+        used = np.isfinite(state["network_nm"])
+        assert used.mean() > 0.9
+        assert {2, 6} & set(state["status"])
+        assert (state["temperature_c"] == 25.0).all()
+        assert np.isfinite(state["physics_nm"][used]).all()
+        assert not np.isfinite(state["tob_nm"]).any(), "no stage of this method"
+
+
+def test_a_network_of_another_method_is_refused_in_one_line(
+    tmp_path: Path, environment: dict[str, str]
+) -> None:
+    config = str(configured(tmp_path, "network", fused_networks()))
+    result = run("--bus", "sim", "--config", config, "--record", "none", environment=environment)
+    assert result.returncode == 1
+    (line,) = (text for text in no_traceback(result).splitlines() if not text.startswith("bench ready"))
+    assert line.startswith(
+        f"jtqd: {tmp_path}/n1.onnx: found input 'x' of shape ['N', 9], expected ['N', 6] ("
+    )
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """The commander leads the emulated bench through a motion, in lock-step: what it sends, and that the joints follow."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from sim_can import cia402
 from sysid.motion.result import MotionError, MotionResult
 from sysid.motion.setpoints import Setpoints
 from sysid.motion.stopping import Phase
-from tests.motion_helpers import MS, WARM, LockStep, plateau
+from tests.motion_helpers import MS, WARM, WIDE, LockStep, plateau
 
 OFF = (cia402.SWITCH_ON_DISABLED, cia402.SWITCH_ON_DISABLED)
 RPDOS = {0x201, 0x202, 0x301, 0x302}
@@ -226,10 +227,14 @@ def test_the_travel_begins_where_the_motion_begins_and_counters_roll_over(lock: 
     plant.motor_position[0] = turns
     plant.motor_position[1] = -turns
     plant.link_position = turns / 100
-    motion = lock.commander(plateau(1.0, 0.5, hold_ms=100))
+    motion = lock.commander(plateau(1.0, 0.5, hold_ms=100), replace(WIDE, travel_rad=1.0))
+    lock.run_for(20)
+    plant.motor_position[0] += 300.0  # turned by 3 rad before the start: no travel of the motion
+    plant.motor_position[1] -= 300.0
+    plant.link_position += 3.0
     lock.run(lambda: motion.phase is Phase.BRAKING)
     one, two = motion.inputs.drives
-    true = (plant.motor_position[0] - turns) / 100
+    true = (plant.motor_position[0] - turns - 300.0) / 100
     assert true == pytest.approx(0.4, abs=0.01)
     assert one.travel_rad == pytest.approx(true, abs=1e-3)
     assert two.travel_rad == pytest.approx(-true, abs=1e-3)

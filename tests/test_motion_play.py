@@ -27,7 +27,7 @@ from tests.motion_helpers import plateau
 
 LIMITS = Limits(current_a=20.0, velocity_rad_s=3.3, torque_nm=100.0, travel_rad=60.0, temperature_c=70.0)
 PATIENT = Timing(
-    sync_lost_s=1.0, late_s=1.0, stale_cycles=500, heartbeats_missing=20, drive_timeout_s=3.0, ready_s=10.0
+    sync_lost_s=1.0, late_s=1.0, stale_cycles=500, heartbeats_missing=20, drive_timeout_s=1.5, ready_s=10.0
 )
 
 
@@ -109,7 +109,7 @@ def test_a_motion_is_played_and_leaves_both_drives_off_and_unwatched(bus: str) -
     speeds = [int.from_bytes(data[:4], "little", signed=True) for can_id, data in frames if can_id == 0x281]
     assert max(speeds) == pytest.approx(1043038, rel=0.15), "1 rad/s of the joint"
     assert speeds[-1] == pytest.approx(0, abs=0.02 * 1043038)
-    time.sleep(3.3)  # beyond 1016h:2: nobody watches any more
+    time.sleep(1.7)  # beyond 1016h:2: nobody watches any more
     later = listener.frames()
     assert not [each for each in later if each[0] != 0x281], "no EMCY, no RPDO"
     states = {int.from_bytes(data[6:8], "little") & 0x6F for can_id, data in later if can_id == 0x281}
@@ -172,7 +172,7 @@ def test_a_second_commander_is_refused_before_it_touches_anything(bus: str) -> N
     """Both in this process: the second one is told off while the first one plays on to its end."""
     results: list[object] = []
     first = threading.Thread(
-        target=lambda: results.append(play(bus, plateau(0.8, 1.0, hold_ms=2500), LIMITS, timing=PATIENT))
+        target=lambda: results.append(play(bus, plateau(0.8, 1.0, hold_ms=1500), LIMITS, timing=PATIENT))
     )
     first.start()
     listener = Listener(bus, 0x301)
@@ -180,7 +180,7 @@ def test_a_second_commander_is_refused_before_it_touches_anything(bus: str) -> N
     with pytest.raises(MotionError, match=r"another commander is on the bus \(node 21h\)"):
         play(bus, plateau(1.0, 1.0), LIMITS, timing=PATIENT)
     first.join()
-    assert results == [("done", "", 3.1)]
+    assert results == [("done", "", 2.1)]
 
 
 def test_a_progress_callback_that_raises_leaves_both_drives_off(bus: str) -> None:

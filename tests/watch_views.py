@@ -4,7 +4,7 @@ from daemon.snapshot import COUNTERS, JointView, View
 from estimator.status import VALID
 
 NAN = float("nan")
-WELL = JointView(10.0, 0.5, NAN, NAN, NAN, 10.0, 0x27, VALID, 0, 7)
+WELL = JointView(10.0, 0.5, NAN, NAN, NAN, 10.0, 0x27, VALID, 0, 15)
 
 
 def view(

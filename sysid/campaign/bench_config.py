@@ -19,10 +19,6 @@ PERIOD_US: Final = 1000
 _SETPOINT_RPDO: Final = 0x200  # or 300h+n: either way four bytes
 _RPDO_BYTES: Final = 4
 """RPDO1: 6040h and 6071h; RPDO2: 60FFh."""
-_TEMPERATURE_TPDO: Final = 0x380
-_TEMPERATURE_BYTES: Final = 2
-_TEMPERATURE_S: Final = 0.5
-"""Event timer of the drives' TPDO3."""
 
 
 @dataclass(frozen=True)
@@ -97,22 +93,16 @@ class BenchConfig:
             ConfigError: above 95 % in the worst case, or two users of one COB-ID.
         """
         extra = [heartbeat_row("commander", COMMANDER_NODE, round(Timing().own_heartbeat_s * 1e3))]
-        for node in self.nodes:
-            # either drive may be the velocity joint: both RPDOs have four bytes, so one row stands for both
-            extra.append(Row(_SETPOINT_RPDO + node, f"set-points of drive {node}", _RPDO_BYTES, 0.5))
-            extra.append(
-                Row(
-                    _TEMPERATURE_TPDO + node,
-                    f"drive {node} temperature",
-                    _TEMPERATURE_BYTES,
-                    1e-6 * PERIOD_US / _TEMPERATURE_S,
-                )
-            )
+        # either drive may be the velocity joint: both RPDOs have four bytes, so one row stands for both
+        extra += [
+            Row(_SETPOINT_RPDO + node, f"set-points of drive {node}", _RPDO_BYTES, 0.5) for node in self.nodes
+        ]
         try:
             return check_bus_load(
                 configured_load(
                     self.nodes,
                     {} if self.sensor is None else {self.sensor.node_id: self.sensor.channels},
+                    temperatures=self.nodes,  # the commander switches TPDO3 on where jtqd does not
                     heartbeat_ms=self.heartbeat_ms,
                     master=self.master,
                     extra=extra,

@@ -21,10 +21,10 @@ from sysid.campaign import dry_run
 from sysid.campaign.bench_config import BenchConfig
 from sysid.campaign.fourier_runs import seed_of
 from sysid.campaign.one_run import Bench, attempt
-from sysid.campaign.options import EMULATED, PLANT, emulated, misuse, parser, recipe, wanted_plan
+from sysid.campaign.options import EMULATED, PLANT, emulated, misuse, parser, recipe, scale_of, wanted_plan
 from sysid.campaign.plan import Plan
 from sysid.campaign.processes import EmulatedBench, ProcessError, StopAsked, unix_bus
-from sysid.campaign.progress import Reporter
+from sysid.campaign.progress import Designing, Reporter
 from sysid.campaign.runner import Outcome, go_through
 from sysid.campaign.segments import check_plan
 from sysid.campaign.state import DONE, CampaignDirectory, StateError
@@ -51,6 +51,14 @@ def main(argv: list[str]) -> int:
         return 1
 
 
+def _made(options: argparse.Namespace, config: BenchConfig) -> Plan:
+    """The plan, with a bar or a line where making it takes its time."""
+    if options.plan != "excitation":
+        return wanted_plan(options, config.joints)
+    with Designing(scale_of(options, config.joints).motions_tried) as designing:
+        return wanted_plan(options, config.joints, designing.advance)
+
+
 def _checked(plan: Plan, options: argparse.Namespace) -> dict[str, Setpoints]:
     try:
         return check_plan(plan)
@@ -59,8 +67,9 @@ def _checked(plan: Plan, options: argparse.Namespace) -> dict[str, Setpoints]:
 
 
 def _dry(options: argparse.Namespace) -> int:
-    load = BenchConfig.load(options.config).load_with_commander()
-    plan = wanted_plan(options)
+    config = BenchConfig.load(options.config)
+    load = config.load_with_commander()
+    plan = _made(options, config)
     setpoints = _checked(plan, options)
     if options.json:
         print(json.dumps(dry_run.content(plan, setpoints, load)))
@@ -72,10 +81,10 @@ def _dry(options: argparse.Namespace) -> int:
 def _campaign(options: argparse.Namespace) -> int:
     config = BenchConfig.load(options.config)
     config.load_with_commander()  # refuses what does not fit the bus
-    made_from = recipe(options)
+    made_from = recipe(options, config.joints)
     directory = CampaignDirectory(options.out)
     try:
-        plan = directory.same_recipe(made_from) or wanted_plan(options)
+        plan = directory.same_recipe(made_from) or _made(options, config)
         setpoints = _checked(plan, options)
         directory.begin(plan, made_from)
         outcome = _run(options, config, plan, setpoints, directory)

@@ -9,6 +9,7 @@ every run serves both.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Final
 
@@ -29,6 +30,8 @@ HOLD_S: Final = 2.1
 _RAMP_PER_RAD_S: Final = 0.35
 """Longer ramps for larger steps: 5.4 rad/s^2 at most, 7.5 Nm for both rotors of the bench, which come on top of the load."""
 _EDGE_S: Final = 0.5
+_TRAVEL_SHARE: Final = 0.95
+"""Part of the travel limit that is used: the joint overshoots a little."""
 
 Point = tuple[float, float]
 """(velocity [rad/s], current [A])"""
@@ -39,12 +42,32 @@ def currents_of(velocity_rad_s: float) -> tuple[float, ...]:
     return CURRENTS_A if abs(velocity_rad_s) <= FAST_RAD_S else CURRENTS_A[:-1]
 
 
-def ladder(name: str, velocity_joint: int, points: Iterable[Point], hold_s: float) -> Run:
-    """One run: from rest over all points, each held for hold_s after its ramp, back to rest."""
+def ladder(
+    name: str, velocity_joint: int, points: Iterable[Point], hold_s: float, travel_rad: float = math.inf
+) -> Run:
+    """One run: from rest over all points, each held for hold_s after its ramp, back to rest.
+
+    Before a point that would take the joint further than travel_rad from where the run began (with some room to stop
+    in), it turns back there without load; a smooth ramp covers the mean of its two velocities times its length.
+    """
     segments: list[Segment] = [Rest(_EDGE_S, 0.0)]
-    velocity = 0.0
+    velocity = position = 0.0
     for target, current in points:
-        segments.append(Plateau(target, current, hold_s, _ramp_s(target - velocity)))
+        ramp_s = _ramp_s(target - velocity)
+        step = 0.5 * (velocity + target) * ramp_s + target * hold_s
+        to_stop = 0.5 * target * _ramp_s(target)
+        if position and abs(position + step + to_stop) > _TRAVEL_SHARE * travel_rad:
+            back = -math.copysign(abs(target), position)
+            ramp_s = _ramp_s(back - velocity)
+            position += 0.5 * (velocity + back) * ramp_s
+            ramp_out_s = _ramp_s(target - back)
+            hold_back_s = max(round(-(position + 0.5 * (back + target) * ramp_out_s) / back, 3), 0.0)
+            segments.append(Plateau(back, 0.0, hold_back_s, ramp_s))
+            position += back * hold_back_s
+            velocity, ramp_s = back, ramp_out_s
+            step = 0.5 * (velocity + target) * ramp_s + target * hold_s
+        segments.append(Plateau(target, current, hold_s, ramp_s))
+        position += step
         velocity = target
     segments.append(Rest(_EDGE_S, _ramp_s(velocity)))
     return Run(name, velocity_joint, tuple(segments))
@@ -54,6 +77,7 @@ def efficiency_runs(
     velocities_rad_s: Sequence[float] = VELOCITIES_RAD_S,
     hold_s: float = HOLD_S,
     currents_a: Sequence[float] | None = None,
+    travel_rad: float = math.inf,
 ) -> tuple[Run, ...]:
     """Section II: a run per velocity, direction and kind of drive, each over the currents (default: the paper's).
 
@@ -66,7 +90,7 @@ def efficiency_runs(
         for drive, joint in DRIVES.items():
             for letter, sign in (("p", 1.0), ("n", -1.0)):
                 points = [(sign * velocity, sign * current + 0.0) for current in currents]  # no "-0.0"
-                runs.append(ladder(f"{drive}_{letter}{velocity:g}", joint, points, hold_s))
+                runs.append(ladder(f"{drive}_{letter}{velocity:g}", joint, points, hold_s, travel_rad))
     return tuple(runs)
 
 

@@ -7,12 +7,19 @@ the losses; those of `variable_runs` are drawn, because a judge must not be chos
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from typing import Final
 
 from estimator.checked import ConfigError
+from estimator.parameters import Joint
 from sysid.campaign.plan import Fourier, Rest, Run, Segment
-from sysid.excitation_design import ExcitationLimits, design
+from sysid.excitation_design import Design, ExcitationLimits, design, draw
 from sysid.motion.limits import Limits
+
+Joints = tuple[Joint, Joint] | None
+"""Velocity joint and driving joint of the design; None: those that ship. Either order serves, the joints being alike."""
+Tried = Callable[[int], None]
+"""Told the number of motions that have been tried since the last call."""
 
 FULL_RAD_S: Final = 3.0
 MEDIUM_RAD_S: Final = 1.2
@@ -30,13 +37,20 @@ BETWEEN_S: Final = 2.0
 SHORTEST_S: Final = 2.0
 """Of one trajectory: below it, acceleration limits leave nothing of the velocity."""
 HARMONICS: Final = 5
-_DRAWN: Final = 1
-"""Evaluations of the design that leave the first random coefficients as they are."""
 
 _SECOND_LEVELS: Final = (SLOW_RAD_S, MEDIUM_RAD_S, FULL_RAD_S)
 
 
-def excitation_runs(limits: Limits, count: int, run_s: float, seed: int, evaluations: int) -> tuple[Run, ...]:
+def excitation_runs(
+    limits: Limits,
+    count: int,
+    run_s: float,
+    *,
+    seed: int,
+    evaluations: int,
+    joints: Joints = None,
+    on_progress: Tried | None = None,
+) -> tuple[Run, ...]:
     """Section III: `count` runs of two trajectories each with 2 s of rest between; run_s [s] is a run's length.
 
     The first trajectory of a run uses all of the velocity, the second one is slow, medium or fast in turn; the velocity
@@ -51,8 +65,17 @@ def excitation_runs(limits: Limits, count: int, run_s: float, seed: int, evaluat
     for level in dict.fromkeys(levels):
         places = [k for k, each in enumerate(levels) if each == level]
         chosen = seed_of("excitation", level, seed)
-        made = _designed(limits, level, len(places), duration_s, seed=chosen, evaluations=evaluations)
-        fourier.update(zip(places, made, strict=True))
+        made = design(
+            _design_limits(limits, level),
+            count=len(places),
+            duration_s=duration_s,
+            harmonics=HARMONICS,
+            seed=chosen,
+            evaluations=evaluations,
+            joints=joints,
+            on_progress=on_progress,
+        )
+        fourier.update(zip(places, map(_segment, made), strict=True))
     return tuple(
         Run(
             f"excitation_{k + 1:02d}",
@@ -63,7 +86,9 @@ def excitation_runs(limits: Limits, count: int, run_s: float, seed: int, evaluat
     )
 
 
-def variable_runs(limits: Limits, count: int, run_s: float, seed: int) -> tuple[Run, ...]:
+def variable_runs(
+    limits: Limits, count: int, run_s: float, *, seed: int, joints: Joints = None
+) -> tuple[Run, ...]:
     """Section IV.B: `count` runs of one trajectory each, never to be trained on; the velocity joint alternates.
 
     Raises:
@@ -71,9 +96,16 @@ def variable_runs(limits: Limits, count: int, run_s: float, seed: int) -> tuple[
     """
     duration_s = _trajectory_s(run_s, 2.0 * EDGE_S, 1)
     chosen = seed_of("variable", FULL_RAD_S, seed)
-    made = _designed(limits, FULL_RAD_S, count, duration_s, seed=chosen, evaluations=_DRAWN)
+    made = draw(
+        _design_limits(limits, FULL_RAD_S),
+        count=count,
+        duration_s=duration_s,
+        harmonics=HARMONICS,
+        seed=chosen,
+        joints=joints,
+    )
     return tuple(
-        Run(f"variable_{k + 1:02d}", 1 + k % 2, (*_rests(EDGE_S), one, *_rests(EDGE_S)))
+        Run(f"variable_{k + 1:02d}", 1 + k % 2, (*_rests(EDGE_S), _segment(one), *_rests(EDGE_S)))
         for k, one in enumerate(made)
     )
 
@@ -103,22 +135,16 @@ def _rests(hold_s: float) -> tuple[Segment, ...]:
     return (Rest(hold_s, 0.0),)  # it begins at rest: nothing to ramp
 
 
-def _designed(
-    limits: Limits, peak_rad_s: float, count: int, duration_s: float, *, seed: int, evaluations: int
-) -> list[Fourier]:
-    wanted = ExcitationLimits(
+def _segment(made: Design) -> Fourier:
+    return Fourier(made.velocity, made.current)
+
+
+def _design_limits(limits: Limits, peak_rad_s: float) -> ExcitationLimits:
+    """Well within the plan's limits, so that none of them ends a run."""
+    return ExcitationLimits(
         velocity_rad_s=min(peak_rad_s, _LIMIT_SHARE * limits.velocity_rad_s),
         travel_rad=_LIMIT_SHARE * limits.travel_rad,
         current_a=min(CURRENT_A, _LIMIT_SHARE * limits.current_a),
         joint_current_a=min(JOINT_CURRENT_A, _LIMIT_SHARE * limits.current_a),
         torque_nm=_LIMIT_SHARE * limits.torque_nm,
     )
-    made = design(
-        wanted,
-        count=count,
-        duration_s=duration_s,
-        harmonics=HARMONICS,
-        seed=seed,
-        evaluations=evaluations,
-    )
-    return [Fourier(one.velocity, one.current) for one in made]

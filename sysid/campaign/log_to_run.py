@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.devices import NOT_MEASURED, TEMPERATURE_C_PER_UNIT, drive_tpdo3
 from estimator.friction import FloatArray
 from estimator.run import JointColumns, RunTable
 from sysid.joint_log import LogError, Records, read_topic
@@ -17,10 +18,6 @@ from sysid.joint_log import LogError, Records, read_topic
 ALL_INPUTS: Final = 7
 """input_flags of the log: both PDOs of the drive and the sensor's are of this cycle."""
 DRIVE_INPUTS: Final = 3
-TEMPERATURE_COB_ID: Final = 0x380
-"""TPDO3 of a drive: its joint's temperature, I16 in 0.1 degC, 8000h: not measured (docs/plant.md)."""
-_C_PER_COUNT: Final = 0.1
-_NOT_MEASURED: Final = -0x8000
 _ENABLED_MASK, _ENABLED = 0x6F, 0x27  # 6041h: "operation enabled" of CiA 402
 _INPUTS: Final = ("current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad")
 _NS: Final = 1e-9
@@ -152,16 +149,16 @@ def _columns(state: Records, sensor: bool, temperature: FloatArray | None) -> Jo
 
 
 def _temperature(frames: Records, node: int, span: slice) -> FloatArray | None:
-    """Temperature [n] of a drive's joint over the cycles of `span` [degC], held between two frames; None without any.
+    """Temperature [n] of a drive's joint over the cycles of `span` [degC] by its TPDO3, held between two; None without any.
 
     Frames from before the span count: a joint's temperature changes within minutes, its PDO comes twice a second.
     """
     raw = frames["frames"]
     stored = np.arange(raw.shape[1]) < frames["frame_count"][:, None]
-    at = stored & (raw["id"] == TEMPERATURE_COB_ID + node) & (raw["length"] >= 2)
+    at = stored & (raw["id"] == drive_tpdo3(node).cob_id) & (raw["length"] >= 2)
     rows, places = np.nonzero(at)
     counts = np.ascontiguousarray(raw["data"][rows, places][:, :2]).view("<i2")[:, 0]
-    rows, values = rows[counts != _NOT_MEASURED], counts[counts != _NOT_MEASURED] * _C_PER_COUNT
+    rows, values = rows[counts != NOT_MEASURED], counts[counts != NOT_MEASURED] * TEMPERATURE_C_PER_UNIT
     if not len(rows):
         return None
     last = np.searchsorted(rows, np.arange(len(frames))[span], side="right") - 1

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import math
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Final
 
 from estimator.arguments import count, natural, seconds
+from estimator.parameters import Joint
+from sysid.campaign.fourier_runs import Tried
 from sysid.campaign.plan import DEFAULT_LIMITS, Plan, load_plan
 from sysid.campaign.plans import KINDS, Scale, make_plan
 from sysid.motion.limits import Limits
@@ -88,22 +91,33 @@ def emulated(bus: str | None) -> bool:
     return bus is not None and (bus == EMULATED or bus.startswith(f"{EMULATED}:"))
 
 
-def recipe(options: argparse.Namespace) -> dict[str, Any]:
+def recipe(options: argparse.Namespace, joints: tuple[Joint, Joint]) -> dict[str, Any]:
     """What the plan is made from, as plain values; the same recipe is the same plan. Raises ConfigError."""
     limits = {name: None if math.isinf(value) else value for name, value in options.limit}
     if options.plan not in KINDS:
         return {"plan_sha256": load_plan(Path(options.plan)).sha256, "limits": limits}
-    return {"kind": options.plan, **{name: getattr(options, name) for name in _SCALING}, "limits": limits}
+    return {
+        "kind": options.plan,
+        **{name: getattr(options, name) for name in _SCALING},
+        "limits": limits,
+        "joints_sha256": hashlib.sha256(repr(joints).encode()).hexdigest(),
+    }
 
 
-def wanted_plan(options: argparse.Namespace) -> Plan:
-    """Read or make the plan. Raises ConfigError."""
-    changes = dict(options.limit)
+def scale_of(options: argparse.Namespace, joints: tuple[Joint, Joint]) -> Scale:
+    """Size of a campaign that is not a file."""
+    scale = {name: getattr(options, name) for name in _SCALING}
+    return Scale(**scale, limits=replace(DEFAULT_LIMITS, **dict(options.limit)), joints=joints)
+
+
+def wanted_plan(
+    options: argparse.Namespace, joints: tuple[Joint, Joint], on_progress: Tried | None = None
+) -> Plan:
+    """Read or make the plan; `joints` are those of the bench. Raises ConfigError."""
     if options.plan not in KINDS:
         plan = load_plan(Path(options.plan))
-        return replace(plan, limits=replace(plan.limits, **changes))
-    scale = {name: getattr(options, name) for name in _SCALING}
-    return make_plan(options.plan, Scale(**scale, limits=replace(DEFAULT_LIMITS, **changes)))
+        return replace(plan, limits=replace(plan.limits, **dict(options.limit)))
+    return make_plan(options.plan, scale_of(options, joints), on_progress)
 
 
 def _limit(text: str) -> tuple[str, float]:

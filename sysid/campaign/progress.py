@@ -16,6 +16,8 @@ BETWEEN_RUNS_S: Final = 4.0
 """What a run takes beside its motion, until one has been measured: start of jtqd, set-up of the drives, table."""
 _REFRESH_S: Final = 1.0
 """Drawing takes 1 to 2 ms and happens between two set-points: not more often than necessary."""
+_WORTH_A_LINE: Final = 20_000
+"""Motions tried in about 4 s."""
 
 
 def clock_text(seconds: float) -> str:
@@ -64,6 +66,33 @@ class Remaining:
                 (elapsed_s - self._played_s - played_s) / (self._finished + (played_s > 0.0)), 0.0
             )
         return self._motions_s - played_s + between_s * self._left
+
+
+class Designing:
+    """A bar, or a line, while trajectories are designed; a context manager.
+
+    Args:
+        total: motions that will be tried.
+    """
+
+    def __init__(self, total: int, console: Console | None = None) -> None:
+        self._console = console or Console(stderr=True)
+        self._bar = Progress(console=self._console, transient=True, disable=not self._console.is_terminal)
+        self._task = self._bar.add_task("designing trajectories", total=total)
+        self._total = total
+
+    def __enter__(self) -> Designing:
+        if not self._console.is_terminal and self._total > _WORTH_A_LINE:
+            print("jtq campaign: designing trajectories", file=sys.stderr, flush=True)
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def advance(self, tried: int) -> None:
+        """So many more motions have been tried."""
+        self._bar.advance(self._task, tried)
 
 
 class Reporter:

@@ -58,13 +58,17 @@ class JointModels:
     training: TrainingRuns
     files: Mapping[str, str]
 
-    def estimate(self, time_s: FloatArray, columns: JointColumns) -> tuple[Mapping[str, EstimateRun], ObservedRun]:
+    def estimate(
+        self, time_s: FloatArray, columns: JointColumns
+    ) -> tuple[Mapping[str, EstimateRun], ObservedRun]:
         """Return every method's estimates of a run and what the observer saw; ConfigError, ValueError as the estimators."""
         runs = {}
         for method in self.methods:
             if method not in ("physics", OURS):
                 settings = EstimatorSettings(method=method)
-                runs[method] = estimate_columns(self.joint, settings, self.networks.get(method), time_s, columns)
+                runs[method] = estimate_columns(
+                    self.joint, settings, self.networks.get(method), time_s, columns
+                )
         settings = EstimatorSettings(method=OURS)
         torsion = None if self.joint.fused is None else self.joint.fused.torsion
         inputs = (getattr(columns, name) for name in _INPUTS)
@@ -88,9 +92,13 @@ def load_models(directory: Path, numbers: Sequence[int] = ()) -> tuple[JointMode
         NetworkError: a network file cannot be used.
     """
     if not directory.is_dir():
-        raise ConfigError(f"--models {directory}: found no directory, expected one with joint1.yaml, joint1.onnx, ...")
+        raise ConfigError(
+            f"--models {directory}: found no directory, expected one with joint1.yaml, joint1.onnx, ..."
+        )
     there = sorted(
-        int(match.group(1)) for path in directory.iterdir() if (match := re.fullmatch(r"joint(\d)\.yaml", path.name))
+        int(match.group(1))
+        for path in directory.iterdir()
+        if (match := re.fullmatch(r"joint(\d)\.yaml", path.name))
     )
     absent = [number for number in numbers if number not in there]
     if absent or not there:
@@ -114,7 +122,9 @@ def _joint_models(directory: Path, number: int) -> JointModels:
             continue
         network = load_network(method, str(source))
         if network.joint != joint.name:
-            raise ConfigError(f"{source}: found a network of joint '{network.joint}', expected one of '{joint.name}'")
+            raise ConfigError(
+                f"{source}: found a network of joint '{network.joint}', expected one of '{joint.name}'"
+            )
         networks[method] = network
         files[name] = network.sha256
         training = training.and_those_of(network_training_runs(source))

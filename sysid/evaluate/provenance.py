@@ -68,7 +68,9 @@ def run_hashes(path: Path) -> tuple[str, ...]:
     data = path.read_bytes()
     hashes = [hashlib.sha256(data).hexdigest()]
     try:
-        other = gzip.decompress(data) if path.name.endswith(".gz") else gzip.compress(data, _COMPRESSION, mtime=0)
+        other = (
+            gzip.decompress(data) if path.name.endswith(".gz") else gzip.compress(data, _COMPRESSION, mtime=0)
+        )
     except (OSError, EOFError, zlib.error):  # not a run, as its reader will say
         return tuple(hashes)
     return (*hashes, hashlib.sha256(other).hexdigest())

@@ -221,6 +221,8 @@ class Commander:
 
     def _waiting(self) -> None:
         """Until SYNC, every input and standstill have been there long enough; refused when they do not come in time."""
+        for drive in self.inputs.drives:
+            drive.begin_travel()
         missing: str | None = "no SYNC: is jtqd running on this bus?"
         if self._pace.synced:
             missing = self._supervision.missing(self._now_ns)
@@ -231,8 +233,6 @@ class Commander:
                 self.refusal = missing
                 self.phase = Phase.OVER
         elif self._now_ns - self._still_since_ns >= self.timing.still_s * 1e9:
-            for drive in self.inputs.drives:
-                drive.begin_travel()
             self._enter(Phase.ENABLING)
 
     def _enabling(self, turn: int) -> bytes | None:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Final
 
-from drivers.devices import COMMANDER_NODE, MotionError, drive_rpdo1, drive_rpdo2
+from drivers.devices import COMMANDER_NODE, drive_rpdo1, drive_rpdo2
 from drivers.frame import FRAME, pack
 from sysid.motion.cia402_client import ENABLE_OPERATION, QUICK_STOP_WORD
 from sysid.motion.drive_setup import DriveUnits
+from sysid.motion.result import MotionError
 from sysid.motion.setpoints import Setpoints
 
 _COMMAND, _VELOCITY = drive_rpdo1(1).layout, drive_rpdo2(1).layout

@@ -1,0 +1,135 @@
+"""`jtq evaluate`: every method beside the torque sensor on runs never trained on; table, JSON and an HTML report."""
+
+from __future__ import annotations
+
+import argparse
+import datetime as dt
+import importlib.util
+import json
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from estimator.checked import ConfigError
+from estimator.onnx_graph import NetworkError
+from sim_can.run_files import RunError
+from sysid.evaluate.evaluation import Evaluation, evaluate
+from sysid.evaluate.inputs import Inputs, read_inputs
+from sysid.evaluate.mapping import as_mapping
+from sysid.evaluate.methods import JointModels, load_models
+from sysid.evaluate.text import text_lines
+from sysid.findings import Finding
+from sysid.fit_inputs import progress
+
+BY: Final = "jtq evaluate"
+_NEEDED: Final = ("matplotlib", "jinja2", "onnx")
+
+
+def main(argv: list[str]) -> int:
+    """Evaluate and write; exit status 0 done, 1 failure (a trained-on run included), 2 usage, 3 done with findings."""
+    options = _parser().parse_args(argv)
+    missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
+    if missing:
+        print(f"{BY}: {', '.join(missing)} not installed: pip install 'jtqd[train]'", file=sys.stderr)
+        return 1
+    try:
+        models = load_models(options.models, options.joint)
+        _make(options.out)
+        inputs = read_inputs(options.runs, models, options.columns)
+        outside = Inputs((), (), ())
+        if options.outside:
+            outside = read_inputs(options.outside, models, options.columns)
+        result = evaluate(_distinct(inputs, outside), outside.runs, models, progress)
+        result = replace(result, findings=(*_silent(models), *inputs.findings, *outside.findings, *result.findings))
+        _write(options, result)
+    except (ConfigError, NetworkError, RunError, ValueError, OSError) as error:
+        for line in str(error).splitlines() or [type(error).__name__]:
+            print(f"{BY}: {line}", file=sys.stderr)
+        return 1
+    for note in (*inputs.notes, *outside.notes):
+        print(f"{BY}: {note}", file=sys.stderr)
+    return 3 if result.findings else 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=BY,
+        description="Compare all methods with the torque sensor on runs that no model has seen (the paper's section IV).",
+        epilog=(
+            "examples:\n"
+            "  jtq evaluate campaigns/validate --models models --out report\n"
+            "  jtq evaluate campaigns/validate --models models --outside campaigns/outside --out report --json\n\n"
+            "DIR/evaluation.html is the report, DIR/evaluation.json the same for programs. Exit status: 0 done; 1 failure,\n"
+            "or a run that a model was made from; 2 usage; 3 done, but something was left out or found."
+        ),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "runs", nargs="+", type=Path, metavar="RUNS", help="run files (.csv, .csv.gz) or directories of them"
+    )
+    parser.add_argument(
+        "--models", type=Path, required=True, metavar="DIR",
+        help="joint1.yaml, joint1.onnx (the paper's network), joint1.fused.onnx (ours), and so on for each joint",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the report goes; made if missing")
+    parser.add_argument(
+        "--joint", type=int, action="append", choices=range(1, 8), default=[], metavar="N",
+        help="only this joint; may be given again (default: every jointN.yaml)",
+    )
+    parser.add_argument(
+        "--outside", nargs="+", type=Path, default=[], metavar="RUNS",
+        help="runs with more load or warmer than any training run, to judge ours outside its envelope",
+    )
+    parser.add_argument("--columns", type=Path, metavar="FILE", help="column map for other names, units and signs")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON instead of the table")
+    return parser
+
+
+def _make(directory: Path) -> None:
+    """Make the directory before minutes of work. Raises ConfigError."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = "it is a file" if isinstance(error, FileExistsError) else error.strerror
+        raise ConfigError(f"--out {directory}: cannot be made: {reason}") from None
+
+
+def _distinct(inputs: Inputs, outside: Inputs) -> tuple:  # type: ignore[type-arg]
+    """The runs to judge; one that is also given as outside would count in two places. Raises ConfigError."""
+    beyond = {run.sha256: run.name for run in outside.runs}
+    for run in inputs.runs:
+        if run.sha256 in beyond:
+            raise ConfigError(f"--outside {beyond[run.sha256]}: found the same data as in {run.name}, expected other runs")
+    return inputs.runs
+
+
+def _silent(models: tuple[JointModels, ...]) -> list[Finding]:
+    return [
+        Finding(
+            "training_runs_unknown",
+            f"{name}: found no runs in its metadata, expected names and SHA-256 of what it was trained on: whether it has "
+            "seen these runs cannot be told",
+        )
+        for each in models
+        for name in each.training.silent
+    ]
+
+
+def _write(options: argparse.Namespace, result: Evaluation) -> None:
+    """evaluation.json and evaluation.html, each whole or not at all; then the table or the JSON on standard output."""
+    from sysid.evaluate.report import report_html
+
+    mapping = as_mapping(result)
+    text = json.dumps(mapping, indent=1, allow_nan=False)
+    made = f"{BY}, {dt.datetime.now().astimezone():%Y-%m-%d %H:%M}"
+    for name, content in (("evaluation.json", f"{text}\n"), ("evaluation.html", report_html(result, mapping, made))):
+        temporary = options.out / f".{name}.part"
+        try:
+            temporary.write_text(content, encoding="utf-8")
+            os.replace(temporary, options.out / name)
+        finally:
+            temporary.unlink(missing_ok=True)
+    print(text if options.json else "\n".join(text_lines(result, mapping)))
+    print(f"{BY}: wrote {options.out / 'evaluation.html'}", file=sys.stderr)

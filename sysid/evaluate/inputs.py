@@ -1,0 +1,140 @@
+"""From run files to runs that may be judged: trained-on runs refuse everything, broken ones are named and left out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from estimator.checked import ConfigError
+from estimator.parameters import Joint
+from estimator.run import JointColumns, RunTable
+from sim_can.run_files import ColumnMap, RunError, RunFile, read_run
+from sysid.channel_checks import check_channels
+from sysid.evaluate.methods import JointModels
+from sysid.evaluate.provenance import run_hashes
+from sysid.evaluate.velocity_joint import by_data, by_marks
+from sysid.findings import Finding
+from sysid.fit_inputs import progress, run_paths
+
+_NEEDED = ("current_a", "motor_position_rad", "link_position_rad", "torque_nm")
+"""Columns of a joint that must have been measured; the motor's velocity may be derived."""
+
+
+class JudgedRun(NamedTuple):
+    """One run: columns by joint number, complete and checked; velocity_joint None: not known; `by`: marks or data."""
+
+    name: str
+    sha256: str
+    table: RunTable
+    columns: Mapping[int, JointColumns]
+    velocity_joint: int | None
+    by: str
+
+
+class Inputs(NamedTuple):
+    """runs: at least one joint of each can be judged; findings: what was left out; notes: what the reader noticed."""
+
+    runs: tuple[JudgedRun, ...]
+    findings: tuple[Finding, ...]
+    notes: tuple[str, ...]
+
+
+class LeakError(ConfigError):
+    """Runs to judge by are runs that the models were made from; one line per run."""
+
+
+def read_inputs(
+    arguments: Sequence[Path], models: Sequence[JointModels], columns: Path | None = None
+) -> Inputs:
+    """Read and check all runs; a progress bar on a terminal.
+
+    Raises:
+        LeakError: models were fitted to, or trained on, one of them.
+        RunError: a path that does not exist, or a directory without a run. ConfigError: the column map.
+    """
+    paths = run_paths(arguments)
+    mapping = None if columns is None else ColumnMap.load(columns)
+    refuse_trained_on(paths, models)
+    runs: list[JudgedRun] = []
+    findings: list[Finding] = []
+    notes: list[str] = []
+    for path in progress(paths, "reading runs"):
+        name = path.name if all(path.name != run.name for run in runs) else str(path)
+        try:
+            file = read_run(path, mapping)
+        except RunError as error:
+            findings.append(Finding("unreadable", f"{error}: run left out"))
+            continue
+        twin = next((run.name for run in runs if run.sha256 == file.sha256), None)
+        if twin is not None:
+            findings.append(
+                Finding("twice", f"{name}: found the same data as in {twin}: left out, judged once")
+            )
+            continue
+        judged, found = _judged(name, file, models, path)
+        findings += found
+        notes += [f"{name}: {note}" for note in file.notes]
+        if judged.columns:
+            runs.append(judged)
+    return Inputs(tuple(runs), tuple(findings), tuple(notes))
+
+
+def refuse_trained_on(paths: Sequence[Path], models: Sequence[JointModels]) -> None:
+    """Raise LeakError when a file holds the data of a run that a model was made from."""
+    leaks = []
+    for path in paths:
+        if not path.is_file():
+            continue
+        sources = [
+            name
+            for sha256 in run_hashes(path)
+            for each in models
+            for name in each.training.sources.get(sha256, ())
+        ]
+        if sources:
+            leaks.append(f"{path}: found a run that {', '.join(dict.fromkeys(sources))} was made from")
+    if leaks:
+        raise LeakError("\n".join(leaks) + "\nexpected runs that no model has seen: nothing was judged")
+
+
+def _judged(
+    name: str, file: RunFile, models: Sequence[JointModels], path: Path
+) -> tuple[JudgedRun, list[Finding]]:
+    usable: dict[int, JointColumns] = {}
+    findings: list[Finding] = []
+    for each in models:
+        found = _check(name, file, each.number, each.joint)
+        findings += found
+        if not found:
+            usable[each.number] = file.table.joint(each.number, each.joint.gear_ratio)
+    marked = by_marks(_marks(path))
+    number = marked if marked is not None else by_data(file.table)
+    by = "unknown" if number is None else "data" if marked is None else "marks"
+    return JudgedRun(name, file.sha256, file.table, usable, number, by), findings
+
+
+def _check(name: str, file: RunFile, number: int, joint: Joint) -> list[Finding]:
+    """What keeps a joint of a run from being judged."""
+    where = f"{name}: j{number}"
+    if number not in file.table.joints:
+        return [Finding("missing_joint", f"{where}: found no columns of this joint: not judged")]
+    columns = file.table.joints[number]
+    dead = [note for note in file.notes if note.startswith(f"j{number}.")]
+    missing = [key for key in _NEEDED if getattr(columns, key) is None]
+    if dead:
+        return [Finding("dead_channel", f"{name}: {note}: j{number} not judged") for note in dead]
+    if missing:
+        return [Finding("missing_columns", f"{where}: found no {', '.join(missing)}: not judged")]
+    found = check_channels(file.table.time_s, columns, joint, where)
+    return [Finding(item.kind, f"{item.text}: j{number} not judged") for item in found]
+
+
+def _marks(path: Path) -> object:
+    """The campaign's NAME.json beside NAME.csv.gz; None where there is none or it is no JSON."""
+    stem = path.name.removesuffix(".gz").removesuffix(".csv")
+    try:
+        return json.loads(path.with_name(f"{stem}.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
