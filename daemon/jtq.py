@@ -15,7 +15,12 @@ COMMANDS = {
         "sysid.fit_command",
         "fit a section of a joint file to measured runs: efficiency, friction, losses",
     ),
+    "reproduce": ("sysid.reproduce_command", "campaigns, fits, training and evaluation from nothing"),
     "train": ("sysid.train_command", "train networks on recorded runs (extra: train)"),
+    "evaluate": (
+        "sysid.evaluate.command",
+        "all methods beside the torque sensor on runs never trained on: report and figures",
+    ),
     "plot": ("sysid.plot_command", "draw a log: estimate beside the torque sensor"),
     "bus-load": ("daemon.bus_load_command", "worst-case load of the bus by a configuration"),
     "measured": (

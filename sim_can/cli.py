@@ -11,6 +11,9 @@ from sim_can.eds_entries import EdsChild
 from sim_can.plant_parameters import PROFILES
 from sim_can.source import Source
 
+PLANT = "campaign_plant.yaml"
+"""The bench that the shipped models were identified on."""
+
 EXAMPLES = """examples:
   jtq sim --bus vcan0                              two joints and a sensor on SocketCAN
   jtq sim --bus unix:/tmp/bench --bitrate 1000000  the same on a unix bus with the wire modelled
@@ -39,7 +42,7 @@ def parser() -> argparse.ArgumentParser:
         "--bus", help="SocketCAN interface (vcan0) or unix:PATH; a unix bus without a hub gets one"
     )
     made.add_argument(
-        "--plant", type=Path, metavar="FILE", help="plant.yaml, or a joint.yaml for two ideal joints"
+        "--plant", type=Path, metavar="FILE", help=f"plant file (default: {PLANT}), or a joint.yaml for two ideal joints"
     )
     made.add_argument("--seed", type=natural, default=0, metavar="N", help="seed of the noise (default 0)")
     made.add_argument(
@@ -103,7 +106,7 @@ def _run(options: argparse.Namespace) -> int:
     from sim_can.plant_parameters import load_plant
 
     if options.cost:
-        return _print_cost(options, load_plant(options.plant or shipped("plant.yaml")))
+        return _print_cost(options, load_plant(options.plant or shipped(PLANT)))
     child = EdsChild()  # reads while this process loads numpy and makes the plant
     try:
         if options.play is not None:
@@ -112,7 +115,7 @@ def _run(options: argparse.Namespace) -> int:
         else:
             from sim_can.plant_source import PlantSource
 
-            parameters = load_plant(options.plant or shipped("plant.yaml"))
+            parameters = load_plant(options.plant or shipped(PLANT))
             source = PlantSource(parameters, options.seed)
             profile = options.profile or parameters.profile
     except BaseException:

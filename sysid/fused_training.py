@@ -38,6 +38,7 @@ _VELOCITY_STEP_RAD_S: Final = 0.25
 _TORQUE_STEP_NM: Final = 3.0
 _SLOW_SAMPLES: Final = 501
 """Half a second at 1 kHz: at 0.1 rad/s the ripple at 2 per motor revolution has turned 1.6 times."""
+_LEAST_SHARE: Final = 0.05
 _VISITS: Final = 20
 """Samples at 1 kHz in a cell that make it known."""
 
@@ -76,25 +77,31 @@ def train_fused(
         )
     if len(runs) < 8:
         raise ValueError(f"found {len(runs)} runs, expected at least 8: standard deviations need unseen runs")
-    errors, sigmas, quadrants, scores = [], [], [], {}
+    unseen: list[tuple[Seen, FloatArray]] = []
     for known, judged in folds(runs):
         loss, torsion = fit_loss(known, joint.friction).loss, fit_torsion(known)
         trained = _train([Seen(run, loss, torsion, fused.sigma) for run in known], iterations, seed, progress)
         for n in judged:
             one = Seen(runs[n], loss, torsion, fused.sigma)
-            error = one.residual_nm - network_output(trained, one.features)
-            errors.append(error)
-            sigmas.append(one.sigma_nm)
-            quadrants.append(one.quadrant)
-            scores[one.name] = (float(np.mean(error**2)), float(np.mean(one.residual_nm**2)))
+            unseen.append((one, network_output(trained, one.features)))
+    share = safe_share([(one.residual_nm, correction) for one, correction in unseen])
+    errors = [one.residual_nm - share * correction for one, correction in unseen]
+    scores = {
+        one.name: (float(np.mean(error**2)), float(np.mean(one.residual_nm**2)))
+        for (one, _), error in zip(unseen, errors, strict=True)
+    }
     blocks = [Seen(run, fused.loss, fused.torsion, fused.sigma) for run in runs]
     trained = _train(blocks, iterations, seed, progress)
+    trained = replace(trained, output_mean=share * trained.output_mean, output_std=share * trained.output_std)
     features = np.concatenate([block.features for block in blocks])
     low, high = np.quantile(features, [1e-4, 1.0 - 1e-4], axis=0)
     metadata = {
         "features": list(FUSED_FEATURES),
         "envelope": envelope_of(blocks, runs).to_mapping(),
-        "sigma_scale": list(conformal_scale(errors, sigmas, quadrants)),
+        "sigma_scale": list(
+            conformal_scale(errors, [one.sigma_nm for one, _ in unseen], [one.quadrant for one, _ in unseen])
+        ),
+        "share": share,
         "input_low": low.tolist(),
         "input_high": high.tolist(),
         "joint": joint.name,
@@ -102,6 +109,24 @@ def train_fused(
         "runs": hashes,
     }
     return TrainedNetwork(exported(trained, metadata), trained, metadata, scores)
+
+
+def safe_share(unseen: Sequence[tuple[FloatArray, FloatArray]]) -> float:
+    """Return the part of the correction that helps on unseen runs: (residual [n], correction [n]) of each.
+
+    With share s the MSE of a run changes by s^2 E[c^2] - 2 s E[c r]: best at E[c r]/E[c^2], harmful beyond twice that.
+    Taken is the best over all runs, but no more than what would harm a single one. Raises ValueError when even a
+    twentieth would: then the network has learned nothing that lasts.
+    """
+    products = np.array([float(np.mean(r * c)) for r, c in unseen])
+    squares = np.array([float(np.mean(c * c)) for _, c in unseen])
+    share = min(1.0, float(products.sum() / squares.sum()), float(np.min(1.8 * products / squares)))
+    if share < _LEAST_SHARE:
+        raise ValueError(
+            f"found a network that makes unseen runs worse (useful part {share:.2f}), expected at least {_LEAST_SHARE}: "
+            "more runs, or method 'fused' without a network"
+        )
+    return share
 
 
 def quick_part(residual_nm: FloatArray) -> FloatArray:

@@ -7,6 +7,8 @@ Residuals e_c = tau_raw - loss - sensor and e_t = tau_t - sensor, each from a fi
     e_t^2 - reference^2 ~ torsion^2 + (load tau_t)^2
     scale_q = 90 % quantile of |error|/sigma in quadrant q, over 1.645: split conformal prediction by runs
               (Vovk et al. 2005; Lei et al. 2018), every run weighted alike
+
+Where a whole run shares its error (its zeros), n runs have not shown the largest yet: 8 of them cover 87 % of others.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
     sensor = K d + K3 d^3 - K sum_n (c_n cos(n theta_m) + s_n sin(n theta_m)) + zero of the run
 
-d is the filtered torsion angle, and so are the waves. Each run has a zero of its own: the sensor's zero and the link
+d is the filtered torsion angle less its offsets, and so are the waves; the fit is repeated with the offsets found, so
+that the cubic acts on the deflection alone. Each run has a zero of its own: the sensor's zero and the link
 encoder's cannot be told apart in one run; their mean over the runs is the torsion's zero.
 """
 
@@ -22,6 +23,7 @@ _EVERY: Final = 5
 _ORDERS: Final = tuple(float(order) for order in RIPPLE_ORDERS)
 _COMMON: Final = 7
 """Columns that all runs share: d, d^3, the four waves, and the zero."""
+_REPETITIONS: Final = 3
 _ZERO_SIGMA_NM: Final = 0.5  # a priori, per run: far more than a good sensor drifts
 _CUBIC_SHARE: Final = 0.5  # a priori sigma of K3 d^3 at the largest d, as a share of the largest torque
 
@@ -37,39 +39,54 @@ def fit_torsion(runs: Sequence[RunSignals]) -> Torsion:
     )
     if largest <= 0.0:
         raise TorsionError("found no torsion between motor and link encoder, expected some under load")
-    x, y = _equations(runs, largest)
-    if len(y) < 10 * x.shape[1]:
-        raise TorsionError(f"found {len(y)} moving samples, expected at least {10 * x.shape[1]}")
-    noise = _noise_of(x, y)
-    prior = np.zeros(x.shape[1])
-    prior[1] = noise / max(_CUBIC_SHARE * float(np.abs(y).max()), 1e-9) ** 2
-    prior[_COMMON:] = noise / _ZERO_SIGMA_NM**2
-    w = np.linalg.lstsq(x.T @ x + np.diag(prior), x.T @ y, rcond=None)[0]
-    stiffness = float(w[0]) / largest
-    if not stiffness > 0.0:
-        raise TorsionError(f"found a stiffness of {stiffness:.3g} Nm/rad, expected one > 0")
+    offsets = np.zeros(_COMMON - 2)  # kinematic error (c2, s2, c4, s4) and zero [rad]
+    for _ in range(_REPETITIONS):
+        x, y = _equations(runs, offsets, largest)
+        if len(y) < 10 * x.shape[1]:
+            raise TorsionError(f"found {len(y)} moving samples, expected at least {10 * x.shape[1]}")
+        w = _solve(x, y)
+        stiffness = float(w[0]) / largest
+        if not stiffness > 0.0:
+            raise TorsionError(f"found a stiffness of {stiffness:.3g} Nm/rad, expected one > 0")
+        offsets = offsets - w[2:_COMMON] / stiffness
+    c2, s2, c4, s4, zero = offsets.tolist()
     return Torsion(
         stiffness_nm_per_rad=stiffness,
         cubic_nm_per_rad3=float(w[1]) / largest**3,
-        zero_rad=-float(w[6]) / stiffness,
+        zero_rad=zero,
         orders_per_motor_rev=_ORDERS,
-        cos_rad=(-float(w[2]) / stiffness, -float(w[4]) / stiffness),
-        sin_rad=(-float(w[3]) / stiffness, -float(w[5]) / stiffness),
+        cos_rad=(c2, c4),
+        sin_rad=(s2, s4),
     )
 
 
-def _equations(runs: Sequence[RunSignals], largest: float) -> tuple[FloatArray, FloatArray]:
-    """Return columns [n, _COMMON + runs] and sensor [n] of all moving samples, thinned; d in parts of `largest`."""
+def _equations(
+    runs: Sequence[RunSignals], offsets: FloatArray, largest: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return columns [n, _COMMON + runs] and sensor [n] of all moving samples, thinned.
+
+    d is less what is known of its offsets, and in parts of `largest`: then its cube carries no wave and no zero.
+    """
     blocks: list[FloatArray] = []
     targets: list[FloatArray] = []
     for n, run in enumerate(runs):
         keep = np.flatnonzero(run.moving)[::_EVERY]
-        d = run.seen.torsion_nm[keep] / largest
+        shared = np.column_stack((run.seen.waves[keep], np.ones(len(keep))))
+        d = (run.seen.torsion_nm[keep] - shared @ offsets) / largest
         zero = np.zeros((len(keep), len(runs)))
         zero[:, n] = 1.0
-        blocks.append(np.column_stack((d, d**3, run.seen.waves[keep], np.ones(len(keep)), zero)))
+        blocks.append(np.column_stack((d, d**3, shared, zero)))
         targets.append(run.sensor_nm[keep])
     return np.vstack(blocks), np.concatenate(targets)
+
+
+def _solve(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return the most probable coefficients."""
+    noise = _noise_of(x, y)
+    prior = np.zeros(x.shape[1])
+    prior[1] = noise / max(_CUBIC_SHARE * float(np.abs(y).max()), 1e-9) ** 2
+    prior[_COMMON:] = noise / _ZERO_SIGMA_NM**2
+    return np.asarray(np.linalg.lstsq(x.T @ x + np.diag(prior), x.T @ y, rcond=None)[0], np.float64)
 
 
 def _noise_of(x: FloatArray, y: FloatArray) -> float:

@@ -71,10 +71,6 @@ def drop(key: str) -> Any:
         (put("realtime.priority", 99), ["realtime.priority", "99"]),
         (put("joint_1.temperature", 1), ["joint_1.temperature", "found 1", "true or false"]),
         (put("joint_1.temperatur", True), ["joint_1.temperatur", "did you mean 'temperature'"]),
-        (
-            put("estimator.method", "fused"),
-            ["joint1.yaml", "'fused'", "missing", "estimator.method is fused"],
-        ),
         (put("joint_1.network", {"file": "bench.yaml", "sha256": "00"}), ["sha256", "expected 00"]),
         (put("joint_1.network", {"file": "none.onnx", "sha256": "00"}), ["none.onnx", "cannot be read"]),
     ],

@@ -18,8 +18,8 @@ from daemon.snapshot import SnapshotReader
 from daemon.temperature import JointTemperature
 from estimator.methods import AnyEstimator, load_network, make_estimator
 from estimator.settings import EstimatorSettings
-from tests.cycle_helpers import estimates, frame, inputs, make, turn
-from tests.fused_helpers import fused_joint, fused_network
+from tests.cycle_helpers import I32, estimates, frame, inputs, make, turn
+from tests.fused_configuration import joint_of, network_of
 
 LIFE = 200
 """Slots; the real 2 s are 2000 at 1 kHz."""
@@ -31,6 +31,13 @@ def temperatures() -> list[JointTemperature]:
 
 def tpdo3(node: int, tenths: int) -> bytes:
     return frame(0x380 + node, struct.pack("<h", tenths))
+
+
+def coupled(velocity: int = 5000) -> list[bytes]:
+    """The inputs with both encoders of a joint at the same angle: its torsion tells no absurd torque."""
+    positions = [frame(0x180 + n, I32.pack(sign * 1000, sign * 100)) for n, sign in ((1, 1), (2, -1))]
+    _, one, _, two, sensor = inputs(velocity=velocity)
+    return [positions[0], one, positions[1], two, sensor]
 
 
 class Spy:
@@ -46,8 +53,8 @@ class Spy:
 
 
 def fused(number: int) -> AnyEstimator:
-    network = load_network("fused", fused_network(f"joint{number}"))
-    return make_estimator(fused_joint(number), EstimatorSettings(method="fused"), network)
+    network = load_network("fused", network_of(number))
+    return make_estimator(joint_of(number), EstimatorSettings(method="fused"), network)
 
 
 def test_each_joint_has_its_own_from_the_cycle_of_its_frame_on(tmp_path: Path) -> None:
@@ -76,7 +83,7 @@ def test_a_temperature_changes_the_estimate_of_a_method_that_knows_it(tmp_path: 
     for tenths in (150, 250):
         directory = tmp_path / str(tenths)
         directory.mkdir()
-        script = [*inputs(velocity=20_000), tpdo3(1, tenths)]
+        script = [*coupled(velocity=20_000), tpdo3(1, tenths)]
         cycle, socket, _ = make(
             directory,
             lambda n, script=script: script,
@@ -92,7 +99,7 @@ def test_a_temperature_changes_the_estimate_of_a_method_that_knows_it(tmp_path: 
 
 def test_without_one_the_joint_is_estimated_all_the_same(tmp_path: Path) -> None:
     cycle, socket, reader = make(
-        tmp_path, lambda n: inputs(), temperatures=temperatures(), estimators=[fused(1), fused(2)]
+        tmp_path, lambda n: coupled(), temperatures=temperatures(), estimators=[fused(1), fused(2)]
     )
     turn(cycle, 30)
     # degraded: the network's training data had temperatures, so that its share of trust is zero without one

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import math
 import struct
+from pathlib import Path
 
 import pytest
+import yaml
 
 from daemon.config import load_config
 from daemon.input_pdos import joint_temperatures
 from daemon.intake import InputPdo, Intake
+from daemon.load import bus_load_of
+from daemon.loop import _joint_inputs
 from daemon.temperature import JointTemperature
+from models.files import shipped
 
 POSITION = InputPdo(0x181, 8, struct.Struct("<ii"), 1, "181h drive 1 TPDO1")
 NAME = "381h drive 1 TPDO3"
@@ -157,6 +162,28 @@ def test_two_users_of_one_identifier_are_refused() -> None:
     ):
         with pytest.raises(ValueError, match="share a COB-ID"):
             Intake(pdos, temperatures)
+
+
+@pytest.mark.parametrize("have", [(), (1,), (2,), (1, 2)])
+def test_each_joint_finds_its_own(tmp_path: Path, have: tuple[int, ...]) -> None:
+    content = yaml.safe_load(shipped("bench.yaml").read_text())
+    content["estimator"] = {"method": "tob"}
+    for number in (1, 2):
+        section = content[f"joint_{number}"]
+        section |= {"file": str(shipped(section["file"])), "temperature": number in have}
+        del section["network"]
+    path = tmp_path / "c.yaml"
+    path.write_text(yaml.safe_dump(content))
+    config = load_config(path)
+    drive = {"motor_rad_per_count": 1.0, "motor_rad_s_per_unit": 1.0, "link_rad_per_count": 1.0}
+    scaling = {"1": drive | {"ampere_per_unit": 1.0}, "3": {"nm_per_unit": {"1": 1.0}}}
+    scaling["2"] = scaling["1"]
+    report = {"nodes": {node: {"scaling": factors} for node, factors in scaling.items()}}
+    found = joint_temperatures(config)
+    for number, inputs in enumerate(_joint_inputs(config, report), start=1):
+        node = None if inputs.temperature is None else found[inputs.temperature].node_id
+        assert node == (number if number in have else None)
+    assert [row.cob_id for row in bus_load_of(config).rows if row.length == 2] == [0x380 + n for n in have]
 
 
 def test_the_configuration_says_which_joints_have_one_and_two_seconds_are_slots() -> None:

@@ -15,7 +15,7 @@ from estimator.fused_estimator import FusedEstimator
 from estimator.joint_estimator import JointEstimator
 from estimator.network import NetworkError
 from tests.estimator_helpers import small_network
-from tests.fused_helpers import configured, fused_joint, fused_networks
+from tests.fused_configuration import configured, joint_of, networks
 
 JOINTS = (1, 2)
 
@@ -25,19 +25,19 @@ def the_papers() -> dict[int, bytes]:
 
 
 def test_method_fused_uses_its_networks(tmp_path: Path) -> None:
-    config = load_config(configured(tmp_path, "fused", fused_networks()))
+    config = load_config(configured(tmp_path, "fused", networks()))
     estimators = [build_estimator(config, joint) for joint in config.joints]
     warm_up(estimators)
     for number, estimator in zip(JOINTS, estimators, strict=True):
         assert isinstance(estimator, FusedEstimator)
-        assert estimator.joint == fused_joint(number)
+        assert estimator.joint == joint_of(number)
         found = [estimator.step(1e-3, 2.0, 0.1 * n, 100.0, 0.001 * n - 1e-3, 25.0) for n in range(50)][-1]
         assert found.status == 2
         assert found.torque_nm != found.physics_nm
 
 
 def test_method_fused_without_networks_is_its_physics(tmp_path: Path) -> None:
-    config = load_config(configured(tmp_path, "fused", {1: fused_networks()[1]}))
+    config = load_config(configured(tmp_path, "fused", {1: networks()[1]}))
     assert [joint.network is None for joint in config.joints] == [False, True]
     estimator = build_estimator(config, config.joints[1])
     found = [estimator.step(1e-3, 2.0, 0.1 * n, 100.0, 0.001 * n, 25.0) for n in range(50)][-1]
@@ -46,7 +46,7 @@ def test_method_fused_without_networks_is_its_physics(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("method", ["tob", "efficiency"])
 def test_other_methods_leave_a_network_alone(tmp_path: Path, method: str) -> None:
-    config = load_config(configured(tmp_path, method, fused_networks()))
+    config = load_config(configured(tmp_path, method, networks()))
     assert [joint.network for joint in config.joints] == [None, None]
     assert isinstance(build_estimator(config, config.joints[0]), JointEstimator)
 
@@ -60,21 +60,21 @@ def test_method_network_still_needs_one(tmp_path: Path) -> None:
 
 def test_a_joint_without_section_fused_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as caught:
-        load_config(configured(tmp_path, "fused", fused_networks(), without_fused=(2,)))
+        load_config(configured(tmp_path, "fused", networks(), without_fused=(2,)))
     assert str(caught.value) == (
         f"{tmp_path}/j2.yaml: key 'fused': missing, expected because estimator.method is fused"
     )
 
 
 @pytest.mark.parametrize(
-    ("method", "networks", "found"),
+    ("method", "kind", "found"),
     [
         ("fused", the_papers, "found input 'x' of shape ['N', 6], expected ['N', 9]"),
-        ("network", fused_networks, "found input 'x' of shape ['N', 9], expected ['N', 6]"),
+        ("network", networks, "found input 'x' of shape ['N', 9], expected ['N', 6]"),
     ],
 )
-def test_a_network_of_another_method_is_named(tmp_path: Path, method: str, networks: Any, found: str) -> None:
-    config = load_config(configured(tmp_path, method, networks()))
+def test_a_network_of_another_method_is_named(tmp_path: Path, method: str, kind: Any, found: str) -> None:
+    config = load_config(configured(tmp_path, method, kind()))
     with pytest.raises(NetworkError) as caught:
         build_estimator(config, config.joints[1])
     assert str(caught.value) == (
@@ -84,8 +84,8 @@ def test_a_network_of_another_method_is_named(tmp_path: Path, method: str, netwo
 
 @pytest.mark.parametrize("method", ["fused", "network"])
 def test_a_network_of_another_joint_is_named(tmp_path: Path, method: str) -> None:
-    networks = fused_networks() if method == "fused" else the_papers()
-    config = load_config(configured(tmp_path, method, {1: networks[2], 2: networks[2]}))
+    second = (networks() if method == "fused" else the_papers())[2]
+    config = load_config(configured(tmp_path, method, {1: second, 2: second}))
     with pytest.raises(ConfigError) as caught:
         build_estimator(config, config.joints[0])
     message = str(caught.value)

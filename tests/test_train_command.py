@@ -1,65 +1,102 @@
-"""`jtq train` says what is wrong before it spends minutes: one line, exit status 1 (input) or 2 (usage)."""
+"""`jtq train` and `jtq fit losses` say what is wrong before they spend minutes: one line, exit status 1, 2 or 3."""
 
-import sys
-from types import SimpleNamespace
+import importlib.util
 
+import numpy as np
 import pytest
 
-from sysid import train_command
+from estimator.run import JointColumns, RunTable
+from models.files import shipped
+from sim_can.run_table_file import write_run
+from sysid import loss_fit_command, train_command
+
+JOINT = str(shipped("joint1.yaml"))
 
 
-@pytest.fixture(autouse=True)
-def no_torch(monkeypatch):
-    """Whatever is refused is refused before torch is loaded."""
-    monkeypatch.setitem(sys.modules, "torch", None)
+@pytest.fixture
+def run(tmp_path):
+    """A run file of a joint that turns to and fro under load; `sensor` replaces its torque."""
+
+    def made(name="a.csv", sensor=None, count=3000):
+        t = np.arange(count) * 1e-3
+        v = np.sin(2 * np.pi * 0.5 * t)
+        angle = (1 - np.cos(2 * np.pi * 0.5 * t)) / np.pi
+        current = 2.0 * np.sign(v) + np.sin(2 * np.pi * 1.7 * t)
+        torque = 8.0 * np.sign(v) + 0.01 * np.cos(53.0 * t) if sensor is None else np.full(count, sensor)
+        joint = JointColumns(
+            current_a=current,
+            motor_position_rad=100.0 * angle,
+            motor_velocity_rad_s=100.0 * v,
+            link_position_rad=angle - torque / 12000.0,
+            link_velocity_rad_s=None,
+            torque_nm=torque,
+            temperature_c=None,
+        )
+        path = tmp_path / name
+        write_run(path, RunTable(time_s=t, joints={1: joint}))
+        return str(path)
+
+    return made
+
+
+def arguments(run, tmp_path, *more):
+    return [run, "--joint", JOINT, "--network", "paper", "--out", str(tmp_path / "out"), *more]
 
 
 @pytest.mark.parametrize(
     ("option", "value", "expected"),
     [
-        ("--runs", "0", "a whole number >= 1"),
-        ("--held-out", "0", "a whole number >= 1"),
         ("--iterations", "0", "a whole number >= 1"),
-        ("--runs", "many", "a whole number >= 1"),
+        ("--iterations", "many", "a whole number >= 1"),
         ("--seed", "-1", "a whole number >= 0"),
-        ("--seconds", "nan", "a time in seconds > 0"),
-        ("--seconds", "0", "a time in seconds > 0"),
     ],
 )
-def test_numbers_without_sense_are_usage_errors(tmp_path, capsys, option, value, expected):
+def test_numbers_without_sense_are_usage_errors(run, tmp_path, capsys, option, value, expected):
     with pytest.raises(SystemExit) as refused:
-        train_command.main(["--out", str(tmp_path), option, value])
+        train_command.main(arguments(run(), tmp_path, option, value))
     assert refused.value.code == 2
     assert f"argument {option}: found {value!r}, expected {expected}" in capsys.readouterr().err
 
 
-def test_plant_that_cannot_be_read_is_one_line(tmp_path, capsys):
-    missing = tmp_path / "plant.yaml"
-    assert train_command.main(["--out", str(tmp_path), "--plant", str(missing)]) == 1
-    assert capsys.readouterr().err == f"jtq train: {missing}: cannot be read: No such file or directory\n"
+def test_missing_packages_are_named_before_any_run_is_read(run, tmp_path, capsys, monkeypatch):
+    real = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "torch" else real(name))
+    assert train_command.main(arguments("nowhere.csv", tmp_path)) == 1
+    assert capsys.readouterr().err == "jtq train: torch: not installed: pip install 'jtqd[train]'\n"
 
 
-def test_out_that_cannot_hold_files_is_one_line(tmp_path, capsys):
+def test_out_that_cannot_hold_files_is_one_line(run, tmp_path, capsys):
     file = tmp_path / "file"
     file.touch()
-    assert train_command.main(["--out", str(file)]) == 1
+    assert train_command.main([run(), "--joint", JOINT, "--network", "ours", "--out", str(file)]) == 1
     assert capsys.readouterr().err == f"jtq train: --out {file}: files cannot be made there: it is a file\n"
-    assert train_command.main(["--out", str(file / "below")]) == 1
-    assert "below: files cannot be made there: Not a directory\n" in capsys.readouterr().err
 
 
-def test_missing_out_is_made_and_nothing_is_left_in_it(tmp_path, capsys):
-    out = tmp_path / "new" / "models"
-    assert train_command.main(["--out", str(out)]) == 1
-    assert "torch is not installed" in capsys.readouterr().err
-    assert list(out.iterdir()) == []
+def test_too_few_runs_are_one_line_and_leave_nothing(run, tmp_path, capsys):
+    assert train_command.main(arguments(run(), tmp_path)) == 1
+    assert "found 1 runs, expected at least 5" in capsys.readouterr().err
+    assert list((tmp_path / "out").iterdir()) == []
 
 
-def test_runs_too_short_to_move_are_refused_before_training(tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(set_num_threads=lambda n: None))
-    arguments = ["--out", str(tmp_path), "--runs", "1", "--held-out", "1", "--seconds", "0.01"]
-    assert train_command.main(arguments) == 1
-    said = capsys.readouterr().err.splitlines()
-    assert said[-1] == (
-        "jtq train: --seconds: found 0.01, expected runs long enough for motion: run 1 has none"
-    )
+def test_our_network_needs_the_fitted_section(run, tmp_path, capsys):
+    assert train_command.main([run(), "--joint", JOINT, "--network", "ours", "--out", str(tmp_path / "o")]) == 1
+    assert "found no section 'fused'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", [train_command, loss_fit_command])
+def test_dead_sensor_is_named_and_nothing_is_written(run, tmp_path, capsys, command):
+    out = tmp_path / "out.yaml"
+    if command is train_command:
+        given = arguments(run(sensor=3.5), tmp_path)
+    else:
+        given = [run(sensor=3.5), "--joint", JOINT, "--out", str(out)]
+    assert command.main(given) == 3
+    assert "torque_nm" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_missing_run_and_too_few_runs_of_the_loss_fit(run, tmp_path, capsys):
+    assert loss_fit_command.main([str(tmp_path / "no.csv"), "--joint", JOINT]) == 1
+    assert "no.csv: found nothing there" in capsys.readouterr().err
+    assert loss_fit_command.main([run(), "--joint", JOINT]) == 1
+    assert "found 1 runs, expected at least 6" in capsys.readouterr().err

@@ -110,6 +110,36 @@ def variable_runs(
     )
 
 
+def outside_runs(
+    limits: Limits, count: int, run_s: float, *, seed: int, joints: Joints = None
+) -> tuple[Run, ...]:
+    """Runs with half as much load again as any other campaign has: what no model has been trained on.
+
+    Raises:
+        ConfigError: runs too short for a trajectory.
+    """
+    wanted = ExcitationLimits(
+        velocity_rad_s=FULL_RAD_S,
+        travel_rad=_LIMIT_SHARE * limits.travel_rad,
+        current_a=1.5 * CURRENT_A,
+        joint_current_a=1.5 * JOINT_CURRENT_A,
+        torque_nm=_LIMIT_SHARE * limits.torque_nm,
+    )
+    chosen = seed_of("outside", FULL_RAD_S, seed)
+    made = draw(
+        wanted,
+        count=count,
+        duration_s=_trajectory_s(run_s, 2.0 * EDGE_S, 1),
+        harmonics=HARMONICS,
+        seed=chosen,
+        joints=joints,
+    )
+    return tuple(
+        Run(f"outside_{k + 1:02d}", 1 + k % 2, (*_rests(EDGE_S), _segment(one), *_rests(EDGE_S)))
+        for k, one in enumerate(made)
+    )
+
+
 def seed_of(purpose: str, level: float, seed: int) -> int:
     """A seed of 32 bits for each purpose and level: no two of them share their random numbers, whatever `seed` is."""
     digest = hashlib.sha256(f"{purpose}/{level!r}/{seed}".encode()).digest()

@@ -15,7 +15,7 @@ from sysid.campaign.state import DONE, RunState
 BETWEEN_RUNS_S: Final = 4.0
 """What a run takes beside its motion, until one has been measured: start of jtqd, set-up of the drives, table."""
 _REFRESH_S: Final = 1.0
-"""Drawing takes 1 to 2 ms and happens between two set-points: not more often than necessary."""
+"""Drawing takes 0.5 ms and happens between two set-points: not more often than necessary."""
 _WORTH_A_LINE: Final = 20_000
 """Motions tried in about 4 s."""
 

@@ -1,1 +1,1 @@
-"""`jtq evaluate`: the experiments of the paper's section IV, every method beside the torque sensor, on runs never trained on."""
+"""`jtq evaluate`: section IV of the paper, every method beside the torque sensor, on runs that no model has seen."""

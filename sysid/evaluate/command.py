@@ -42,7 +42,9 @@ def main(argv: list[str]) -> int:
         if options.outside:
             outside = read_inputs(options.outside, models, options.columns)
         result = evaluate(_distinct(inputs, outside), outside.runs, models, progress)
-        result = replace(result, findings=(*_silent(models), *inputs.findings, *outside.findings, *result.findings))
+        result = replace(
+            result, findings=(*_silent(models), *inputs.findings, *outside.findings, *result.findings)
+        )
         _write(options, result)
     except (ConfigError, NetworkError, RunError, ValueError, OSError) as error:
         for line in str(error).splitlines() or [type(error).__name__]:
@@ -70,19 +72,35 @@ def _parser() -> argparse.ArgumentParser:
         "runs", nargs="+", type=Path, metavar="RUNS", help="run files (.csv, .csv.gz) or directories of them"
     )
     parser.add_argument(
-        "--models", type=Path, required=True, metavar="DIR",
+        "--models",
+        type=Path,
+        required=True,
+        metavar="DIR",
         help="joint1.yaml, joint1.onnx (the paper's network), joint1.fused.onnx (ours), and so on for each joint",
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the report goes; made if missing")
     parser.add_argument(
-        "--joint", type=int, action="append", choices=range(1, 8), default=[], metavar="N",
+        "--out", type=Path, required=True, metavar="DIR", help="where the report goes; made if missing"
+    )
+    parser.add_argument(
+        "--joint",
+        type=int,
+        action="append",
+        choices=range(1, 8),
+        default=[],
+        metavar="N",
         help="only this joint; may be given again (default: every jointN.yaml)",
     )
     parser.add_argument(
-        "--outside", nargs="+", type=Path, default=[], metavar="RUNS",
+        "--outside",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="RUNS",
         help="runs with more load or warmer than any training run, to judge ours outside its envelope",
     )
-    parser.add_argument("--columns", type=Path, metavar="FILE", help="column map for other names, units and signs")
+    parser.add_argument(
+        "--columns", type=Path, metavar="FILE", help="column map for other names, units and signs"
+    )
     parser.add_argument("--json", action="store_true", help="print the result as JSON instead of the table")
     return parser
 
@@ -101,7 +119,9 @@ def _distinct(inputs: Inputs, outside: Inputs) -> tuple:  # type: ignore[type-ar
     beyond = {run.sha256: run.name for run in outside.runs}
     for run in inputs.runs:
         if run.sha256 in beyond:
-            raise ConfigError(f"--outside {beyond[run.sha256]}: found the same data as in {run.name}, expected other runs")
+            raise ConfigError(
+                f"--outside {beyond[run.sha256]}: found the same data as in {run.name}, expected other runs"
+            )
     return inputs.runs
 
 
@@ -124,7 +144,10 @@ def _write(options: argparse.Namespace, result: Evaluation) -> None:
     mapping = as_mapping(result)
     text = json.dumps(mapping, indent=1, allow_nan=False)
     made = f"{BY}, {dt.datetime.now().astimezone():%Y-%m-%d %H:%M}"
-    for name, content in (("evaluation.json", f"{text}\n"), ("evaluation.html", report_html(result, mapping, made))):
+    for name, content in (
+        ("evaluation.json", f"{text}\n"),
+        ("evaluation.html", report_html(result, mapping, made)),
+    ):
         temporary = options.out / f".{name}.part"
         try:
             temporary.write_text(content, encoding="utf-8")

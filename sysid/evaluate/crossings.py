@@ -3,8 +3,8 @@
     jump = R(estimate) - max R(sensor),      R: max - min over 20 ms
 
 What the torque itself does in that time is not held against the estimate, and a spike that comes and goes is not missed.
-The maximum is over the sensor's windows shifted by up to 10 ms: the torque of a reversing joint swings by 10 Nm in 20 ms, and
-an estimate that follows it 2 ms late is late there and does not jump. `unshifted_nm` is without that allowance.
+The maximum is over the sensor's windows shifted by up to 10 ms: the torque of a reversing joint swings by 10 Nm in 20 ms,
+and an estimate that follows it 2 ms late is late and does not jump. `unshifted_nm` is without that allowance.
 
 `at` the crossing: the 20 ms around it. Over the `passage`: the largest of any 20 ms of the whole passage through
 |v| <= 0.02 rad/s (or |tau| <= 0.3 Nm), entry and exit of the standstill status included, however long the joint rested.
@@ -40,14 +40,14 @@ class Crossing(NamedTuple):
 
 
 class Jump(NamedTuple):
-    """The largest jump [Nm] of one method and where it was; median over all `count` crossings; largest one unshifted."""
+    """The largest jump [Nm] of one method and where it was; median over all `crossings`; largest one unshifted."""
 
     nm: float
     run: str
     number: int
     time_s: float
     of: str
-    count: int
+    crossings: int
     median_nm: float
     unshifted_nm: float
 
@@ -60,7 +60,7 @@ def crossings(values: FloatArray, band: float) -> list[Crossing]:
     found = []
     for before, after in zip(outside[changed], outside[changed + 1], strict=True):
         inside = values[before : after + 1]
-        last = np.flatnonzero(inside * side[before] > 0.0)[-1]  # after it the old side is not seen again
+        last = np.flatnonzero(inside * side[before] >= 0.0)[-1]  # after it the old side is not seen again
         found.append(Crossing(int(before) + 1, int(before + last) + 1, int(after)))
     return found
 

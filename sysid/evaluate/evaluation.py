@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, TypeVar
+from typing import Final, NamedTuple, TypeVar
+
+import numpy as np
 
 from estimator.fused_network import FusedNetwork
 from estimator.fused_trust import Envelope
@@ -19,6 +21,9 @@ from sysid.evaluate.targets import Target, targets
 from sysid.evaluate.variable import ErrorTables, error_tables, median_run
 from sysid.findings import Finding
 from sysid.plateaus import Plateau
+
+SILENT_SHARE: Final = 0.01
+"""Share of the moving samples that a method may leave without a value and not be named for it."""
 
 T = TypeVar("T")
 Progress = Callable[[Sequence[T], str], Iterable[T]]
@@ -89,7 +94,8 @@ def evaluate(
         raise ValueError(
             "found no run with a moving sample that every method has a value for: nothing to judge"
         )
-    constant, variable = [], []
+    constant: list[_Judged] = []
+    variable: list[_Judged] = []
     for each in judged:
         (constant if any(map(is_constant, each.plateaus, each.samples)) else variable).append(each)
     scored: list[PlateauScore] = []
@@ -145,11 +151,32 @@ def _judge(
                     Finding("nothing_to_score", f"{run.name}: j{each.number}: {_why_nothing(one)}")
                 )
                 continue
+            findings += _silent(one)
             samples.append(one)
             plateaus.append(tuple(plateaus_of(run.name, run.table.time_s, columns, each.joint)))
         if samples:
             judged.append(_Judged(run, tuple(samples), tuple(plateaus)))
     return judged
+
+
+def _silent(samples: Samples) -> list[Finding]:
+    """Name methods that had no value where the joint moved: what they miss is in no score."""
+    moving = samples.scored | samples.missing
+    share = float(np.count_nonzero(samples.missing)) / float(np.count_nonzero(moving))
+    if share <= SILENT_SHARE:
+        return []
+    silent = [
+        TITLES[method]
+        for method, value in samples.estimate_nm.items()
+        if np.isnan(value[samples.missing]).mean() > SILENT_SHARE
+    ]
+    return [
+        Finding(
+            "no_value",
+            f"{samples.run}: j{samples.number}: found no value of {', '.join(silent)} in {100.0 * share:.1f} % of the "
+            "moving samples: these are scored for no method",
+        )
+    ]
 
 
 def _why_nothing(samples: Samples) -> str:

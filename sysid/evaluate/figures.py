@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import io
-import re
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from estimator.friction import FloatArray
 from sysid.evaluate.constant import PlateauScore
+from sysid.evaluate.figure_base import STYLES, as_svg, legend_above, new_figure, plain_log, thinned
 from sysid.evaluate.intervals import IntervalTables
 from sysid.evaluate.methods import OURS, TITLES
 from sysid.evaluate.samples import Samples
@@ -18,58 +15,6 @@ from sysid.evaluate.score import LEVELS, VELOCITY_EDGES_RAD_S, bin_name
 from sysid.evaluate.variable import PAPER_MSE_NM2, ErrorTables, common_methods
 from sysid.figure_parts import SENSOR, STANDING, plain, shade
 from sysid.sigma_fit import GAUSS
-
-
-class Style(NamedTuple):
-    """Of one method in every picture; the first three as in the paper's figures."""
-
-    colour: str
-    line: str
-    marker: str
-
-
-STYLES: Final = {
-    "tob": Style("#c0392b", "--", "v"),
-    "efficiency": Style("#c98a00", ":", "s"),
-    "network": Style("#7d3c98", "-.", "D"),
-    "physics": Style("#2e9e6b", (0, (5, 1)), "^"),  # type: ignore[arg-type]  # matplotlib's own dash pattern
-    OURS: Style("#1565a7", "-", "o"),
-}
-_WIDTH: Final = 7.4
-_BUCKETS: Final = 700
-"""Of a curve over time: each keeps its lowest and highest sample, so that no spike is lost."""
-
-
-def new_figure(rows: int, height: float, **options: Any) -> tuple[Any, Any]:
-    """Return figure and axes [rows] of the report's width."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")  # no display is needed
-    mpl.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "jtq evaluate", "font.size": 9.5})
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(
-        rows, 1, figsize=(_WIDTH, height), layout="constrained", squeeze=False, **options
-    )
-    return figure, axes[:, 0]
-
-
-def as_svg(figure: Any) -> str:
-    """Return the figure as an SVG element without size of its own, and close it. The same figure gives the same text."""
-    from matplotlib import pyplot as plt
-
-    stream = io.StringIO()
-    figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
-    plt.close(figure)
-    text = stream.getvalue()
-    text = text[text.index("<svg") :]
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    return re.sub(
-        r'(<svg[^>]*?) height="[^"]*"([^>]*?) width="[^"]*"|(<svg[^>]*?) width="[^"]*"([^>]*?) height="[^"]*"',
-        r"\1\2\3\4",
-        text,
-        count=1,
-    )
 
 
 def constant_figure(plateaus: Sequence[PlateauScore], drive: str) -> str | None:
@@ -112,8 +57,9 @@ def constant_figure(plateaus: Sequence[PlateauScore], drive: str) -> str | None:
     lower.set_xticks([])
     upper.set_ylabel("|torque| [Nm]")
     lower.set_ylabel("error [% of torque]")
-    lower.set_ylim(bottom=0.0)
-    _legend(figure, upper)
+    for axis in (upper, lower):
+        axis.set_ylim(bottom=0.0)
+    legend_above(figure, upper)
     return as_svg(figure)
 
 
@@ -124,9 +70,7 @@ def run_figure(samples: Samples) -> str:
     for axis in (upper, lower):
         plain(axis)
         shade(axis, time, samples.standing, STANDING, "standstill" if axis is upper else None)
-    upper.plot(
-        *thinned(time, samples.sensor_nm), color=SENSOR, linewidth=1.6, label="torque sensor", zorder=4
-    )
+    upper.plot(*thinned(time, samples.sensor_nm), color=SENSOR, linewidth=2.0, label="torque sensor")
     for method in common_methods([samples]):
         style = STYLES[method]
         look = {"color": style.colour, "linestyle": style.line, "linewidth": 1.3 if method == OURS else 1.0}
@@ -149,7 +93,7 @@ def run_figure(samples: Samples) -> str:
     lower.set_ylabel("error [Nm]")
     lower.set_xlabel("time [s]")
     upper.set_xlim(time[0], time[-1])
-    _legend(figure, upper, lower)
+    legend_above(figure, upper, lower)
     return as_svg(figure)
 
 
@@ -176,18 +120,18 @@ def paper_figure(tables: ErrorTables) -> str | None:
             axis.plot(PAPER_MSE_NM2[method], place, "x", color=SENSOR, markersize=8, markeredgewidth=1.8)
     for marker, face, label in (
         ("o", "#777777", "here, joint in velocity mode"),
-        ("o", "white", "here, both joints"),
+        ("o", "white", "here, all joints"),
         ("x", SENSOR, "paper"),
     ):
         axis.plot(
             [], [], marker, color="#777777" if marker == "o" else SENSOR, markerfacecolor=face, label=label
         )
-    axis.set_xscale("log")
+    plain_log(axis.xaxis, axis.set_xscale)
     axis.set_yticks(y, [TITLES[method] for method in methods])
     axis.set_ylim(-0.6, len(methods) - 0.4)
     axis.set_xlabel("mean square error [Nm²]")
     plain(axis)
-    _legend(figure, axis)
+    legend_above(figure, axis)
     return as_svg(figure)
 
 
@@ -211,12 +155,12 @@ def runs_figure(tables: ErrorTables, number: int) -> str | None:
             linewidth=0.8,
             label=TITLES[method],
         )
-    axis.set_yscale("log")
+    plain_log(axis.yaxis, axis.set_yscale)
     axis.set_ylabel("MSE [Nm²]")
     axis.set_xlabel(f"runs, by the MSE of {TITLES[reference]}")
     axis.set_xticks(np.arange(1, len(runs) + 1) if len(runs) <= 30 else [])
     plain(axis)
-    _legend(figure, axis)
+    legend_above(figure, axis)
     return as_svg(figure)
 
 
@@ -239,11 +183,11 @@ def velocities_figure(tables: ErrorTables, number: int) -> str | None:
             linewidth=1.2,
             label=TITLES[method],
         )
-    axis.set_yscale("log")
+    plain_log(axis.yaxis, axis.set_yscale)
     axis.set_ylabel("RMSE [% of rated]")
     axis.set_xlabel("|velocity| [rad/s]")
     plain(axis)
-    _legend(figure, axis)
+    legend_above(figure, axis)
     return as_svg(figure)
 
 
@@ -279,37 +223,3 @@ def calibration_figure(tables: Mapping[str, IntervalTables]) -> str | None:
     plain(axis)
     axis.legend(loc="lower right", fontsize=8.5, framealpha=0.9, edgecolor="none")
     return as_svg(figure)
-
-
-def thinned(time_s: FloatArray, values: FloatArray, buckets: int = _BUCKETS) -> tuple[FloatArray, FloatArray]:
-    """Return a curve of at most 2 `buckets` points: of each bucket its lowest and its highest sample, in order of time.
-
-    A bucket that holds a NaN keeps one, so that gaps stay gaps.
-    """
-    size = -(-len(values) // buckets)
-    if size <= 2:
-        return time_s, values
-    kept: list[int] = []
-    for start in range(0, len(values), size):
-        part = values[start : start + size]
-        gap = np.flatnonzero(np.isnan(part))
-        if len(gap) == len(part):
-            ends = {0}
-        elif len(gap):
-            ends = {int(np.nanargmin(part)), int(np.nanargmax(part)), int(gap[0])}
-        else:
-            ends = {int(np.argmin(part)), int(np.argmax(part))}
-        kept += [start + k for k in sorted(ends)]
-    return time_s[kept], values[kept]
-
-
-def _legend(figure: Any, *axes: Any) -> None:
-    """One legend above the figure, as many columns as fit."""
-    handles, labels = [], []
-    for axis in axes:
-        more, names = axis.get_legend_handles_labels()
-        handles += more
-        labels += names
-    figure.legend(
-        handles, labels, loc="outside upper left", ncols=min(len(labels), 4), fontsize=8.5, frameon=False
-    )

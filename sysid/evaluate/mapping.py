@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from sysid.evaluate import constant
 from sysid.evaluate.constant import PlateauScore, speed_groups
-from sysid.evaluate.evaluation import Evaluation
+from sysid.evaluate.evaluation import Evaluation, RunRecord
 from sysid.evaluate.intervals import IntervalTables
 from sysid.evaluate.methods import OURS, PAPERS, TITLES, JointModels
 from sysid.evaluate.score import ratio
@@ -61,7 +61,7 @@ def _models(each: JointModels) -> dict[str, Any]:
     }
 
 
-def _run(record: Any, result: Evaluation) -> dict[str, Any]:
+def _run(record: RunRecord, result: Evaluation) -> dict[str, Any]:
     tables = {"variable": result.variable, "constant": result.constant_tables}.get(record.kind)
     joints = {
         number: {

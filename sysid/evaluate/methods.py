@@ -71,9 +71,11 @@ class JointModels:
                 )
         settings = EstimatorSettings(method=OURS)
         torsion = None if self.joint.fused is None else self.joint.fused.torsion
-        inputs = (getattr(columns, name) for name in _INPUTS)
         dt = np.diff(time_s, prepend=time_s[0])
-        seen = observe_run(self.joint, settings, torsion, dt, *inputs, columns.temperature_c)
+        current, motor, velocity, link = (getattr(columns, name) for name in _INPUTS)
+        seen = observe_run(
+            self.joint, settings, torsion, dt, current, motor, velocity, link, columns.temperature_c
+        )
         for method in ("physics", OURS):  # one observer serves both
             if method in self.methods:
                 network = self.networks.get(method)

@@ -49,8 +49,8 @@ class Outside(NamedTuple):
 
 def training_range(envelope: Envelope) -> Range:
     """Return the range of load and temperature of an envelope; a cell reaches half a step beyond its middle."""
-    known = np.array(envelope.known).any(axis=0)
-    columns = np.flatnonzero(known) - len(known) // 2
+    table = np.array(envelope.known)
+    columns = np.flatnonzero(table.any(axis=0)) - table.shape[1] // 2
     if not len(columns):
         return Range((0.0, 0.0), envelope.temperature_c)
     step = envelope.torque_step_nm

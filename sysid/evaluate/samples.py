@@ -33,8 +33,9 @@ class Samples:
 
     sensor_nm: torque sensor, filtered like the estimates; raw_nm: G Kt i less the rotor's share, whose sign with the
     velocity's [rad/s, joint side] makes the quadrant (index into QUADRANTS); estimate_nm, sigma_nm, status: by method;
-    scored: all methods move and have a value; standing: all have a value and stand still; temperature_c: NaN where the
-    run has none; bare_nm: the paper's network by itself, without the guard around it, NaN where there is none.
+    scored: all methods move and have a value; standing: all have a value and stand still; missing: settled, but some
+    method has no value; temperature_c: NaN where the run has none; bare_nm: the paper's network by itself, without the
+    guard around it, NaN where there is none.
     """
 
     run: str
@@ -51,6 +52,7 @@ class Samples:
     status: Mapping[str, NDArray[np.uint8]]
     scored: Flags
     standing: Flags
+    missing: Flags
     bare_nm: FloatArray
 
     def error_nm(self, method: str) -> FloatArray:
@@ -68,8 +70,8 @@ def take_samples(run: str, models: JointModels, time_s: FloatArray, columns: Joi
         raise ValueError(f"{run}: j{models.number}.torque_nm: missing")
     dt = np.diff(time_s, prepend=time_s[0])
     sensor = same_age(columns.torque_nm, dt, EstimatorSettings().bandwidth_rad_s)
-    published = np.logical_and.reduce([np.isfinite(each.torque_nm) for each in runs.values()])
-    published &= time_s - time_s[0] >= SETTLE_S
+    settled = time_s - time_s[0] >= SETTLE_S
+    published = settled & np.logical_and.reduce([np.isfinite(each.torque_nm) for each in runs.values()])
     moving = np.logical_and.reduce([np.isin(each.status, (VALID, DEGRADED)) for each in runs.values()])
     standing = np.logical_and.reduce([each.status == STANDSTILL for each in runs.values()])
     paper = runs.get("network")
@@ -88,5 +90,6 @@ def take_samples(run: str, models: JointModels, time_s: FloatArray, columns: Joi
         status={method: each.status for method, each in runs.items()},
         scored=published & moving,
         standing=published & standing,
+        missing=settled & ~published,
         bare_nm=np.full_like(sensor, np.nan) if paper is None else paper.network_nm,
     )

@@ -68,6 +68,11 @@ class Coverage(NamedTuple):
     share: float
     se: float
 
+    def __str__(self) -> str:
+        """E.g. "91.3 % +- 1.2"; without the standard error where there is none."""
+        beside = f" +- {100.0 * self.se:.1f}" if math.isfinite(self.se) else ""
+        return f"{100.0 * self.share:.1f} %{beside}"
+
 
 def coverage(inside: Sequence[NDArray[np.bool_]]) -> Coverage | None:
     """Return the coverage of runs, each an array [n] of whether a sample is inside; None when there is no sample.

@@ -1,36 +1,50 @@
-"""The evaluation for a terminal: the same numbers as in the report, at most 120 columns wide."""
+"""The evaluation for a terminal: the same numbers as in the report."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
+from estimator.parameters import QUADRANTS
 from sysid.evaluate.evaluation import Evaluation
-from sysid.evaluate.methods import TITLES
-from sysid.evaluate.score import ratio
-from sysid.evaluate.targets import mse
+from sysid.evaluate.intervals import IntervalTables
+from sysid.evaluate.methods import OURS, PAPERS, TITLES
+from sysid.evaluate.score import Coverage, ratio
+from sysid.evaluate.targets import Target, mse
 from sysid.evaluate.variable import PAPER_MSE_NM2, Row
 
-_SHORT = {
+_SHORT: Final = {
     "tob": "TOB",
     "efficiency": "efficiency",
-    "network": "paper's",
+    PAPERS: "paper's",
     "physics": "physics",
-    "fused": "ours",
+    OURS: "ours",
 }
+_KINDS: Final = {
+    "constant": "at constant velocity",
+    "variable": "at variable velocity",
+    "outside": "to look outside the envelope",
+}
+_MARKS: Final = {True: "yes", False: "NO", None: "-"}
 
 
 def text_lines(result: Evaluation, mapping: Mapping[str, Any]) -> list[str]:
     """Return the lines; mapping: `as_mapping(result)`."""
-    lines = _runs(result)
-    lines += [
+    lines = [
+        *_runs(result),
         "",
-        "A. constant velocity: worst error in % of the torque (in brackets % of rated)",
+        "A. constant velocity: worst error in % of the torque (in brackets: % of rated torque)",
         *_constant(mapping),
+        "",
+        "B. variable velocity: mean square error in Nm²",
+        *_variable(result),
+        "",
+        "C. 90 % interval of ours: how often it held the sensor, in %",
+        *_intervals(result),
+        "",
+        "D. figures to reach",
+        *_targets(result.targets),
     ]
-    lines += ["", "B. variable velocity: mean square error in Nm²", *_variable(result)]
-    lines += ["", "C. 90 % interval of ours: how often it held the sensor, in %", *_intervals(result)]
-    lines += ["", "D. figures to reach", *_targets(result)]
     if result.findings:
         lines += ["", "findings", *(f"  {item.kind}: {item.text}" for item in result.findings)]
     return lines
@@ -40,27 +54,16 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     """Return lines with columns as wide as they must be; the first column to the left, the others to the right."""
     every = [list(header), *map(list, rows)]
     widths = [max(len(row[k]) for row in every) for k in range(len(header))]
-    return [
-        (
-            "  "
-            + row[0].ljust(widths[0])
-            + "".join("  " + cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True))
-        ).rstrip()
-        for row in every
-    ]
+    lines = []
+    for row in every:
+        cells = [row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))]
+        lines.append(("  " + "  ".join(cells)).rstrip())
+    return lines
 
 
 def _runs(result: Evaluation) -> list[str]:
     kinds = [record.kind for record in result.runs]
-    counts = ", ".join(
-        f"{kinds.count(kind)} {text}"
-        for kind, text in (
-            ("constant", "at constant velocity"),
-            ("variable", "at variable velocity"),
-            ("outside", "outside the envelope"),
-        )
-        if kind in kinds
-    )
+    counts = ", ".join(f"{kinds.count(kind)} {text}" for kind, text in _KINDS.items() if kind in kinds)
     lines = [f"{len(kinds)} runs: {counts}"]
     for models in result.models:
         lines.append(
@@ -77,82 +80,82 @@ def _constant(mapping: Mapping[str, Any]) -> list[str]:
     methods = list(mapping["methods"])
     rows = []
     for each in speeds:
-        cells = [
-            f"{_cell(each['worst_percent'].get(m), '.1f')} ({_cell(each['worst_rated_percent'].get(m), '.2f')})"
+        errors = [
+            f"{_cell(each['worst_percent'][m], '.1f')} ({_cell(each['worst_rated_percent'][m], '.2f')})"
             for m in methods
         ]
         load = f"{each['least_torque_nm']:.1f} to {each['most_torque_nm']:.1f} Nm"
         place = f"j{each['number']} {each['drive']} {each['velocity_rad_s']:g} rad/s"
-        rows.append([place, str(each["plateaus"]), load, *cells])
+        rows.append([place, str(each["plateaus"]), load, *errors])
     lines = table(["", "plateaus", "load", *(_SHORT[m] for m in methods)], rows)
     hard = mapping["constant"]["hardest"]
     for number, group in hard["joints"].items():
         if group["plateaus"]:
-            values = ", ".join(
-                f"{_SHORT[m]} {_cell(group['worst_percent'].get(m), '.1f')} %" for m in methods
-            )
-            lines.append(
-                f"  2.5 rad/s and about 30 Nm, back drive, j{number}: {values} (paper: TOB {hard['paper_percent']:g} %)"
-            )
+            worst = ", ".join(f"{_SHORT[m]} {_cell(group['worst_percent'][m], '.1f')} %" for m in methods)
+            paper = f"(paper: TOB {hard['paper_percent']:g} %)"
+            lines.append(f"  2.5 rad/s and about 30 Nm, back drive, j{number}: {worst} {paper}")
     return lines
 
 
 def _variable(result: Evaluation) -> list[str]:
-    tables = result.variable
+    tables, methods = result.variable, result.methods
     if not tables.both:
         return ["  no run at variable velocity"]
-    rows: list[list[str]] = []
-    methods = result.methods
-    paper: list[str] = [_cell(PAPER_MSE_NM2.get(m), ".2f") for m in methods]
-    rows.append(["paper, tested joint", "", *paper])
-    named: list[tuple[str, Row]] = [("joint in velocity mode", tables.tested), ("both joints", tables.both)]
+    named: list[tuple[str, Row]] = [("joint in velocity mode", tables.tested), ("all joints", tables.both)]
     named += [(f"j{number}", row) for number, row in tables.joints.items()]
+    rows = [["paper, tested joint", "", *(_cell(PAPER_MSE_NM2.get(m), ".2f") for m in methods)]]
     rows += [[name, _samples(row), *(_cell(mse(row, m), ".3f") for m in methods)] for name, row in named]
     lines = table(["", "samples", *(_SHORT[m] for m in methods)], rows)
     for name, row in named[:2]:
-        values = [
-            _cell(ratio(mse(row, a), mse(row, b)), form)
-            for a, b, form in (
-                ("tob", "network", ".1f"),
-                ("efficiency", "network", ".1f"),
-                ("fused", "network", ".3f"),
-                ("fused", "physics", ".3f"),
-            )
-        ]
-        lines.append(
-            f"  ratios, {name}: TOB : paper's {values[0]} (paper 46), efficiency : paper's {values[1]} (paper 9.0), "
-            f"ours : paper's {values[2]}, ours : physics {values[3]}"
-        )
+        lines.append(f"  ratios, {name}: " + ", ".join(_ratio(row, a, b) for a, b in _PAIRS))
     return lines
+
+
+_PAIRS: Final = (("tob", PAPERS), ("efficiency", PAPERS), (OURS, PAPERS), (OURS, "physics"))
+
+
+def _ratio(row: Row, a: str, b: str) -> str:
+    """E.g. "TOB : paper's 23.9 (paper 45.8)"."""
+    paper = ratio(PAPER_MSE_NM2.get(a), PAPER_MSE_NM2.get(b))
+    beside = "" if paper is None else f" (paper {paper:.1f})"
+    form = ".3f" if a == OURS else ".1f"
+    return f"{_SHORT[a]} : {_SHORT[b]} {_cell(ratio(mse(row, a), mse(row, b)), form)}{beside}"
 
 
 def _intervals(result: Evaluation) -> list[str]:
-    rows = []
-    for kind, tables in result.intervals.items():
-        if kind == "all":
-            continue
-        for number, quadrants in tables.quadrants.items():
-            cells = [
-                f"{100 * one.share:.1f} +- {100 * one.se:.1f}"
-                for one in (tables.joints[number], *quadrants.values())
-            ]
-            cells += ["-"] * (5 - len(cells))
-            rows.append([f"j{number} {kind} velocity", *cells])
+    rows = [
+        [f"j{number} {kind} velocity", *_coverages(tables, number)]
+        for kind, tables in result.intervals.items()
+        if kind != "all"
+        for number in tables.joints
+    ]
     lines = table(["", "all", "i>0 w>0", "i<0 w<0", "i<0 w>0", "i>0 w<0"], rows) if rows else ["  not known"]
     for number, one in result.standstill.items():
-        held = ", ".join(f"{_SHORT[m]} {100 * c.share:.1f}" for m, c in one.coverage.items())
+        held = ", ".join(f"{_SHORT[m]} {100 * c.share:.1f} %" for m, c in one.coverage.items())
+        share = f"{100 * one.share:.0f} % of the samples"
         lines.append(
-            f"  standstill j{number}: {100 * one.share:.0f} % of the samples; interval held the sensor in % of them: {held}"
+            f"  standstill j{number}, {share}: the interval held the sensor in {held or 'no sample'}"
         )
     return lines
 
 
-def _targets(result: Evaluation) -> list[str]:
-    rows = []
-    for each in result.targets:
-        mark = {True: "yes", False: "NO", None: "-"}[each.reached]
-        rows.append([each.figure, each.paper, each.goal, each.ours, mark])
-    return table(["figure", "paper", "to reach", "ours", "reached"], rows)
+def _coverages(tables: IntervalTables, number: int) -> list[str]:
+    quadrants = tables.quadrants[number]
+    return [_coverage(one) for one in (tables.joints[number], *(quadrants.get(name) for name in QUADRANTS))]
+
+
+def _coverage(one: Coverage | None) -> str:
+    return "-" if one is None else str(one).replace(" %", "")
+
+
+def _targets(targets: Sequence[Target]) -> list[str]:
+    """The table, and under it the details of what is not reached."""
+    rows = [[each.figure, each.paper, each.goal, each.ours, _MARKS[each.reached]] for each in targets]
+    lines = table(["figure", "paper", "to reach", "ours", "reached"], rows)
+    for each in targets:
+        if each.reached is False and each.details:
+            lines += [f"  {each.figure}:", *(f"    {line}" for line in each.details)]
+    return lines
 
 
 def _samples(row: Row) -> str:

@@ -20,7 +20,7 @@ from estimator.methods import load_network, make_estimator
 from estimator.network import TorqueNetwork
 from tests.benchmarks.table import mark
 from tests.estimator_helpers import joint1, motion, small_network
-from tests.fused_helpers import fused_joint, fused_network
+from tests.fused_configuration import joint_of, network_of
 
 SAMPLES = 60_000
 JOINTS = 2
@@ -45,11 +45,11 @@ def best_us(call: Callable[[], object], number: int = 2000, rounds: int = 9) -> 
 
 def step_costs_us() -> dict[str, float]:
     """Cost of one step by method [us], networks included; the methods take turns, so that a busy machine hurts all alike."""
-    networks = {"network": small_network().data, "fused": fused_network()}
+    networks = {"network": small_network().data, "fused": network_of(1)}
     steps = {}
     for method in METHODS:
         data = networks.get(method)
-        joint = fused_joint() if method == "fused" else joint1()
+        joint = joint_of(1) if method == "fused" else joint1()
         network = None if data is None else load_network(method, data)
         steps[method] = make_estimator(joint, EstimatorSettings(method=method), network).step
         steps[method](*_STEP)

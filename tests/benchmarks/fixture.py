@@ -96,12 +96,11 @@ def small_network(number: int) -> SmallNetwork:
 
 def make_fixture(directory: Path) -> Fixture:
     """Write configuration, networks and boot report into `directory`."""
-    shipped_config = shipped("bench.yaml")
-    mapping = yaml.safe_load(shipped_config.read_text(encoding="utf-8"))
+    mapping = yaml.safe_load(shipped("bench.yaml").read_text(encoding="utf-8"))
     mapping["estimator"]["method"] = "network"
     for number in (1, 2):
         joint = mapping[f"joint_{number}"]
-        joint["file"] = str(shipped_config.parent / joint["file"])
+        joint["file"] = str(shipped(f"joint{number}.yaml"))  # the same whatever ships as trained
         file = directory / f"joint{number}.onnx"
         data = small_network(number).onnx(load_joint(joint["file"]).name)
         file.write_bytes(data)

@@ -1,0 +1,172 @@
+"""The fused estimator's observer against closed forms: no transient, lag 1/g, torsion, exact ripple and direction."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from estimator.friction import FloatArray
+from estimator.fused_observer import FusedObserved, FusedObserver
+from estimator.fused_parameters import Torsion
+from estimator.observer import Observer, first_order_hold
+from tests.estimator_helpers import joint1
+from tests.fused_helpers import TORSION, twisted
+
+G, KT, J, RATE = 100.0, 0.062, 7e-5, 200.0
+PLAIN = Torsion(12000.0, 0.0, 0.0, (2.0, 4.0), (0.0, 0.0), (0.0, 0.0))
+
+
+def observer(torsion: Torsion | None = PLAIN, link_rate: float = RATE) -> FusedObserver:
+    return FusedObserver(joint1(), torsion, RATE, link_rate)
+
+
+def outputs(o: FusedObserver, rows: Iterable[tuple[float, ...]]) -> FloatArray:
+    """Outputs [n, 9] over rows of (dt, current, motor position, motor velocity, link position)."""
+    first, *rest = rows
+    return np.array([o.start(*first[1:]), *(o.step(*row) for row in rest)])
+
+
+def column(found: FloatArray, name: str) -> FloatArray:
+    values: FloatArray = found[:, FusedObserved._fields.index(name)]
+    return values
+
+
+def uneven(count: int, seed: int = 1) -> FloatArray:
+    return np.random.default_rng(seed).uniform(0.0004, 0.0021, count)
+
+
+def spinning(v: FloatArray, dt: FloatArray, current: FloatArray) -> list[tuple[float, ...]]:
+    """Rows of a rigid joint that turns at v [rad/s, joint side]."""
+    link = np.cumsum(v * dt)
+    return list(zip(*(a.tolist() for a in (dt, current, G * link, G * v, link)), strict=True))
+
+
+@pytest.mark.parametrize("v", [0.0, 0.005, 0.3, -2.0])
+def test_constant_speed_has_no_transient(v: float) -> None:
+    dt = uneven(300)
+    rows = spinning(np.full(300, v), dt, np.full(300, 2.5))
+    twist = 3e-4
+    found = outputs(observer(), [(a, i, q + G * twist, *rest) for a, i, q, *rest in rows])
+    for name, expected in (
+        ("raw_nm", G * KT * 2.5),
+        ("joint_velocity_rad_s", v),
+        ("link_velocity_rad_s", v),
+        ("torsion_nm", 12000.0 * twist),
+        ("direction", math.tanh(v / 0.02)),
+    ):
+        assert np.max(np.abs(column(found, name) - expected)) < 1e-9, name
+
+
+def test_a_ramp_is_followed_with_a_lag_of_one_over_g() -> None:
+    """Current, torsion and speed rise in a straight line; after 0.2 s, e^-40 of the start is left."""
+    dt = uneven(400)
+    t = np.cumsum(dt)
+    a = 1.2  # rad/s^2, joint side
+    twist = 2e-4 * t
+    link = 0.5 * a * t**2
+    rows = zip(dt, 0.8 * t, G * (link + twist), G * a * t, link, strict=True)
+    found = outputs(observer(), rows)
+    old = t > 0.25
+    delayed = (t - 1.0 / RATE)[old]
+    for name, expected in (
+        (
+            "raw_nm",
+            G * KT * 0.8 * delayed - G * J * G * a,
+        ),  # the rotor takes its part without lag: it is constant
+        ("joint_velocity_rad_s", a * delayed),
+        ("torsion_nm", 12000.0 * 2e-4 * delayed),
+    ):
+        assert np.max(np.abs(column(found, name)[old] - expected)) < 1e-9, name
+
+
+def test_torque_and_velocities_are_those_of_the_papers_observer() -> None:
+    for link_rate in (RATE, 37.0):
+        m = twisted(5, 1500)
+        found = outputs(observer(TORSION, link_rate), m.rows())
+        other = Observer(joint1(), RATE, link_rate)
+        first, *rest = m.rows()
+        paper = np.array([other.start(*first[1:]), *(other.step(*row) for row in rest)])
+        for name, k in (("raw_nm", 0), ("joint_velocity_rad_s", 2), ("link_velocity_rad_s", 3)):
+            assert np.max(np.abs(column(found, name) - paper[:, k])) < 1e-9
+
+
+@pytest.mark.parametrize("orders", [(2.0, 4.0), (4.0,), (1.0, 2.0, 2.0, 5.5)])
+def test_torsion_with_its_cubic_and_kinematic_error(orders: tuple[float, ...]) -> None:
+    """The torque of each sample by the formula, then through the filter; orders other than 2 and 4 too."""
+    rng = np.random.default_rng(len(orders))
+    cos, sin = (tuple(rng.uniform(-5e-5, 5e-5, len(orders)).tolist()) for _ in range(2))
+    torsion = Torsion(9000.0, 3e8, 7e-5, orders, cos, sin)
+    m = twisted(8, 800)
+    angle = m.motor_position_rad
+    error = sum(
+        c * np.cos(n * angle) + s * np.sin(n * angle) for n, c, s in zip(orders, cos, sin, strict=True)
+    )
+    d = angle / G - m.link_position_rad - 7e-5 - error
+    assert np.max(np.abs(3e8 * d**3)) > 0.5
+    torque = 9000.0 * d + 3e8 * d**3
+    z, expected = torque[0], [torque[0]]
+    for k in range(1, len(torque)):
+        a, b0, b1 = first_order_hold(RATE, m.dt_s[k])
+        z = a * z + b0 * torque[k] + b1 * torque[k - 1]
+        expected.append(z)
+    assert np.max(np.abs(column(outputs(observer(torsion), m.rows()), "torsion_nm") - expected)) < 1e-8
+
+
+def test_without_torsion_its_torque_is_zero() -> None:
+    assert not np.any(column(outputs(observer(None), twisted(8, 700).rows()), "torsion_nm"))
+
+
+@pytest.mark.parametrize(("order", "wave"), [(2, ("cos2", "sin2")), (4, ("cos4", "sin4"))])
+def test_a_torque_ripple_is_linear_in_the_waves_at_every_speed(order: int, wave: tuple[str, str]) -> None:
+    """A cos(n theta + p) at the motor, in the current: raw less the ripple is raw without it, in every sample."""
+    amplitude, phase = 0.004, 0.7
+    m = twisted(9, 1500)
+    ripple = amplitude * np.cos(order * m.motor_position_rad + phase)
+    clean = outputs(observer(), m.rows())
+    rippled = outputs(observer(), replace(m, current_a=m.current_a + ripple / KT).rows())
+    c, s = (column(clean, name) for name in wave)
+    recovered = column(rippled, "raw_nm") - G * amplitude * (math.cos(phase) * c - math.sin(phase) * s)
+    assert np.max(np.abs(column(rippled, "raw_nm") - column(clean, "raw_nm"))) > 0.1
+    assert np.max(np.abs(recovered - column(clean, "raw_nm"))) < 1e-9
+
+
+def test_waves_of_a_turning_motor_have_the_filters_gain_and_phase() -> None:
+    """At constant speed: cos(n theta) through g/(s+g), hence smaller by g/|g + j n w| and later by its angle."""
+    dt = np.full(2000, 0.0002)
+    v = 0.7
+    found = outputs(observer(), spinning(np.full(2000, v), dt, np.zeros(2000)))
+    angle = G * v * np.cumsum(dt)
+    for order, name in ((2, "cos2"), (4, "cos4")):
+        response = RATE / (RATE + 1j * order * G * v)
+        expected = np.real(response * np.exp(1j * order * angle))
+        assert np.max(np.abs(column(found, name) - expected)[1000:]) < 1e-3
+
+
+def test_friction_that_turns_with_the_motion_is_linear_in_direction() -> None:
+    """Reversals of any quickness: current for F tanh(v/w0) at the joint shows up as F direction, in every sample."""
+    m = twisted(4, 2000)
+    friction = 6.0
+    turning = friction * np.tanh(m.motor_velocity_rad_s / G / 0.02)
+    clean = outputs(observer(), m.rows())
+    loaded = outputs(observer(), replace(m, current_a=m.current_a + turning / (G * KT)).rows())
+    s = column(clean, "direction")
+    assert np.max(np.abs(column(loaded, "raw_nm") - friction * s - column(clean, "raw_nm"))) < 1e-9
+    assert s.min() < -0.99
+    assert s.max() > 0.99
+
+
+def test_no_finite_angle_raises() -> None:
+    """Multiples of the largest numbers are infinite, and cos(inf) is an error: such torsion is not a number."""
+    torsion = replace(TORSION, orders_per_motor_rev=(2.0, 5.5))
+    for angle in (1e300, -1.7e308):
+        for o in (observer(torsion), observer(TORSION), observer(None)):
+            o.start(1.0, 0.0, 0.0, 0.0)
+            seen = o.step(0.001, 1.0, angle, 0.0, 0.0)
+            assert all(-1.0 <= wave <= 1.0 for wave in seen[4:])
+    o = observer(TORSION)
+    o.start(1.0, 0.0, 0.0, 0.0)
+    assert math.isnan(o.step(0.001, 1.0, 1e6, 0.0, 0.0).raw_nm)  # impossible torsion: the guard starts again
