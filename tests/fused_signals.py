@@ -124,7 +124,9 @@ def emulated(seed: int, duration_s: float, day: int | Day | None = None) -> tupl
     """Both joints of one run of the campaign's bench."""
     table = emulate_run(campaign_plant(), sines(seed), duration_s, seed, day=day)
     one, two = (
-        run_signals(f"run {seed}", load_joint(shipped(f"joint{n}.yaml")), FUSED, table.time_s, table.joints[n])
+        run_signals(
+            f"run {seed}", load_joint(shipped(f"joint{n}.yaml")), FUSED, table.time_s, table.joints[n]
+        )
         for n in (1, 2)
     )
     return one, two

@@ -25,11 +25,11 @@ def from_mapping(changed):
 
 def test_campaign_plant_is_the_hard_bench():
     plant = load_plant(shipped(CAMPAIGN))
-    assert plant.run_to_run == RunToRun(0.15, 0.3, 4.0, 1e-5)
-    assert plant.profile == "rest"
+    assert plant.run_to_run == RunToRun(0.15, 0.3, 2.0, 1e-5)
+    assert plant.profile == "demo"
     for side, phase in zip(plant.joints, (0.9, 2.3), strict=True):
         d = side.deviations
-        assert (d.ripple_nm, d.ripple_order_per_motor_rev) == (0.4, 2.0)
+        assert (d.ripple_nm, d.ripple_order_per_motor_rev) == (0.25, 2.0)
         assert (d.kinematic_error_rad, d.kinematic_error_order_per_motor_rev) == (4e-5, 2.0)
         assert d.kinematic_error_phase_rad == phase
         assert (d.hysteresis_nm, d.hysteresis_travel_rad) == (0.4, 1e-4)
