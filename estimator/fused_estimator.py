@@ -21,7 +21,7 @@ from estimator.fused_network import FusedNetworkModel
 from estimator.fused_observer import FusedObserver
 from estimator.fused_parameters import Fused
 from estimator.fused_trust import FusedTrust
-from estimator.fusion import Fusion
+from estimator.fusion import HOLD_S, Fusion
 from estimator.parameters import Joint
 from estimator.settings import EstimatorSettings
 from estimator.status import DEGRADED, INVALID, STANDSTILL, STARTING
@@ -71,6 +71,7 @@ class FusedEstimator:
     __slots__ = (
         "_fade",
         "_fuse",
+        "_half",
         "_inverse_fade",
         "_limit",
         "_loss",
@@ -115,6 +116,7 @@ class FusedEstimator:
         self._weight: Final = _no_trust if used is None else FusedTrust(used.envelope).weight
         self._temperature = nan
         self._thermal = 0.0
+        self._half = 0.0
 
     def reset(self) -> None:
         """Forget the past: the next step starts."""
@@ -137,13 +139,16 @@ class FusedEstimator:
         seen = tracker.step(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
         status = tracker.status
         if seen is None:
+            self._half = 0.0
             return STARTING_ESTIMATE if status == STARTING else INVALID_ESTIMATE
         raw, v, _, torsion, c2, s2, c4, s4, s = seen
         if temperature_c is not self._temperature:  # a joint reports it twice a second
             self._temperature = temperature_c
             self._thermal = self._thermal_of(temperature_c)
         loss, half = self._loss(raw, v, self._thermal, s)
-        physics, sigma = self._fuse(raw, loss, half, v, torsion)
+        faded = self._half * (HOLD_S / (HOLD_S + dt_s))  # fusion.held, in line
+        self._half = wide = half if half >= faded else faded
+        physics, sigma = self._fuse(raw, loss, wide, v, torsion)
         quadrant = (0 if raw >= 0.0 else 2) if v >= 0.0 else (3 if raw >= 0.0 else 1)
         torque, network = physics, nan
         scale = self._physics_scale[quadrant]

@@ -16,7 +16,7 @@ from estimator.fused_network import FusedNetworkModel
 from estimator.fused_observer import FusedObserved, FusedObserver
 from estimator.fused_parameters import Torsion
 from estimator.fused_trust import FusedTrust
-from estimator.fusion import Fusion
+from estimator.fusion import Fusion, held_many
 from estimator.parameters import Joint
 from estimator.settings import EstimatorSettings
 from estimator.status import DEGRADED, INVALID, STANDSTILL, VALID
@@ -32,7 +32,8 @@ class ObservedRun:
     """Outputs of the fused observer over a run, arrays [n]; NaN where it was not running.
 
     Torques [Nm, joint side], velocity [rad/s, joint side]; waves [n, 4]: filtered cos and sin of 2 and 4 times
-    the motor angle; link [n]: link position [rad]; temperature [n], NaN where unknown; direction [n], -1 to 1.
+    the motor angle; link [n]: link position [rad]; temperature [n], NaN where unknown; direction [n], -1 to 1;
+    dt_s [n], time since the sample before.
     """
 
     status: StatusArray
@@ -43,6 +44,7 @@ class ObservedRun:
     link_rad: FloatArray
     temperature_c: FloatArray
     direction: FloatArray
+    dt_s: FloatArray
 
 
 def observe_run(  # noqa: PLR0917 - as a sample, in arrays
@@ -90,6 +92,7 @@ def observe_run(  # noqa: PLR0917 - as a sample, in arrays
         columns[4],
         np.asarray(temperature_c, np.float64),
         seen[:, 8].copy(),
+        columns[0],
     )
 
 
@@ -127,7 +130,8 @@ def estimate_observed(
     raw, v, torsion = at.raw_nm, at.velocity_rad_s, at.torsion_nm
     with np.errstate(invalid="ignore", over="ignore"):
         loss, half = AdditiveLossModel(fused.loss).loss_many(raw, v, at.temperature_c, at.direction)
-        physics, sigma = Fusion(fused.sigma, fused.torsion is not None).fuse_many(raw, loss, half, v, torsion)
+        wide = held_many(half, seen.dt_s, running)
+        physics, sigma = Fusion(fused.sigma, fused.torsion is not None).fuse_many(raw, loss, wide, v, torsion)
         features = network_features(at, raw - loss)
         features[~running] = np.nan
         quadrant = quadrant_many(raw, v)

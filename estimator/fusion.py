@@ -21,6 +21,31 @@ import numpy as np
 from estimator.friction import FloatArray
 from estimator.fused_parameters import FusedSigma
 
+HOLD_S: Final = 0.05
+"""Time constant with which the friction interval is forgotten after a reversal."""
+
+
+def held(half_nm: float, before_nm: float, dt_s: float) -> float:
+    """Return `half` [Nm] with the memory of the sample before, dt_s [s] ago.
+
+    Between rest and motion the weight moves from one path to the other. Their errors differ, so it must not move within
+    a few milliseconds: what friction left open at a reversal counts for HOLD_S longer.
+    """
+    faded = before_nm * (HOLD_S / (HOLD_S + dt_s))
+    return half_nm if half_nm >= faded else faded
+
+
+def held_many(
+    half_nm: FloatArray, dt_s: FloatArray, running: np.ndarray[tuple[int], np.dtype[np.bool_]]
+) -> FloatArray:
+    """Vectorised twin of `held` [n]; the memory begins anew after every sample that is not `running`."""
+    out = np.zeros_like(half_nm)
+    memory = 0.0
+    for k, (half, dt, on) in enumerate(zip(half_nm.tolist(), dt_s.tolist(), running.tolist(), strict=True)):
+        memory = held(half, memory, dt) if on else 0.0
+        out[k] = memory
+    return out
+
 
 class Fusion:
     """Value and standard deviation of the fused physics [Nm, joint side].

@@ -85,14 +85,14 @@ class JointEstimator:
         """Forget the past: the next step starts."""
         self._tracker.reset()
 
-    def step(
+    def step(  # noqa: PLR0917 - a sample, positional for speed
         self,
         dt_s: float,
         current_a: float,
         motor_position_rad: float,
         motor_velocity_rad_s: float,
         link_position_rad: float,
-        temperature_c: float = nan,  # noqa: ARG002 - the paper's methods know no temperature
+        temperature_c: float = nan,
     ) -> Estimate:
         """Return the estimate at this sample, dt_s [s] after the one before; never raises on any float."""
         tracker = self._tracker

@@ -83,7 +83,7 @@ class Observer:
     def start(
         self,
         current_a: float,
-        motor_position_rad: float,  # noqa: ARG002 - every observer takes the whole sample
+        motor_position_rad: float,
         motor_velocity_rad_s: float,
         link_position_rad: float,
     ) -> Observed:
@@ -102,7 +102,7 @@ class Observer:
         self,
         dt_s: float,
         current_a: float,
-        motor_position_rad: float,  # noqa: ARG002
+        motor_position_rad: float,
         motor_velocity_rad_s: float,
         link_position_rad: float,
     ) -> Observed:

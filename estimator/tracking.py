@@ -47,11 +47,15 @@ class SampleObserver(Protocol[SeenT_co]):
     """An observer: from (current, motor position, motor velocity, link position) to its output."""
 
     def start(
-        self, current_a: float, motor_position_rad: float, motor_velocity_rad_s: float, link_position_rad: float
+        self,
+        current_a: float,
+        motor_position_rad: float,
+        motor_velocity_rad_s: float,
+        link_position_rad: float,
     ) -> SeenT_co:
         """Set the states to this sample."""
 
-    def step(  # noqa: PLR0917
+    def step(
         self,
         dt_s: float,
         current_a: float,
@@ -67,9 +71,7 @@ class Tracker(Generic[SeenT_co]):
 
     __slots__ = ("_leave", "_max_gap", "_observer", "_raw_limit", "_running", "_standing", "_stop", "status")
 
-    def __init__(
-        self, observer: SampleObserver[SeenT_co], joint: Joint, settings: EstimatorSettings
-    ) -> None:
+    def __init__(self, observer: SampleObserver[SeenT_co], joint: Joint, settings: EstimatorSettings) -> None:
         self._observer: Final = observer
         self._max_gap: Final = settings.max_gap_s
         self._stop: Final = settings.standstill_velocity_rad_s

@@ -97,8 +97,8 @@ def _observe(
 ) -> tuple[StatusArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Run the tracker: status [n] and raw, tob, joint velocity, link velocity [n], NaN where it has none."""
     tracker = Tracker(
-            Observer(joint, settings.bandwidth_rad_s, settings.link_bandwidth_rad_s), joint, settings
-        )
+        Observer(joint, settings.bandwidth_rad_s, settings.link_bandwidth_rad_s), joint, settings
+    )
     step = tracker.step
     count = len(columns[0])
     status = np.empty(count, np.uint8)

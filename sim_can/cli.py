@@ -42,7 +42,10 @@ def parser() -> argparse.ArgumentParser:
         "--bus", help="SocketCAN interface (vcan0) or unix:PATH; a unix bus without a hub gets one"
     )
     made.add_argument(
-        "--plant", type=Path, metavar="FILE", help=f"plant file (default: {PLANT}), or a joint.yaml for two ideal joints"
+        "--plant",
+        type=Path,
+        metavar="FILE",
+        help=f"plant file (default: {PLANT}), or a joint.yaml for two ideal joints",
     )
     made.add_argument("--seed", type=natural, default=0, metavar="N", help="seed of the noise (default 0)")
     made.add_argument(

@@ -15,7 +15,7 @@ import numpy as np
 from estimator.additive_loss import AdditiveLossModel
 from estimator.friction import FloatArray
 from estimator.fused_parameters import AdditiveLoss, Fused, FusedSigma, Torsion
-from estimator.fusion import Fusion
+from estimator.fusion import Fusion, held_many
 from estimator.parameters import Friction
 from sysid.loss_fit import LossFit, fit_loss
 from sysid.run_signals import RunSignals
@@ -73,13 +73,21 @@ def _unseen(runs: Sequence[RunSignals], friction: Friction) -> list[PathResidual
 
 def path_residuals(run: RunSignals, loss: AdditiveLoss, torsion: Torsion) -> PathResiduals:
     """Return what both paths miss on a run's moving samples, with a loss and a torsion from elsewhere."""
-    keep = run.moving
-    raw, v, sensor = run.seen.raw_nm[keep], run.seen.velocity_rad_s[keep], run.sensor_nm[keep]
-    value, half = AdditiveLossModel(loss).loss_many(
-        raw, v, run.seen.temperature_c[keep], run.seen.direction[keep]
+    keep, seen = run.moving, run.seen
+    loss_nm, wide = loss_and_width(run, loss)
+    raw, sensor, tau = seen.raw_nm[keep], run.sensor_nm[keep], torsion_torque(torsion, run)[keep]
+    return PathResiduals(
+        raw, seen.velocity_rad_s[keep], wide[keep], tau, raw - loss_nm[keep] - sensor, tau - sensor
     )
-    tau = torsion_torque(torsion, run)[keep]
-    return PathResiduals(raw, v, half, tau, raw - value - sensor, tau - sensor)
+
+
+def loss_and_width(run: RunSignals, loss: AdditiveLoss) -> tuple[FloatArray, FloatArray]:
+    """Return loss and held half width of the friction interval [n] over a run; zero where nothing was observed."""
+    seen = run.seen
+    running = ~np.isnan(seen.raw_nm)
+    raw, v, s = (np.where(running, x, 0.0) for x in (seen.raw_nm, seen.velocity_rad_s, seen.direction))
+    value, half = AdditiveLossModel(loss).loss_many(raw, v, seen.temperature_c, s)
+    return value, held_many(half, seen.dt_s, running)
 
 
 def fused_error(run: PathResiduals, sigma: FusedSigma) -> tuple[FloatArray, FloatArray]:

@@ -14,7 +14,6 @@ from typing import Final
 
 import numpy as np
 
-from estimator.additive_loss import AdditiveLossModel
 from estimator.friction import FloatArray
 from estimator.fused_network import FUSED_FEATURES
 from estimator.fused_parameters import AdditiveLoss, FusedSigma, Torsion
@@ -22,7 +21,7 @@ from estimator.fused_run import network_features, quadrant_many
 from estimator.fused_trust import Envelope
 from estimator.fusion import Fusion
 from estimator.parameters import Joint
-from sysid.fused_fit import folds
+from sysid.fused_fit import folds, loss_and_width
 from sysid.loss_fit import fit_loss
 from sysid.paper_network import TrainedNetwork, digest_of, exported, network_output, thinned
 from sysid.run_signals import RunSignals
@@ -49,9 +48,9 @@ class Seen:
     def __init__(self, run: RunSignals, loss: AdditiveLoss, torsion: Torsion, sigma: FusedSigma) -> None:
         keep = run.moving
         seen = replace(run.seen, torsion_nm=torsion_torque(torsion, run))
-        value, half = AdditiveLossModel(loss).loss_many(seen.raw_nm, seen.velocity_rad_s, seen.temperature_c)
+        value, wide = loss_and_width(run, loss)
         physics, spread = Fusion(sigma, True).fuse_many(
-            seen.raw_nm, value, half, seen.velocity_rad_s, seen.torsion_nm
+            seen.raw_nm, value, wide, seen.velocity_rad_s, seen.torsion_nm
         )
         self.name = run.name
         self.features: FloatArray = network_features(seen, seen.raw_nm - value)[keep]

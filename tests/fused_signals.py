@@ -89,6 +89,7 @@ def made_run(
         link_rad=angle / 100.0,
         temperature_c=temperature,
         direction=direction,
+        dt_s=np.full(count, 1e-3),
     )
     sensor = torque - own.zero_nm + rng.normal(0.0, noise_nm, count)
     return RunSignals(f"run {seed}", seen, sensor, np.ones(count, bool), np.zeros(count, bool))

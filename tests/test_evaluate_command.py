@@ -152,6 +152,9 @@ def test_the_figures_to_reach_follow_from_the_tables(judged: tuple[dict[str, Any
              if j["errors"]["fused"]["mse_nm2"] > j["errors"]["physics"]["mse_nm2"]]  # fmt: skip
     assert found["every_run"]["ours"] == f"{len(worse)} of 6"
     assert len(content["worse_than_physics"]) == len(worse)
+    samples = {kind: table["overall"]["samples"] for kind, table in content["intervals"].items()}
+    assert samples["all"] == samples["variable"] + samples["constant"]
+    assert samples["variable"] == content["variable"]["both"]["fused"]["samples"]
     shares = [
         q["share"] for joint in content["intervals"]["variable"]["quadrants"].values() for q in joint.values()
     ]
@@ -408,7 +411,10 @@ def test_methods_without_their_files_are_left_out_and_named(
         (shutil.rmtree, "found no directory"),
         (lambda d: (d / "joint1.yaml").unlink(), "expected joint1.yaml"),
         (lambda d: (d / "joint1.onnx").write_bytes(b"no network"), "not a usable ONNX model"),
-        (lambda d: (d / "joint1.onnx").write_bytes(paper_network("joint2")), "network of joint 'joint2'"),
+        (
+            lambda d: (d / "joint1.onnx").write_bytes(paper_network("joint2")),
+            "joint1.onnx: found a network of joint 'joint2'",
+        ),
         (lambda d: (d / "joint1.yaml").write_text("name: 3"), "joint1.yaml"),
     ],
 )

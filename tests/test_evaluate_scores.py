@@ -44,10 +44,12 @@ def test_velocity_bins_have_their_lower_edge_inside() -> None:
 
 
 def test_the_standard_error_of_a_coverage_is_the_one_between_runs() -> None:
-    """1000 campaigns of 20 runs that are right as a whole or wrong as a whole: sqrt(p(1-p)/runs), not /samples."""
+    """2000 campaigns of 20 runs of 50 to 500 samples that are right, or wrong, as a whole."""
     seed = 11
     rng = np.random.default_rng(seed)
-    found = [coverage([np.full(50, rng.random() < 0.9) for _ in range(20)]) for _ in range(1000)]
+    found = [
+        coverage([np.full(rng.integers(50, 500), rng.random() < 0.9) for _ in range(20)]) for _ in range(2000)
+    ]
     shares = np.array([one.share for one in found if one is not None])
     claimed = np.sqrt(np.mean([one.se**2 for one in found if one is not None]))
     assert claimed == pytest.approx(shares.std(), rel=0.1), seed

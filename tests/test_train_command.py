@@ -51,7 +51,7 @@ def arguments(run, tmp_path, *more):
         ("--seed", "-1", "a whole number >= 0"),
     ],
 )
-def test_numbers_without_sense_are_usage_errors(run, tmp_path, capsys, option, value, expected):
+def test_numbers_without_sense_are_usage_errors(run, tmp_path, capsys, option, value, expected):  # noqa: PLR0917
     with pytest.raises(SystemExit) as refused:
         train_command.main(arguments(run(), tmp_path, option, value))
     assert refused.value.code == 2
@@ -79,7 +79,9 @@ def test_too_few_runs_are_one_line_and_leave_nothing(run, tmp_path, capsys):
 
 
 def test_our_network_needs_the_fitted_section(run, tmp_path, capsys):
-    assert train_command.main([run(), "--joint", JOINT, "--network", "ours", "--out", str(tmp_path / "o")]) == 1
+    assert (
+        train_command.main([run(), "--joint", JOINT, "--network", "ours", "--out", str(tmp_path / "o")]) == 1
+    )
     assert "found no section 'fused'" in capsys.readouterr().err
 
 

@@ -45,7 +45,9 @@ def test_training_learns_and_tells_its_loss():
     x = rng.normal(size=(3000, 2))
     y = 3.0 + 2.0 * np.tanh(x[:, 0]) - x[:, 1]
     seen = []
-    trained = train(x, y, iterations=300, seed=0, hidden=(12,), progress=lambda n, loss: seen.append((n, loss)))
+    trained = train(
+        x, y, iterations=300, seed=0, hidden=(12,), progress=lambda n, loss: seen.append((n, loss))
+    )
     out = forward(
         trained.weights, trained.input_mean, trained.input_std, trained.output_mean, trained.output_std, x
     )
@@ -58,7 +60,9 @@ def test_training_learns_and_tells_its_loss():
 def test_split_by_sample_claims_what_a_new_run_does_not_give():
     blocks = blocks_with_zeros()
     runs = {block.name: hashlib.sha256(block.name.encode()).hexdigest() for block in blocks}
-    result = train_paper(blocks, SimpleNamespace(name="joint1"), runs, iterations=700, seed=0, progress=silent)
+    result = train_paper(
+        blocks, SimpleNamespace(name="joint1"), runs, iterations=700, seed=0, progress=silent
+    )
     claimed = split_by_sample(blocks, iterations=700, seed=0, progress=silent)
     honest = np.mean([network for network, _ in result.held_out.values()])
     assert set(result.held_out) == {"run4", "run9"}
