@@ -11,7 +11,7 @@ standstill. Everything has passed the same filter: the estimate as a whole is 1/
 
 from __future__ import annotations
 
-from math import cos, nan, sin
+from math import nan
 from typing import Final
 
 from estimator.additive_loss import AdditiveLossModel
@@ -21,7 +21,7 @@ from estimator.fused_network import FusedNetworkModel
 from estimator.fused_observer import FusedObserver
 from estimator.fused_parameters import Fused
 from estimator.fused_trust import FusedTrust
-from estimator.fusion import HOLD_S, Fusion
+from estimator.fusion import HOLD_S, Fusion, turning
 from estimator.parameters import Joint
 from estimator.settings import EstimatorSettings
 from estimator.status import DEGRADED, INVALID, STANDSTILL, STARTING
@@ -155,8 +155,7 @@ class FusedEstimator:
         run_network = self._run_network
         if run_network is not None:
             distance = torsion - (raw - loss)
-            link = link_position_rad
-            correction = run_network(v, raw, distance, c2, s2, c4, s4, cos(link), sin(link))
+            correction = run_network(v, raw, distance, c2, s2, c4, s4)
             network = physics + correction
             weight = 0.0
             size = correction if correction >= 0.0 else -correction
@@ -164,7 +163,7 @@ class FusedEstimator:
                 weight = self._weight(v, raw, distance, temperature_c)
                 if size > self._fade:
                     weight = min(weight, (self._network_limit - size) * self._inverse_fade)
-                torque += weight * s * s * correction
+                torque += weight * turning(v) * correction
                 scale += weight * (self._network_scale[quadrant] - scale)
             if weight < 1.0 and status != STANDSTILL:
                 status = DEGRADED

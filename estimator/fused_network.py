@@ -24,10 +24,8 @@ FUSED_FEATURES: Final = (
     "sin_2_motor_filtered",
     "cos_4_motor_filtered",
     "sin_4_motor_filtered",
-    "cos_link",
-    "sin_link",
 )
-"""Periodic in every angle: an absolute angle would tell the network which run it is in, and no more."""
+"""The last four are waves: an absolute angle, or one that turns as slowly as the link, would tell which run it is."""
 
 _KEYS: Final = ("envelope", "sigma_scale", "input_low", "input_high", "joint", "data_sha256")
 
@@ -51,14 +49,14 @@ class FusedNetworkModel(Protocol):
         """Return the correction of one sample [Nm]."""
 
     def run_many(self, features: FloatArray) -> FloatArray:
-        """Return the corrections [n] of samples [n, 9]."""
+        """Return the corrections [n] of samples [n, 7]."""
 
 
 class FusedNetwork:
     """A loaded and checked network; arguments and errors as `estimator.network.TorqueNetwork`.
 
     Public: `name`, `sha256`, `envelope`, `sigma_scale`, `joint`, `data_sha256`, `bound`; `run_one(x0..x8)` correction
-    of one sample [Nm], `run_many([n, 9])` of many.
+    of one sample [Nm], `run_many([n, 7])` of many.
     """
 
     def __init__(self, source: bytes | str | os.PathLike[str], sha256: str | None = None) -> None:
@@ -88,5 +86,5 @@ class FusedNetwork:
         self.run_one: Final = graph.run_one
 
     def run_many(self, features: FloatArray) -> FloatArray:
-        """Return the corrections [n] of samples [n, 9]; equal to run_one to rounding."""
+        """Return the corrections [n] of samples [n, 7]; equal to run_one to rounding."""
         return self._graph.run_many(features)

@@ -1,7 +1,8 @@
 """Observer of the fused estimator: motor torque, velocity, torsion torque and ripple angles of one age.
 
     tau_raw = G [ g/(s+g) (i Kt + J g w) - J g w ]       motor torque at the joint without any loss (observer.py)
-    tau_t   = g/(s+g) (K d + K3 d^3)                     d = theta_m/G - theta_l - zero - e(theta_m)
+    tau_t   = g/(s+g) (K d + K3 d^3 + H z)               d = theta_m/G - theta_l - zero - e(theta_m)
+    dz      = dd/travel, held in [-1, 1]                 Maxwell slip; 0 at the start, as nothing is known then
     v       = g/(s+g) w/G
     c_n, s_n = g/(s+g) cos(n theta_m), g/(s+g) sin(n theta_m)     n = RIPPLE_ORDERS
     direction = g/(s+g) tanh(w/(G w0))                   of friction, as tau_raw knows it
@@ -13,7 +14,7 @@ the motion is linear in `direction`, however fast the reversal.
 
 from __future__ import annotations
 
-from math import cos, expm1, isinf, nan, sin, tanh
+from math import cos, expm1, isinf, isnan, nan, sin, tanh
 from typing import Final, NamedTuple
 
 from estimator.friction import DIRECTION_VELOCITY_RAD_S
@@ -58,9 +59,12 @@ class FusedObserver:
         "_cos2",
         "_cos4",
         "_cubic",
+        "_d",
         "_gear",
+        "_hysteresis",
         "_inertia_rate",
         "_inverse_gear",
+        "_inverse_travel",
         "_kt",
         "_last",
         "_link",
@@ -70,6 +74,7 @@ class FusedObserver:
         "_rate",
         "_sin2",
         "_sin4",
+        "_slip",
         "_state",
         "_stiffness",
         "_torsion_limit",
@@ -88,6 +93,10 @@ class FusedObserver:
         self._stiffness: Final = 0.0 if torsion is None else torsion.stiffness_nm_per_rad
         self._cubic: Final = 0.0 if torsion is None else torsion.cubic_nm_per_rad3
         self._zero: Final = 0.0 if torsion is None else torsion.zero_rad
+        self._hysteresis: Final = 0.0 if torsion is None else torsion.hysteresis_nm
+        self._inverse_travel: Final = 0.0 if torsion is None else 1.0 / torsion.hysteresis_travel_rad
+        self._slip = 0.0
+        self._d = nan
         self._torsion_limit: Final = RAW_LIMIT * joint.rated_torque_nm
         waves = [] if torsion is None else _waves(torsion)
         # the ripple angles are there anyway: a kinematic error of their orders costs no further cos and sin
@@ -127,6 +136,18 @@ class FusedObserver:
         )
         if self._others:
             d -= self._other_waves(angle)
+        torsion = d * (self._stiffness + self._cubic * d * d)
+        if self._hysteresis:
+            z = self._slip + (d - self._d) * self._inverse_travel
+            if z > 1.0:
+                z = 1.0
+            elif z < -1.0:
+                z = -1.0
+            elif isnan(z):  # the first sample
+                z = 0.0
+            self._slip = z
+            self._d = d
+            torsion += self._hysteresis * z
         v = motor_velocity_rad_s * self._inverse_gear
         if v > _SETTLED_RAD_S:
             direction = 1.0
@@ -137,7 +158,7 @@ class FusedObserver:
         return (
             current_a * self._kt + self._inertia_rate * motor_velocity_rad_s,
             v,
-            d * (self._stiffness + self._cubic * d * d),
+            torsion,
             c2,
             s2,
             c4,
@@ -163,6 +184,7 @@ class FusedObserver:
         link_position_rad: float,
     ) -> FusedObserved:
         """Set the states of a joint that has always moved at this speed with this torsion."""
+        self._d = nan
         now = self._inputs(current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
         self._last = self._state = now
         self._link = link_position_rad

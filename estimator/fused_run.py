@@ -16,7 +16,7 @@ from estimator.fused_network import FusedNetworkModel
 from estimator.fused_observer import FusedObserved, FusedObserver
 from estimator.fused_parameters import Torsion
 from estimator.fused_trust import FusedTrust
-from estimator.fusion import Fusion, held_many
+from estimator.fusion import Fusion, held_many, turning_many
 from estimator.parameters import Joint
 from estimator.settings import EstimatorSettings
 from estimator.status import DEGRADED, INVALID, STANDSTILL, VALID
@@ -97,15 +97,13 @@ def observe_run(  # noqa: PLR0917 - as a sample, in arrays
 
 
 def network_features(seen: ObservedRun, current_path_nm: FloatArray) -> FloatArray:
-    """Return FUSED_FEATURES [n, 9]; current_path_nm [n]: motor torque less loss; link angles must be finite."""
+    """Return FUSED_FEATURES [n, 7]; current_path_nm [n]: motor torque less loss."""
     return np.column_stack(
         (
             seen.velocity_rad_s,
             seen.raw_nm,
             seen.torsion_nm - current_path_nm,
             seen.waves,
-            np.cos(seen.link_rad),
-            np.sin(seen.link_rad),
         )
     )
 
@@ -119,7 +117,7 @@ def quadrant_many(raw_nm: FloatArray, velocity_rad_s: FloatArray) -> QuadrantArr
 def estimate_observed(
     joint: Joint, settings: EstimatorSettings, network: FusedNetworkModel | None, seen: ObservedRun
 ) -> EstimateRun:
-    """Return the estimates of an observed run (observed with the joint's own torsion); features are [n, 9].
+    """Return the estimates of an observed run (observed with the joint's own torsion); features are [n, 7].
 
     Raises ConfigError as FusedEstimator does.
     """
@@ -143,7 +141,7 @@ def estimate_observed(
             limit = settings.network_limit * joint.rated_torque_nm
             weight = _weight(used, at, raw - loss, correction, limit)
             answer = physics + correction
-            torque = physics + np.where(weight > 0.0, weight * at.direction**2 * correction, 0.0)
+            torque = physics + np.where(weight > 0.0, weight * turning_many(v) * correction, 0.0)
             scale = scale + weight * (np.array(used.sigma_scale)[quadrant] - scale)
             status[(status == VALID) & (weight < 1.0)] = DEGRADED
         open_nm = (1.0 + settings.friction_uncertainty) * half + settings.sigma_floor * joint.rated_torque_nm

@@ -21,8 +21,25 @@ import numpy as np
 from estimator.friction import FloatArray
 from estimator.fused_parameters import FusedSigma
 
+SLOW_RAD_S: Final = 0.05
+FAST_RAD_S: Final = 0.2
+"""The network fades in between these speeds: slower, a wave of the motor angle looks like an offset."""
+
 HOLD_S: Final = 0.05
 """Time constant with which the friction interval is forgotten after a reversal."""
+
+
+def turning(velocity_rad_s: float) -> float:
+    """Return the network's share at this speed, 0 to 1."""
+    a = velocity_rad_s if velocity_rad_s >= 0.0 else -velocity_rad_s
+    if a >= FAST_RAD_S:
+        return 1.0
+    return (a - SLOW_RAD_S) * (1.0 / (FAST_RAD_S - SLOW_RAD_S)) if a > SLOW_RAD_S else 0.0
+
+
+def turning_many(velocity_rad_s: FloatArray) -> FloatArray:
+    """Vectorised twin of `turning`."""
+    return np.clip((np.abs(velocity_rad_s) - SLOW_RAD_S) * (1.0 / (FAST_RAD_S - SLOW_RAD_S)), 0.0, 1.0)
 
 
 def held(half_nm: float, before_nm: float, dt_s: float) -> float:

@@ -1,9 +1,9 @@
 """Our network trained on runs: a correction to the fused physics, its envelope, and its calibrated sigma. Pure.
 
-What is slow in a run's residual is taken out of the target (a running mean over half a second): it holds that
-run's zeros and that day's friction, which no feature can tell, and a network that learns them from one day spoils
-the next. What is left turns with the motor: ripple and kinematic error. sigma_scale comes from runs that neither
-the physics nor the network of their fold had seen.
+The network gives gains of waves (sysid/gated_network.py): it corrects what turns with the motor and cannot
+learn anything else, as a run's zeros or a day's friction. What is slow in a run's residual is taken out of its target
+too (a running mean over half a second), because it is nothing but noise to these gains. sigma_scale comes from runs
+that neither the physics nor the network of their fold had seen.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ from estimator.fused_network import FUSED_FEATURES
 from estimator.fused_parameters import AdditiveLoss, FusedSigma, Torsion
 from estimator.fused_run import network_features, quadrant_many
 from estimator.fused_trust import Envelope
-from estimator.fusion import Fusion
+from estimator.fusion import Fusion, turning_many
 from estimator.parameters import Joint
 from sysid.fused_fit import folds, loss_and_width
+from sysid.gated_network import export_gated, gated_output
 from sysid.loss_fit import fit_loss
-from sysid.paper_network import TrainedNetwork, digest_of, exported, network_output, thinned
+from sysid.paper_network import TrainedNetwork, digest_of, thinned
 from sysid.run_signals import RunSignals
 from sysid.sigma_fit import conformal_scale
 from sysid.torsion_fit import fit_torsion, torsion_torque
@@ -32,6 +33,8 @@ from sysid.training import Trained, train
 Table = np.ndarray[tuple[int, int], np.dtype[np.bool_]]
 
 HIDDEN: Final = (16, 16)
+_CORE: Final = 3
+"""Features that set the gains (speed, motor torque, torsion less current); the others are the waves."""
 _WEIGHT_DECAY: Final = 0.05
 _VELOCITY_STEP_RAD_S: Final = 0.25
 _TORQUE_STEP_NM: Final = 3.0
@@ -43,7 +46,7 @@ _VISITS: Final = 20
 
 
 class Seen:
-    """A run through physics with given parameters: features [n, 9], physics and sigma [n], all of moving samples."""
+    """A run through physics with given parameters: features [n, 7], physics and sigma [n], all of moving samples."""
 
     def __init__(self, run: RunSignals, loss: AdditiveLoss, torsion: Torsion, sigma: FusedSigma) -> None:
         keep = run.moving
@@ -54,6 +57,8 @@ class Seen:
         )
         self.name = run.name
         self.features: FloatArray = network_features(seen, seen.raw_nm - value)[keep]
+        turning = turning_many(seen.velocity_rad_s[keep])
+        self.waves: FloatArray = self.features[:, _CORE:] * turning[:, None]
         self.residual_nm: FloatArray = (run.sensor_nm - physics)[keep]
         self.sigma_nm: FloatArray = spread[keep]
         self.quadrant = quadrant_many(seen.raw_nm[keep], seen.velocity_rad_s[keep])
@@ -82,7 +87,7 @@ def train_fused(
         trained = _train([Seen(run, loss, torsion, fused.sigma) for run in known], iterations, seed, progress)
         for n in judged:
             one = Seen(runs[n], loss, torsion, fused.sigma)
-            unseen.append((one, network_output(trained, one.features)))
+            unseen.append((one, gated_output(trained, one.features[:, :_CORE], one.waves)))
     share = safe_share([(one.residual_nm, correction) for one, correction in unseen])
     errors = [one.residual_nm - share * correction for one, correction in unseen]
     scores = {
@@ -91,7 +96,7 @@ def train_fused(
     }
     blocks = [Seen(run, fused.loss, fused.torsion, fused.sigma) for run in runs]
     trained = _train(blocks, iterations, seed, progress)
-    trained = replace(trained, output_mean=share * trained.output_mean, output_std=share * trained.output_std)
+    trained = replace(trained, output_std=share * trained.output_std)
     features = np.concatenate([block.features for block in blocks])
     low, high = np.quantile(features, [1e-4, 1.0 - 1e-4], axis=0)
     metadata = {
@@ -107,7 +112,8 @@ def train_fused(
         "data_sha256": digest_of(hashes),
         "runs": hashes,
     }
-    return TrainedNetwork(exported(trained, metadata), trained, metadata, scores)
+    data = export_gated(trained, len(FUSED_FEATURES) - _CORE, metadata)
+    return TrainedNetwork(data, trained, metadata, scores)
 
 
 def safe_share(unseen: Sequence[tuple[FloatArray, FloatArray]]) -> float:
@@ -142,11 +148,12 @@ def _train(
     blocks: Sequence[Seen], iterations: int, seed: int, progress: Callable[[int, float], None]
 ) -> Trained:
     return train(
-        thinned([block.features for block in blocks]),
+        thinned([block.features[:, :_CORE] for block in blocks]),
         thinned([quick_part(block.residual_nm) for block in blocks]),
         iterations=iterations,
         seed=seed,
         hidden=HIDDEN,
+        waves=thinned([block.waves for block in blocks]),
         weight_decay=_WEIGHT_DECAY,
         progress=progress,
     )

@@ -24,7 +24,11 @@ IR_VERSION: Final = 9  # what the oldest supported onnxruntime reads
 
 
 def _checked(
-    weights: Sequence[Layer], input_mean: FloatArray, input_std: FloatArray, output_std: float
+    weights: Sequence[Layer],
+    input_mean: FloatArray,
+    input_std: FloatArray,
+    output_std: float,
+    last_is_one: bool = True,
 ) -> list[Layer]:
     layers = [(np.asarray(w, np.float64), np.asarray(b, np.float64)) for w, b in weights]
     width = len(input_mean)
@@ -34,7 +38,7 @@ def _checked(
                 f"layer {n}: found W {w.shape} and b {b.shape}, expected W ({width}, m) and b (m,)"
             )
         width = w.shape[1]
-    if not layers or width != 1:
+    if not layers or (last_is_one and width != 1):
         raise ValueError(f"found {width} outputs, expected 1")
     if len(input_std) != len(input_mean) or not (np.all(np.asarray(input_std) > 0.0) and output_std > 0.0):
         raise ValueError("found a standard deviation that is not > 0, or not one per input")
@@ -104,6 +108,31 @@ def _folded(
     return result
 
 
+def folded_layers(  # noqa: PLR0917
+    weights: Sequence[Layer],
+    input_mean: FloatArray,
+    input_std: FloatArray,
+    output_mean: float,
+    output_std: float,
+    last_is_one: bool = True,
+) -> list[Layer]:
+    """Return weights over plain tanh and raw quantities; last_is_one: the network must have one output. ValueError."""
+    layers = _checked(weights, input_mean, input_std, output_std, last_is_one)
+    return _folded(layers, input_mean, input_std, output_mean, output_std)
+
+
+def hidden_output(
+    weights: Sequence[Layer], input_mean: FloatArray, input_std: FloatArray, x: FloatArray
+) -> FloatArray:
+    """Return the last layer's standardised outputs [n, m] for x [n, inputs] in numpy, by Eq. (9) itself."""
+    h: FloatArray = (x - input_mean) / input_std
+    for n, (w, b) in enumerate(weights):
+        h = h @ w + b
+        if n < len(weights) - 1:
+            h = (1.0 - np.exp(-h)) / (1.0 + np.exp(-h))
+    return h
+
+
 def forward(  # noqa: PLR0917 - twin of export_network
     weights: Sequence[Layer],
     input_mean: FloatArray,
@@ -114,10 +143,5 @@ def forward(  # noqa: PLR0917 - twin of export_network
 ) -> FloatArray:
     """Return the output [n] for x [n, inputs] in numpy: what the exported graph must equal."""
     layers = _checked(weights, input_mean, input_std, output_std)
-    h: FloatArray = (x - input_mean) / input_std
-    for n, (w, b) in enumerate(layers):
-        h = h @ w + b
-        if n < len(layers) - 1:
-            h = (1.0 - np.exp(-h)) / (1.0 + np.exp(-h))
-    result: FloatArray = output_mean + output_std * h[:, 0]
+    result: FloatArray = output_mean + output_std * hidden_output(layers, input_mean, input_std, x)[:, 0]
     return result

@@ -13,6 +13,7 @@ Where a whole run shares its error (its zeros), n runs have not shown the larges
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
@@ -97,13 +98,22 @@ def conformal_scale(
     return a, b, c, d
 
 
+_HIGHEST_LEVEL: Final = 0.97
+
+
 def _quantile_by_runs(parts: Sequence[FloatArray]) -> float:
-    """Return the COVERAGE quantile of the samples of all parts, each part with the same weight."""
+    """Return the quantile of the samples of all parts, each part with the same weight, for COVERAGE on a new part.
+
+    Runs are what is exchangeable, not samples: with n of them the level is ceil((n + 1) COVERAGE)/n, the finite-sample
+    correction of split conformal prediction (Lei et al. 2018); at most _HIGHEST_LEVEL: the largest of few says nothing.
+    """
     values = np.concatenate(parts)
     weights = np.concatenate([np.full(len(part), 1.0 / max(len(part), 1)) for part in parts])
     order = np.argsort(values)
     share = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(share, COVERAGE * share[-1])])
+    level = min(_HIGHEST_LEVEL, math.ceil((len(parts) + 1) * COVERAGE) / len(parts))
+    at = min(int(np.searchsorted(share, level * share[-1] * (1.0 - 1e-12))), len(values) - 1)
+    return float(values[order][at])
 
 
 def quadrants_of(run: PathResiduals) -> QuadrantArray:

@@ -1,16 +1,19 @@
 """Fit of the torsion: stiffness and kinematic error from both encoders and the torque sensor. Pure.
 
-    sensor = K d + K3 d^3 - K sum_n (c_n cos(n theta_m) + s_n sin(n theta_m)) + zero of the run
+    sensor = K d + K3 d^3 + H z - K sum_n (c_n cos(n theta_m) + s_n sin(n theta_m)) + zero of the run
 
 d is the filtered torsion angle less its offsets, and so are the waves; the fit is repeated with the offsets found, so
 that the cubic acts on the deflection alone. Each run has a zero of its own: the sensor's zero and the link
 encoder's cannot be told apart in one run; their mean over the runs is the torsion's zero.
+
+z is d through a Maxwell-slip element; its travel is the best of a grid. A hysteresis is written only when it takes away
+a twentieth of the residual variance and dissipates (H > 0).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -24,6 +27,10 @@ _ORDERS: Final = tuple(float(order) for order in RIPPLE_ORDERS)
 _COMMON: Final = 7
 """Columns that all runs share: d, d^3, the four waves, and the zero."""
 _REPETITIONS: Final = 3
+_TRAVELS_RAD: Final = (3e-5, 5e-5, 7e-5, 1e-4, 1.4e-4, 2e-4, 3e-4)
+"""From a tenth of an arc minute to one: harmonic drives lose less than that (lost motion, hysteresis)."""
+_HYSTERESIS_WORTH: Final = 0.05
+"""Part of the residual variance that a hysteresis must take away to be believed."""
 _ZERO_SIGMA_NM: Final = 0.5  # a priori, per run: far more than a good sensor drifts
 _CUBIC_SHARE: Final = 0.5  # a priori sigma of K3 d^3 at the largest d, as a share of the largest torque
 
@@ -39,31 +46,73 @@ def fit_torsion(runs: Sequence[RunSignals]) -> Torsion:
     )
     if largest <= 0.0:
         raise TorsionError("found no torsion between motor and link encoder, expected some under load")
-    offsets = np.zeros(_COMMON - 2)  # kinematic error (c2, s2, c4, s4) and zero [rad]
-    for _ in range(_REPETITIONS):
-        x, y = _equations(runs, offsets, largest)
-        if len(y) < 10 * x.shape[1]:
-            raise TorsionError(f"found {len(y)} moving samples, expected at least {10 * x.shape[1]}")
-        w = _solve(x, y)
-        stiffness = float(w[0]) / largest
-        if not stiffness > 0.0:
-            raise TorsionError(f"found a stiffness of {stiffness:.3g} Nm/rad, expected one > 0")
-        offsets = offsets - w[2:_COMMON] / stiffness
-    c2, s2, c4, s4, zero = offsets.tolist()
+    best = _fit(runs, largest, np.zeros(_COMMON - 2), None)
+    least = (1.0 - _HYSTERESIS_WORTH) * best.residual_nm2
+    offsets = best.offsets
+    for travel in _TRAVELS_RAD:
+        found = _fit(runs, largest, offsets, travel)
+        if found.hysteresis_nm > 0.0 and found.residual_nm2 < least:
+            best, least = found, found.residual_nm2
+    c2, s2, c4, s4, zero = best.offsets.tolist()
     return Torsion(
-        stiffness_nm_per_rad=stiffness,
-        cubic_nm_per_rad3=float(w[1]) / largest**3,
+        stiffness_nm_per_rad=best.stiffness,
+        cubic_nm_per_rad3=best.cubic,
         zero_rad=zero,
         orders_per_motor_rev=_ORDERS,
         cos_rad=(c2, c4),
         sin_rad=(s2, s4),
+        hysteresis_nm=best.hysteresis_nm,
+        hysteresis_travel_rad=best.travel_rad,
     )
 
 
+class _Found(NamedTuple):
+    """One solution; offsets: kinematic error (c2, s2, c4, s4) and zero [rad]; residual variance [Nm^2]."""
+
+    stiffness: float
+    cubic: float
+    offsets: FloatArray
+    hysteresis_nm: float
+    travel_rad: float
+    residual_nm2: float
+
+
+def _fit(runs: Sequence[RunSignals], largest: float, offsets: FloatArray, travel_rad: float | None) -> _Found:
+    """Solve with the hysteresis of one travel, or without; the offsets found are taken out and the fit repeated."""
+    for _ in range(_REPETITIONS):
+        x, y = _equations(runs, offsets, largest, travel_rad)
+        if len(y) < 10 * x.shape[1]:
+            raise TorsionError(f"found {len(y)} moving samples, expected at least {10 * x.shape[1]}")
+        w = _solve(x, y, _COMMON + (travel_rad is not None))
+        stiffness = float(w[0]) / largest
+        if not stiffness > 0.0:
+            raise TorsionError(f"found a stiffness of {stiffness:.3g} Nm/rad, expected one > 0")
+        offsets = offsets - w[2:_COMMON] / stiffness
+    return _Found(
+        stiffness,
+        float(w[1]) / largest**3,
+        offsets,
+        0.0 if travel_rad is None else float(w[_COMMON]),
+        travel_rad or _TRAVELS_RAD[0],
+        float(np.mean((y - x @ w) ** 2)),
+    )
+
+
+def slipped(d_rad: FloatArray, travel_rad: float) -> FloatArray:
+    """Return z [n] of a Maxwell-slip element that follows d [n]; 0 at the first sample and where d is NaN."""
+    out = np.zeros_like(d_rad)
+    known = np.flatnonzero(np.isfinite(d_rad))
+    z = 0.0
+    for k, step in zip(known[1:].tolist(), np.diff(d_rad[known] / travel_rad).tolist(), strict=True):
+        z = min(max(z + step, -1.0), 1.0)
+        out[k] = z
+    return out
+
+
 def _equations(
-    runs: Sequence[RunSignals], offsets: FloatArray, largest: float
+    runs: Sequence[RunSignals], offsets: FloatArray, largest: float, travel_rad: float | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return columns [n, _COMMON + runs] and sensor [n] of all moving samples, thinned.
+    """Return columns [n, _COMMON (+ 1) + runs] and sensor [n] of all moving samples, thinned.
 
     d is less what is known of its offsets, and in parts of `largest`: then its cube carries no wave and no zero.
     """
@@ -71,32 +120,35 @@ def _equations(
     targets: list[FloatArray] = []
     for n, run in enumerate(runs):
         keep = np.flatnonzero(run.moving)[::_EVERY]
-        shared = np.column_stack((run.seen.waves[keep], np.ones(len(keep))))
-        d = (run.seen.torsion_nm[keep] - shared @ offsets) / largest
+        shared = np.column_stack((run.seen.waves, np.ones(len(run.seen.waves))))
+        d = run.seen.torsion_nm - shared @ offsets
+        columns = [d[keep] / largest, (d[keep] / largest) ** 3, shared[keep]]
+        if travel_rad is not None:
+            columns.append(slipped(d, travel_rad)[keep])
         zero = np.zeros((len(keep), len(runs)))
         zero[:, n] = 1.0
-        blocks.append(np.column_stack((d, d**3, shared, zero)))
+        blocks.append(np.column_stack((*columns, zero)))
         targets.append(run.sensor_nm[keep])
     return np.vstack(blocks), np.concatenate(targets)
 
 
-def _solve(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the most probable coefficients."""
-    noise = _noise_of(x, y)
+def _solve(x: FloatArray, y: FloatArray, shared: int) -> FloatArray:
+    """Return the most probable coefficients; the first `shared` columns belong to all runs."""
+    noise = _noise_of(x, y, shared)
     prior = np.zeros(x.shape[1])
     prior[1] = noise / max(_CUBIC_SHARE * float(np.abs(y).max()), 1e-9) ** 2
-    prior[_COMMON:] = noise / _ZERO_SIGMA_NM**2
+    prior[shared:] = noise / _ZERO_SIGMA_NM**2
     return np.asarray(np.linalg.lstsq(x.T @ x + np.diag(prior), x.T @ y, rcond=None)[0], np.float64)
 
 
-def _noise_of(x: FloatArray, y: FloatArray) -> float:
+def _noise_of(x: FloatArray, y: FloatArray, shared: int) -> float:
     """Return the residual variance with one zero for all runs [Nm^2]."""
-    w = np.linalg.lstsq(x[:, :_COMMON], y, rcond=None)[0]
-    return float(np.mean((y - x[:, :_COMMON] @ w) ** 2))
+    w = np.linalg.lstsq(x[:, :shared], y, rcond=None)[0]
+    return float(np.mean((y - x[:, :shared] @ w) ** 2))
 
 
 def torsion_torque(torsion: Torsion, run: RunSignals) -> FloatArray:
-    """Return tau_t [n] of observed signals, as FusedObserver gives it but for the order of filter and cube.
+    """Return tau_t [n] of observed signals, as FusedObserver gives it but for the order of filter and cube or slip.
 
     Raises ValueError for a kinematic error of other orders than RIPPLE_ORDERS, whose waves the signals hold.
     """
@@ -105,4 +157,6 @@ def torsion_torque(torsion: Torsion, run: RunSignals) -> FloatArray:
     pairs = np.column_stack((torsion.cos_rad, torsion.sin_rad)).ravel()  # c2, s2, c4, s4 as the waves
     d = run.seen.torsion_nm - torsion.zero_rad - run.seen.waves @ pairs
     result: FloatArray = d * (torsion.stiffness_nm_per_rad + torsion.cubic_nm_per_rad3 * d * d)
+    if torsion.hysteresis_nm > 0.0:
+        result = result + torsion.hysteresis_nm * slipped(d, torsion.hysteresis_travel_rad)
     return result

@@ -108,7 +108,7 @@ def _parser() -> argparse.ArgumentParser:
         "--network",
         choices=sorted(_ITERATIONS),
         required=True,
-        help="paper: section III, absolute angles, 6-20-40-10-1; ours: correction to the fused physics, 9-16-16-1",
+        help="paper: section III, absolute angles, 6-20-40-10-1; ours: correction to the fused physics, 7-16-16-4",
     )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="where networks and cards go; made if missing"

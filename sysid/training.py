@@ -45,6 +45,7 @@ def train(
     iterations: int,
     seed: int,
     hidden: tuple[int, ...] = HIDDEN,
+    waves: FloatArray | None = None,
     weight_decay: float = 0.0,
     progress: Callable[[int, float], None] = lambda n, loss: None,
 ) -> Trained:
@@ -56,6 +57,8 @@ def train(
         iterations: each BATCHES batches of BATCH samples, or all samples where there are fewer.
         seed: of initial weights and batches.
         hidden: widths of the hidden layers.
+        waves: [n, m]; when given, the network has m outputs, each the gain of one wave, and their sum is the result:
+            it has no part that does not turn with the waves, and no mean.
         weight_decay: of AdamW; 0 is Adam.
         progress: called with iteration and mean loss [Nm^2].
     """
@@ -66,9 +69,12 @@ def train(
     torch.use_deterministic_algorithms(True)
     mean, std = features.mean(axis=0), np.maximum(features.std(axis=0), 1e-9)
     output_mean, output_std = float(target_nm.mean()), max(float(target_nm.std()), 1e-9)
+    outputs, wave = 1, None
+    if waves is not None:
+        output_mean, outputs, wave = 0.0, waves.shape[1], torch.tensor(waves, dtype=torch.float32)
     x = torch.tensor((features - mean) / std, dtype=torch.float32)
     y = torch.tensor((target_nm - output_mean) / output_std, dtype=torch.float32)[:, None]
-    layers = _layers((features.shape[1], *hidden, 1))
+    layers = _layers((features.shape[1], *hidden, outputs))
     parameters = [parameter for layer in layers for parameter in layer.parameters()]
     optimiser = torch.optim.AdamW(parameters, lr=_RATE, weight_decay=weight_decay)
     used = min(len(x), BATCH * BATCHES)
@@ -81,7 +87,10 @@ def train(
         total = 0.0
         for part in torch.randperm(len(x))[:used].tensor_split(batches):
             optimiser.zero_grad(set_to_none=True)
-            loss = torch.nn.functional.mse_loss(_forward(layers, x[part]), y[part])
+            out = _forward(layers, x[part])
+            if wave is not None:
+                out = (out * wave[part]).sum(dim=1, keepdim=True)
+            loss = torch.nn.functional.mse_loss(out, y[part])
             loss.backward()
             optimiser.step()
             schedule.step()

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -20,6 +20,8 @@ from estimator.status import VALID
 from models.files import load_joint, shipped
 from sim_can.emulated_run import JointCommand, emulate_run
 from sim_can.plant_parameters import load_plant
+from sim_can.run_table_file import write_run
+from sysid.evaluate.command import main
 from sysid.evaluate.samples import Samples
 from sysid.joint_writer import write_joint
 from sysid.onnx_export import export_network
@@ -145,6 +147,33 @@ def emulated(velocity_joint: int, kind: str, seconds: float, day: int = 0) -> Ru
         velocity, current = JointCommand.velocity(steps(2.5, -1.5)), JointCommand.current(steps(4.5, -2.0))
     commands = (velocity, current) if velocity_joint == 1 else (current, velocity)
     return emulate_run(plant, commands, seconds, 3, day=day)
+
+
+def make_bench(base: Path) -> Path:
+    """base/models, and base/runs with two runs at variable velocity, of either joint, and one at constant velocity."""
+    write_models(base / "models")
+    (base / "runs").mkdir()
+    plans = ((1, "variable", 3.0), (2, "variable", 3.0), (1, "constant", 5.0))
+    for number, (joint, kind, seconds) in enumerate(plans):
+        write_run(base / "runs" / f"{kind}_{joint}.csv.gz", emulated(joint, kind, seconds, day=number))
+    return base
+
+
+NO_PICTURES: Final = {
+    "constant": {},
+    "run": None,
+    "paper": None,
+    "runs": {},
+    "velocities": {},
+    "calibration": None,
+}
+"""In place of `sysid.evaluate.report.pictures`, which takes most of the time."""
+
+
+def evaluate(base: Path, runs: list[Path], *options: str, models: Path | None = None) -> int:
+    """Exit status of `jtq evaluate` on runs with base/models, or other ones, into base/out, or as the options say."""
+    where = models or base / "models"
+    return main([*map(str, runs), "--models", str(where), "--out", str(base / "out"), *options])
 
 
 def report(directory: Path) -> dict[str, Any]:

@@ -17,9 +17,9 @@ from estimator.parameters import Joint
 from tests.estimator_helpers import Motion, SmallNetwork, joint1, motion
 
 NODES = (-30.0, -12.0, -4.0, 0.0, 3.0, 9.0, 21.0, 40.0)
-SIZES = (9, 16, 16, 1)
-LOW = (-3.5, -50.0, -4.0, *([-1.0] * 6))
-HIGH = (3.5, 50.0, 4.0, *([1.0] * 6))
+SIZES = (7, 16, 16, 1)
+LOW = (-3.5, -50.0, -4.0, *([-1.0] * 4))
+HIGH = (3.5, 50.0, 4.0, *([1.0] * 4))
 TRAINED_C = (20.0, 32.0)
 
 
@@ -66,7 +66,7 @@ def patches(seed: int, temperature_c: tuple[float, float] | None = TRAINED_C) ->
 
 
 def fused_network(seed: int = 1, noise: float = 0.4, size_nm: float = 1.0, **metadata: Any) -> SmallNetwork:
-    """9-16-16-1 of random weights; `size_nm` scales its answer. Metadata `...` leaves a key out."""
+    """7-16-16-1 of random weights; `size_nm` scales its answer. Metadata `...` leaves a key out."""
     rng = np.random.default_rng(seed)
     layers = tuple((noise * rng.normal(size=(m, n)), noise * rng.normal(size=n)) for m, n in pairwise(SIZES))
     values = {
@@ -79,7 +79,7 @@ def fused_network(seed: int = 1, noise: float = 0.4, size_nm: float = 1.0, **met
         "data_sha256": "cd" * 32,
     }
     kept = {key: value for key, value in (values | metadata).items() if value is not ...}
-    return SmallNetwork(layers, np.zeros(9), np.array(HIGH), 0.0, size_nm, kept)
+    return SmallNetwork(layers, np.zeros(7), np.array(HIGH), 0.0, size_nm, kept)
 
 
 class FakeNetwork:

@@ -15,9 +15,9 @@ from sim_can.emulated_run import JointCommand, emulate_run
 from sim_can.plant_parameters import load_plant, plant_of_joint
 from sim_can.run_files import ColumnMap, read_run
 from sysid.channel_checks import check_channels, gear_ratio_of
-from sysid.excitation import Excitation, random_current, random_velocity
 from tests.campaign_helpers import plateau_run
 from tests.estimator_helpers import joint1
+from tests.random_motion import Excitation, random_current, random_velocity
 
 JOINT = joint1()
 POINTS = [(v, i) for v in (0.4, 2.0, -1.0) for i in (0.0, 3.0, 5.0, -4.0)]

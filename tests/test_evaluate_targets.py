@@ -139,9 +139,10 @@ def test_outside_every_joint_counts(ours: float, flagged: float, reached: tuple[
 
 @pytest.mark.parametrize(("nm", "reached"), [(0.19, True), (0.21, False)])
 def test_the_largest_jump_of_ours_counts_and_the_papers_is_shown(nm: float, reached: bool) -> None:
-    jump = Jump(nm, "run", 1, 0.5, "v = 0", 3, 0.1, 0.4)
+    jump = Jump(nm, "run", 1, 0.5, "v = 0", 3, 0.1, 0.4, 0.15)
     result = replace(EMPTY, jumps={"fused": jump, "network": jump}, passages={"fused": jump._replace(nm=0.9)})
     assert target(result, "jump_fused").reached is reached
     assert target(result, "jump_network").reached is None
     assert target(result, "jump_network").ours == f"{nm:.2f} Nm"
-    assert "0.90 Nm" in target(result, "jump_fused").details[1]
+    assert "0.15 Nm" in target(result, "jump_fused").details[1]
+    assert "0.90 Nm" in target(result, "jump_fused").details[2]

@@ -162,7 +162,7 @@ def test_no_jump_where_the_network_leaves_its_limit() -> None:
 
 
 def test_the_network_fades_at_standstill() -> None:
-    for v, share in ((1.0, 1.0), (0.02, math.tanh(1.0) ** 2), (0.005, math.tanh(0.25) ** 2), (0.0, 0.0)):
+    for v, share in ((1.0, 1.0), (0.2, 1.0), (0.125, 0.5), (-0.08, 0.2), (0.05, 0.0), (0.0, 0.0)):
         got = steady(estimator(says(1.5)), 3.0, v)
         assert got.torque_nm - got.physics_nm == pytest.approx(share * 1.5, abs=1e-9)
 

@@ -72,11 +72,13 @@ def test_the_scaled_interval_covers_90_percent_of_runs_it_has_not_seen() -> None
             error, sigma, where = heteroscedastic(rng)
             inside = np.abs(error) <= GAUSS * scale[quadrant] * sigma
             covered.append(np.mean(inside[where == quadrant]))
-        assert np.mean(covered) == pytest.approx(0.9, abs=0.015), quadrant
+        assert 0.895 < np.mean(covered) < 0.935, (
+            quadrant
+        )  # the finite-sample correction of 60 runs aims at 0.917
 
 
 def test_errors_that_whole_runs_share_are_covered_nearly_as_well() -> None:
-    """Each run has its own zero and little else, calibrated on 8 runs: 87 % on average over 200 campaigns."""
+    """Each run has its own zero and little else, calibrated on 20 runs: 90 to 95 % on average over 200 campaigns."""
     rng = np.random.default_rng(36)
     one, where = np.ones(100), np.zeros(100, int)
 
@@ -85,16 +87,17 @@ def test_errors_that_whole_runs_share_are_covered_nearly_as_well() -> None:
 
     covered = []
     for _ in range(200):
-        scale = conformal_scale([error() for _ in range(8)], [one] * 8, [where] * 8)[0]
+        scale = conformal_scale([error() for _ in range(20)], [one] * 20, [where] * 20)[0]
         covered.append(np.mean(np.abs([error() for _ in range(40)]) <= GAUSS * scale))
-    assert np.mean(covered) == pytest.approx(0.87, abs=0.025)
+    assert np.mean(covered) == pytest.approx(0.925, abs=0.02)
 
 
 def test_gaussian_errors_of_the_believed_size_need_no_factor() -> None:
     rng = np.random.default_rng(34)
     one = np.ones(4000)
-    runs = [(rng.normal(size=4000), one, rng.integers(0, 4, 4000)) for _ in range(10)]
-    assert conformal_scale(*zip(*runs, strict=True)) == pytest.approx((1.0,) * 4, abs=0.03)
+    runs = [(rng.normal(size=4000), one, rng.integers(0, 4, 4000)) for _ in range(100)]
+    # 100 runs: level 0.91, a quantile of 1.695 against 1.645
+    assert conformal_scale(*zip(*runs, strict=True)) == pytest.approx((1.03,) * 4, abs=0.01)
 
 
 def test_runs_count_alike_whatever_their_length() -> None:
@@ -110,7 +113,7 @@ def test_a_quadrant_without_samples_takes_the_factor_of_all() -> None:
     rng = np.random.default_rng(35)
     runs = [(3.0 * rng.normal(size=500), np.ones(500), np.repeat((0, 1), (480, 20))) for _ in range(20)]
     scale = conformal_scale(*zip(*runs, strict=True))
-    assert scale[1] == scale[2] == scale[3] == pytest.approx(3.0, abs=0.1)
+    assert scale[1] == scale[2] == scale[3] == pytest.approx(3.0 * 1.96 / 1.645, abs=0.1)  # level 0.95
     with pytest.raises(ValueError, match="found no samples to calibrate sigma with"):
         conformal_scale([np.zeros(0)] * 2, [np.zeros(0)] * 2, [np.zeros(0, int)] * 2)
 
@@ -179,7 +182,7 @@ def test_unseen_runs_are_as_wrong_as_sigma_says(runs: list[RunSignals], fit: Fus
             assert np.sqrt(np.mean(error**2)) == pytest.approx(fit.unseen_rmse_nm[n], rel=1e-6)
             scale = np.array(fit.fused.sigma.scale)[quadrants_of(parts)]
             judged.append(np.mean(np.abs(error) <= GAUSS * scale * sigma))
-    assert np.mean(judged) == pytest.approx(0.9, abs=0.01)
+    assert 0.89 < np.mean(judged) < 0.98  # few runs: the level of the quantile is up to 0.97
 
 
 def test_the_error_of_the_fused_value(runs: list[RunSignals], fit: FusedFit) -> None:

@@ -43,13 +43,13 @@ def test_what_the_file_says(tmp_path: Path) -> None:
 def test_one_sample_many_and_numpy_agree() -> None:
     small = fused_network(5, noise=0.8, size_nm=4.0)
     network = FusedNetwork(small.data)
-    x = np.random.default_rng(6).uniform(LOW, HIGH, (1500, 9)) * 1.5
+    x = np.random.default_rng(6).uniform(LOW, HIGH, (1500, 7)) * 1.5
     expected = small.numpy(x)
     assert np.ptp(expected) > 1.0
     assert network.bound
     assert np.max(np.abs(network.run_many(x) - expected)) < 1e-9
     assert np.max(np.abs(expected - [network.run_one(*row) for row in x.tolist()])) < 1e-9
-    assert math.isnan(network.run_one(math.nan, *[0.0] * 8))
+    assert math.isnan(network.run_one(math.nan, *[0.0] * 6))
     assert network.run_one(*x[0].tolist()) == pytest.approx(
         expected[0], abs=1e-9
     )  # NaN leaves nothing behind
@@ -59,7 +59,7 @@ def test_one_sample_many_and_numpy_agree() -> None:
     ("key", "value", "words"),
     [
         *((key, ..., f"metadata '{key}': missing") for key in fused_network().metadata),
-        ("features", list(FUSED_FEATURES)[::-1], "metadata 'features': found ['sin_link'"),
+        ("features", list(FUSED_FEATURES)[::-1], "metadata 'features': found ['sin_4"),
         (
             "envelope",
             everywhere().to_mapping() | {"distance_nm": 0},
@@ -96,7 +96,7 @@ def test_wrong_metadata(key: str, value: object, words: str) -> None:
 
 
 def test_wrong_graphs() -> None:
-    assert "expected ['N', 9]" in refused(
+    assert "expected ['N', 7]" in refused(
         export_network(
             [(np.ones((6, 1)), np.zeros(1))], np.zeros(6), np.ones(6), 0.0, 1.0, fused_network().metadata
         )
@@ -108,7 +108,7 @@ def test_wrong_graphs() -> None:
 
 
 def test_the_two_kinds_are_not_mistaken_for_each_other() -> None:
-    assert "expected ['N', 9]" in refused(small_network().data)
+    assert "expected ['N', 7]" in refused(small_network().data)
     with pytest.raises(NetworkError, match=r"expected \['N', 6\]"):
         TorqueNetwork(fused_network().data)
 

@@ -170,3 +170,20 @@ def test_no_finite_angle_raises() -> None:
     o = observer(TORSION)
     o.start(1.0, 0.0, 0.0, 0.0)
     assert math.isnan(o.step(0.001, 1.0, 1e6, 0.0, 0.0).raw_nm)  # impossible torsion: the guard starts again
+
+
+def test_hysteresis_loop_of_the_torsion() -> None:
+    """Slow triangle of the torsion angle: K d on the way up and down, H above it on the way up, H below on the way down."""
+    torsion = replace(TORSION, cubic_nm_per_rad3=0.0, zero_rad=0.0, cos_rad=(0.0, 0.0), sin_rad=(0.0, 0.0))
+    loop = replace(torsion, hysteresis_nm=0.6, hysteresis_travel_rad=1e-4)
+    observer = FusedObserver(joint1(), loop, 200.0, 200.0)
+    angle = 1e-3 * np.concatenate(
+        (np.linspace(0, 1, 2000), np.linspace(1, -1, 4000), np.linspace(-1, 0, 2000))
+    )
+    observer.start(0.0, 0.0, 0.0, 0.0)
+    seen = np.array([observer.step(1e-3, 0.0, 0.0, 0.0, -d).torsion_nm for d in angle.tolist()])
+    plain = loop.stiffness_nm_per_rad * angle
+    lag = loop.stiffness_nm_per_rad * 5e-7 / 1e-3 * 5e-3  # a ramp of 0.5 urad per ms, 1/g late
+    assert seen[1500] - plain[1500] == pytest.approx(0.6 - lag, abs=2e-3)
+    assert seen[4000] - plain[4000] == pytest.approx(-0.6 + lag, abs=2e-3)
+    assert seen[7500] - plain[7500] == pytest.approx(0.6 - lag, abs=2e-3)

@@ -12,7 +12,7 @@ from estimator.observer import first_order_hold
 from estimator.run import JointColumns
 from estimator.status import STANDSTILL
 from sysid.run_signals import UNIT_TORSION, RunSignals, run_signals, same_age
-from sysid.torsion_fit import TorsionError, fit_torsion, torsion_torque
+from sysid.torsion_fit import TorsionError, fit_torsion, slipped, torsion_torque
 from tests.estimator_helpers import joint1
 from tests.fused_helpers import twisted
 from tests.fused_signals import FUSED, STIFF, Nuisance, made_run, one_way, smooth_loss
@@ -138,3 +138,24 @@ def test_a_run_without_what_is_needed_is_refused() -> None:
         ValueError, match="r7: joint joint1: torque_nm: found 3 gaps, expected finite numbers"
     ):
         run_signals("r7", joint1(), FUSED, time, replace(one, torque_nm=holes))
+
+
+def test_hysteresis_is_found_with_its_half_width() -> None:
+    """A loop of +-0.6 Nm over 0.1 mrad: half width to a tenth, stiffness not bent by it; none where there is none."""
+    true = replace(STIFF, hysteresis_nm=0.6, hysteresis_travel_rad=1e-4)
+    runs = []
+    for seed in range(4):
+        run = made_run(seed, smooth_loss(), noise_nm=0.02)
+        pairs = np.column_stack((STIFF.cos_rad, STIFF.sin_rad)).ravel()
+        d = run.seen.torsion_nm - STIFF.zero_rad - run.seen.waves @ pairs
+        runs.append(replace(run, sensor_nm=run.sensor_nm + 0.6 * slipped(d, 1e-4)))
+    found = fit_torsion(runs)
+    assert found.hysteresis_nm == pytest.approx(0.6, rel=0.1)
+    assert found.hysteresis_travel_rad == 1e-4
+    assert found.stiffness_nm_per_rad == pytest.approx(true.stiffness_nm_per_rad, rel=0.01)
+    assert fit_torsion([made_run(seed, smooth_loss()) for seed in range(4)]).hysteresis_nm == 0.0
+
+
+def test_slip_follows_saturates_and_comes_back() -> None:
+    d = np.array([0.0, 0.5, 1.0, 3.0, 2.5, np.nan, 2.0, 0.0, 0.25])
+    assert slipped(d, 1.0).tolist() == [0.0, 0.5, 1.0, 1.0, 0.5, 0.0, 0.0, -1.0, -0.75]

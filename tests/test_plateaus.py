@@ -14,11 +14,11 @@ from estimator.run import JointColumns
 from models.files import shipped
 from sim_can.emulated_run import JointCommand, emulate_run
 from sim_can.plant_parameters import load_plant
-from sysid.excitation import Excitation, random_current, random_velocity
 from sysid.plateaus import Plateau, PlateauError, PlateauRules, find_plateaus, standard_error
 from sysid.ripple_cells import cut_cells, integral, means_between
 from tests.campaign_helpers import plateau_run
 from tests.estimator_helpers import joint1
+from tests.random_motion import Excitation, random_current, random_velocity
 
 JOINT = joint1()
 NM_PER_A = JOINT.gear_ratio * JOINT.torque_constant_nm_per_a

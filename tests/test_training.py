@@ -6,8 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from estimator.fused_network import FUSED_FEATURES, FusedNetwork
 from estimator.network import FEATURES, TorqueNetwork
 from sysid.fused_training import envelope_of, quick_part, safe_share
+from sysid.gated_network import export_gated, gated_output
 from sysid.onnx_export import forward
 from sysid.paper_network import PaperBlock, digest_of, split_by_sample, thinned, train_paper
 from sysid.training import train
@@ -15,6 +17,26 @@ from sysid.training import train
 
 def silent(n, loss):
     """No progress."""
+
+
+def fused_metadata():
+    """What a network of method `fused` must say about itself."""
+    envelope = {
+        "velocity_step_rad_s": 0.25,
+        "torque_step_nm": 3.0,
+        "known": [[1, 1, 1]] * 3,
+        "distance_nm": 2.0,
+        "temperature_c": None,
+    }
+    return {
+        "features": list(FUSED_FEATURES),
+        "envelope": envelope,
+        "sigma_scale": [1.0] * 4,
+        "input_low": [-1.0] * 7,
+        "input_high": [1.0] * 7,
+        "joint": "joint1",
+        "data_sha256": "00",
+    }
 
 
 def blocks_with_zeros(count=10, samples=400, zero_nm=1.0, seed=3):
@@ -134,3 +156,18 @@ def test_envelope_knows_visited_cells_and_holes_between_them():
     assert known[middle[0] + 3].sum() == 0
     assert envelope.temperature_c == (21.5, 27.5)
     assert envelope.distance_nm == pytest.approx(0.5)
+
+
+def test_gated_network_in_numpy_and_as_a_graph_agree_and_have_no_mean():
+    rng = np.random.default_rng(8)
+    core, angle = rng.normal(size=(3000, 3)), rng.uniform(0, 2 * np.pi, 3000)
+    waves = np.column_stack((np.cos(angle), np.sin(angle), np.cos(2 * angle), np.sin(2 * angle)))
+    target = 5.0 + (0.3 + 0.1 * core[:, 0]) * waves[:, 0]
+    trained = train(core, target - 5.0, iterations=200, seed=0, hidden=(8,), waves=waves)
+    out = gated_output(trained, core, waves)
+    assert np.std(out - (target - 5.0)) < 0.03
+    turn = np.linspace(0, 2 * np.pi, 360, endpoint=False)
+    around = np.column_stack((np.cos(turn), np.sin(turn), np.cos(2 * turn), np.sin(2 * turn)))
+    assert abs(gated_output(trained, np.tile(core[0], (360, 1)), around).mean()) < 1e-9
+    data = export_gated(trained, 4, fused_metadata())
+    assert np.abs(FusedNetwork(data).run_many(np.column_stack((core, waves))) - out).max() < 1e-6

@@ -40,7 +40,10 @@ class Crossing(NamedTuple):
 
 
 class Jump(NamedTuple):
-    """The largest jump [Nm] of one method and where it was; median over all `crossings`; largest one unshifted."""
+    """The largest jump [Nm] of one method and where it was; median over all `crossings`; largest one unshifted.
+
+    elsewhere_nm: what one in `crossings` windows anywhere in motion exceeds: as much is noise and dynamics, not crossing.
+    """
 
     nm: float
     run: str
@@ -50,6 +53,7 @@ class Jump(NamedTuple):
     crossings: int
     median_nm: float
     unshifted_nm: float
+    elsewhere_nm: float
 
 
 def crossings(values: FloatArray, band: float) -> list[Crossing]:
@@ -83,7 +87,7 @@ def jumps_around(estimate_nm: FloatArray, sensor_nm: FloatArray, width: int, shi
 def largest_jump(samples: Iterable[Samples], method: str, *, passage: bool = False) -> Jump | None:
     """Return the largest jump of a method over all crossings of all runs; None where nothing is crossed."""
     found: list[tuple[float, Samples, int, str]] = []
-    unshifted = []
+    unshifted, elsewhere = [], []
     for each in samples:
         if method not in each.estimate_nm:
             continue
@@ -91,6 +95,7 @@ def largest_jump(samples: Iterable[Samples], method: str, *, passage: bool = Fal
         estimate = each.estimate_nm[method]
         jump = jumps_around(estimate, each.sensor_nm, 2 * reach + 1, reach)
         strict = jumps_around(estimate, each.sensor_nm, 2 * reach + 1)
+        elsewhere.append(jump[each.scored & np.isfinite(jump)])
         for of, one in _all_crossings(each):
             inside = slice(one.at, one.at + 1)
             if passage:
@@ -103,8 +108,10 @@ def largest_jump(samples: Iterable[Samples], method: str, *, passage: bool = Fal
         return None
     size, each, at, of = max(found, key=lambda item: item[0])
     median = float(np.median([item[0] for item in found]))
+    anywhere = np.concatenate(elsewhere)
+    beyond = float(np.quantile(anywhere, 1.0 - 1.0 / len(found))) if len(anywhere) else np.nan
     time_s = float(each.time_s[at])
-    return Jump(size, each.run, each.number, time_s, of, len(found), median, max(unshifted))
+    return Jump(size, each.run, each.number, time_s, of, len(found), median, max(unshifted), beyond)
 
 
 def _all_crossings(samples: Samples) -> list[tuple[str, Crossing]]:

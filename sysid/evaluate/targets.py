@@ -215,10 +215,11 @@ def _outside(found: Sequence[outside.Outside]) -> tuple[Target, Target]:
 def _jump(method: str, name: str, at: Jump | None, passage: Jump | None) -> Target:
     details = []
     if at is not None:
-        details.append(
+        details += [
             f"at {at.of} in {at.run} j{at.number}, {at.time_s:.2f} s; median {at.median_nm:.2f} Nm of {at.crossings} "
-            f"crossings; {at.unshifted_nm:.2f} Nm without allowance for a shift in time"
-        )
+            f"crossings; {at.unshifted_nm:.2f} Nm without allowance for a shift in time",
+            f"of as many windows anywhere in motion one exceeds {at.elsewhere_nm:.2f} Nm",
+        ]
     if passage is not None:
         details.append(
             f"over whole passages, standstill included: {passage.nm:.2f} Nm ({passage.run} j{passage.number})"
