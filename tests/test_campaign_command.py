@@ -108,10 +108,9 @@ def test_a_dry_run_as_json_adds_up(plan: str, capsys: pytest.CaptureFixture[str]
 
 
 def bench_config(folder: Path, **changes: object) -> Path:
-    """The shipped configuration beside copies of its joint files, with changes of top-level keys."""
+    """The shipped configuration beside copies of its models, with changes of top-level keys."""
     content = yaml.safe_load(shipped("bench.yaml").read_text()) | changes
-    for name in ("joint1.yaml", "joint2.yaml"):
-        shutil.copy(shipped(name), folder)
+    shutil.copytree(shipped("trained/joint1.yaml").parent, folder / "trained")
     path = folder / "bench.yaml"
     path.write_text(yaml.safe_dump(content))
     return path
