@@ -56,7 +56,7 @@ def _locked(directory: Path) -> int:
     try:
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
     except FileExistsError:
-        if directory.exists():
+        if directory.exists() and not directory.is_dir():
             raise
         raise FileNotFoundError(f"{directory} was removed") from None
     if directory.lstat().st_uid != os.getuid():

@@ -154,8 +154,6 @@ def test_features_are_what_the_network_gets() -> None:
             seen.raw_nm,
             seen.torsion_nm - (seen.raw_nm - loss_nm(joint, seen)),
             seen.waves,
-            np.cos(m.link_position_rad),
-            np.sin(m.link_position_rad),
         )
     )
     assert run.features[running] == pytest.approx(expected[running], abs=1e-12)

@@ -69,8 +69,8 @@ def test_a_joint_without_section_fused_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("method", "kind", "found"),
     [
-        ("fused", the_papers, "found input 'x' of shape ['N', 6], expected ['N', 9]"),
-        ("network", networks, "found input 'x' of shape ['N', 9], expected ['N', 6]"),
+        ("fused", the_papers, "found input 'x' of shape ['N', 6], expected ['N', 7]"),
+        ("network", networks, "found input 'x' of shape ['N', 7], expected ['N', 6]"),
     ],
 )
 def test_a_network_of_another_method_is_named(tmp_path: Path, method: str, kind: Any, found: str) -> None:

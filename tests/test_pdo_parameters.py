@@ -5,7 +5,7 @@ import struct
 import pytest
 from canopen_nodes import drive_store, sensor_store
 
-from drivers.devices import drive_tpdo1, drive_tpdo2
+from drivers.devices import drive_tpdo1, drive_tpdo2, drive_tpdo3
 from drivers.pdo_parameters import PdoParameters
 from drivers.sdo_abort import SdoAbort
 
@@ -49,8 +49,8 @@ def remap(store, pdo):
 
 def test_default_maps_are_not_those_of_the_bench(parameters):
     tpdos = parameters.tpdos()
-    assert [pdo.words for pdo in tpdos] == [(0x60410010,), (0x60640020, 0x606C0020)]
-    assert [pdo.transmission_type for pdo in tpdos] == [255, 255]
+    assert [pdo.words for pdo in tpdos] == [(0x60410010,), (0x60640020, 0x606C0020), (0x30010010,)]
+    assert [pdo.transmission_type for pdo in tpdos] == [255, 255, 255]
     assert [(pdo.cob_id, pdo.words) for pdo in parameters.rpdos()] == [
         (0x201, (0x60400010, 0x60710010)),
         (0x301, (0x60FF0020,)),
@@ -60,7 +60,8 @@ def test_default_maps_are_not_those_of_the_bench(parameters):
 def test_the_whole_procedure_gives_the_bench_map(store, parameters):
     remap(store, drive_tpdo1(1))
     remap(store, drive_tpdo2(1))
-    assert parameters.tpdos() == [drive_tpdo1(1), drive_tpdo2(1)]
+    assert parameters.tpdos()[:2] == [drive_tpdo1(1), drive_tpdo2(1)]
+    assert parameters.tpdos()[2].words == drive_tpdo3(1).words
 
 
 def test_generation_grows_with_accepted_writes_only(store, parameters):
@@ -68,7 +69,7 @@ def test_generation_grows_with_accepted_writes_only(store, parameters):
     assert parameters.generation == 0
     write(store, 0x1800, 1, OFF | 0x40000181)
     assert parameters.generation == 1
-    assert [pdo.cob_id for pdo in parameters.tpdos()] == [0x281]
+    assert [pdo.cob_id for pdo in parameters.tpdos()] == [0x281, 0x381]
 
 
 def test_mapping_of_an_existing_pdo_is_refused(store, parameters):
