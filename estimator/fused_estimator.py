@@ -1,8 +1,8 @@
 """Our estimator of one joint, sample by sample: observer, additive loss, fusion with torsion, network, validity.
 
-    tau_raw, v, tau_t, ripple, s  <-  FusedObserver         s: direction, -1 to 1
+    tau_raw, v, tau_t, waves, s  <-  FusedObserver          s: direction, -1 to 1
     physics = fusion of tau_raw - loss(tau_raw, v, s, T) and tau_t
-    torque  = physics + w s^2 N(features)                   w: trust of the network, which fades at standstill
+    torque  = physics + w turning(v) N(features)            w: trust of the network; turning: 0 at rest, 1 from 0.2 rad/s
 
 w is 1 inside the network's envelope, falls continuously to 0 outside of it, and falls from 1 to 0 while |N| goes from
 75 % to 100 % of the limit. Status 2 where w = 1, 3 where it is less (at w = 0 the value is the physics alone), 6 at

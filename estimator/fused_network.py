@@ -55,7 +55,7 @@ class FusedNetworkModel(Protocol):
 class FusedNetwork:
     """A loaded and checked network; arguments and errors as `estimator.network.TorqueNetwork`.
 
-    Public: `name`, `sha256`, `envelope`, `sigma_scale`, `joint`, `data_sha256`, `bound`; `run_one(x0..x8)` correction
+    Public: `name`, `sha256`, `envelope`, `sigma_scale`, `joint`, `data_sha256`, `bound`; `run_one(x0..x6)` correction
     of one sample [Nm], `run_many([n, 7])` of many.
     """
 
