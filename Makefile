@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-all bench bench-kernel lint format clean
+.PHONY: help setup demo test test-here test-guest test-all bench bench-kernel fuzz soak soak-exact lint format clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
@@ -20,7 +20,14 @@ demo: $(VENV)/.installed ## 20 s of jtqd on the emulated bench
 
 test: lint ## everything but the tests marked campaign
 	$(BIN)/python -m sim_can.bench_kernel build --unless-vcan
-	$(BIN)/python -m pytest -m "not campaign"
+	@$(MAKE) --no-print-directory -j2 --output-sync=target test-here test-guest
+
+# Two lanes side by side: the bench kernel keeps a time of its own, so neither lane feels the other.
+test-here:
+	$(BIN)/python -m pytest -m "not (campaign or socketcan or boots)"
+
+test-guest:
+	$(BIN)/python -m pytest -m "(socketcan or boots) and not campaign"
 
 test-all: lint ## everything
 	$(BIN)/python -m sim_can.bench_kernel build --unless-vcan
@@ -37,6 +44,18 @@ format: $(VENV)/.installed-dev ## rewrite the sources in the project's style
 
 bench: $(VENV)/.installed-dev ## measure the loop: ratios from one run
 	$(BIN)/python -m tests.benchmarks
+
+fuzz: $(VENV)/.installed-test ## a million frames by both paths, 300 damaged files of each kind, a storm
+	$(BIN)/python -m tests.fuzz frames --count 1000000
+	$(BIN)/python -m tests.fuzz service --count 1000000
+	$(BIN)/python -m tests.fuzz files --count 300
+	$(BIN)/python -m tests.fuzz storm
+
+soak: $(VENV)/.installed-dev ## jtqd for 30 minutes with faults drawn at random
+	$(BIN)/python -m tests.soak --minutes 30
+
+soak-exact: $(VENV)/.installed-dev ## the same in the bench kernel: as much guest time as an hour gives
+	$(BIN)/python -m tests.soak --exact --minutes 1440 --wall 3600
 
 bench-kernel: $(VENV)/.installed ## build the kernel with SocketCAN into the cache, once
 	$(BIN)/python -m sim_can.bench_kernel build

@@ -21,8 +21,32 @@ COMMANDS = {
         "sysid.evaluate.command",
         "all methods beside the torque sensor on runs never trained on: report and figures",
     ),
+    "diagnose": (
+        "sysid.diagnosis.command",
+        "what the simulation gets wrong on measured runs, its cause by name, the extended joint file",
+    ),
+    "export": ("daemon.logs.export_command", "a log as CSV, Parquet or candump lines; the bus as a DBC"),
+    "recover": ("daemon.logs.recover_command", "repair logs left by a crash, or damaged"),
+    "replay": (
+        "daemon.replay.command",
+        "run the estimator over a log again: is it what was published, and what would another model say",
+    ),
+    "batch": (
+        "sysid.batch.command",
+        "diagnose or replay many logs, here or on a dask cluster; one page over all",
+    ),
     "plot": ("sysid.plot_command", "draw a log: estimate beside the torque sensor"),
-    "bus-load": ("daemon.bus_load_command", "worst-case load of the bus by a configuration"),
+    "control": ("daemon.tools.control_command", "orders to a running jtqd: ping, reload, reset, save"),
+    "bus-load": ("daemon.tools.bus_load_command", "worst-case load of the bus by a configuration"),
+    "layout": ("daemon.live.layout_command", "layout file for Foxglove and Lichtblick"),
+    "status": ("daemon.tools.status_command", "how a running jtqd is doing, live"),
+    "check": ("daemon.tools.check_command", "self-test of a bus and of this machine's timing"),
+    "doctor": (
+        "daemon.tools.doctor_command",
+        "is this machine fit for jtqd? kernel, rights, interface, files",
+    ),
+    "completion": ("daemon.tools.completion_command", "completion for bash, zsh or fish"),
+    "man": ("daemon.tools.man_command", "manual page of jtq, made from its help"),
     "measured": (
         "sysid.measured",
         "estimate measured runs before and after fitting the joint file's friction",
@@ -36,12 +60,16 @@ def _help() -> str:
     rows = "\n".join(f"  {name:<{width}}  {text}" for name, (_, text) in COMMANDS.items())
     return (
         f"usage: jtq COMMAND ...\n\nToolbox around jtqd.\n\ncommands:\n{rows}\n\n"
-        "examples:\n  jtq sim --bus vcan0\n  jtq bus-load\n  jtq COMMAND --help\n"
+        "examples:\n"
+        "  jtq sim --bus vcan0               emulated bench on a CAN interface\n"
+        "  jtq status                        how the daemon here is doing\n"
+        "  jtq COMMAND --help                options and examples of a command\n"
+        "  source <(jtq completion bash)     completion in this shell\n"
     )
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run a subcommand; returns its exit status (0 done, 1 failure, 2 usage, 3 done with findings or loss)."""
+    """Run a subcommand; returns its exit status (0 done, 1 failure, 2 usage, 3 done with findings or loss, 130 Ctrl-C)."""
     arguments = sys.argv[1:] if argv is None else argv
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(_help(), end="")
@@ -55,8 +83,11 @@ def main(argv: list[str] | None = None) -> int:
     try:
         status = importlib.import_module(command[0]).main(arguments[1:])
         sys.stdout.flush()
+    except KeyboardInterrupt:  # Ctrl-C: whoever pressed it knows
+        return 130
     except OSError as error:  # a full disk, a directory that is not there, a pipe that was closed
-        print(f"jtq {arguments[0]}: {error.filename or 'output'}: {error.strerror}", file=sys.stderr)
+        if not isinstance(error, BrokenPipeError):  # `| head` has what it wanted
+            print(f"jtq {arguments[0]}: {error.filename or 'output'}: {error.strerror}", file=sys.stderr)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     return int(status or 0)

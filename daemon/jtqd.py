@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
+from typing import Any
 
-from daemon.config import load_config
-from daemon.supervisor import Supervisor, SupervisorError
-from drivers.errors import BusError
+# What is heavy to load is loaded in `_run`: Ctrl-C must find its handler there, also in the first second.
+from daemon.live.address import NEEDED, Address, address, installed
 from estimator.arguments import seconds
-from estimator.checked import ConfigError
 
 _EXAMPLES = """examples:
   jtqd --bus sim --duration 20          emulated bench in its own processes, 20 s, with a live table
   jtqd --bus vcan0                      SocketCAN interface, until Ctrl-C or SIGTERM
   jtqd --bus unix:/run/bench.sock       frame socket of `jtq sim --bus unix:/run/bench.sock`
   jtqd --bus can0 --config /etc/jtqd/arm.yaml --record /var/log/jtqd
+  jtqd --bus can0 --live                open ws://127.0.0.1:8765 in Foxglove, with the layout of `jtq layout`
 
 exit status: 0 done, 1 failure, 2 usage, 3 done, but cycles are missing in the log"""
 
@@ -44,6 +48,14 @@ def parser() -> argparse.ArgumentParser:
     result.add_argument(
         "--duration", type=seconds, metavar="S", help="end after S seconds (default: run until stopped)"
     )
+    result.add_argument(
+        "--live",
+        type=address,
+        nargs="?",
+        const=Address(),
+        metavar="HOST:PORT",
+        help="serve Foxglove or Lichtblick, read-only, 50 Hz (default: 127.0.0.1:8765; extra: live)",
+    )
     result.add_argument("--json", action="store_true", help="print the final summary as JSON")
     return result
 
@@ -51,16 +63,59 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Run the daemon; returns the exit status."""
     arguments = parser().parse_args(argv)
+    with _early_signals() as told_to_end:
+        return _run(arguments, told_to_end)
+
+
+@contextmanager
+def _early_signals() -> Iterator[list[int]]:
+    """Until the supervisor takes the signals: an order to end is kept for it, SIGHUP comes before any file is read.
+
+    An exception instead would come out of the libraries that are being loaded as errors of theirs.
+    """
+    told_to_end: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        told_to_end.append(number)
+
+    handlers: dict[int, Callable[[int, FrameType | None], Any] | int] = {
+        signal.SIGINT: note,
+        signal.SIGTERM: note,
+        signal.SIGHUP: signal.SIG_IGN,
+    }
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    try:
+        yield told_to_end
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
+
+
+def _run(arguments: argparse.Namespace, told_to_end: list[int]) -> int:
     if not arguments.bus:
         parser().error("argument --bus: found '', expected an interface, unix:PATH or sim")
+    if arguments.live is not None and not installed():
+        print(f"jtqd: {NEEDED}", file=sys.stderr)
+        return 1
+    from daemon.config import load_config
+    from daemon.supervisor.process import Supervisor
+    from daemon.supervisor.start import SupervisorError
+    from drivers.errors import BusError
+    from estimator.checked import ConfigError
+
     try:
         config = load_config(arguments.config)
-        supervisor = Supervisor(config, arguments.bus, arguments.config, arguments.record, arguments.duration)
+        supervisor = Supervisor(
+            config, arguments.bus, arguments.config, arguments.record, arguments.duration, arguments.live
+        )
+        if told_to_end:
+            supervisor.stop()
         summary = supervisor.run()
     except (ConfigError, BusError, SupervisorError) as error:
         print(f"jtqd: {error}", file=sys.stderr)
         return 1
     if summary is None:
+        print("jtqd: stopped before it ran", file=sys.stderr)
         return 0
     try:
         print(json.dumps(summary.content()) if arguments.json else summary.text(), flush=True)

@@ -2,7 +2,7 @@
 
 canopen and its threads live here and end here, so that nothing shares the loop's interpreter.
 The request is that of `drivers.boot_request`. The report is
-    {"ok": true, "duration_s", "nodes": {"1": {...}}}                                       exit status 0
+    {"ok": true, "duration_s", "nodes": {"1": {...}}, "absent": {"3": error}}               exit status 0
     {"ok": false, "error": {"node", "object", "expected", "found", "letter", "message"}}    exit status 1
 Boot is run again with a shorter list of nodes for a node that has come back.
 """
@@ -12,24 +12,24 @@ from __future__ import annotations
 import json
 import logging
 import sys
-import threading
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 
 import can
 import canopen
 
 from drivers.boot_error import BootError
-from drivers.boot_procedure import BootedNode, NodeBoot, reset_during_boot
+from drivers.boot_listeners import NOTIFIER_S, STATE_BOOT_UP, BusErrors, ForeignMaster, Heartbeats
+from drivers.boot_procedure import BootedNode, NodeBoot, Profile, reset_during_boot
 from drivers.boot_request import BootRequest, RequestError, node_report, parse_request
 from drivers.frame import CAN_RTR_FLAG, CAN_SFF_MASK
 from drivers.object_dictionary import entries_to_json, read_eds
 from drivers.sdo_client import NodeSdo
 
 NMT_START, NMT_PRE_OPERATIONAL = 0x01, 0x80
-STATE_BOOT_UP, STATE_STOPPED, STATE_OPERATIONAL, STATE_PRE_OPERATIONAL = 0x00, 0x04, 0x05, 0x7F
-SYNC_LISTEN_S = 0.12  # a little more than the longest period that jtqd itself may have
-NOTIFIER_S = 0.01  # canopen's default of 1 s is what closing the network would wait for
+STATE_STOPPED, STATE_OPERATIONAL, STATE_PRE_OPERATIONAL = 0x04, 0x05, 0x7F
 _UNIX = "unix:"
 _STATE_NAMES = {STATE_BOOT_UP: "boot-up", STATE_STOPPED: "stopped", STATE_PRE_OPERATIONAL: "pre-operational"}
 
@@ -40,67 +40,14 @@ class BootReport:
 
     nodes: dict[int, BootedNode]
     duration_s: float
+    absent: dict[int, BootError]
+    """Optional nodes that could not be booted, and why."""
 
     def as_json(self) -> dict[str, object]:
         """The report of a boot that went well."""
         nodes = {str(number): node_report(node) for number, node in self.nodes.items()}
-        return {"ok": True, "duration_s": round(self.duration_s, 4), "nodes": nodes}
-
-
-class _Heartbeats:
-    """Newest NMT state of each node, from the notifier's thread."""
-
-    def __init__(self) -> None:
-        self._news = threading.Condition()
-        self._state: dict[int, int] = {}
-        self._restarted: set[int] = set()
-
-    def on_heartbeat(self, can_id: int, data: bytes, _timestamp: float) -> None:
-        """canopen callback; a frame that is not one byte is no heartbeat."""
-        if len(data) != 1:
-            return
-        with self._news:
-            self._state[can_id - 0x700] = data[0] & 0x7F
-            if data[0] == STATE_BOOT_UP:
-                self._restarted.add(can_id - 0x700)
-            self._news.notify_all()
-
-    def forget(self, node: int) -> None:
-        """What was heard so far does not count."""
-        with self._news:
-            self._state.pop(node, None)
-            self._restarted.discard(node)
-
-    def restarted(self, node: int) -> bool:
-        """A boot-up message came since `forget`."""
-        with self._news:
-            return node in self._restarted
-
-    def wait(self, node: int, wanted: int | None, timeout_s: float) -> int | None:
-        """Newest state once it is `wanted` (None: any), or what it is after `timeout_s`."""
-
-        def arrived() -> bool:
-            state = self._state.get(node)
-            return state is not None and (wanted is None or state == wanted)
-
-        with self._news:
-            self._news.wait_for(arrived, timeout_s)
-            return self._state.get(node)
-
-
-class _BusErrors(can.Listener):  # type: ignore[misc]
-    """Keeps canopen's receiving thread from dying with a traceback, and the reason for the message."""
-
-    def __init__(self) -> None:
-        self.last: Exception | None = None
-
-    def on_message_received(self, msg: can.Message) -> None:
-        """Nothing: canopen's own listener does it."""
-
-    def on_error(self, exc: Exception) -> None:
-        """Keep the reason; a failing recv returns at once, so wait a little."""
-        self.last = exc
-        time.sleep(NOTIFIER_S)
+        absent = {str(number): error.report() for number, error in self.absent.items()}
+        return {"ok": True, "duration_s": round(self.duration_s, 4), "nodes": nodes, "absent": absent}
 
 
 def boot(request: BootRequest, bus: can.BusABC | None = None) -> BootReport:
@@ -109,11 +56,11 @@ def boot(request: BootRequest, bus: can.BusABC | None = None) -> BootReport:
     network = canopen.Network()
     network.bus = open_bus(request) if bus is None else bus
     network.NOTIFIER_CYCLE = NOTIFIER_S
-    errors = _BusErrors()
+    errors = BusErrors()
     network.listeners.append(errors)
     try:
         network.connect()
-        nodes = _boot_nodes(network, request)
+        nodes, absent = _boot_nodes(network, request)
     except BootError as error:
         if errors.last is not None:
             raise _bus_error(request.bus, errors.last) from error
@@ -122,39 +69,69 @@ def boot(request: BootRequest, bus: can.BusABC | None = None) -> BootReport:
         raise _bus_error(request.bus, error) from error
     finally:
         _close(network)
-    return BootReport(nodes, time.monotonic() - started)
+    return BootReport(nodes, time.monotonic() - started, absent)
 
 
-def _boot_nodes(network: canopen.Network, request: BootRequest) -> dict[int, BootedNode]:
-    heartbeats = _Heartbeats()
-    syncs: list[float] = []
-    listening_since = time.monotonic()
-    if request.check_foreign_sync:
-        network.subscribe(request.settings.sync_cob_id, lambda _id, _data, stamp: syncs.append(stamp))
+def _boot_nodes(
+    network: canopen.Network, request: BootRequest
+) -> tuple[dict[int, BootedNode], dict[int, BootError]]:
+    """(nodes that are operational, optional ones that are not and why)."""
+    heartbeats = Heartbeats()
+    foreign = ForeignMaster(network, request)
+    for profile in request.profiles:
+        network.subscribe(0x700 + profile.node_id, heartbeats.on_heartbeat)
     # Before anything is sent: a second daemon must not disturb the one that runs.
-    _require_no_sync(request, syncs, listening_since)
-    booted = {}
+    foreign.require_none()
+    foreign.announce()
+    wait_s = max(3 * request.settings.heartbeat_ms, 100) * 1e-3
+    booted: dict[int, BootedNode] = {}
+    absent: dict[int, BootError] = {}
+
+    def attempt(node: int, step: Callable[[], None]) -> None:
+        try:
+            step()
+        except BootError as error:
+            if node not in request.optional or error.node != node:
+                raise
+            absent[node] = error
+            booted.pop(node, None)
+
     for profile in request.profiles:
         node = profile.node_id
-        network.subscribe(0x700 + node, heartbeats.on_heartbeat)
-        # A running node would refuse to be re-mapped, and a stopped one does not answer SDO.
-        network.send_message(0, [NMT_PRE_OPERATIONAL, node])
-        procedure = NodeBoot(NodeSdo(network, node, request.answer_timeout_s), profile, request.settings)
-        device_type = procedure.check_device_type()
-        heartbeats.forget(node)  # a boot-up message up to its first answer is its own start
-        booted[node] = procedure.run(device_type)
-    wait_s = max(3 * request.settings.heartbeat_ms, 100) * 1e-3
-    for node in booted:
-        _require_heartbeat(heartbeats, node, wait_s)
-    _require_no_sync(request, syncs, listening_since)
+
+        def configure(profile: Profile = profile, node: int = node) -> None:
+            booted[node] = _configure(network, request, profile, heartbeats)
+
+        attempt(node, configure)
+    for node in list(booted):
+        attempt(node, partial(_require_heartbeat, heartbeats, node, wait_s))
+    foreign.require_none()
     for node in booted:
         network.send_message(0, [NMT_START, node])
-    for node in booted:
-        _require_operational(network, heartbeats, node, wait_s)
+    for node in list(booted):
+        attempt(node, partial(_require_operational, network, heartbeats, node, wait_s))
+    return booted, absent
+
+
+def _configure(
+    network: canopen.Network, request: BootRequest, profile: Profile, heartbeats: Heartbeats
+) -> BootedNode:
+    """One node up to its configuration; it is pre-operational then."""
+    node = profile.node_id
+    was_operational = heartbeats.wait(node, None, 0.0) == STATE_OPERATIONAL
+    # A running node would refuse to be re-mapped, and a stopped one does not answer SDO.
+    network.send_message(0, [NMT_PRE_OPERATIONAL, node])
+    procedure = NodeBoot(NodeSdo(network, node, request.timeout_s(node)), profile, request.settings)
+    device_type = procedure.check_device_type()
+    heartbeats.forget(node)  # a boot-up message up to its first answer is its own start
+    booted = procedure.run(device_type)
+    if was_operational and request.check_foreign_sync:
+        note = "it was already operational (status L): stopped, and configured anew"
+        return replace(booted, notes=(note, *booted.notes))
     return booted
 
 
-def _require_heartbeat(heartbeats: _Heartbeats, node: int, wait_s: float) -> None:
+def _require_heartbeat(heartbeats: Heartbeats, node: int, wait_s: float) -> None:
     """Start of error control: the node is heard before it is started."""
     if heartbeats.wait(node, None, wait_s) is None:
         detail = f"no heartbeat {0x700 + node:03X}h within {wait_s:g} s"
@@ -163,7 +140,7 @@ def _require_heartbeat(heartbeats: _Heartbeats, node: int, wait_s: float) -> Non
         raise reset_during_boot(node)
 
 
-def _require_operational(network: canopen.Network, heartbeats: _Heartbeats, node: int, wait_s: float) -> None:
+def _require_operational(network: canopen.Network, heartbeats: Heartbeats, node: int, wait_s: float) -> None:
     """The node says operational, if need be after a second start.
 
     A drive may still watch the heartbeat of a jtqd that ended a moment ago: not every device begins anew when 1016h is
@@ -181,22 +158,11 @@ def _require_operational(network: canopen.Network, heartbeats: _Heartbeats, node
         raise BootError(node, "NMT state", expected="operational", found=found, detail=detail)
 
 
-def _require_no_sync(request: BootRequest, syncs: list[float], since: float) -> None:
-    """A second SYNC producer would make every input's cycle ambiguous."""
-    if not request.check_foreign_sync:
-        return
-    time.sleep(max(0.0, since + SYNC_LISTEN_S - time.monotonic()))
-    if syncs:
-        where = f"COB-ID {request.settings.sync_cob_id:03X}h"
-        detail = f"another SYNC producer is on the bus ({where}, {len(syncs)} frames during boot)"
-        raise BootError(None, where, expected="no SYNC", found=f"{len(syncs)} frames", detail=detail)
-
-
 def open_bus(request: BootRequest) -> can.BusABC:
     """A bus that receives the answers of the nodes and SYNC, and nothing else. Raises BootError."""
     identifiers = [base + profile.node_id for profile in request.profiles for base in (0x580, 0x700)]
     if request.check_foreign_sync:
-        identifiers.append(request.settings.sync_cob_id)
+        identifiers += [request.settings.sync_cob_id, 0x700 + request.settings.master_node]
     # "extended": False puts CAN_EFF_FLAG into the mask: canopen takes 29-bit frames for 11-bit ones
     mask = CAN_SFF_MASK | CAN_RTR_FLAG
     filters = [{"can_id": cob_id, "can_mask": mask, "extended": False} for cob_id in identifiers]

@@ -13,8 +13,8 @@ def label(index: int, subindex: int = 0) -> str:
 class BootError(Exception):
     """Boot refused. `letter` is "" where CiA 302-2 has none; `str()` is one line that says it all.
 
-    B no answer, C device type, D vendor, M product, N revision, O serial number, J configuration refused or
-    not taken, K no heartbeat.
+    A not in the configuration, B no answer, C device type, D vendor, M product, N revision, O serial number, G no software
+    version, H another one, J configuration refused or not taken, K no heartbeat, L was already operational.
     """
 
     def __init__(

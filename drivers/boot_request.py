@@ -8,7 +8,8 @@
            {"node": 3, "kind": "sensor", "channels": [1], "unit_words": {"0x00560000": 1.0}}]}
 
 Only "bus" and "nodes" with "node" and "kind" are needed. `given` replaces objects that are then not read;
-`temperature` of a drive asks for TPDO3 with 3001h.
+`temperature` of a drive asks for TPDO3 with 3001h; a node that is not `mandatory` may be absent. "error_behaviour"
+is 1029h:1; without it the nodes keep theirs.
 """
 
 from __future__ import annotations
@@ -29,8 +30,11 @@ _TOP = {
     "heartbeat_ms",
     "master_timeout_ms",
     "answer_timeout_s",
+    "error_behaviour",
 }
-_NODE = {"node", "kind", "identity", "channels", "given", "unit_words", "temperature"}
+_NODE = {"node", "kind", "identity", "channels", "given", "unit_words", "temperature", "mandatory"}
+_OPTIONAL_TIMEOUT_S = 0.5
+"""An optional node is not waited for any longer: it is booted again when it appears."""
 _SYNC = {"cob_id", "counter_overflow", "check_foreign"}
 
 
@@ -52,6 +56,15 @@ class BootRequest:
     check_foreign_sync: bool = True
     answer_timeout_s: float = 0.5
     own_eds: str | None = None
+    optional: frozenset[int] = frozenset()
+
+    def timeout_s(self, node: int) -> float:
+        """How long a node may take for an answer."""
+        return (
+            min(self.answer_timeout_s, _OPTIONAL_TIMEOUT_S)
+            if node in self.optional
+            else self.answer_timeout_s
+        )
 
 
 def parse_request(raw: object) -> BootRequest:
@@ -78,6 +91,9 @@ def parse_request(raw: object) -> BootRequest:
         heartbeat_ms=_integer(top, "heartbeat_ms", 1, 0xFFFF, 100),
         sync_cob_id=_integer(sync, "cob_id", 1, 0x7FF, SYNC_COB_ID),
         counter_overflow=overflow,
+        error_behaviour=None
+        if top.get("error_behaviour") is None
+        else _integer(top, "error_behaviour", 0, 2, 0),
     )
     timeout = top.get("answer_timeout_s", 0.5)
     if isinstance(timeout, bool) or not isinstance(timeout, int | float) or not 0 < timeout <= 60:
@@ -85,15 +101,19 @@ def parse_request(raw: object) -> BootRequest:
     own_eds = top.get("own_eds")
     if own_eds is not None and not isinstance(own_eds, str):
         raise RequestError(f"own_eds: found {own_eds!r}, expected a path")
-    return BootRequest(
-        bus, profiles, settings, bool(sync.get("check_foreign", True)), float(timeout), own_eds
+    optional = frozenset(
+        profile.node_id
+        for profile, node in zip(profiles, nodes, strict=True)
+        if not _truth(node, "mandatory", default=True)
     )
+    foreign = bool(sync.get("check_foreign", True))
+    return BootRequest(bus, profiles, settings, foreign, float(timeout), own_eds, optional)
 
 
 def _profile(raw: object, where: str) -> Profile:
     node = _mapping(raw, where, _NODE)
     number = _integer(node, "node", 1, 127, None, where=where)
-    identity = Identity(**_integers(node.get("identity"), f"{where}.identity", set(asdict(Identity()))))
+    identity = _identity(node.get("identity"), f"{where}.identity")
     try:
         given = {
             parse_key(key): value for key, value in _integers(node.get("given"), f"{where}.given").items()
@@ -102,16 +122,29 @@ def _profile(raw: object, where: str) -> Profile:
         raise RequestError(f"{where}.given: {error}") from error
     kind = node.get("kind")
     if kind == "drive":
-        temperature = node.get("temperature", False)
-        if not isinstance(temperature, bool):
-            raise RequestError(f"{where}.temperature: found {temperature!r}, expected true or false")
-        return DriveProfile(number, identity, given, temperature)
+        return DriveProfile(number, identity, given, _truth(node, "temperature", default=False, where=where))
     if kind != "sensor":
         raise RequestError(f"{where}.kind: found {kind!r}, expected 'drive' or 'sensor'")
     channels = node.get("channels", [1])
     if channels not in ([1], [1, 2]):
         raise RequestError(f"{where}.channels: found {channels!r}, expected [1] or [1, 2]")
     return SensorProfile(number, identity, tuple(channels), given, _unit_words(node, where))
+
+
+def _identity(raw: object, where: str) -> Identity:
+    fields = set(asdict(Identity()))
+    mapping = dict(_mapping({} if raw is None else raw, where, fields))
+    software = mapping.pop("software", None)
+    if software is not None and not isinstance(software, str):
+        raise RequestError(f"{where}.software: found {software!r}, expected a text")
+    return Identity(**_integers(mapping, where, fields), software=software)
+
+
+def _truth(mapping: Mapping[str, Any], key: str, *, default: bool, where: str = "node") -> bool:
+    value = mapping.get(key, default)
+    if not isinstance(value, bool):
+        raise RequestError(f"{where}.{key}: found {value!r}, expected true or false")
+    return value
 
 
 def _unit_words(node: Mapping[str, Any], where: str) -> dict[int, float]:
@@ -156,6 +189,16 @@ def node_report(node: BootedNode) -> dict[str, object]:
         "serial": node.serial,
         "scaling": asdict(node.scaling),
         "gear_ratio": node.gear_ratio,
-        "tpdos": [{"cob_id": pdo.cob_id, "words": list(pdo.words)} for pdo in node.tpdos],
+        "tpdos": [
+            {
+                "cob_id": pdo.cob_id,
+                "transmission_type": pdo.transmission_type,
+                "words": list(pdo.words),
+            }
+            for pdo in node.tpdos
+        ],
         "configuration_sha256": node.configuration_sha256,
+        "signed": node.signed,
+        "watched": [list(each) for each in node.watched],
+        "notes": list(node.notes),
     }

@@ -49,12 +49,14 @@ EVENT_DRIVEN = (254, 255)
 
 @dataclass(frozen=True)
 class Identity:
-    """Expected 1018h; None: not checked."""
+    """Expected 1018h and software version; None: not checked."""
 
     vendor: int | None = None
     product: int | None = None
     revision: int | None = None
     serial: int | None = None
+    software: str | None = None
+    """100Ah."""
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,8 @@ class FrameSocket:
     After `receive` returned n, for i < n: `frames[16 * i : 16 * i + 16]`, `stamps_ns[i]` (kernel time stamp,
     CLOCK_REALTIME, ns), `own[i]` (echo of a frame sent here), `lengths[i]` (bytes received, 16 expected).
     Counters: `tx_dropped` (transmit queue full), `rx_dropped` (lost because this socket was read too late; on
-    a unix bus an upper bound, since the hub cannot see which of them a filter would have refused).
+    a unix bus an upper bound, since the hub cannot see which of them a filter would have refused; `rx_dropped_before` is
+    added to what the kernel counts).
     """
 
     def __init__(
@@ -75,7 +76,7 @@ class FrameSocket:
         self.bus = bus
         self.fd = sock.fileno()
         self.tx_dropped = 0
-        self.rx_dropped = 0
+        self.rx_dropped = self.rx_dropped_before = 0
         self.own: Sequence[bool] = ()
         self._receiver = FrameReceiver(capacity)
         self.frames = self._receiver.frames
@@ -134,7 +135,7 @@ class FrameSocket:
             else:
                 self.own = self._not_own[n]
         else:
-            self.rx_dropped = receiver.overflow
+            self.rx_dropped = receiver.overflow + self.rx_dropped_before
             if self._receive_own:
                 self.own = [flags & MSG_CONFIRM != 0 for flags in receiver.flags]
             else:

@@ -6,6 +6,7 @@ import socket
 import stat
 
 from drivers.errors import BusError
+from drivers.socket_path import reachable
 from drivers.unix_socket import PREFIX, require_directory
 
 
@@ -18,13 +19,14 @@ def listen(path: str, backlog: int) -> socket.socket:
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     umask = os.umask(0o177)
     try:
-        try:
-            sock.bind(path)
-        except OSError as error:
-            if error.errno != errno.EADDRINUSE:
-                raise
-            _remove_dead(path)
-            sock.bind(path)
+        with reachable(path) as address:
+            try:
+                sock.bind(address)
+            except OSError as error:
+                if error.errno != errno.EADDRINUSE:
+                    raise
+                _remove_dead(path, address)
+                sock.bind(address)
         sock.listen(backlog)
         sock.setblocking(False)
     except BusError:
@@ -39,14 +41,14 @@ def listen(path: str, backlog: int) -> socket.socket:
     return sock
 
 
-def _remove_dead(path: str) -> None:
+def _remove_dead(path: str, address: str) -> None:
     """Remove the socket file of a hub that no longer listens. Raises BusError for anything else."""
     if not stat.S_ISSOCK(os.lstat(path).st_mode):
         raise BusError(f"{PREFIX}{path}: a file that is no socket is there")
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
         probe.setblocking(False)
         try:
-            probe.connect(path)
+            probe.connect(address)
         except ConnectionRefusedError:
             os.unlink(path)
             return

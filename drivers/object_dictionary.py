@@ -215,15 +215,23 @@ class ObjectStore:
         return entry.layout.pack(value)
 
 
+class EdsError(ValueError):
+    """An EDS file that cannot be read; the message is one line with its path."""
+
+
 def read_eds(eds: Path | str, node_id: int) -> list[Entry]:
     """Entries of an EDS file with $NODEID filled in.
 
     The parser is canopen's. It is loaded here and not with this module: it takes 20 MB, and a process that is
-    handed its entries as JSON (`entries_to_json`, `entries_from_json`) does without.
+    handed its entries as JSON (`entries_to_json`, `entries_from_json`) does without. Raises EdsError.
     """
     from canopen.objectdictionary import import_od
 
-    return [_entry(variable) for variable in _variables(import_od(str(eds), node_id))]
+    try:
+        return [_entry(variable) for variable in _variables(import_od(str(eds), node_id))]
+    except Exception as error:  # the parser raises whatever its parts raise
+        reason = " ".join(str(error).split())[:200]
+        raise EdsError(f"{eds}: not an EDS that can be read: {type(error).__name__}: {reason}") from None
 
 
 _JSON_FIELDS = ("index", "subindex", "name", "data_type", "access", "mappable", "low", "high")

@@ -1,64 +1,68 @@
-"""SDO client of one node over canopen's Network, with this project's waiting times and checks.
+"""SDO client of one node over canopen's Network, for the boot: waits, asks again, takes no answer to another request.
 
-canopen's client alone retries nothing (MAX_RETRIES = 1 means one try), takes any frame length, and does not
-compare the answer to a download with its request; all three are done here. Writes are expedited: boot writes
-1..4 bytes.
+canopen's own client retries nothing (MAX_RETRIES = 1 means one try), takes any frame length, and does not compare the answer
+to a download with its request; so only its Network is used, and `drivers.sdo_transfer` does the talking.
 """
 
 from __future__ import annotations
 
-import struct
+import queue
 import time
 from typing import Any
 
-from canopen import ObjectDictionary, SdoAbortedError, SdoCommunicationError
-from canopen.sdo import SdoClient
-
 from drivers.boot_procedure import SdoSilence
 from drivers.sdo_abort import SdoAbort
+from drivers.sdo_transfer import Exchange
 
-ANSWER_S = 0.1  # a device answers within milliseconds; a longer silence is a lost frame, so ask again
-_INITIATE = struct.Struct("<BHB")
-_DOWNLOAD_RESPONSE = 0x60
+_KEPT = 64
+"""Answers that wait to be looked at: a flood of them must not fill the memory."""
 
 
 class NodeSdo:
     """Implements `boot_procedure.SdoAccess`. Asks again until `timeout_s` is over, then raises SdoSilence."""
 
     def __init__(self, network: Any, node: int, timeout_s: float) -> None:
+        self._network, self._node = network, node
         self._timeout_s = timeout_s
-        self._client = SdoClient(0x600 + node, 0x580 + node, ObjectDictionary())
-        self._client.network = network
-        self._client.RESPONSE_TIMEOUT = min(ANSWER_S, timeout_s)
-        self._client.MAX_RETRIES = 1
+        self._replies: queue.Queue[bytes] = queue.Queue(_KEPT)
         network.subscribe(0x580 + node, self._on_response)
 
-    def _on_response(self, can_id: int, data: bytes, timestamp: float) -> None:
-        if len(data) == 8:  # anything else is no SDO
-            self._client.on_response(can_id, data, timestamp)
+    def _on_response(self, _can_id: int, data: bytes, _timestamp: float) -> None:
+        """From the network's thread."""
+        try:
+            self._replies.put_nowait(bytes(data))
+        except queue.Full:
+            return
 
     def read(self, index: int, subindex: int) -> bytes:
         """Upload, expedited or segmented."""
-        return bytes(self._repeat(lambda: self._client.upload(index, subindex)))
+        return self._exchange(index, subindex, None)
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
-        """Expedited download of 1..4 bytes."""
-        head = _INITIATE.pack(0x23 | (4 - len(data)) << 2, index, subindex)
+        """Download, expedited up to 4 bytes."""
+        self._exchange(index, subindex, data)
 
-        def download() -> None:
-            reply = self._client.request_response(head + data.ljust(4, b"\0"))
-            if _INITIATE.unpack_from(reply) != (_DOWNLOAD_RESPONSE, index, subindex):
-                raise SdoCommunicationError(f"answer to another request: {reply.hex(' ')}")
-
-        self._repeat(download)
-
-    def _repeat(self, request: Any) -> Any:
-        deadline = time.monotonic() + self._timeout_s
-        while True:
+    def _exchange(self, index: int, subindex: int, data: bytes | None) -> bytes:
+        while not self._replies.empty():
+            self._replies.get_nowait()  # answers to what was given up: not ours
+        exchange = Exchange(index, subindex, data, now=time.monotonic(), timeout_s=self._timeout_s)
+        self._send(exchange.begin())
+        while not exchange.over:
             try:
-                return request()
-            except SdoAbortedError as abort:
-                raise SdoAbort(abort.code) from abort
-            except SdoCommunicationError as error:
-                if time.monotonic() >= deadline - 0.5 * ANSWER_S:
-                    raise SdoSilence(self._timeout_s) from error
+                reply = self._replies.get(timeout=max(exchange.due - time.monotonic(), 1e-4))
+            except queue.Empty:
+                self._send(exchange.tick(time.monotonic()))
+            else:
+                self._send(exchange.on_reply(reply, time.monotonic()))
+                self._send(
+                    exchange.tick(time.monotonic())
+                )  # a flood must not keep the clock from being looked at
+        if exchange.refusal is not None:
+            raise SdoAbort(exchange.refusal)
+        if exchange.value is None:
+            raise SdoSilence(self._timeout_s)
+        return exchange.value
+
+    def _send(self, requests: list[bytes]) -> None:
+        for request in requests:
+            self._network.send_message(0x600 + self._node, request)

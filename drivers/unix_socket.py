@@ -9,6 +9,7 @@ from drivers import bpf
 from drivers.can_filter import CanFilter
 from drivers.errors import BusError
 from drivers.receive import SO_TIMESTAMPNS
+from drivers.socket_path import reachable
 
 PREFIX = "unix:"
 BUFFER_BYTES = 1 << 20  # the kernel cuts it to net.core.wmem_max
@@ -36,7 +37,8 @@ def open_unix(path: str, filters: Sequence[CanFilter], error_frames: bool) -> so
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
         # Bounds connect() when the hub hangs with a full backlog; a non-blocking connect would fail at once.
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _CONNECT_TIMEOUT)
-        sock.connect(path)
+        with reachable(path) as address:
+            sock.connect(address)
         sock.setblocking(False)
     except (FileNotFoundError, NotADirectoryError, ConnectionRefusedError):
         sock.close()

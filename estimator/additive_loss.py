@@ -80,7 +80,7 @@ class _Side:
     ) -> FloatArray:
         """Vectorised twin of `value`."""
         n = np.searchsorted(self._nodes, load, side="right")
-        node, c, dc, f, df, q, dq = np.array(self._rows)[n].T
+        node, c, dc, f, df, q, dq = (column[n] for column in np.array(self._rows).T.copy())
         x = load - node
         loss = c + dc * x + self._stribeck * stribeck + speed * (f + df * x + thermal + speed * (q + dq * x))
         result: FloatArray = np.maximum(loss, 0.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import reprlib
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
@@ -20,8 +21,14 @@ class ConfigError(ValueError):
     """What an operator wrote cannot be used; the message is one line: where, what, and what instead."""
 
 
+_SHORT: Final = reprlib.Repr()
+"""YAML's aliases can make a list of lists without end out of a few bytes: repr() would fill the memory with it."""
+_SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxdict, _SHORT.maxset = 3, 20, 20, 20
+_SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 200
+
+
 def _shown(value: object) -> str:
-    text = repr(value)
+    text = _SHORT.repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
 

@@ -1,6 +1,6 @@
 """Our estimator of one joint, sample by sample: observer, additive loss, fusion with torsion, network, validity.
 
-    tau_raw, v, tau_t, waves, s  <-  FusedObserver          s: direction, -1 to 1
+    tau_raw, v, tau_t, waves, s, open  <-  FusedObserver    s: direction, -1 to 1; open: of the torsion's slip
     physics = fusion of tau_raw - loss(tau_raw, v, s, T) and tau_t
     torque  = physics + w turning(v) N(features)            w: trust of the network; turning: 0 at rest, 1 from 0.2 rad/s
 
@@ -43,7 +43,7 @@ def fused_parts(
     if joint.effects:
         names = ", ".join(effect.name for effect in joint.effects)
         raise ConfigError(
-            f"joint {joint.name}: found effects ({names}), which this estimator cannot apply; expected none"
+            f"joint {joint.name}: found effects ({names}), which `make_estimator` applies, not this class"
         )
     if joint.fused is None:
         raise ConfigError(
@@ -64,8 +64,8 @@ def _no_trust(*_: float) -> float:
 class FusedEstimator:
     """Estimator of one joint by method `fused`; without a network its physics alone, status valid.
 
-    Raises ConfigError for a joint without section `fused`, effects it cannot apply, another joint's network, or
-    settings of another method.
+    Raises ConfigError for a joint without section `fused`, effects (`make_estimator` applies them), another joint's
+    network, or settings of another method.
     """
 
     __slots__ = (
@@ -118,6 +118,11 @@ class FusedEstimator:
         self._thermal = 0.0
         self._half = 0.0
 
+    @property
+    def with_network(self) -> bool:
+        """Whether a network is used."""
+        return self._run_network is not None
+
     def reset(self) -> None:
         """Forget the past: the next step starts."""
         self._tracker.reset()
@@ -130,10 +135,12 @@ class FusedEstimator:
         motor_velocity_rad_s: float,
         link_position_rad: float,
         temperature_c: float = nan,
+        network_wanted: bool = True,
     ) -> Estimate:
         """Return the estimate at this sample, dt_s [s] after the one before; never raises on any float.
 
-        temperature_c: of the joint, NaN where it is not known (the loss is then that of the fit's temperature).
+        temperature_c: of the joint, NaN where it is not known (the loss is then that of the fit's temperature). Without
+        network_wanted there is no time for it: this sample is physics only.
         """
         tracker = self._tracker
         seen = tracker.step(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
@@ -141,19 +148,22 @@ class FusedEstimator:
         if seen is None:
             self._half = 0.0
             return STARTING_ESTIMATE if status == STARTING else INVALID_ESTIMATE
-        raw, v, _, torsion, c2, s2, c4, s4, s = seen
+        raw, v, _, torsion, c2, s2, c4, s4, s, open_nm = seen
         if temperature_c is not self._temperature:  # a joint reports it twice a second
             self._temperature = temperature_c
             self._thermal = self._thermal_of(temperature_c)
         loss, half = self._loss(raw, v, self._thermal, s)
         faded = self._half * (HOLD_S / (HOLD_S + dt_s))  # fusion.held, in line
         self._half = wide = half if half >= faded else faded
-        physics, sigma = self._fuse(raw, loss, wide, v, torsion)
+        physics, sigma = self._fuse(raw, loss, wide, v, torsion, open_nm)
         quadrant = (0 if raw >= 0.0 else 2) if v >= 0.0 else (3 if raw >= 0.0 else 1)
         torque, network = physics, nan
         scale = self._physics_scale[quadrant]
         run_network = self._run_network
-        if run_network is not None:
+        if run_network is not None and not network_wanted:
+            if status != STANDSTILL:
+                status = DEGRADED
+        elif run_network is not None:
             distance = torsion - (raw - loss)
             correction = run_network(v, raw, distance, c2, s2, c4, s4)
             network = physics + correction

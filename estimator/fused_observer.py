@@ -1,20 +1,23 @@
 """Observer of the fused estimator: motor torque, velocity, torsion torque and ripple angles of one age.
 
     tau_raw = G [ g/(s+g) (i Kt + J g w) - J g w ]       motor torque at the joint without any loss (observer.py)
-    tau_t   = g/(s+g) (K d + K3 d^3 + H z)               d = theta_m/G - theta_l - zero - e(theta_m)
-    dz      = dd/travel, held in [-1, 1]                 Maxwell slip; 0 at the start, as nothing is known then
+    d       = g/(s+g) (theta_m/G - theta_l - zero - e(theta_m))
+    tau_t   = K d + K3 d^3 + D d' + H z,   z = (lo + hi)/2,   open = H (hi - lo)/2
+    dlo = dhi = dd/travel, each held in [-1, 1]          Maxwell slip, between bounds: -1 and 1 at each start
     v       = g/(s+g) w/G
     c_n, s_n = g/(s+g) cos(n theta_m), g/(s+g) sin(n theta_m)     n = RIPPLE_ORDERS
     direction = g/(s+g) tanh(w/(G w0))                   of friction, as tau_raw knows it
 
 All pass the same filter (first-order hold, measured step), so a torque ripple A cos(n theta_m + phi), which
 reaches tau_raw through that filter, is exactly linear in c_n and s_n at every speed, and friction that turns with
-the motion is linear in `direction`, however fast the reversal.
+the motion is linear in `direction`, however fast the reversal. The slip follows the filtered deflection: an element
+that slips would rectify the encoder's noise. Where it was when the observer started is not known: its bounds meet after
+twice its travel in one direction, and until then `open` says what it may hold to either side of the middle.
 """
 
 from __future__ import annotations
 
-from math import cos, expm1, isinf, isnan, nan, sin, tanh
+from math import cos, expm1, isinf, nan, sin, tanh
 from typing import Final, NamedTuple
 
 from estimator.friction import DIRECTION_VELOCITY_RAD_S
@@ -30,6 +33,7 @@ class FusedObserved(NamedTuple):
     """Outputs of one step; torques [Nm, joint side], velocities [rad/s, joint side], angles as filtered cos and sin.
 
     raw_nm is NaN where the torsion is impossible: the guard then starts again, as for an impossible motor torque.
+    open_nm: half of what the torsion's slip leaves open, 0 once it is known and where there is none.
     """
 
     raw_nm: float
@@ -41,12 +45,13 @@ class FusedObserved(NamedTuple):
     cos4: float
     sin4: float
     direction: float
+    open_nm: float = 0.0
 
 
 _new: Final = tuple.__new__
 
 _Inputs = tuple[float, float, float, float, float, float, float, float]
-"""What the filter takes: u = i Kt + J g w, v, torsion torque, cos 2, sin 2, cos 4, sin 4, direction."""
+"""What the filter takes: u = i Kt + J g w, v, deflection d, cos 2, sin 2, cos 4, sin 4, direction."""
 
 _INVERSE_W0: Final = 1.0 / DIRECTION_VELOCITY_RAD_S
 _SETTLED_RAD_S: Final = 20.0 * DIRECTION_VELOCITY_RAD_S  # tanh(20) is 1 in float64
@@ -60,7 +65,9 @@ class FusedObserver:
         "_cos4",
         "_cubic",
         "_d",
+        "_damping",
         "_gear",
+        "_high",
         "_hysteresis",
         "_inertia_rate",
         "_inverse_gear",
@@ -70,11 +77,11 @@ class FusedObserver:
         "_link",
         "_link_rate",
         "_link_velocity",
+        "_low",
         "_others",
         "_rate",
         "_sin2",
         "_sin4",
-        "_slip",
         "_state",
         "_stiffness",
         "_torsion_limit",
@@ -93,10 +100,11 @@ class FusedObserver:
         self._stiffness: Final = 0.0 if torsion is None else torsion.stiffness_nm_per_rad
         self._cubic: Final = 0.0 if torsion is None else torsion.cubic_nm_per_rad3
         self._zero: Final = 0.0 if torsion is None else torsion.zero_rad
+        self._damping: Final = 0.0 if torsion is None else torsion.damping_nms_per_rad
         self._hysteresis: Final = 0.0 if torsion is None else torsion.hysteresis_nm
         self._inverse_travel: Final = 0.0 if torsion is None else 1.0 / torsion.hysteresis_travel_rad
-        self._slip = 0.0
-        self._d = nan
+        self._low, self._high = -1.0, 1.0
+        self._d = 0.0
         self._torsion_limit: Final = RAW_LIMIT * joint.rated_torque_nm
         waves = [] if torsion is None else _waves(torsion)
         # the ripple angles are there anyway: a kinematic error of their orders costs no further cos and sin
@@ -136,18 +144,6 @@ class FusedObserver:
         )
         if self._others:
             d -= self._other_waves(angle)
-        torsion = d * (self._stiffness + self._cubic * d * d)
-        if self._hysteresis:
-            z = self._slip + (d - self._d) * self._inverse_travel
-            if z > 1.0:
-                z = 1.0
-            elif z < -1.0:
-                z = -1.0
-            elif isnan(z):  # the first sample
-                z = 0.0
-            self._slip = z
-            self._d = d
-            torsion += self._hysteresis * z
         v = motor_velocity_rad_s * self._inverse_gear
         if v > _SETTLED_RAD_S:
             direction = 1.0
@@ -158,7 +154,7 @@ class FusedObserver:
         return (
             current_a * self._kt + self._inertia_rate * motor_velocity_rad_s,
             v,
-            torsion,
+            d,
             c2,
             s2,
             c4,
@@ -176,6 +172,26 @@ class FusedObserver:
             error += c * cos(a) + s * sin(a)
         return error
 
+    def _torsion(self, d: float, dt_s: float) -> tuple[float, float]:
+        """Return (torque, open) [Nm] at the filtered deflection d [rad], dt_s after the last one; moves the slip to it."""
+        step = d - self._d
+        self._d = d
+        torsion = d * (self._stiffness + self._cubic * d * d) + self._damping * step / dt_s
+        if not self._hysteresis:
+            return torsion, 0.0
+        step *= self._inverse_travel
+        low = self._low + step
+        high = self._high + step
+        if high > 1.0:
+            high = 1.0
+            low = min(low, 1.0)
+        elif low < -1.0:
+            low = -1.0
+            high = max(high, -1.0)
+        self._low, self._high = low, high
+        half = 0.5 * self._hysteresis
+        return torsion + half * (low + high), half * (high - low)
+
     def start(
         self,
         current_a: float,
@@ -183,14 +199,16 @@ class FusedObserver:
         motor_velocity_rad_s: float,
         link_position_rad: float,
     ) -> FusedObserved:
-        """Set the states of a joint that has always moved at this speed with this torsion."""
-        self._d = nan
+        """Set the states of a joint that has always moved at this speed with this torsion; the slip is unknown."""
+        self._low, self._high = -1.0, 1.0
         now = self._inputs(current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
         self._last = self._state = now
         self._link = link_position_rad
         self._link_velocity = now[1]
+        self._d = now[2]
+        torsion, open_nm = self._torsion(now[2], 1.0)
         raw = (now[0] - self._inertia_rate * motor_velocity_rad_s) * self._gear
-        return FusedObserved(raw, now[1], now[1], *now[2:])
+        return FusedObserved(raw, now[1], now[1], torsion, *now[3:], open_nm)
 
     def step(
         self,
@@ -208,28 +226,29 @@ class FusedObserver:
         b0 = 1.0 - share
         b1 = share - a
         now = self._inputs(current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
-        u, v, t, c2, s2, c4, s4, s = now
-        u_, v_, t_, c2_, s2_, c4_, s4_, s_ = self._last
-        zu, zv, zt, zc2, zs2, zc4, zs4, zs = self._state
+        u, v, d, c2, s2, c4, s4, s = now
+        u_, v_, d_, c2_, s2_, c4_, s4_, s_ = self._last
+        zu, zv, zd, zc2, zs2, zc4, zs4, zs = self._state
         zu = a * zu + b0 * u + b1 * u_
         zv = a * zv + b0 * v + b1 * v_
-        zt = a * zt + b0 * t + b1 * t_
+        zd = a * zd + b0 * d + b1 * d_
         zc2 = a * zc2 + b0 * c2 + b1 * c2_
         zs2 = a * zs2 + b0 * s2 + b1 * s2_
         zc4 = a * zc4 + b0 * c4 + b1 * c4_
         zs4 = a * zs4 + b0 * s4 + b1 * s4_
         zs = a * zs + b0 * s + b1 * s_
         self._last = now
-        self._state = (zu, zv, zt, zc2, zs2, zc4, zs4, zs)
+        self._state = (zu, zv, zd, zc2, zs2, zc4, zs4, zs)
         if self._link_rate != self._rate:
             gone = -expm1(-self._link_rate * dt_s)
         slope = (link_position_rad - self._link) / dt_s
         self._link_velocity = r = self._link_velocity + gone * (slope - self._link_velocity)
         self._link = link_position_rad
         raw = (zu - self._inertia_rate * motor_velocity_rad_s) * self._gear
-        if not -self._torsion_limit <= zt <= self._torsion_limit:  # NaN included
+        torsion, open_nm = self._torsion(zd, dt_s)
+        if not -self._torsion_limit <= torsion <= self._torsion_limit:  # NaN included
             raw = nan
-        return _new(FusedObserved, (raw, zv, r, zt, zc2, zs2, zc4, zs4, zs))
+        return _new(FusedObserved, (raw, zv, r, torsion, zc2, zs2, zc4, zs4, zs, open_nm))
 
 
 def _waves(torsion: Torsion) -> list[tuple[float, float, float]]:

@@ -110,7 +110,7 @@ class AdditiveLoss:
 
 @dataclass(frozen=True, slots=True)
 class Torsion:
-    """Torque from both encoders: tau = K d + K3 d^3 + H z, d = theta_m/G - theta_l - zero - kinematic error [rad].
+    """Torque from both encoders: tau = K d + K3 d^3 + D d' + H z, d = theta_m/G - theta_l - zero - kinematic error [rad].
 
     z follows d through a Maxwell-slip element, dz = dd/travel held in [-1, 1]: elastic hysteresis of half width H.
     Kinematic error: sum over orders n per motor revolution of c cos(n theta_m) + s sin(n theta_m).
@@ -124,6 +124,7 @@ class Torsion:
     sin_rad: tuple[float, ...]
     hysteresis_nm: float = 0.0
     hysteresis_travel_rad: float = 1e-4
+    damping_nms_per_rad: float = 0.0
 
     @classmethod
     def from_section(cls, section: Section) -> Torsion:
@@ -138,6 +139,7 @@ class Torsion:
             sin_rad=_numbers(section, "sin_rad", "rad", len(orders), len(orders)),
             hysteresis_nm=section.number("hysteresis_nm", "Nm", low=0.0, default=0.0),
             hysteresis_travel_rad=section.number("hysteresis_travel_rad", "rad", above=0.0, default=1e-4),
+            damping_nms_per_rad=section.number("damping_nms_per_rad", "Nms/rad", low=0.0, default=0.0),
         )
         section.finish()
         return torsion

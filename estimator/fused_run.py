@@ -17,6 +17,7 @@ from estimator.fused_observer import FusedObserved, FusedObserver
 from estimator.fused_parameters import Torsion
 from estimator.fused_trust import FusedTrust
 from estimator.fusion import Fusion, held_many, turning_many
+from estimator.observer_run import observe_fused
 from estimator.parameters import Joint
 from estimator.settings import EstimatorSettings
 from estimator.status import DEGRADED, INVALID, STANDSTILL, VALID
@@ -32,8 +33,8 @@ class ObservedRun:
     """Outputs of the fused observer over a run, arrays [n]; NaN where it was not running.
 
     Torques [Nm, joint side], velocity [rad/s, joint side]; waves [n, 4]: filtered cos and sin of 2 and 4 times
-    the motor angle; link [n]: link position [rad]; temperature [n], NaN where unknown; direction [n], -1 to 1;
-    dt_s [n], time since the sample before.
+    the motor angle; temperature [n], NaN where unknown; direction [n], -1 to 1; dt_s [n], time since the sample before;
+    open_nm [n]: what the torsion's slip leaves open to either side.
     """
 
     status: StatusArray
@@ -41,10 +42,10 @@ class ObservedRun:
     velocity_rad_s: FloatArray
     torsion_nm: FloatArray
     waves: FloatArray
-    link_rad: FloatArray
     temperature_c: FloatArray
     direction: FloatArray
     dt_s: FloatArray
+    open_nm: FloatArray
 
 
 def observe_run(  # noqa: PLR0917 - as a sample, in arrays
@@ -73,6 +74,9 @@ def observe_run(  # noqa: PLR0917 - as a sample, in arrays
         temperature_c = np.full(count, np.nan)
     elif np.shape(temperature_c) != (count,):
         raise ValueError(f"found temperatures of shape {np.shape(temperature_c)}, expected ({count},)")
+    quick = observe_fused(joint, settings, torsion, columns)
+    if quick is not None:
+        return _observed(quick[0], quick[1].T, temperature_c, columns[0])
     observer = FusedObserver(joint, torsion, settings.bandwidth_rad_s, settings.link_bandwidth_rad_s)
     tracker = Tracker(observer, joint, settings)
     step = tracker.step
@@ -82,17 +86,23 @@ def observe_run(  # noqa: PLR0917 - as a sample, in arrays
     for k, sample in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
         rows.append(step(*sample) or nothing)
         status[k] = tracker.status
-    seen = np.array(rows, np.float64).reshape(-1, len(nothing))
+    return _observed(status, np.array(rows, np.float64).reshape(-1, len(nothing)), temperature_c, columns[0])
+
+
+def _observed(
+    status: StatusArray, seen: FloatArray, temperature_c: FloatArray, dt_s: FloatArray
+) -> ObservedRun:
+    """Return outputs `seen` [n, fields of FusedObserved] by name."""
     return ObservedRun(
         status,
         seen[:, 0].copy(),
         seen[:, 1].copy(),
         seen[:, 3].copy(),
         seen[:, 4:8].copy(),
-        columns[4],
         np.asarray(temperature_c, np.float64),
         seen[:, 8].copy(),
-        columns[0],
+        dt_s,
+        seen[:, 9].copy(),
     )
 
 
@@ -129,7 +139,8 @@ def estimate_observed(
     with np.errstate(invalid="ignore", over="ignore"):
         loss, half = AdditiveLossModel(fused.loss).loss_many(raw, v, at.temperature_c, at.direction)
         wide = held_many(half, seen.dt_s, running)
-        physics, sigma = Fusion(fused.sigma, fused.torsion is not None).fuse_many(raw, loss, wide, v, torsion)
+        fusion = Fusion(fused.sigma, fused.torsion is not None)
+        physics, sigma = fusion.fuse_many(raw, loss, wide, v, torsion, at.open_nm)
         features = network_features(at, raw - loss)
         features[~running] = np.nan
         quadrant = quadrant_many(raw, v)
@@ -168,8 +179,8 @@ def _running_only(seen: ObservedRun, running: np.ndarray[tuple[int], np.dtype[np
         raw_nm=np.where(running, seen.raw_nm, 0.0),
         velocity_rad_s=np.where(running, seen.velocity_rad_s, 0.0),
         torsion_nm=np.where(running, seen.torsion_nm, 0.0),
-        link_rad=np.where(running, seen.link_rad, 0.0),
         direction=np.where(running, seen.direction, 0.0),
+        open_nm=np.where(running, seen.open_nm, 0.0),
     )
 
 

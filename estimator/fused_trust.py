@@ -168,9 +168,11 @@ class FusedTrust:
         x, y = np.where(inside, x, 0.0), np.where(inside, y, 0.0)
         m, n = x.astype(np.intp), y.astype(np.intp)
         x, y = x - m, y - n
-        table = self._table
-        a = table[m, n] + y * (table[m, n + 1] - table[m, n])
-        b = table[m + 1, n] + y * (table[m + 1, n + 1] - table[m + 1, n])
+        width = self._table.shape[1]
+        table, at = self._table.ravel(), m * width + n
+        a, b = table[at], table[at + width]
+        a += y * (table[at + 1] - a)
+        b += y * (table[at + width + 1] - b)
         weight: FloatArray = np.where(inside, a + x * (b - a), 0.0)
         excess = np.maximum(np.abs(distance) - self._distance, 0.0)
         weight = weight * np.maximum(0.0, 1.0 - excess * self._inverse_fade)

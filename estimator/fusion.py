@@ -1,10 +1,10 @@
 """Two independent views of one torque, weighted by their variances: motor current less loss, and torsion.
 
     tau_c = tau_raw - loss                 knows fast changes and any load; fails with friction
-    tau_t = K d + K3 d^3                   knows nothing of friction; fails with hysteresis and encoder errors
+    tau_t = K d + K3 d^3 + D d' + H z      knows nothing of friction; fails with hysteresis and encoder errors
     alpha = s_c^2/(s_c^2 + s_t^2)          physics = tau_c + alpha (tau_t - tau_c)
     s_c^2 = a^2 + (b v)^2 + (c tau_raw)^2 + half^2        half: what friction leaves open near v = 0
-    s_t^2 = e^2 + (f tau_t)^2
+    s_t^2 = e^2 + (f tau_t)^2 + open^2     open: what the slip leaves open until its bounds have met
     sigma^2 = s_c^2 s_t^2/(s_c^2 + s_t^2) + reference^2
 
 Towards standstill `half` grows to the half width of the friction interval and the torsion takes over: continuous,
@@ -20,10 +20,14 @@ import numpy as np
 
 from estimator.friction import FloatArray
 from estimator.fused_parameters import FusedSigma
+from estimator.lanes import fading_maximum
 
 SLOW_RAD_S: Final = 0.05
 FAST_RAD_S: Final = 0.2
 """The network fades in between these speeds: slower, a wave of the motor angle looks like an offset."""
+
+_LONG: Final = 2000
+"""Samples from which on arrays pay."""
 
 HOLD_S: Final = 0.05
 """Time constant with which the friction interval is forgotten after a reversal."""
@@ -57,6 +61,13 @@ def held_many(
 ) -> FloatArray:
     """Vectorised twin of `held` [n]; the memory begins anew after every sample that is not `running`."""
     out = np.zeros_like(half_nm)
+    steps = dt_s[running]
+    if len(steps) > _LONG and steps.min() >= 0.0 and steps.max() <= HOLD_S:
+        edges = np.flatnonzero(np.diff(running, prepend=False, append=False)).tolist()
+        for first, end in zip(edges[::2], edges[1::2], strict=True):
+            kept = HOLD_S / (HOLD_S + dt_s[first:end])
+            out[first:end] = fading_maximum(half_nm[first:end], kept)
+        return out
     memory = 0.0
     for k, (half, dt, on) in enumerate(zip(half_nm.tolist(), dt_s.tolist(), running.tolist(), strict=True)):
         memory = held(half, memory, dt) if on else 0.0
@@ -81,10 +92,16 @@ class Fusion:
         self._reference: Final = sigma.reference_nm**2
         self._with_torsion: Final = with_torsion
 
-    def fuse(
-        self, raw_nm: float, loss_nm: float, half_nm: float, velocity_rad_s: float, torsion_nm: float
+    def fuse(  # noqa: PLR0917 - the two paths and what each leaves open
+        self,
+        raw_nm: float,
+        loss_nm: float,
+        half_nm: float,
+        velocity_rad_s: float,
+        torsion_nm: float,
+        open_nm: float = 0.0,
     ) -> tuple[float, float]:
-        """Return (physics, sigma) [Nm]; half_nm: `AdditiveLossModel.loss`."""
+        """Return (physics, sigma) [Nm]; half_nm: `AdditiveLossModel.loss`; open_nm: `FusedObserved`."""
         c = (
             self._current
             + self._viscous * velocity_rad_s * velocity_rad_s
@@ -94,30 +111,36 @@ class Fusion:
         value = raw_nm - loss_nm
         if not self._with_torsion:
             return value, sqrt(c + self._reference)
-        t = self._torsion + self._torsion_load * torsion_nm * torsion_nm
+        t = self._torsion + self._torsion_load * torsion_nm * torsion_nm + open_nm * open_nm
         alpha = c / (c + t)
         return value + alpha * (torsion_nm - value), sqrt(alpha * t + self._reference)
 
-    def fuse_many(
+    def fuse_many(  # noqa: PLR0917
         self,
         raw_nm: FloatArray,
         loss_nm: FloatArray,
         half_nm: FloatArray,
         velocity_rad_s: FloatArray,
         torsion_nm: FloatArray,
+        open_nm: FloatArray | float = 0.0,
     ) -> tuple[FloatArray, FloatArray]:
         """Vectorised twin of `fuse`, arrays [n]."""
-        alpha, sigma = self.weigh_many(raw_nm, half_nm, velocity_rad_s, torsion_nm)
+        alpha, sigma = self.weigh_many(raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm)
         value = raw_nm - loss_nm
         return value + alpha * (torsion_nm - value), sigma
 
     def weigh_many(
-        self, raw_nm: FloatArray, half_nm: FloatArray, velocity_rad_s: FloatArray, torsion_nm: FloatArray
+        self,
+        raw_nm: FloatArray,
+        half_nm: FloatArray,
+        velocity_rad_s: FloatArray,
+        torsion_nm: FloatArray,
+        open_nm: FloatArray | float = 0.0,
     ) -> tuple[FloatArray, FloatArray]:
         """Return (alpha, sigma), arrays [n]: share of the torsion, and standard deviation of the fused value [Nm]."""
         c = self._current + self._viscous * velocity_rad_s**2 + self._load * raw_nm**2 + half_nm**2
         if not self._with_torsion:
             return np.zeros_like(c), np.sqrt(c + self._reference)
-        t = self._torsion + self._torsion_load * torsion_nm**2
+        t = self._torsion + self._torsion_load * torsion_nm**2 + np.square(open_nm)
         alpha = c / (c + t)
         return alpha, np.sqrt(alpha * t + self._reference)

@@ -39,7 +39,7 @@ _new: Final = tuple.__new__
 
 
 class JointEstimator:
-    """Estimator of one joint. Raises ConfigError for effects it cannot apply and for another joint's network.
+    """Estimator of one plain joint. Raises ConfigError for effects (`make_estimator` applies them), another's network.
 
     joint: parameters; settings: method and thresholds; network: needed by method "network" only. A joint
     without efficiency may use methods "tob" and "network" (the loss is then its additive friction).
@@ -81,6 +81,11 @@ class JointEstimator:
         self._network_sigma: Final = 0.0 if used is None else used.sigma_nm
         self._weight: Final = None if used is None else trust_of(joint, settings, used).weight
 
+    @property
+    def with_network(self) -> bool:
+        """Whether a network is used."""
+        return self._run_network is not None
+
     def reset(self) -> None:
         """Forget the past: the next step starts."""
         self._tracker.reset()
@@ -93,8 +98,12 @@ class JointEstimator:
         motor_velocity_rad_s: float,
         link_position_rad: float,
         temperature_c: float = nan,
+        network_wanted: bool = True,
     ) -> Estimate:
-        """Return the estimate at this sample, dt_s [s] after the one before; never raises on any float."""
+        """Return the estimate at this sample, dt_s [s] after the one before; never raises on any float.
+
+        Without network_wanted there is no time for it: this sample is physics only.
+        """
         tracker = self._tracker
         seen = tracker.step(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
         status = tracker.status
@@ -108,7 +117,7 @@ class JointEstimator:
             physics = efficiency = raw - self._loss(i, v)
         weight = 0.0
         run_network = self._run_network
-        if run_network is not None:
+        if run_network is not None and network_wanted:
             network = run_network(
                 current_a,
                 motor_position_rad,

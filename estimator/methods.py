@@ -1,10 +1,16 @@
-"""The estimator of a joint by its method: one door for the loop, one for whole runs."""
+"""The estimator of a joint by its method: one door for the loop, one for whole runs.
+
+Effects of the joint file are applied here, whatever the method: the estimators themselves take plain joints only.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from estimator.checked import ConfigError
+from estimator.extended_estimator import ExtendedEstimator, corrected_by_steps
+from estimator.extended_inputs import acting, needs_torque, plain_joint
+from estimator.extended_run import extended_run
 from estimator.friction import FloatArray
 from estimator.fused_estimator import FusedEstimator, fused_parts
 from estimator.fused_network import FusedNetwork
@@ -16,8 +22,9 @@ from estimator.run import JointColumns
 from estimator.settings import EstimatorSettings
 from estimator.whole_run import EstimateRun, estimate_run
 
-AnyEstimator = JointEstimator | FusedEstimator
+AnyEstimator = JointEstimator | FusedEstimator | ExtendedEstimator
 AnyNetwork = TorqueNetwork | FusedNetwork
+_Inputs = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 def load_network(method: str, source: bytes | str, sha256: str | None = None) -> AnyNetwork:
@@ -29,9 +36,13 @@ def make_estimator(
     joint: Joint, settings: EstimatorSettings, network: AnyNetwork | None = None
 ) -> AnyEstimator:
     """Return the step-by-step estimator of a joint. Raises ConfigError when joint, method and network do not fit."""
+    plain = plain_joint(joint)
+    inner: JointEstimator | FusedEstimator
     if settings.method == "fused":
-        return FusedEstimator(joint, settings, _fused(joint, network))
-    return JointEstimator(joint, settings, _paper(joint, network))
+        inner = FusedEstimator(plain, settings, _fused(plain, network))
+    else:
+        inner = JointEstimator(plain, settings, _paper(plain, network))
+    return ExtendedEstimator(joint, settings, inner) if acting(joint) else inner
 
 
 def estimate_columns(
@@ -45,8 +56,20 @@ def estimate_columns(
 
     Raises ConfigError as `make_estimator` does, ValueError for a missing column.
     """
-    dt = np.diff(time_s, prepend=time_s[0])
-    inputs = _inputs(joint, columns)
+    return estimate_steps(joint, settings, network, np.diff(time_s, prepend=time_s[0]), columns)
+
+
+def estimate_steps(
+    joint: Joint,
+    settings: EstimatorSettings,
+    network: AnyNetwork | None,
+    dt_s: FloatArray,
+    columns: JointColumns,
+) -> EstimateRun:
+    """Return the estimates as `estimate_columns`, by time steps: dt_s[k] is the time since sample k-1, 0 begins anew."""
+    dt = dt_s
+    inputs = _corrected(joint, settings, network, dt, columns)
+    joint = plain_joint(joint)
     if settings.method == "fused":
         fused, used = fused_parts(joint, settings, _fused(joint, network))
         seen = observe_run(joint, settings, fused.torsion, dt, *inputs, columns.temperature_c)
@@ -54,7 +77,27 @@ def estimate_columns(
     return estimate_run(joint, settings, _paper(joint, network), dt, *inputs)
 
 
-def _inputs(joint: Joint, columns: JointColumns) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def _corrected(
+    joint: Joint,
+    settings: EstimatorSettings,
+    network: AnyNetwork | None,
+    dt_s: FloatArray,
+    columns: JointColumns,
+) -> _Inputs:
+    """Return what the estimator of the plain joint is given; ValueError for a missing column."""
+    inputs = _inputs(joint, columns)
+    if not acting(joint):
+        return inputs
+    if needs_torque(joint):
+        estimator = make_estimator(joint, settings, network)
+        assert isinstance(estimator, ExtendedEstimator)
+        current, link = corrected_by_steps(estimator, dt_s, inputs, columns.temperature_c)
+    else:
+        current, link = extended_run(joint, settings, dt_s, *inputs, columns.temperature_c)
+    return current, inputs[1], inputs[2], link
+
+
+def _inputs(joint: Joint, columns: JointColumns) -> _Inputs:
     """Return current, motor position, motor velocity and link position; ValueError for a missing column."""
     needed = {
         name: getattr(columns, name)

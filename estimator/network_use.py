@@ -43,10 +43,14 @@ def checked_network(
     joint: Joint, settings: EstimatorSettings, network: NetworkModel | None
 ) -> NetworkModel | None:
     """Return the network that the method uses, if it uses one; ConfigError when the three do not fit."""
+    if settings.method == "fused":
+        raise ConfigError(
+            f"joint {joint.name}: found method 'fused', which FusedEstimator applies, not this one"
+        )
     if joint.effects:
         names = ", ".join(effect.name for effect in joint.effects)
         raise ConfigError(
-            f"joint {joint.name}: found effects ({names}), which this estimator cannot apply; expected none"
+            f"joint {joint.name}: found effects ({names}), which `make_estimator` applies, not this class"
         )
     if settings.method == "efficiency" and joint.efficiency is None:
         raise ConfigError(

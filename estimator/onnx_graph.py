@@ -110,6 +110,7 @@ class OnnxGraph:
     def _open(self, data: bytes) -> Any:
         import onnxruntime as ort
 
+        ort.disable_telemetry_events()  # some builds report to their maker; a controller has nobody to report to
         options = ort.SessionOptions()
         options.intra_op_num_threads = 1
         options.inter_op_num_threads = 1

@@ -12,6 +12,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from estimator.checked import ConfigError, Section
+from estimator.effects.library import EFFECTS, checked_parameters, read_parameters
 from estimator.fused_parameters import Fused
 
 CONVENTIONS: Final = ("joint_over_motor", "motor_over_joint")
@@ -20,17 +21,7 @@ CONVENTIONS: Final = ("joint_over_motor", "motor_over_joint")
 QUADRANTS: Final = ("i_pos_w_pos", "i_neg_w_neg", "i_neg_w_pos", "i_pos_w_neg")
 """Order of Table I: two driving quadrants, then two back-driving quadrants."""
 
-_EFFECTS: Final = {
-    "friction": "coulomb_friction viscous_friction stribeck_friction load_dependent_friction"
-    " friction_asymmetry temperature_dependent_friction",
-    "transmission": "torque_ripple kinematic_error nonlinear_stiffness hysteresis lost_motion",
-    "actuator": "torque_constant torque_constant_saturation torque_constant_temperature cogging"
-    " current_offset rotor_inertia",
-    "measurement": "sensor_offset sensor_gain sensor_drift sensor_crosstalk encoder_eccentricity"
-    " channel_delay",
-    "load": "link_inertia unbalance",
-}
-EFFECT_NAMES: Final = frozenset(name for group in _EFFECTS.values() for name in group.split())
+EFFECT_NAMES: Final = frozenset(EFFECTS)
 
 
 def _require(name: str, value: object, low: float, exclusive: bool) -> None:
@@ -139,17 +130,17 @@ _CONVENTION_TEXT: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """One term of the extended model: a name of EFFECT_NAMES and its parameters in SI units."""
+    """One term of the extended model: a name of the effect library and its parameters in SI units.
+
+    Defaults are filled in. Raises ConfigError for an unknown name, an unknown, missing or implausible parameter.
+    """
 
     name: str
     parameters: Mapping[str, float]
 
     def __post_init__(self) -> None:
-        if self.name not in EFFECT_NAMES:
-            raise ConfigError(
-                f"effect: found {self.name!r}, expected one of " + ", ".join(sorted(EFFECT_NAMES))
-            )
-        object.__setattr__(self, "parameters", MappingProxyType(dict(self.parameters)))
+        parameters = checked_parameters(self.name, self.parameters)
+        object.__setattr__(self, "parameters", MappingProxyType(parameters))
 
     def __reduce__(self) -> tuple[type[Effect], tuple[str, dict[str, float]]]:
         """Copy and pickle through plain dicts: a mapping proxy can do neither."""
@@ -160,9 +151,10 @@ class Effect:
         """Read one entry of the list `effects`."""
         name = section.text("name", choices=sorted(EFFECT_NAMES))
         inner = section.section("parameters", optional=True)
-        parameters = {} if inner is None else {key: inner.number(key) for key in inner.names()}
+        if inner is None:
+            inner = Section({}, section.where, f"{section.path}.parameters")
         section.finish()
-        return cls(name, parameters)
+        return cls(name, read_parameters(name, inner))
 
 
 # key -> unit, lower limit, whether the limit itself is excluded
@@ -181,8 +173,7 @@ _JOINT_NUMBERS: Final = {
 class Joint:
     """One joint: `joint.yaml` as values. Numbers out of range raise ConfigError (replace() too).
 
-    `effects` are carried and checked by name; who uses the joint decides whether they can be applied (the
-    estimator of this version refuses a joint that has any).
+    `effects` add to what the other sections say; an effect that replaces one of their values may be there once.
     """
 
     name: str
@@ -203,6 +194,7 @@ class Joint:
         for key, (_, low, exclusive) in _JOINT_NUMBERS.items():
             _require(f"joint {self.name}: {key}", getattr(self, key), low, exclusive)
         object.__setattr__(self, "effects", tuple(self.effects))
+        self._check_effects()
         object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
 
     def __reduce__(self) -> tuple[type[Joint], tuple[Any, ...]]:
@@ -211,6 +203,17 @@ class Joint:
             dict(self.provenance) if item.name == "provenance" else getattr(self, item.name)
             for item in fields(self)
         )
+
+    def _check_effects(self) -> None:
+        """Refuse two right values for one key."""
+        seen: set[str] = set()
+        for effect in self.effects:
+            if any(p.key for p in EFFECTS[effect.name].parameters):
+                if effect.name in seen:
+                    raise ConfigError(
+                        f"joint {self.name}: effects: found {effect.name!r} twice, expected once"
+                    )
+                seen.add(effect.name)
 
     @classmethod
     def from_mapping(cls, mapping: object, where: str) -> Joint:

@@ -24,7 +24,8 @@ class JointColumns:
     """Columns [n] of one joint, None where the run has none; SI units.
 
     Motor position and velocity are motor side, the rest is joint side. torque_nm is measured: what the
-    joint exerts on the coupling, positive along its own positive current.
+    joint exerts on the coupling, positive along its own positive current. enabled: 0 where the drive's power
+    stage is off, else 1; None: nothing is known of it.
     """
 
     current_a: FloatArray | None = None
@@ -34,6 +35,7 @@ class JointColumns:
     link_velocity_rad_s: FloatArray | None = None
     torque_nm: FloatArray | None = None
     temperature_c: FloatArray | None = None
+    enabled: FloatArray | None = None
 
     def __post_init__(self) -> None:
         for item in fields(self):

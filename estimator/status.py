@@ -7,7 +7,9 @@ from typing import Final
 OFF: Final = 0
 STARTING: Final = 1
 VALID: Final = 2
-DEGRADED: Final = 3  # outside the network's envelope or refused by its plausibility check: physics only
+DEGRADED: Final = (
+    3  # the network is not alone in charge: outside its envelope, far from physics, or no time for it
+)
 STALE: Final = 4  # an input of this cycle is missing (set by the loop, never by the estimator)
 DRIVE_FAULT: Final = 5  # set by the loop, never by the estimator
 STANDSTILL: Final = 6  # known to an interval only; sigma is its half width

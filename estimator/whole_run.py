@@ -1,7 +1,7 @@
 """Vectorised twin of JointEstimator for whole runs: same numbers to 1e-9, a fraction of the time.
 
-The observer is a recursion and stays a loop over the same code as in service; losses, network, sigma and
-status are arrays.
+The observer is a recursion: long runs go through `observer_run` in arrays, short ones and those with garbage through a loop
+over the same code as in service. Losses, network, sigma and status are arrays.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from estimator.friction import FloatArray
 from estimator.losses import LossModel
 from estimator.network_use import NetworkModel, checked_network, trust_of
 from estimator.observer import Observer
+from estimator.observer_run import observe_paper
 from estimator.parameters import Joint
 from estimator.settings import EstimatorSettings
 from estimator.status import DEGRADED, INVALID, STANDSTILL, VALID
@@ -96,6 +97,10 @@ def _observe(
     joint: Joint, settings: EstimatorSettings, columns: list[FloatArray]
 ) -> tuple[StatusArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Run the tracker: status [n] and raw, tob, joint velocity, link velocity [n], NaN where it has none."""
+    found = observe_paper(joint, settings, columns)
+    if found is not None:
+        raw, tob, v, link_velocity = found[1]
+        return found[0], raw, tob, v, link_velocity
     tracker = Tracker(
         Observer(joint, settings.bandwidth_rad_s, settings.link_bandwidth_rad_s), joint, settings
     )

@@ -14,11 +14,26 @@ from estimator.parameters import Joint
 
 _LARGEST_YAML: Final = 1_000_000
 """Bytes; ours have 3000. A log given by mistake must not keep the parser busy for minutes."""
+_MOST_KEYS: Final = 100_000
+"""Of all mappings together, those that were merged into others counted again."""
 _SHIPPED: Final = Path(__file__).resolve().parent
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader that refuses a key given twice: YAML says unique, PyYAML would silently keep the last."""
+    """SafeLoader that refuses a key given twice: YAML says unique, PyYAML would silently keep the last.
+
+    It also refuses merge keys (<<) that multiply: a few hundred bytes of them would take hours and all memory.
+    """
+
+    _merged = 0
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        super().flatten_mapping(node)
+        self._merged += len(node.value)
+        if self._merged > _MOST_KEYS:
+            raise yaml.constructor.ConstructorError(
+                None, None, f"more than {_MOST_KEYS} keys by merging", node.start_mark
+            )
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()
@@ -35,6 +50,12 @@ class _Loader(yaml.SafeLoader):
 
 def load_yaml(path: str | os.PathLike[str]) -> tuple[dict[str, Any], str]:
     """Return the root mapping of a YAML file and the SHA-256 of its bytes (hex). Raises ConfigError."""
+    mapping, data = read_yaml(path)
+    return mapping, hashlib.sha256(data).hexdigest()
+
+
+def read_yaml(path: str | os.PathLike[str]) -> tuple[dict[str, Any], bytes]:
+    """Return the root mapping of a YAML file and the very bytes it was read from. Raises ConfigError."""
     name = os.fspath(path)
     try:
         with open(path, "rb") as file:
@@ -57,7 +78,7 @@ def load_yaml(path: str | os.PathLike[str]) -> tuple[dict[str, Any], str]:
     if not isinstance(content, dict):
         kind = "an empty file" if content is None else type(content).__name__
         raise ConfigError(f"{name}: found {kind}, expected a mapping of keys to values")
-    return content, hashlib.sha256(data).hexdigest()
+    return content, data
 
 
 def load_joint(path: str | os.PathLike[str]) -> Joint:

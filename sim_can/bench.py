@@ -11,6 +11,7 @@ from sim_can.profile import targets
 from sim_can.sensor_node import SENSOR_NODE, SensorNode
 from sim_can.source import OFF, VELOCITY, Source
 
+CLOCK_STEP_NS = 100_000_000  # stamps and steady clock never differ by this from SYNC to SYNC, unless CLOCK_REALTIME was set
 LONGEST_STEP_NS = 50_000_000  # a source never jumps further than this, however long SYNC was away
 RESOLUTION_NS = (
     10_000  # a software stamp is no better; the plant then sees an exact grid wherever SYNC keeps one
@@ -52,6 +53,7 @@ class Bench:
         self._first_stamp_ns = 0
         self._last_time_ns = 0  # of the last SYNC, since the first one
         self._last_steady_ns = 0  # steady clock at the last step, for idle steps
+        self._sync_steady_ns = 0  # steady clock at the last SYNC
         self._idle_ns = 0  # source time spent in idle steps since the last SYNC
 
     @property
@@ -87,15 +89,19 @@ class Bench:
     def _on_sync(self, data: bytes, stamp_ns: int, now_ns: int) -> list[bytes]:
         step_ns = 0
         if self.sync_count:
-            # a clock that was stepped back must not stop the bench, nor may time that idle steps covered
-            # count twice
             time_ns = _rounded(stamp_ns - self._first_stamp_ns)
-            step_ns = min(max(time_ns - self._last_time_ns - self._idle_ns, 0), LONGEST_STEP_NS)
+            since_ns, steady_ns = time_ns - self._last_time_ns, now_ns - self._sync_steady_ns
+            if abs(since_ns - steady_ns) > CLOCK_STEP_NS:
+                since_ns = _rounded(
+                    steady_ns
+                )  # a clock that was set must neither stop the bench nor hurry it
+            # time that idle steps covered does not count twice
+            step_ns = min(max(since_ns - self._idle_ns, 0), LONGEST_STEP_NS)
             self._last_time_ns = time_ns
         else:
             self._first_stamp_ns = stamp_ns
         self.sync_count += 1
-        self._last_steady_ns = now_ns
+        self._last_steady_ns = self._sync_steady_ns = now_ns
         self._idle_ns = 0
         frames = self._advance(step_ns * 1e-9)
         if self.over:

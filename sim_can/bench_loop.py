@@ -145,8 +145,7 @@ def run(bus: str, bench: Bench, bitrate: int | None = None, duration_s: float | 
     Raises:
         BusError: the bus cannot be opened or has gone.
     """
-    signal.signal(signal.SIGTERM, _stop)
-    signal.signal(signal.SIGINT, _stop)
+    before = {number: signal.signal(number, _stop) for number in (signal.SIGTERM, signal.SIGINT)}
     # the default slack of 50 us on every timeout is a frame on the wire at 1 Mbit/s
     ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0)
     line: _Bus | None = None
@@ -165,6 +164,8 @@ def run(bus: str, bench: Bench, bitrate: int | None = None, duration_s: float | 
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         if line is not None:
             line.close()
+        for number, handler in before.items():
+            signal.signal(number, handler)
     return 0
 
 

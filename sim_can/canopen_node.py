@@ -23,6 +23,7 @@ _START, _STOP, _ENTER_PRE_OPERATIONAL, _RESET_NODE, _RESET_COMMUNICATION = 1, 2,
 HEARTBEAT_LOST = 0x8130
 PDO_TOO_SHORT = 0x8210
 SYNC_LENGTH = 0x8240
+_VERIFY, _DOWNLOADED = 0x1020, 0x60
 _MS = 1_000_000
 
 Handler = Callable[[int], None]
@@ -190,11 +191,21 @@ class CanopenNode:
     def _on_sdo(self, data: bytes, t_ns: int) -> list[bytes]:
         before = self.store.number(0x1017)
         reply = self._sdo.handle(data)
+        self._forget_signature(data, reply)
         if self.store.number(0x1017) != before:
             self._plan_heartbeat(t_ns)
         self.due_ns = 0  # whatever was written, let the next tick look at its times again
         frames = [] if reply is None else [pack(0x580 + self.node_id, reply)]
         return frames + self.after_command()
+
+    def _forget_signature(self, request: bytes, reply: bytes | None) -> None:
+        """1020h is 0 once a communication parameter has been written after it (CiA 301, 7.5.2.22)."""
+        if reply is None or reply[0] != _DOWNLOADED or len(request) != 8 or not self.store.has(_VERIFY, 1):
+            return
+        index = int.from_bytes(request[1:3], "little")
+        if 0x1005 <= index < 0x2000 and index != _VERIFY:
+            self.store.set_number(_VERIFY, 1, 0)
+            self.store.set_number(_VERIFY, 2, 0)
 
     def after_command(self) -> list[bytes]:
         """What a device has to say after an SDO or RPDO wrote to it (EMCY, event-driven TPDOs)."""

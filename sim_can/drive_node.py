@@ -46,6 +46,7 @@ class DriveNode(CanopenNode):
         self._signals: DriveSignals = source.drives[number]
         self._ratings: DriveRatings = source.ratings[number]
         self._mode = 0
+        self._ran = False  # since it was set up: 6060h written, or power-on
         self._own_target = 0.0
         self._sent = (OFF, 0.0)
         self._interpolation_s = _INTERPOLATION_S
@@ -134,6 +135,7 @@ class DriveNode(CanopenNode):
             raise SdoAbort(VALUE_RANGE)
         self._take_over()
         self._mode = mode
+        self._ran = False
 
     def _interpolation_value(self, value: int) -> None:
         self._interpolate(value, self.store.number(0x60C2, 2))
@@ -188,6 +190,10 @@ class DriveNode(CanopenNode):
         """Tell the source what this drive's power stage does now."""
         command = self._command()
         if command != self._sent:
+            if command[0] != OFF:
+                if self._ran and self._sent[0] == OFF:
+                    self._source.resume()
+                self._ran = True
             self._sent = command
             self._source.command(self._number, *command)
 
@@ -242,6 +248,7 @@ class DriveNode(CanopenNode):
     def on_reset(self) -> None:
         """Power-on state: power stage off, no mode, no fault."""
         self.machine.release()
+        self._ran = False
         self._mode = 0
         self._error_code = 0
         self._interpolate(self.store.number(0x60C2, 1), self.store.number(0x60C2, 2))

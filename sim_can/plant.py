@@ -22,6 +22,7 @@ clock.
 """
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 from estimator.losses import LossModel
@@ -85,8 +86,10 @@ def _relaxed(c: _Constants) -> float:
 
 
 def loss_table(side: JointPlant) -> LossTable:
-    """Losses of the joint's file over what the gear transmits."""
+    """Losses of the joint's file over what the gear transmits, without a Stribeck peak: that is a deviation."""
     joint = side.joint
+    if joint.efficiency is None:
+        joint = replace(joint, friction=replace(joint.friction, stribeck_nm=0.0))
     return LossTable(
         LossModel(joint).loss_many,
         joint.gear_ratio,
@@ -108,14 +111,18 @@ class Plant:
 
     Public state (may be set before a run): motor_position, motor_velocity (lists of two, motor side),
     link_position, link_velocity, slip (z of both joints); `drives` are the control loops, `temperatures` the
-    joints' thermal states.
+    joints' thermal states. Joint files with effects need `sim_can.effect_plant.EffectPlant` (ValueError here).
     """
 
     def __init__(self, parameters: PlantParameters) -> None:
+        if parameters.has_effects and type(self) is Plant:
+            raise ValueError(
+                "found joints with effects, expected none: EffectPlant has the equations for these"
+            )
         self.parameters = parameters
         one, two = parameters.joints
         self._joints = (_constants(one), _constants(two))
-        self._link_inertia = (one.joint.link_inertia_kgm2, two.joint.link_inertia_kgm2)
+        self._link_inertia = (one.link_inertia, two.link_inertia)
         table = loss_table(one)
         same = one.joint == two.joint and one.drive.current_limit_a == two.drive.current_limit_a
         self.friction = (joint_friction(one, table), joint_friction(two, table if same else None))
@@ -130,6 +137,9 @@ class Plant:
         self.link_velocity = 0.0
         self.slip = [0.0, 0.0]
         self._loss_w = [0.0, 0.0]  # power of the friction in the last integration step
+
+    def begin_run(self) -> None:
+        """The drives are about to be enabled: the time that effects may depend on begins here."""
 
     def begin_day(self, day: Day) -> None:
         """Friction and temperature of another day; both joints are as warm as their surroundings."""

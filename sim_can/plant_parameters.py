@@ -6,12 +6,14 @@ encoders, thermal behaviour; the sensor; what changes from day to day.
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from estimator.checked import Section
 from estimator.parameters import Joint
+from sim_can.joint_effects import changed_joint, uses_temperature
 from sim_can.plant_deviations import Deviations, deviations_from
 from sim_can.plant_equipment import (
     DriveParameters,
@@ -42,6 +44,8 @@ PROFILES = ("demo", "rest")
 # Largest part of the gear's own transmission 1/G that a kinematic error may add or take away; with 1 the
 # link would stand still, or go back, while the motor turns on.
 STEEPEST_KINEMATIC_ERROR = 0.5
+# Warming of a joint that comes as a joint file with effects of the temperature: that of campaign_plant.yaml.
+WARMING_K_PER_W = 0.6
 
 
 @dataclass(frozen=True)
@@ -54,20 +58,40 @@ class JointPlant:
     measurement: MeasurementParameters = field(default_factory=MeasurementParameters)
     thermal: Thermal = field(default_factory=Thermal)
 
+    @cached_property
+    def true_joint(self) -> Joint:
+        """The joint with its true constants: its file's, the deviations, and inertias that effects replace.
+
+        An effect states the right value, whatever file and deviations say.
+        """
+        joint, d = self.joint, self.deviations
+        joint = replace(
+            joint,
+            torque_constant_nm_per_a=joint.torque_constant_nm_per_a * d.torque_constant_scale,
+            rotor_inertia_kgm2=joint.rotor_inertia_kgm2 * d.rotor_inertia_scale,
+            stiffness_nm_per_rad=joint.stiffness_nm_per_rad * d.stiffness_scale,
+        )
+        return changed_joint(joint)
+
     @property
     def torque_constant(self) -> float:
-        """True Kt, Nm/A."""
-        return self.joint.torque_constant_nm_per_a * self.deviations.torque_constant_scale
+        """True Kt, Nm/A; effects on it are losses."""
+        return self.true_joint.torque_constant_nm_per_a
 
     @property
     def rotor_inertia(self) -> float:
         """True Jm, kgm² on the motor side."""
-        return self.joint.rotor_inertia_kgm2 * self.deviations.rotor_inertia_scale
+        return self.true_joint.rotor_inertia_kgm2
 
     @property
     def stiffness(self) -> float:
-        """True K, Nm/rad."""
-        return self.joint.stiffness_nm_per_rad * self.deviations.stiffness_scale
+        """True K, Nm/rad; effects on it are twists."""
+        return self.true_joint.stiffness_nm_per_rad
+
+    @property
+    def link_inertia(self) -> float:
+        """True Jl, kgm²."""
+        return self.true_joint.link_inertia_kgm2
 
 
 @dataclass(frozen=True)
@@ -79,6 +103,11 @@ class PlantParameters:
     profile: str = "demo"
     substep_s: float = 125e-6
     run_to_run: RunToRun = field(default_factory=RunToRun)
+
+    @property
+    def has_effects(self) -> bool:
+        """Whether a joint has effects of the library; the bench is then an `EffectPlant`."""
+        return any(side.joint.effects for side in self.joints)
 
 
 def load_plant(path: Path) -> PlantParameters:
@@ -101,13 +130,19 @@ def load_plant(path: Path) -> PlantParameters:
 
 
 def plant_of_joint(joint: Joint) -> PlantParameters:
-    """Two ideal joints of one kind: the file's friction, no deviation, no noise beyond quantisation."""
+    """Two ideal joints of one kind: the file's friction and effects, no deviation, no noise beyond quantisation.
+
+    They stay at 25 °C, but warm as the campaign's bench does where an effect depends on the temperature.
+    """
     friction = joint.friction
     stribeck = {}
     if friction.stribeck_nm > 0.0:
-        velocity = min(max(friction.stribeck_velocity_rad_s, 0.002), 0.06)
+        velocity = max(friction.stribeck_velocity_rad_s, 0.002)
+        if joint.efficiency is not None:
+            velocity = min(velocity, 0.06)  # Table I holds from 0.2 rad/s on
         stribeck = {"stribeck_nm": friction.stribeck_nm, "stribeck_velocity_rad_s": velocity}
-    side = JointPlant(joint, Deviations(**stribeck))
+    thermal = Thermal(kelvin_per_w=WARMING_K_PER_W) if uses_temperature(joint) else Thermal()
+    side = JointPlant(joint, Deviations(**stribeck), thermal=thermal)
     return PlantParameters((side, side))
 
 
@@ -150,21 +185,30 @@ def _joint_plant(part: Section, joint_of: Callable[[str], Joint]) -> JointPlant:
     return side
 
 
-def substep_limit(parameters: PlantParameters) -> float:
+def substep_limit(
+    parameters: PlantParameters,
+    stiffer: tuple[float, float] = (1.0, 1.0),
+    steeper: tuple[float, float] = (0.0, 0.0),
+) -> float:
     """Largest integration step [s]: substep_s, made smaller where a stiff or light joint needs it.
+
+    stiffer: factor of each joint's stiffness by its effects; steeper: G |de/dθm| of their kinematic errors.
 
     Semi-implicit Euler is stable up to ω h = 2; ω h <= 0.25 keeps the frequency error (ωh)²/24 below 0.3 %.
     ω² <= the sum of K / J over what a mass hangs on bounds every mode (Gershgorin). Damping D: D h / J <=
     0.25. A sticking hysteresis element is a spring beside K; a kinematic error changes the gear ratio.
     """
     one, two = parameters.joints
-    link = one.joint.link_inertia_kgm2 + two.joint.link_inertia_kgm2
+    link = one.link_inertia + two.link_inertia
     damping = one.joint.damping_nms_per_rad + two.joint.damping_nms_per_rad
-    stiffness = [side.stiffness + side.deviations.hysteresis_stiffness for side in (one, two)]
+    stiffness = [
+        side.stiffness * factor + side.deviations.hysteresis_stiffness
+        for side, factor in zip((one, two), stiffer, strict=True)
+    ]
     squares = [2.0 * sum(stiffness) / link]
     rates = [damping / link]
-    for side, spring in zip((one, two), stiffness, strict=True):
-        steepest = 1.0 + side.joint.gear_ratio * side.deviations.kinematic_slope
+    for side, spring, bend in zip((one, two), stiffness, steeper, strict=True):
+        steepest = 1.0 + side.joint.gear_ratio * side.deviations.kinematic_slope + bend
         inertia = side.rotor_inertia * (side.joint.gear_ratio / steepest) ** 2
         squares.append(2.0 * spring / inertia)
         rates.append(side.joint.damping_nms_per_rad / inertia)

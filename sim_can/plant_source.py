@@ -6,8 +6,10 @@ import math
 import random
 from collections.abc import Callable
 
+from sim_can.effect_plant import EffectPlant
 from sim_can.plant import Plant
 from sim_can.plant_parameters import JointPlant, PlantParameters
+from sim_can.plant_readings import Readings
 from sim_can.run_to_run import NOMINAL_DAY, Day, day
 from sim_can.source import OFF, ChannelSignal, DriveRatings, DriveSignals
 
@@ -65,15 +67,27 @@ class _Encoders:
         signals.current_a = current_a + self._current_offset + self._current_noise * self._normal()
 
 
+def _plant_of(parameters: PlantParameters) -> tuple[Plant, Readings | None]:
+    """The plant for these joints, and what its instruments read beside the truth.
+
+    Raises ConfigError for effects that cannot be.
+    """
+    if not parameters.has_effects:
+        return Plant(parameters), None
+    plant = EffectPlant(parameters)
+    return plant, Readings(plant)
+
+
 class PlantSource:
     """`Source` of the emulated bench; the same seed and the same calls give the same signals bit by bit.
 
     Where the plant file has `run_to_run`, the source begins in day 0 of its seed, and each time a drive is
-    enabled after both were off again it is another day. `noise_seed`: of the noise, where it is not `seed`.
+    enabled after both were off again it is another day, unless the run goes on (`resume`). `noise_seed`: of
+    the noise, where it is not `seed`.
     """
 
     def __init__(self, parameters: PlantParameters, seed: int = 0, noise_seed: str | None = None) -> None:
-        self.plant = Plant(parameters)
+        self.plant, self._readings = _plant_of(parameters)
         self.ratings = tuple(ratings_of(side) for side in parameters.joints)
         self.drives = (DriveSignals(), DriveSignals())
         self.channels = (ChannelSignal(),)
@@ -87,7 +101,7 @@ class PlantSource:
         self._widths = parameters.run_to_run
         self._seed = seed
         self._modes = [OFF, OFF]
-        self._ran = False
+        self._ran = self._resumed = False
         self.day_number = 0
         self.begin_day(day(self._widths, seed, 0))
 
@@ -106,14 +120,20 @@ class PlantSource:
         link = plant.link_position
         motor_1, motor_2 = plant.motor_position
         drive_1, drive_2 = self.drives
-        self._encoders[0].sample(drive_1, dt_s, motor_1, link, one.current_a)
-        self._encoders[1].sample(drive_2, dt_s, motor_2, -link, two.current_a)
+        link_1, link_2, current_1, current_2 = link, -link, one.current_a, two.current_a
+        torque_nm = plant.sensor_torque()
+        if self._readings is not None:
+            (more_1, more_2), torque_nm = self._readings.read(torque_nm, dt_s)
+            motor_1, link_1, current_1 = motor_1 + more_1[0], link_1 + more_1[1], current_1 + more_1[2]
+            motor_2, link_2, current_2 = motor_2 + more_2[0], link_2 + more_2[1], current_2 + more_2[2]
+        self._encoders[0].sample(drive_1, dt_s, motor_1, link_1, current_1)
+        self._encoders[1].sample(drive_2, dt_s, motor_2, link_2, current_2)
         warmth_1, warmth_2 = plant.temperatures
         drive_1.temperature_c = warmth_1.celsius
         drive_2.temperature_c = warmth_2.celsius
         sensor = self._sensor
         self.channels[0].torque_nm = (
-            sensor.gain * plant.sensor_torque() + self._offset_nm + sensor.noise_nm * self._normal()
+            sensor.gain * torque_nm + self._offset_nm + sensor.noise_nm * self._normal()
         )
         return True
 
@@ -121,12 +141,18 @@ class PlantSource:
         """Mode and target for the control loops of drive 0 or 1."""
         modes = self._modes
         if mode != modes[drive]:
-            if self._ran and modes == [OFF, OFF] and any(self._widths):
-                self.day_number += 1
-                self.begin_day(day(self._widths, self._seed, self.day_number))
+            if modes == [OFF, OFF] and not self._resumed:
+                self.plant.begin_run()
+                if self._ran and any(self._widths):
+                    self.day_number += 1
+                    self.begin_day(day(self._widths, self._seed, self.day_number))
             modes[drive] = mode
-            self._ran = True
+            self._ran, self._resumed = True, False
         self.plant.command(drive, mode, target)
+
+    def resume(self) -> None:
+        """What is enabled next goes on with the run, also after both drives were off."""
+        self._resumed = True
 
     def interpolate(self, drive: int, period_s: float) -> None:
         """Time between two velocity targets of drive 0 or 1 [s]."""

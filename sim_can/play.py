@@ -88,6 +88,9 @@ class PlaySource:
     def command(self, drive: int, mode: int, target: float) -> None:
         """Ignored: what was measured cannot be commanded."""
 
+    def resume(self) -> None:
+        """Ignored, as `command`."""
+
     def interpolate(self, drive: int, period_s: float) -> None:
         """Ignored, as `command`."""
 

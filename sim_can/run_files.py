@@ -4,7 +4,8 @@ A run file has one header row; the columns are those of the design's run table (
 ...) or, with a column map, whatever the map names. Only the columns asked for are parsed: garbage in the
 others cannot hurt. Anything wrong in the ones asked for is refused in one line that names file, line,
 column, found and expected. What is suspicious but usable is returned as notes; a torque channel that is
-exactly zero in every row is dead and comes back as None, never as zeros.
+exactly zero in every row is dead and comes back as None, never as zeros. `jN.enabled` (0: power stage off, else 1) is
+optional; without it nothing is known of the power stage.
 """
 
 import csv
@@ -111,8 +112,30 @@ def read_run(path: Path | str, columns: ColumnMap | None = None) -> RunFile:
     text, sha256 = _text(path)
     rows = csv.reader(io.StringIO(text, newline=""))
     header = _header(rows, path)
+    values, lines = _parse(rows, path, header, wanted_columns(header, path, columns))
+    return run_of_columns(path, values, lines, sha256)
+
+
+def wanted_columns(header: list[str], path: Path, columns: ColumnMap | None) -> Mapping[str, Column]:
+    """Where each target column comes from: the map's, or the design's own names that are there. Raises RunError."""
     wanted = columns.columns if columns is not None else _own_columns(header, path)
-    values, lines = _parse(rows, path, header, wanted)
+    for target, column in wanted.items():
+        if column.name not in header:
+            raise RunError(
+                f"{path}:{_header_place(path)} found no column '{column.name}', expected it for {target}"
+            )
+    return wanted
+
+
+def run_of_columns(
+    path: Path, values: Mapping[str, NDArray[np.float64]], lines: list[int] | None, sha256: str
+) -> RunFile:
+    """Check the target columns [n] of a run and make its table; lines [n] are for the messages, None: sample numbers.
+
+    Raises RunError.
+    """
+    if len(values[TIME]) < 2:
+        raise RunError(f"{path}: found {len(values[TIME])} samples, expected at least 2")
     notes = _check_time(values[TIME], lines, path)
     joints: dict[int, JointColumns] = {}
     for joint in JOINTS:
@@ -128,13 +151,18 @@ def read_run(path: Path | str, columns: ColumnMap | None = None) -> RunFile:
         joints[joint] = JointColumns(**parts)
     if not joints:
         raise RunError(
-            f"{path}: line 1: found no joint's columns, expected at least one of j1.current_a, ..."
+            f"{path}:{_header_place(path)} found no joint's columns, expected at least one of j1.current_a, ..."
         )
     try:
         table = RunTable(time_s=values[TIME], joints=joints)
     except RunTableError as error:  # a scale of the column map that leaves the range of a float
         raise RunError(f"{path}: {error}") from None
     return RunFile(table, tuple(notes), sha256)
+
+
+def _header_place(path: Path) -> str:
+    """Only text has lines."""
+    return " line 1:" if ".csv" in path.suffixes else ""
 
 
 def _targets() -> list[str]:
@@ -199,7 +227,7 @@ def _own_columns(header: list[str], path: Path) -> dict[str, Column]:
     """The design's own names, for a file without a column map."""
     if TIME not in header:
         raise RunError(
-            f"{path}: line 1: found no column '{TIME}' (first columns: {header[:4]}), "
+            f"{path}:{_header_place(path)} found no column '{TIME}' (first columns: {header[:4]}), "
             "expected the run table's names or a column map"
         )
     return {name: Column(name) for name in _targets() if name in header}
@@ -209,9 +237,6 @@ def _parse(
     rows: _Rows, path: Path, header: list[str], wanted: Mapping[str, Column]
 ) -> tuple[dict[str, NDArray[np.float64]], list[int]]:
     """Target columns as float64 arrays [n], n >= 2, all finite, and the line [n] each sample ended on."""
-    for target, column in wanted.items():
-        if column.name not in header:
-            raise RunError(f"{path}: line 1: found no column '{column.name}', expected it for {target}")
     source = {column.name: header.index(column.name) for column in wanted.values()}
     cells: dict[str, list[float]] = {name: [] for name in source}
     lines: list[int] = []
@@ -241,20 +266,24 @@ def _parse(
     return values, lines
 
 
-def _check_time(time_s: NDArray[np.float64], lines: list[int], path: Path) -> list[str]:
+def _check_time(time_s: NDArray[np.float64], lines: list[int] | None, path: Path) -> list[str]:
     """Refuse time that stands, runs back or has long gaps; note the short gaps."""
+
+    def at(row: int) -> str:
+        return f"sample {row}" if lines is None else f"line {lines[row]}"
+
     steps = np.diff(time_s)
     if not np.all(steps > 0.0):
         row = int(np.argmax(steps <= 0.0)) + 1
         raise RunError(
-            f"{path}: line {lines[row]}: found time {time_s[row]:.6g} s after {time_s[row - 1]:.6g} s, "
+            f"{path}: {at(row)}: found time {time_s[row]:.6g} s after {time_s[row - 1]:.6g} s, "
             "expected rising time"
         )
     median = float(np.median(steps))
     longest = int(np.argmax(steps))
     if steps[longest] > LONGEST_GAP * median:
         raise RunError(
-            f"{path}: line {lines[longest + 1]}: found a gap of {steps[longest]:.6g} s, "
+            f"{path}: {at(longest + 1)}: found a gap of {steps[longest]:.6g} s, "
             f"expected steps of about {median:.6g} s"
         )
     gaps = int(np.count_nonzero(steps > GAP_NOTED * median))

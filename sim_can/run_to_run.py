@@ -12,9 +12,12 @@ from typing import NamedTuple
 
 from estimator.checked import Section
 
-# α_j = frac(sqrt(prime)). Not the first seven primes: with these the seven values of 6 to 40 days are the
-# least correlated with each other of all choices below 120.
-_PRIMES = (5, 7, 17, 29, 53, 67, 71)
+# α_j = frac(sqrt(prime)), in the order of `Day`'s values: viscous, temperature and link zero of both joints, sensor zero.
+# Not any primes: where a α_i + b α_j is nearly a whole number for small a and b (2 frac(sqrt(71)) - 3 frac(sqrt(53)) is
+# 0.012), two values stay on a few lines of their square for as many days, no more even together than independent draws.
+# These were searched for a small diaphony (Zinterhof 1976) of every pair, over 12 to 96 days, every one or every 2nd to
+# 6th of them; and ordered so that it is smallest for the sensor's zero beside a link encoder's, the sum that a run shows.
+_PRIMES = (5, 17, 37, 97, 11, 53, 23)
 _STEPS = tuple(math.sqrt(prime) % 1.0 for prime in _PRIMES)
 
 # Day-to-day viscous changes must leave friction dissipative.

@@ -97,6 +97,11 @@ class Source(Protocol):
         run ignores it.
         """
 
+    def resume(self) -> None:
+        """A drive is about to be enabled again that was switched off and has not been set up anew: the run goes on. A
+        recorded run ignores it.
+        """
+
     def interpolate(self, drive: int, period_s: float) -> None:
         """Time between two targets of drive 0 or 1 [s] (60C2h): VELOCITY targets are approached in a straight
         line of that length. Not called: one control cycle. A recorded run ignores it.

@@ -206,8 +206,8 @@ def _held(
 ) -> list[Finding]:
     """One finding per channel: stretches of one number, of a moving joint, in which the partner moved by moved_nm."""
     # Runs of equal values: a new one begins where the value changes or the joint starts or stops moving.
-    new = np.flatnonzero(np.diff(channel, prepend=math.nan) != 0.0)
-    starts = np.union1d(new, np.flatnonzero(np.diff(moving, prepend=not moving[0])))
+    new = np.diff(channel, prepend=math.nan) != 0.0
+    starts = np.flatnonzero(new | np.diff(moving, prepend=not moving[0]))
     ends = np.append(starts[1:], len(channel))
     seconds = time_s[ends - 1] - time_s[starts]
     block = max(1, round(_BLOCK_S / float(np.median(np.diff(time_s)))))

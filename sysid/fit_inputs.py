@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 from estimator.checked import ConfigError
 from estimator.parameters import Joint
 from estimator.run import RunTable
-from sim_can.run_files import ColumnMap, RunError, read_run
+from sim_can.run_files import ColumnMap, RunError, RunFile, read_run
 from sysid.channel_checks import check_channels
 from sysid.findings import Finding
 from sysid.plateaus import Plateau, PlateauError, PlateauRules, find_plateaus
@@ -59,9 +59,17 @@ def read_runs(arguments: Sequence[Path], columns: Path | None = None) -> list[In
         ConfigError: the column map cannot be used.
     """
     mapping = None if columns is None else ColumnMap.load(columns)
+    return each_once(run_paths(arguments), lambda path: read_run(path, mapping))
+
+
+def each_once(paths: Sequence[Path], read: Callable[[Path], RunFile]) -> list[InputRun]:
+    """Read every path; names are unique; a progress bar on a terminal.
+
+    Raises RunError as `read`, and for the same data given twice, which would count it twice.
+    """
     runs: list[InputRun] = []
-    for path in progress(run_paths(arguments), "reading runs"):
-        file = read_run(path, mapping)
+    for path in progress(paths, "reading runs"):
+        file = read(path)
         same = [run.name for run in runs if run.sha256 == file.sha256]
         if same:
             raise RunError(f"{path}: found the same data as in {same[0]}, expected every run once")

@@ -75,10 +75,10 @@ def path_residuals(run: RunSignals, loss: AdditiveLoss, torsion: Torsion) -> Pat
     """Return what both paths miss on a run's moving samples, with a loss and a torsion from elsewhere."""
     keep, seen = run.moving, run.seen
     loss_nm, wide = loss_and_width(run, loss)
-    raw, sensor, tau = seen.raw_nm[keep], run.sensor_nm[keep], torsion_torque(torsion, run)[keep]
-    return PathResiduals(
-        raw, seen.velocity_rad_s[keep], wide[keep], tau, raw - loss_nm[keep] - sensor, tau - sensor
-    )
+    raw, sensor = seen.raw_nm[keep], run.sensor_nm[keep]
+    tau, open_nm = (each[keep] for each in torsion_torque(torsion, run))
+    current = raw - loss_nm[keep] - sensor
+    return PathResiduals(raw, seen.velocity_rad_s[keep], wide[keep], tau, open_nm, current, tau - sensor)
 
 
 def loss_and_width(run: RunSignals, loss: AdditiveLoss) -> tuple[FloatArray, FloatArray]:
@@ -93,6 +93,6 @@ def loss_and_width(run: RunSignals, loss: AdditiveLoss) -> tuple[FloatArray, Flo
 def fused_error(run: PathResiduals, sigma: FusedSigma) -> tuple[FloatArray, FloatArray]:
     """Return error and standard deviation [n] of the fused physics: its weights apply to the paths' errors alike."""
     alpha, spread = Fusion(sigma, True).weigh_many(
-        run.raw_nm, run.half_nm, run.velocity_rad_s, run.torsion_nm
+        run.raw_nm, run.half_nm, run.velocity_rad_s, run.torsion_nm, run.open_nm
     )
     return run.current_error_nm + alpha * (run.torsion_error_nm - run.current_error_nm), spread

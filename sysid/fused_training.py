@@ -50,10 +50,11 @@ class Seen:
 
     def __init__(self, run: RunSignals, loss: AdditiveLoss, torsion: Torsion, sigma: FusedSigma) -> None:
         keep = run.moving
-        seen = replace(run.seen, torsion_nm=torsion_torque(torsion, run))
+        torque, open_nm = torsion_torque(torsion, run)
+        seen = replace(run.seen, torsion_nm=torque, open_nm=open_nm)
         value, wide = loss_and_width(run, loss)
         physics, spread = Fusion(sigma, True).fuse_many(
-            seen.raw_nm, value, wide, seen.velocity_rad_s, seen.torsion_nm
+            seen.raw_nm, value, wide, seen.velocity_rad_s, seen.torsion_nm, seen.open_nm
         )
         self.name = run.name
         self.features: FloatArray = network_features(seen, seen.raw_nm - value)[keep]
@@ -96,7 +97,7 @@ def train_fused(
     }
     blocks = [Seen(run, fused.loss, fused.torsion, fused.sigma) for run in runs]
     trained = _train(blocks, iterations, seed, progress)
-    trained = replace(trained, output_std=share * trained.output_std)
+    trained = scaled(trained, share)
     features = np.concatenate([block.features for block in blocks])
     low, high = np.quantile(features, [1e-4, 1.0 - 1e-4], axis=0)
     metadata = {
@@ -116,22 +117,24 @@ def train_fused(
     return TrainedNetwork(data, trained, metadata, scores)
 
 
+def scaled(trained: Trained, share: float) -> Trained:
+    """Return the network whose answer is `share` of this one's: its last layer is linear, and 0 is allowed."""
+    *hidden, (weight, bias) = trained.weights
+    return replace(trained, weights=[*hidden, (share * weight, share * bias)])
+
+
 def safe_share(unseen: Sequence[tuple[FloatArray, FloatArray]]) -> float:
     """Return the part of the correction that helps on unseen runs: (residual [n], correction [n]) of each.
 
     With share s the MSE of a run changes by s^2 E[c^2] - 2 s E[c r]: best at E[c r]/E[c^2], harmful beyond twice that.
-    Taken is the best over all runs, but no more than what would harm a single one. Raises ValueError when even a
-    twentieth would: then the network has learned nothing that lasts.
+    Taken is the best over all runs, but no more than what would harm a single one. 0 when even a twentieth would: then
+    the network has learned nothing that lasts, and the physics alone is the better estimate.
     """
     products = np.array([float(np.mean(r * c)) for r, c in unseen])
     squares = np.array([float(np.mean(c * c)) for _, c in unseen])
+    squares = np.maximum(squares, 1e-12)
     share = min(1.0, float(products.sum() / squares.sum()), float(np.min(1.8 * products / squares)))
-    if share < _LEAST_SHARE:
-        raise ValueError(
-            f"found a network that makes unseen runs worse (useful part {share:.2f}), expected at least {_LEAST_SHARE}: "
-            "more runs, or method 'fused' without a network"
-        )
-    return share
+    return share if share >= _LEAST_SHARE else 0.0
 
 
 def quick_part(residual_nm: FloatArray) -> FloatArray:

@@ -19,12 +19,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from daemon.logs.reader import LogError
 from estimator.checked import ConfigError
 from estimator.run import RunTableError
 from models.files import shipped
 from sim_can.run_files import ColumnMap, RunError, read_run
 from sysid.figure_parts import draw_each_joint
-from sysid.joint_log import LogError
 from sysid.measured import JOINTS, RUNS
 from sysid.measured_bus_score import BusRun, Played, as_mapping, configured, score_log
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.logs.reader import LogError, Records, read_topic
 from estimator.checked import Section
 from estimator.parameters import Joint
 from estimator.run import RunTable
@@ -16,7 +17,6 @@ from estimator.whole_run import estimate_run
 from models.files import load_joint, load_yaml
 from sim_can.bench import LONGEST_STEP_NS
 from sysid.friction_fit import low_pass
-from sysid.joint_log import LogError, Records, read_topic
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -97,11 +97,11 @@ def score_log(log: Path, index: int, played: Played) -> BusRun:
     state, frames = read_topic(log, f"/joint/{index + 1}/state"), read_topic(log, "/can/frames")
     if not np.array_equal(state["cycle"], frames["cycle"]):
         raise LogError(f"{log}: found cycles in one topic that are not in the other, expected the same")
-    time_s = _time(state["header"]["stamp"])
+    time_s = sync_time(state["header"]["stamp"])
     row = _played_row(time_s, played.table.time_s)
     running = row < len(played.table.time_s)
     published = published_torque(frames, index)
-    reference = _reference(state, time_s, played.settings.bandwidth_rad_s)
+    reference = reference_torque(state, time_s, played.settings.bandwidth_rad_s)
     offline = np.full(len(time_s), np.nan)
     offline[running] = _offline(played)[row[running]]
     used = running & np.isfinite(published) & np.isfinite(reference) & np.isfinite(offline)
@@ -136,7 +136,7 @@ def as_mapping(run: BusRun) -> Mapping[str, object]:
     return {key: value for key, value in vars(run).items() if not isinstance(value, np.ndarray)}
 
 
-def _time(stamp: Records) -> Array:
+def sync_time(stamp: Records) -> Array:
     """Time of each SYNC since the first [s]."""
     whole = (stamp["sec"].astype(np.int64) - int(stamp["sec"][0])) * 1_000_000_000
     return np.asarray((whole + stamp["nanosec"] - int(stamp["nanosec"][0])) * _NS)
@@ -161,7 +161,7 @@ def _offline(played: Played) -> Array:
     return np.where(np.isin(result.status, PUBLISHED), result.torque_nm, np.nan)
 
 
-def _reference(state: Records, time_s: Array, bandwidth_rad_s: float) -> Array:
+def reference_torque(state: Records, time_s: Array, bandwidth_rad_s: float) -> Array:
     """The sensor as received through the observer's low-pass; NaN where no sensor value came."""
     sensor = state["sensor_torque_nm"]
     there = np.isfinite(sensor)

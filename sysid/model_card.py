@@ -35,6 +35,7 @@ def write_card(path: Path, joint: Joint, kind: str, result: TrainedNetwork, dige
         f"- Trained: {len(trained.losses)} iterations, last loss {trained.losses[-1]:.4f} Nm^2; Python "
         f"{platform.python_version()}, one thread, so that the same runs and seed give the same file",
         f"- Data: {len(result.metadata['runs'])} runs, digest {result.metadata['data_sha256']}",
+        *_share(result),
         "",
         "## On runs it was not trained on",
         "",
@@ -55,6 +56,15 @@ def write_card(path: Path, joint: Joint, kind: str, result: TrainedNetwork, dige
         "",
     ]
     path.with_suffix(".md").write_text("\n".join(lines), encoding="utf-8")
+
+
+def _share(result: TrainedNetwork) -> list[str]:
+    """A line where only part of the correction is used, because all of it would harm runs it was not trained on."""
+    share = float(result.metadata.get("share", 1.0))
+    if share >= 1.0:
+        return []
+    nothing = "" if share else ": none of it, the estimate is the physics alone"
+    return [f"- Share of the correction that helps on unseen runs and harms none: {share:.2f}{nothing}"]
 
 
 def _mean(result: TrainedNetwork, which: int) -> float:

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from daemon.logs.reader import LogError, Records, read_topic
 from estimator.status import DEGRADED, NAMES, STANDSTILL, VALID
 from sysid.figure_parts import shade
-from sysid.joint_log import LogError, Records, read_topic
 
 _SHADES = {STANDSTILL: "#dcecf2", DEGRADED: "#fbe8c8"}
 _OTHER = "#f3d6d6"
@@ -39,7 +39,10 @@ def main(argv: list[str]) -> int:
         print("jtq plot: matplotlib is not installed: pip install matplotlib", file=sys.stderr)
         return 1
     except (LogError, OSError, ValueError) as error:
-        print(f"jtq plot: {error}", file=sys.stderr)
+        text = (
+            f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else error
+        )
+        print(f"jtq plot: {text}", file=sys.stderr)
         return 1
     if arguments.json:
         shown = None if math.isnan(rmse) else rmse

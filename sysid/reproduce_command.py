@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import json
 import re
 import subprocess
 import sys
@@ -22,13 +23,16 @@ from estimator.arguments import natural
 from models.files import shipped
 from sysid.campaign.fourier_runs import outside_runs
 from sysid.campaign.plan import DEFAULT_LIMITS, Plan
+from sysid.campaign.state import DONE, STATE_FILE
 
 _OUTSIDE_PLANT: Final = "campaign_plant_outside.yaml"
 _FINDINGS: Final = 3
+_OTHER_DAYS: Final = 7
+"""Added to the seed: days and trajectories that no campaign has."""
 TRAINED: Final = "trained"
 """Folder in models/ with what this command has made; beside the configuration in a directory of its own."""
 _EXAMPLES: Final = """examples:
-  jtq reproduce --out reproduction            everything, about 50 minutes of which the bench moves 35
+  jtq reproduce --out reproduction            everything, about 85 minutes of which the bench moves 41
   jtq reproduce --out /tmp/quick --quick      the same steps in a few minutes; too few runs for good figures"""
 
 
@@ -37,6 +41,13 @@ class Step(NamedTuple):
 
     arguments: tuple[str, ...]
     findings_are_fine: bool = False
+    module: str = "daemon.jtq"
+
+    @property
+    def text(self) -> str:
+        """The command as one would type it."""
+        name = "jtq" if self.module == "daemon.jtq" else f"python -m {self.module}"
+        return " ".join((name, *self.arguments))
 
 
 def main(argv: list[str]) -> int:
@@ -48,12 +59,11 @@ def main(argv: list[str]) -> int:
         (out / "models").mkdir(parents=True, exist_ok=True)
         _write_outside_plan(out / "outside.plan.yaml", options.seed, 2 if options.quick else 6)
         for step in steps(out, options.bus, options.quick, options.seed):
-            print(f"$ jtq {' '.join(step.arguments)}", file=sys.stderr, flush=True)
-            status = subprocess.run(
-                [sys.executable, "-m", "daemon.jtq", *step.arguments], check=False
-            ).returncode
+            print(f"$ {step.text}", file=sys.stderr, flush=True)
+            status = _run(step)
             if status and not (status == _FINDINGS and step.findings_are_fine):
-                print(f"jtq reproduce: jtq {step.arguments[0]} ended with status {status}", file=sys.stderr)
+                name = " ".join(step.text.split()[: 2 if step.module == "daemon.jtq" else 3])
+                print(f"jtq reproduce: {name} ended with status {status}", file=sys.stderr)
                 return 1
             worst = max(worst, status)
             if step.arguments[0] == "train" and "ours" in step.arguments:
@@ -63,9 +73,33 @@ def main(argv: list[str]) -> int:
         print(f"jtq reproduce: {error.filename or out}: {error.strerror or error}", file=sys.stderr)
         return 1
     print(
-        f"report: {out / 'report' / 'evaluation.html'}\nconfiguration for jtqd: {out / 'models' / 'bench.yaml'}"
+        f"report: {out / 'report' / 'evaluation.html'}, of many days {out / 'report_days' / 'evaluation.html'}\n"
+        f"configuration for jtqd: {out / 'models' / 'bench.yaml'}"
     )
     return worst
+
+
+def _run(step: Step) -> int:
+    """Run a step; a campaign that ended early goes on for as long as each attempt gets at least one more run done."""
+    done = -1
+    while True:
+        status = subprocess.run([sys.executable, "-m", step.module, *step.arguments], check=False).returncode
+        if status != 1 or step.arguments[0] != "campaign":
+            return status
+        now = _runs_done(Path(step.arguments[step.arguments.index("--out") + 1]))
+        if now <= done:
+            return status
+        done = now
+        print(f"jtq reproduce: {now} runs are done, the campaign goes on", file=sys.stderr, flush=True)
+
+
+def _runs_done(campaign: Path) -> int:
+    """Return how many runs of a campaign are done; -1 where no campaign was begun."""
+    try:
+        runs = json.loads((campaign / STATE_FILE).read_text(encoding="utf-8"))["runs"]
+    except (OSError, ValueError, KeyError):
+        return -1
+    return sum(run["status"] == DONE for run in runs)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -102,10 +136,10 @@ def steps(out: Path, bus: str, quick: bool, seed: int) -> Iterator[Step]:
         "efficiency": ("--quick",) if quick else ("--hold", "1.2"),
         "excitation": ("--runs", "8", "--seconds", "10", "--evaluations", "160")
         if quick
-        else ("--runs", "48", "--seconds", "14", "--evaluations", "400"),
+        else ("--runs", "96", "--seconds", "12", "--evaluations", "400"),
         "validate": ("--runs", "4", "--seconds", "6", "--hold", "1.0")
         if quick
-        else ("--runs", "48", "--seconds", "8", "--hold", "1.6"),
+        else ("--runs", "96", "--seconds", "8", "--hold", "1.6"),
     }
     for kind in ("excitation", "efficiency"):
         yield Step(("campaign", kind, *common, "--out", str(runs / kind), *sizes[kind]), True)
@@ -132,6 +166,14 @@ def steps(out: Path, bus: str, quick: bool, seed: int) -> Iterator[Step]:
          "--out", str(out / "report")),
         True,
     )  # fmt: skip
+    # How often an interval covers takes more days than a bus has time for.
+    days = ("2", "6", "1.0") if quick else ("384", "8", "1.6")
+    size = tuple(x for pair in zip(("--runs", "--seconds", "--hold"), days, strict=True) for x in pair)
+    other = ("--seed", str(seed + _OTHER_DAYS))
+    yield Step(("--out", str(out / "days"), *size, *other), module="sysid.emulated_runs")
+    yield Step(
+        ("evaluate", str(out / "days"), "--models", str(models), "--out", str(out / "report_days")), True
+    )
 
 
 def _write_outside_plan(path: Path, seed: int, count: int) -> None:

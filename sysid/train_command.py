@@ -163,6 +163,13 @@ def _train_joint(
         f"the physics it builds on {physics:.3f} Nm^2",
         file=sys.stderr if options.json else sys.stdout,
     )
+    share = result.metadata.get("share", 1.0)
+    if share < 1.0:
+        nothing = "" if share else ": it harms some of them, and what is estimated is the physics"
+        print(
+            f"  share of its correction that helps on them and harms none: {share:.2f}{nothing}",
+            file=sys.stderr if options.json else sys.stdout,
+        )
     if claimed is not None:
         print(
             f"  split by sample, the same data would claim an MSE of {claimed:.3f} Nm^2",
@@ -174,6 +181,7 @@ def _train_joint(
         "sha256": digest,
         "network_mse_nm2": network,
         "physics_mse_nm2": physics,
+        "share": share,
         "runs": len(result.held_out),
     }
 

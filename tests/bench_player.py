@@ -21,6 +21,7 @@ class FakeSource:
         self.channels = tuple(ChannelSignal() for _ in range(channels))
         self.steps = []
         self.commands = []
+        self.resumed = 0
         self.rows = rows
         for drive in self.drives:
             drive.enabled = enabled
@@ -31,6 +32,9 @@ class FakeSource:
 
     def command(self, drive, mode, target):
         self.commands.append((drive, mode, target))
+
+    def resume(self):
+        self.resumed += 1
 
 
 class Player:

@@ -2,15 +2,18 @@
 
 import math
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from daemon import cycle_record as cr
-from daemon.mcap_messages import BLOCK_PARTS, JointStateMessage
-from daemon.mcap_writer import McapFile
-from daemon.recorder import definitions
-from daemon.recording import Recording
+from daemon.recording.chunk import ChunkBuilder, SealedChunk
+from daemon.recording.definitions import definitions
+from daemon.recording.journal import Journal
+from daemon.recording.mcap_file import Head, McapFile
+from daemon.recording.messages import BLOCK_PARTS, JointStateMessage
+from daemon.recording.progress import Account
+from daemon.recording.recording import Recording
+from daemon.shared import cycle_record as cr
 
 START_NS = 1_700_000_000_000_000_000
 ENABLED, OFF = 0x1237, 0x1250
@@ -37,16 +40,28 @@ class Cycle(NamedTuple):
     frames: Sequence[tuple[int, bytes]] = ()
 
 
-def write_log(path: Path, cycles: Sequence[Cycle]) -> Path:
+class _OneFile:
+    """Where the chunks go."""
+
+    def __init__(self, file: McapFile) -> None:
+        self._file = file
+
+    def write(self, chunk: SealedChunk, at_ns: int) -> None:
+        """Append it."""
+        self._file.append(chunk)
+
+
+def write_log(path: Path, cycles: Iterable[Cycle]) -> Path:
     """An MCAP file of these cycles."""
     schemas, channels = definitions(None)
-    file = McapFile(
-        path, schemas=schemas, channels=channels, attachments=[], block_parts=BLOCK_PARTS, time_ns=1
-    )
-    recording = Recording(file, JointStateMessage(("a", "b"), (1.0, 1.0)), 500_000_000, print)
+    file = McapFile(path, Head(schemas, channels, []), {"run": "test", "part": "1"}, 1)
+    journal = Journal(ChunkBuilder(schemas, channels, BLOCK_PARTS, 60), print)
+    overview = JointStateMessage(("a", "b"), (1.0, 1.0))
+    recording = Recording(journal, _OneFile(file), overview, 500_000_000, Account())
     for cycle in cycles:
         recording.add(_record(cycle))
-    assert recording.finish()
+    recording.flush()
+    file.finish(path.name)
     return path
 
 

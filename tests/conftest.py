@@ -7,6 +7,7 @@ See docs/bench_kernel.md.
 
 import json
 import os
+import signal
 import sys
 import time
 from pathlib import Path
@@ -27,13 +28,16 @@ def pytest_addoption(parser):
     group.addoption(
         "--bench-timeout",
         type=float,
-        default=float(os.environ.get("JTQD_BENCH_TIMEOUT", "900")),
+        default=float(os.environ.get("JTQD_BENCH_TIMEOUT", "1200")),
         metavar="S",
-        help="wall time for all tests in the bench kernel (default: JTQD_BENCH_TIMEOUT or 900)",
+        help="wall time for all tests in the bench kernel (default: JTQD_BENCH_TIMEOUT or 1200)",
     )
 
 
 def pytest_configure(config):
+    # A shell that puts a command into the background lets it ignore Ctrl-C, and so would every process started here.
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     if os.environ.get(guest.MARK) != "1":
         config.pluginmanager.register(SocketCanTests(config), "jtqd-socketcan")
     elif os.environ.get(FORWARDED) == "1":

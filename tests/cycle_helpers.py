@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import struct
+import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from daemon import cycle_record as cr
-from daemon.cycle import Cycle
-from daemon.grid import Grid
-from daemon.intake import InputPdo, Intake
-from daemon.joint_cycle import JointInputs
-from daemon.ring import Ring, RingReader
-from daemon.snapshot import Snapshot
-from daemon.temperature import JointTemperature
+import pytest
+
+from daemon.loop import cycle as cycle_module
+from daemon.loop.cycle import Cycle
+from daemon.loop.grid import Grid
+from daemon.loop.intake import InputPdo, Intake
+from daemon.loop.joint_cycle import JointInputs
+from daemon.loop.joint_safety import JointSafety
+from daemon.loop.temperature import JointTemperature
+from daemon.shared import cycle_record as cr
+from daemon.shared.ring import Ring, RingReader
+from daemon.shared.snapshot import Snapshot
 from drivers.errors import BusDown
 from estimator.joint_estimator import EstimatorSettings, JointEstimator
 from models.files import load_joint, shipped
@@ -42,6 +47,40 @@ ENABLED = 0x27
 
 def frame(can_id: int, data: bytes) -> bytes:
     return struct.pack("<IB3x8s", can_id, len(data), data)
+
+
+class ExactTime:
+    """Clock of a cycle and of its scripted bus: it goes on only when told to, whatever the machine does meanwhile."""
+
+    def __init__(self) -> None:
+        self.now_ns = time.time_ns()
+
+    def monotonic_ns(self) -> int:
+        """Both clocks are one."""
+        return self.now_ns
+
+    time_ns = monotonic_ns
+
+    def sleep(self, seconds: float) -> None:
+        """Passes at once."""
+        self.now_ns += round(seconds * 1e9)
+
+    def install(self, monkeypatch: pytest.MonkeyPatch) -> ExactTime:
+        """Take the place of module `time` in the cycle and in this file."""
+        monkeypatch.setattr(cycle_module, "time", self)
+        monkeypatch.setattr(sys.modules[__name__], "time", self)
+        return self
+
+    def turn(self, cycle: Cycle, count: int = 1, before: dict[str, Callable[[], None]] | None = None) -> None:
+        """Whole cycles, each begun exactly in its slot; `before` names what happens just before a stage."""
+        grid = cycle.grid
+        for _ in range(count):
+            grid.slot_ns = self.now_ns = max(grid.slot_ns, self.now_ns) + grid.period_ns
+            for stage in ("begin", "gather", "observe", "publish", "record"):
+                if before and stage in before:
+                    before[stage]()
+                getattr(cycle, stage)()
+            self.now_ns = grid.slot_ns
 
 
 class ScriptedSocket:
@@ -100,6 +139,7 @@ def make(
     *,
     temperatures: Sequence[JointTemperature] = (),
     estimators: Sequence[Any] | None = None,
+    safety: Sequence[JointSafety] | None = None,
     slots: int = 64,
 ) -> tuple[Cycle, ScriptedSocket, RingReader]:
     """A cycle with both joints by method efficiency; `temperatures` are of joint 1 and 2, in this order."""
@@ -120,6 +160,7 @@ def make(
         joints,
         Ring(tmp_path / "ring", slots, cr.RECORD_SIZE),
         Snapshot(tmp_path / "snapshot", 1e-3, 0.8),
+        safety=safety,
         node_id=0x20,
         counter_overflow=240,
         wait_ns=0,
@@ -136,6 +177,8 @@ def turn(cycle: Cycle, count: int = 1, **before: Callable[[], None]) -> None:
         for stage in ("begin", "gather", "observe", "publish", "record"):
             before.get(stage, lambda: None)()
             getattr(cycle, stage)()
+        if isinstance(time, ExactTime):
+            time.now_ns += cycle.grid.period_ns
         cycle.grid.slot_ns = time.monotonic_ns()
 
 

@@ -86,10 +86,10 @@ def made_run(
         velocity_rad_s=v,
         torsion_nm=d + torsion.zero_rad + waves @ pairs + rng.normal(0.0, 2e-6, count),
         waves=waves,
-        link_rad=angle / 100.0,
         temperature_c=temperature,
         direction=direction,
         dt_s=np.full(count, 1e-3),
+        open_nm=np.zeros(count),
     )
     sensor = torque - own.zero_nm + rng.normal(0.0, noise_nm, count)
     return RunSignals(f"run {seed}", seen, sensor, np.ones(count, bool), np.zeros(count, bool))

@@ -12,9 +12,18 @@ from pathlib import Path
 from cdr_decoder import Definition
 from mcap.reader import make_reader
 
-from daemon import cycle_record as cr
-from daemon import mcap_schemas as schemas
-from daemon.ring import Ring
+from daemon.recording import schemas
+from daemon.recording.chunk import ChunkBuilder
+from daemon.recording.definitions import definitions
+from daemon.recording.journal import Journal
+from daemon.recording.mcap_file import Head, McapFile
+from daemon.recording.messages import BLOCK_PARTS, JointStateMessage
+from daemon.recording.progress import Account
+from daemon.recording.recording import Recording
+from daemon.recording.request import RecorderRequest
+from daemon.recording.session import Session
+from daemon.shared import cycle_record as cr
+from daemon.shared.ring import Ring
 
 ROOT = Path(__file__).resolve().parent.parent
 START_NS = 1_700_000_000_000_000_000
@@ -57,7 +66,7 @@ def put(ring, record):
 
 
 class RecorderProcess:
-    """`python -m daemon.recorder` on a ring of its own."""
+    """`python -m daemon.recording.recorder` on a ring of its own."""
 
     def __init__(self, directory, *, slots=4096, output=None, before=None, prepare=None, **request):
         self.output = directory / "logs" if output is None else output
@@ -67,7 +76,7 @@ class RecorderProcess:
         request = {"ring": str(directory / "ring"), "directory": str(self.output), "prefix": "test"} | request
         (directory / "request.json").write_text(json.dumps(request))
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "daemon.recorder", str(directory / "request.json")],
+            [sys.executable, "-m", "daemon.recording.recorder", str(directory / "request.json")],
             cwd=ROOT,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -126,11 +135,73 @@ class RecorderProcess:
         self.process.communicate()
 
 
-def messages_of(path):
-    """{topic: [(log time, decoded message)]} of a finished file, by the library's reader, CRCs checked."""
+def messages_of(*paths):
+    """{topic: [(log time, decoded message)]} of finished files, by the library's reader, CRCs checked."""
     found = {topic.name: [] for topic in schemas.TOPICS}
-    with open(path, "rb") as file:
-        for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
-            assert schema.data.decode() == schemas.SCHEMAS[schema.name]
-            found[channel.topic].append((message.log_time, DEFINITIONS[schema.name].decode(message.data)))
+    for path in paths:
+        with open(path, "rb") as file:
+            reader = make_reader(file, validate_crcs=True)
+            for schema, channel, message in reader.iter_messages(log_time_order=False):
+                assert schema.data.decode() == schemas.SCHEMAS[schema.name]
+                found[channel.topic].append((message.log_time, DEFINITIONS[schema.name].decode(message.data)))
     return found
+
+
+def cycles_of(*paths):
+    """Numbers of the recorded cycles in the order of the files, by the library's reader, CRCs checked."""
+    found = []
+    for path in paths:
+        with open(path, "rb") as file:
+            messages = make_reader(file, validate_crcs=True).iter_messages(
+                ["/can/frames"], log_time_order=False
+            )
+            found += [message.sequence for _, _, message in messages]
+    return found
+
+
+def metadata_of(path):
+    """The metadata record `jtqd` of a file."""
+    with open(path, "rb") as file:
+        return {item.name: item.metadata for item in make_reader(file).iter_metadata()}["jtqd"]
+
+
+def statuses_of(message):
+    """{name: (level, message, {key: value})} of a decoded /diagnostics."""
+    return {
+        status["name"]: (
+            status["level"],
+            status["message"].rstrip(),
+            {item["key"]: item["value"].rstrip() for item in status["values"]},
+        )
+        for status in message["status"]
+    }
+
+
+class SimpleFile:
+    """A single file as the sink of a `Recording`, as the tests of one file need it."""
+
+    def __init__(self, path, head):
+        self.path = path
+        self.file = McapFile(path, head, {"run": "test", "part": "1"}, 1)
+
+    def write(self, chunk, at_ns):
+        self.file.append(chunk)
+
+    def end(self):
+        self.file.finish(self.path.name)
+
+
+def one_file(path, chunk_ns=99_000_000):
+    """(recording, sink) into one file."""
+    schema_records, channels = definitions(None)
+    sink = SimpleFile(path, Head(schema_records, channels, []))
+    journal = Journal(ChunkBuilder(schema_records, channels, BLOCK_PARTS, 60), print)
+    overview = JointStateMessage(("a", "b"), (1.0, 1.0))
+    return Recording(journal, sink, overview, chunk_ns, Account()), sink
+
+
+def session_on(directory, say=lambda _: None, **request):
+    """A `Session` in this process, with files in DIRECTORY/logs and no repair."""
+    values = {"ring": directory / "ring", "directory": directory / "logs", "prefix": "test", "repair": False}
+    values |= {key: tuple(value) if key == "attachments" else value for key, value in request.items()}
+    return Session(RecorderRequest(**values), Account(), say)

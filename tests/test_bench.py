@@ -22,9 +22,12 @@ def test_first_sync_is_time_zero_and_then_measured_time_counts():
     player.sync(after_ms=1.0)
     player.sync(after_ms=1.7)
     player.sync(after_ms=400.0)  # clipped
-    player.stamp -= 10_000 * MS  # the clock was stepped back
+    player.stamp -= 10_000 * MS  # the clock was set back
     player.sync(after_ms=1.0)
-    assert player.source.steps == pytest.approx([0.0, 0.001, 0.0017, 0.05, 0.0])
+    player.stamp += 7_200_000 * MS  # ... and on
+    player.sync(after_ms=1.0)
+    player.sync(after_ms=1.7)
+    assert player.source.steps == pytest.approx([0.0, 0.001, 0.0017, 0.05, 0.001, 0.001, 0.0017])
 
 
 def test_equal_stamps_give_equal_frames():

@@ -11,9 +11,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from daemon import cycle as cycle_module
-from daemon import estimate_pdo, loop
 from daemon.config import load_config
+from daemon.loop import cycle as cycle_module
+from daemon.loop import estimate_pdo
+from daemon.loop import process as loop
 from drivers.frame import FRAME, pack
 from tests.benchmarks import c_program, traffic
 from tests.benchmarks.fixture import make_fixture
@@ -73,7 +74,7 @@ def python_estimates(fixture, tmp_path, monkeypatch, cycles):
     config = load_config(fixture.config)
     estimators = [loop.build_estimator(config, joint) for joint in config.joints]
     request = {"ring": str(tmp_path / "ring"), "snapshot": str(tmp_path / "snapshot"), "worst_load": 0.0}
-    cycle, grid = loop._build(config, request, fixture.report, bus, estimators)
+    cycle, grid = loop.build_cycle(config, request, fixture.report, bus, estimators)
     for n in range(cycles):
         grid.slot_ns = 2 * 10**9 + n * PERIOD_NS
         bus.clock_ns = grid.slot_ns

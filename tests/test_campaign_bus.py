@@ -94,7 +94,10 @@ def campaign_process(cmdline: Path) -> bool:
         words = cmdline.read_bytes().split(b"\0")
     except OSError:
         return False
-    return any(each in words for each in (b"sim_can", b"daemon.jtqd", b"daemon.loop", b"daemon.recorder"))
+    return any(
+        each in words
+        for each in (b"sim_can", b"daemon.jtqd", b"daemon.loop.process", b"daemon.recording.recorder")
+    )
 
 
 def check_done(out: Path, status: int, content: dict[str, Any], runs: list[str]) -> None:

@@ -15,6 +15,7 @@ from sysid.campaign.bench_config import BenchConfig
 from sysid.campaign.command import main
 from sysid.campaign.options import parser, recipe, wanted_plan
 from sysid.campaign.state import DONE, CampaignDirectory, RunState
+from tests.hub_helpers import until_it_listens
 
 SMALL = {
     "schema": "jtq.plan/1",
@@ -223,9 +224,8 @@ def test_what_jtqd_says_when_it_does_not_start_is_told(
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
     hub = subprocess.Popen([sys.executable, "-m", "drivers.hub", f"unix:{tmp_path}/bus"])
     try:
-        while not (tmp_path / "bus").exists():
-            assert hub.poll() is None
         bus = f"unix:{tmp_path}/bus"
+        until_it_listens(bus, hub)
         assert main([plan, "--bus", bus, "--out", str(tmp_path / "out"), "--json"]) == 1
         content = json.loads(capsys.readouterr().out)
         assert "node 1" in content["not_done"]["a"]

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from campaign_log import OFF, Cycle, Joint, regular, temperature, write_log
 
+from daemon.logs.reader import LogError
 from estimator.run import COLUMN_NAMES
 from sysid.campaign.log_to_run import log_to_run
-from sysid.joint_log import LogError
 
 NAN = math.nan
 
@@ -41,6 +41,21 @@ def test_every_column_is_the_log_s_and_time_is_that_of_sync(tmp_path: Path) -> N
     assert (logged.missed, logged.incomplete, logged.lost_share) == (0, 0, 0.0)
 
 
+def test_a_run_of_several_parts_is_one_table(tmp_path: Path) -> None:
+    """A run longer than recording.rotate_s; the recorder was killed as well: cycles 30 to 34 are in both parts."""
+    cycles = regular(90, joints)
+    whole = log_to_run(write_log(tmp_path / "a.mcap", cycles))
+    parts = [tmp_path / "b-20260101T000000Z-0001.mcap", tmp_path / "b-20260101T000000Z-0002.mcap"]
+    write_log(parts[0], cycles[:35])
+    write_log(parts[1], cycles[30:])
+    logged = log_to_run(parts)
+    assert logged.table.time_s.tolist() == whole.table.time_s.tolist()
+    assert (logged.missed, logged.incomplete) == (0, 0)
+    for number in (1, 2):
+        columns = [each.table.joints[number] for each in (logged, whole)]
+        assert columns[0].motor_position_rad.tolist() == columns[1].motor_position_rad.tolist()
+
+
 def test_only_cycles_in_which_both_drives_are_enabled_are_the_run(tmp_path: Path) -> None:
     def wanted(n: int) -> tuple[Joint, Joint]:
         one, two = joints(n)
@@ -54,6 +69,23 @@ def test_only_cycles_in_which_both_drives_are_enabled_are_the_run(tmp_path: Path
     assert len(logged.table.time_s) == 60
     assert logged.table.joints[1].current_a is not None
     assert logged.table.joints[1].current_a[0] == pytest.approx(2.0)
+
+
+def test_the_column_enabled_is_there_where_the_power_was_off_within_the_run(tmp_path: Path) -> None:
+    """Switch on disabled, ready and switched on carry no current; quick stop active (1217h) does."""
+    words = {10: 0x1250, 11: 0x1231, 12: 0x1233, 13: 0x1217}
+
+    def wanted(n: int) -> tuple[Joint, Joint]:
+        one, two = joints(n)
+        return one._replace(statusword=words.get(n, one.statusword)), two
+
+    logged = log_to_run(write_log(tmp_path / "a.mcap", regular(30, wanted)))
+    enabled = logged.table.joints[1].enabled
+    assert enabled is not None
+    assert np.flatnonzero(enabled == 0.0).tolist() == [10, 11, 12]
+    assert set(enabled) == {0.0, 1.0}
+    assert logged.table.joints[2].enabled is None, "its power was on all the time"
+    assert (logged.missed, logged.incomplete) == (0, 0)
 
 
 def test_missing_inputs_and_cycles_are_left_out_and_counted_by_input(tmp_path: Path) -> None:

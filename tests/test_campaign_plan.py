@@ -42,7 +42,14 @@ PLAN: dict[str, Any] = {
                 {"kind": "rest", "hold_s": 0.5, "ramp_s": 0.0},
             ],
         },
-        {"name": "two", "velocity_joint": 1, "segments": [{"kind": "rest", "hold_s": 1.0, "ramp_s": 0.5}]},
+        {
+            "name": "two",
+            "velocity_joint": 1,
+            "segments": [
+                {"kind": "rest", "hold_s": 1.0, "ramp_s": 0.5},
+                {"kind": "power_off", "hold_s": 2.0},
+            ],
+        },
     ],
 }
 
@@ -65,7 +72,7 @@ def test_a_plan_is_the_same_after_yaml(tmp_path: Path) -> None:
     again = load_plan(path)
     assert again == plan
     assert again.sha256 == plan.sha256
-    assert plan.duration_s == pytest.approx(1.5 + 0.9 + 4.0 + 0.5 + 1.5)
+    assert plan.duration_s == pytest.approx(1.5 + 0.9 + 4.0 + 0.5 + 1.5 + 2.0)
 
 
 def test_every_number_of_a_plan_counts_for_its_hash() -> None:
@@ -103,6 +110,11 @@ def test_every_number_of_a_plan_counts_for_its_hash() -> None:
         (lambda p: p["runs"][0]["segments"][0].update(hold_s="1e0x"), ["hold_s", "1e0x"]),
         (lambda p: p["runs"][0]["segments"][1].update(current_a=1.0), ["segments[1].current_a", "unknown"]),
         (lambda p: p["runs"][0]["segments"].pop(1), ["segments[1].kind", "a rest before it"]),
+        (
+            lambda p: p["runs"][0]["segments"].insert(1, {"kind": "power_off", "hold_s": 2.0}),
+            ["segments[1].kind", "power_off", "a rest before it"],
+        ),
+        (lambda p: p["runs"][1]["segments"][1].update(hold_s=0.5), ["segments[1].hold_s", "1.5"]),
         (lambda p: p["runs"][0]["segments"][2]["velocity"].update(b=[1.0]), ["velocity.b", "as many"]),
         (lambda p: p["runs"][0]["segments"][2]["current"].pop("omega_rad_s"), ["current.omega_rad_s"]),
         (lambda p: p["runs"][0]["segments"][2].pop("duration_s"), ["duration_s", "missing"]),

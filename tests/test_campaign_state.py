@@ -43,7 +43,10 @@ def test_what_is_done_is_found_again_and_the_rest_begins_anew(tmp_path: Path) ->
     directory = begun(tmp_path)
     files(tmp_path, "a", ".csv.gz", ".json", ".mcap")
     directory.put("a", DONE_STATE)
+    files(tmp_path, "a@2", ".mcap")  # a second part of its log
     files(tmp_path, "b", ".stopped.mcap")
+    files(tmp_path, "b@2", ".stopped.mcap", ".mcap")
+    files(tmp_path, "b@x", ".mcap")  # somebody else's
     directory.put("b", RunState(STOPPED, "too hot", attempts=1))
     files(tmp_path, "c", ".csv.gz", ".json")  # killed while it was being kept: no state says done
     (tmp_path / "c.part").mkdir()
@@ -54,7 +57,9 @@ def test_what_is_done_is_found_again_and_the_rest_begins_anew(tmp_path: Path) ->
     assert again.runs["a"] == DONE_STATE
     assert again.runs["b"] == again.runs["c"] == RunState()
     left = sorted(file.name for file in tmp_path.iterdir())
-    assert left == [".lock", "a.csv.gz", "a.json", "a.mcap", "campaign.json", "plan.yaml"]
+    assert left == [
+        ".lock", "a.csv.gz", "a.json", "a.mcap", "a@2.mcap", "b@x.mcap", "campaign.json", "plan.yaml",
+    ]  # fmt: skip
     again.close()
 
 

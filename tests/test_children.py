@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from daemon.children import Child, ChildError, ChildSilence
+from daemon.supervisor.children import Child, ChildError, ChildSilence
 
 
 def child(statement: str) -> Child:

@@ -8,11 +8,18 @@ from types import SimpleNamespace
 
 import pytest
 
-from daemon import cycle_record as cr
-from daemon.estimate_pdo import decode
-from daemon.snapshot import SnapshotReader
-from daemon.unwrap import Unwrap
-from tests.cycle_helpers import I32, SENSOR, estimates, frame, inputs, make, turn
+from daemon.loop.estimate_pdo import decode
+from daemon.loop.unwrap import Unwrap
+from daemon.loop.wake_up import WakeUp
+from daemon.shared import cycle_record as cr
+from daemon.shared.snapshot import SnapshotReader
+from tests.cycle_helpers import I32, SENSOR, ExactTime, estimates, frame, inputs, make, turn
+
+
+@pytest.fixture(autouse=True)
+def _exact_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cycle is late only where a test wants it to be."""
+    ExactTime().install(monkeypatch)
 
 
 def test_each_sync_gets_one_estimate_with_its_counter(tmp_path: Path) -> None:
@@ -103,12 +110,12 @@ def test_a_bus_that_is_down_is_stale_and_counted_and_comes_back(tmp_path: Path) 
     cycle, socket, reader = make(tmp_path, lambda n: inputs())
     turn(cycle, 30)
     socket.down = True
-    turn(cycle, 5)
+    turn(cycle, 2)
     socket.down = False
-    turn(cycle, 5)
-    records = reader.read().records
-    # Five cycles without a bus, one in which the first answers could be old ones, then as before.
-    assert [cr.joint_of(record, 1).status for record in records[29:37]] == [2, 4, 4, 4, 4, 4, 4, 2]
+    turn(cycle, 15)
+    records = reader.read(limit=64).records
+    # Two cycles without a bus, one in which the first answers could be old ones, then good again with the fifth good one.
+    assert [cr.joint_of(record, 1).status for record in records[29:38]] == [2, *[4] * (2 + 1 + 4), 2]
     assert not cr.header_of(records[31]).flags & cr.FLAG_PUBLISHED
 
 
@@ -137,15 +144,14 @@ def test_leaving_says_off(tmp_path: Path) -> None:
     assert pdo.torque_nm == (None, None)
 
 
-def test_the_wake_up_follows_the_arrival_of_the_inputs(tmp_path: Path) -> None:
-    cycle, _, _ = make(tmp_path, lambda n: inputs())
+def test_the_wake_up_follows_the_arrival_of_the_inputs() -> None:
+    wake_up = WakeUp(0, 100_000)
     for _ in range(3000):
-        cycle._adapt_wait(60_000)
-    assert cycle._wait_ns == pytest.approx(70_000, abs=20_000)
+        wake_up.follow(60_000)
+    assert wake_up.wait_ns == pytest.approx(70_000, abs=20_000)
     for _ in range(30):
-        cycle._adapt_wait(90_000)
-    assert cycle._deadline_ns == 100_000
-    assert cycle._wait_ns <= 90_000, "never beyond the deadline"
+        wake_up.follow(90_000)
+    assert wake_up.wait_ns <= 90_000, "never beyond the deadline"
 
 
 def test_a_position_that_rolls_over_goes_on() -> None:
@@ -179,9 +185,13 @@ def test_an_estimate_that_is_too_late_is_withdrawn(tmp_path: Path) -> None:
     pdo = decode(estimates(socket)[-1])
     assert pdo.status == (4, 4)
     assert pdo.torque_nm == (None, None)
-    joint = cr.joint_of(reader.read().records[-1], 1)
+    record = reader.read().records[-1]
+    assert cr.header_of(record).flags & cr.FLAG_WITHDRAWN
+    joint = cr.joint_of(record, 1)
     assert joint.status == 4
     assert math.isnan(joint.torque_nm)
+    turn(cycle, 5)
+    assert [decode(data).status for data in estimates(socket)[-5:]] == [(4, 4)] * 4 + [(2, 2)]
 
 
 def test_a_stall_of_minutes_is_recorded_and_not_fatal(tmp_path: Path) -> None:

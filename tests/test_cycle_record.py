@@ -5,7 +5,7 @@ import struct
 
 import pytest
 
-from daemon import cycle_record as cr
+from daemon.shared import cycle_record as cr
 
 HEADER = (7, 1_000, 1_700_000_000_123_456_789, 0xF, 50_000, -3, 2, 240, 2, 255, 1, 2, 3, 4, 0)
 JOINT_1 = (*(0.5 + n for n in range(12)), 0x1237, 2, 0x80, 7)

@@ -11,18 +11,24 @@ from typing import Any
 
 import pytest
 
-from daemon import cycle_record as cr
-from daemon.estimate_pdo import decode
-from daemon.joint_cycle import FLAG_TEMPERATURE
-from daemon.snapshot import SnapshotReader
-from daemon.temperature import JointTemperature
+from daemon.loop.estimate_pdo import decode
+from daemon.loop.joint_cycle import FLAG_TEMPERATURE
+from daemon.loop.temperature import JointTemperature
+from daemon.shared import cycle_record as cr
+from daemon.shared.snapshot import SnapshotReader
 from estimator.methods import AnyEstimator, load_network, make_estimator
 from estimator.settings import EstimatorSettings
-from tests.cycle_helpers import I32, estimates, frame, inputs, make, turn
+from tests.cycle_helpers import I32, ExactTime, estimates, frame, inputs, make, turn
 from tests.fused_configuration import joint_of, network_of
 
 LIFE = 200
 """Slots; the real 2 s are 2000 at 1 kHz."""
+
+
+@pytest.fixture(autouse=True)
+def _exact_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cycle is late only where a test wants it to be."""
+    ExactTime().install(monkeypatch)
 
 
 def temperatures() -> list[JointTemperature]:
@@ -46,6 +52,7 @@ class Spy:
     def __init__(self, inner: AnyEstimator) -> None:
         self.inner = inner
         self.given: list[float] = []
+        self.with_network = inner.with_network
 
     def step(self, *sample: float) -> Any:
         self.given.append(sample[5])
@@ -200,7 +207,7 @@ def test_frames_and_cycle_numbers_of_the_log_give_the_same_values_again(tmp_path
     for _ in range(1500):
         socket.pending += [(data, False) for data in some() if random_.random() < 0.05]  # late, for the drain
         if random_.random() < 0.02:
-            cycle.intake.gap_wanted = True
+            cycle.intake.gaps.wanted = True
             assert cycle.hold_back()
             socket.pending += [(data, False) for data in some()]  # in the slot without SYNC
             assert not cycle.hold_back()

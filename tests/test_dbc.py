@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import cantools
 import pytest
 
-from daemon.dbc import Quantity, dbc_of, dbc_text
-from daemon.estimate_pdo import encode
+from daemon.loop.estimate_pdo import encode
+from daemon.recording.dbc import Quantity, dbc_of, dbc_text
 from drivers.pdo import MappedObject, PdoMap
 
 TURN = 2 * math.pi

@@ -2,7 +2,7 @@
 
 import pytest
 
-from daemon.deviation_watch import DeviationWatch
+from daemon.supervisor.deviation_watch import DeviationWatch
 from estimator.status import STALE
 from tests.watch_views import NAN, WELL, view
 

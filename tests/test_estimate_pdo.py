@@ -5,7 +5,7 @@ from math import inf, nan
 import numpy as np
 import pytest
 
-from daemon.estimate_pdo import decode, encode, field
+from daemon.loop.estimate_pdo import decode, encode, field
 
 
 def test_transcript() -> None:
@@ -35,8 +35,13 @@ def test_sigma_is_never_narrower_than_it_was() -> None:
         assert steps * 0.05 >= sigma - 1e-9
         assert steps * 0.05 - sigma < 0.05 + 1e-9
     assert field(0.0, 12.70, 2)[1] == 254
-    for unknown in (12.71, inf, nan, -1.0):
-        assert field(0.0, unknown, 2)[1] == 255
+    assert field(0.0, 12.71, 2) == (0, 255, 2)
+
+
+@pytest.mark.parametrize("sigma", [nan, inf, -inf, -1e-9, -1.0])
+@pytest.mark.parametrize("status", [2, 3, 6])
+def test_a_torque_whose_sigma_is_none_is_none(sigma: float, status: int) -> None:
+    assert field(1.0, sigma, status) == (-0x8000, 255, 15)
 
 
 def test_round_trip() -> None:

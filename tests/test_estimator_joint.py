@@ -13,12 +13,14 @@ from estimator_helpers import Motion, joint1, motion, reciprocal_efficiency, sma
 from estimator import status as st
 from estimator.checked import ConfigError
 from estimator.friction import FloatArray, FrictionModel
-from estimator.joint_estimator import METHODS, Estimate, EstimatorSettings, JointEstimator, estimate_run
+from estimator.joint_estimator import METHODS as ALL_METHODS
+from estimator.joint_estimator import Estimate, EstimatorSettings, JointEstimator, estimate_run
 from estimator.losses import LossModel
 from estimator.network import TorqueNetwork
 from estimator.observer import first_order_hold
 from estimator.parameters import Effect, Joint
 
+METHODS = tuple(method for method in ALL_METHODS if method != "fused")  # FusedEstimator's own
 NETWORK = TorqueNetwork(small_network().data)
 # i, v, and Table I there: e.g. 0.2530 + 0.1493*3 - 0.0820 - 0.0117*9 + 0.0060*3 + 0.0066 = 0.5382
 TABLE_POINTS = ((3.0, 1.0, 0.5382), (-3.0, 1.0, 1.1272), (-3.0, -1.0, 0.5512), (3.0, -1.0, 1.1110))
@@ -271,6 +273,8 @@ def test_what_cannot_be_applied_is_refused() -> None:
     for method in METHODS:
         with pytest.raises(ConfigError, match=r"joint1: found effects \(torque_ripple\)"):
             JointEstimator(joint, EstimatorSettings(method=method), NETWORK)
+    with pytest.raises(ConfigError, match="found method 'fused', which FusedEstimator applies"):
+        JointEstimator(joint1(), EstimatorSettings(method="fused"), NETWORK)
     bare = replace(joint1(), efficiency=None)
     with pytest.raises(ConfigError, match="found no efficiency"):
         JointEstimator(bare, EstimatorSettings(method="efficiency"))

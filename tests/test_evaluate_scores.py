@@ -12,7 +12,6 @@ from estimator.parameters import QUADRANTS
 from estimator.run import JointColumns, RunTable
 from estimator.status import DEGRADED, VALID
 from sysid.evaluate.constant import PlateauScore, hardest, is_constant, plateau_scores, worst
-from sysid.evaluate.figure_base import thinned
 from sysid.evaluate.intervals import covered, interval_tables, standstill
 from sysid.evaluate.outside import outside_scores, training_range
 from sysid.evaluate.samples import Samples
@@ -20,6 +19,7 @@ from sysid.evaluate.score import LEVELS, Block, coverage, score, velocity_bins
 from sysid.evaluate.targets import worse_runs
 from sysid.evaluate.variable import error_tables, median_run, row
 from sysid.evaluate.velocity_joint import by_data, by_marks
+from sysid.figure_parts import thinned
 from sysid.plateaus import Mean, Plateau
 from tests.evaluate_helpers import samples
 

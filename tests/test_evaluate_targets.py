@@ -12,6 +12,7 @@ from sysid.evaluate.constant import PlateauScore
 from sysid.evaluate.crossings import Jump
 from sysid.evaluate.evaluation import Evaluation
 from sysid.evaluate.intervals import interval_tables
+from sysid.evaluate.loop_time import LoopTime
 from sysid.evaluate.outside import Outside, Range
 from sysid.evaluate.samples import Samples
 from sysid.evaluate.score import Block, Score, score
@@ -146,3 +147,12 @@ def test_the_largest_jump_of_ours_counts_and_the_papers_is_shown(nm: float, reac
     assert target(result, "jump_network").ours == f"{nm:.2f} Nm"
     assert "0.15 Nm" in target(result, "jump_fused").details[1]
     assert "0.90 Nm" in target(result, "jump_fused").details[2]
+
+
+@pytest.mark.parametrize(("ours", "reached"), [(29.0, True), (31.0, False)])
+def test_extra_time_is_that_over_the_papers_chain(ours: float, reached: bool) -> None:
+    cost = LoopTime({"tob": 4.0, "network": 15.0, "fused": ours}, 2, 3000, "run")
+    found = target(replace(EMPTY, loop_time=cost), "loop_time")
+    assert found.reached is reached
+    assert found.ours == f"{ours - 15.0:.1f} us"
+    assert f"over the classical TOB {ours - 4.0:.1f} us" in found.details[0]

@@ -14,7 +14,7 @@ from estimator.parameters import Friction, Joint
 from sysid.fused_fit import FOLDS, FusedFit, fit_fused, folds, fused_error, path_residuals
 from sysid.loss_fit import fit_loss
 from sysid.run_signals import RunSignals
-from sysid.sigma_fit import GAUSS, PathResiduals, conformal_scale, fit_sigma, quadrants_of
+from sysid.sigma_fit import GAUSS, PathResiduals, conformal_scale, fit_sigma, quadrants_of, unbiased_level
 from sysid.torsion_fit import fit_torsion
 from tests.fused_helpers import fused_joint
 from tests.fused_signals import STIFF, Nuisance, made_run, one_way, smooth_loss
@@ -31,7 +31,7 @@ def residuals(rng: np.random.Generator, count: int = 2000) -> PathResiduals:
     torsion = np.sqrt(0.3**2 + (0.03 * torque) ** 2)
     zero = rng.normal(0.0, 0.4)
     errors = (rng.normal(0.0, sd) + zero for sd in (current, torsion))
-    return PathResiduals(raw, v, np.zeros(count), torque, *errors)
+    return PathResiduals(raw, v, np.zeros(count), torque, np.zeros(count), *errors)
 
 
 def test_known_standard_deviations_come_back() -> None:
@@ -44,7 +44,7 @@ def test_known_standard_deviations_come_back() -> None:
 
 def test_sigma_needs_three_unseen_runs_with_motion() -> None:
     rng = np.random.default_rng(32)
-    none = PathResiduals(*[np.zeros(0)] * 6)
+    none = PathResiduals(*[np.zeros(0)] * 7)
     with pytest.raises(ValueError, match="found 2 unseen runs with motion, expected at least 3"):
         fit_sigma([residuals(rng), none, residuals(rng)])
     slow = [
@@ -72,13 +72,14 @@ def test_the_scaled_interval_covers_90_percent_of_runs_it_has_not_seen() -> None
             error, sigma, where = heteroscedastic(rng)
             inside = np.abs(error) <= GAUSS * scale[quadrant] * sigma
             covered.append(np.mean(inside[where == quadrant]))
-        assert 0.895 < np.mean(covered) < 0.935, (
-            quadrant
-        )  # the finite-sample correction of 60 runs aims at 0.917
+        assert np.mean(covered) == pytest.approx(0.9, abs=0.015), quadrant
 
 
-def test_errors_that_whole_runs_share_are_covered_nearly_as_well() -> None:
-    """Each run has its own zero and little else, calibrated on 20 runs: 90 to 95 % on average over 200 campaigns."""
+def test_errors_that_whole_runs_share_are_covered_alike() -> None:
+    """Each run has its own zero and little else, calibrated on 20 runs: 90 % on average over 200 campaigns.
+
+    Level 0.9 of the pooled samples would cover 87 %, that of split conformal prediction, rounded up, 91 %.
+    """
     rng = np.random.default_rng(36)
     one, where = np.ones(100), np.zeros(100, int)
 
@@ -89,15 +90,27 @@ def test_errors_that_whole_runs_share_are_covered_nearly_as_well() -> None:
     for _ in range(200):
         scale = conformal_scale([error() for _ in range(20)], [one] * 20, [where] * 20)[0]
         covered.append(np.mean(np.abs([error() for _ in range(40)]) <= GAUSS * scale))
-    assert np.mean(covered) == pytest.approx(0.925, abs=0.02)
+    assert np.mean(covered) == pytest.approx(0.9, abs=0.015)
+
+
+def test_the_level_lies_between_that_of_samples_and_that_of_runs() -> None:
+    rng = np.random.default_rng(37)
+    alike = [np.abs(rng.normal(size=4000)) for _ in range(48)]
+    assert unbiased_level(alike) == pytest.approx(0.9, abs=0.003)
+    apart = [np.full(100, k / 48) for k in rng.permutation(48)]
+    assert unbiased_level(apart) == pytest.approx(0.9 * 49 / 48, abs=0.01)  # of 48 places one must be taken
+    between = [np.abs(rng.normal() + rng.normal(size=4000)) for _ in range(48)]
+    assert 0.9 < unbiased_level(between) < 0.9 * 49 / 48
+    assert (
+        unbiased_level(apart[:8]) == unbiased_level(apart[:1]) == 0.97
+    )  # 8 runs have not shown their largest
 
 
 def test_gaussian_errors_of_the_believed_size_need_no_factor() -> None:
     rng = np.random.default_rng(34)
     one = np.ones(4000)
     runs = [(rng.normal(size=4000), one, rng.integers(0, 4, 4000)) for _ in range(100)]
-    # 100 runs: level 0.91, a quantile of 1.695 against 1.645
-    assert conformal_scale(*zip(*runs, strict=True)) == pytest.approx((1.03,) * 4, abs=0.01)
+    assert conformal_scale(*zip(*runs, strict=True)) == pytest.approx((1.0,) * 4, abs=0.01)
 
 
 def test_runs_count_alike_whatever_their_length() -> None:
@@ -113,7 +126,7 @@ def test_a_quadrant_without_samples_takes_the_factor_of_all() -> None:
     rng = np.random.default_rng(35)
     runs = [(3.0 * rng.normal(size=500), np.ones(500), np.repeat((0, 1), (480, 20))) for _ in range(20)]
     scale = conformal_scale(*zip(*runs, strict=True))
-    assert scale[1] == scale[2] == scale[3] == pytest.approx(3.0 * 1.96 / 1.645, abs=0.1)  # level 0.95
+    assert scale[1] == scale[2] == scale[3] == pytest.approx(3.0, abs=0.1)
     with pytest.raises(ValueError, match="found no samples to calibrate sigma with"):
         conformal_scale([np.zeros(0)] * 2, [np.zeros(0)] * 2, [np.zeros(0, int)] * 2)
 
@@ -169,7 +182,7 @@ def test_the_section_is_whole_and_can_be_written(fit: FusedFit) -> None:
 
 
 def test_unseen_runs_are_as_wrong_as_sigma_says(runs: list[RunSignals], fit: FusedFit) -> None:
-    """Zeros of +-0.3 Nm are 0.17 Nm RMS, noise 0.1; judged by fits without the run, 90 % of samples are inside."""
+    """Zeros of +-0.3 Nm are 0.17 Nm RMS, noise 0.1; judged by fits without the run, the share inside is that aimed at."""
     assert len(fit.unseen_rmse_nm) == len(runs)
     assert fit.fused.sigma.reference_nm == pytest.approx(0.17, abs=0.06)
     assert 0.15 < np.sqrt(np.mean(np.square(fit.unseen_rmse_nm))) < 0.25
@@ -182,7 +195,7 @@ def test_unseen_runs_are_as_wrong_as_sigma_says(runs: list[RunSignals], fit: Fus
             assert np.sqrt(np.mean(error**2)) == pytest.approx(fit.unseen_rmse_nm[n], rel=1e-6)
             scale = np.array(fit.fused.sigma.scale)[quadrants_of(parts)]
             judged.append(np.mean(np.abs(error) <= GAUSS * scale * sigma))
-    assert 0.89 < np.mean(judged) < 0.98  # few runs: the level of the quantile is up to 0.97
+    assert np.mean(judged) == pytest.approx(0.9, abs=0.02)
 
 
 def test_the_error_of_the_fused_value(runs: list[RunSignals], fit: FusedFit) -> None:
@@ -198,6 +211,7 @@ def test_the_error_of_the_fused_value(runs: list[RunSignals], fit: FusedFit) -> 
         parts.half_nm,
         parts.velocity_rad_s,
         parts.torsion_nm,
+        parts.open_nm,
     )
     assert error == pytest.approx(value - sensor, abs=1e-9)
     assert np.array_equal(sigma, spread)

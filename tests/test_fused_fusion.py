@@ -105,3 +105,22 @@ def test_the_memory_of_a_run() -> None:
     assert len(after) > 5
     assert np.array_equal(got[after], half[after])
     assert not got[~running].any()
+
+
+# ---- what the slip leaves open
+
+
+def test_an_open_slip_widens_sigma_and_gives_the_weight_to_the_current() -> None:
+    """As if the torsion's own standard deviation were that much larger, in both forms; nothing open is the default."""
+    fusion = Fusion(replace(SIGMA, torsion_load=0.0), True)
+    wider = Fusion(replace(SIGMA, torsion_nm=(0.35**2 + 0.4**2) ** 0.5, torsion_load=0.0), True)
+    known = fusion.fuse(RAW, LOSS, HALF, V, TORSION_NM)
+    assert fusion.fuse(RAW, LOSS, HALF, V, TORSION_NM, 0.0) == known
+    opened = fusion.fuse(RAW, LOSS, HALF, V, TORSION_NM, 0.4)
+    assert opened == pytest.approx(wider.fuse(RAW, LOSS, HALF, V, TORSION_NM), abs=1e-12)
+    assert opened[1] > known[1]
+    assert abs(opened[0] - (RAW - LOSS)) < abs(known[0] - (RAW - LOSS))
+    columns = [np.full(3, x) for x in (RAW, LOSS, HALF, V, TORSION_NM)]
+    many = fusion.fuse_many(*columns, np.array((0.0, 0.4, 0.4)))
+    assert np.array(many)[:, 0] == pytest.approx(known, abs=1e-12)
+    assert np.array(many)[:, 1] == pytest.approx(opened, abs=1e-12)

@@ -16,6 +16,7 @@ from estimator.network import TorqueNetwork
 from estimator.parameters import Effect
 from estimator.run import JointColumns
 from estimator.settings import EstimatorSettings
+from estimator.whole_run import estimate_run
 from tests.estimator_helpers import joint1, small_network
 from tests.fused_helpers import fused_joint, fused_network
 
@@ -29,7 +30,7 @@ def test_what_does_not_fit_is_refused() -> None:
     ):
         make_estimator(joint1(), FUSED)
     with pytest.raises(ConfigError, match=r"joint1: found effects \(torque_ripple\)"):
-        make_estimator(replace(JOINT, effects=(Effect("torque_ripple", {}),)), FUSED)
+        FusedEstimator(replace(JOINT, effects=(Effect("torque_ripple", {"amplitude_nm": 0.3}),)), FUSED)
     with pytest.raises(ConfigError, match="joint1: found method 'tob', expected 'fused'"):
         FusedEstimator(JOINT, EstimatorSettings(method="tob"))
 
@@ -66,3 +67,12 @@ def test_the_door_gives_the_estimator_of_the_method() -> None:
     assert isinstance(make_estimator(JOINT, FUSED, ours), FusedEstimator)
     for method, network in (("tob", None), ("efficiency", None), ("network", paper)):
         assert isinstance(make_estimator(JOINT, EstimatorSettings(method=method), network), JointEstimator)
+
+
+def test_the_papers_estimator_does_not_apply_ours() -> None:
+    """Given method `fused` it would quietly be something else."""
+    words = "joint joint1: found method 'fused', which FusedEstimator applies"
+    with pytest.raises(ConfigError, match=words):
+        JointEstimator(JOINT, FUSED)
+    with pytest.raises(ConfigError, match=words):
+        estimate_run(JOINT, FUSED, None, *[np.full(3, 0.001)] * 5)

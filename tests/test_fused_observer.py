@@ -25,7 +25,7 @@ def observer(torsion: Torsion | None = PLAIN, link_rate: float = RATE) -> FusedO
 
 
 def outputs(o: FusedObserver, rows: Iterable[tuple[float, ...]]) -> FloatArray:
-    """Outputs [n, 9] over rows of (dt, current, motor position, motor velocity, link position)."""
+    """Outputs [n, 10] over rows of (dt, current, motor position, motor velocity, link position)."""
     first, *rest = rows
     return np.array([o.start(*first[1:]), *(o.step(*row) for row in rest)])
 
@@ -96,7 +96,7 @@ def test_torque_and_velocities_are_those_of_the_papers_observer() -> None:
 
 @pytest.mark.parametrize("orders", [(2.0, 4.0), (4.0,), (1.0, 2.0, 2.0, 5.5)])
 def test_torsion_with_its_cubic_and_kinematic_error(orders: tuple[float, ...]) -> None:
-    """The torque of each sample by the formula, then through the filter; orders other than 2 and 4 too."""
+    """The deflection through the filter, then the torque by the formula; orders other than 2 and 4 too."""
     rng = np.random.default_rng(len(orders))
     cos, sin = (tuple(rng.uniform(-5e-5, 5e-5, len(orders)).tolist()) for _ in range(2))
     torsion = Torsion(9000.0, 3e8, 7e-5, orders, cos, sin)
@@ -107,12 +107,12 @@ def test_torsion_with_its_cubic_and_kinematic_error(orders: tuple[float, ...]) -
     )
     d = angle / G - m.link_position_rad - 7e-5 - error
     assert np.max(np.abs(3e8 * d**3)) > 0.5
-    torque = 9000.0 * d + 3e8 * d**3
-    z, expected = torque[0], [torque[0]]
-    for k in range(1, len(torque)):
+    z, filtered = d[0], [d[0]]
+    for k in range(1, len(d)):
         a, b0, b1 = first_order_hold(RATE, m.dt_s[k])
-        z = a * z + b0 * torque[k] + b1 * torque[k - 1]
-        expected.append(z)
+        z = a * z + b0 * d[k] + b1 * d[k - 1]
+        filtered.append(z)
+    expected = 9000.0 * np.array(filtered) + 3e8 * np.array(filtered) ** 3
     assert np.max(np.abs(column(outputs(observer(torsion), m.rows()), "torsion_nm") - expected)) < 1e-8
 
 
@@ -166,7 +166,7 @@ def test_no_finite_angle_raises() -> None:
         for o in (observer(torsion), observer(TORSION), observer(None)):
             o.start(1.0, 0.0, 0.0, 0.0)
             seen = o.step(0.001, 1.0, angle, 0.0, 0.0)
-            assert all(-1.0 <= wave <= 1.0 for wave in seen[4:])
+            assert all(-1.0 <= wave <= 1.0 for wave in seen[4:9])
     o = observer(TORSION)
     o.start(1.0, 0.0, 0.0, 0.0)
     assert math.isnan(o.step(0.001, 1.0, 1e6, 0.0, 0.0).raw_nm)  # impossible torsion: the guard starts again
@@ -174,8 +174,7 @@ def test_no_finite_angle_raises() -> None:
 
 def test_hysteresis_loop_of_the_torsion() -> None:
     """Slow triangle of the torsion angle: K d on the way up and down, H above it on the way up, H below on the way down."""
-    torsion = replace(TORSION, cubic_nm_per_rad3=0.0, zero_rad=0.0, cos_rad=(0.0, 0.0), sin_rad=(0.0, 0.0))
-    loop = replace(torsion, hysteresis_nm=0.6, hysteresis_travel_rad=1e-4)
+    loop = replace(PLAIN, hysteresis_nm=0.6, hysteresis_travel_rad=1e-4)
     observer = FusedObserver(joint1(), loop, 200.0, 200.0)
     angle = 1e-3 * np.concatenate(
         (np.linspace(0, 1, 2000), np.linspace(1, -1, 4000), np.linspace(-1, 0, 2000))
@@ -187,3 +186,63 @@ def test_hysteresis_loop_of_the_torsion() -> None:
     assert seen[1500] - plain[1500] == pytest.approx(0.6 - lag, abs=2e-3)
     assert seen[4000] - plain[4000] == pytest.approx(-0.6 + lag, abs=2e-3)
     assert seen[7500] - plain[7500] == pytest.approx(0.6 - lag, abs=2e-3)
+
+
+def test_damping_of_the_torsion_follows_its_rate() -> None:
+    """A torsion that rises at 2 mrad/s: K d as late as ever, and D d' whatever the steps; none at the start."""
+    o = observer(replace(PLAIN, damping_nms_per_rad=8.0))
+    dt = uneven(400)
+    twist = 2e-3 * np.cumsum(dt)
+    rows = [(step, 0.0, G * d, 0.0, 0.0) for step, d in zip(dt.tolist(), twist.tolist(), strict=True)]
+    found = column(outputs(o, rows), "torsion_nm")
+    assert found[0] == pytest.approx(12000.0 * twist[0], abs=1e-9)
+    late = np.cumsum(dt) > 0.25
+    assert found[late] == pytest.approx(12000.0 * (twist[late] - 2e-3 / RATE) + 8.0 * 2e-3, abs=1e-9)
+
+
+LOOP = replace(PLAIN, hysteresis_nm=0.6, hysteresis_travel_rad=1e-4)
+
+
+def at_rest(o: FusedObserver, twist_rad: FloatArray) -> FloatArray:
+    """Outputs while the twist takes these values, 50 ms each: the filter has settled at every one."""
+    o.start(0.0, G * twist_rad[0], 0.0, 0.0)
+    return np.array(
+        [[o.step(1e-3, 0.0, G * twist, 0.0, 0.0) for _ in range(50)][-1] for twist in twist_rad.tolist()]
+    )
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_slip_that_began_anywhere_lies_between_its_bounds(sign: float) -> None:
+    """Nothing is known at first; what is left open shrinks with the largest swing, to nothing from twice the travel on."""
+    twist = sign * np.array((2.0, 2.5, 2.0, 3.0, 2.8, 3.9, 4.0, 3.9, 2.1)) * 1e-4
+    found = at_rest(observer(LOOP), twist)
+    expected = 0.6 * np.array((1.0, 0.75, 0.75, 0.5, 0.5, 0.05, 0.0, 0.0, 0.0))
+    assert column(found, "open_nm") == pytest.approx(expected, abs=2e-4)
+    middle = (column(found, "torsion_nm") - 12000.0 * twist) / 0.6
+    for began in np.linspace(-1.0, 1.0, 21).tolist():
+        z, true = began, []
+        for step in np.diff(twist, prepend=twist[0]) / 1e-4:
+            z = min(max(z + step, -1.0), 1.0)
+            true.append(z)
+        assert np.all(np.abs(middle - true) <= expected / 0.6 + 1e-3)
+    assert middle[-3:] == pytest.approx((sign, 0.9 * sign, -0.9 * sign), abs=1e-3)
+
+
+def test_a_new_start_knows_nothing_of_the_slip() -> None:
+    o = observer(LOOP)
+    at_rest(o, np.array((0.0, 5e-4)))
+    assert o.step(1e-3, 0.0, G * 5e-4, 0.0, 0.0).open_nm == 0.0
+    assert o.start(0.0, G * 5e-4, 0.0, 0.0).open_nm == 0.6
+    assert o.step(1e-3, 0.0, G * 5e-4, 0.0, 0.0)[3] == pytest.approx(6.0, abs=1e-9)
+    assert observer(PLAIN).start(0.0, G * 5e-4, 0.0, 0.0).open_nm == 0.0
+
+
+def test_noise_of_the_encoder_does_not_make_the_slip_creep() -> None:
+    """A rising torsion with 6 urad of noise: an element that followed every sample would stay 0.1 Nm below its hold."""
+    rng = np.random.default_rng(3)
+    twist = np.linspace(0.0, 1e-3, 8000)
+    o = observer(LOOP)
+    o.start(0.0, 0.0, 0.0, 0.0)
+    seen = [o.step(1e-3, 0.0, G * d, 0.0, e) for d, e in zip(twist, rng.normal(0.0, 6e-6, 8000), strict=True)]
+    off = column(np.array(seen), "torsion_nm") - 12000.0 * (twist - twist[1] / 1e-3 / RATE)
+    assert np.mean(off[4000:]) == pytest.approx(0.6, abs=0.025)

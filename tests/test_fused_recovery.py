@@ -87,6 +87,9 @@ def test_stiffness_and_kinematic_error_of_the_plant_come_back(
     assert torsion.cos_rad[0] == pytest.approx(-4e-5 * math.sin(phase), abs=3e-6)
     assert torsion.sin_rad[0] == pytest.approx(-4e-5 * math.cos(phase), abs=3e-6)
     assert np.abs((torsion.cos_rad[1], torsion.sin_rad[1])).max() < 3e-6
+    assert torsion.hysteresis_nm == pytest.approx(0.4, rel=0.2)
+    assert torsion.hysteresis_travel_rad == pytest.approx(1e-4, rel=0.21)
+    assert torsion.damping_nms_per_rad == pytest.approx(8.0, rel=0.3)
     assert abs(torsion.zero_rad) < 5e-6
 
 
@@ -106,21 +109,35 @@ def test_viscous_per_k_of_the_plant_lies_within_its_interval() -> None:
         assert abs(fitted.loss.viscous_per_k - 0.025) < 1.96 * fitted.viscous_per_k_sigma
 
 
-def test_a_run_it_has_not_seen_is_estimated(fit: FusedFit) -> None:
-    """Other motion, another day: 0.5 Nm RMS of up to 30 Nm, and better than either path of it alone is known."""
-    ours = replace(joint(1), fused=fit.fused)
-    table = emulate_run(campaign_plant(), harmonic(2.0, 0.6, 3.0), 4.0, 55, day=3)
-    run = estimate_columns(ours, FUSED, None, table.time_s, table.joints[1])
-    sensor = same_age(np.asarray(table.joints[1].torque_nm), table.dt_s, 200.0)
-    moving = (run.status == st.VALID) & (table.time_s > 0.2)
-    error = (run.torque_nm - sensor)[moving]
-    assert np.ptp(sensor) > 20.0
-    assert np.sqrt(np.mean(error**2)) < 0.5
-    # nine in ten are meant; a handful of short runs knows less of other motions than that
-    assert np.mean(np.abs(error - error.mean()) <= 1.645 * run.sigma_nm[moving]) > 0.7
-    standing = (run.status == st.STANDSTILL) & (table.time_s > 0.2)
-    # the sensor's zero of that day, 0.27 Nm, is most of what there is to cover
-    assert np.mean(np.abs(run.torque_nm - sensor)[standing] <= run.sigma_nm[standing]) > 0.75
+@pytest.fixture(scope="module")
+def fit_of_days() -> FusedFit:
+    """Joint 1 in 12 runs of 6 s, each of a day of its own: only so is it known what a day changes."""
+    return fit_fused([emulated(3000 + k, 6.0, day=100 + k)[0] for k in range(12)], joint(1).friction)
+
+
+def test_runs_of_other_days_are_estimated_as_well_as_sigma_says(fit_of_days: FusedFit) -> None:
+    """Other motions, eight other days with their zeros and friction, errors as they are: each day 0.5 Nm RMS of up to 30 Nm.
+
+    80 % or more of all moving samples are in the 90 % interval (eight days are few), 95 % of the standing ones in theirs.
+    """
+    ours = replace(joint(1), fused=fit_of_days.fused)
+    moving_inside, standing_inside = [], []
+    for day in range(8):
+        motion = harmonic(1.2 + 0.2 * day, 0.4 + 0.05 * day, (3.0, -3.0, 1.5, -1.5)[day % 4])
+        table = emulate_run(campaign_plant(), motion, 4.0, 55 + day, day=day)
+        run = estimate_columns(ours, FUSED, None, table.time_s, table.joints[1])
+        sensor = same_age(np.asarray(table.joints[1].torque_nm), table.dt_s, 200.0)
+        error = run.torque_nm - sensor
+        moving = (run.status == st.VALID) & (table.time_s > 0.2)
+        standing = (run.status == st.STANDSTILL) & (table.time_s > 0.2)
+        assert np.ptp(sensor) > 15.0
+        assert np.sqrt(np.mean(error[moving] ** 2)) < 0.5
+        assert np.mean(run.sigma_nm[moving]) < 0.4
+        moving_inside.append(np.mean(np.abs(error[moving]) <= 1.645 * run.sigma_nm[moving]))
+        standing_inside.append(np.mean(np.abs(error[standing]) <= run.sigma_nm[standing]))
+    print("inside, by day:", np.round(moving_inside, 2), np.round(standing_inside, 2))
+    assert np.mean(moving_inside) > 0.8
+    assert np.mean(standing_inside) > 0.95
 
 
 # ---- reversal

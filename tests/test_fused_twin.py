@@ -33,6 +33,7 @@ from tests.fused_helpers import (
 
 FIELDS = ("torque_nm", "sigma_nm", "status", "tob_nm", "physics_nm", "network_nm")
 FUSED = EstimatorSettings(method="fused")
+SLIPPING = replace(TORSION, hysteresis_nm=0.7, hysteresis_travel_rad=8e-5, damping_nms_per_rad=9.0)
 RUNNING = {st.STARTING, st.VALID, st.STANDSTILL, st.INVALID}
 
 
@@ -68,7 +69,7 @@ def compare(  # noqa: PLR0917 - what both take, and a note
     return run
 
 
-@pytest.mark.parametrize("torsion", [TORSION, None], ids=["torsion", "rigid"])
+@pytest.mark.parametrize("torsion", [TORSION, SLIPPING, None], ids=["torsion", "hysteresis", "rigid"])
 @pytest.mark.parametrize("with_network", [True, False], ids=["network", "physics"])
 def test_random_runs_equal_their_twin(torsion: Any, with_network: bool) -> None:
     """Reversals, standstill, uneven steps, gaps, NaN, infinities, absurd jumps, a warming joint, holes in the map."""

@@ -1,6 +1,6 @@
 """The grid skips missed slots and never bursts."""
 
-from daemon.grid import Grid
+from daemon.loop.grid import Grid
 
 MS = 1_000_000
 

@@ -3,7 +3,7 @@
 import pytest
 
 from daemon.config import load_config
-from daemon.input_watch import InputWatch
+from daemon.supervisor.input_watch import InputWatch
 from estimator.status import OFF, STALE
 from models.files import shipped
 from tests.watch_views import NAN, WELL, view
@@ -39,6 +39,8 @@ def test_healthy_and_switched_off_joints_are_no_news():
         ({"states": {1: 4}}, "node 1 is stopped"),
         ({"states": {1: 127}, "bus_errors": 1}, "node 1 is pre-operational"),
         ({"unconfigured": (1,), "states": {1: 127}}, "node 1 has restarted and is not configured yet"),
+        ({"unconfigured": (1,), "states": {1: 0}}, "node 1 is not there"),
+        ({"unconfigured": (1,), "states": {1: 5}}, "node 1 is not configured as it was"),
         ({"unconfigured": (2, 3)}, "281h drive 1 TPDO2 not received in time"),
     ],
 )
@@ -118,3 +120,9 @@ def test_the_end_is_told():
         lost = 20 <= n < 60
         lines += watch.lines(view(8 * n, STALE_NO_MOTION if lost else WELL), 0.05 * n)
     assert lines[1:] == ["joint 1: inputs back after 2.0 s"]
+
+
+def test_an_absent_sensor_is_named_by_its_node():
+    gone = WELL._replace(sensor_nm=NAN, input_flags=3)
+    lines = told(view(8, one=gone, two=gone, unconfigured=(3,), states={3: 0}))
+    assert lines == [f"joint {number}: torque sensor lost: node 3 is not there" for number in (1, 2)]

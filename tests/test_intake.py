@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import pytest
 
-from daemon.intake import InputPdo, Intake
+from daemon.loop.counters import frame_counts
+from daemon.loop.intake import InputPdo, Intake
 
 PAIR = struct.Struct("<ii")
 TPDO1 = InputPdo(0x181, 8, PAIR, 1, "181h drive 1 TPDO1")
@@ -101,9 +102,9 @@ def test_a_lost_frame_is_written_off_once_the_next_one_has_come_alone_and_as_usu
     assert not bus.cycle((one(2), 210_000), (two(2), 300_000))
     assert bus.cycle((one(3), 200_000), (two(3), 300_000))
     assert bus.intake.values(0) == (3, -3)
-    assert bus.intake.counters()["181h drive 1 TPDO1"]["lost"] == 1
+    assert frame_counts(bus.intake)["181h drive 1 TPDO1"]["lost"] == 1
     assert bus.intake.stale_inputs == 2
-    assert not bus.intake.gap_wanted
+    assert not bus.intake.gaps.wanted
 
 
 def test_where_arrivals_are_irregular_a_slot_without_sync_settles_it() -> None:
@@ -112,13 +113,13 @@ def test_where_arrivals_are_irregular_a_slot_without_sync_settles_it() -> None:
         assert bus.cycle((one(n), 100_000 + 13_000 * n), (two(n), 300_000))  # a band of 0.6 ms tells nothing
     assert not bus.cycle((two(1), 300_000))
     assert not bus.cycle((one(2), 300_000), (two(2), 300_000))
-    assert bus.intake.gap_wanted
-    bus.intake.gap()
+    assert bus.intake.gaps.wanted
+    bus.intake.gaps.pass_slot()
     for n in range(5):
         assert not bus.cycle((one(n), 300_000), (two(n), 300_000)), "five regular cycles first"
     assert bus.cycle((one(5), 300_000), (two(5), 300_000))
-    assert bus.intake.counters()["181h drive 1 TPDO1"]["lost"] == 1
-    assert bus.intake.gaps == 1
+    assert frame_counts(bus.intake)["181h drive 1 TPDO1"]["lost"] == 1
+    assert bus.intake.gaps.count == 1
 
 
 def test_a_frame_after_the_deadline_is_late_and_never_used(bus: Bus) -> None:
@@ -126,7 +127,7 @@ def test_a_frame_after_the_deadline_is_late_and_never_used(bus: Bus) -> None:
     assert bus.intake.late_frames == 1
     assert bus.cycle((one(2), 200_000), (two(2), 300_000))
     assert bus.intake.values(0) == (2, -2)
-    assert bus.intake.counters()["181h drive 1 TPDO1"]["lost"] == 0
+    assert frame_counts(bus.intake)["181h drive 1 TPDO1"]["lost"] == 0
 
 
 def test_a_frame_that_slips_into_the_next_cycle_spoils_that_one_and_pays(bus: Bus) -> None:
@@ -218,7 +219,7 @@ def test_a_length_beyond_eight_is_rejected(bus: Bus) -> None:
 def test_29_bit_and_remote_frames_are_rejected_and_named(bus: Bus, flag: int) -> None:
     assert bus.cycle((one(5), 200_000), (frame(0x181 | flag), 250_000), (two(5), 300_000))
     assert bus.intake.values(0) == (5, -5)
-    assert bus.intake.counters()["181h drive 1 TPDO1"]["rejected"] == 1
+    assert frame_counts(bus.intake)["181h drive 1 TPDO1"]["rejected"] == 1
 
 
 def test_a_foreign_sync_makes_every_input_doubtful(bus: Bus) -> None:
@@ -240,7 +241,7 @@ def test_a_node_that_booted_again_is_not_believed_until_configured(bus: Bus) -> 
 
 def test_heartbeats_are_kept_by_node(bus: Bus) -> None:
     bus.cycle((frame(0x701, b"\x05"), 100_000), (one(1), 200_000), (two(1), 300_000))
-    assert bus.intake.node_states == {1: 5}
+    assert bus.intake.nodes.states == {1: 5}
 
 
 @pytest.mark.parametrize("spread_us", [20, 500])
@@ -318,8 +319,8 @@ class Timeline:
         intake, start = self.intake, self.now_us
         self.now_us += 1000
         intake.drain(*self._arrived(start))
-        if intake.gap_wanted:
-            intake.gap()
+        if intake.gaps.wanted:
+            intake.gaps.pass_slot()
             return False
         for n, (delay, make) in enumerate(zip(self.delays(self.syncs), (one, two), strict=True)):
             if delay is not None:

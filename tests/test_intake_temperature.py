@@ -10,11 +10,12 @@ import pytest
 import yaml
 
 from daemon.config import load_config
-from daemon.input_pdos import joint_temperatures
-from daemon.intake import InputPdo, Intake
-from daemon.load import bus_load_of
-from daemon.loop import _joint_inputs
-from daemon.temperature import JointTemperature
+from daemon.loop.counters import frame_counts
+from daemon.loop.input_pdos import joint_temperatures
+from daemon.loop.intake import InputPdo, Intake
+from daemon.loop.process import joint_inputs
+from daemon.loop.temperature import JointTemperature
+from daemon.master.bus_load import bus_load_of
 from models.files import shipped
 
 POSITION = InputPdo(0x181, 8, struct.Struct("<ii"), 1, "181h drive 1 TPDO1")
@@ -100,7 +101,7 @@ def test_lost_after_two_seconds_and_back_with_the_next_frame(line: Line) -> None
     assert math.isnan(line.value)
     for _ in range(3000):
         assert line.cycle()
-    assert line.intake.counters()[NAME] == {"late": 0, "lost": 1, "duplicate": 0, "rejected": 0}
+    assert frame_counts(line.intake)[NAME] == {"late": 0, "lost": 1, "duplicate": 0, "rejected": 0}
     line.cycle(celsius(260))
     assert line.value == 26.0
 
@@ -127,14 +128,14 @@ def test_another_length_is_rejected_and_counted(line: Line, length: int) -> None
     assert line.cycle(frame(0x381, struct.pack("<h", 999), length))
     line.cycle(late=(frame(0x381, struct.pack("<h", 999), length),))
     assert line.value == 25.0
-    assert line.intake.counters()[NAME]["rejected"] == line.intake.rejected_frames == 2
+    assert frame_counts(line.intake)[NAME]["rejected"] == line.intake.rejected_frames == 2
 
 
 @pytest.mark.parametrize("flag", [0x8000_0000, 0x4000_0000, 0xC000_0000])
 def test_29_bit_and_remote_frames_are_rejected_and_named(line: Line, flag: int) -> None:
     line.cycle(frame(0x381 | flag, struct.pack("<h", 999)))
     assert math.isnan(line.value)
-    assert line.intake.counters()[NAME]["rejected"] == line.intake.rejected_frames == 1
+    assert frame_counts(line.intake)[NAME]["rejected"] == line.intake.rejected_frames == 1
 
 
 def test_a_node_that_restarted_is_not_believed_until_it_is_configured(line: Line) -> None:
@@ -180,7 +181,7 @@ def test_each_joint_finds_its_own(tmp_path: Path, have: tuple[int, ...]) -> None
     scaling["2"] = scaling["1"]
     report = {"nodes": {node: {"scaling": factors} for node, factors in scaling.items()}}
     found = joint_temperatures(config)
-    for number, inputs in enumerate(_joint_inputs(config, report), start=1):
+    for number, inputs in enumerate(joint_inputs(config, report), start=1):
         node = None if inputs.temperature is None else found[inputs.temperature].node_id
         assert node == (number if number in have else None)
     assert [row.cob_id for row in bus_load_of(config).rows if row.length == 2] == [0x380 + n for n in have]

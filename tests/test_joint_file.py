@@ -63,7 +63,10 @@ def test_shipped_numbers() -> None:
 
 
 def test_round_trip_copy_and_pickle() -> None:
-    joint = replace(load_joint(shipped("joint1.yaml")), effects=(Effect("cogging", {"amplitude_nm": 0.1}),))
+    joint = replace(
+        load_joint(shipped("joint1.yaml")),
+        effects=(Effect("cogging", {"amplitude_nm": 0.1, "order_per_motor_rev": 12}),),
+    )
     assert Joint.from_mapping(joint.to_mapping(), "x") == joint
     assert pickle.loads(pickle.dumps(joint)) == joint
     assert copy.deepcopy(joint) == joint

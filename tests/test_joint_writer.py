@@ -38,7 +38,7 @@ def test_every_section_comes_back_with_effects_and_any_provenance(tmp_path: Path
         joint1(),
         effects=(
             Effect("torque_ripple", {"amplitude_nm": 0.4, "order_per_motor_rev": 2.0, "phase_rad": -0.1}),
-            Effect("lost_motion", {}),
+            Effect("lost_motion", {"width_rad": 1.5e-4}),
         ),
         provenance={
             "source": "a: b # no comment, äöü",

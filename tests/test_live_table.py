@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from daemon.live_table import LiveTable
-from daemon.snapshot import Snapshot, SnapshotReader
+from daemon.shared.snapshot import Snapshot, SnapshotReader
+from daemon.supervisor.live_table import LiveTable
 
 NAN = float("nan")
 JOINTS = (
-    (-117.94, 0.48, NAN, NAN, NAN, -118.48, 0x27, 2, 0, 7),
+    (-117.94, 0.48, NAN, NAN, NAN, -118.48, 0x27, 2, 0, 7, 0),
     (
         3.0,
         0.5,
@@ -23,6 +23,7 @@ JOINTS = (
         5,
         0,
         7,
+        0,
     ),  # drive_fault, the longest status: its torque must not show
 )
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from daemon.config import load_config
-from daemon.loop import build_estimator, loop_filters, warm_up
+from daemon.loop.process import build_estimator, loop_filters, warm_up
 from drivers.can_filter import CanFilter
 from estimator.checked import ConfigError
 from estimator.fused_estimator import FusedEstimator

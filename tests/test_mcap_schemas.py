@@ -7,10 +7,10 @@ import struct
 import pytest
 from cdr_decoder import Definition
 
-from daemon import cycle_record as cr
-from daemon import joint_cycle
-from daemon import mcap_messages as messages
-from daemon import mcap_schemas as schemas
+from daemon.loop import joint_cycle
+from daemon.recording import messages, schemas
+from daemon.shared import cycle_record as cr
+from daemon.shared import faults
 
 DEFINITIONS = {name: Definition(name, text) for name, text in schemas.SCHEMAS.items()}
 JOINT = DEFINITIONS["jtqd_msgs/msg/JointEstimate"]
@@ -165,14 +165,18 @@ def test_log():
 
 
 def test_diagnostics():
-    small = messages.diagnostics(NOW, 0, "recording", {"a.backlog": 0, "cpu": 0.5})
-    large = messages.diagnostics(NOW, 2, "cycles were lost", {"a.backlog": 10**15, "cpu": 1e300})
+    def message(level, text, backlog, cpu):
+        first = messages.Status("recorder", "can0", level, text, {"backlog": backlog, "cpu": cpu})
+        return messages.diagnostics(NOW, [first, messages.Status("x", "", 0, "", {"mode": text})])
+
+    small, large = message(0, "recording", 0, 0.5), message(2, "cycles were lost " * 9, 10**15, 1e300)
     assert len(small) == len(large)
     status = DEFINITIONS["diagnostic_msgs/msg/DiagnosticArray"].decode(large)["status"]
-    assert len(status) == 1
-    assert (status[0]["level"], status[0]["message"].rstrip()) == (2, "cycles were lost")
+    assert [each["name"] for each in status] == ["recorder", "x"]
+    assert (status[0]["level"], status[0]["hardware_id"]) == (2, "can0")
+    assert status[0]["message"].startswith("cycles were lost cycles")
     values = {entry["key"]: float(entry["value"]) for entry in status[0]["values"]}
-    assert values == {"a.backlog": 1e15, "cpu": 1e300}
+    assert values == {"backlog": 1e15, "cpu": 1e300}
 
 
 def test_status_constants_are_those_of_the_pdo():
@@ -192,6 +196,9 @@ def test_status_constants_are_those_of_the_pdo():
     inputs = ("POSITION", "MOTION", "SENSOR", "TEMPERATURE")
     names = ("INPUT_TPDO1", "INPUT_TPDO2", "INPUT_SENSOR", "INPUT_TEMPERATURE")
     flags |= {name: getattr(joint_cycle, f"FLAG_{part}") for name, part in zip(names, inputs, strict=True)}
+    flags |= {"WITHDRAWN": cr.FLAG_WITHDRAWN, "LATCHES_RESET": cr.FLAG_RESET}
+    flags |= {"NETWORK_SKIPPED": joint_cycle.FLAG_NETWORK_SKIPPED, "FAULT_LATCHED": joint_cycle.FLAG_LATCHED}
+    flags |= {f"FAULT_{faults.NAMES[bit].upper()}": bit << 8 for bit in faults.COUNTED}
     assert flags.items() <= JOINT.constants.items()
 
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from daemon.logs.reader import read_topic
 from drivers.frame import FRAME, pack
 from drivers.frame_socket import open_frame_socket
 from estimator.status import STALE, STARTING
 from models.files import load_yaml, shipped
 from sim_can.run_files import ColumnMap, read_run
 from sysid import measured
-from sysid.joint_log import read_topic
 from sysid.measured_bus import config_file, record
 from sysid.measured_bus_score import Played, configured, published_torque, score_log
 from tests.cdr_decoder import Definition

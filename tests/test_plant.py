@@ -344,3 +344,13 @@ def test_current_loop_is_first_order_at_its_bandwidth_and_limited():
     for _ in range(1000):
         current = drive.step(1e-4, 0.0)
     assert current == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_joint_file_without_efficiency_has_the_friction_it_says():
+    """Fc + Fv |v| + Fs exp(-(v/vs)²) at any torque, with a wide peak too."""
+    friction = replace(JOINT.friction, stribeck_nm=1.5, stribeck_velocity_rad_s=0.15)
+    joint = replace(JOINT, efficiency=None, friction=friction)
+    law = Plant(plant_of_joint(joint)).friction[0]
+    for v in (0.0, 0.01, -0.07, 0.15, -0.3, 0.61, 2.0):
+        expected = 3.0 + 2.0 * abs(v) + 1.5 * math.exp(-((v / 0.15) ** 2))
+        assert law(12.0, v) == pytest.approx(expected, abs=1e-6), v

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from daemon.logs.reader import LogError
 from estimator.status import DEGRADED, STALE, STANDSTILL, VALID
 from sysid import plot_command
-from sysid.joint_log import LogError
 
 pytest.importorskip("matplotlib")
 ROWS = [  # status, estimate, sensor

@@ -2,7 +2,7 @@
 
 from itertools import pairwise
 
-from daemon.presence import Presence
+from daemon.supervisor.presence import Presence
 
 STEP = 1.0 / 16.0  # exact in binary; two of them are longer than what counts as a flicker
 
@@ -53,3 +53,9 @@ def test_a_loss_too_soon_that_lasts_is_told_as_soon_as_allowed():
         (6.125, "lost: asked at 2.125"),
         (9.125, "back after 7.0 s"),
     ]
+
+
+def test_two_losses_are_two_and_the_next_line_waits_for_its_time():
+    lines = told((1.0, 1.5), (2.0, 2.5), (3.0, 3.5), (7.0, 7.5), until=20)
+    assert lines[2] == (6.125, "back after 1.0 s, lost 2 times: asked at 3.125")
+    assert lines[3] == (11.125, "back after 0.5 s: asked at 7.125")

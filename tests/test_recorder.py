@@ -25,10 +25,11 @@ from recorder_bench import (
     messages_of,
     put,
     record_of,
+    statuses_of,
 )
 
-from daemon import cycle_record as cr
-from daemon.recorder_request import RecorderRequest, RequestError
+from daemon.recording.request import RecorderRequest, RequestError
+from daemon.shared import cycle_record as cr
 
 EVENT = DEFINITIONS["jtqd_msgs/msg/Event"].constants
 
@@ -62,7 +63,7 @@ def test_round_trip(recorder):
     status, summary, errors = process.end()
     assert (status, errors) == (0, "")
     path = process.files()[0]
-    assert [path] == process.files("test-2*Z.mcap")
+    assert [path] == process.files("test-2*Z-0001.mcap")
     expected = {"path": str(path), "cycles": 1234, "written": 1234, "lost": 0, "bytes": path.stat().st_size}
     assert expected.items() <= summary.items()
     found = messages_of(path)
@@ -151,9 +152,9 @@ def test_flapping_status_is_bounded_and_counted(recorder):
     _, summary, _ = process.end()
     found = messages_of(summary["path"])
     written = len(events(found, "STATUS_CHANGED"))
-    values = {item["key"]: item["value"] for item in found["/diagnostics"][-1][1]["status"][0]["values"]}
+    values = statuses_of(found["/diagnostics"][-1][1])["jtqd: recorder"][2]
     assert 50 <= written <= 150
-    assert written + int(values["recorder.events_left_out"]) == 999
+    assert written + int(values["events_left_out"]) == 999
 
 
 def test_stopped_recorder_loses_and_counts(recorder):
@@ -257,40 +258,23 @@ def test_loop_that_ends_after_the_order(recorder):
     assert (status, summary["written"]) == (0, 500)
 
 
-def test_full_disk(recorder):
-    """A limit on the file's size stands for the full disk: whole chunks up to it, the rest is counted."""
-    limit = 60_000
+def test_limit_on_the_length_of_a_file(recorder):
+    """A file that must not grow any more is as good as a full disk; another one may: the parts hold all of it."""
+    limit = 100_000
 
     def small_files():
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
     process = recorder(before=small_files, chunk_s=0.1)
-    for n in range(1500):
+    for n in range(3000):
         put(process.ring, record_of(n))
     status, summary, errors = process.end()
-    assert status == 3
-    assert summary["written"] + summary["lost"] == summary["cycles"] == 1500
-    assert summary["lost"] == summary["lost_unwritten"] > 0
-    assert summary["written"] > 0
-    assert errors.count("recording fails") == 1
-    path = process.files()[0]
-    assert summary["path"] == str(path)
-    assert summary["bytes"] == path.stat().st_size <= limit
-    with open(path, "rb") as file:
-        numbers = [record.channel_id for record in StreamReader(file).records if isinstance(record, Message)]
-    assert numbers.count(1) == summary["written"]
-
-
-def test_removed_directory(recorder):
-    process = recorder()
-    process.paced(0, 700, 1000)
-    shutil.rmtree(process.output)
-    process.paced(700, 700, 1000)
-    status, summary, errors = process.end()
-    assert status == 3
-    assert (summary["path"], summary["written"], summary["lost"], summary["bytes"]) == (None, 0, 1400, 0)
-    assert errors.startswith("recorder: recording fails, cycles are being lost: ")
-    assert errors.count("\n") == 1
+    assert (summary["written"], summary["lost"]) == (3000, 0)
+    assert errors.count("recording fails: File too large") >= 1
+    assert len(summary["paths"]) > 1
+    assert all(Path(path).stat().st_size <= limit for path in summary["paths"])
+    # Those for whose summary there was no room keep their name; the repair at the next start gives them one.
+    assert status == (3 if any(path.endswith(".active") for path in summary["paths"]) else 0)
 
 
 def test_directory_that_cannot_be_made(recorder, tmp_path):
@@ -299,17 +283,11 @@ def test_directory_that_cannot_be_made(recorder, tmp_path):
     process.paced(0, 100, 1000)
     status, summary, errors = process.end()
     assert status == 3
-    assert errors == f"recorder: cannot record to {tmp_path}/file/logs: Not a directory\n"
+    assert errors == (
+        f"recorder: cannot record to {tmp_path}/file/logs: Not a directory; "
+        "cycles are counted as lost until it goes on\n"
+    )
     assert (summary["path"], summary["cycles"], summary["written"], summary["lost"]) == (None, 100, 0, 100)
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root writes everywhere")
-def test_read_only_directory(recorder, tmp_path):
-    (tmp_path / "closed").mkdir(mode=0o500)
-    process = recorder(output=tmp_path / "closed", wait_for_file=False)
-    process.paced(0, 100, 1000)
-    status, summary, errors = process.end()
-    assert (status, summary["lost"], errors.count("\n")) == (3, 100, 1)
 
 
 def test_reader_of_the_summary_has_gone(recorder):
@@ -331,6 +309,9 @@ def test_reader_of_the_summary_has_gone(recorder):
         ('{"ring": "a", "directory": "b", "chunk_s": 0}', "chunk_s"),
         ('{"ring": "a", "directory": "b", "chunk_s": "x"}', "TypeError"),
         ('{"ring": "a", "directory": "b", "prefix": "../x"}', "prefix"),
+        ('{"ring": "a", "directory": "b", "run": "today"}', "run"),
+        ('{"ring": "a", "directory": "b", "budget_mb": -1}', "budget_mb"),
+        ('{"ring": "a", "directory": "b", "flight_recorder_s": "x"}', "TypeError"),
         ('{"ring": "a", "directory": "b", "gear_ratios": [1]}', "gear_ratios"),
         ('{"ring": "a", "directory": "b", "gear_ratios": [1, 0]}', "gear_ratios"),
         ('{"ring": "a", "directory": "b", "attachments": [{"name": "x"}]}', "attachment"),
@@ -347,7 +328,7 @@ def test_wrong_request(tmp_path, content, said):
 
 def test_exit_status_of_wrong_use(tmp_path):
     def run(*arguments):
-        command = [sys.executable, "-m", "daemon.recorder", *arguments]
+        command = [sys.executable, "-m", "daemon.recording.recorder", *arguments]
         result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
         assert result.stderr.count("\n") == 1
         assert result.stdout == ""
@@ -363,12 +344,14 @@ def test_exit_status_of_wrong_use(tmp_path):
 def test_stays_small(recorder):
     """Nothing of the estimator or of the CAN libraries is loaded, and 3 s of recording fit into 25 MB."""
     unwanted = {"numpy", "onnxruntime", "canopen", "can", "yaml", "estimator", "drivers"}
-    code = f"import sys, daemon.recorder; print(*{unwanted!r} & set(sys.modules))"
+    code = f"import sys, daemon.recording.recorder; print(*{unwanted!r} & set(sys.modules))"
     found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert found.stdout == "\n"
     process = recorder()
     process.paced(0, 3000, 2000)
     status = Path(f"/proc/{process.process.pid}/status").read_text()
     assert int(status.split("VmHWM:")[1].split()[0]) < 25_000  # kB
-    assert os.getpriority(os.PRIO_PROCESS, process.process.pid) == os.getpriority(os.PRIO_PROCESS, 0) + 5
+    assert os.getpriority(os.PRIO_PROCESS, process.process.pid) == min(
+        19, os.getpriority(os.PRIO_PROCESS, 0) + 5
+    )
     assert process.end()[0] == 0

@@ -1,6 +1,7 @@
 """`jtq reproduce`: the commands, their order, what ends it, the configuration it leaves; the shipped models fit theirs."""
 
 import hashlib
+import json
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -22,7 +23,7 @@ def test_every_step_comes_after_what_it_reads(tmp_path):
     made |= {str(tmp_path / "outside.plan.yaml")}
     names = []
     for step in steps(tmp_path, "sim", True, 0):
-        names.append(step.arguments[0])
+        names.append(step.text.split()[2 if step.module != "daemon.jtq" else 1])
         paths = [word for word in step.arguments if "/" in word and not word.startswith("-")]
         out = step.arguments[step.arguments.index("--out") + 1]
         for path in paths:
@@ -37,13 +38,17 @@ def test_every_step_comes_after_what_it_reads(tmp_path):
         "campaign",
         "campaign",
         "evaluate",
+        "sysid.emulated_runs",
+        "evaluate",
     ]
 
 
 def test_nothing_is_trained_on_what_judges(tmp_path):
     for step in steps(tmp_path, "sim", False, 0):
         if step.arguments[0] in ("fit", "train"):
-            assert not any("validate" in word or "outside" in word for word in step.arguments)
+            assert not any(
+                part in word for word in step.arguments for part in ("validate", "outside", "days")
+            )
 
 
 def test_failed_step_ends_it_and_findings_of_a_campaign_do_not(tmp_path, monkeypatch, capsys):
@@ -57,6 +62,27 @@ def test_failed_step_ends_it_and_findings_of_a_campaign_do_not(tmp_path, monkeyp
     assert reproduce_command.main(["--out", str(tmp_path), "--quick"]) == 1
     assert called == ["campaign", "campaign", "fit"]
     assert "jtq fit ended with status 1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("done", "calls"), [([1, 2, 2], 3), ([0, 0], 2), ([], 1)])
+def test_campaign_that_ended_early_goes_on_while_runs_get_done(tmp_path, monkeypatch, capsys, done, calls):
+    """Each number is how many runs are done after an attempt that ended early; without a state nothing was begun."""
+    called = []
+
+    def run(command, check):
+        called.append(command[3])
+        state = tmp_path / "campaigns" / "excitation" / "campaign.json"
+        if done:
+            state.parent.mkdir(parents=True, exist_ok=True)
+            count = done[len(called) - 1]
+            runs = [{"name": f"run{n}", "status": "done" if n < count else "pending"} for n in range(3)]
+            state.write_text(json.dumps({"runs": runs}))
+        return SimpleNamespace(returncode=1)
+
+    monkeypatch.setattr(subprocess, "run", run)
+    assert reproduce_command.main(["--out", str(tmp_path), "--quick"]) == 1
+    assert called == ["campaign"] * calls
+    assert "jtq campaign ended with status 1" in capsys.readouterr().err
 
 
 def test_out_that_cannot_be_made_is_one_line(tmp_path, capsys):
@@ -105,4 +131,5 @@ def test_quick_reproduction_from_nothing(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, timeout=1500, check=False)
     assert done.returncode in (0, 3), done.stderr[-2000:]
     assert (tmp_path / "report" / "evaluation.html").stat().st_size > 10_000
+    assert (tmp_path / "report_days" / "evaluation.html").stat().st_size > 10_000
     assert load_config(tmp_path / "models" / "bench.yaml").estimator.method == "fused"

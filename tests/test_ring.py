@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from daemon.ring import Ring, RingError, RingReader
+from daemon.shared.ring import Ring, RingError, RingReader
 
 SIZE = 64
 

@@ -1,11 +1,12 @@
 """The directory of shared memory: one holder at a time, gone when its holder is done with it."""
 
+import fcntl
 import os
 import threading
 
 import pytest
 
-from daemon.runtime_dir import claim, instance_name, remove
+from daemon.shared.runtime_dir import claim, instance_name, remove
 
 
 @pytest.fixture(autouse=True)
@@ -17,7 +18,7 @@ def root(tmp_path, monkeypatch):
 def test_a_claimed_directory_is_private_and_refused_to_others_by_name(root):
     directory, held = claim("vcan0")
     assert directory == root / f"jtqd-{os.getuid()}-vcan0"
-    assert directory.stat().st_mode & 0o777 == 0o700
+    assert directory.stat().st_mode & 0o777 == 0o750
     with pytest.raises(BlockingIOError, match=f"process {os.getpid()} is already running there"):
         claim("vcan0")
     other, also_held = claim("vcan1")
@@ -107,3 +108,35 @@ def test_names_are_fit_for_files_and_do_not_collide():
     assert instance_name("vcan0") == "vcan0"
     assert instance_name("unix:/tmp/a") != instance_name("unix:/tmp-a")
     assert "/" not in instance_name("unix:/tmp/a")
+
+
+def test_what_a_killed_daemon_left_is_taken_away_by_the_next_one(root):
+    """Of whatever bus; what a running daemon holds, and what is not ours, stays."""
+    left, held = claim("unix:/tmp/bench")
+    (left / "ring").write_bytes(b"x")
+    os.close(held)  # as the kernel does when a process is killed
+    running, also_held = claim("vcan1")
+    other = root / f"jtqd-{os.getuid()}-something"
+    other.mkdir()
+    (other / "file").touch()
+    directory, third = claim("vcan2")
+    assert not left.exists()
+    assert {each.name for each in root.iterdir()} == {running.name, directory.name, other.name}
+    os.close(also_held)
+    os.close(third)
+
+
+def test_who_comes_while_left_overs_are_taken_away_waits_a_moment(root):
+    """The lock is held by a process that only sweeps; the name in it is that of one that is gone."""
+    directory = root / f"jtqd-{os.getuid()}-vcan0"
+    directory.mkdir()
+    lock = directory / "lock"
+    lock.write_text("999999999\n")
+    descriptor = os.open(lock, os.O_RDWR)
+    fcntl.flock(descriptor, fcntl.LOCK_EX)
+    timer = threading.Timer(0.1, os.close, [descriptor])
+    timer.start()
+    found, held = claim("vcan0")
+    timer.join()
+    assert found == directory
+    os.close(held)

@@ -1,6 +1,9 @@
 """Frame sockets on a unix bus: what is not there, the end of the hub, the full queue, descriptors."""
 
+import os
+import re
 import socket
+import stat
 from pathlib import Path
 
 import pytest
@@ -9,6 +12,7 @@ from drivers.errors import BusError, BusGone
 from drivers.frame import pack
 from drivers.frame_socket import open_frame_socket
 from drivers.hub import Hub
+from drivers.socket_path import LONGEST, reachable
 
 SYNC = pack(0x080, b"\x01")
 TPDO = pack(0x181, bytes(range(8)))
@@ -123,3 +127,46 @@ def test_repeated_opening_leaks_no_descriptor(tmp_path):
             open_frame_socket(f"unix:{tmp_path}/none", None)
     assert len(list(Path("/proc/self/fd").iterdir())) == before
     hub.close()
+
+
+def deep(directory: Path) -> Path:
+    """A directory whose path alone is longer than what the kernel takes as an address."""
+    path = directory / ("d" * 90) / ("e" * 90)
+    path.mkdir(parents=True)
+    assert len(os.fsencode(path)) > LONGEST
+    return path
+
+
+def test_a_bus_in_a_deep_directory(tmp_path):
+    path = deep(tmp_path) / "bus"
+    bus = f"unix:{path}"
+    held = len(os.listdir("/proc/self/fd"))
+    hub = Hub(str(path))
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    with pytest.raises(BusError, match=re.escape(f"{bus}: another hub is running there")):
+        Hub(str(path))
+    one, two = open_frame_socket(bus, None), open_frame_socket(bus, None)
+    for _ in range(3):
+        hub.poll(0.0)
+    one.send(SYNC)
+    hub.poll(0.1)
+    assert two.wait(1.0)
+    assert two.receive() == 1
+    for each in (one, two, hub):
+        each.close()
+    assert not path.exists()
+    assert len(os.listdir("/proc/self/fd")) == held, "no descriptor of the directory stays open"
+
+
+def test_a_socket_file_of_a_dead_hub_in_a_deep_directory_is_replaced(tmp_path):
+    path = deep(tmp_path) / "bus"
+    with reachable(path) as address, socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sock:
+        sock.bind(address)
+    Hub(str(path)).close()
+    assert not path.exists()
+    with pytest.raises(BusError, match="no bus at"):
+        open_frame_socket(f"unix:{path}", None)
+    with pytest.raises(BusError, match="does not exist"):
+        open_frame_socket(f"unix:{path.parent}/none/bus", None)
+    with pytest.raises(BusError, match="does not exist"):
+        Hub(f"{path.parent}/none/bus")

@@ -1,6 +1,6 @@
 """Readings of the snapshot for the tests of what watches them."""
 
-from daemon.snapshot import COUNTERS, JointView, View
+from daemon.shared.snapshot import COUNTERS, JointView, View
 from estimator.status import VALID
 
 NAN = float("nan")

@@ -32,7 +32,7 @@ def identity(vendor: int, product: int, revision: int) -> dict[int, Var | Entrie
     return {0x1018: record("Identity object", *(Var(name, U32, "ro", value) for name, value in members))}
 
 
-def errors() -> dict[int, Var | Entries]:
+def errors(behaviour_access: str = "rw", behaviour: int = 0, inhibit: int = 0) -> dict[int, Var | Entries]:
     """Error history, EMCY and error behaviour."""
     history = {i: Var(f"Standard error field {i}", U32, "ro", 0) for i in range(1, 9)}
     return {
@@ -40,9 +40,15 @@ def errors() -> dict[int, Var | Entries]:
             "Pre-defined error field", ARRAY, history, Var("Number of errors", U8, "rw", 0, low=0, high=8)
         ),
         0x1014: Var("COB-ID EMCY", U32, "const", "$NODEID+0x80"),
-        0x1015: Var("Inhibit time EMCY", U16, "rw", 0, comment="100 us"),
-        0x1029: array("Error behaviour", U8, "rw", [("Communication error", 0)]),
+        0x1015: Var("Inhibit time EMCY", U16, "rw", inhibit, comment="100 us"),
+        0x1029: array("Error behaviour", U8, behaviour_access, [("Communication error", behaviour)]),
     }
+
+
+def verify_configuration(access: str) -> dict[int, Var | Entries]:
+    """1020h: the master's signature of the configuration; 0 when it was changed since, or never written."""
+    names = ("Configuration date", "Configuration time")
+    return {0x1020: array("Verify configuration", U32, access, [(name, 0) for name in names])}
 
 
 def heartbeat(producer_ms: int = 0, consumed: int = 1) -> dict[int, Var | Entries]:

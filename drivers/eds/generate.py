@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from drivers.eds import communication as comm
-from drivers.eds.own_objects import COUNTERS, JOINT_PARAMETERS
+from drivers.eds.own_objects import BUS_FIELDS, COUNTERS, JOINT_PARAMETERS, NODES, VERSION
 from drivers.eds.schema import (
     ARRAY,
     I8,
@@ -41,6 +41,7 @@ def drive() -> Sheet:
         **comm.device(0x0002_0192, "emulated joint drive", "1.0", "1.0"),
         **comm.errors(),
         **comm.heartbeat(consumed=2),  # the master's, and that of a node which commands beside it
+        **comm.verify_configuration("rw"),
         **comm.identity(VENDOR, 0x402, REVISION),
         **comm.sync_consumer(),
         **comm.sdo_server(),
@@ -159,14 +160,17 @@ def torque_sensor() -> Sheet:
 def jtqd() -> Sheet:
     """The daemon's own node: SYNC producer with the estimate as its only PDO."""
     joints = [("Joint 1", 0), ("Joint 2", 0)]
+    nodes = [(name, 0) for name in ("Joint 1", "Joint 2", "Sensor")]
     objects: dict[int, Var | Entries] = {
-        **comm.device(0, "jtqd", "none", "0.1.0"),
+        **comm.device(0, "jtqd", "none", VERSION),
+        **comm.errors(behaviour_access="const", behaviour=1, inhibit=100),
         0x1005: Var("COB-ID SYNC message", U32, "const", comm.SYNC_PRODUCER + 0x80),
         0x1006: Var("Communication cycle period", U32, "const", 1000, comment="us"),
-        0x1014: Var("COB-ID EMCY", U32, "const", "$NODEID+0x80"),
+        0x1016: array("Consumer heartbeat time", U32, "ro", [(f"Node {n}", 0) for n in range(1, NODES + 1)]),
         0x1017: Var("Producer heartbeat time", U16, "const", 100, comment="ms"),
         **comm.identity(VENDOR, 0x001, REVISION),
         0x1019: Var("Synchronous counter overflow value", U8, "const", 240, low=0, high=240),
+        **comm.verify_configuration("ro"),
         **comm.sdo_server(),
         **comm.tpdo(
             1,
@@ -181,13 +185,27 @@ def jtqd() -> Sheet:
             "Estimate status", U8, "ro", 0, pdo=True, comment="low nibble joint 1, high nibble joint 2"
         ),
         0x2103: Var("Estimate sequence", U8, "ro", 0, pdo=True, comment="SYNC counter of the inputs, 1..240"),
+        0x2104: array("Latched faults", U16, "ro", [("Joint 1", 0), ("Joint 2", 0)]),
+        0x2110: Var(
+            "Reset latched faults", U8, "rw", 0, low=0, high=1, comment="write 1; read: 1 not done yet"
+        ),
         0x2200: array("Counters", U32, "ro", [(name, 0) for name in COUNTERS]),
         0x2201: array("Cycle time", U32, "ro", [("p50_us", 0), ("p99_us", 0), ("max_us", 0)]),
         0x2202: array("Parameters of joint 1", REAL32, "ro", [(name, 0.0) for name in JOINT_PARAMETERS]),
         0x2203: array("Parameters of joint 2", REAL32, "ro", [(name, 0.0) for name in JOINT_PARAMETERS]),
         0x2204: Var("Configuration hash", TEXT, "ro", ""),
+        0x2205: array("Bus state", U32, "ro", [(name, 0) for name in BUS_FIELDS]),
+        0x2206: array("Nodes", U32, "ro", nodes),
+        0x2207: array("Last EMCY of nodes", U32, "ro", nodes),
     }
-    note = ["2100h in 0.01 Nm, 8000h: no estimate. 2101h in 0.05 Nm, 255: more or unknown."]
+    note = [
+        "2100h in 0.01 Nm, 8000h: no estimate. 2101h in 0.05 Nm, 255: more or unknown.",
+        "2104h: bits 0 not finite, 1 out of range, 2 motor jump, 3 link jump, 4 velocity mismatch,",
+        "5 torsion, 6 current frozen, 7 deviation, 8 drive fault, 9 stale. 2110h: 1 releases them.",
+        "2205h:1 0 error active, 1 warning, 2 passive, 3 bus-off, 4 interface down.",
+        "2206h: NMT state, heartbeat (1 awaited, 2 heard, 3 lost), configured, node-ID; from the lowest byte.",
+        "2207h: error code (2 bytes), error register, number of messages.",
+    ]
     return Sheet("jtqd.eds", "joint torque estimator daemon", "jtqd", 0x001, REVISION, "JTQD", objects, note)
 
 

@@ -12,8 +12,57 @@ COUNTERS = (
     "rx_dropped",
     "network_fallbacks",
     "recorder_lost",
+    "complete",
+    "published",
+    "published_late",
+    "unknown_frames",
+    "sync_errors",
+    "sync_gaps",
+    "boot_ups",
+    "temperatures_lost",
+    "bus_errors",
+    "bits_worst_case",
+    "overruns",
+    "network_no_time",
+    "network_not_finite",
+    "network_far",
+    "network_outside",
+    "fault_not_finite",
+    "fault_out_of_range",
+    "fault_motor_jump",
+    "fault_link_jump",
+    "fault_velocity_mismatch",
+    "fault_torsion",
+    "fault_current_frozen",
+    "fault_deviation",
+    "latches",
+    "latch_resets",
 )
-"""Sub-indices 1.. of 2200h, in order: the names of the loop's counters."""
+"""Sub-indices 1.. of 2200h, in order: the names of the loop's counters. New ones come last: others know them by number."""
+
+BUS_FIELDS = (
+    "state",
+    "tx_errors",
+    "rx_errors",
+    "warnings",
+    "passives",
+    "bus_offs",
+    "restarts",
+    "no_acknowledge",
+    "arbitration_lost",
+    "protocol_errors",
+    "overruns",
+    "transceiver",
+    "tx_timeouts",
+    "downs",
+)
+"""Sub-indices 1.. of 2205h (`daemon/master/bus_state.py`): state 0 error active, 1 warning, 2 passive, 3 bus-off, 4
+interface down; the controller's two error counters as it told them last; then how often each thing has happened."""
+
+NODES = 3
+"""Nodes of a bus: joint 1, joint 2, the sensor. Sub-indices 1.. of 1016h, 2206h and 2207h."""
+VERSION = "0.1.0"
+"""100Ah."""
 
 JOINT_PARAMETERS = (
     "gear_ratio",

@@ -58,13 +58,16 @@ def run(
     env: Mapping[str, str] | None = None,
     memory: str = "2G",
     sinks: tuple[IO[bytes], IO[bytes]] | None = None,
+    systemd: bool = False,
 ) -> Result:
     """Run `command` in a guest of its own and return its result; arguments as in Guest.
 
     `sinks` receives standard output and standard error while the command runs.
     Raises GuestTimeoutError, GuestError, build.BuildError, packages.MissingPackagesError.
     """
-    with Guest(command, time_travel=time_travel, out_dir=out_dir, env=env, memory=memory) as guest:
+    with Guest(
+        command, time_travel=time_travel, out_dir=out_dir, env=env, memory=memory, systemd=systemd
+    ) as guest:
         return guest.wait(timeout_s, sinks)
 
 
@@ -79,6 +82,7 @@ class Guest:
     directory     working directory (default: the caller's)
     memory        RAM of the guest; half of it and more can be taken by files that the guest writes
     vcans         CAN interfaces that are up when the command starts
+    systemd       the host's systemd is PID 1 and runs the command as a unit; not together with time travel
     """
 
     def __init__(
@@ -91,6 +95,7 @@ class Guest:
         directory: str | os.PathLike[str] | None = None,
         memory: str = "2G",
         vcans: Sequence[str] = DEFAULT_VCANS,
+        systemd: bool = False,
     ) -> None:
         kernel = build.ensure()
         self.command = tuple(command)
@@ -106,7 +111,7 @@ class Guest:
                 [
                     *_die_with_parent(),
                     str(kernel),
-                    *kernel_arguments(self.job, memory, vcans, time_travel=time_travel),
+                    *kernel_arguments(self.job, memory, vcans, time_travel=time_travel, systemd=systemd),
                 ],
                 env={
                     "PATH": "/usr/bin:/bin",
@@ -209,7 +214,9 @@ def command_script(command: Sequence[str], variables: Mapping[str, str], directo
     )
 
 
-def kernel_arguments(job: Path, memory: str, vcans: Sequence[str], *, time_travel: bool) -> list[str]:
+def kernel_arguments(
+    job: Path, memory: str, vcans: Sequence[str], *, time_travel: bool, systemd: bool = False
+) -> list[str]:
     """Command line of the kernel; what it does not know itself it hands to init as environment."""
     return [
         f"mem={memory}",
@@ -226,6 +233,7 @@ def kernel_arguments(job: Path, memory: str, vcans: Sequence[str], *, time_trave
         f"JTQD_JOB={job}",
         f"JTQD_VCANS={','.join(vcans)}",
         f"JTQD_PYTHON={sys.executable}",
+        *(["JTQD_SYSTEMD=1"] if systemd else []),
         "init=/bin/sh",
         "--",
         str(INIT),

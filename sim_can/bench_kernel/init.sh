@@ -4,6 +4,7 @@
 #                written through to the host; receives stdout, stderr and status
 #   JTQD_VCANS   names of the interfaces, separated by commas
 #   JTQD_PYTHON  interpreter, needed to switch off where there is no `halt`
+#   JTQD_SYSTEMD when it is 1, systemd becomes PID 1 and runs the command as a unit (systemd.sh)
 # Everything else the guest writes ends in a tmpfs above the host's files.
 PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
 export PATH
@@ -54,6 +55,10 @@ ip link set lo up
 for name in $(echo "$JTQD_VCANS" | tr , ' '); do
     ip link add dev "$name" type vcan && ip link set "$name" txqueuelen 1000 up || give_up "ip link add $name"
 done
+if [ "$JTQD_SYSTEMD" = 1 ]; then
+    . "${0%/*}/systemd.sh"
+    give_up "systemd did not start"
+fi
 /bin/sh "$JTQD_JOB/command.sh" </dev/null >"$JTQD_JOB/stdout" 2>"$JTQD_JOB/stderr"
 status=$?
 sync

@@ -31,6 +31,12 @@ BUILD = (
 )
 GUEST = (Requirement("iproute2", "ip"),)
 TESTS = (Requirement("can-utils", "candump"),)
+SYSTEMD = (
+    Requirement("systemd", "/lib/systemd/systemd"),
+    Requirement("udev", "/lib/systemd/systemd-udevd"),
+    Requirement("dbus", "/usr/bin/dbus-daemon"),
+    Requirement("python3-venv", "/usr/bin/python3"),
+)
 
 
 class MissingPackagesError(RuntimeError):

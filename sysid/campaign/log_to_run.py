@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -10,16 +10,22 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.logs.reader import LogError, Records, read_topics
 from drivers.devices import NOT_MEASURED, TEMPERATURE_C_PER_UNIT, drive_tpdo3
 from estimator.friction import FloatArray
 from estimator.run import JointColumns, RunTable
-from sysid.joint_log import LogError, Records, read_topic
 
 ALL_INPUTS: Final = 7
 """input_flags of the log: both PDOs of the drive and the sensor's are of this cycle."""
 DRIVE_INPUTS: Final = 3
 _ENABLED_MASK, _ENABLED = 0x6F, 0x27  # 6041h: "operation enabled" of CiA 402
+_NO_POWER: Final = (
+    (0x4F, 0x40),
+    (0x6F, 0x21),
+    (0x6F, 0x23),
+)  # switch on disabled, ready to switch on, switched on
 _INPUTS: Final = ("current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad")
+_TOPICS: Final = ("/joint/1/state", "/joint/2/state", "/can/frames")
 _NS: Final = 1e-9
 
 Flags = NDArray[np.bool_]
@@ -51,14 +57,16 @@ class LoggedRun:
         return lost / (lost + len(self.table.time_s))
 
 
-def log_to_run(log: Path, *, nodes: tuple[int, int] = (1, 2), sensor: bool = True) -> LoggedRun:
+def log_to_run(
+    log: Path | Sequence[Path], *, nodes: tuple[int, int] = (1, 2), sensor: bool = True
+) -> LoggedRun:
     """Read both joints of a log from the first to the last cycle in which both drives are in "operation enabled".
 
     The commander sends its first set-point in the cycle after the first of these, and ends with a quick stop: no other
     clock is needed to know when the motion was.
 
     Args:
-        log: MCAP of jtqd.
+        log: MCAP of jtqd, or the parts of one run, or their directory.
         nodes: node-IDs of drive 1 and 2, for their temperatures.
         sensor: a row needs the sensor's value; False: the bench has none, torque_nm is None.
 
@@ -66,8 +74,8 @@ def log_to_run(log: Path, *, nodes: tuple[int, int] = (1, 2), sensor: bool = Tru
         LogError: no such cycle, an input that never came, or topics that do not belong together.
         OSError: the file cannot be read.
     """
-    states = [read_topic(log, f"/joint/{number}/state") for number in (1, 2)]
-    frames = read_topic(log, "/can/frames")
+    *states, frames = read_topics(log, _TOPICS).values()
+    log = log if isinstance(log, Path) else log[0]  # names the run where something is wrong
     for state in states:
         if not np.array_equal(state["cycle"], frames["cycle"]):
             raise LogError(f"{log}: found cycles in one topic that are not in the other, expected the same")
@@ -145,7 +153,14 @@ def _columns(state: Records, sensor: bool, temperature: FloatArray | None) -> Jo
         **{name: column(name) for name in _INPUTS},
         torque_nm=torque if torque is not None and np.isfinite(torque).all() else None,
         temperature_c=temperature,
+        enabled=_powered(state["statusword"]),
     )
+
+
+def _powered(statusword: NDArray[Any]) -> FloatArray | None:
+    """Column `enabled` [n]; None for a run in which the power was never off, which is most of them."""
+    off = np.logical_or.reduce([(statusword & mask) == value for mask, value in _NO_POWER])
+    return np.where(off, 0.0, 1.0) if off.any() else None
 
 
 def _temperature(frames: Records, node: int, span: slice) -> FloatArray | None:

@@ -6,11 +6,12 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from daemon.logs.reader import LogError
 from sim_can.run_table_file import write_run
 from sysid.campaign.bench_config import BenchConfig
 from sysid.campaign.log_to_run import log_to_run
@@ -18,7 +19,6 @@ from sysid.campaign.plan import Run
 from sysid.campaign.processes import Interrupted, Jtqd, ProcessError, StopAsked, on_time
 from sysid.campaign.state import DONE, FAILED, PARTS, STOPPED, RunState
 from sysid.campaign.table_checks import findings, unusable
-from sysid.joint_log import LogError
 from sysid.motion.limits import Limits
 from sysid.motion.result import MotionError, MotionResult
 from sysid.motion.setpoints import Setpoints
@@ -73,9 +73,9 @@ class Attempt(NamedTuple):
 
 
 class Recorded(NamedTuple):
-    """What jtqd left of a run: log, summary; and where the run's files go."""
+    """What jtqd left of a run: parts of the log, summary; and where the run's files go."""
 
-    log: Path
+    log: tuple[Path, ...]
     summary: dict[str, Any]
     out: Path
 
@@ -108,10 +108,10 @@ def attempt(
                 result = motion(setpoints)
             log, summary = jtqd.log()
         except (ProcessError, MotionError) as error:
-            _keep(jtqd.said, out / f"{run.name}.jtqd.log")
+            _keep([jtqd.said], out, run.name, ".jtqd.log")
             return Attempt(RunState(FAILED, str(error)), again=isinstance(error, MotionError), begun=False)
         if result.status == "stopped":
-            _keep(log, out / f"{run.name}.stopped.mcap")
+            _keep(log, out, run.name, ".stopped.mcap")
             return _stopped(result)
         state = RunState(played_s=result.played_s)
         return _kept(run, setpoints, bench.config, Recorded(log, summary, out), state)
@@ -138,7 +138,7 @@ def _kept(
     try:
         logged = log_to_run(log, nodes=config.nodes, sensor=config.sensor is not None)
     except LogError as error:
-        _keep(log, out / f"{run.name}.failed.mcap")
+        _keep(log, out, run.name, ".failed.mcap")
         return Attempt(replace(state, reason=str(error)), again=True)
     state = replace(
         state,
@@ -152,11 +152,11 @@ def _kept(
         state = replace(state, findings=(f"log: found {lost} cycles lost by the recorder", *state.findings))
     why = unusable(logged)
     if why is not None:
-        _keep(log, out / f"{run.name}.failed.mcap")
+        _keep(log, out, run.name, ".failed.mcap")
         return Attempt(replace(state, reason=why), again=True)
     sha256 = write_run(out / f"{run.name}.csv.gz", logged.table)
     (out / f"{run.name}.json").write_text(json.dumps(marks_of(run, setpoints), indent=1) + "\n")
-    _keep(log, out / f"{run.name}.mcap")
+    _keep(log, out, run.name, ".mcap")
     return Attempt(replace(state, status=DONE, sha256=sha256))
 
 
@@ -179,7 +179,11 @@ def marks_of(run: Run, setpoints: Setpoints) -> dict[str, Any]:
     }
 
 
-def _keep(path: Path, target: Path) -> None:
-    """Move a file out of the run's own directory, if it is there; both lie in the same file system."""
-    if path.exists():
-        os.replace(path, target)
+def _keep(paths: Sequence[Path], out: Path, run: str, ending: str) -> None:
+    """Move files out of the run's own directory, as far as they are there; both lie in the same file system.
+
+    The first becomes RUN.ENDING, the second RUN@2.ENDING and so on (no name has a @): a long run's log has several parts.
+    """
+    for number, path in enumerate(paths, start=1):
+        if path.exists():
+            os.replace(path, out / (run + ("" if number == 1 else f"@{number}") + ending))

@@ -25,6 +25,8 @@ SCHEMA: Final = "jtq.plan/1"
 DEFAULT_RAMP_S: Final = 0.5
 LONGEST_S: Final = 3600.0
 """Of one segment. A run is one log and one table in memory."""
+SHORTEST_OFF_S: Final = 1.5
+"""Of one segment without power: standing, switching off and on again take about half a second of it."""
 
 DEFAULT_LIMITS: Final = Limits(
     current_a=10.0, velocity_rad_s=3.3, torque_nm=60.0, travel_rad=60.0, temperature_c=70.0
@@ -88,6 +90,24 @@ class Rest:
 
 
 @dataclass(frozen=True)
+class Off:
+    """Both joints stand and their drives are off for hold_s [s], the way there and back included: what the current reads
+    then is its sensor's own error. Must begin at rest.
+    """
+
+    hold_s: float
+
+    @property
+    def duration_s(self) -> float:
+        """From rest to rest."""
+        return self.hold_s
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Plain numbers, ready for YAML."""
+        return {"kind": "power_off", "hold_s": self.hold_s}
+
+
+@dataclass(frozen=True)
 class Fourier:
     """Eq. (10) for the velocity joint and a Fourier series for the other joint's current; from rest to rest."""
 
@@ -109,7 +129,7 @@ class Fourier:
         }
 
 
-Segment = Plateau | Rest | Fourier
+Segment = Plateau | Rest | Fourier | Off
 
 
 @dataclass(frozen=True)
@@ -224,17 +244,20 @@ def _run(section: Section) -> Run:
         raise section.error("segments", section.raw("segments", None), "a list of at least one segment")
     segments = tuple(_segment(each) for each in inner)
     for before, one, each in zip((None, *segments), segments, inner, strict=False):
-        if isinstance(one, Fourier) and isinstance(before, Plateau) and before.moving:
-            raise each.error("kind", "fourier", "a rest before it: the plateau before it ends in motion")
+        if isinstance(one, Fourier | Off) and isinstance(before, Plateau) and before.moving:
+            kind = one.to_mapping()["kind"]
+            raise each.error("kind", kind, "a rest before it: the plateau before it ends in motion")
     section.finish()
     return Run(name, joint, segments)
 
 
 def _segment(section: Section) -> Segment:
-    kind = section.text("kind", ("plateau", "rest", "fourier"))
+    kind = section.text("kind", ("plateau", "rest", "power_off", "fourier"))
     result: Segment
     if kind == "fourier":
         result = _fourier(section)
+    elif kind == "power_off":
+        result = Off(section.number("hold_s", "s", low=SHORTEST_OFF_S, high=LONGEST_S))
     else:
         hold_s = section.number("hold_s", "s", low=0.0, high=LONGEST_S)
         ramp_s = section.number("ramp_s", "s", low=0.0, high=LONGEST_S, default=DEFAULT_RAMP_S)

@@ -191,8 +191,8 @@ class Jtqd:
         if self._status is None:
             self._status = _end(self._process)
 
-    def log(self) -> tuple[Path, dict[str, Any]]:
-        """MCAP and summary, after the end.
+    def log(self) -> tuple[tuple[Path, ...], dict[str, Any]]:
+        """Parts of the log in their order, and the summary, after the end.
 
         Raises:
             ProcessError: it ended by a failure, or recorded nothing.
@@ -206,7 +206,7 @@ class Jtqd:
         recording = summary.get("recording") or {}
         if not recording.get("path"):
             raise ProcessError(f"jtqd recorded nothing: {recording.get('error') or 'no reason given'}")
-        return Path(recording["path"]), summary
+        return tuple(map(Path, recording.get("paths") or [recording["path"]])), summary
 
     def _wait(self, seen: Callable[[float], bool]) -> None:
         deadline = time.monotonic() + READY_S

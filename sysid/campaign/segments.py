@@ -6,7 +6,7 @@ import numpy as np
 
 from estimator.checked import ConfigError
 from estimator.friction import FloatArray
-from sysid.campaign.plan import Fourier, Plan, Plateau, Run
+from sysid.campaign.plan import Fourier, Off, Plan, Plateau, Run
 from sysid.motion.limits import Limits, check_setpoints
 from sysid.motion.result import MotionError
 from sysid.motion.setpoints import PERIOD_S, Mark, Setpoints
@@ -22,12 +22,13 @@ def expand(run: Run) -> Setpoints:
     """Set-points of a run at 1 kHz, from rest.
 
     A plateau or rest begins where the segment before it ended: both targets go to their new values on one smooth step
-    (velocity and acceleration continuous) and then hold. Ramp, hold and Fourier series are a mark each; "ramp" marks
-    have no values.
+    (velocity and acceleration continuous) and then hold. Ramp, hold, Fourier series and time
+    without power are a mark each; "ramp" marks have no values.
     """
     velocities: list[FloatArray] = []
     currents: list[FloatArray] = []
     marks: list[Mark] = []
+    off: list[tuple[int, int]] = []
     velocity = current = 0.0
     count = 0
     for segment in run.segments:
@@ -39,6 +40,14 @@ def expand(run: Run) -> Setpoints:
             marks.append(Mark("fourier", count * PERIOD_S, (count + n) * PERIOD_S))
             count += n
             continue  # from rest to rest
+        if isinstance(segment, Off):
+            n = samples(segment.duration_s)
+            velocities.append(np.full(n, velocity))  # at rest, or Setpoints refuses it
+            currents.append(np.full(n, current))
+            marks.append(Mark("power_off", count * PERIOD_S, (count + n) * PERIOD_S))
+            off.append((count, count + n))
+            count += n
+            continue
         target = (segment.velocity_rad_s, segment.current_a) if isinstance(segment, Plateau) else (0.0, 0.0)
         ramp, hold = samples(segment.ramp_s), samples(segment.hold_s)
         if (velocity, current) == target:  # nothing to ramp: all of it is held
@@ -54,7 +63,9 @@ def expand(run: Run) -> Setpoints:
             marks.append(Mark(kind, middle, end, *target))
         velocity, current = target
         count += ramp + hold
-    return Setpoints(run.velocity_joint, np.concatenate(velocities), np.concatenate(currents), tuple(marks))
+    return Setpoints(
+        run.velocity_joint, np.concatenate(velocities), np.concatenate(currents), tuple(marks), tuple(off)
+    )
 
 
 def samples(duration_s: float) -> int:

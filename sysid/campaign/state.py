@@ -8,6 +8,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import re
 import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
@@ -24,7 +25,7 @@ LOCK_FILE: Final = ".lock"
 PARTS: Final = ".part"
 """Suffix of a run's directory while the run is under way."""
 ENDINGS: Final = (".csv.gz", ".json", ".mcap")
-"""Files of a run that is done."""
+"""Files of a run that is done; further parts of its log are NAME@2.mcap, NAME@3.mcap ...."""
 EVIDENCE: Final = (".stopped.mcap", ".failed.mcap", ".jtqd.log")
 """What is left of an attempt that came to nothing, until the next attempt."""
 DONE, STOPPED, FAILED, PENDING = STATUSES = ("done", "stopped", "failed", "pending")
@@ -122,9 +123,7 @@ class CampaignDirectory:
                 f"'{plan.name}' ({plan.sha256[:8]}): give another --out, or the same campaign with the same options"
             )
         if not self.begun:
-            foreign = [
-                name for run in plan.runs for name in _files_of(run.name) if (self.path / name).exists()
-            ]
+            foreign = [path.name for run in plan.runs for path in _files_of(self.path, run.name)]
             if foreign:
                 raise StateError(
                     f"{self.path}: found {foreign[0]} and no {STATE_FILE}, expected a directory without runs"
@@ -134,8 +133,8 @@ class CampaignDirectory:
         for name, state in self.runs.items():
             shutil.rmtree(self.path / (name + PARTS), ignore_errors=True)
             if state.status != DONE:
-                for file in _files_of(name):
-                    (self.path / file).unlink(missing_ok=True)
+                for path in _files_of(self.path, name):
+                    path.unlink()
         _write_whole(self.path / PLAN_FILE, plan.to_yaml())
         self._save()
 
@@ -186,8 +185,11 @@ def _run_state(section: Section) -> RunState:
     return RunState(**values)
 
 
-def _files_of(name: str) -> list[str]:
-    return [name + ending for ending in (*ENDINGS, *EVIDENCE)]
+def _files_of(directory: Path, run: str) -> list[Path]:
+    """Files of a run that are there, all parts of its log among them."""
+    endings = "|".join(map(re.escape, (*ENDINGS, *EVIDENCE)))
+    of_run = re.compile(rf"{re.escape(run)}(@\d+)?({endings})")
+    return sorted(path for path in directory.iterdir() if of_run.fullmatch(path.name))
 
 
 def _write_whole(path: Path, text: str) -> None:

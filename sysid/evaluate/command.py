@@ -17,6 +17,7 @@ from estimator.onnx_graph import NetworkError
 from sim_can.run_files import RunError
 from sysid.evaluate.evaluation import Evaluation, evaluate
 from sysid.evaluate.inputs import Inputs, read_inputs
+from sysid.evaluate.loop_time import loop_time
 from sysid.evaluate.mapping import as_mapping
 from sysid.evaluate.methods import JointModels, load_models
 from sysid.evaluate.text import text_lines
@@ -41,7 +42,8 @@ def main(argv: list[str]) -> int:
         outside = Inputs((), (), ())
         if options.outside:
             outside = read_inputs(options.outside, models, options.columns)
-        result = evaluate(_distinct(inputs, outside), outside.runs, models, progress)
+        runs = _distinct(inputs, outside)
+        result = evaluate(runs, outside.runs, models, progress, loop_time(runs, models))
         result = replace(
             result, findings=(*_silent(models), *inputs.findings, *outside.findings, *result.findings)
         )

@@ -14,6 +14,7 @@ from sysid.evaluate.constant import PlateauScore, is_constant, plateau_scores, p
 from sysid.evaluate.crossings import Jump, largest_jump
 from sysid.evaluate.inputs import JudgedRun
 from sysid.evaluate.intervals import IntervalTables, Standstill, interval_tables, standstill
+from sysid.evaluate.loop_time import LoopTime
 from sysid.evaluate.methods import OURS, TITLES, JointModels
 from sysid.evaluate.outside import Outside, outside_scores
 from sysid.evaluate.samples import Samples, take_samples
@@ -47,7 +48,7 @@ class Evaluation:
 
     plateaus: of runs at constant velocity; variable, constant_tables: errors over the samples of runs of either kind;
     intervals: of ours, under "variable", "constant" and "all"; jumps, passages: largest ones by method; picture: the run
-    of the figure like the paper's Fig. 16.
+    of the figure like the paper's Fig. 16; loop_time: what steps cost, None where it was not measured.
     """
 
     models: tuple[JointModels, ...]
@@ -62,6 +63,7 @@ class Evaluation:
     passages: Mapping[str, Jump]
     outside: tuple[Outside, ...]
     picture: Samples | None
+    loop_time: LoopTime | None = None
     targets: tuple[Target, ...] = field(default=())
 
     @property
@@ -82,8 +84,9 @@ def evaluate(
     outside: Sequence[JudgedRun],
     models: Sequence[JointModels],
     progress: Progress[JudgedRun] = lambda items, text: items,
+    measured: LoopTime | None = None,
 ) -> Evaluation:
-    """Judge all methods on runs, and ours outside its envelope on the runs `outside`.
+    """Judge all methods on runs, and ours outside its envelope on the runs `outside`; measured: what their steps cost.
 
     Raises ConfigError when a joint and its networks do not fit, ValueError when no run has a sample to score.
     """
@@ -131,6 +134,7 @@ def evaluate(
         },
         outside=tuple(outside_scores(_samples(beyond), _envelopes(models))),
         picture=_picture(parts["variable"], modes),
+        loop_time=measured,
     )
     return replace(result, targets=targets(result))
 

@@ -1,14 +1,9 @@
-"""What the pictures of the evaluation have in common: styles of the methods, size, curves thinned, SVG as text."""
+"""What the pictures of the evaluation have in common: styles of the methods, size, axes, legend."""
 
 from __future__ import annotations
 
-import io
-import re
 from typing import Any, Final, NamedTuple
 
-import numpy as np
-
-from estimator.friction import FloatArray
 from sysid.evaluate.methods import OURS, PAPERS
 
 
@@ -28,8 +23,6 @@ STYLES: Final = {
     OURS: Style("#1565a7", "-", "o"),
 }
 WIDTH_IN: Final = 6.4
-BUCKETS: Final = 700
-"""Of a curve over time: each keeps its lowest and highest sample, so that no spike is lost."""
 
 
 def new_figure(rows: int, height: float, **options: Any) -> tuple[Any, Any]:
@@ -44,46 +37,6 @@ def new_figure(rows: int, height: float, **options: Any) -> tuple[Any, Any]:
         rows, 1, figsize=(WIDTH_IN, height), layout="constrained", squeeze=False, **options
     )
     return figure, axes[:, 0]
-
-
-def as_svg(figure: Any) -> str:
-    """Return the figure as an SVG element without size of its own, and close it. The same figure gives the same text."""
-    from matplotlib import pyplot as plt
-
-    stream = io.StringIO()
-    figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
-    plt.close(figure)
-    text = stream.getvalue()
-    text = text[text.index("<svg") :]
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    return re.sub(
-        r'(<svg[^>]*?) height="[^"]*"([^>]*?) width="[^"]*"|(<svg[^>]*?) width="[^"]*"([^>]*?) height="[^"]*"',
-        r"\1\2\3\4",
-        text,
-        count=1,
-    )
-
-
-def thinned(time_s: FloatArray, values: FloatArray, buckets: int = BUCKETS) -> tuple[FloatArray, FloatArray]:
-    """Return a curve of at most 2 `buckets` points: of each bucket its lowest and its highest sample, in order of time.
-
-    A bucket that holds a NaN keeps one, so that gaps stay gaps.
-    """
-    size = -(-len(values) // buckets)
-    if size <= 2:
-        return time_s, values
-    kept: list[int] = []
-    for start in range(0, len(values), size):
-        part = values[start : start + size]
-        gap = np.flatnonzero(np.isnan(part))
-        if len(gap) == len(part):
-            ends = {0}
-        elif len(gap):
-            ends = {int(np.nanargmin(part)), int(np.nanargmax(part)), int(gap[0])}
-        else:
-            ends = {int(np.argmin(part)), int(np.argmax(part))}
-        kept += [start + k for k in sorted(ends)]
-    return time_s[kept], values[kept]
 
 
 def plain_log(axis: Any, set_scale: Any) -> None:

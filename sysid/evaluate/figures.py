@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from sysid.evaluate.constant import PlateauScore
-from sysid.evaluate.figure_base import STYLES, as_svg, legend_above, new_figure, plain_log, thinned
+from sysid.evaluate.figure_base import STYLES, legend_above, new_figure, plain_log
 from sysid.evaluate.intervals import IntervalTables
 from sysid.evaluate.methods import OURS, TITLES
 from sysid.evaluate.samples import Samples
 from sysid.evaluate.score import LEVELS, VELOCITY_EDGES_RAD_S, bin_name
 from sysid.evaluate.variable import PAPER_MSE_NM2, ErrorTables, common_methods
-from sysid.figure_parts import SENSOR, STANDING, plain, shade
+from sysid.figure_parts import SENSOR, STANDING, as_svg, plain, shade, thinned
 from sysid.sigma_fit import GAUSS
 
 

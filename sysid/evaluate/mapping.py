@@ -40,6 +40,7 @@ def as_mapping(result: Evaluation) -> dict[str, Any]:
         "standstill": {number: vars(each) for number, each in result.standstill.items()},
         "jumps": {"at": result.jumps, "passage": result.passages},
         "outside": list(result.outside),
+        "loop_time": result.loop_time,
         "picture": None
         if result.picture is None
         else {"run": result.picture.run, "number": result.picture.number},

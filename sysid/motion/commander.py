@@ -1,6 +1,7 @@
 """The commander: a pure state machine, frames and stamps in, frames out. No socket, no clock.
 
     waiting ──> enabling ──> playing ──> ramping ──> braking ──> disabling ──> over
+       │                      │   └─> powerless ──> playing (`power_off`, where the set-points say so)
        └── refused: nothing has moved        └── any violation: ramping, or braking at once ──┘
 
 In every cycle one RPDO is sent, to one drive after the other, so that each gets a set-point every second SYNC and the bus
@@ -25,6 +26,7 @@ from sysid.motion.drive_setup import DriveUnits, SensorUnits
 from sysid.motion.inputs import Inputs
 from sysid.motion.limits import Limits, Monitor
 from sysid.motion.pace import Pace
+from sysid.motion.power_off import PowerOff
 from sysid.motion.result import MotionResult, Timing, Violation
 from sysid.motion.setpoints import PERIOD_S, Setpoints
 from sysid.motion.stopping import Phase, Stopping
@@ -67,6 +69,8 @@ class Commander:
         self._commands = Commands(setpoints, drives)
         self._turn = 0
         self._index = -1  # of the set-point in force
+        self._stretches = list(setpoints.off)  # without power, still to come
+        self._power_off: PowerOff | None = None
         self._stopping: Stopping | None = None
         self._now_ns = self._since_ns = self._still_since_ns = now_ns
         self._full = 0
@@ -156,14 +160,16 @@ class Commander:
     def _examine(self) -> None:
         """Limits and supervision of the newest values. On the stop ramp only what makes it impossible counts."""
         phase = self.phase
-        if phase is Phase.PLAYING or phase is Phase.ENABLING:
+        pause = self._power_off
+        if phase in (Phase.PLAYING, Phase.ENABLING, Phase.POWERLESS):
             reason = self._monitor.check(self.inputs.sample())
             if reason is not None:
                 self._stop(Violation(reason, False))
                 return
         elif phase is not Phase.RAMPING:
             return
-        violation = self._supervision.check(self._now_ns, enabled=phase is not Phase.ENABLING)
+        enabled = phase is not Phase.ENABLING and (pause is None or pause.powered)
+        violation = self._supervision.check(self._now_ns, enabled=enabled)
         if violation is not None and (violation.hard or phase is not Phase.RAMPING):
             self._stop(violation)
 
@@ -175,13 +181,14 @@ class Commander:
         if self.phase is Phase.WAITING:
             self.phase = Phase.OVER
         elif self._stopping is None:
-            self._begin_stop(hard=violation.hard or self.phase is Phase.ENABLING)
+            self._begin_stop(hard=violation.hard or self.phase in (Phase.ENABLING, Phase.POWERLESS))
         elif violation.hard:
             self._stopping.brake(self._now_ns)
             self.phase = self._stopping.phase
 
     def _begin_stop(self, *, hard: bool) -> None:
         start = (0.0, 0.0)
+        self._power_off = None
         if self._index >= 0:
             setpoints = self._setpoints
             start = float(setpoints.velocity_rad_s[self._index]), float(setpoints.current_a[self._index])
@@ -202,8 +209,12 @@ class Commander:
     def _step(self, advance: int) -> bytes | None:
         """One cycle of the present phase: the RPDO for the drive whose turn it is."""
         self._turn = turn = 1 - self._turn
+        if self.phase is Phase.POWERLESS:
+            return self._powerless(turn, advance)
         if self.phase is Phase.PLAYING:
             self._index += advance
+            if self._stretches and self._index >= self._stretches[0][0]:
+                return self._without_power(turn)
             if self._index < len(self._setpoints):
                 return self._commands.setpoint(turn, self._index)
             self._index = len(self._setpoints) - 1
@@ -217,6 +228,29 @@ class Commander:
         assert stopping is not None
         frame = stopping.step(turn, advance, self._now_ns, synced=self._pace.synced)
         self.phase = stopping.phase
+        return frame
+
+    def _without_power(self, turn: int) -> bytes | None:
+        """The next stretch without power begins with this set-point, also where cycles were lost just before it."""
+        stretch = self._stretches.pop(0)
+        self._index = stretch[0]
+        self._power_off = PowerOff(
+            self.inputs, self._supervision, self._commands, self.timing, stretch, self._now_ns
+        )
+        self.phase = Phase.POWERLESS
+        return self._power_off.step(turn, 0, self._now_ns)
+
+    def _powerless(self, turn: int, advance: int) -> bytes | None:
+        pause = self._power_off
+        assert pause is not None
+        frame = pause.step(turn, advance, self._now_ns)
+        self._index = pause.index
+        if pause.violation is not None:
+            self._stop(pause.violation)
+            return None
+        if pause.over:
+            self._power_off = None
+            self._enter(Phase.PLAYING)
         return frame
 
     def _waiting(self) -> None:

@@ -18,7 +18,7 @@ class Mark:
     """A named stretch of a run.
 
     Attributes:
-        kind: "plateau", "rest" or "fourier".
+        kind: "plateau", "rest", "power_off" or "fourier".
         start_s, end_s: from the first set-point, end not included.
         velocity_rad_s, current_a: what is held; None where it varies.
     """
@@ -39,15 +39,18 @@ class Setpoints:
         velocity_rad_s: [n] joint side, in the own frame of the velocity joint.
         current_a: [n] motor current of the other joint, in its own frame.
         marks: what is when, in order of time; for people and files, not for the motion.
+        off: (first, end) of set-points during which both drives have no power, in order, end not included.
 
     Raises ValueError with one line for another joint, arrays that are not one-dimensional, empty, of unequal
-    length, or not finite, and marks that are not Mark. The arrays are copied and read-only.
+    length, or not finite, marks that are not Mark, and times without power that overlap or have a target other than 0.
+    The arrays are copied and read-only.
     """
 
     velocity_joint: int
     velocity_rad_s: FloatArray
     current_a: FloatArray
     marks: tuple[Mark, ...] = ()
+    off: tuple[tuple[int, int], ...] = ()
 
     def __post_init__(self) -> None:
         if self.velocity_joint not in (1, 2):
@@ -72,6 +75,19 @@ class Setpoints:
         for mark in self.marks:
             if not isinstance(mark, Mark):
                 raise ValueError(f"set-points: {mark!r} is no Mark")
+        object.__setattr__(self, "off", tuple(self.off))
+        before = 0
+        for first, end in self.off:
+            if not before <= first < end <= len(self):
+                raise ValueError(
+                    f"set-points: off from {first} to {end}, expected rising numbers up to {len(self)}"
+                )
+            before = end
+            for array in (self.velocity_rad_s, self.current_a):
+                if np.any(array[first:end]):
+                    raise ValueError(
+                        f"set-points: off at {first * PERIOD_S:.3f} s with a target other than 0, expected rest"
+                    )
 
     def __len__(self) -> int:
         return len(self.velocity_rad_s)

@@ -41,6 +41,7 @@ class Phase(Enum):
     WAITING = "waiting"
     ENABLING = "enabling"
     PLAYING = "playing"
+    POWERLESS = "powerless"
     RAMPING = "ramping"
     BRAKING = "braking"
     DISABLING = "disabling"

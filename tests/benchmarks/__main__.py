@@ -1,4 +1,4 @@
-"""Command line: `python -m tests.benchmarks [cycle] [stages] [grid] [start] [--quick] [--json]`; no name means all."""
+"""Command line: `python -m tests.benchmarks [NAME ...] [--quick] [--json]`; no name means all."""
 
 from __future__ import annotations
 
@@ -10,10 +10,21 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from tests.benchmarks import cycle, host, long_run, stage_table, start
+from tests.benchmarks import (
+    cycle,
+    host,
+    log_reading,
+    long_run,
+    recording,
+    replay_speed,
+    service_cost,
+    stage_table,
+    start,
+    status_cost,
+)
 from tests.benchmarks.fixture import make_fixture
 
-NAMES = ("cycle", "stages", "grid", "start")
+NAMES = ("cycle", "stages", "grid", "start", "logs", "recording", "status", "replay", "service")
 _BITRATE = 1_000_000
 _EXAMPLES = """examples:
   python -m tests.benchmarks                   everything, about 13 minutes
@@ -73,9 +84,18 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _measure(name: str, directory: Path, options: argparse.Namespace) -> tuple[Any, str]:
     """(content for JSON, text) of one benchmark."""
-    if name == "start":
-        result = start.run(directory)
-        return result, start.text(result)
+    small = {
+        "start": (start, {}),
+        "recording": (recording, {"seconds": 5.0 if options.quick else 30.0}),
+        "logs": (log_reading, {"minutes": 0.25 if options.quick else 5.0}),
+        "status": (status_cost, {}),
+        "service": (service_cost, {}),
+        "replay": (replay_speed, {"seconds": 10.0 if options.quick else 300.0}),
+    }
+    if name in small:
+        module, arguments = small[name]
+        result = module.run(directory, **arguments)
+        return result, module.text(result)
     fixture = make_fixture(directory)
     if name == "grid":
         result = long_run.run(fixture, minutes=options.minutes)

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon import cycle_record, joint_cycle
 from daemon.config import Config, load_config
+from daemon.loop import joint_cycle, joint_status
+from daemon.shared import cycle_record
 from estimator.losses import BLEND_CURRENT_A, LossModel
 from estimator.parameters import Joint
 from estimator.settings import EstimatorSettings
+from estimator.status import DEGRADED
 from estimator.tracking import LINK_SPEED_LIMIT_RAD_S, RAW_LIMIT
 from estimator.validity import FADE_START
 from tests.benchmarks.fixture import (
@@ -44,6 +46,7 @@ def _header(config: Config) -> str:
         "FRAME_CAPACITY": cycle_record.FRAME_CAPACITY,
         "RING_SLOTS": config.ring_cycles,
         "STAMP_ACCURACY_NS": joint_cycle.STAMP_ACCURACY_NS,
+        "DEGRADED_CYCLES": joint_status.NEEDED[DEGRADED],
         "WAIT_NS": config.input_wait_ns,
         "DEADLINE_NS": config.input_deadline_ns,
         "MOTOR_RAD_PER_COUNT": SCALING["motor_rad_per_count"],

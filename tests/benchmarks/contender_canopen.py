@@ -16,9 +16,10 @@ from typing import Any
 
 import canopen
 
-from daemon import estimate_pdo, loop
 from daemon.config import load_config
-from daemon.grid import Grid
+from daemon.loop import estimate_pdo
+from daemon.loop import process as loop
+from daemon.loop.grid import Grid
 from drivers.devices import drive_tpdo1, drive_tpdo2, sensor_tpdo1
 from drivers.pdo import PdoMap
 from drivers.python_can_unix import UnixBus

@@ -1,4 +1,4 @@
-"""Contender: jtqd's own loop, the code of daemon.loop and daemon.cycle as it ships."""
+"""Contender: jtqd's own loop, the code of daemon.loop.process and daemon.loop.cycle as it ships."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import sys
 import time
 from typing import Any
 
-from daemon import loop, realtime
 from daemon.config import Config, load_config
-from daemon.cycle import Cycle
-from daemon.cycle_record import FLAG_PUBLISHED
-from daemon.grid import Grid
+from daemon.loop import process as loop
+from daemon.loop import realtime
+from daemon.loop.cycle import Cycle
+from daemon.loop.grid import Grid
+from daemon.shared.cycle_record import FLAG_PUBLISHED
 from drivers.frame_socket import FrameSocket, open_frame_socket
 from estimator.methods import AnyEstimator
 from estimator.status import PUBLISHED
@@ -35,7 +36,7 @@ class JtqdLoop:
         realtime.freeze()
 
     def connect(self) -> tuple[Cycle, Grid, FrameSocket]:
-        """A cycle on the bus, as `daemon.loop.serve` builds it."""
+        """A cycle on the bus, as `daemon.loop.process.serve` builds it."""
         request = {
             "ring": str(self.task.directory / "jtqd.ring"),
             "snapshot": str(self.task.directory / "jtqd.snapshot"),
@@ -45,7 +46,7 @@ class JtqdLoop:
         for estimator in self.estimators:
             estimator.reset()
         report = Fixture(self.task.directory).report
-        cycle, grid = loop._build(self.config, request, report, socket, self.estimators)
+        cycle, grid = loop.build_cycle(self.config, request, report, socket, self.estimators)
         return cycle, grid, socket
 
     def run(self, cycles: int) -> dict[str, Any]:
@@ -54,13 +55,13 @@ class JtqdLoop:
         meter = CycleMeter()
         measured(cycle, meter)
         loop_start(grid)
-        loop.run(cycle, grid, _never, cycles * grid.period_ns * 1e-9)
+        loop.run(cycle, grid, _never, grid.slot_ns + cycles * grid.period_ns)
         socket.close()
         return meter.result(grid.missed)
 
 
 def loop_start(grid: Grid) -> None:
-    """Put the first slot two periods ahead, as daemon.loop does."""
+    """Put the first slot two periods ahead, as daemon.loop.process does."""
     grid.slot_ns = time.monotonic_ns() + 2 * grid.period_ns
 
 

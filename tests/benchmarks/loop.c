@@ -72,6 +72,7 @@ typedef struct {
     int64_t sync_stamp, last_sync;
     uint32_t late, duplicates, rejected, stale;
     joint_state joints[2];
+    int held[2], calm[2], asked[2];
     struct mmsghdr messages[CAPACITY];
     struct iovec parts[CAPACITY];
     frame frames[CAPACITY];
@@ -170,13 +171,30 @@ static void field(double torque, double sigma, int *status, int16_t *torque_fiel
     *sigma_field = 255;
     if (!known)
         return;
-    if (!(counts >= -32767.0 && counts <= 32767.0)) {
+    if (!(counts >= -32767.0 && counts <= 32767.0 && sigma >= 0.0 && sigma < INFINITY)) {
         *status = INVALID;
         return;
     }
-    if (sigma >= 0.0 && sigma <= 12.7)
+    if (sigma <= 12.7)
         *sigma_field = (uint8_t)ceil(sigma * 20.0 - 1e-9);
     *torque_field = (int16_t)nearbyint(counts);
+}
+
+/* daemon/joint_status.py for the statuses of this traffic, which has no faults and loses nothing. */
+static int hold(loop_state *s, int n, int status)
+{
+    static const int rank[16] = {[VALID] = 0, [STANDSTILL] = 1, [DEGRADED] = 2, [STARTING] = 3};
+    int held = s->held[n] ? s->held[n] : STARTING;
+    if (rank[status] >= rank[held] || rank[held] <= 1) {
+        s->calm[n] = 0;
+        return s->held[n] = status;
+    }
+    if (!s->calm[n] || rank[status] > rank[s->asked[n]])
+        s->asked[n] = status;
+    if (++s->calm[n] < (held == DEGRADED ? DEGRADED_CYCLES : 1))
+        return status == STANDSTILL && held == DEGRADED ? STANDSTILL : held;
+    s->calm[n] = 0;
+    return s->held[n] = s->asked[n];
 }
 
 /* Both joints from the inputs of this cycle; fills the record and the eight bytes of the estimate PDO. */
@@ -211,6 +229,7 @@ static void observe(loop_state *s, int64_t sync, cycle_record *r, uint8_t pdo[8]
             if ((j->statusword & 0x6F) != 0x27 && (j->statusword & 0x6F) != 0x07)
                 e.status = (j->statusword & 0x4F) == 0x0F || (j->statusword & 0x4F) == 0x08 ? DRIVE_FAULT : OFF;
         }
+        e.status = hold(s, n, e.status);
         j->torque = e.torque, j->sigma = e.sigma, j->tob = e.tob, j->efficiency = e.efficiency, j->network = e.network;
         j->status = (uint16_t)e.status;
         status[n] = e.status;

@@ -14,7 +14,8 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
-from daemon import estimate_pdo, loop
+from daemon.loop import estimate_pdo
+from daemon.loop import process as loop
 from estimator.methods import AnyEstimator, load_network, make_estimator
 from tests.benchmarks.contender import serve
 from tests.benchmarks.contender_jtqd import JtqdLoop, _never, loop_start, measured
@@ -32,8 +33,8 @@ STAGES = {
 }
 
 
-cycle_module: Any = importlib.import_module("daemon.cycle")
-joint_module: Any = importlib.import_module("daemon.joint_cycle")
+cycle_module: Any = importlib.import_module("daemon.loop.cycle")
+joint_module: Any = importlib.import_module("daemon.loop.joint_cycle")
 """Their names `estimate_pdo` and `time` are exchanged for timed ones during a round."""
 
 
@@ -141,7 +142,7 @@ class StagedLoop(JtqdLoop):
 
         cycle.record = end_of_cycle  # type: ignore[method-assign]
         loop_start(grid)
-        loop.run(cycle, grid, _never, cycles * grid.period_ns * 1e-9)
+        loop.run(cycle, grid, _never, grid.slot_ns + cycles * grid.period_ns)
         socket.close()
 
 

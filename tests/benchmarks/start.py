@@ -10,8 +10,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from daemon.estimate_pdo import LAYOUT
-from daemon.runtime_dir import instance_name
+from daemon.loop.estimate_pdo import LAYOUT
+from daemon.shared.runtime_dir import instance_name
 from drivers.errors import BusError
 from drivers.frame_socket import FrameSocket, exact, open_frame_socket
 from estimator.status import PUBLISHED

@@ -1,0 +1,1 @@
+"""What viewers get of jtqd: the layout for Foxglove and Lichtblick, and the live view of a running daemon."""

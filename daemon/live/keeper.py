@@ -1,0 +1,95 @@
+"""The supervisor's side of the live view: starts its process, says where it listens and what becomes of it."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from daemon.config import Config
+from daemon.live.address import Address
+from daemon.recording.contents import nodes_of
+from daemon.shared.notices import FILE as NOTICES
+from daemon.supervisor.children import Child, ChildError
+
+_STARTS = 5
+"""A live view that dies more often than this in a minute is not started again."""
+_PAUSE_S = 1.0
+
+
+class LiveKeeper:
+    """The live view of one run of jtqd. Whatever happens to it, the loop goes on.
+
+    Args:
+        start_child: (module, arguments, name) -> child; the supervisor ends what it has started.
+        address: where it listens.
+    """
+
+    def __init__(self, start_child: Callable[[str, list[str], str], Child], address: Address) -> None:
+        self._start_child = start_child
+        self._address = address
+        self._request: dict[str, Any] = {}
+        self._child: Child | None = None
+        self._starts: list[float] = []
+
+    def start(self, config: Config, directory: Path, bus: str) -> None:
+        """Begin to serve what the daemon leaves in its runtime directory.
+
+        Args:
+            config: in force.
+            directory: holds `ring`, `snapshot` and `notices`.
+            bus: name of the bus.
+        """
+        self._request = {
+            "ring": str(directory / "ring"),
+            "snapshot": str(directory / "snapshot"),
+            "notices": str(directory / NOTICES),
+            "host": self._address.host,
+            "port": self._address.port,
+            "bus": bus,
+            "nodes": nodes_of(config),
+            "gear_ratios": [joint.joint.gear_ratio for joint in config.joints],
+        }
+        if not self._address.loopback:
+            _say(f"the live view is open to everyone who can reach {self._address.host}; it can only be read")
+        self._run()
+
+    @property
+    def pid(self) -> int | None:
+        """Process-ID of the live view; None while there is none."""
+        return self._child.pid if self._child is not None and self._child.alive() else None
+
+    def watch(self) -> None:
+        """Pass on what it says; start it again when it died, at most once a second, and not for ever."""
+        if self._child is None:
+            return
+        ended = not self._child.alive()  # asked first: what it said before its end is then in the pipe
+        try:
+            answer = self._child.poll_answer() or {}
+        except (ChildError, ValueError) as error:
+            answer = {"failed": str(error)}
+        if "listening" in answer:
+            _say(f"live view: {answer['listening']}")
+        if "failed" in answer:
+            _say(f"no live view: {answer['failed']}; the loop goes on")
+            self._child = None
+        elif ended and time.monotonic() - self._starts[-1] > _PAUSE_S:
+            code = self._child.process.returncode
+            if len(self._starts) > _STARTS:
+                _say(f"the live view ended with exit status {code}, too often; the loop goes on without it")
+                self._child = None
+                return
+            _say(f"the live view ended with exit status {code}; started again, the loop goes on")
+            self._run()
+
+    def _run(self) -> None:
+        now = time.monotonic()
+        self._starts = [*(start for start in self._starts if now - start < 60.0), now]
+        self._child = self._start_child("daemon.live.process", [json.dumps(self._request)], "the live view")
+
+
+def _say(text: str) -> None:
+    print(f"jtqd: {text}", file=sys.stderr, flush=True)

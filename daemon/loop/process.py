@@ -1,0 +1,292 @@
+"""The loop process: everything is made and warmed up first, then one cycle after the other until told to stop.
+
+Started by the supervisor as `python -m daemon.loop.process` with a JSON request as its only argument. It answers on
+standard output with one JSON line when it is ready, reads the boot report as one JSON line from standard input, runs, and
+ends with one JSON line of results. It has no second thread, logs nothing while it runs, and shares only memory with
+other processes.
+
+A request with the key `handover` makes it the successor of a running loop (`daemon/reload/successor.py`).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from daemon.config import Config, JointConfig, load_config
+from daemon.loop import realtime
+from daemon.loop.counters import frame_counts
+from daemon.loop.cycle import Cycle
+from daemon.loop.duties import Duties
+from daemon.loop.grid import Grid
+from daemon.loop.input_pdos import input_pdos, joint_temperatures, sensor_index
+from daemon.loop.intake import Intake
+from daemon.loop.joint_cycle import JointInputs
+from daemon.loop.joint_safety import safety_of
+from daemon.reload.handover import Giver
+from daemon.shared.cycle_record import RECORD_SIZE
+from daemon.shared.ring import Ring
+from daemon.shared.snapshot import Snapshot
+from daemon.supervisor.notify import LoopWatchdog, Notifier, watchdog_seconds
+from drivers.can_filter import CanFilter, look_alikes
+from drivers.devices import SYNC_COB_ID
+from drivers.errors import BusError, BusGone
+from drivers.frame_socket import FrameSocket, open_frame_socket
+from estimator.checked import ConfigError
+from estimator.methods import AnyEstimator, load_network, make_estimator
+from estimator.network import NetworkError
+
+_WARM_UP_STEPS = 300
+_DRIVE_FACTORS = ("motor_rad_per_count", "motor_rad_s_per_unit", "link_rad_per_count", "ampere_per_unit")
+
+
+class Stop:
+    """Set by SIGTERM and SIGINT; asked once per cycle."""
+
+    def __init__(self) -> None:
+        self.requested = False
+        signal.signal(signal.SIGTERM, self._handle)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the supervisor decides
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        self.requested = True
+
+
+def build_estimator(config: Config, joint: JointConfig) -> AnyEstimator:
+    """Estimator of one joint as configured; raises ConfigError or NetworkError."""
+    method, network = config.estimator.method, None
+    try:
+        if joint.network is not None:
+            network = load_network(method, str(joint.network.path), joint.network.sha256)
+        return make_estimator(joint.joint, config.estimator, network)
+    except (ConfigError, NetworkError) as error:
+        key = f"joint_{joint.number}"
+        raise type(error)(f"{error} ({config.path}: '{key}', estimator.method is {method})") from None
+
+
+def _scaling(report: dict[str, Any], node: int, names: tuple[str, ...]) -> dict[str, Any]:
+    """Factors of a node; zeros for one that is absent: they come with its configuration, before any of its data is used."""
+    booted = report["nodes"].get(str(node))
+    return dict.fromkeys(names, 0.0) if booted is None else booted["scaling"]
+
+
+def joint_inputs(config: Config, report: dict[str, Any]) -> list[JointInputs]:
+    """Indices into `input_pdos` and the scaling that the boot read from the devices."""
+    result = []
+    told = [joint.number for joint in config.joints if joint.temperature]
+    for number, joint in enumerate(config.joints):
+        drive = _scaling(report, joint.node_id, _DRIVE_FACTORS)
+        sensor_nm = 0.0
+        if joint.sensor_channel is not None and config.sensor is not None:
+            scaling = _scaling(report, config.sensor.node_id, ("nm_per_unit",))
+            sensor_nm = scaling["nm_per_unit"][str(joint.sensor_channel)] if scaling["nm_per_unit"] else 0.0
+        result.append(
+            JointInputs(
+                position=2 * number,
+                motion=2 * number + 1,
+                sensor=sensor_index(config, joint.sensor_channel),
+                **drive,
+                sensor_nm_per_unit=sensor_nm,
+                temperature=told.index(joint.number) if joint.temperature else None,
+            )
+        )
+    return result
+
+
+def loop_filters(config: Config) -> list[CanFilter]:
+    """SYNC (own echo and foreign ones), the inputs, temperatures, the nodes' heartbeats: nothing else wakes the loop.
+
+    Each in every frame format, so that 29-bit and remote frames under our identifiers are seen and counted.
+    """
+    inputs = input_pdos(config)
+    pdos = [*(pdo.cob_id for pdo in inputs), *(each.cob_id for each in joint_temperatures(config))]
+    nodes = dict.fromkeys(pdo.node_id for pdo in inputs)
+    return [look_alikes(cob_id) for cob_id in (SYNC_COB_ID, *pdos, *(0x700 + node for node in nodes))]
+
+
+def warm_up(estimators: list[AnyEstimator]) -> None:
+    """Run every estimator often enough that caches, allocators and the interpreter's specialisation have settled."""
+    for estimator in estimators:
+        for n in range(_WARM_UP_STEPS):
+            estimator.step(1e-3, 1.0 + 0.01 * (n % 7), 0.1 * n, 100.0, 0.001 * n, 25.0)
+        estimator.reset()
+
+
+def run(
+    cycle: Cycle,
+    grid: Grid,
+    stop: Callable[[], bool],
+    end_ns: int | None = None,
+    *,
+    after: Callable[[], bool] | None = None,
+    after_sync: Callable[[], None] | None = None,
+) -> bool:
+    """Cycle until `stop()`, `end_ns` (CLOCK_MONOTONIC) or until `after()`, called in the pause after each cycle, is true.
+
+    Args:
+        cycle, grid: state of the loop; the first cycle is that of the grid's slot.
+        stop: asked before each cycle.
+        end_ns: no cycle begins from here on; None: without end.
+        after: see `daemon.loop.duties`.
+        after_sync: called once, when the first SYNC has been sent and nobody waits for anything yet.
+
+    Returns:
+        True when `after` ended it: the bus belongs to somebody else.
+    """
+    monotonic_ns, sleep = time.monotonic_ns, time.sleep
+    while not stop():
+        pause = grid.slot_ns - monotonic_ns()
+        if pause > 0:
+            sleep(pause * 1e-9)
+        now = monotonic_ns()
+        if grid.too_late(now):
+            cycle.skip(grid.advance(now) + 1)
+            grid.missed += 1
+            continue
+        if end_ns is not None and grid.slot_ns >= end_ns:
+            break
+        if cycle.hold_back():
+            grid.advance(now)
+            continue
+        cycle.begin()
+        if after_sync is not None:
+            after_sync()
+            after_sync = None
+        cycle.gather()
+        cycle.observe()
+        cycle.publish()
+        cycle.record()
+        if after is not None and after():
+            return True
+        cycle.skip(grid.advance(monotonic_ns()))
+    return False
+
+
+def answer(**content: Any) -> None:
+    """Tell the supervisor."""
+    try:
+        print(json.dumps(content), flush=True)
+    except BrokenPipeError:  # the supervisor has gone, and we are about to
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def build_cycle(
+    config: Config,
+    request: dict[str, Any],
+    report: dict[str, Any],
+    socket: FrameSocket,
+    estimators: list[AnyEstimator],
+    *,
+    attach: bool = False,
+) -> tuple[Cycle, Grid]:
+    """Cycle and grid from configuration and boot report; with `attach`, on the shared memory of the running loop."""
+    grid = Grid(0, config.period_ns)
+    snapshot = Snapshot(
+        Path(request["snapshot"]), config.period_ns * 1e-9, float(request["worst_load"]), attach=attach
+    )
+    intake = Intake(input_pdos(config), joint_temperatures(config))
+    for node in {pdo.node_id for pdo in intake.pdos} - {int(node) for node in report["nodes"]}:
+        intake.absent(node)
+    cycle = Cycle(
+        socket,
+        intake,
+        list(zip(joint_inputs(config, report), estimators, strict=True)),
+        Ring(Path(request["ring"]), config.ring_cycles, RECORD_SIZE, attach=attach),
+        snapshot,
+        safety=safety_of(config),
+        node_id=config.node_id,
+        counter_overflow=config.counter_overflow,
+        wait_ns=config.input_wait_ns,
+        deadline_ns=config.input_deadline_ns,
+        heartbeat_cycles=max(1, config.heartbeat_ms * 1_000_000 // config.period_ns),
+        grid=grid,
+    )
+    return cycle, grid
+
+
+def build_estimators(request: dict[str, Any]) -> tuple[Config, list[AnyEstimator]]:
+    """Configuration and warm estimators of both joints; raises ConfigError or NetworkError."""
+    config = load_config(Path(request["config"]) if request["config"] else None)
+    if config.files_sha256 != request["config_sha256"]:
+        raise ConfigError(f"{config.path}: it or one of its joint files changed while jtqd was reading it")
+    estimators = [build_estimator(config, joint) for joint in config.joints]
+    warm_up(estimators)
+    return config, estimators
+
+
+def serve(request: dict[str, Any]) -> int:
+    """Build, say ready, wait for the boot report, run, say what happened. Returns the exit status."""
+    stop = Stop()
+    config, estimators = build_estimators(request)
+    answer(ready=True)
+    line = read_line(stop)
+    if line is None:
+        return 0
+    socket = open_frame_socket(request["bus"], loop_filters(config), receive_own=True)
+    cycle, grid = build_cycle(config, request, json.loads(line), socket, estimators)
+    refused = realtime.prepare(config.realtime.priority, config.realtime.cpu, config.realtime.lock_memory)
+    duties, giver = make_duties(cycle, request)
+    realtime.freeze()
+    answer(running=True, refused=refused)
+    grid.slot_ns = time.monotonic_ns() + 2 * config.period_ns
+    duration_s = request.get("duration_s")
+    giver.end_ns = None if duration_s is None else grid.slot_ns + round(duration_s * 1e9)
+    return finish(cycle, lambda: run(cycle, grid, lambda: stop.requested, giver.end_ns, after=duties))
+
+
+def make_duties(cycle: Cycle, request: dict[str, Any]) -> tuple[Duties, Giver]:
+    """Watchdog, orders and hand-over of this loop."""
+    watchdog = LoopWatchdog(Notifier(), cycle.grid.period_ns, watchdog_seconds())
+    giver = Giver(cycle, Path(request["successor"]))
+    return Duties(cycle, watchdog, giver, lambda why: answer(not_handed_over=why)), giver
+
+
+def finish(cycle: Cycle, go: Callable[[], bool]) -> int:
+    """Run, take leave of the bus unless it is somebody else's by then, say what happened. Returns the exit status."""
+    error = None
+    try:
+        if go():
+            answer(handed_over=True)
+            return 0
+        cycle.leave()
+    except BusGone as gone:
+        error = f"the bus went away: {gone}"
+    answer(done=True, error=error, counters=frame_counts(cycle.intake))
+    return 1 if error else 0
+
+
+def read_line(stop: Stop) -> str | None:
+    """The boot report, or None when we are told to stop or the supervisor has gone."""
+    while not stop.requested:
+        if select.select([sys.stdin], [], [], 0.2)[0]:
+            return sys.stdin.readline() or None
+    return None
+
+
+def main(argv: list[str]) -> int:
+    """Entry of the process; every foreseeable failure is one JSON line and exit status 1."""
+    request = json.loads(argv[0])
+    try:
+        if "handover" in request:
+            from daemon.reload.successor import succeed
+
+            return succeed(request)
+        return serve(request)
+    except (ConfigError, NetworkError, BusError) as error:
+        answer(failed=str(error))
+        return 1
+    except OSError as error:
+        answer(failed=f"shared memory: {error.strerror or error}")
+        return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

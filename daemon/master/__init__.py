@@ -1,0 +1,1 @@
+"""The CANopen master in service, beside the loop: nodes, configuration, errors, jtqd as a node."""

@@ -1,0 +1,196 @@
+"""What /diagnostics says once a second: loop, bus, both joints, every node, recorder and disk, one status each. Pure.
+
+Levels follow what happened since the last time: a slot that was missed an hour ago is in the count, not in the level.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from daemon.recording import schemas
+from daemon.recording.messages import Status
+from daemon.recording.progress import Account
+from daemon.recording.space import MEGABYTE
+from daemon.shared.snapshot import View
+from daemon.shared.snapshot_view import BUS_COUNTERS
+
+OK, WARN, ERROR, STALE = range(4)
+_OF_THE_BUS = (*BUS_COUNTERS, "bits_worst_case")
+_JOINT_LEVELS = {"VALID": OK, "STANDSTILL": OK, "STALE": STALE, "DRIVE_FAULT": ERROR, "INVALID": ERROR}
+_NMT_STATES = {0: "initialising", 4: "stopped", 5: "operational", 127: "pre-operational"}
+_SILENT_S = 1.0
+_NEAR = 2.0
+"""Times the reserve: less free space than this is a warning."""
+
+
+class Node(NamedTuple):
+    """A node of the bus."""
+
+    node_id: int
+    name: str
+
+
+class RecorderState(NamedTuple):
+    """What the recorder knows of itself; sizes in bytes, `budget` -1 for none, `free` -1 for unknown."""
+
+    mode: str
+    obstacle: str
+    backlog: int
+    cpu_percent: float
+    events_left_out: int
+    part: int
+    part_bytes: int
+    total_bytes: int
+    free: int
+    reserve: int
+    budget: int
+    memory_bytes: int
+    memory_s: float
+
+
+class Diagnostics:
+    """Makes the statuses; remembers the counts of the last time.
+
+    Args:
+        bus: name of the bus.
+        joints: names of joint 1 and 2.
+        nodes: whose heartbeats are watched.
+    """
+
+    def __init__(self, bus: str, joints: Sequence[str], nodes: Sequence[Node]) -> None:
+        self._bus = bus
+        self._joints = joints
+        self._nodes = nodes
+        self._before: dict[str, int] = {}
+        self._lost = 0
+        self._cycle: int | None = None
+
+    def statuses(
+        self,
+        view: View | None,
+        account: Account,
+        recorder: RecorderState,
+        *,
+        work_us: Sequence[float],
+        late_us: Sequence[float],
+        now_ns: int,
+    ) -> list[Status]:
+        """All of them; those of the loop only where there is a snapshot.
+
+        Args:
+            view: of the loop.
+            work_us, late_us: its p50, p99 and maximum.
+            now_ns: CLOCK_REALTIME.
+        """
+        result = []
+        if view is not None:
+            result = self.of_the_loop(view, work_us=work_us, late_us=late_us, now_ns=now_ns)
+        result += [self._recorder(account, recorder), self._disk(recorder)]
+        self._lost = account.lost
+        return result
+
+    def of_the_loop(
+        self, view: View, *, work_us: Sequence[float], late_us: Sequence[float], now_ns: int
+    ) -> list[Status]:
+        """Those of loop, bus, joints and nodes; arguments as of `statuses`."""
+        result = [self._loop(view, work_us, late_us), self._bus_status(view)]
+        result += [self._joint(view, number) for number in (1, 2)]
+        result += [self._node(view, node, now_ns) for node in self._nodes]
+        self._before, self._cycle = dict(view.counters), view.cycle
+        return result
+
+    def _grown(self, view: View, *names: str) -> list[str]:
+        return [name for name in names if view.counters.get(name, 0) > self._before.get(name, 0)]
+
+    def _loop(self, view: View, work_us: Sequence[float], late_us: Sequence[float]) -> Status:
+        level, text = OK, "running"
+        if view.cycle == self._cycle:
+            level, text = STALE, "the loop stands still"
+        elif self._before and self._grown(view, "missed"):
+            missed = view.counters["missed"] - self._before["missed"]
+            level, text = WARN, f"{missed} slots missed since the last message"
+        values: dict[str, float | str] = {"cycle": view.cycle}
+        values |= {name: count for name, count in view.counters.items() if name not in _OF_THE_BUS}
+        for name, figures in (("work", work_us), ("late", late_us)):
+            values |= dict(zip((f"{name}_p50_us", f"{name}_p99_us", f"{name}_max_us"), figures, strict=True))
+        return Status("jtqd: loop", self._bus, level, text, values)
+
+    def _bus_status(self, view: View) -> Status:
+        level, text = OK, "running"
+        if self._before:
+            faults = self._grown(
+                view, "bus_errors", "tx_dropped", "rx_dropped", "foreign_sync", "sync_errors"
+            )
+            if faults:
+                level, text = WARN, "since the last message: " + ", ".join(faults)
+        values: dict[str, float | str] = {
+            name: view.counters[name] for name in _OF_THE_BUS if name in view.counters
+        }
+        return Status("jtqd: bus", self._bus, level, text, values | {"worst_case_load": view.worst_load})
+
+    def _joint(self, view: View, number: int) -> Status:
+        joint = view.joints[number - 1]
+        name = schemas.STATUS_NAMES.get(joint.status, str(joint.status))
+        values: dict[str, float | str] = {
+            "status": name,
+            "torque_nm": joint.torque_nm,
+            "sigma_nm": joint.sigma_nm,
+            "sensor_nm": joint.sensor_nm,
+            "rmse_nm": view.rmse_nm[number - 1],
+            "statusword": f"{joint.statusword:04X}h",
+            "sensor_status": joint.sensor_status,
+            "input_flags": joint.input_flags,
+        }
+        title, hardware = f"jtqd: joint {number}", self._joints[number - 1]
+        return Status(title, hardware, _JOINT_LEVELS.get(name, WARN), name, values)
+
+    def _node(self, view: View, node: Node, now_ns: int) -> Status:
+        state = view.node_states[node.node_id]
+        name = _NMT_STATES.get(state, f"state {state}")
+        heard = view.node_heard_ns[node.node_id]
+        age_s = (now_ns - heard) * 1e-9 if heard else float("nan")
+        level, text = OK if state == 5 else WARN, name
+        if node.node_id in view.unconfigured:
+            level, text = WARN, "restarted, waits for its configuration"
+        if not age_s <= _SILENT_S:
+            level, text = STALE, "no heartbeat"
+        values: dict[str, float | str] = {"nmt_state": name, "heartbeat_age_s": age_s}
+        return Status(f"jtqd: node {node.node_id}", node.name, level, text, values)
+
+    def _recorder(self, account: Account, state: RecorderState) -> Status:
+        level, text = OK, state.mode
+        if account.lost:
+            level, text = WARN, f"{account.lost} cycles lost so far"
+        if account.lost > self._lost:
+            level, text = ERROR, f"{account.lost - self._lost} cycles lost since the last message"
+        values: dict[str, float | str] = {
+            "mode": state.mode,
+            "backlog": state.backlog,
+            "cycles": account.cycles,
+            "written": account.written,
+            "lost_overwritten": account.overwritten,
+            "lost_unwritten": account.unwritten,
+            "let_go": account.let_go,
+            "events_left_out": state.events_left_out,
+            "cpu_percent": state.cpu_percent,
+            "part": state.part,
+            "memory_mb": state.memory_bytes / MEGABYTE,
+            "memory_s": state.memory_s,
+        }
+        return Status("jtqd: recorder", self._bus, level, text, values)
+
+    def _disk(self, state: RecorderState) -> Status:
+        level, text = OK, "room"
+        if 0 <= state.free < _NEAR * state.reserve:
+            level, text = WARN, "little room"
+        if state.obstacle:
+            level, text = ERROR, state.obstacle
+        values: dict[str, float | str] = {
+            "part_mb": state.part_bytes / MEGABYTE,
+            "logs_mb": state.total_bytes / MEGABYTE,
+            "budget_mb": state.budget / MEGABYTE if state.budget >= 0 else "none",
+            "free_mb": state.free / MEGABYTE if state.free >= 0 else "unknown",
+            "reserve_mb": state.reserve / MEGABYTE,
+        }
+        return Status("jtqd: disk", self._bus, level, text, values)

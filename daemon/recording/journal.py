@@ -1,0 +1,65 @@
+"""What the recorder notes while it records: each occurrence once as a message on /events and once on /log."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from daemon.recording import schemas
+from daemon.recording.chunk import ChunkBuilder
+from daemon.recording.messages import event, log
+
+_PER_CHUNK = 50
+"""A status that flaps every cycle must not fill the disk; what is left out is counted."""
+_BOUNDED = (schemas.STATUS_CHANGED, schemas.SLOTS_MISSED, schemas.NOTICE)
+INFO, WARN, ERROR = 20, 30, 40
+
+
+class Journal:
+    """Adds events to the chunk that is being collected.
+
+    Args:
+        builder: of the chunks.
+        say: called with one line for the operator.
+
+    Attributes:
+        newest: index and CLOCK_REALTIME of the newest cycle.
+        left_out: events for which there was no room.
+    """
+
+    def __init__(self, builder: ChunkBuilder, say: Callable[[str], None]) -> None:
+        self.builder = builder
+        self.say = say
+        self.newest = (0, 0)
+        self.left_out = 0
+        self._in_chunk = 0
+
+    def new_chunk(self) -> None:
+        """The room for events is there again."""
+        self._in_chunk = 0
+
+    def note(
+        self,
+        kind: int,
+        text: str,
+        *,
+        level: int,
+        time_ns: int | None = None,
+        count: int = 0,
+        joint: int = 0,
+        change: tuple[int, int] = (0, 0),
+    ) -> None:
+        """Write an event, and its text to /log; the time is the newest cycle's unless one is given."""
+        self._in_chunk += 1
+        if self._in_chunk > _PER_CHUNK and kind in _BOUNDED:
+            self.left_out += 1
+            return
+        index, newest = self.newest
+        when = newest if time_ns is None else time_ns
+        payload = event(when, kind, text, index=index, count=count, joint=joint, change=change)
+        self.builder.add(schemas.EVENTS.number, when, payload)
+        self.builder.add(schemas.LOG.number, when, log(when, level, text))
+
+    def tell(self, kind: int, text: str, *, level: int, count: int = 0) -> None:
+        """The same for what the operator must hear too."""
+        self.say(text)
+        self.note(kind, text, level=level, count=count)

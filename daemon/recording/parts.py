@@ -1,0 +1,282 @@
+"""The files of one run, one after the other: rotation, budget, reserve, and what is done when the disk takes no more.
+
+A file that cannot go on is ended with its summary; its cycles from then on are counted, the matter is said once, and another
+part is begun as soon as that is possible. Nothing here raises for a disk that fails.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from daemon.recording import schemas
+from daemon.recording.chunk import SealedChunk
+from daemon.recording.journal import ERROR, INFO, WARN, Journal
+from daemon.recording.mcap_file import Head, McapFile, NamedData
+from daemon.recording.naming import ACTIVE, own_files, part_name
+from daemon.recording.progress import Account
+from daemon.recording.space import MEGABYTE, free_bytes, sized, to_remove
+
+_RETRY_NS = 900_000_000
+"""An attempt to begin a file costs little: at most this, and what was being collected, is lost when the disk is back."""
+_ROOM_AGAIN = 1.25
+"""Times the reserve: a disk at its limit must not begin a file every second."""
+
+
+@dataclass(frozen=True)
+class Rules:
+    """Where the files go and how large they get; sizes in bytes, None for no budget."""
+
+    directory: Path
+    prefix: str
+    run: str
+    rotate_ns: int
+    rotate_bytes: int
+    budget: int | None
+    keep_run: bool
+    reserve: int
+
+
+class Parts:
+    """Takes sealed chunks and has them on the disk, or counts their cycles as lost.
+
+    Args:
+        rules: of this run.
+        head: what every part begins with.
+        journal: for what must be noted.
+        account: kept up to date.
+    """
+
+    def __init__(self, rules: Rules, head: Head, journal: Journal, account: Account) -> None:
+        self._rules = rules
+        self._head = head
+        self._journal = journal
+        self._account = account
+        self._file: McapFile | None = None
+        self._part = 0
+        self._previous = ""
+        self._began_ns: int | None = None
+        self._cycles = 0
+        self._others = 0
+        self._over_budget = False
+        self._now_ns, self._retry_ns = 0, 0
+        self._missed = 0
+        self.obstacle = ""
+        """Why nothing is being written; empty while all is well."""
+        self.all_ended = True
+        """Every part got its summary and its name."""
+
+    # What diagnostics show -------------------------------------------------------------------------------------------------
+
+    @property
+    def part(self) -> int:
+        """Number of the newest part; 0 before the first."""
+        return self._part
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file being written."""
+        return 0 if self._file is None else self._file.size
+
+    @property
+    def total_size(self) -> int:
+        """Bytes of all our files, as far as they were looked at."""
+        return self._others + self.size
+
+    @property
+    def free_bytes(self) -> int:
+        """Free space; -1 where it cannot be told."""
+        try:
+            return free_bytes(self._rules.directory) if self._file is None else self._file.free_bytes
+        except OSError:
+            return -1
+
+    @property
+    def is_open(self) -> bool:
+        """There is a file."""
+        return self._file is not None
+
+    # Begin and end ---------------------------------------------------------------------------------------------------------
+
+    def open(self, why: str) -> bool:
+        """Begin the next part; False, said once, where that is not possible."""
+        rules = self._rules
+        try:
+            if free_bytes(rules.directory) < rules.reserve * (_ROOM_AGAIN if self.obstacle else 1.0):
+                return self._no_room()
+            rules.directory.mkdir(parents=True, exist_ok=True)
+            earlier = [each for each in own_files(rules.directory, rules.prefix) if each.run == rules.run]
+            part = max([self._part, *(each.part for each in earlier)]) + 1
+            name = part_name(rules.prefix, rules.run, part)
+            previous = self._previous or (
+                part_name(rules.prefix, rules.run, earlier[-1].part) if earlier else ""
+            )
+            metadata = {
+                "run": rules.run,
+                "part": str(part),
+                "previous": previous,
+                "prefix": rules.prefix,
+                "reason": why,
+            }
+            path = rules.directory / (name + ACTIVE)
+            self._file = McapFile(path, self._head, metadata, time.time_ns())
+        except OSError as error:
+            self._stop_for(f"cannot record to {rules.directory}: {error.strerror or error}")
+            return False
+        self._part, self._previous = part, name
+        self._began_ns, self._cycles = self._now_ns or None, 0
+        self._journal.builder.restart()
+        self._enforce_budget()
+        return True
+
+    def end(self) -> None:
+        """End the part with its summary."""
+        file, self._file = self._file, None
+        if file is None:
+            return
+        if file.removed:
+            self._gone(file)
+            return
+        if not file.chunks:
+            file.abandon(remove=True)
+            return
+        try:
+            file.finish(part_name(self._rules.prefix, self._rules.run, self._part))
+        except OSError as error:
+            self.all_ended = False
+            self._journal.say(
+                f"part {self._part} could not be ended and keeps its name {ACTIVE}: {error.strerror or error}"
+            )
+
+    def attach(self, attachments: Sequence[NamedData]) -> None:
+        """From the next part on these are attached."""
+        self._head = self._head._replace(attachments=attachments)
+
+    def rotate(self, why: str) -> None:
+        """End the part and begin the next."""
+        if self._file is not None and self._file.chunks:
+            self.end()
+            self.open(why)
+
+    # Chunks ----------------------------------------------------------------------------------------------------------------
+
+    def write(self, chunk: SealedChunk, at_ns: int) -> None:
+        """Have a chunk on the disk, or count it; `at_ns` is the CLOCK_MONOTONIC time of its last cycle."""
+        self._now_ns = at_ns
+        if self._file is None and not self._try_again():
+            self._miss(chunk.cycles)
+            return
+        # A file that was removed, or must not grow: the next one may do.
+        if not self._append(chunk) and not (
+            self.open("the part before could not go on") and self._append(chunk)
+        ):
+            self._miss(chunk.cycles)
+        file = self._file
+        if file is None:
+            return
+        if self._began_ns is None:
+            self._began_ns = at_ns
+        budget = self._rules.budget
+        if budget is not None and not self._over_budget and self._others + file.size > budget:
+            self._enforce_budget()
+        if 0 <= self.free_bytes < self._rules.reserve:
+            self._no_room()
+        elif at_ns - self._began_ns >= self._rules.rotate_ns:
+            self.rotate("time")
+        elif file.size >= self._rules.rotate_bytes:
+            self.rotate("size")
+
+    def _append(self, chunk: SealedChunk) -> bool:
+        """False when it did not go into the file, which then has been ended."""
+        file = self._file
+        assert file is not None
+        try:
+            file.append(chunk)
+        except OSError as error:
+            removed = file.removed
+            self.end()
+            if not removed:
+                self._stop_for(f"recording fails: {error.strerror or error}")
+            return False
+        self._account.written += chunk.cycles
+        self._cycles += chunk.cycles
+        if self.obstacle:
+            self._went_on()
+        return True
+
+    def _miss(self, cycles: int) -> None:
+        self._account.unwritten += cycles
+        self._missed += cycles
+
+    def _gone(self, file: McapFile) -> None:
+        """Somebody has removed the file: what was in it is lost."""
+        file.abandon()
+        count, self._cycles = self._cycles, 0
+        self._account.written -= count
+        self._account.unwritten += count
+        text = f"part {self._part} was removed while it was being written: {count} cycles are gone with it"
+        self._journal.tell(schemas.FILE_REMOVED, text, level=ERROR, count=count)
+
+    # Obstacles -------------------------------------------------------------------------------------------------------------
+
+    def _no_room(self) -> bool:
+        """Less is free than shall stay free. Always False."""
+        free, reserve = self.free_bytes / MEGABYTE, self._rules.reserve / MEGABYTE
+        text = (
+            f"recording ends: {free:.4g} MB are free in {self._rules.directory}, {reserve:.4g} MB stay free"
+        )
+        if not self.obstacle and self._file is not None:
+            self._journal.note(schemas.SPACE_LOW, text, level=ERROR)
+            last = self._journal.builder.seal()
+            with suppress(OSError):
+                if last is not None:
+                    self._file.append(last)
+        self._stop_for(text)
+        self.end()
+        return False
+
+    def _stop_for(self, obstacle: str) -> None:
+        """Say an obstacle once, and wait a little before the next attempt."""
+        if not self.obstacle:
+            self._journal.say(f"{obstacle}; cycles are counted as lost until it goes on")
+        self.obstacle = obstacle
+        self._retry_ns = self._now_ns + _RETRY_NS
+
+    def _try_again(self) -> bool:
+        if self.obstacle and self._now_ns < self._retry_ns:
+            return False
+        return self.open("recording goes on" if self._part else "start")
+
+    def _went_on(self) -> None:
+        self.obstacle = ""
+        count, self._missed = self._missed, 0
+        text = f"recording goes on in part {self._part}; {count} cycles could not be written"
+        self._journal.tell(schemas.WRITE_FAILED, text, level=ERROR if count else WARN, count=count)
+
+    # Budget ----------------------------------------------------------------------------------------------------------------
+
+    def _enforce_budget(self) -> None:
+        """Remove what the budget asks for, oldest first."""
+        rules = self._rules
+        active = part_name(rules.prefix, rules.run, self._part) + ACTIVE
+        files = [each for each in own_files(rules.directory, rules.prefix) if each.path.name != active]
+        found = sized(files)
+        if rules.budget is not None:
+            for each in to_remove(found, rules.budget, self.size, rules.run, keep_run=rules.keep_run):
+                try:
+                    each.file.path.unlink()
+                except OSError as error:
+                    self._journal.say(f"{each.file.path} cannot be removed: {error.strerror}")
+                    continue
+                found.remove(each)
+                text = f"removed {each.file.path.name}: budget of {rules.budget / MEGABYTE:g} MB"
+                self._journal.tell(schemas.FILE_RETIRED, text, level=INFO)
+        self._others = sum(each.size for each in found)
+        over = rules.budget is not None and self.total_size > rules.budget
+        if over and not self._over_budget:
+            text = "the budget is exceeded by files that are not removed; recording goes on"
+            self._journal.tell(schemas.FILE_RETIRED, text, level=WARN)
+        self._over_budget = over

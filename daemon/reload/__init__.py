@@ -1,0 +1,1 @@
+"""New joint files, networks and settings in a running daemon, without a late or missing cycle."""

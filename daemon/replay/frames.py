@@ -1,0 +1,169 @@
+"""From the raw frames of a log to what each cycle was given: the mapped integers of every input PDO, temperatures, and
+the estimate PDO that went out. Pure, in arrays.
+
+The frames of a record are in order of arrival, late ones of the cycle before first. Of an input that counted, the last frame
+with its identifier and length is therefore the one that was used (see `daemon.loop.intake`); whether it counted is what the
+log's `input_flags` say. Where a record had no room for all frames, the integers come from the SI values beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from daemon.loop.input_pdos import input_pdos, joint_temperatures
+from daemon.loop.intake import InputPdo
+from daemon.loop.joint_cycle import FLAG_MOTION, FLAG_POSITION, FLAG_SENSOR, JointInputs
+from daemon.replay.origin import Origin
+
+Records = npt.NDArray[np.void]
+Floats = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+_ESTIMATE_LENGTH = 8
+_HALF, _FULL = 1 << 31, 1 << 32
+
+
+@dataclass(frozen=True)
+class Pdo:
+    """One input PDO over n cycles: integers by the order of its mapping, and whether it counted."""
+
+    values: tuple[Integers, ...]
+    fresh: Flags
+
+
+@dataclass(frozen=True)
+class Frames:
+    """What the raw frames of n cycles say.
+
+    Attributes:
+        pdos: in the order of `input_pdos`.
+        temperatures: of each joint that tells one: (cycle row, frame as `struct can_frame`) in order of arrival.
+        estimate: estimate PDO [n, 8]; told: it is in the record [n].
+        from_si: inputs whose frame may not be in the record.
+    """
+
+    pdos: tuple[Pdo, ...]
+    temperatures: tuple[tuple[tuple[int, bytes], ...], ...]
+    estimate: npt.NDArray[np.uint8]
+    told: Flags
+    from_si: int
+
+
+class _Table:
+    """All frames of the records [n, capacity], those that are not there masked."""
+
+    def __init__(self, records: Records) -> None:
+        frames = records["frames"]
+        self.count, self.capacity = frames.shape
+        there = np.arange(self.capacity) < records["frame_count"][:, None]
+        self.ids = np.where(there, frames["id"], np.uint32(0xFFFF_FFFF))
+        self.lengths, self.data = frames["length"], frames["data"]
+
+    def last(self, cob_id: int, length: int) -> tuple[Flags, npt.NDArray[np.uint8]]:
+        """Whether a cycle has the frame [n], and the data of its last one [n, 8]."""
+        match = (self.ids == cob_id) & (self.lengths == length)
+        place = self.capacity - 1 - np.argmax(match[:, ::-1], axis=1)
+        return match.any(axis=1), self.data[np.arange(self.count), place]
+
+    def every(self, cob_id: int) -> tuple[tuple[int, bytes], ...]:
+        """(row, frame) of each frame with this identifier, whatever its length."""
+        rows, places = np.nonzero(self.ids == cob_id)
+        return tuple(
+            (row, cob_id.to_bytes(4, "little") + bytes((length, 0, 0, 0)) + data.tobytes())
+            for row, length, data in zip(
+                rows.tolist(), self.lengths[rows, places].tolist(), self.data[rows, places], strict=True
+            )
+        )
+
+
+def decode(origin: Origin, records: Records, joints: Sequence[Records]) -> Frames:
+    """What the raw frames `records` (/can/frames) say, beside the joints' states of the same cycles."""
+    table = _Table(records)
+    left_out = records["frames_left_out"] > 0
+    pdos, from_si = [], 0
+    for index, pdo in enumerate(input_pdos(origin.config)):
+        fresh = _fresh(index, origin.inputs, joints)
+        there, data = table.last(pdo.cob_id, pdo.length)
+        values = [*_unpack(pdo, data)]
+        absent = fresh & (~there | left_out)
+        if absent.any():
+            from_si += int(absent.sum())
+            for column, known in zip(values, _counts(index, origin.inputs, joints), strict=True):
+                column[absent] = known[absent]
+        pdos.append(Pdo(tuple(values), fresh))
+    told, estimate = table.last(0x180 + origin.config.node_id, _ESTIMATE_LENGTH)
+    return Frames(
+        tuple(pdos),
+        tuple(table.every(each.cob_id) for each in joint_temperatures(origin.config)),
+        estimate,
+        told,
+        from_si,
+    )
+
+
+def _fresh(index: int, inputs: Sequence[JointInputs], joints: Sequence[Records]) -> Flags:
+    """Whether PDO `index` counted, by the flags of the joints that use it [n]."""
+    fresh: Flags = np.zeros(len(joints[0]), np.bool_)
+    for each, records in zip(inputs, joints, strict=True):
+        for place, flag in (
+            (each.position, FLAG_POSITION),
+            (each.motion, FLAG_MOTION),
+            (each.sensor, FLAG_SENSOR),
+        ):
+            if place == index:
+                fresh |= (records["input_flags"] & flag) != 0
+    return fresh
+
+
+def _unpack(pdo: InputPdo, data: npt.NDArray[np.uint8]) -> list[Integers]:
+    """Mapped integers of frames [n, 8], one array per object."""
+    letters = pdo.layout.format.lstrip("<")
+    layout = np.dtype([(f"f{n}", f"<{letter}") for n, letter in enumerate(letters)])
+    rows = np.ascontiguousarray(data[:, : pdo.length]).view(layout)[:, 0]
+    return [rows[name].astype(np.int64) for name in layout.names or ()]
+
+
+def _counts(index: int, inputs: Sequence[JointInputs], joints: Sequence[Records]) -> list[Integers]:
+    """Integers of PDO `index` by the SI values that the log has beside the frames."""
+    for each, records in zip(inputs, joints, strict=True):
+        if index == each.position:
+            motor = _whole(records["motor_position_rad"], each.motor_rad_per_count)
+            link = _whole(records["link_position_rad"], each.link_rad_per_count)
+            return [_rolled(motor), _rolled(link)]
+        if index == each.motion:
+            velocity = _whole(records["motor_velocity_rad_s"], each.motor_rad_s_per_unit)
+            current = _whole(records["current_a"], each.ampere_per_unit)
+            return [velocity, current, records["statusword"].astype(np.int64)]
+        if index == each.sensor:
+            torque = _whole(records["sensor_torque_nm"], each.sensor_nm_per_unit)
+            return [torque, records["sensor_status"].astype(np.int64)]
+    raise AssertionError("every PDO has a joint")
+
+
+def _whole(values: Floats, unit: float) -> Integers:
+    """Counts of SI values; 0 for those that are not known."""
+    with np.errstate(all="ignore"):
+        counts = np.rint(values / unit)
+    return np.where(np.isfinite(counts), counts, 0.0).astype(np.int64)
+
+
+def _rolled(counts: Integers) -> Integers:
+    """As a 32-bit position that has rolled over."""
+    return (counts + _HALF) % _FULL - _HALF
+
+
+def offsets(pdo: Pdo, records: Records, each: JointInputs, row: int) -> tuple[int, int]:
+    """Whole ranges [counts] that motor and link position had rolled over by `row`: the log says where they were."""
+    found = []
+    for column, name, unit in (
+        (pdo.values[0], "motor_position_rad", each.motor_rad_per_count),
+        (pdo.values[1], "link_position_rad", each.link_rad_per_count),
+    ):
+        counts = int(_whole(records[name][row : row + 1], unit)[0])
+        found.append(round((counts - int(column[row])) / _FULL) * _FULL)
+    return found[0], found[1]

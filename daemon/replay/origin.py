@@ -1,0 +1,173 @@
+"""Where a log comes from, out of the log itself: configuration, joint files, networks and scaling, hashes checked.
+
+The files are written into a directory of the caller's, under names made here: nothing that a log says can name a place on
+this machine.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from daemon.config import Config, load_config
+from daemon.logs.errors import LogError
+from daemon.loop.joint_cycle import JointInputs
+from daemon.loop.process import joint_inputs
+from estimator.checked import ConfigError
+from models.files import load_yaml
+
+CONFIGURATION, PROVENANCE = "configuration.yaml", "provenance.json"
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What one log was recorded with.
+
+    Attributes:
+        config: as it was in force; its paths lead into the private directory.
+        inputs: indices of each joint's PDOs among `daemon.loop.input_pdos.input_pdos`, and the devices' scaling.
+        hashes: of the configuration, then joint file and network of each joint.
+        versions: of the programs that made the log, e.g. {"numpy": "2.4.6"}.
+        machine: kind of processor, e.g. "x86_64"; empty where the log does not say.
+    """
+
+    config: Config
+    inputs: tuple[JointInputs, ...]
+    hashes: tuple[str, ...]
+    versions: Mapping[str, str]
+    machine: str
+
+
+def open_origin(log: Path, attachments: Mapping[str, bytes], directory: Path) -> Origin:
+    """Read the attachments of `log`; files go to `directory`, which must be empty and nobody else's.
+
+    Raises:
+        LogError: one line; something is missing, damaged, or not what its hash says.
+    """
+    text = _attachment(log, attachments, CONFIGURATION)
+    provenance = _provenance(log, _attachment(log, attachments, PROVENANCE))
+    sha256 = _text(log, provenance, "configuration", "sha256")
+    _check_hash(log, CONFIGURATION, text, sha256)
+    original = directory / "as_logged.yaml"
+    original.write_bytes(text)
+    try:
+        mapping, _ = load_yaml(original)
+        files = [
+            each
+            for number in (1, 2)
+            for each in _place(log, attachments, provenance, mapping, number, directory)
+        ]
+        rewritten = directory / CONFIGURATION
+        rewritten.write_text(yaml.safe_dump(mapping, sort_keys=False), encoding="utf-8")
+        config = load_config(rewritten)
+    except ConfigError as error:
+        raise LogError(f"{log}: its configuration: {_without(str(error), directory)}") from None
+    try:
+        inputs = tuple(joint_inputs(config, provenance))
+        for each in inputs:
+            _check_scaling(each)
+    except (KeyError, TypeError, ValueError) as error:
+        raise LogError(
+            f"{log}: {PROVENANCE}: nodes: no usable scaling ({str(error) or type(error).__name__})"
+        ) from None
+    versions = provenance.get("versions")
+    return Origin(
+        config,
+        inputs,
+        (sha256, *files),
+        {str(k): str(v) for k, v in versions.items()} if isinstance(versions, dict) else {},
+        str(provenance.get("machine", "")),
+    )
+
+
+def _without(text: str, directory: Path) -> str:
+    """The message without the private directory, which is gone when somebody reads it."""
+    return text.replace(f"{directory}/", "").replace("as_logged.yaml", CONFIGURATION)
+
+
+def _attachment(log: Path, attachments: Mapping[str, bytes], name: str) -> bytes:
+    if name not in attachments:
+        raise LogError(
+            f"{log}: found no attachment {name}, expected one: not a log of jtqd, or its beginning is lost"
+        )
+    return attachments[name]
+
+
+def _provenance(log: Path, data: bytes) -> dict[str, Any]:
+    try:
+        content = json.loads(data)
+    except (ValueError, RecursionError):
+        raise LogError(f"{log}: {PROVENANCE}: found no JSON") from None
+    if not isinstance(content, dict):
+        raise LogError(f"{log}: {PROVENANCE}: found {type(content).__name__}, expected an object")
+    return content
+
+
+def _text(log: Path, content: Any, *keys: str) -> str:
+    """A text of the provenance by its path of keys."""
+    for key in keys:
+        content = content.get(key) if isinstance(content, dict) else None
+    if not isinstance(content, str):
+        raise LogError(f"{log}: {PROVENANCE}: {'.'.join(keys)}: missing")
+    return content
+
+
+def _check_hash(log: Path, name: str, data: bytes, expected: str) -> None:
+    found = hashlib.sha256(data).hexdigest()
+    if found != expected.lower():
+        raise LogError(
+            f"{log}: attachment {name}: found SHA-256 {found[:12]}..., expected {expected[:12]}...: it was changed"
+        )
+
+
+def _place(  # noqa: PLR0917
+    log: Path,
+    attachments: Mapping[str, bytes],
+    provenance: dict[str, Any],
+    mapping: dict[str, Any],
+    number: int,
+    directory: Path,
+) -> list[str]:
+    """Write one joint's files and let the configuration name them; returns their hashes.
+
+    A wrong configuration is load_config's to refuse.
+    """
+    key = f"joint_{number}"
+    section = mapping.get(key)
+    if not isinstance(section, dict):
+        return []
+    name = _text(log, provenance, "joints", str(number), "file")
+    data = _attachment(log, attachments, name)
+    said = provenance["joints"][str(number)].get("file_sha256")
+    if isinstance(said, str):
+        _check_hash(log, name, data, said)
+    file = f"{key}.yaml"
+    (directory / file).write_bytes(data)
+    section["file"] = file
+    hashes = [hashlib.sha256(data).hexdigest()]
+    network = section.get("network")
+    if not isinstance(network, dict):
+        return hashes
+    name = provenance["joints"][str(number)].get("network")
+    if name is None:  # the method has no use for it: it was not read
+        section.pop("network")
+        return hashes
+    data = _attachment(log, attachments, str(name))
+    (directory / f"{key}.onnx").write_bytes(data)
+    network["file"] = f"{key}.onnx"  # its hash is in the configuration, and load_config checks it
+    return [*hashes, hashlib.sha256(data).hexdigest()]
+
+
+def _check_scaling(inputs: JointInputs) -> None:
+    """ValueError unless all factors are numbers above 0 (the sensor's may be 0: there is none)."""
+    for name in ("motor_rad_per_count", "motor_rad_s_per_unit", "link_rad_per_count", "ampere_per_unit"):
+        if not getattr(inputs, name) > 0.0:
+            raise ValueError(f"{name} is 0: the drive was absent when the log began")
+    if not inputs.sensor_nm_per_unit >= 0.0:
+        raise ValueError("sensor_nm_per_unit is below 0")

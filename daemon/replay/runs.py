@@ -1,0 +1,277 @@
+"""Logs as runs: the parts of one run of jtqd in their order, with where they come from.
+
+Two logs are parts of one run when their configuration, joint files and networks are the same and their cycles lie on one
+grid: cycle numbers and the monotonic clock advance together. After a change of models (`jtq control reload`) a run is two.
+
+A long run comes in stretches, one after the other, so that memory holds one of them whatever the length of the log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from numpy.lib.recfunctions import repack_fields
+
+from daemon.logs.errors import LogError
+from daemon.logs.log_file import LogFile
+from daemon.logs.reader import iter_messages, iter_topics, read_attachments, read_topic, read_topics
+from daemon.replay.breaks import Steps, steps_of
+from daemon.replay.fields import FRAMES, JOINT, check_fields
+from daemon.replay.origin import Origin, open_origin
+
+Records = npt.NDArray[np.void]
+
+JOINT_TOPICS = ("/joint/1/state", "/joint/2/state")
+FRAMES_TOPIC = "/can/frames"
+
+STRETCH_CYCLES = 650_000
+"""Longest stretch of several parts: one part of ten minutes at 1 kHz with something to spare."""
+_KEPT_ROWS = 5_000
+"""Of the stretch before: whatever the estimator remembers of its inputs, it has forgotten after so many cycles."""
+_LEAST_BYTES = 200
+"""Of a cycle in a log: ours take 256."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One log, or a piece of a long one: its states of joint 1 and 2, cycle by cycle, both of the same cycles."""
+
+    path: Path
+    origin: Origin
+    joints: tuple[Records, Records]
+    piece: bool = False
+
+    def frames(self) -> Records:
+        """Messages of /can/frames of the same cycles. Raises LogError, OSError."""
+        cycles = self.joints[0]["cycle"]
+        if self.piece:
+            records = _frames_between(self.path, int(cycles[0]), int(cycles[-1]))
+        else:
+            records = read_topic(self.path, FRAMES_TOPIC)
+            check_fields(records, FRAMES, self.path, FRAMES_TOPIC)
+        if len(records) == len(cycles) and np.array_equal(records["cycle"], cycles):
+            return records
+        _, here, _ = np.intersect1d(records["cycle"], cycles, return_indices=True)
+        if len(here) != len(cycles):
+            raise LogError(
+                f"{self.path}: {FRAMES_TOPIC}: found {len(here)} of the {len(cycles)} cycles, expected all"
+            )
+        return records[here]
+
+
+@dataclass(frozen=True)
+class Run:
+    """Parts of one run in their order; of a long run one stretch.
+
+    Attributes:
+        parts: their states are views of `joints`.
+        joints: states of joint 1 and 2 over all parts.
+        number: the stretches of one run have the same.
+        before: last states of the stretch before, none for the first one.
+    """
+
+    parts: tuple[Part, ...]
+    joints: tuple[Records, Records]
+    number: int = 0
+    before: tuple[Records, Records] | None = None
+
+    @classmethod
+    def of(cls, parts: Sequence[Part], number: int = 0, before: tuple[Records, Records] | None = None) -> Run:
+        """Run, or stretch, of parts that follow one another."""
+        one, two = (_joined([part.joints[n] for part in parts]) for n in (0, 1))
+        ends = np.cumsum([len(part.joints[0]) for part in parts]).tolist()
+        spans = [slice(begin, end) for begin, end in zip([0, *ends[:-1]], ends, strict=True)]
+        views = [replace(part, joints=(one[at], two[at])) for part, at in zip(parts, spans, strict=True)]
+        return cls(tuple(views), (one, two), number, before)
+
+    @property
+    def origin(self) -> Origin:
+        """Of the first part; the others' is the same."""
+        return self.parts[0].origin
+
+    @property
+    def cycles(self) -> int:
+        """Number of cycles in the logs."""
+        return len(self.joints[0])
+
+    def widened(self) -> tuple[tuple[Records, Records], tuple[Steps, Steps], int]:
+        """States with those kept of the stretch before in front of them, their time steps, and how many those are."""
+        kept = self.before or (self.joints[0][:0], self.joints[1][:0])
+        one, two = (
+            _joined([old, new] if len(old) else [new]) for old, new in zip(kept, self.joints, strict=True)
+        )
+        return (
+            (one, two),
+            (steps_of(one, self.origin.config), steps_of(two, self.origin.config)),
+            len(kept[0]),
+        )
+
+    def steps(self) -> tuple[Steps, Steps]:
+        """Time steps of both joints over all parts."""
+        (records, _), (one, two), kept = self.widened()
+        return one.part(kept, len(records)), two.part(kept, len(records))
+
+
+def _joined(every: Sequence[Records]) -> Records:
+    return every[0] if len(every) == 1 else np.concatenate(every)
+
+
+def read_part(path: Path, directory: Path) -> Part:
+    """Read one log; its files go to `directory`, which must be empty. Raises LogError, OSError."""
+    origin = open_origin(path, read_attachments(path), directory)
+    return _part(path, origin, read_topics(path, JOINT_TOPICS))
+
+
+def read_pieces(path: Path, directory: Path, limit: int = STRETCH_CYCLES) -> Iterator[Part]:
+    """As `read_part`, but a log of more than `limit` cycles in pieces of about so many. Raises LogError, OSError."""
+    if _most_cycles(path) <= limit:
+        yield read_part(path, directory)
+        return
+    origin = open_origin(path, read_attachments(path), directory)
+    kept: dict[str, list[Records]] = {topic: [] for topic in JOINT_TOPICS}
+    count, made = 0, False
+    for found in iter_topics(path, JOINT_TOPICS):
+        for topic, messages in found.items():
+            kept[topic].append(messages.records.copy())  # without the room for more
+        count += len(found[JOINT_TOPICS[0]].records) if JOINT_TOPICS[0] in found else 0
+        if count >= limit and all(kept.values()):
+            yield _piece(path, origin, kept)
+            count, made = 0, True
+    if all(kept.values()) or not made:
+        yield _piece(path, origin, kept)
+
+
+def _most_cycles(path: Path) -> int:
+    """Cycles in a log as its summary says; without one as many as it may have by its size."""
+    with LogFile(path) as log:
+        counts = [log.counts.get(n, 0) for n, each in log.channels.items() if each.topic in JOINT_TOPICS]
+        return max(counts) if log.counts and counts else path.stat().st_size // _LEAST_BYTES
+
+
+def _piece(path: Path, origin: Origin, kept: dict[str, list[Records]]) -> Part:
+    """A part of what was kept; what one joint has of a cycle in the next chunk, which the other's is in, stays."""
+    joined = {}
+    for topic, chunks in kept.items():
+        if not chunks:
+            raise LogError(f"{path}: found no message on {topic}, expected one per cycle")
+        joined[topic] = _joined(chunks)
+        check_fields(joined[topic], JOINT, path, topic)
+    last = min(records["cycle"][-1] for records in joined.values())
+    for topic, records in joined.items():
+        behind = records["cycle"] > last
+        kept[topic] = [records[behind]] if behind.any() else []
+        joined[topic] = records[~behind]
+    return replace(_part(path, origin, joined), piece=True)
+
+
+def _frames_between(path: Path, first: int, last: int) -> Records:
+    """Messages of /can/frames of these cycles."""
+    found = []
+    for messages in iter_messages(path, FRAMES_TOPIC):
+        records = messages.records
+        check_fields(records, FRAMES, path, FRAMES_TOPIC)
+        inside = (records["cycle"] >= first) & (records["cycle"] <= last)
+        if inside.any():
+            found.append(records[inside])
+    if not found:
+        raise LogError(f"{path}: {FRAMES_TOPIC}: found none of the cycles {first} to {last}, expected all")
+    return _joined(found)
+
+
+def _part(path: Path, origin: Origin, found: dict[str, Records]) -> Part:
+    one, two = (found[topic] for topic in JOINT_TOPICS)
+    for topic, records in zip(JOINT_TOPICS, (one, two), strict=True):
+        check_fields(records, JOINT, path, topic)
+    if not np.array_equal(one["cycle"], two["cycle"]):
+        _, here, there = np.intersect1d(one["cycle"], two["cycle"], return_indices=True)
+        one, two = one[here], two[there]
+    if not len(one):
+        raise LogError(f"{path}: found no cycle with both joints, expected one at least")
+    if np.any(np.diff(one["cycle"].astype(np.int64)) <= 0):
+        raise LogError(f"{path}: found cycles that do not increase, expected the order of the run")
+    return Part(path, origin, (one, two))
+
+
+def in_order(logs: Sequence[Path]) -> list[Path]:
+    """Logs in the order of their first cycles. Raises LogError, OSError."""
+    return list(logs) if len(logs) < 2 else sorted(logs, key=_first_ns)
+
+
+def _first_ns(path: Path) -> int:
+    """CLOCK_MONOTONIC of the first cycle; 0 where there is none: reading it says so."""
+    found = next(iter_messages(path, JOINT_TOPICS[0]), None)
+    known = found is not None and "sync_monotonic_ns" in (found.records.dtype.names or ())
+    return int(found.records["sync_monotonic_ns"][0]) if found is not None and known else 0
+
+
+@dataclass
+class _Open:
+    """A run whose parts still come."""
+
+    number: int
+    parts: list[Part]
+    before: tuple[Records, Records] | None = field(default=None)
+
+    def close(self, *following: Part) -> Run:
+        """The stretch so far; the next one begins with `following`."""
+        run = Run.of(self.parts, self.number, self.before)
+        one, two = (records[-_KEPT_ROWS:].copy() for records in run.joints)
+        self.before, self.parts = (one, two), list(following)
+        return run
+
+
+def stretches(parts: Iterable[Part], limit: int = STRETCH_CYCLES) -> Iterator[Run]:
+    """Runs of the parts, which come in the order of their time; cycles that two parts have are taken once.
+
+    A run of more than `limit` cycles comes in several stretches of whole parts, each as soon as it is complete; what is
+    shorter comes at the end, in the order of time.
+
+    Raises LogError where two logs say different things of one cycle, or one is given twice.
+    """
+    begun: list[_Open] = []
+    for part in parts:
+        run = next((each for each in begun if _goes_on(each.parts[-1], part)), None)
+        if run is None:
+            begun.append(_Open(len(begun), [part]))
+            continue
+        new = _behind(run.parts[-1], part)
+        if sum(len(each.joints[0]) for each in run.parts) + len(new.joints[0]) > limit:
+            yield run.close(new)
+        else:
+            run.parts.append(new)
+    while begun:
+        yield begun.pop(0).close()
+
+
+def _goes_on(before: Part, part: Part) -> bool:
+    """Whether `part` is a later part of the run of `before`; the pieces of one log always are."""
+    if part.piece and part.path == before.path:
+        return True
+    if before.origin.hashes != part.origin.hashes or before.origin.inputs != part.origin.inputs:
+        return False
+    last, first = before.joints[0][-1], part.joints[0][0]
+    period_ns = before.origin.config.period_ns
+    begun = [int(row["sync_monotonic_ns"]) - int(row["cycle"]) * period_ns for row in (last, first)]
+    return abs(begun[1] - begun[0]) <= period_ns
+
+
+def _behind(before: Part, part: Part) -> Part:
+    """`part` from the end of `before` on: after a crash of the recorder a chunk may be in both. Raises LogError."""
+    last, first = int(before.joints[0]["cycle"][-1]), int(part.joints[0]["cycle"][0])
+    if first > last:
+        return part
+    new = part.joints[0]["cycle"] > last
+    for one, other in zip(before.joints, part.joints, strict=True):
+        if not new.any() or _packed(one[one["cycle"] >= first]) != _packed(other[~new]):
+            raise LogError(f"{part.path}: found cycle {first}, which {before.path} has too: given twice?")
+    return replace(part, joints=(part.joints[0][new], part.joints[1][new]))
+
+
+def _packed(records: Records) -> bytes:
+    """Bits of all fields; what lies between them is not copied along by numpy and says nothing."""
+    packed: Records = repack_fields(records, recurse=True)
+    return packed.tobytes()

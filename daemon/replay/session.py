@@ -1,0 +1,297 @@
+"""A replay from logs to results: reading, estimating, comparing. No output; what `jtq replay` and `jtq batch` call."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from daemon.logs.errors import LogError
+from daemon.logs.reader import log_parts
+from daemon.replay.breaks import Steps, cut_before, lost_cycles
+from daemon.replay.compare import Comparison, compare
+from daemon.replay.difference import Identity, identity
+from daemon.replay.exact import ExactReplay
+from daemon.replay.frames import decode
+from daemon.replay.models import Models, logged_models, other_models
+from daemon.replay.runs import STRETCH_CYCLES, Part, Run, in_order, read_pieces, stretches
+from daemon.replay.whole import WHOLE, replay_whole
+from estimator.checked import ConfigError
+from estimator.onnx_graph import NetworkError
+
+Records = npt.NDArray[np.void]
+
+SHORT_CYCLES = 120_000
+"""Up to so many cycles a replay with the logged models is exact without being asked: some seconds."""
+ROUNDING_NM = 1e-9
+"""In arrays sums are in another order, and numpy's functions differ from libm's in the last bit (`docs/replay.md`)."""
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What is asked for.
+
+    Attributes:
+        model: directory with other joint files and networks.
+        method: another method of the estimator.
+        exact: cycle by cycle; None: where it is short and with the logged models.
+        compare: differences and errors against the sensor, too.
+    """
+
+    model: Path | None = None
+    method: str | None = None
+    exact: bool | None = None
+    compare: bool = False
+
+    @property
+    def other(self) -> bool:
+        """Another model than the logged one."""
+        return self.model is not None or self.method is not None
+
+
+@dataclass(frozen=True)
+class Result:
+    """Replay of one run, or of one stretch of a long one.
+
+    Attributes:
+        run: its logs and states.
+        files: of the models.
+        method: of the estimator.
+        exact: cycle by cycle, by the loop's own code.
+        seconds, read_s, replay_s: length of the run; wall time of reading and of estimating.
+        lost: cycles that are missing in the middle of the logs.
+        from_si: inputs whose frame was not in the log, from the SI values beside it (exact only).
+        temperatures_from_log: the same of temperatures.
+        identity: comparison bit for bit, with the logged models only.
+        comparisons: of joint 1 and 2.
+        joints: estimates of joint 1 and 2, fields as `WHOLE` at least.
+    """
+
+    run: Run
+    files: tuple[str, ...]
+    method: str
+    exact: bool
+    seconds: float
+    read_s: float
+    replay_s: float
+    lost: int
+    from_si: int
+    temperatures_from_log: int
+    identity: Identity | None
+    comparisons: tuple[Comparison, Comparison]
+    joints: tuple[Records, Records]
+
+    @property
+    def good(self) -> bool:
+        """Nothing differs without a reason."""
+        return self.identity is None or self.identity.explained
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        first, last = self.run.parts[0].joints[0]["cycle"][0], self.run.parts[-1].joints[0]["cycle"][-1]
+        return {
+            "logs": [str(part.path) for part in self.run.parts],
+            "cycles": self.run.cycles,
+            "first_cycle": int(first),
+            "last_cycle": int(last),
+            "seconds": self.seconds,
+            "method": self.method,
+            "models": list(self.files),
+            "exact": self.exact,
+            "read_s": self.read_s,
+            "replay_s": self.replay_s,
+            "times_real_time": self.seconds / max(self.replay_s, 1e-9),
+            "lost_cycles": self.lost,
+            "inputs_from_si": self.from_si,
+            "temperatures_from_log": self.temperatures_from_log,
+            "identity": None if self.identity is None else _plain(self.identity.to_mapping()),
+            "joints": [each.to_mapping() for each in self.comparisons],
+        }
+
+
+def _plain(content: Any) -> Any:
+    """None in place of NaN, all the way down."""
+    if isinstance(content, dict):
+        return {key: _plain(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_plain(value) for value in content]
+    return None if isinstance(content, float) and np.isnan(content) else content
+
+
+Progress = Callable[[str, int, int], None]
+"""Told what is being done, how much of it, and of how much."""
+
+
+def replay(paths: Sequence[Path], wishes: Wishes, progress: Progress = lambda *_: None) -> list[Result]:
+    """As `replay_each`, all results at once."""
+    return list(replay_each(paths, wishes, progress))
+
+
+def replay_each(
+    paths: Sequence[Path],
+    wishes: Wishes,
+    progress: Progress = lambda *_: None,
+    stretch: int = STRETCH_CYCLES,
+) -> Iterator[Result]:
+    """Replay logs; parts of one run are joined, and a directory stands for those in it.
+
+    A run of more than `stretch` cycles gives several results, one after the other: whoever lets go of each before
+    asking for the next needs memory for one of them only.
+
+    Raises LogError, ConfigError, NetworkError: one line each; OSError.
+    """
+    with tempfile.TemporaryDirectory(prefix="jtq-replay-") as scratch:
+        logs = in_order([log for path in paths for log in log_parts(path)])
+        replayers: dict[int, ExactReplay] = {}
+        runs = stretches(_parts(logs, Path(scratch), progress, stretch), stretch)
+        while True:
+            begun = time.perf_counter()
+            run = next(runs, None)
+            if run is None:
+                return
+            yield _replay_run(run, wishes, progress, time.perf_counter() - begun, replayers)
+            del run  # its states take most of the memory
+
+
+def _parts(logs: Sequence[Path], scratch: Path, progress: Progress, stretch: int) -> Iterator[Part]:
+    for n, path in enumerate(logs):
+        progress("reading", n, len(logs))
+        directory = scratch / str(n)
+        directory.mkdir(mode=0o700)
+        yield from read_pieces(path, directory, stretch)
+
+
+def _models(run: Run, wishes: Wishes) -> Models:
+    try:
+        if wishes.other:
+            return other_models(run.origin, wishes.model, wishes.method)
+        return logged_models(run.origin)
+    except (ConfigError, NetworkError) as error:
+        if wishes.other:
+            raise
+        raise LogError(f"{run.parts[0].path}: its models: {error}") from None
+
+
+def _replay_run(
+    run: Run, wishes: Wishes, progress: Progress, read_s: float, replayers: dict[int, ExactReplay]
+) -> Result:
+    models = _models(run, wishes)
+    short = run.before is None and run.cycles <= SHORT_CYCLES
+    exact = (not wishes.other and short) if wishes.exact is None else wishes.exact
+    logged = run.joints
+    begun = time.perf_counter()
+    if exact:
+        steps = run.steps()
+        replayer = replayers.get(run.number)
+        if replayer is None:
+            safety = models.safety(run.origin.config)
+            replayers[run.number] = replayer = ExactReplay(run.origin, models.estimators(), safety)
+        found = _exact(run, replayer, steps, progress)
+        estimate = (found.sent, found.made, found.told)
+    else:
+        progress("replaying", 0, run.cycles)
+        found, steps = _in_arrays(run, models)
+        estimate = None
+    replay_s = time.perf_counter() - begun
+    progress("replaying", run.cycles, run.cycles)
+    same = None
+    if not wishes.other:
+        same = identity(logged, found.joints, steps, estimate, 0.0 if exact else ROUNDING_NM)
+    taken = [_known(run, same, n) for n in (1, 2)]
+    first, second = (compare(n + 1, logged[n], found.joints[n], taken[n]) for n in (0, 1))
+    return Result(
+        run,
+        models.files,
+        models.joints[0].settings.method,
+        exact,
+        run.cycles * run.origin.config.period_ns * 1e-9,
+        read_s,
+        replay_s,
+        lost_cycles(logged[0], run.origin.config.counter_overflow),
+        found.from_si,
+        found.temperatures,
+        same,
+        (first, second),
+        found.joints,
+    )
+
+
+def _known(run: Run, same: Identity | None, number: int) -> npt.NDArray[np.bool_]:
+    """Cycles [n] whose state was known, as far as the comparison with the logged models has found out."""
+    cycle = run.joints[0]["cycle"].astype(np.int64)
+    known: npt.NDArray[np.bool_] = np.ones(len(cycle), np.bool_)
+    for each in () if same is None else same.unknown:
+        if each.joint == number and not each.until_end:
+            known &= (cycle < each.first_cycle) | (cycle >= each.first_cycle + each.cycles)
+    return known
+
+
+def _tell(progress: Progress, before: int, total: int, row: int) -> None:
+    progress("replaying", before + row, total)
+
+
+@dataclass(frozen=True)
+class _Exact:
+    """Results of all parts, one after the other."""
+
+    joints: tuple[Records, Records]
+    sent: npt.NDArray[np.uint8]
+    made: npt.NDArray[np.uint8]
+    told: npt.NDArray[np.bool_]
+    from_si: int
+    temperatures: int
+
+
+def _in_arrays(run: Run, models: Models) -> tuple[_Exact, tuple[Steps, Steps]]:
+    """In arrays; a later stretch of a run begins with states of the one before, whose estimates are dropped."""
+    records, (one, two), kept = run.widened()
+    safety = models.safety(run.origin.config)
+    with ThreadPoolExecutor(len(records)) as pool:  # numpy and ONNX Runtime let go of the interpreter
+        made = list(pool.map(replay_whole, models.joints, safety, records, (one, two)))
+    if kept:
+        end = len(records[0])
+        one, two = (cut_before(each.part(kept, end)) for each in (one, two))
+    empty = np.zeros((run.cycles, 8), np.uint8)
+    told = np.zeros(run.cycles, np.bool_)
+    return _Exact((made[0][kept:], made[1][kept:]), empty, empty, told, 0, 0), (one, two)
+
+
+def _exact(run: Run, replayer: ExactReplay, steps: Sequence[Steps], progress: Progress) -> _Exact:
+    """Cycle by cycle, part by part: the raw frames of only one part are in memory at a time.
+
+    `replayer`: new, or as the stretch before has left it.
+    """
+    done, from_si, temperatures = 0, 0, 0
+    joints, sent, made, told = [], [], [], []
+    for part in run.parts:
+        end = done + len(part.joints[0])
+        frames = decode(run.origin, part.frames(), part.joints)
+        here = [each.part(done, end) for each in steps]
+        result = replayer.run(part.joints, frames, here, partial(_tell, progress, done, run.cycles))
+        joints.append(result.joints)
+        sent.append(frames.estimate)
+        made.append(result.estimate)
+        told.append(frames.told)
+        from_si += frames.from_si
+        temperatures += result.temperatures_from_log
+        done = end
+    first, second = (np.concatenate([each[n] for each in joints]) for n in (0, 1))
+    return _Exact(
+        (first, second),
+        np.concatenate(sent),
+        np.concatenate(made),
+        np.concatenate(told),
+        from_si,
+        temperatures,
+    )
+
+
+__all__ = ["SHORT_CYCLES", "WHOLE", "Progress", "Result", "Wishes", "replay", "replay_each"]

@@ -1,0 +1,1 @@
+"""What several processes read: records, counters and notices in shared memory, and what describes a running daemon."""

@@ -1,0 +1,139 @@
+"""The record of one cycle as it lies in shared memory: one fixed-size struct, written by the loop, read by the recorder.
+
+Little endian, 648 bytes, no padding decided by a compiler:
+
+    header   index, times, flags and counters of the cycle
+    joints   two blocks of the same layout: inputs in SI units and every stage of the estimate
+    frames   up to 16 frames as `struct can_frame` with their kernel stamps, in order of arrival
+    tail     the index again: a reader that finds head and tail different has met a half-written record
+
+Quantities are NaN where they are not known in that cycle (an input that did not come, a stage that was not computed).
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Collection
+from typing import NamedTuple
+
+JOINT_FORMAT = "12d4H"
+HEADER_FORMAT = "QqqIIiI8B"
+FRAME_CAPACITY = 16
+
+HEADER = struct.Struct("<" + HEADER_FORMAT)
+JOINT = struct.Struct("<" + JOINT_FORMAT)
+HEAD = struct.Struct("<" + HEADER_FORMAT + JOINT_FORMAT + JOINT_FORMAT)
+"""Header and both joints in one call: packing them together costs a third of packing them apart."""
+
+FRAMES_OFFSET = HEAD.size
+STAMPS_OFFSET = FRAMES_OFFSET + 16 * FRAME_CAPACITY
+TAIL_OFFSET = STAMPS_OFFSET + 8 * FRAME_CAPACITY
+TAIL = struct.Struct("<Q")
+RECORD_SIZE = TAIL_OFFSET + TAIL.size
+
+FLAG_COMPLETE = 0x01
+"""Every expected input of this cycle arrived before its deadline."""
+FLAG_PUBLISHED = 0x02
+"""The estimate PDO of this cycle was handed to the socket."""
+FLAG_BEFORE_NEXT_SYNC = 0x04
+"""... and that happened before the next SYNC was due."""
+FLAG_SYNC_CONFIRMED = 0x08
+"""The SYNC's own echo came back, so `sync_realtime_ns` is its send time on the wire and not the time of the call."""
+FLAG_WITHDRAWN = 0x10
+"""The estimate was not ready before the next SYNC was due: both joints were stale (`JointCycle.withdraw`)."""
+FLAG_RESET = 0x20
+"""Latched faults were reset just before this cycle's estimate (`JointCycle.reset_latch`)."""
+
+
+class Header(NamedTuple):
+    """Times in integer ns; `cycle` counts cycles since the start, missed slots included."""
+
+    cycle: int
+    sync_monotonic_ns: int
+    sync_realtime_ns: int
+    flags: int
+    work_ns: int
+    """CPU and wall time from the wake-up for the inputs to the end of the cycle's work [ns]."""
+    late_ns: int
+    """SYNC's send time minus its slot on the grid [ns]."""
+    missed: int
+    """Slots missed so far."""
+    sync_counter: int
+    frame_count: int
+    """Frames stored in this record."""
+    frames_left_out: int
+    """Frames of this cycle that did not fit (255 = that many or more)."""
+    stale_inputs: int
+    late_frames: int
+    duplicate_frames: int
+    rejected_frames: int
+    """Frames with our identifiers and a wrong length, or 29-bit or remote frames."""
+    spare: int
+
+
+class JointRecord(NamedTuple):
+    """SI units, signs of docs/architecture.md; joint side unless the name says motor."""
+
+    current_a: float
+    motor_position_rad: float
+    motor_velocity_rad_s: float
+    link_position_rad: float
+    sensor_torque_nm: float
+    temperature_c: float
+    """Of the joint, as its drive told last; NaN where it told none for 2 s."""
+    torque_nm: float
+    sigma_nm: float
+    tob_nm: float
+    physics_nm: float
+    network_nm: float
+    dt_s: float
+    statusword: int
+    status: int
+    sensor_status: int
+    input_flags: int
+    """Bit n set: input n of this joint (0 TPDO1, 1 TPDO2, 2 sensor) is of this cycle; bit 3: temperature_c is known; bit 4:
+    no time for the network; bit 5: a fault is latched; bits 8 to 15: the faults (`daemon/shared/faults.py`) for which there
+    is no torque: of this cycle, of one not long ago, or latched."""
+
+
+def selection(header: Collection[str], joint: Collection[str]) -> struct.Struct:
+    """Layout that unpacks only these fields, from the start of a record: those of the header, then of joint 1 and 2.
+
+    The values come in the order of the record. Raises ValueError for a field that the record does not have.
+    """
+    unknown = {*header} - {*Header._fields} | {*joint} - {*JointRecord._fields}
+    if unknown:
+        raise ValueError(f"found {', '.join(sorted(unknown))}, expected fields of Header and JointRecord")
+    one_joint = _selected(JOINT_FORMAT, JointRecord._fields, joint)
+    return struct.Struct("<" + _selected(HEADER_FORMAT, Header._fields, header) + 2 * one_joint)
+
+
+def _selected(layout: str, names: tuple[str, ...], wanted: Collection[str]) -> str:
+    """The same layout with padding in place of what is not wanted."""
+    codes = "".join(int(count or 1) * code for count, code in re.findall(r"(\d*)(\D)", layout))
+    return "".join(
+        code if name in wanted else f"{struct.calcsize('<' + code)}x"
+        for code, name in zip(codes, names, strict=True)
+    )
+
+
+def header_of(record: bytes | memoryview) -> Header:
+    """Header of one record of `RECORD_SIZE` bytes."""
+    return Header._make(HEADER.unpack_from(record, 0))
+
+
+def joint_of(record: bytes | memoryview, joint: int) -> JointRecord:
+    """Block of joint 1 or 2 of one record."""
+    return JointRecord._make(JOINT.unpack_from(record, HEADER.size + (joint - 1) * JOINT.size))
+
+
+def frames_of(record: bytes | memoryview) -> list[tuple[bytes, int]]:
+    """Frames of one record as (16 bytes of `struct can_frame`, CLOCK_REALTIME stamp in ns), in order of arrival."""
+    count = header_of(record).frame_count
+    stamps = struct.unpack_from(f"<{count}q", record, STAMPS_OFFSET)
+    view = memoryview(record)
+    return [
+        (bytes(view[FRAMES_OFFSET + 16 * n : FRAMES_OFFSET + 16 * n + 16]), stamp)
+        for n, stamp in enumerate(stamps)
+    ]

@@ -1,0 +1,317 @@
+"""Live state of the loop in shared memory: counters, histograms and the last estimate.
+
+For status views and for jtqd's own objects. The loop writes, the daemon's user and group read; nothing a
+reader does can delay the loop. The counters are single 64-bit words; the block of the last estimate is
+guarded by a sequence number that is odd while it is being written, with everything else that is written every 8th cycle.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import struct
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from daemon.shared.snapshot_view import (
+    COUNTERS,
+    MAX_NODE,
+    NOT_MEASURED,
+    STATUS_CODES,
+    InputView,
+    JointView,
+    Measured,
+    View,
+    quantiles,
+)
+
+__all__ = [
+    "COUNTERS",
+    "STATUS_CODES",
+    "InputView",
+    "JointView",
+    "Measured",
+    "Snapshot",
+    "SnapshotError",
+    "SnapshotReader",
+    "View",
+]
+
+WORK_BINS, WORK_BIN_NS = 500, 4_000
+LATE_BINS, LATE_BIN_NS = 250, 4_000
+MAX_INPUTS = 8
+"""Two TPDOs of each drive and two sensor channels are six."""
+
+_MAGIC = 0x4A54_5144_5354_4105  # "JTQDSTA", layout 5
+_HEAD = struct.Struct("<QQdd")
+_JOINT = struct.Struct("<6dHBBHH")
+_ESTIMATE = struct.Struct("<qQqq2q")
+_MEASURED = struct.Struct("<12d")
+INPUT = struct.Struct("<12q")
+"""An `InputView`."""
+_ORDERS_OFFSET = 32
+_COUNTERS_OFFSET = 64
+_SEQUENCE_OFFSET = _COUNTERS_OFFSET + 8 * len(COUNTERS)
+_ESTIMATE_OFFSET = _SEQUENCE_OFFSET + 8
+_MEASURED_OFFSET = _ESTIMATE_OFFSET + _ESTIMATE.size + 2 * _JOINT.size
+_ERRORS_OFFSET = _MEASURED_OFFSET + _MEASURED.size
+_WORK_OFFSET = _ERRORS_OFFSET + 4 * 8
+_LATE_OFFSET = _WORK_OFFSET + 8 * WORK_BINS
+_STATUS_OFFSET = _LATE_OFFSET + 8 * LATE_BINS
+_INPUTS_OFFSET = _STATUS_OFFSET + 8 * 2 * STATUS_CODES
+_HEARD_OFFSET = _INPUTS_OFFSET + INPUT.size * MAX_INPUTS
+_NODES_OFFSET = _HEARD_OFFSET + 8 * MAX_NODE
+_CONFIGURED_OFFSET = _NODES_OFFSET + MAX_NODE
+_UNCONFIGURED_OFFSET = _CONFIGURED_OFFSET + MAX_NODE
+_FACTORS_OFFSET = _UNCONFIGURED_OFFSET + MAX_NODE
+_FACTORS = struct.Struct("<4d")
+_RESTARTS_OFFSET = _FACTORS_OFFSET + _FACTORS.size * MAX_NODE
+_CONFIGURED_FOR_OFFSET = _RESTARTS_OFFSET + 8 * MAX_NODE
+_DOUBTS_OFFSET = _CONFIGURED_FOR_OFFSET + 8 * MAX_NODE
+SIZE = _DOUBTS_OFFSET + MAX_NODE
+_WORD = struct.Struct("<Q")
+_PATIENCE_S = 0.05
+"""Of a reader, with a loop in the midst of a write: many times what a preempted loop may take."""
+_PAUSE_S = 50e-6
+
+
+class SnapshotError(Exception):
+    """No snapshot of this layout at the path."""
+
+
+class Snapshot:
+    """Writer's side, one per loop.
+
+    With `attach` it takes over the memory that another loop has made, as it is; from `own` on it is this process's.
+
+    Attributes:
+        orders: requests of the supervisor and what became of them: [resets asked, done, doubts told, seen].
+        counters: memory of the counters, one unsigned 64-bit word each, in the order of `COUNTERS`.
+        work: histogram of the work per cycle, `WORK_BIN_NS` per bin, the last bin takes the rest.
+        late: histogram of the SYNC's lateness, `LATE_BIN_NS` per bin.
+        errors: sum of squared errors and number of samples of each joint: [sum 1, n 1, sum 2, n 2].
+        status_cycles: cycles that joint 1 has spent in each of the 16 status codes, then joint 2.
+        inputs: one `INPUT` for each input PDO.
+        node_states: last heartbeat state of each node-ID.
+        node_heard: kernel stamp of that heartbeat [ns].
+        configured: number of times each node-ID has been configured; written by the supervisor.
+        unconfigured: 1 for each node-ID that restarted and has not been configured since.
+        restarts: boot-up messages of each node-ID.
+        configured_for: of each node-ID, the `restarts` after which it was last configured; written by the supervisor.
+        doubts: number of times each node-ID was found to be configured otherwise; written by the supervisor.
+    """
+
+    def __init__(self, path: Path, period_s: float, worst_load: float, *, attach: bool = False) -> None:
+        self._head = (period_s, worst_load)
+        if attach:
+            with open(path, "r+b") as file:
+                self._memory = mmap.mmap(file.fileno(), 0)
+            if len(self._memory) != SIZE or _WORD.unpack_from(self._memory, 0)[0] != _MAGIC:
+                raise SnapshotError(f"{path}: not a status snapshot of this version")
+        else:
+            self._create(path)
+        view = memoryview(self._memory)
+        self.orders = view[_ORDERS_OFFSET:_COUNTERS_OFFSET].cast("Q")
+        self.counters = view[_COUNTERS_OFFSET:_SEQUENCE_OFFSET].cast("Q")
+        self.errors = view[_ERRORS_OFFSET:_WORK_OFFSET].cast("d")
+        self.work = view[_WORK_OFFSET:_LATE_OFFSET].cast("Q")
+        self.late = view[_LATE_OFFSET:_STATUS_OFFSET].cast("Q")
+        self.status_cycles = view[_STATUS_OFFSET:_INPUTS_OFFSET].cast("Q")
+        self.inputs = view[_INPUTS_OFFSET:_HEARD_OFFSET]
+        self.node_heard = view[_HEARD_OFFSET:_NODES_OFFSET].cast("q")
+        self.node_states = view[_NODES_OFFSET:_CONFIGURED_OFFSET]
+        self.configured = view[_CONFIGURED_OFFSET:_UNCONFIGURED_OFFSET]
+        self.unconfigured = view[_UNCONFIGURED_OFFSET:_FACTORS_OFFSET]
+        self.restarts = view[_RESTARTS_OFFSET:_CONFIGURED_FOR_OFFSET].cast("Q")
+        self.configured_for = view[_CONFIGURED_FOR_OFFSET:_DOUBTS_OFFSET].cast("Q")
+        self.doubts = view[_DOUBTS_OFFSET:SIZE]
+        self._sequence = view[_SEQUENCE_OFFSET:_ESTIMATE_OFFSET].cast("Q")
+        self._status = [-1, -1]
+        self._since = [0, 0]
+
+    def _create(self, path: Path) -> None:
+        temporary = path.with_name(path.name + ".new")
+        with open(temporary, "w+b") as file:
+            os.fchmod(file.fileno(), 0o640)  # the daemon's group may look
+            os.posix_fallocate(file.fileno(), 0, SIZE)  # a full tmpfs refuses here, not by SIGBUS
+            self._memory = mmap.mmap(file.fileno(), 0)
+        self.own()
+        os.replace(temporary, path)
+
+    def own(self) -> None:
+        """From now on the loop is this process."""
+        _HEAD.pack_into(self._memory, 0, _MAGIC, os.getpid(), *self._head)
+
+    def begin(self) -> None:
+        """From here to the end of `write` a reader knows that what it sees is half new (counters and inputs included)."""
+        self._sequence[0] |= 1
+
+    def write(
+        self,
+        index: int,
+        sync_counter: int,
+        sync_realtime_ns: int,
+        joints: tuple[tuple[float, ...], tuple[float, ...]],
+        *,
+        sync_monotonic_ns: int = 0,
+        measured: tuple[Sequence[float], Sequence[float]] = (NOT_MEASURED, NOT_MEASURED),
+    ) -> None:
+        """Publish the last estimate; `joints` are `JointView` tuples, `measured` begin with the fields of `Measured`."""
+        for n, joint in enumerate(joints):
+            if joint[7] != self._status[n]:
+                self._status[n], self._since[n] = int(joint[7]), index
+        self._sequence[0] |= 1
+        memory = self._memory
+        _ESTIMATE.pack_into(
+            memory,
+            _ESTIMATE_OFFSET,
+            index,
+            sync_counter,
+            sync_realtime_ns,
+            sync_monotonic_ns,
+            *self._since,
+        )
+        _MEASURED.pack_into(memory, _MEASURED_OFFSET, *measured[0][:6], *measured[1][:6])
+        offset = _ESTIMATE_OFFSET + _ESTIMATE.size
+        _JOINT.pack_into(memory, offset, *joints[0])
+        _JOINT.pack_into(memory, offset + _JOINT.size, *joints[1])
+        self._sequence[0] += 1
+
+    def factors(self, node_id: int) -> tuple[float, ...]:
+        """Four scaling factors that the supervisor has noted for a node (`note_factors`); zeros where none."""
+        return _FACTORS.unpack_from(self._memory, _FACTORS_OFFSET + node_id * _FACTORS.size)
+
+
+class SnapshotReader:
+    """Reader's side.
+
+    Raises:
+        SnapshotError: nothing to read at the path, or of another layout.
+    """
+
+    def __init__(self, path: Path, *, supervisor: bool = False) -> None:
+        access = mmap.ACCESS_WRITE if supervisor else mmap.ACCESS_READ
+        try:
+            with open(path, "r+b" if supervisor else "rb") as file:
+                self._memory = mmap.mmap(file.fileno(), 0, access=access)
+        except (OSError, ValueError) as error:
+            raise SnapshotError(f"{path}: no running loop: {error}") from None
+        if len(self._memory) != SIZE or _WORD.unpack_from(self._memory, 0)[0] != _MAGIC:
+            raise SnapshotError(f"{path}: not a status snapshot of this version")
+
+    def read(self) -> View:
+        """A consistent view; waits while the loop is writing.
+
+        A loop that was killed in the midst of a write never ends it; after `_PATIENCE_S` the reading is of what it left.
+        """
+        end = 0.0
+        while True:
+            before = _WORD.unpack_from(self._memory, _SEQUENCE_OFFSET)[0]
+            view = self._view()
+            if before % 2 == 0 and before == _WORD.unpack_from(self._memory, _SEQUENCE_OFFSET)[0]:
+                return view
+            now = time.monotonic()
+            end = end or now + _PATIENCE_S
+            if now >= end:
+                return view
+            time.sleep(_PAUSE_S)  # the loop may have been preempted in its write: it needs the processor more
+
+    def _view(self) -> View:
+        memory = self._memory
+        _, pid, period_s, worst_load = _HEAD.unpack_from(memory, 0)
+        block = memory[_ESTIMATE_OFFSET:_ERRORS_OFFSET]
+        index, sync_counter, realtime_ns, monotonic_ns, *since = _ESTIMATE.unpack_from(block, 0)
+        measured = _MEASURED.unpack_from(block, _MEASURED_OFFSET - _ESTIMATE_OFFSET)
+        joints = tuple(
+            JointView._make(_JOINT.unpack_from(block, _ESTIMATE.size + n * _JOINT.size)) for n in range(2)
+        )
+        words = struct.unpack_from(f"<{len(COUNTERS)}Q", memory, _COUNTERS_OFFSET)
+        cycles = struct.unpack_from(f"<{2 * STATUS_CODES}Q", memory, _STATUS_OFFSET)
+        inputs = (
+            InputView._make(INPUT.unpack_from(memory, _INPUTS_OFFSET + n * INPUT.size))
+            for n in range(MAX_INPUTS)
+        )
+        sums = struct.unpack_from("<4d", memory, _ERRORS_OFFSET)
+        rmse = tuple(
+            (sums[2 * n] / sums[2 * n + 1]) ** 0.5 if sums[2 * n + 1] else float("nan") for n in range(2)
+        )
+        return View(
+            pid,
+            index,
+            sync_counter,
+            realtime_ns,
+            period_s,
+            worst_load,
+            (joints[0], joints[1]),
+            dict(zip(COUNTERS, words, strict=True)),
+            (rmse[0], rmse[1]),
+            bytes(memory[_NODES_OFFSET:_CONFIGURED_OFFSET]),
+            tuple(node for node, flag in enumerate(memory[_UNCONFIGURED_OFFSET:_FACTORS_OFFSET]) if flag),
+            monotonic_ns,
+            (since[0], since[1]),
+            (Measured._make(measured[:6]), Measured._make(measured[6:])),
+            (cycles[:STATUS_CODES], cycles[STATUS_CODES:]),
+            tuple(each for each in inputs if any(each)),
+            struct.unpack_from(f"<{MAX_NODE}q", memory, _HEARD_OFFSET),
+            struct.unpack_from(f"<{MAX_NODE}Q", memory, _RESTARTS_OFFSET),
+        )
+
+    def work_us(self, *shares: float) -> list[float]:
+        """Quantiles of the work per cycle [us], upper edge of their bin (1.0: the true maximum); NaN without data."""
+        largest = self.read().counters["work_max_ns"]
+        return quantiles(self.work_bins(), WORK_BIN_NS, largest, shares)
+
+    def late_us(self, *shares: float) -> list[float]:
+        """Quantiles of the SYNC's lateness [us], upper edge of their bin (1.0: the true maximum); NaN without data."""
+        largest = self.read().counters["late_max_ns"]
+        return quantiles(self.late_bins(), LATE_BIN_NS, largest, shares)
+
+    def work_bins(self) -> tuple[int, ...]:
+        """Histogram of the work per cycle: cycles in each bin of `WORK_BIN_NS`; the last takes the rest."""
+        return self._histogram(_WORK_OFFSET, WORK_BINS)
+
+    def late_bins(self) -> tuple[int, ...]:
+        """Histogram of the SYNC's lateness: cycles in each bin of `LATE_BIN_NS`; the last takes the rest."""
+        return self._histogram(_LATE_OFFSET, LATE_BINS)
+
+    def note_configured(self, node_id: int, restarts: int) -> None:
+        """Tell the loop that a node has been configured (supervisor only).
+
+        `restarts`: its `View.restarts` when that began; the loop believes nothing of a node that has restarted since.
+        """
+        _WORD.pack_into(self._memory, _CONFIGURED_FOR_OFFSET + 8 * node_id, restarts)
+        offset = _CONFIGURED_OFFSET + node_id
+        self._memory[offset] = (self._memory[offset] + 1) % 256
+
+    def note_factors(self, node_id: int, factors: Sequence[float]) -> None:
+        """Scaling of a node that was absent at the start, before `note_configured` (supervisor only).
+
+        A drive: rad per count and rad/s per unit of the motor, rad per count of the link, A per unit. A sensor: Nm per unit
+        of its channels.
+        """
+        values = (*factors, 0.0, 0.0, 0.0, 0.0)[:4]
+        _FACTORS.pack_into(self._memory, _FACTORS_OFFSET + node_id * _FACTORS.size, *values)
+
+    def note_doubt(self, node_id: int) -> None:
+        """Tell the loop that a node is not configured as it was: not to be used until it is again (supervisor only)."""
+        offset = _DOUBTS_OFFSET + node_id
+        self._memory[offset] = (self._memory[offset] + 1) % 256
+        self._ask(2)
+
+    def ask_reset(self) -> int:
+        """Ask the loop to let go of latched faults (supervisor only); returns the number of the request."""
+        return self._ask(0)
+
+    def _ask(self, word: int) -> int:
+        number = int(_WORD.unpack_from(self._memory, _ORDERS_OFFSET + 8 * word)[0]) + 1
+        _WORD.pack_into(self._memory, _ORDERS_OFFSET + 8 * word, number)
+        return number
+
+    @property
+    def resets_done(self) -> int:
+        """Number of the last reset request that the loop has carried out."""
+        return int(_WORD.unpack_from(self._memory, _ORDERS_OFFSET + 8)[0])
+
+    def _histogram(self, offset: int, bins: int) -> tuple[int, ...]:
+        return struct.unpack_from(f"<{bins}Q", self._memory, offset)

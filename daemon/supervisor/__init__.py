@@ -1,0 +1,1 @@
+"""The supervisor process: children, systemd, control socket, and every line that an operator sees."""

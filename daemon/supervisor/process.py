@@ -1,0 +1,317 @@
+"""The supervisor: starts bench, loop, boot and recorder, shows how the loop is doing, ends all in order.
+
+It also serves the own node. It has no thread and touches no frame of the cycle; if it is busy, or dies, no
+cycle is late for it.
+"""
+
+from __future__ import annotations
+
+import json
+import select
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from daemon.config import Config
+from daemon.live.address import Address
+from daemon.live.keeper import LiveKeeper
+from daemon.master.bus_service import BusService, service_filters
+from daemon.master.own_node import OwnNode
+from daemon.master.returning_nodes import ReturningNodes
+from daemon.recording.contents import recording_request
+from daemon.recording.keeper import Keeper
+from daemon.reload.files import SOCKET, Reload, ReloadError
+from daemon.shared.about import About, about, write_about
+from daemon.shared.notices import FILE as NOTICES
+from daemon.shared.notices import Notices
+from daemon.shared.runtime_dir import claim, instance_name, remove
+from daemon.shared.snapshot import SnapshotReader, View
+from daemon.supervisor.children import Child, ChildError
+from daemon.supervisor.display import Display
+from daemon.supervisor.say import ERROR, WARNING, Say
+from daemon.supervisor.service import Service
+from daemon.supervisor.start import (
+    SupervisorError,
+    boot_nodes,
+    check_gears,
+    checked_load,
+    log_directory,
+    put_back,
+    start_bench,
+    wait_for,
+)
+from daemon.supervisor.summary import Summary, summary_of
+from daemon.supervisor.teller import Teller
+from daemon.supervisor.watches import Watches
+from drivers.errors import BusError
+from drivers.frame_socket import open_frame_socket
+from drivers.object_dictionary import ObjectStore, entries_from_json
+
+_LOOP_END_S = 3.0
+
+
+class Supervisor:
+    """One run of the daemon.
+
+    Args:
+        config: what was read from `config_path`.
+        bus: SocketCAN interface, "unix:PATH" or "sim".
+        config_path: the file, None for the one that ships.
+        record: directory for logs, "none", or None for the default.
+        duration_s: end by itself after this time, None to run until told.
+        live: where to serve viewers, None for no live view.
+    """
+
+    def __init__(  # noqa: PLR0917 - the command line's options
+        self,
+        config: Config,
+        bus: str,
+        config_path: Path | None,
+        record: str | None,
+        duration_s: float | None,
+        live: Address | None = None,
+    ) -> None:
+        self._config = config
+        self._config_path = config_path
+        self._duration_s = duration_s
+        self._stop = False
+        signal.signal(signal.SIGTERM, self._on_signal)
+        signal.signal(signal.SIGINT, self._on_signal)
+        self._bus_gone = False
+        self._send: Callable[[bytes], bool] | None = None
+        """Set as long as nodes that we have started are on the bus."""
+        self._load = checked_load(config)
+        self._log_directory = log_directory(record)
+        try:
+            self._directory, self._lock = claim(bus)
+        except BlockingIOError as error:
+            raise SupervisorError(f"{bus}: {error}: one jtqd per bus") from None
+        except OSError as error:
+            raise SupervisorError(f"no directory for shared memory: {error}") from None
+        self._emulate = bus == "sim"
+        self._bus = f"unix:{self._directory / 'bus'}" if self._emulate else bus
+        self._instance = instance_name(bus)
+        self._ring = self._directory / "ring"
+        self._snapshot = self._directory / "snapshot"
+        self._children: list[Child] = []
+        self._recorder = Keeper(self._child, self._directory, self._snapshot)
+        self._live = None if live is None else LiveKeeper(self._child, live)
+        self._say = Say()
+        self._tell = Teller(self._say)
+        self._service = Service(
+            config, self._directory, self._instance, self._say, save=self._recorder.save, renew=self._renew
+        )
+        self._watches = Watches(config, self._tell)
+        signal.signal(signal.SIGHUP, self._on_reload)
+
+    def stop(self) -> None:
+        """End in order, as for SIGTERM."""
+        self._stop = True
+
+    def run(self) -> Summary | None:
+        """Run to the end. None when it was stopped before the loop ran.
+
+        Raises:
+            SupervisorError, BusError: it could not start.
+        """
+        try:
+            return self._run()
+        except ChildError as error:
+            raise SupervisorError(str(error)) from None
+        except OSError as error:  # of the runtime directory: everything else has its own word for it
+            where = error.filename or self._directory
+            raise SupervisorError(f"{where}: {error.strerror or error}") from None
+        finally:
+            self._service.close()
+            for child in reversed(self._children):
+                child.end()
+            self._leave()
+            remove(self._directory)
+
+    # Start ---------------------------------------------------------------------------------------------------------------
+
+    def _run(self) -> Summary | None:
+        if self._stop:
+            return None
+        self._about = self._own_description()
+        write_about(self._directory, self._about)
+        bench = start_bench(self._config, self._bus, self._child) if self._emulate else None
+        socket = open_frame_socket(self._bus, service_filters(self._config), error_frames=True)
+        loop = self._child("daemon.loop.process", [json.dumps(self._loop_request())], "the loop")
+        report = boot_nodes(self._config, self._bus, self._child, self._stopped)
+        if report is None:
+            return None
+        self._send = socket.send  # from here on the nodes are ours to put back
+        wrong = check_gears(self._config, report)
+        if wrong is not None:
+            raise SupervisorError(wrong)
+        if wait_for(loop, self._stopped) is None:
+            return None
+        loop.tell(report)
+        running = wait_for(loop, self._stopped)
+        if running is None:
+            return None
+        for line in running["refused"]:
+            self._say(f"not granted: {line}", WARNING)
+        reader = SnapshotReader(self._snapshot, supervisor=True)
+        self._tell.notices = Notices(self._directory / NOTICES)
+        self._record(report)
+        if self._live is not None:
+            self._live.start(self._config, self._directory, self._instance)
+        store = ObjectStore(entries_from_json(report["own_entries"]), self._config.node_id)
+        self._bus_service = BusService(
+            socket,
+            self._config,
+            report,
+            reader=reader,
+            store=store,
+            returning=ReturningNodes(self._config, self._bus, report, self._child, self._tell),
+            say=self._tell,
+            directory=self._directory,
+        )
+        self._node = node = self._bus_service.own
+        self._bus_service.begin(time.monotonic())
+        self._report = report
+        self._service.open(reader, Reload(self._loop_request(), report, self._child, self._check_reloaded))
+        result = self._watch(loop, node, reader, bench)
+        self._leave()
+        failed = result.get("error") or result.get("failed")
+        if failed:
+            self._say(f"ended: {failed}", ERROR)
+        recording = self._recorder.end(failed=bool(failed))
+        return summary_of(reader, result, running["refused"], recording, self._watches.deviations)
+
+    def _own_description(self) -> About:
+        return about(self._config, bus=self._bus, instance=self._instance, log_directory=self._log_directory)
+
+    def _record(self, report: dict[str, Any], *, again: bool = False) -> None:
+        if self._log_directory is None:
+            return
+        request = recording_request(
+            self._config,
+            report,
+            directory=self._log_directory,
+            ring=self._ring,
+            progress=self._recorder.progress,
+            snapshot=self._snapshot,
+            notices=self._directory / NOTICES,
+            instance=self._instance,
+        )
+        if again:
+            self._recorder.renew(request)
+        else:
+            self._recorder.start(request)
+
+    def _child(self, module: str, arguments: list[str], name: str) -> Child:
+        child = Child(module, arguments, name=name)
+        # One that has ended is kept by who started it, as long as it matters: nodes may be booted for months.
+        self._children[:] = [*(each for each in self._children if each.process.poll() is None), child]
+        return child
+
+    def _loop_request(self) -> dict[str, Any]:
+        return {
+            "config": str(self._config_path) if self._config_path else None,
+            "config_sha256": self._config.files_sha256,
+            "bus": self._bus,
+            "ring": str(self._ring),
+            "snapshot": str(self._snapshot),
+            "worst_load": self._load.worst,
+            "duration_s": self._duration_s,
+            "successor": str(self._directory / SOCKET),
+        }
+
+    # Run -----------------------------------------------------------------------------------------------------------------
+
+    def _watch(
+        self, loop: Child, node: OwnNode, reader: SnapshotReader, bench: Child | None
+    ) -> dict[str, Any]:
+        """Until the loop ends: table, SDO requests, recorder. Returns the loop's last answer."""
+        title = f"jtqd on {self._instance}, node {self._config.node_id:02X}h, {self._config.estimator.method}"
+        stopping = 0.0
+        with Display(reader, self._config.bitrate, title, self._say) as display:
+            while True:
+                sockets = [] if self._bus_gone else [self._bus_service.socket.fd]
+                select.select([*loop.outputs, *sockets, *self._service.descriptors], [], [], 0.05)
+                answer = loop.poll_answer()
+                if answer is not None and answer.get("done"):
+                    return answer
+                if answer is not None and "not_handed_over" in answer:
+                    self._service.not_handed_over(str(answer["not_handed_over"]))
+                if not loop.alive() and not self._service.reloading:
+                    final = loop.poll_answer()
+                    return final or {"error": f"the loop ended with exit status {loop.process.returncode}"}
+                if bench is not None and not bench.alive():
+                    self._say(f"the emulated bench ended with exit status {bench.process.returncode}", ERROR)
+                    bench = None
+                if self._stop and not stopping:
+                    stopping = time.monotonic()
+                    self._service.stopping()
+                    loop.process.send_signal(signal.SIGTERM)
+                    loop.process.send_signal(signal.SIGCONT)  # a stopped one would sleep through it
+                if stopping and time.monotonic() - stopping > _LOOP_END_S:
+                    loop.process.kill()
+                    return {"error": f"the loop did not end within {_LOOP_END_S:g} s"}
+                self._recorder.watch()
+                if self._live is not None:
+                    self._live.watch()
+                node.recorder_lost = self._recorder.lost
+                view, now = reader.read(), time.monotonic()
+                self._serve(view, now)
+                loop = self._loop_now(loop, view, node.recorder_lost, stopping=stopping > 0.0)
+                self._watches.turn(view, now)
+                display.turn(now)
+
+    def _serve(self, view: View, now: float) -> None:
+        """The own node's duties, for as long as there is a bus; what became of it the loop says."""
+        if self._bus_gone:
+            return
+        known = len(self._report["nodes"])
+        try:
+            self._bus_service.turn(view, now)
+        except BusError:
+            self._bus_gone = True
+        if (
+            len(self._report["nodes"]) > known
+        ):  # absent at the start: without its scaling the log cannot be understood
+            self._record(self._report, again=True)
+
+    def _loop_now(self, loop: Child, view: View, recorder_lost: int, *, stopping: bool) -> Child:
+        """Systemd's, operators' and reloads' turn; the loop, or its successor."""
+        now = self._service.serve(loop, view, recorder_lost)
+        if stopping and now is not loop:
+            now.process.send_signal(signal.SIGTERM)  # it took over just when the order to end came
+        return now
+
+    def _stopped(self) -> bool:
+        return self._stop
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self.stop()
+
+    def _on_reload(self, number: int, frame: FrameType | None) -> None:
+        self._service.want_reload()
+
+    def _check_reloaded(self, config: Config) -> None:
+        wrong = check_gears(config, self._report)
+        if wrong is not None:
+            raise ReloadError(wrong)
+
+    def _renew(self, config: Config) -> None:
+        """Another configuration is in force: say so wherever it shows."""
+        self._config = config
+        self._node.set_parameters(config)
+        write_about(self._directory, replace(self._own_description(), started=self._about.started))
+        self._record(self._report, again=True)
+
+    # End -----------------------------------------------------------------------------------------------------------------
+
+    def _leave(self) -> None:
+        """The SYNC has ended with the loop, or never begun: put the nodes that we started back to pre-operational."""
+        send, self._send = self._send, None
+        if send is None:
+            return
+        put_back(self._config, send)

@@ -1,0 +1,262 @@
+"""What the supervisor does for those who look after a daemon: systemd, the control socket, reloads, the metrics file.
+
+Nothing here touches the loop but through shared memory and signals.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from daemon.config import Config
+from daemon.reload.files import Reload, ReloadError
+from daemon.shared.snapshot import SnapshotReader, View
+from daemon.supervisor.children import Child
+from daemon.supervisor.control import FILE, Answer, ControlError, ControlServer, Reply
+from daemon.supervisor.metrics import metrics_text, write_metrics
+from daemon.supervisor.notify import Notifier
+from daemon.supervisor.say import ERROR, NOTICE, WARNING, Say
+from estimator import status as st
+
+_STATUS_PERIOD_S = _METRICS_PERIOD_S = 5.0
+_RESET_S = 2.0
+_NOT_READY = (st.STARTING, st.STALE, st.INVALID)
+"""Statuses of a joint whose inputs or estimator are not there yet. A drive that is off or in fault is no reason to wait:
+others switch it on, and perhaps only when we are ready."""
+
+
+class Service:
+    """One per run.
+
+    Args:
+        config: in force at the start.
+        directory: runtime directory.
+        bus: name for the metrics.
+        say: tells the operator.
+        save: has the flight recording written; False where there is no recorder.
+        renew: called with a new configuration that has come into force.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        directory: Path,
+        bus: str,
+        say: Say,
+        *,
+        save: Callable[[], bool],
+        renew: Callable[[Config], None],
+    ) -> None:
+        self._config, self._bus, self._say = config, bus, say
+        self._directory, self._save, self._renew = directory, save, renew
+        self._notifier = Notifier()
+        self._control: ControlServer | None = None
+        self._reload: Reload | None = None
+        self._reader: SnapshotReader | None = None
+        self._outcome: list[Reply] = []
+        self._ready = self._reload_wanted = False
+        self._status_due = self._metrics_due = 0.0
+
+    def open(self, reader: SnapshotReader, reload: Reload) -> None:
+        """The loop runs: take orders. Raises OSError."""
+        self._reader, self._reload = reader, reload
+        handlers: dict[str, Callable[[Reply], Reply | Answer]] = {
+            "ping": self._ping,
+            "reload": self._ask_reload,
+            "reset": self._reset,
+            "save": self._ask_save,
+        }
+        self._control = ControlServer(self._directory / FILE, handlers)
+
+    @property
+    def descriptors(self) -> list[int]:
+        """For select."""
+        control = self._control.descriptors if self._control is not None else []
+        return [*control, *(self._reload.outputs if self._reload is not None else [])]
+
+    def want_reload(self) -> None:
+        """SIGHUP. While a reload is under way, another one follows it: the files may have changed since it read them."""
+        self._reload_wanted = True
+
+    def serve(self, loop: Child, view: View, recorder_lost: int) -> Child:
+        """All that is due; returns the loop that runs, which is another one after a reload."""
+        if self._reload_wanted and not self.reloading:
+            self._reload_wanted = False
+            try:
+                self._start_reload()
+            except ReloadError as error:
+                self._reload_failed(error)
+        loop = self._poll_reload(loop)
+        if self._control is not None:
+            self._control.serve()
+        now = time.monotonic()
+        if not self._ready and self._estimating(view):
+            self._ready = True
+            self._notifier.send("READY=1", f"STATUS={_status(view)}")
+            self._status_due = now + _STATUS_PERIOD_S
+        elif now >= self._status_due:
+            self._status_due = now + _STATUS_PERIOD_S
+            self._notifier.send(f"STATUS={_status(view)}")
+        if self._config.metrics_file is not None and now >= self._metrics_due:
+            self._metrics_due = now + _METRICS_PERIOD_S
+            self._write_metrics(view, recorder_lost)
+        return loop
+
+    @property
+    def reloading(self) -> bool:
+        """A hand-over may be under way: a loop that has ended may have a successor."""
+        return self._reload is not None and self._reload.running
+
+    def not_handed_over(self, why: str) -> None:
+        """The running loop says why it has kept the bus."""
+        if self._reload is not None and self._reload.running:
+            self._reload_failed(self._reload.refused(why))
+
+    def stopping(self, why: str = "") -> None:
+        """The daemon begins to end."""
+        self._notifier.send(
+            "STOPPING=1", f"STATUS={why or 'ending: the nodes go to pre-operational, the log is finished'}"
+        )
+
+    def failed(self, why: str) -> None:
+        """The daemon ends because of this."""
+        self._notifier.send(f"STATUS=failed: {why}")
+
+    def close(self) -> None:
+        """No more orders."""
+        if self._reload is not None:
+            self._reload.abandon()
+        if self._control is not None:
+            self._control.close()
+
+    # Orders --------------------------------------------------------------------------------------------------------------
+
+    def _ping(self, request: Reply) -> Reply:
+        assert self._reader is not None
+        view = self._reader.read()
+        who = {"ok": True, "bus": self._bus, "pid": os.getpid(), "loop": view.pid}
+        return who | {"cycle": view.cycle, "ready": self._ready}
+
+    def _ask_save(self, request: Reply) -> Reply:
+        if not self._save():
+            raise ControlError("nothing is recorded")
+        self._say("the flight recording is written, as asked", NOTICE, "save")
+        return {"ok": True}
+
+    def _reset(self, request: Reply) -> Answer:
+        reader = self._reader
+        assert reader is not None
+        before = sum(each.latched for each in reader.read().joints)
+        number, until = reader.ask_reset(), time.monotonic() + _RESET_S
+        self._say("reset of latched faults, as asked", NOTICE, "reset")
+
+        def answer() -> Reply | None:
+            if reader.resets_done >= number:
+                return {"ok": True, "released": "some" if before else "none was latched"}
+            late = time.monotonic() > until
+            return {"ok": False, "error": "the loop did not answer"} if late else None
+
+        return answer
+
+    def _ask_reload(self, request: Reply) -> Answer:
+        if self.reloading:
+            raise ControlError("another reload is under way")
+        try:
+            self._start_reload()
+        except ReloadError as error:
+            self._reload_failed(error)
+            raise ControlError(str(error)) from None
+        outcome = self._outcome  # of this reload, whatever is asked after it
+        return lambda: outcome[0] if outcome else None
+
+    # Reload --------------------------------------------------------------------------------------------------------------
+
+    def _start_reload(self) -> None:
+        if self._reload is None:
+            raise ReloadError("jtqd is still starting")
+        self._outcome = []
+        self._reload.start(self._config, self._config.path)
+        self._notifier.send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
+
+    def _poll_reload(self, loop: Child) -> Child:
+        if self._reload is None:
+            return loop
+        try:
+            done = self._reload.poll(loop)
+        except ReloadError as error:
+            self._reload_failed(error)
+            return loop
+        if done is None:
+            return loop
+        new, self._config, about = done
+        try:
+            self._renew(self._config)
+        except OSError as error:  # the loop has taken over all the same
+            self._say(f"reloaded, but the runtime directory cannot be written: {error.strerror}", ERROR)
+        missed = self._missed() - int(about["missed_before"])
+        self._outcome.append(
+            {
+                "ok": True,
+                "cycle": about["took_over"],
+                "missed": missed,
+                "shadowed_cycles": about["cycles"],
+                "changes": about["changes"],
+            }
+        )
+        changes = ", ".join(
+            f"{name.replace('_', ' ')} by {change['rms_change_nm']:.3f} Nm (RMS)"
+            for name, change in about["changes"].items()
+            if change["rms_change_nm"] is not None
+        )
+        self._say(
+            f"reloaded {self._config.path}: in force from cycle {about['took_over']} on, {missed} cycles missed; "
+            f"on the last {about['cycles']} cycles the estimate changes: {changes or 'nothing to compare'}",
+            NOTICE,
+        )
+        self._notifier.send("READY=1")
+        return new
+
+    def _missed(self) -> int:
+        assert self._reader is not None
+        return self._reader.read().counters["missed"]
+
+    def _reload_failed(self, error: ReloadError) -> None:
+        self._outcome.append({"ok": False, "error": str(error)})
+        self._say(f"not reloaded, the old files stay in force: {error}", ERROR)
+        self._notifier.send("READY=1")
+
+    # State ---------------------------------------------------------------------------------------------------------------
+
+    def _estimating(self, view: View) -> bool:
+        """The loop publishes, and every joint whose node must be there has inputs and an estimator that has settled."""
+        if not view.counters["published"]:
+            return False
+        mandatory = (joint.mandatory for joint in self._config.joints)
+        return not any(
+            must and joint.status in _NOT_READY for must, joint in zip(mandatory, view.joints, strict=True)
+        )
+
+    def _write_metrics(self, view: View, recorder_lost: int) -> None:
+        assert self._config.metrics_file is not None
+        assert self._reader is not None
+        path = self._directory / self._config.metrics_file  # an absolute one stays what it is
+        try:
+            write_metrics(path, metrics_text(view, self._reader, self._bus, recorder_lost))
+        except OSError as error:
+            self._say(f"metrics: {path}: {error.strerror}", WARNING, "metrics")
+
+
+def _status(view: View) -> str:
+    joints = "; ".join(
+        f"joint {number}: {st.NAMES[joint.status]}" + _torque(joint)
+        for number, joint in enumerate(view.joints, start=1)
+    )
+    counters = view.counters
+    return f"{joints}; {counters['cycles']} cycles, {counters['missed']} missed"
+
+
+def _torque(joint: Any) -> str:
+    return "" if joint.torque_nm != joint.torque_nm else f" {joint.torque_nm:+.2f} Nm"

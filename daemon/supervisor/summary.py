@@ -1,0 +1,162 @@
+"""What a run of jtqd says at its end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import isfinite
+from typing import Any
+
+from daemon.shared.snapshot import SnapshotReader
+from daemon.supervisor.deviation_watch import FAR, LASTING_S
+
+_REFUSED = ("overruns", "latches", "latch_resets")
+"""Counters beside those of the faults (docs/safety.md)."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Figures of one run; times in us, torque in Nm. `error` is what ended it, if anything did."""
+
+    cycles: int
+    missed: int
+    stale_inputs: int
+    work_us: tuple[float, float, float]
+    late_us: tuple[float, float, float]
+    rmse_nm: tuple[float, float]
+    counters: dict[str, int]
+    refused: tuple[str, ...]
+    recording: dict[str, Any] | None
+    error: str | None
+    inputs: dict[str, dict[str, int]]
+    """Late, lost, duplicate and rejected frames of each PDO by its name."""
+    deviations: tuple[int, int]
+    """How often each joint's estimate stayed far from the sensor (`daemon/supervisor/deviation_watch.py`)."""
+
+    @property
+    def exit_status(self) -> int:
+        """0 done, 1 the run ended by a failure, 3 done with cycles missing in the log."""
+        if self.error:
+            return 1
+        return 3 if self.recording is not None and self.recording.get("lost", 0) else 0
+
+    def content(self) -> dict[str, Any]:
+        """The same as plain data for JSON."""
+        return {
+            "cycles": self.cycles,
+            "missed": self.missed,
+            "stale_inputs": self.stale_inputs,
+            "work_us": dict(zip(("p50", "p99", "max"), map(_json, self.work_us), strict=True)),
+            "late_us": dict(zip(("p50", "p99", "max"), map(_json, self.late_us), strict=True)),
+            "rmse_nm": {"joint_1": _json(self.rmse_nm[0]), "joint_2": _json(self.rmse_nm[1])},
+            "deviations": {"joint_1": self.deviations[0], "joint_2": self.deviations[1]},
+            "counters": self.counters,
+            "not_granted": list(self.refused),
+            "inputs": self.inputs,
+            "recording": self.recording,
+            "error": self.error,
+        }
+
+    def text(self) -> str:
+        """The same for people."""
+        counters = self.counters
+        lines = [
+            f"cycles        {self.cycles}, missed {self.missed}, stale inputs {self.stale_inputs}",
+            "cycle work    p50 {:.0f} us, p99 {:.0f} us, max {:.0f} us (wake-up for the inputs to hand-over)".format(
+                *self.work_us
+            ),
+            "SYNC lateness p50 {:.0f} us, p99 {:.0f} us, max {:.0f} us".format(*self.late_us),
+        ]
+        for joint, rmse in enumerate(self.rmse_nm, start=1):
+            shown = f"{rmse:.3f} Nm against the sensor while it moves" if isfinite(rmse) else "no reference"
+            lines.append(f"RMSE joint {joint}  {shown}")
+        lines += [
+            f"deviation     joint {joint}: {count} times more than {FAR:g} sigma from the sensor for {LASTING_S:g} s"
+            for joint, count in enumerate(self.deviations, start=1)
+            if count
+        ]
+        refused = [
+            f"{name.removeprefix('fault_').replace('_', ' ')} {count}"
+            for name, count in counters.items()
+            if count and (name.startswith("fault_") or name in _REFUSED)
+        ]
+        if refused:
+            lines.append("no torque     " + ", ".join(refused))
+        faults = [
+            f"{name.replace('_', ' ')} {counters[name]}"
+            for name in (
+                "sync_gaps",
+                "sync_errors",
+                "late_frames",
+                "duplicate_frames",
+                "rejected_frames",
+                "foreign_sync",
+                "tx_dropped",
+                "rx_dropped",
+            )
+            if counters.get(name)
+        ]
+        if faults:
+            lines.append("bus           " + ", ".join(faults))
+        for name, counts in self.inputs.items():
+            shown = ", ".join(f"{kind} {count}" for kind, count in counts.items() if count)
+            if shown:
+                lines.append(f"  {name:<24} {shown}")
+        if self.recording is None:
+            lines.append("log           none")
+        else:
+            lost, path = self.recording.get("lost", 0), self.recording.get("path")
+            nothing = (
+                "nothing happened"
+                if self.recording.get("flight_recordings") == 0
+                else "it could not be written"
+            )
+            shown = path or f"none: {self.recording.get('error') or nothing}"
+            parts = len(self.recording.get("paths", ()))
+            shown += f" (the last of {parts} parts)" if parts > 1 else ""
+            lines.append(f"log           {shown}" + (f", {lost} cycles lost" if lost else ""))
+            lines += [
+                f"              {left} (left by a recorder that died)"
+                for left in self.recording.get("left", [])
+            ]
+        if self.error:
+            lines.append(f"ended by      {self.error}")
+        return "\n".join(lines)
+
+
+def _json(value: float) -> float | None:
+    return value if isfinite(value) else None
+
+
+def summary_of(
+    reader: SnapshotReader,
+    result: dict[str, Any],
+    refused: list[str],
+    recording: dict[str, Any] | None,
+    deviations: tuple[int, int],
+) -> Summary:
+    """The summary of a run that has ended.
+
+    Args:
+        reader: snapshot of its loop.
+        result: last answer of the loop.
+        refused: what the kernel did not grant.
+        recording: the recorder's account, None where nothing was recorded.
+        deviations: as in `Summary`.
+    """
+    view = reader.read()
+    p50, p99, worst = reader.work_us(0.5, 0.99, 1.0)
+    late50, late99, late_worst = reader.late_us(0.5, 0.99, 1.0)
+    return Summary(
+        cycles=view.counters["cycles"],
+        missed=view.counters["missed"],
+        stale_inputs=view.counters["stale_inputs"],
+        work_us=(p50, p99, worst),
+        late_us=(late50, late99, late_worst),
+        rmse_nm=view.rmse_nm,
+        counters=view.counters,
+        refused=tuple(refused),
+        recording=recording,
+        error=result.get("error") or result.get("failed"),
+        inputs=result.get("counters", {}),
+        deviations=deviations,
+    )

@@ -1,0 +1,1 @@
+"""Commands of `jtq` about a bus or a running daemon."""

@@ -1,0 +1,218 @@
+"""`jtq check`: a bus and this machine's timing, measured for some seconds and judged item by item."""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from rich.console import Console
+
+from daemon.config import Config, load_config
+from daemon.loop import realtime
+from daemon.master.boot_request import boot_request
+from daemon.shared.snapshot import SnapshotError, SnapshotReader
+from daemon.supervisor.children import Child, ChildError
+from daemon.tools.check_bus import check_bus
+from daemon.tools.check_timing import loop_timing, own_timing
+from daemon.tools.finding import FAIL, GOOD, Finding, as_json, exit_status, show
+from daemon.tools.listener import drive, leave, listen, silent
+from daemon.tools.running import Daemon, find_daemons, on_bus
+from daemon.tools.traffic import Traffic
+from drivers.errors import BusError
+from drivers.frame_socket import FrameSocket, open_frame_socket
+from estimator.arguments import seconds
+from estimator.checked import ConfigError
+
+SCHEMA = "jtq.check/1"
+_EXAMPLES = """examples:
+  jtq check --bus can0                   listen for 10 s beside a running jtqd, or to whatever is there
+  jtq check 60 --bus can0 --config /etc/jtqd/can0.yaml
+  jtq check --bus vcan0 --drive-sync     without jtqd: boot the nodes as it does, send SYNC, measure the answers
+  jtq check 5 --bus sim                  this machine's timing, against the emulated bench
+  jtq check --json | jq '.items[] | select(.level != "GOOD")'
+
+Without --drive-sync nothing is sent. With it the nodes are configured and started, and set to pre-operational at the
+end, exactly as by jtqd; no drive is commanded. It is refused where jtqd runs, or anybody else sends SYNC.
+
+exit status: 0 all good, 3 warnings, 1 failures, 2 usage"""
+_CAPACITY = 256
+_QUIET_S = 0.5
+_BENCH_WAIT_S = 60.0
+_BENCH_PRIORITY = 40
+
+
+class CheckError(Exception):
+    """The check cannot be made; the message is one line for the operator."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Options of `jtq check`."""
+    made = argparse.ArgumentParser(
+        prog="jtq check",
+        description="Self-test of a bus and of this machine's timing: GOOD, WARN or FAIL for each item, and what to do.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    made.add_argument(
+        "seconds", type=seconds, nargs="?", default=10.0, metavar="S", help="how long (default 10)"
+    )
+    made.add_argument("--bus", default="can0", help="SocketCAN interface, unix:PATH, or sim (default can0)")
+    made.add_argument(
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="what should be on the bus (default: the running jtqd's configuration, else the bench that ships)",
+    )
+    made.add_argument("--drive-sync", action="store_true", help="boot the nodes and send SYNC")
+    made.add_argument("--json", action="store_true", help="print as JSON")
+    return made
+
+
+def main(argv: list[str]) -> int:
+    """Measure and judge; returns the exit status."""
+    arguments = parser().parse_args(argv)
+    try:
+        daemon = None if arguments.bus == "sim" else on_bus(find_daemons(), arguments.bus)
+        path = arguments.config or (Path(daemon.about.configuration) if daemon else None)
+        config = load_config(path)
+        with _bus(arguments.bus, config, daemon) as bus:
+            findings = list(
+                _driven(bus, config, arguments.seconds, daemon)
+                if arguments.drive_sync or arguments.bus == "sim"
+                else _heard(bus, config, arguments.seconds, daemon)
+            )
+    except (CheckError, ConfigError, BusError, ChildError) as error:
+        print(f"jtq check: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 1
+    if arguments.json:
+        more = {"bus": arguments.bus, "seconds": arguments.seconds, "configuration": str(config.path)}
+        print(json.dumps(as_json(SCHEMA, findings, **more)))
+    else:
+        show(Console(), findings)
+    return exit_status(findings)
+
+
+def _say(text: str) -> None:
+    if sys.stderr.isatty():
+        print(f"jtq check: {text}", file=sys.stderr)
+
+
+def _open(bus: str, *, receive_own: bool = False) -> FrameSocket:
+    errors = not bus.startswith("unix:")
+    return open_frame_socket(bus, None, receive_own=receive_own, error_frames=errors, capacity=_CAPACITY)
+
+
+def _heard(bus: str, config: Config, for_s: float, daemon: Daemon | None) -> Iterator[Finding]:
+    """Listen only."""
+    traffic, socket = Traffic(config), _open(bus)
+    reader = _reader(daemon)
+    refused = [] if reader else _punctual(config)
+    _say(
+        f"listening on {bus} for {for_s:g} s"
+        + (f" beside jtqd, process {daemon.about.pid}" if daemon else "")
+    )
+    before = (reader.late_bins(), reader.read()) if reader else None
+    timing = listen(socket, traffic, for_s, config.period_ns, timed=reader is None)
+    if reader is not None and before is not None:
+        yield loop_timing(before[0], reader.late_bins(), before[1], reader.read())
+    elif timing is not None:
+        yield from own_timing(timing, config.period_ns, refused, driven=False)
+    yield from _judged(traffic, config, bus, socket)
+
+
+def _driven(bus: str, config: Config, for_s: float, daemon: Daemon | None) -> Iterator[Finding]:
+    """Boot the nodes, send SYNC, and put them back."""
+    if daemon is not None:
+        raise CheckError(
+            f"jtqd runs on {bus} (process {daemon.about.pid}): without --drive-sync this check listens"
+        )
+    socket = _open(bus, receive_own=True)
+    if not silent(socket, _QUIET_S):
+        raise CheckError(f"somebody sends SYNC on {bus}: without --drive-sync this check listens")
+    _say(f"booting the nodes on {bus}")
+    booted = _boot(bus, config)
+    yield booted
+    if booted.level != GOOD:
+        return
+    refused = _punctual(config)
+    traffic = Traffic(config)
+    while socket.receive():
+        pass  # what was said during the boot
+    _say(f"sending SYNC on {bus} for {for_s:g} s")
+    try:
+        timing = drive(socket, traffic, for_s, config)
+    finally:
+        leave(socket, config)
+    yield from own_timing(timing, config.period_ns, refused, driven=True)
+    yield from (each for each in _judged(traffic, config, bus, socket) if "jtqd" not in each.item)
+
+
+def _judged(traffic: Traffic, config: Config, bus: str, socket: FrameSocket) -> Iterator[Finding]:
+    return check_bus(traffic, config, lost=socket.rx_dropped, error_frames=not bus.startswith("unix:"))
+
+
+def _reader(daemon: Daemon | None) -> SnapshotReader | None:
+    if daemon is None:
+        return None
+    try:
+        return SnapshotReader(daemon.directory / "snapshot")
+    except SnapshotError as error:
+        raise CheckError(f"jtqd on {daemon.about.instance} is still starting ({error})") from None
+
+
+def _punctual(config: Config) -> list[str]:
+    """Run as jtqd's loop does. Returns what was refused."""
+    wanted = config.realtime
+    refused = realtime.prepare(wanted.priority, wanted.cpu, wanted.lock_memory)
+    gc.disable()
+    return refused
+
+
+def _boot(bus: str, config: Config) -> Finding:
+    child = Child("drivers.boot", name="the boot")
+    try:
+        child.tell(boot_request(config, bus))
+        child.end_of_input()
+        report = child.answer(60.0)
+    finally:
+        child.end()
+    if not report["ok"]:
+        hint = (
+            "identity, mapping or scaling of a node is not what the configuration says, or the node is silent"
+        )
+        return Finding("boot", FAIL, str(report["error"]["message"]), hint)
+    nodes = ", ".join(sorted(report["nodes"]))
+    return Finding("boot", GOOD, f"nodes {nodes}: identity, mapping and scaling as configured, operational")
+
+
+@contextmanager
+def _bus(name: str, config: Config, daemon: Daemon | None) -> Iterator[str]:
+    """The name under which it can be opened; for "sim" the emulated bench is started for as long as it is used."""
+    if name != "sim":
+        yield daemon.about.bus if daemon else name
+        return
+    with tempfile.TemporaryDirectory(prefix="jtq-check-") as directory:
+        path = Path(directory) / "bus"
+        bench = Child("sim_can", ["--bus", f"unix:{path}"], name="the emulated bench")
+        try:
+            until = time.monotonic() + _BENCH_WAIT_S
+            while not path.exists():
+                if not bench.alive() or time.monotonic() > until:
+                    raise CheckError("the emulated bench did not open its bus")
+                time.sleep(0.01)
+            if config.realtime.priority > _BENCH_PRIORITY:
+                with suppress(PermissionError):  # the emulated nodes stand for hardware
+                    os.sched_setscheduler(bench.pid, os.SCHED_FIFO, os.sched_param(_BENCH_PRIORITY))
+            yield f"unix:{path}"
+        finally:
+            bench.end()

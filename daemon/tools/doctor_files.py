@@ -1,0 +1,185 @@
+"""Files that jtqd needs and directories that it writes, packages, the unit, and what dead daemons have left."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, requires
+from pathlib import Path
+
+from daemon.config import Config
+from daemon.loop.process import build_estimator
+from daemon.master.bus_load import bus_load_of
+from daemon.shared.about import installed
+from daemon.tools.figures import share, size
+from daemon.tools.finding import FAIL, GOOD, SKIP, WARN, Finding
+from daemon.tools.running import Found
+from drivers.bus_load import BusLoadError, check_bus_load
+from estimator.checked import ConfigError
+from estimator.network import NetworkError
+
+_UNITS = (
+    "/etc/systemd/system",
+    "/run/systemd/system",
+    "/usr/local/lib/systemd/system",
+    "/usr/lib/systemd/system",
+    "/lib/systemd/system",
+)
+_UNIT = "jtqd@.service"
+_LOG_FREE = 10 << 30
+"""A working day of recording."""
+_SHM_FREE = 64 << 20
+_BYTES_AN_HOUR = 1.1e9
+
+
+def file_findings(config: Config) -> Iterator[Finding]:
+    """Configuration, joint files, models and their hashes; the configuration has been read already."""
+    load = bus_load_of(config)
+    yield Finding(
+        "configuration", GOOD, f"{config.path}, sha256 {config.sha256[:12]}, method {config.estimator.method}"
+    )
+    try:
+        check_bus_load(load)
+        yield Finding("bus load", GOOD, f"{share(load.worst)} in the worst case (`jtq bus-load`)")
+    except BusLoadError as error:
+        yield Finding("bus load", FAIL, str(error), "`jtq bus-load` shows who takes how much")
+    for joint in config.joints:
+        item = f"joint {joint.number}"
+        shown = f"{joint.joint_path.name} {hashlib.sha256(joint.joint_path.read_bytes()).hexdigest()[:12]}"
+        network = (
+            f", {joint.network.path.name} {joint.network.sha256[:12]}" if joint.network else ", no network"
+        )
+        try:
+            build_estimator(config, joint).step(1e-3, 0.1, 0.0, 1.0, 0.0, 25.0)
+        except (ConfigError, NetworkError) as error:
+            yield Finding(item, FAIL, str(error), "jtqd will not start with it")
+        else:
+            yield Finding(item, GOOD, f"{joint.joint.name}: {shown}{network}: loads and runs")
+
+
+def directory_findings(log: Path | None, roots: list[Path]) -> Iterator[Finding]:
+    """Where logs and shared memory go, for this user; `log` None: where none has been said and none is usual."""
+    if log is None:
+        yield Finding(
+            "log directory", SKIP, "jtqd writes to ./logs unless told: --record DIR, $LOGS_DIRECTORY"
+        )
+    else:
+        yield _directory(
+            "log directory", log, _LOG_FREE, f"an hour takes up to {size(round(_BYTES_AN_HOUR))}"
+        )
+    yield _directory("shared memory", roots[0], _SHM_FREE, "ring and snapshot of a daemon take 3 MB")
+
+
+def _directory(item: str, path: Path, wanted: int, what: str) -> Finding:
+    existing = next(
+        each for each in (path, *path.absolute().parents) if os.path.exists(each)
+    )  # not in a closed one
+    free = shutil.disk_usage(existing).free
+    text = f"{path}: {size(free)} free, {what}"
+    if not os.access(existing, os.W_OK | os.X_OK):
+        return Finding(
+            item, FAIL, f"{path}: this user may not write there", "owner and mode; LogsDirectory= in the unit"
+        )
+    if existing != path:
+        text += "; it will be made"
+    if free < wanted:
+        return Finding(item, WARN, text, f"less than {size(wanted)}: recording ends when the disk is full")
+    return Finding(item, GOOD, text)
+
+
+def package_findings() -> Iterator[Finding]:
+    """Installed versions against what jtqd's own package asks for."""
+    try:
+        wanted = [each for each in requires("jtqd") or () if "extra ==" not in each]
+    except PackageNotFoundError:
+        yield Finding(
+            "packages",
+            WARN,
+            "jtqd is not installed as a package: its requirements are unknown",
+            "pip install .",
+        )
+        return
+    found, wrong = [], []
+    for line in wanted:
+        name, limits = requirement(line)
+        version = installed(name)
+        found.append(f"{name} {version}")
+        if version is None:
+            wrong.append(f"{name} is missing")
+        elif not all(fits(version, *limit) for limit in limits):
+            wrong.append(f"{name} {version}, wanted {line.removeprefix(name)}")
+    text = f"jtqd {installed('jtqd')}, " + ", ".join(found)
+    if wrong:
+        yield Finding(
+            "packages", FAIL, "; ".join(wrong), "pip install --upgrade jtqd, in its own environment"
+        )
+    else:
+        yield Finding("packages", GOOD, text)
+
+
+def requirement(line: str) -> tuple[str, list[tuple[str, str]]]:
+    """Name and limits of a requirement: "mcap>=1.3,<2" is ("mcap", [(">=", "1.3"), ("<", "2")])."""
+    name = re.split(r"[^A-Za-z0-9_.-]", line, maxsplit=1)[0]
+    return name, re.findall(r"(>=|<=|==|<|>)\s*([0-9][0-9A-Za-z.]*)", line.partition(";")[0])
+
+
+def fits(version: str, operator: str, limit: str) -> bool:
+    """Compare the numbers of two versions; what is not a number ends them."""
+    have, want = _numbers(version), _numbers(limit)
+    length = max(len(have), len(want))
+    have, want = have + (0,) * (length - len(have)), want + (0,) * (length - len(want))
+    return {">=": have >= want, "<=": have <= want, "==": have == want, "<": have < want, ">": have > want}[
+        operator
+    ]
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    found = re.match(r"\d+(?:\.\d+)*", version)
+    return tuple(map(int, found[0].split("."))) if found else ()
+
+
+def unit_finding() -> Finding:
+    """The systemd unit."""
+    if not Path("/run/systemd/system").exists():
+        return Finding("systemd unit", SKIP, "systemd does not run here")
+    for directory in _UNITS:
+        path = Path(directory) / _UNIT
+        if path.exists():
+            return Finding("systemd unit", GOOD, str(path))
+    return Finding(
+        "systemd unit", WARN, "not installed", "docs/deployment.md; jtqd then does not start with the machine"
+    )
+
+
+def left_over_findings(log: Path | None, found: Found) -> Iterator[Finding]:
+    """Logs without an end and runtime directories of daemons that were killed."""
+    running = [each.about for each in found.daemons]
+    text = ", ".join(f"{each.instance} (process {each.pid})" for each in running) or "none"
+    yield Finding("running jtqd", GOOD, text)
+    directories = {Path(each.log_directory) for each in running if each.log_directory} | (
+        {log} if log else set()
+    )
+    growing = tuple(each.log_prefix for each in running)
+    files = [
+        path
+        for directory in sorted(directories)
+        for path in sorted(directory.glob("*.mcap.active"))
+        if not (growing and path.name.startswith(growing))
+    ]
+    if files:
+        names = ", ".join(str(path) for path in files[:3]) + (
+            f" and {len(files) - 3} more" if len(files) > 3 else ""
+        )
+        yield Finding("unended logs", WARN, names, "left by a crash: jtq recover FILE")
+    else:
+        yield Finding("unended logs", GOOD, "none")
+    if found.left_over:
+        yield Finding(
+            "left over",
+            WARN,
+            ", ".join(map(str, found.left_over)),
+            "of daemons that were killed; the next start on the same bus takes it over, or remove it",
+        )

@@ -1,0 +1,151 @@
+"""One look at a running daemon: its snapshot twice, its recorder's account, its disk. Reads only."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+
+from daemon.recording.progress import Account, read_account
+from daemon.shared.notices import FILE as NOTICES
+from daemon.shared.notices import Notice, NoticesError, NoticesReader
+from daemon.shared.snapshot import SnapshotError, SnapshotReader, View
+from daemon.tools.running import Daemon
+
+STILL_S = 0.25
+"""A loop whose SYNC is older stands still; the snapshot is written every 8th cycle."""
+STARTING, RUNNING, STILL = "starting", "running", "still"
+_NOTICES = 20
+_PROCESS = {
+    "T": "stopped (SIGSTOP)",
+    "t": "stopped by a debugger",
+    "D": "waiting for the kernel",
+    "R": "busy",
+    "S": "asleep",
+}
+
+
+@dataclass(frozen=True)
+class LogFile:
+    """What the recorder has left so far."""
+
+    account: Account
+    path: Path | None
+    """The file that is being written."""
+    size: int | None
+    """Bytes of it."""
+    disk_free: int | None
+    disk_size: int | None
+
+
+@dataclass(frozen=True)
+class Reading:
+    """State of a daemon at one moment; `view` and what follows only when its loop has begun."""
+
+    daemon: Daemon
+    state: str
+    why: str
+    """Why it does not run."""
+    view: View | None
+    earlier: View | None
+    """A reading from a moment before, for what changes."""
+    work: tuple[int, ...] = ()
+    late: tuple[int, ...] = ()
+    work_us: tuple[float, float, float] = (float("nan"),) * 3
+    late_us: tuple[float, float, float] = (float("nan"),) * 3
+    """Quantiles 0.5, 0.99 and 1."""
+    log: LogFile | None = None
+    notices: tuple[Notice, ...] = ()
+    """The last lines that the daemon had to say about the bus."""
+
+
+class Watch:
+    """Looks at one daemon again and again."""
+
+    def __init__(self, daemon: Daemon) -> None:
+        self.daemon = daemon
+        self._reader: SnapshotReader | None = None
+        self._earlier: View | None = None
+        self._said: NoticesReader | None = None
+        self._notices: deque[Notice] = deque(maxlen=_NOTICES)
+
+    def read(self) -> Reading:
+        """How it is now."""
+        view = self._view()
+        if view is None:
+            return Reading(self.daemon, STARTING, "its nodes are being booted", None, None)
+        assert self._reader is not None
+        earlier, self._earlier = self._earlier or view, view
+        state, why = _state(view)
+        return Reading(
+            self.daemon,
+            state,
+            why,
+            view,
+            earlier,
+            self._reader.work_bins(),
+            self._reader.late_bins(),
+            _three(self._reader.work_us(0.5, 0.99, 1.0)),
+            _three(self._reader.late_us(0.5, 0.99, 1.0)),
+            _log(self.daemon),
+            self._news(),
+        )
+
+    def _news(self) -> tuple[Notice, ...]:
+        if self._said is None:
+            try:
+                self._said = NoticesReader(self.daemon.directory / NOTICES)
+            except NoticesError:
+                return ()
+        self._notices.extend(self._said.read()[0])
+        return tuple(self._notices)
+
+    def _view(self) -> View | None:
+        if self._reader is None:
+            try:
+                self._reader = SnapshotReader(self.daemon.directory / "snapshot")
+            except SnapshotError:
+                return None
+        view = self._reader.read()
+        return view if view.sync_monotonic_ns else None
+
+
+def _three(values: list[float]) -> tuple[float, float, float]:
+    return values[0], values[1], values[2]
+
+
+def _state(view: View) -> tuple[str, str]:
+    age_s = time.monotonic() - view.sync_monotonic_ns * 1e-9
+    if age_s <= max(STILL_S, 50 * view.period_s):
+        return RUNNING, ""
+    try:
+        code = Path(f"/proc/{view.pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return STILL, f"the loop (process {view.pid}) has gone; no cycle for {age_s:.1f} s"
+    return STILL, f"the loop (process {view.pid}) is {_PROCESS.get(code, code)}: no cycle for {age_s:.1f} s"
+
+
+def _log(daemon: Daemon) -> LogFile | None:
+    about = daemon.about
+    if about.log_directory is None:
+        return None
+    directory = Path(about.log_directory)
+    account = read_account(daemon.directory / "recorded") or Account()
+    path, size, free, total = None, None, None, None
+    try:
+        files = [
+            (each.stat().st_mtime_ns, each) for each in directory.glob(f"{about.log_prefix}*.mcap.active")
+        ]
+        if files:
+            path = max(files)[1]
+            size = path.stat().st_size
+    except OSError:
+        pass  # a file that has just been renamed, or a directory that is not ours to read
+    try:
+        disk = os.statvfs(directory)
+        free, total = disk.f_bavail * disk.f_frsize, disk.f_blocks * disk.f_frsize
+    except OSError:
+        pass
+    return LogFile(account, path, size, free, total)

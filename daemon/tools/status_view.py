@@ -1,0 +1,266 @@
+"""The picture of `jtq status`: joints, inputs, loop, bus, nodes and recorder of one daemon, at the width of the terminal."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from math import nan
+
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
+from rich.measure import Measurement
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+from daemon.shared.about import About
+from daemon.shared.notices import ERROR, WARNING, Notice
+from daemon.shared.snapshot import LATE_BIN_NS, WORK_BIN_NS, View
+from daemon.shared.snapshot_view import BUS_COUNTERS
+from daemon.supervisor.live_table import COLOURS, bus_load
+from daemon.tools.figures import NOTHING, duration, histogram, number, share, size
+from daemon.tools.reading import RUNNING, LogFile, Reading
+from daemon.tools.reasons import NMT_STATES, reason, silent_s
+from estimator.status import NAMES, PUBLISHED
+
+_HEAD = "bold"
+_HEADING = 9
+"""Width of the headings of lines."""
+_FAULTS = (
+    "stale_inputs",
+    "published_late",
+    *BUS_COUNTERS,
+    "network_fallbacks",
+    "overruns",
+    "latches",
+)
+"""Counters shown when they are not zero."""
+_OPERATIONAL = 5
+_LAST_NOTICES = 4
+
+
+class StatusView:
+    """Renderable of one reading."""
+
+    def __init__(self, reading: Reading) -> None:
+        self._reading = reading
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Called by rich with the width of the terminal."""
+        reading, width = self._reading, options.max_width
+        yield _title(reading)
+        if reading.state != RUNNING:
+            yield Text(f"NOT RUNNING: {reading.why}" if reading.view else reading.why, style="bold red")
+        if reading.view is None or reading.earlier is None:
+            return
+        about, view = reading.daemon.about, reading.view
+        still = reading.state != RUNNING
+        yield ""
+        yield _joints(about, view, still=still)
+        if not still:
+            yield from _reasons(about, view, reading.earlier)
+        yield ""
+        yield _inputs(about, view)
+        yield ""
+        yield _loop(reading, view, width)
+        yield _bus(about, view, reading.earlier)
+        faults = [
+            f"{name.replace('_', ' ')} {view.counters[name]}" for name in _FAULTS if view.counters[name]
+        ]
+        if faults:
+            yield _line("counted", ", ".join(faults))
+        yield ""
+        yield _nodes(about, view)
+        yield ""
+        yield from _log(reading.log)
+        yield from _notices(reading.notices)
+
+
+def _title(reading: Reading) -> Text:
+    about, view = reading.daemon.about, reading.view
+    text = Text(f"jtqd on {about.instance}", style=_HEAD)
+    text.append(f"  node {about.node:02X}h  {about.method}  pid {about.pid}", style="")
+    if view is not None:
+        text.append(f"  cycle {view.cycle}  up {duration(view.cycle * view.period_s)}", style="")
+    text.append(f"\n{about.configuration}  {about.configuration_sha256[:8]}", style="dim")
+    text.overflow = "fold"
+    return text
+
+
+class Columns:
+    """A table whose columns go, in the order of `dispensable`, where the terminal is too narrow for all; nothing is cut."""
+
+    def __init__(self, headings: dict[str, str], dispensable: tuple[str, ...] = ()) -> None:
+        self._headings = headings
+        self._dispensable = dispensable
+        self._rows: list[dict[str, str | Text]] = []
+
+    def add(self, *cells: str | Text) -> None:
+        """One row, a cell for each heading."""
+        self._rows.append(dict(zip(self._headings, cells, strict=True)))
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Called by rich with the width of the terminal."""
+        unlimited = options.update(max_width=1000)
+        for dropped in range(len(self._dispensable) + 1):
+            table = self._table([name for name in self._headings if name not in self._dispensable[:dropped]])
+            if Measurement.get(console, unlimited, table).maximum <= options.max_width:
+                break
+        yield table
+
+    def _table(self, names: list[str]) -> Table:
+        table = Table(
+            box=None, pad_edge=False, padding=(0, 2, 0, 0), collapse_padding=True, header_style=_HEAD
+        )
+        for name in names:
+            right = self._headings[name] == "right"
+            table.add_column(name, justify="right" if right else "left", no_wrap=True)
+        for row in self._rows:
+            table.add_row(*(row[name] for name in names))
+        return table
+
+
+def _quantity(value: float, unit: str, digits: int = 2) -> str:
+    text = number(value, digits)
+    return text if text == NOTHING else f"{text} {unit}"
+
+
+def _joints(about: About, view: View, *, still: bool) -> Columns:
+    headings = {"joint": "left", "status": "left"} | dict.fromkeys(
+        ("torque", "sigma", "sensor", "current", "motor", "temp.", "with a number"), "right"
+    )
+    table = Columns(headings, ("with a number", "motor", "temp.", "current", "sensor", "sigma"))
+    for n, (joint, seen) in enumerate(zip(about.joints, view.joints, strict=True)):
+        known = seen.status in PUBLISHED and not still
+        measured, spent = view.measured[n], view.status_cycles[n]
+        name = NAMES.get(seen.status, str(seen.status))
+        table.add(
+            f"{joint.number} {joint.name}",
+            Text(name, style="dim" if still else COLOURS.get(name, "bold red")),
+            _quantity(seen.torque_nm if known else nan, "Nm"),
+            _quantity(seen.sigma_nm if known else nan, "Nm"),
+            _quantity(seen.sensor_nm, "Nm"),
+            _quantity(measured.current_a, "A"),
+            _quantity(measured.motor_velocity_rad_s, "rad/s", 1),
+            _quantity(measured.temperature_c, "°C", 1),
+            share(sum(spent[code] for code in PUBLISHED) / max(1, sum(spent))),
+        )
+    return table
+
+
+def _reasons(about: About, view: View, earlier: View) -> Iterator[Text]:
+    """Always a line for each joint, so that the picture does not jump."""
+    for joint, seen, since in zip(about.joints, view.joints, view.status_since, strict=True):
+        why = reason(about, joint.number, view, earlier)
+        name = NAMES.get(seen.status, str(seen.status))
+        lasting = duration((view.cycle - since) * view.period_s)
+        yield Text.assemble(
+            f"joint {joint.number} ",
+            (f"{name} for {lasting}", COLOURS.get(name, "bold red")),
+            f": {why}" if why else "",
+        )
+
+
+def _inputs(about: About, view: View) -> Columns:
+    headings = {"input": "left"} | dict.fromkeys(
+        ("age", "after SYNC", "usual", "missed", "late", "lost", "twice", "wrong"), "right"
+    )
+    table = Columns(headings, ("wrong", "twice", "usual", "lost", "late"))
+    for name, each in zip(about.inputs, view.inputs, strict=False):
+        age_s = (view.sync_monotonic_ns - each.used_ns) * 1e-9 if each.used_ns else nan
+        old = not age_s <= 2 * 8 * view.period_s  # looked at every 8th cycle
+        band = f"{each.low_ns / 1000:.0f}..{each.high_ns / 1000:.0f} us"
+        table.add(
+            name,
+            Text("never" if not each.used_ns else duration(age_s), style="bold red" if old else ""),
+            f"{each.delay_ns / 1000:.0f} us" if each.used_ns else NOTHING,
+            band if each.low_ns <= each.high_ns else NOTHING,
+            *map(str, (each.missed, each.late, each.lost, each.duplicates, each.rejected)),
+        )
+    return table
+
+
+def _line(heading: str, text: str | Text) -> RenderableType:
+    """A heading of a fixed width, and text that wraps beside it."""
+    grid = Table.grid(padding=(0, 1))
+    grid.add_column(width=_HEADING, no_wrap=True, style=_HEAD)
+    grid.add_column(overflow="fold")
+    grid.add_row(heading, text)
+    return grid
+
+
+def _loop(reading: Reading, view: View, width: int) -> RenderableType:
+    grid = Table.grid(padding=(0, 1))
+    grid.add_column(width=_HEADING, no_wrap=True, style=_HEAD)
+    grid.add_column()
+    for name, values, bins, bin_ns in (
+        ("work", reading.work_us, reading.work, WORK_BIN_NS),
+        ("lateness", reading.late_us, reading.late, LATE_BIN_NS),
+    ):
+        p50, p99, worst = values
+        text = f"p50 {number(p50, 0)}  p99 {number(p99, 0)}  max {number(worst, 0)} us"
+        columns = min(60, max(10, width - 66))
+        grid.add_row(name, Text.assemble(text.ljust(31), (histogram(bins, bin_ns / 1000, columns), "cyan")))
+    counters = view.counters
+    slots = max(1, counters["cycles"] + counters["missed"])
+    missed = Text(f"{counters['missed']} of {slots} cycles", style="yellow" if counters["missed"] else "")
+    short = counters["cycles"] - counters["complete"]
+    missed.append(f", an input missing in {short}", style="yellow" if short else "default")
+    grid.add_row("missed", missed)
+    return grid
+
+
+def _bus(about: About, view: View, earlier: View) -> RenderableType:
+    now = bus_load(earlier, view, about.bitrate)
+    return _line(
+        "bus load",
+        f"{share(now)} now, counted with every stuff bit; {share(view.worst_load)} by configuration",
+    )
+
+
+def _nodes(about: About, view: View) -> Columns:
+    table = Columns({"node": "left", "what": "left", "state": "left", "heartbeat": "right"}, ("what",))
+    for node, what in sorted(about.nodes.items()):
+        heard = view.node_heard_ns[node]
+        silence = silent_s(view, node, about.heartbeat_ms)
+        state = Text(NMT_STATES.get(view.node_states[node], "?") if heard else "no heartbeat yet")
+        if silence is not None:
+            state = Text(f"silent, was {state.plain}", style="bold red")
+        elif node in view.unconfigured:
+            state = Text("restarted, not configured yet", style="bold red")
+        elif heard and view.node_states[node] != _OPERATIONAL:
+            state.stylize("yellow")
+        age = duration(max(0, view.sync_realtime_ns - heard) * 1e-9) + " ago" if heard else NOTHING
+        table.add(f"{node:02X}h", what, state, age)
+    return table
+
+
+def _log(log: LogFile | None) -> Iterator[RenderableType]:
+    if log is None:
+        yield _line("recorder", "no recording")
+        return
+    lost = Text(f"{log.account.lost} lost", style="bold red" if log.account.lost else "")
+    held = f", {log.account.let_go} let go (flight recorder)" if log.account.let_go else ""
+    yield _line(
+        "recorder",
+        Text.assemble(
+            f"{log.account.written} cycles written, ", lost, f"{held}, {size(log.size)} in this file"
+        ),
+    )
+    yield _line("", str(log.path) if log.path else "no file is being written")
+    yield _line("disk", f"{size(log.disk_free)} free of {size(log.disk_size)}")
+
+
+def _notices(notices: Sequence[Notice]) -> Iterator[RenderableType]:
+    if notices:
+        yield ""
+    for each in notices[-_LAST_NOTICES:]:
+        when = time.strftime("%H:%M:%S", time.localtime(each.realtime_ns * 1e-9))
+        style = "bold red" if each.level >= ERROR else "yellow" if each.level >= WARNING else ""
+        yield _line(when, Text(each.text, style=style))
+
+
+def clock() -> RenderableType:
+    """The line below a live view."""
+    return Padding(
+        Text(time.strftime("%H:%M:%S  Ctrl-C ends this view; jtqd goes on"), style="dim"), (1, 0, 0, 0)
+    )

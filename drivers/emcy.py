@@ -1,0 +1,143 @@
+"""EMCY messages (CiA 301, 7.2.7): the eight bytes, and the codes in words. Pure."""
+
+from __future__ import annotations
+
+import struct
+from typing import NamedTuple
+
+EMCY = struct.Struct("<HB5s")
+"""Error code, error register (1001h), manufacturer's field."""
+NO_ERROR = 0x0000
+CAN_OVERRUN, CAN_PASSIVE, HEARTBEAT_LOST, BUS_OFF_RECOVERED, COB_ID_COLLISION = (
+    0x8110,
+    0x8120,
+    0x8130,
+    0x8140,
+    0x8150,
+)
+JOINT_FAULT, FAULT_LATCHED, NODE_CHANGED = 0xFF01, 0xFF02, 0xFF03
+"""Of jtqd: a joint has no torque because of a fault; one waits for a reset; a node is not configured as at its boot. The
+detail is the node-ID."""
+PDO_SHORT, PDO_LONG, SYNC_LENGTH, PDO_TIMEOUT = 0x8210, 0x8220, 0x8240, 0x8250
+GENERIC, COMMUNICATION, MANUFACTURER = 0x01, 0x10, 0x80
+"""Bits of 1001h."""
+
+_EXACT = {
+    0x2310: "continuous overcurrent",
+    0x2320: "short circuit or earth leakage",
+    0x2340: "short circuit, motor side",
+    0x3110: "mains overvoltage",
+    0x3120: "mains undervoltage",
+    0x3210: "DC link overvoltage",
+    0x3220: "DC link undervoltage",
+    0x4210: "excess temperature of the device",
+    0x4310: "excess temperature of the drive",
+    0x5441: "contactor, motor blocked",
+    0x6010: "software reset by watchdog",
+    0x7121: "motor blocked",
+    0x7305: "incremental sensor 1",
+    0x7306: "incremental sensor 2",
+    0x7310: "speed",
+    0x7320: "position",
+    CAN_OVERRUN: "CAN overrun, objects lost",
+    CAN_PASSIVE: "CAN in error passive mode",
+    HEARTBEAT_LOST: "life guard or heartbeat",
+    BUS_OFF_RECOVERED: "recovered from bus-off",
+    COB_ID_COLLISION: "transmit COB-ID collision",
+    PDO_SHORT: "PDO not processed, too short",
+    PDO_LONG: "PDO too long",
+    0x8230: "DAM MPDO not processed",
+    SYNC_LENGTH: "unexpected length of SYNC",
+    PDO_TIMEOUT: "RPDO timeout",
+    JOINT_FAULT: "joint fault",
+    FAULT_LATCHED: "fault latched",
+    NODE_CHANGED: "configuration of a node changed",
+    0x8311: "excess torque",
+    0x8400: "speed control",
+    0x8500: "position control",
+    0x8611: "following error",
+    0x8612: "reference limit",
+}
+_BY_HIGH_BYTE = {
+    0x00: "no error",
+    0x10: "generic error",
+    0x20: "current",
+    0x21: "current, device input side",
+    0x22: "current inside the device",
+    0x23: "current, device output side",
+    0x30: "voltage",
+    0x31: "mains voltage",
+    0x32: "voltage inside the device",
+    0x33: "output voltage",
+    0x40: "temperature",
+    0x41: "ambient temperature",
+    0x42: "device temperature",
+    0x43: "drive temperature",
+    0x44: "supply temperature",
+    0x50: "device hardware",
+    0x60: "device software",
+    0x61: "internal software",
+    0x62: "user software",
+    0x63: "data set",
+    0x70: "additional modules",
+    0x71: "power",
+    0x72: "measurement circuit",
+    0x73: "sensor",
+    0x80: "monitoring",
+    0x81: "communication",
+    0x82: "protocol error",
+    0x83: "torque control",
+    0x84: "velocity speed controller",
+    0x85: "position controller",
+    0x86: "positioning controller",
+    0x90: "external error",
+    0xF0: "additional functions",
+    0xFF: "device specific",
+}
+_REGISTER = (
+    "generic",
+    "current",
+    "voltage",
+    "temperature",
+    "communication",
+    "profile",
+    "reserved",
+    "manufacturer",
+)
+
+
+class Emergency(NamedTuple):
+    """One received message; what a short frame leaves out is zero, and `length` says how long it was."""
+
+    code: int
+    register: int
+    manufacturer: bytes
+    length: int = 8
+
+
+def parse(data: bytes) -> Emergency:
+    """Any frame of 0..8 bytes under an EMCY identifier: a short one is told as far as it goes, never an error."""
+    code, register, manufacturer = EMCY.unpack(bytes(data[:8]).ljust(8, b"\0"))
+    return Emergency(code, register, manufacturer, len(data))
+
+
+def name_of(code: int) -> str:
+    """The code in words: its own name, or that of its group (CiA 301 table 26, CiA 402)."""
+    if code in _EXACT:
+        return _EXACT[code]
+    group = _BY_HIGH_BYTE.get(code >> 8) or _BY_HIGH_BYTE.get(code >> 8 & 0xF0)
+    return group or "unknown group"
+
+
+def register_text(register: int) -> str:
+    """The bits of 1001h in words."""
+    return ", ".join(name for bit, name in enumerate(_REGISTER) if register >> bit & 1) or "none"
+
+
+def describe(emergency: Emergency) -> str:
+    """One line: "EMCY 2310h (continuous overcurrent), register 03h (generic, current)"."""
+    code, register, manufacturer, length = emergency
+    text = f"EMCY {code:04X}h ({name_of(code)}), register {register:02X}h ({register_text(register)})"
+    if any(manufacturer):
+        text += f", {manufacturer.hex(' ')}"
+    return text if length == 8 else f"{text}, a frame of {length} bytes"

@@ -1,0 +1,61 @@
+"""One channel reads late: what it shows is d seconds old."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from estimator.effects.regression import full, linear
+
+if TYPE_CHECKING:
+    from estimator.parameters import Joint
+
+SENSOR, CURRENT, LINK = 0.0, 1.0, 2.0
+"""Codes of `channel`."""
+
+
+class ChannelDelay(Effect):
+    """See the equation; symbols as in `estimator.effects.effect`."""
+
+    name = "channel_delay"
+    group = "measurement"
+    equation = "reading(t) = truth(t - d): sensor = -d dtau/dt, current = -d di/dt, link = -d omega_l"
+    source = "first-order Taylor expansion of a shift in time"
+    tell_tale = "A loop between the channel and what it is compared with, whose area grows with frequency."
+    confused_with = ("rotor_inertia", "hysteresis", "viscous_friction")
+    experiment = "excitation"
+    parameters = (
+        Parameter("delay_s", "s", -0.02, 0.1),
+        Parameter("channel", "", 0.0, 2.0, default=0.0, fixed=True, whole=True),
+    )
+    hooks = ("sensor_nm", "current_a", "link_rad")
+
+    def sensor_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return what the sensor reads above the truth, Nm."""
+        if p["channel"] != SENSOR:
+            return full(0.0, s.torque_rate_nm_s)
+        return -p["delay_s"] * s.torque_rate_nm_s
+
+    def current_a(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return what the current reads above the truth, A."""
+        if p["channel"] != CURRENT:
+            return full(0.0, s.current_a)
+        return -p["delay_s"] * s.current_rate_a_s
+
+    def link_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return what the link encoder reads above the truth, rad."""
+        if p["channel"] != LINK:
+            return full(0.0, s.link_velocity_rad_s)
+        return -p["delay_s"] * s.link_velocity_rad_s
+
+    def at_sensor_of(self, p: Values) -> bool:
+        """Whether it is the sensor that is late."""
+        return p["channel"] == SENSOR
+
+    def terms(self, joint: Joint) -> Sequence[Term]:
+        """Return one column per channel."""
+        return tuple(linear("delay_s", 1e-3, channel=channel) for channel in (SENSOR, CURRENT, LINK))
+
+
+EFFECT = ChannelDelay()

@@ -1,0 +1,53 @@
+"""Cogging of the motor: the torque of its magnets against its slots."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from estimator.effects.regression import Wave
+
+if TYPE_CHECKING:
+    from estimator.parameters import Joint
+
+ORDERS = (6.0, 12.0, 18.0, 24.0, 36.0, 42.0, 48.0, 60.0, 72.0, 84.0)
+"""Usual lcm(poles, slots) and harmonics of the pole pairs; any other order: `term_of_order`."""
+
+
+class Cogging(Effect):
+    """See the equation; symbols as in `estimator.effects.effect`."""
+
+    name = "cogging"
+    group = "actuator"
+    equation = "loss = A cos(n theta_m + phi), A joint side"
+    source = "Hanselman 2006, Brushless Permanent Magnet Motor Design"
+    tell_tale = (
+        "A line of the motor balance at a multiple of lcm(poles, slots) cycles per motor revolution, "
+        "present without current."
+    )
+    confused_with = ("torque_ripple",)
+    experiment = "speed_ladder"
+    parameters = (
+        Parameter("amplitude_nm", "Nm", 0.0, 20.0),
+        Parameter("order_per_motor_rev", "1/rev", 5.0, 1000.0, fixed=True),
+        Parameter("phase_rad", "rad", -2.0 * math.pi, 2.0 * math.pi, default=0.0),
+    )
+    hooks = ("loss_nm",)
+    needs = ("motor_position_rad",)
+
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return the torque lost beyond the file's losses, Nm joint side."""
+        return p["amplitude_nm"] * x.cos(p["order_per_motor_rev"] * s.motor_position_rad + p["phase_rad"])
+
+    def terms(self, joint: Joint) -> Sequence[Term]:
+        """Return a wave (two columns) of each usual order."""
+        return tuple(self.term_of_order(order) for order in ORDERS)
+
+    def term_of_order(self, order: float) -> Term:
+        """Return the wave (two columns) of any order per motor revolution."""
+        return Wave("amplitude_nm", 0.1, {"order_per_motor_rev": float(order)}).term()
+
+
+EFFECT = Cogging()

@@ -1,0 +1,38 @@
+"""Coulomb friction: the joint file's value is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from estimator.effects.regression import linear
+
+if TYPE_CHECKING:
+    from estimator.parameters import Joint
+
+
+class CoulombFriction(Effect):
+    """See the equation; symbols as in `estimator.effects.effect`."""
+
+    name = "coulomb_friction"
+    group = "friction"
+    equation = "loss = (Fc' - Fc) s"
+    source = "Armstrong-Helouvry, Dupont, Canudas de Wit 1994, Automatica 30"
+    tell_tale = "A step of the motor balance at every reversal, the same at any speed, load and angle."
+    confused_with = ("stribeck_friction", "viscous_friction", "load_dependent_friction")
+    experiment = "speed_ladder"
+    parameters = (Parameter("coulomb_nm", "Nm", 0.0, 500.0, key="friction.coulomb_nm"),)
+    hooks = ("loss_nm",)
+    dissipative: ClassVar[bool] = True
+
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return the torque lost beyond the file's losses, Nm joint side."""
+        return (p["coulomb_nm"] - joint.friction.coulomb_nm) * s.direction
+
+    def terms(self, joint: Joint) -> Sequence[Term]:
+        """Return one column."""
+        return (linear("coulomb_nm", 1.0, joint.friction.coulomb_nm),)
+
+
+EFFECT = CoulombFriction()

@@ -1,0 +1,39 @@
+"""Zero of the current measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from estimator.effects.regression import full, linear
+
+if TYPE_CHECKING:
+    from estimator.parameters import Joint
+
+
+class CurrentOffset(Effect):
+    """See the equation; symbols as in `estimator.effects.effect`."""
+
+    name = "current_offset"
+    group = "actuator"
+    equation = "i = I + i0"
+    source = "zero error of a shunt or Hall current sensor"
+    tell_tale = (
+        "A constant of the motor balance of one joint, at rest too, whatever speed, direction and load."
+    )
+    confused_with = ("sensor_offset", "friction_asymmetry")
+    experiment = "zero_reading"
+    parameters = (Parameter("offset_a", "A", -5.0, 5.0),)
+    hooks = ("current_a",)
+
+    def current_a(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return what the current reads above the truth, A."""
+        return full(p["offset_a"], s.current_a)
+
+    def terms(self, joint: Joint) -> Sequence[Term]:
+        """Return one column."""
+        return (linear("offset_a", 0.01),)
+
+
+EFFECT = CurrentOffset()

@@ -1,0 +1,219 @@
+"""What an effect of the library is: one physical deviation from the rigid textbook joint, written once.
+
+Plant, estimator and diagnosis all read the same six hooks. With true values in capitals of what is measured
+(i, tau_s, theta_l) and K the stiffness, a joint with effects obeys, joint side,
+
+    tau_gear = G (Kt I - Jm alpha) - loss0 - loss_nm                 motor balance
+    tau_gear = K (theta_m/G - THETA_L + twist_rad) + D (...)          torsion balance
+    tau_gear = TAU_S + Jl alpha_l + load_nm                           link balance
+    i = I + current_a      theta_l = THETA_L + link_rad      tau_s = TAU_S + sensor_nm
+
+so that what a simulation without the effect leaves over is, from what is measured,
+
+    G (Kt i - Jm alpha) - loss0 - tau_s - Jl alpha_l    =  G Kt current_a + loss_nm + load_nm - sensor_nm
+    K (theta_m/G - theta_l) + D (...) - tau_s - Jl alpha_l  =  -K (twist_rad + link_rad) + load_nm - sensor_nm
+
+A hook is elementwise: fields of the state are floats or arrays alike, and functions come from `x` (`Functions`), so
+that one formula serves the 1 kHz loop and whole runs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol
+
+if TYPE_CHECKING:
+    from estimator.parameters import Joint
+
+Values = Mapping[str, float]
+"""Parameters of an effect by name, SI units."""
+
+MOTOR: Final = "motor"
+TORSION: Final = "torsion"
+BALANCES: Final = (MOTOR, TORSION)
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One parameter: plausible range low..high in `unit`; default None: must be given, NaN: the joint file's own
+    value; fixed: not refined by fits (an order, a channel); whole: a whole number, a code. key: key of the joint file
+    whose value it replaces, dotted, "" for none.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    default: float | None = None
+    fixed: bool = False
+    key: str = ""
+    whole: bool = False
+
+
+class State:
+    """What a hook may use, floats or arrays [n] of one joint in its own frame; NaN where it is not known.
+
+    current_a as measured; velocity_rad_s = omega_m/G; direction: sign of velocity, between -1 and 1 near rest;
+    motor_*: motor side; link_*: joint side; coupling_position_rad: link position of joint 1 (= - that of joint 2), the
+    sensor's angle; torque_nm: what the gear transmits; torsion_rad: theta_m/G - theta_l less its zero; time_s since
+    the run's first sample.
+    """
+
+    __slots__ = (
+        "coupling_position_rad",
+        "current_a",
+        "current_rate_a_s",
+        "direction",
+        "link_acceleration_rad_s2",
+        "link_position_rad",
+        "link_velocity_rad_s",
+        "motor_acceleration_rad_s2",
+        "motor_position_rad",
+        "temperature_c",
+        "time_s",
+        "torque_nm",
+        "torque_rate_nm_s",
+        "torsion_rad",
+        "velocity_rad_s",
+    )
+
+    current_a: Any
+    current_rate_a_s: Any
+    coupling_position_rad: Any
+    direction: Any
+    link_acceleration_rad_s2: Any
+    link_position_rad: Any
+    link_velocity_rad_s: Any
+    motor_acceleration_rad_s2: Any
+    motor_position_rad: Any
+    temperature_c: Any
+    time_s: Any
+    torque_nm: Any
+    torque_rate_nm_s: Any
+    torsion_rad: Any
+    velocity_rad_s: Any
+
+    def __init__(self, **fields: Any) -> None:
+        nan = float("nan")
+        for name in self.__slots__:
+            setattr(self, name, fields.pop(name, nan))
+        if fields:
+            raise TypeError(f"found fields {sorted(fields)}, expected some of {self.__slots__}")
+
+
+class Functions(Protocol):
+    """Elementwise functions for floats (`effects.functions.Scalar`) or arrays (`effects.functions.Whole`).
+
+    slip(d, travel): Maxwell-slip state in -1..1, dz = dd/travel held within; it remembers, so every effect of every
+    joint has `Functions` of its own in the loop, and an array is taken in order from z = 0.
+    """
+
+    def sin(self, a: Any) -> Any:
+        """Return sin of a."""
+
+    def cos(self, a: Any) -> Any:
+        """Return cos of a."""
+
+    def exp(self, a: Any) -> Any:
+        """Return exp of a."""
+
+    def tanh(self, a: Any) -> Any:
+        """Return tanh of a."""
+
+    def clip(self, a: Any, low: float, high: float) -> Any:
+        """Return a held within low..high."""
+
+    def slip(self, d: Any, travel: float) -> Any:
+        """Return the Maxwell-slip state, -1 to 1."""
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """A way to look for an effect by linear regression: the hooks at each of `basis` (less the hooks at the joint
+    file's own values) are columns; `combine(coefficients)` of the columns gives the parameters.
+    """
+
+    basis: tuple[Values, ...]
+    combine: Any  # Callable[[Sequence[float]], dict[str, float]]
+
+
+class Effect:
+    """Base of all effects. One file of this package holds one subclass and an instance of it named EFFECT.
+
+    equation, source: one line each; tell_tale: where it shows and how one recognises it; confused_with: names of effects
+    that can look the same on poor runs; experiment: kind of motion that separates it (see `EXPERIMENTS`);
+    hooks: names of the hooks it has; needs: fields of State without which it cannot be judged;
+    dissipative: loss_nm is a friction (opposes velocity); at_sensor: it belongs to the coupling's sensor, not to a joint.
+    geometric: its twist is one of the teeth, so the damper beside the spring feels its rate too (kinematic error), unlike
+    a property of the spring itself.
+    follows_torsion: its state follows the torsion itself (slip, play), for which tau/K is not good enough.
+    changes_joint: `joint()` says it all for plant and estimator, which then leave its hooks alone (inertias).
+    """
+
+    name: ClassVar[str]
+    group: ClassVar[str]  # friction, transmission, actuator, measurement, load
+    equation: ClassVar[str]
+    source: ClassVar[str]
+    tell_tale: ClassVar[str]
+    confused_with: ClassVar[tuple[str, ...]] = ()
+    experiment: ClassVar[str] = "excitation"
+    parameters: ClassVar[tuple[Parameter, ...]]
+    hooks: ClassVar[tuple[str, ...]]
+    needs: ClassVar[tuple[str, ...]] = ()
+    dissipative: ClassVar[bool] = False
+    at_sensor: ClassVar[bool] = False
+    changes_joint: ClassVar[bool] = False
+    geometric: ClassVar[bool] = False
+    follows_torsion: ClassVar[bool] = False
+
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Motor torque lost in addition to the joint file's losses, Nm joint side."""
+        raise NotImplementedError
+
+    def twist_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """What the spring sees in addition to theta_m/G - theta_l, rad."""
+        raise NotImplementedError
+
+    def load_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Torque taken between gear and sensor in addition to the file's link inertia, Nm."""
+        raise NotImplementedError
+
+    def current_a(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """What the current reads above the truth, A."""
+        raise NotImplementedError
+
+    def link_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """What the link encoder reads above the truth, rad."""
+        raise NotImplementedError
+
+    def sensor_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """What the torque sensor reads above the truth, Nm."""
+        raise NotImplementedError
+
+    def joint(self, p: Values, joint: Joint) -> Joint:
+        """The joint with the values that the effect replaces (`changes_joint`)."""
+        return joint
+
+    def at_sensor_of(self, p: Values) -> bool:
+        """Whether it belongs to the coupling's sensor with these parameters (see `at_sensor`)."""
+        return self.at_sensor
+
+    def at_motor_of(self, p: Values) -> bool:
+        """Whether with these parameters it is the motor's encoder that reads wrong: by -G link_rad, motor side."""
+        return False
+
+    def largest(self, joint: Joint, p: Values) -> float:
+        """Largest size of its leading parameter, beside the others of p, with which the joint would still move as without
+        it: one that would have to be larger to show is invisible, whatever its columns say of motions without it.
+        """
+        return math.inf
+
+    def terms(self, joint: Joint) -> Sequence[Term]:
+        """Ways to look for it; the best is taken and its parameters refined."""
+        raise NotImplementedError
+
+    def term_of_order(self, order: float) -> Term | None:
+        """The way to look for a wave of `order` per motor revolution; None for effects that are none."""
+        return None

@@ -1,0 +1,53 @@
+"""An encoder whose scale does not turn about its axis: one wave per revolution of that encoder."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from estimator.effects.regression import Wave
+
+if TYPE_CHECKING:
+    from estimator.parameters import Joint
+
+
+class EncoderEccentricity(Effect):
+    """See the equation; symbols as in `estimator.effects.effect`."""
+
+    name = "encoder_eccentricity"
+    group = "measurement"
+    equation = "link = A sin(theta_l + phi); motor_side=1: link = -A/G sin(theta_m + phi), A motor side"
+    source = "one-per-revolution error e/r of an eccentric scale; Slocum 1992, Precision Machine Design"
+    tell_tale = (
+        "The torsion swings once per revolution of the link (or of the motor), whatever the load. Of the link: nothing "
+        "in the motor balance; of the motor: an acceleration there that grows with the square of the velocity."
+    )
+    confused_with = ("kinematic_error", "unbalance", "sensor_crosstalk")
+    experiment = "excitation"
+    parameters = (
+        Parameter("amplitude_rad", "rad", 0.0, 0.1),
+        Parameter("phase_rad", "rad", -2.0 * math.pi, 2.0 * math.pi, default=0.0),
+        Parameter("motor_side", "", 0.0, 1.0, default=0.0, fixed=True, whole=True),
+    )
+    hooks = ("link_rad",)
+    needs = ("torsion_rad",)
+
+    def link_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return what the link encoder reads above the truth, rad."""
+        if p["motor_side"]:
+            return (-p["amplitude_rad"] / joint.gear_ratio) * x.sin(s.motor_position_rad + p["phase_rad"])
+        return p["amplitude_rad"] * x.sin(s.link_position_rad + p["phase_rad"])
+
+    def at_motor_of(self, p: Values) -> bool:
+        """Whether it is the motor's encoder."""
+        return bool(p["motor_side"])
+
+    def terms(self, joint: Joint) -> Sequence[Term]:
+        """Return a wave of the link's encoder and one of the motor's."""
+        link = Wave("amplitude_rad", 1e-5, {"motor_side": 0.0}).term()
+        return link, Wave("amplitude_rad", 1e-3, {"motor_side": 1.0}).term()
+
+
+EFFECT = EncoderEccentricity()

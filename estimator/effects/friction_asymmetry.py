@@ -1,0 +1,41 @@
+"""Friction that is larger in one direction than in the other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from estimator.effects.regression import linear
+
+if TYPE_CHECKING:
+    from estimator.parameters import Joint
+
+
+class FrictionAsymmetry(Effect):
+    """See the equation; symbols as in `estimator.effects.effect`."""
+
+    name = "friction_asymmetry"
+    group = "friction"
+    equation = "loss = a |s|"
+    source = "Armstrong-Helouvry, Dupont, Canudas de Wit 1994, Automatica 30 (levels by direction)"
+    tell_tale = (
+        "A constant of the motor balance that goes away at rest: a more in the positive, a less in the "
+        "negative direction."
+    )
+    confused_with = ("current_offset", "sensor_offset")
+    experiment = "zero_reading"
+    parameters = (Parameter("asymmetry_nm", "Nm", -100.0, 100.0),)
+    hooks = ("loss_nm",)
+    dissipative: ClassVar[bool] = True
+
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return the torque lost beyond the file's losses, Nm joint side."""
+        return p["asymmetry_nm"] * abs(s.direction)
+
+    def terms(self, joint: Joint) -> Sequence[Term]:
+        """Return one column."""
+        return (linear("asymmetry_nm", 1.0),)
+
+
+EFFECT = FrictionAsymmetry()

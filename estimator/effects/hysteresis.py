@@ -1,0 +1,48 @@
+"""Hysteresis of the gear's torsion: a loop of torque over torsion, the same at any rate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from estimator.effects.regression import linear
+
+if TYPE_CHECKING:
+    from estimator.parameters import Joint
+
+TRAVELS_RAD = (3e-5, 5e-5, 1e-4, 2e-4, 3e-4)
+"""Grid of the search; the fit refines it."""
+
+
+class Hysteresis(Effect):
+    """See the equation; symbols as in `estimator.effects.effect`."""
+
+    name = "hysteresis"
+    group = "transmission"
+    equation = "tau = K d + H z, dz = dd/travel within -1..1, so that twist = H/K z"
+    source = "Al-Bender, Lampaert, Swevers 2005, IEEE Trans. Automatic Control 50 (one Maxwell-slip element)"
+    tell_tale = (
+        "The torsion balance changes after each reversal of the load, not of the velocity, over a fixed "
+        "travel."
+    )
+    confused_with = ("lost_motion", "nonlinear_stiffness", "channel_delay")
+    experiment = "slow_reversals"
+    parameters = (
+        Parameter("torque_nm", "Nm", 0.0, 50.0),
+        Parameter("travel_rad", "rad", 1e-06, 0.01),
+    )
+    hooks = ("twist_rad",)
+    needs = ("torsion_rad",)
+    follows_torsion = True
+
+    def twist_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return what the spring sees beyond theta_m/G - theta_l, rad."""
+        return (p["torque_nm"] / joint.stiffness_nm_per_rad) * x.slip(s.torsion_rad, p["travel_rad"])
+
+    def terms(self, joint: Joint) -> Sequence[Term]:
+        """Return one column per travel."""
+        return tuple(linear("torque_nm", 1.0, travel_rad=travel) for travel in TRAVELS_RAD)
+
+
+EFFECT = Hysteresis()

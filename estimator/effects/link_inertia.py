@@ -1,0 +1,44 @@
+"""Link inertia: the joint file's value is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from estimator.effects.regression import linear
+
+if TYPE_CHECKING:
+    from estimator.parameters import Joint
+
+
+class LinkInertia(Effect):
+    """See the equation; symbols as in `estimator.effects.effect`."""
+
+    name = "link_inertia"
+    group = "load"
+    equation = "load = (Jl' - Jl) alpha_l"
+    source = "Newton-Euler; Swevers, Verdonck, De Schutter 2007, IEEE Control Systems Magazine 27"
+    tell_tale = "Motor and torsion balance of one joint are in phase with the link's acceleration."
+    confused_with = ("rotor_inertia", "channel_delay")
+    experiment = "excitation"
+    parameters = (Parameter("link_inertia_kgm2", "kg m2", 0.0, 1000.0, key="link_inertia_kgm2"),)
+    hooks = ("load_nm",)
+    needs = ("link_acceleration_rad_s2",)
+    changes_joint: ClassVar[bool] = True
+
+    def load_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return the torque taken before the sensor, Nm."""
+        return (p["link_inertia_kgm2"] - joint.link_inertia_kgm2) * s.link_acceleration_rad_s2
+
+    def joint(self, p: Values, joint: Joint) -> Joint:
+        """Return the joint with this inertia."""
+        return replace(joint, link_inertia_kgm2=p["link_inertia_kgm2"])
+
+    def terms(self, joint: Joint) -> Sequence[Term]:
+        """Return one column."""
+        return (linear("link_inertia_kgm2", 0.01, joint.link_inertia_kgm2),)
+
+
+EFFECT = LinkInertia()

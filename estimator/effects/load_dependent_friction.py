@@ -1,0 +1,41 @@
+"""Friction that grows with the torque that the gear transmits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from estimator.effects.regression import linear
+
+if TYPE_CHECKING:
+    from estimator.parameters import Joint
+
+
+class LoadDependentFriction(Effect):
+    """See the equation; symbols as in `estimator.effects.effect`."""
+
+    name = "load_dependent_friction"
+    group = "friction"
+    equation = "loss = mu |tau| s"
+    source = "Bittencourt, Wernholt, Sander-Tavallaey, Brogardh 2010, IROS; model M3 of BAM, arXiv:2410.08650"
+    tell_tale = (
+        "Steps at reversals that grow with the load: half the difference of both directions at equal torque."
+    )
+    confused_with = ("torque_constant", "torque_constant_saturation", "sensor_gain", "coulomb_friction")
+    experiment = "load_at_both_directions"
+    parameters = (Parameter("load_coefficient", "", 0.0, 0.9),)
+    hooks = ("loss_nm",)
+    needs = ("torque_nm",)
+    dissipative: ClassVar[bool] = True
+
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return the torque lost beyond the file's losses, Nm joint side."""
+        return p["load_coefficient"] * abs(s.torque_nm) * s.direction
+
+    def terms(self, joint: Joint) -> Sequence[Term]:
+        """Return one column."""
+        return (linear("load_coefficient", 0.1),)
+
+
+EFFECT = LoadDependentFriction()

@@ -1,0 +1,43 @@
+"""Lost motion: play between gear and link, crossed when the torque changes its sign."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from estimator.effects.regression import linear
+
+if TYPE_CHECKING:
+    from estimator.parameters import Joint
+
+WIDTHS_RAD = (3e-5, 1e-4, 3e-4, 1e-3)
+"""Grid of the search; the fit refines it."""
+
+
+class LostMotion(Effect):
+    """See the equation; symbols as in `estimator.effects.effect`."""
+
+    name = "lost_motion"
+    group = "transmission"
+    equation = "twist = -clip(d, -w/2, w/2), w the full width"
+    source = "Nordin and Gutman 2002, Automatica 38 (dead zone)"
+    tell_tale = "The torsion balance jumps by K w where the torque, not the velocity, changes its sign."
+    confused_with = ("hysteresis", "nonlinear_stiffness")
+    experiment = "load_ramp"
+    parameters = (Parameter("width_rad", "rad", 0.0, 0.02),)
+    hooks = ("twist_rad",)
+    needs = ("torsion_rad",)
+    follows_torsion = True
+
+    def twist_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return what the spring sees beyond theta_m/G - theta_l, rad."""
+        half = 0.5 * p["width_rad"]
+        return -x.clip(s.torsion_rad, -half, half)
+
+    def terms(self, joint: Joint) -> Sequence[Term]:
+        """Return one column per width; the coefficient scales the width, exact beyond the play."""
+        return tuple(linear("width_rad", width) for width in WIDTHS_RAD)
+
+
+EFFECT = LostMotion()

@@ -1,0 +1,56 @@
+"""The gear is not a spring of the joint file's stiffness: another one, or one that hardens."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from estimator.effects.regression import Linear
+
+if TYPE_CHECKING:
+    from estimator.parameters import Joint
+
+
+class NonlinearStiffness(Effect):
+    """See the equation; symbols as in `estimator.effects.effect`."""
+
+    name = "nonlinear_stiffness"
+    group = "transmission"
+    equation = "tau = K' d + K3 d^3, so that twist = (K'/K - 1) d + K3/K d^3"
+    source = "Tuttle and Seering 1996, IEEE Trans. Robotics and Automation 12"
+    tell_tale = (
+        "The torsion balance is an odd function of the torque alone: a slope, and a cubic at large loads."
+    )
+    confused_with = ("hysteresis", "lost_motion", "sensor_gain")
+    experiment = "load_ramp"
+    parameters = (
+        Parameter(
+            "stiffness_nm_per_rad", "Nm/rad", 100.0, 10000000.0, default=math.nan, key="stiffness_nm_per_rad"
+        ),
+        Parameter("cubic_nm_per_rad3", "Nm/rad3", -100000000000.0, 1000000000000.0, default=0.0),
+    )
+    hooks = ("twist_rad",)
+    needs = ("torsion_rad",)
+
+    def twist_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return what the spring sees beyond theta_m/G - theta_l, rad."""
+        own = joint.stiffness_nm_per_rad
+        d = s.torsion_rad
+        return (p.get("stiffness_nm_per_rad", own) / own - 1.0) * d + (p["cubic_nm_per_rad3"] / own) * (
+            d * d * d
+        )
+
+    def terms(self, joint: Joint) -> Sequence[Term]:
+        """Return another slope, hardening alone, and both."""
+        own = joint.stiffness_nm_per_rad
+        # at the rated torque, K3 d^3 is a tenth of the torque
+        cubic = 0.1 * own * (own / joint.rated_torque_nm) ** 2
+        slope = Linear(("stiffness_nm_per_rad",), (own,), (0.1 * own,), {"cubic_nm_per_rad3": 0.0})
+        hardening = Linear(("cubic_nm_per_rad3",), (0.0,), (cubic,), {"stiffness_nm_per_rad": own})
+        both = Linear(("stiffness_nm_per_rad", "cubic_nm_per_rad3"), (own, 0.0), (0.1 * own, cubic))
+        return slope.term(), hardening.term(), both.term()
+
+
+EFFECT = NonlinearStiffness()

@@ -1,0 +1,46 @@
+"""Rotor inertia: the joint file's value is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from estimator.effects.regression import linear
+
+if TYPE_CHECKING:
+    from estimator.parameters import Joint
+
+
+class RotorInertia(Effect):
+    """See the equation; symbols as in `estimator.effects.effect`."""
+
+    name = "rotor_inertia"
+    group = "actuator"
+    equation = "loss = G (Jm' - Jm) alpha"
+    source = "Newton-Euler; Swevers, Verdonck, De Schutter 2007, IEEE Control Systems Magazine 27"
+    tell_tale = "The motor balance is in phase with the motor's acceleration."
+    confused_with = ("link_inertia", "channel_delay", "viscous_friction")
+    experiment = "excitation"
+    parameters = (Parameter("rotor_inertia_kgm2", "kg m2", 1e-09, 1.0, key="rotor_inertia_kgm2"),)
+    hooks = ("loss_nm",)
+    needs = ("motor_acceleration_rad_s2",)
+    changes_joint: ClassVar[bool] = True
+
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return the torque lost beyond the file's losses, Nm joint side."""
+        more = p["rotor_inertia_kgm2"] - joint.rotor_inertia_kgm2
+        return joint.gear_ratio * more * s.motor_acceleration_rad_s2
+
+    def joint(self, p: Values, joint: Joint) -> Joint:
+        """Return the joint with this inertia."""
+        return replace(joint, rotor_inertia_kgm2=p["rotor_inertia_kgm2"])
+
+    def terms(self, joint: Joint) -> Sequence[Term]:
+        """Return one column."""
+        own = joint.rotor_inertia_kgm2
+        return (linear("rotor_inertia_kgm2", 0.1 * own, own),)
+
+
+EFFECT = RotorInertia()

@@ -1,0 +1,49 @@
+"""The torque sensor reads bending too: once per revolution of the coupling."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from estimator.effects.regression import Wave
+
+if TYPE_CHECKING:
+    from estimator.parameters import Joint
+
+
+class SensorCrosstalk(Effect):
+    """See the equation; symbols as in `estimator.effects.effect`."""
+
+    name = "sensor_crosstalk"
+    group = "measurement"
+    equation = "sensor = (A + share tau) cos(theta_c + phi), theta_c link position of joint 1"
+    source = "parasitic bending moment of a torque transducer, fixed in space, first order"
+    tell_tale = (
+        "All balances of both joints swing once per revolution of the coupling; with the load where the "
+        "load bends."
+    )
+    confused_with = ("unbalance", "encoder_eccentricity")
+    experiment = "excitation"
+    parameters = (
+        Parameter("amplitude_nm", "Nm", 0.0, 20.0, default=0.0),
+        Parameter("share", "", 0.0, 0.5, default=0.0),
+        Parameter("phase_rad", "rad", -2.0 * math.pi, 2.0 * math.pi, default=0.0),
+    )
+    hooks = ("sensor_nm",)
+    needs = ("coupling_position_rad", "torque_nm")
+    at_sensor: ClassVar[bool] = True
+
+    def sensor_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return what the sensor reads above the truth, Nm."""
+        size = p["amplitude_nm"] + p["share"] * s.torque_nm
+        return size * x.cos(s.coupling_position_rad + p["phase_rad"])
+
+    def terms(self, joint: Joint) -> Sequence[Term]:
+        """Return a wave of constant size and one in proportion to the load."""
+        constant = Wave("amplitude_nm", 0.1, {"share": 0.0}).term()
+        return constant, Wave("share", 0.01, {"amplitude_nm": 0.0}).term()
+
+
+EFFECT = SensorCrosstalk()

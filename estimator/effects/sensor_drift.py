@@ -1,0 +1,45 @@
+"""Zero of the torque sensor that wanders with time or temperature."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from estimator.effects.regression import FALLBACK_C, Slope, above, linear, reference_of
+
+if TYPE_CHECKING:
+    from estimator.parameters import Joint
+
+
+class SensorDrift(Effect):
+    """See the equation; symbols as in `estimator.effects.effect`."""
+
+    name = "sensor_drift"
+    group = "measurement"
+    equation = "tau_s = TAU_S + r t + k (T - T0), t since the run's first sample"
+    source = "zero drift and temperature effect on zero, as in data sheets of torque transducers"
+    tell_tale = "A constant of all balances of both joints that grows with time or temperature, at rest too."
+    confused_with = ("sensor_offset", "temperature_dependent_friction")
+    experiment = "warm_up"
+    parameters = (
+        Parameter("rate_nm_per_s", "Nm/s", -1.0, 1.0, default=0.0),
+        Parameter("per_k_nm", "Nm/K", -5.0, 5.0, default=0.0),
+        Parameter("reference_c", "°C", -100.0, 200.0, default=FALLBACK_C),
+    )
+    hooks = ("sensor_nm",)
+    needs = ("time_s",)
+    at_sensor: ClassVar[bool] = True
+
+    def sensor_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return what the sensor reads above the truth, Nm."""
+        drift = p["rate_nm_per_s"] * s.time_s
+        return drift + p["per_k_nm"] * above(s.temperature_c, p["reference_c"]) if p["per_k_nm"] else drift
+
+    def terms(self, joint: Joint) -> Sequence[Term]:
+        """Return a drift with time, and one with temperature (two columns: slope and constant)."""
+        time = linear("rate_nm_per_s", 1e-3, per_k_nm=0.0, reference_c=FALLBACK_C)
+        return time, Slope("per_k_nm", 0.01, reference_of(joint), {"rate_nm_per_s": 0.0}).term()
+
+
+EFFECT = SensorDrift()

@@ -1,0 +1,38 @@
+"""Zero of the torque sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from estimator.effects.regression import full, linear
+
+if TYPE_CHECKING:
+    from estimator.parameters import Joint
+
+
+class SensorOffset(Effect):
+    """See the equation; symbols as in `estimator.effects.effect`."""
+
+    name = "sensor_offset"
+    group = "measurement"
+    equation = "tau_s = TAU_S + b"
+    source = "zero signal of a torque transducer, as in DIN 51309"
+    tell_tale = "A constant of all balances: both joints, motor and torsion, at rest too."
+    confused_with = ("current_offset", "friction_asymmetry", "sensor_drift")
+    experiment = "zero_reading"
+    parameters = (Parameter("offset_nm", "Nm", -100.0, 100.0),)
+    hooks = ("sensor_nm",)
+    at_sensor: ClassVar[bool] = True
+
+    def sensor_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return what the sensor reads above the truth, Nm."""
+        return full(p["offset_nm"], s.torque_nm)
+
+    def terms(self, joint: Joint) -> Sequence[Term]:
+        """Return one column."""
+        return (linear("offset_nm", 0.1),)
+
+
+EFFECT = SensorOffset()

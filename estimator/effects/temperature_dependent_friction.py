@@ -1,0 +1,103 @@
+"""Friction that falls as the grease warms up."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from estimator.effects.regression import SPAN_K, above, reference_of
+
+if TYPE_CHECKING:
+    from estimator.parameters import Joint
+
+RATES_PER_K = (0.003, 0.015, 0.03)
+"""Grid of the search: how curved the fall over temperature is; the fit refines it."""
+
+_FLAT = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class _Exponential:
+    """c1 (E - 1) + c2 (r E - 1) with E = exp(-k (T - Tp)), r = exp(k SPAN_K), as exp(-b (T - T0)) - 1.
+
+    Value and slope are those at the reference Tp, so that it is exact where a single exponential is meant.
+    """
+
+    name: str
+    rate: float
+    reference_c: float
+    other: Mapping[str, float]
+
+    def __call__(self, c: Sequence[float]) -> dict[str, float]:
+        """Return rate and reference; the file's reference where there is no slope."""
+        steep = float(c[0]) + float(c[1]) * math.exp(self.rate * SPAN_K)
+        value = 1.0 + steep - (float(c[0]) + float(c[1]))
+        rate, reference = 0.0, self.reference_c
+        if value > 0.0:
+            rate = self.rate * steep / value
+            if abs(steep) > _FLAT:
+                reference += math.log(value) / rate
+        elif steep:
+            rate = math.copysign(math.inf, steep)  # friction that would feed energy in: out of any range
+        return {self.name: rate, "reference_c": reference} | dict(self.other)
+
+    def term(self) -> Term:
+        """Return the term: columns at the reference and SPAN_K above."""
+        basis = tuple(
+            {self.name: self.rate, "reference_c": self.reference_c + span} | dict(self.other)
+            for span in (0.0, SPAN_K)
+        )
+        return Term(basis, self)
+
+
+class TemperatureDependentFriction(Effect):
+    """See the equation; symbols as in `estimator.effects.effect`."""
+
+    name = "temperature_dependent_friction"
+    group = "friction"
+    equation = "loss = Fv v (exp(-b (T - T0)) - 1) + Fc s (exp(-c (T - T0)) - 1)"
+    source = (
+        "Bittencourt and Gunnarsson 2012, J. Dynamic Systems, Measurement and Control 134; "
+        "Wolf and Iskandar 2018, ICRA"
+    )
+    tell_tale = (
+        "The slope of the motor balance over velocity falls as the joint warms up; nothing changes at rest."
+    )
+    confused_with = ("viscous_friction", "torque_constant_temperature", "sensor_drift")
+    experiment = "warm_up"
+    parameters = (
+        Parameter("viscous_per_k", "1/K", -0.005, 0.2),
+        Parameter("coulomb_per_k", "1/K", -0.05, 0.1, default=0.0),
+        Parameter("reference_c", "°C", -100.0, 200.0),
+    )
+    hooks = ("loss_nm",)
+    needs = ("temperature_c",)
+    dissipative = True
+
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return the torque lost beyond the file's losses, Nm joint side; NaN temperature: 0."""
+        own = joint.friction
+        warmer = above(s.temperature_c, p["reference_c"])
+        viscous = x.exp(-p["viscous_per_k"] * warmer) - 1.0
+        loss = own.viscous_nms_per_rad * s.velocity_rad_s * viscous
+        if p["coulomb_per_k"]:
+            coulomb = x.exp(-p["coulomb_per_k"] * warmer) - 1.0
+            loss = loss + own.coulomb_nm * s.direction * coulomb
+        return loss
+
+    def terms(self, joint: Joint) -> Sequence[Term]:
+        """Return two columns (slope over temperature, constant) per rate, of viscous and of Coulomb friction."""
+        reference = reference_of(joint)
+        viscous, coulomb = "viscous_per_k", "coulomb_per_k"
+        terms: list[Term] = []
+        if joint.friction.viscous_nms_per_rad:
+            terms += [_Exponential(viscous, k, reference, {coulomb: 0.0}).term() for k in RATES_PER_K]
+        if joint.friction.coulomb_nm:
+            terms.append(_Exponential(coulomb, RATES_PER_K[0], reference, {viscous: 0.0}).term())
+        return tuple(terms)
+
+
+EFFECT = TemperatureDependentFriction()

@@ -1,0 +1,50 @@
+"""Torque constant: the joint file's value is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from estimator.effects.regression import linear
+
+if TYPE_CHECKING:
+    from estimator.parameters import Joint
+
+
+class TorqueConstant(Effect):
+    """See the equation; symbols as in `estimator.effects.effect`."""
+
+    name = "torque_constant"
+    group = "actuator"
+    equation = "loss = -G (Kt' - Kt) i"
+    source = "definition of Kt; Hanselman 2006, Brushless Permanent Magnet Motor Design"
+    tell_tale = (
+        "The motor balance is proportional to the current, in both directions of motion alike; the other "
+        "joint does not see it."
+    )
+    confused_with = (
+        "sensor_gain",
+        "load_dependent_friction",
+        "torque_constant_saturation",
+        "torque_constant_temperature",
+    )
+    experiment = "load_at_both_directions"
+    parameters = (
+        Parameter("torque_constant_nm_per_a", "Nm/A", 0.0001, 100.0, key="torque_constant_nm_per_a"),
+    )
+    hooks = ("loss_nm",)
+
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return the torque lost beyond the file's losses, Nm joint side."""
+        return (
+            -joint.gear_ratio * (p["torque_constant_nm_per_a"] - joint.torque_constant_nm_per_a) * s.current_a
+        )
+
+    def terms(self, joint: Joint) -> Sequence[Term]:
+        """Return one column."""
+        own = joint.torque_constant_nm_per_a
+        return (linear("torque_constant_nm_per_a", 0.01 * own, own),)
+
+
+EFFECT = TorqueConstant()

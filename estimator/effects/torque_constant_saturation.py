@@ -1,0 +1,41 @@
+"""Saturation: at large currents the motor gives less torque per ampere."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from estimator.effects.regression import linear
+
+if TYPE_CHECKING:
+    from estimator.parameters import Joint
+
+
+class TorqueConstantSaturation(Effect):
+    """See the equation; symbols as in `estimator.effects.effect`."""
+
+    name = "torque_constant_saturation"
+    group = "actuator"
+    equation = "tau_motor = Kt i (1 - k |i|), so that loss = G Kt k i |i|"
+    source = "Hanselman 2006, Brushless Permanent Magnet Motor Design (iron saturation, first order)"
+    tell_tale = (
+        "The motor balance bends with the current: nothing at small currents, odd and quadratic at large "
+        "ones."
+    )
+    confused_with = ("torque_constant", "load_dependent_friction", "sensor_gain")
+    experiment = "load_at_both_directions"
+    parameters = (Parameter("saturation_per_a", "1/A", 0.0, 0.5),)
+    hooks = ("loss_nm",)
+
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return the torque lost beyond the file's losses, Nm joint side."""
+        scale = joint.gear_ratio * joint.torque_constant_nm_per_a * p["saturation_per_a"]
+        return scale * s.current_a * abs(s.current_a)
+
+    def terms(self, joint: Joint) -> Sequence[Term]:
+        """Return one column."""
+        return (linear("saturation_per_a", 0.01),)
+
+
+EFFECT = TorqueConstantSaturation()

@@ -1,0 +1,45 @@
+"""Warm magnets are weaker: the torque constant falls with temperature."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from estimator.effects.regression import Slope, above, reference_of
+
+if TYPE_CHECKING:
+    from estimator.parameters import Joint
+
+
+class TorqueConstantTemperature(Effect):
+    """See the equation; symbols as in `estimator.effects.effect`."""
+
+    name = "torque_constant_temperature"
+    group = "actuator"
+    equation = "Kt (1 + a (T - T0)), so that loss = -G Kt a (T - T0) i"
+    source = "reversible remanence coefficient of NdFeB magnets, IEC 60404-8-1: about -0.0011 per K"
+    tell_tale = (
+        "The gain of the motor balance over the current drifts with temperature; at equal temperature it "
+        "is constant."
+    )
+    confused_with = ("torque_constant", "temperature_dependent_friction", "sensor_gain")
+    experiment = "warm_up"
+    parameters = (
+        Parameter("per_k", "1/K", -0.02, 0.02),
+        Parameter("reference_c", "°C", -100.0, 200.0),
+    )
+    hooks = ("loss_nm",)
+    needs = ("temperature_c",)
+
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return the torque lost beyond the file's losses, Nm joint side."""
+        scale = -joint.gear_ratio * joint.torque_constant_nm_per_a * p["per_k"]
+        return scale * above(s.temperature_c, p["reference_c"]) * s.current_a
+
+    def terms(self, joint: Joint) -> Sequence[Term]:
+        """Return two columns: slope over temperature, and constant."""
+        return (Slope("per_k", 1e-3, reference_of(joint)).term(),)
+
+
+EFFECT = TorqueConstantTemperature()

@@ -1,0 +1,53 @@
+"""Torque ripple of the wave generator: few cycles per motor revolution."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from estimator.effects.regression import Wave
+
+if TYPE_CHECKING:
+    from estimator.parameters import Joint
+
+ORDERS = (1.0, 2.0, 4.0)
+"""Shaft, its two lobes, and their second harmonic."""
+
+
+class TorqueRipple(Effect):
+    """See the equation; symbols as in `estimator.effects.effect`."""
+
+    name = "torque_ripple"
+    group = "transmission"
+    equation = "loss = A cos(n theta_m + phi)"
+    source = "Tuttle and Seering 1996, IEEE Trans. Robotics and Automation 12"
+    tell_tale = (
+        "A line of the motor balance at 1, 2 or 4 cycles per motor revolution whose frequency follows "
+        "the speed; none in the torsion."
+    )
+    confused_with = ("cogging", "kinematic_error")
+    experiment = "speed_ladder"
+    parameters = (
+        Parameter("amplitude_nm", "Nm", 0.0, 20.0),
+        Parameter("order_per_motor_rev", "1/rev", 0.1, 1000.0, default=2.0, fixed=True),
+        Parameter("phase_rad", "rad", -2.0 * math.pi, 2.0 * math.pi, default=0.0),
+    )
+    hooks = ("loss_nm",)
+    needs = ("motor_position_rad",)
+
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return the torque lost beyond the file's losses, Nm joint side."""
+        return p["amplitude_nm"] * x.cos(p["order_per_motor_rev"] * s.motor_position_rad + p["phase_rad"])
+
+    def terms(self, joint: Joint) -> Sequence[Term]:
+        """Return a wave (two columns) of each usual order."""
+        return tuple(self.term_of_order(order) for order in ORDERS)
+
+    def term_of_order(self, order: float) -> Term:
+        """Return the wave (two columns) of any order per motor revolution."""
+        return Wave("amplitude_nm", 0.1, {"order_per_motor_rev": float(order)}).term()
+
+
+EFFECT = TorqueRipple()

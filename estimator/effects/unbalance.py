@@ -1,0 +1,45 @@
+"""An unbalanced link: its weight turns with the link's angle."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from estimator.effects.regression import Wave
+
+if TYPE_CHECKING:
+    from estimator.parameters import Joint
+
+
+class Unbalance(Effect):
+    """See the equation; symbols as in `estimator.effects.effect`."""
+
+    name = "unbalance"
+    group = "load"
+    equation = "load = U sin(theta_l + phi)"
+    source = "gravity of an eccentric mass, U = m g r"
+    tell_tale = (
+        "Motor and torsion balance of one joint swing once per revolution of the link, whatever load and "
+        "speed."
+    )
+    confused_with = ("sensor_crosstalk", "encoder_eccentricity")
+    experiment = "excitation"
+    parameters = (
+        Parameter("moment_nm", "Nm", 0.0, 100.0),
+        Parameter("phase_rad", "rad", -2.0 * math.pi, 2.0 * math.pi, default=0.0),
+    )
+    hooks = ("load_nm",)
+    needs = ("link_position_rad",)
+
+    def load_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return the torque taken before the sensor, Nm."""
+        return p["moment_nm"] * x.sin(s.link_position_rad + p["phase_rad"])
+
+    def terms(self, joint: Joint) -> Sequence[Term]:
+        """Return one wave (two columns)."""
+        return (Wave("moment_nm", 0.1).term(),)
+
+
+EFFECT = Unbalance()

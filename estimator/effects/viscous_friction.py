@@ -1,0 +1,40 @@
+"""Viscous friction: the joint file's value is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from estimator.effects.regression import linear
+
+if TYPE_CHECKING:
+    from estimator.parameters import Joint
+
+
+class ViscousFriction(Effect):
+    """See the equation; symbols as in `estimator.effects.effect`."""
+
+    name = "viscous_friction"
+    group = "friction"
+    equation = "loss = (Fv' - Fv) v"
+    source = "Armstrong-Helouvry, Dupont, Canudas de Wit 1994, Automatica 30"
+    tell_tale = "The motor balance is proportional to velocity in both directions, at any load."
+    confused_with = ("coulomb_friction", "temperature_dependent_friction", "rotor_inertia")
+    experiment = "speed_ladder"
+    parameters = (
+        Parameter("viscous_nms_per_rad", "Nms/rad", 0.0, 500.0, key="friction.viscous_nms_per_rad"),
+    )
+    hooks = ("loss_nm",)
+    dissipative: ClassVar[bool] = True
+
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+        """Return the torque lost beyond the file's losses, Nm joint side."""
+        return (p["viscous_nms_per_rad"] - joint.friction.viscous_nms_per_rad) * s.velocity_rad_s
+
+    def terms(self, joint: Joint) -> Sequence[Term]:
+        """Return one column."""
+        return (linear("viscous_nms_per_rad", 1.0, joint.friction.viscous_nms_per_rad),)
+
+
+EFFECT = ViscousFriction()

@@ -1,0 +1,206 @@
+"""`jtq diagnose`: what the simulation gets wrong on measured runs, by name; findings, report, extended joint file."""
+
+from __future__ import annotations
+
+import argparse
+import datetime as dt
+import importlib.util
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+from estimator.checked import ConfigError
+from estimator.parameters import Joint
+from estimator.run import RunTableError
+from sim_can.run_files import ColumnMap, RunError
+from sysid.campaign.plan import Plan
+from sysid.diagnosis.channels import Checked, check_runs
+from sysid.diagnosis.extended_joint import FILE, write_extended
+from sysid.diagnosis.findings import INSUFFICIENT, NO_GAP, Findings
+from sysid.diagnosis.findings_json import to_mapping
+from sysid.diagnosis.run_inputs import UsageError, joint_files, joints_of, read_all
+from sysid.diagnosis.summary import summary_lines
+from sysid.fit_inputs import InputRun
+
+BY: Final = "jtq diagnose"
+_NEEDED: Final = ("matplotlib", "jinja2")
+FINDINGS: Final = "findings.json"
+REPORT: Final = "report.html"
+PLAN: Final = "next_experiment.plan.yaml"
+_OWN: Final = (FINDINGS, REPORT, PLAN, FILE, *(f"extended.joint{n}.yaml" for n in range(1, 8)))
+"""All names that a diagnosis may write."""
+
+
+def main(argv: list[str]) -> int:
+    """Diagnose and write; exit status 0 no gap, 3 any other verdict, 1 failure, 2 usage."""
+    options = _parser().parse_args(argv)
+    missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
+    if missing:
+        print(f"{BY}: {', '.join(missing)} not installed: pip install 'jtqd[train]'", file=sys.stderr)
+        return 1
+    try:
+        columns = None if options.columns is None else ColumnMap.load(options.columns)
+        files = joint_files(options.joint, columns)
+        _check_out(options.out, options.force)
+        runs = read_all(options.runs, columns)
+        joints = joints_of(files, runs)
+        for run in runs:
+            for note in run.notes:
+                print(f"{BY}: {run.name}: {note}", file=sys.stderr)
+        findings = diagnosed(runs, joints)
+        mapping = _write(options.out, findings, joints, {run.name: run.sha256 for run in runs})
+    except UsageError as error:
+        print(f"{BY}: {error}", file=sys.stderr)
+        return 2
+    except (ConfigError, RunError, RunTableError) as error:
+        print(f"{BY}: {error}", file=sys.stderr)
+        return 1
+    except OSError as error:
+        print(f"{BY}: {error.filename or options.out}: {error.strerror or error}", file=sys.stderr)
+        return 1
+    print(
+        json.dumps(mapping, indent=1, allow_nan=False) if options.json else "\n".join(summary_lines(findings))
+    )
+    print(f"{BY}: wrote {options.out / REPORT}", file=sys.stderr)
+    return 0 if findings.verdict == NO_GAP else 3
+
+
+def diagnosed(runs: Sequence[InputRun], joints: Mapping[int, Joint]) -> Findings:
+    """Check the channels, diagnose what may be used, and say in the findings what may not."""
+    checked = check_runs([(run.name, run.table) for run in runs], joints)
+    for line in (*checked.refused, *checked.notes):
+        print(f"{BY}: {line}", file=sys.stderr)
+    reader = [f"{run.name}: {note}" for run in runs for note in run.notes]
+    notes = (*checked.refused, *checked.notes, *reader)
+    if not checked.runs:
+        return Findings(
+            verdict=INSUFFICIENT,
+            reasons=checked.refused or ("found no run with columns of a joint to diagnose",),
+            runs=tuple(run.name for run in runs),
+            joints=tuple(joints),
+            channel_notes=notes,
+        )
+    with _waiting(f"diagnosing {len(checked.runs)} runs"):
+        from sysid.diagnosis.diagnose import diagnose
+
+        left = {number: joint for number, joint in joints.items() if number not in checked.lost}
+        findings = diagnose(checked.runs, left)
+    return _with_channels(findings, checked, notes)
+
+
+def _with_channels(findings: Findings, checked: Checked, notes: tuple[str, ...]) -> Findings:
+    """Findings that tell of the channels; without a gap they are no proof for a joint that could not be judged."""
+    findings = replace(findings, channel_notes=notes + findings.channel_notes)
+    if findings.verdict == NO_GAP and checked.lost:
+        lost = ", ".join(str(number) for number in checked.lost)
+        return replace(
+            findings,
+            verdict=INSUFFICIENT,
+            reasons=(f"joint {lost}: no run of it can be used, the rest has no gap", *checked.refused),
+        )
+    if findings.verdict == INSUFFICIENT and checked.refused:
+        return replace(findings, reasons=(*findings.reasons, *checked.refused))
+    return findings
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=BY,
+        description="Measure what a joint file's simulation gets wrong on recorded runs and name the cause, "
+        "or the causes that these runs cannot tell apart and the experiment that would.",
+        epilog=(
+            "examples:\n"
+            "  jtq diagnose campaigns/validate --joint models/joint1.yaml --out diagnosis\n"
+            "  jtq diagnose a.csv b.csv.gz --joint 1=joint1.yaml --joint 2=joint2.yaml --out diagnosis --json\n"
+            "  jtq diagnose rig/*.csv --columns columns.yaml --joint arm.yaml --out diagnosis\n\n"
+            f"DIR/{REPORT} is for people, DIR/{FINDINGS} for programs, DIR/{FILE} the joint file with the effects found;\n"
+            f"DIR/{PLAN}, when there is one, is for `jtq campaign`. Exit status: 0 no gap; 3 any other verdict;\n"
+            "1 failure; 2 usage."
+        ),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "runs",
+        nargs="+",
+        type=Path,
+        metavar="RUN",
+        help="run files (.csv, .csv.gz, .parquet, .mcap) or directories of them",
+    )
+    parser.add_argument(
+        "--joint",
+        action="append",
+        default=[],
+        metavar="[N=]FILE",
+        help="joint file of all joints, or of joint N; may be given again (default: those that the column map names)",
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="where the results go; made if missing"
+    )
+    parser.add_argument(
+        "--columns", type=Path, metavar="FILE", help="column map for other names, units and signs"
+    )
+    parser.add_argument(
+        "--force", action="store_true", help="replace the results of an earlier diagnosis in DIR"
+    )
+    parser.add_argument("--json", action="store_true", help="print findings.json instead of the summary")
+    return parser
+
+
+def _check_out(directory: Path, force: bool) -> None:
+    """Make DIR before minutes of work, and refuse to overwrite. Raises ConfigError."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = "it is a file" if isinstance(error, FileExistsError) else error.strerror
+        raise ConfigError(f"--out {directory}: cannot be made: {reason}") from None
+    there = [name for name in _OWN if (directory / name).exists()]
+    if there and not force:
+        raise ConfigError(
+            f"--out {directory}: found {', '.join(there)} in it, expected a directory without a diagnosis, or --force"
+        )
+
+
+def _write(
+    directory: Path, findings: Findings, joints: Mapping[int, Joint], sha256: Mapping[str, str]
+) -> dict[str, Any]:
+    """Put all files in place and return what is in findings.json. Raises ConfigError, OSError.
+
+    They are made in a directory beside first: what fails on the way leaves the earlier results as they were. Then what
+    an earlier diagnosis wrote goes, so that no plan or joint file of it stays beside the new findings.
+    """
+    from sysid.diagnosis.report import render
+
+    date = dt.datetime.now().astimezone().date().isoformat()
+    with tempfile.TemporaryDirectory(prefix=".diagnosis.", dir=directory) as made:
+        fresh = Path(made)
+        names = write_extended(fresh, joints, findings, sha256=sha256, date=date)
+        experiment = findings.next_experiment
+        if experiment and experiment.get("plan"):
+            names.append(PLAN)
+            plan = Plan.from_mapping(experiment["plan"], PLAN)
+            (fresh / PLAN).write_text(plan.to_yaml(), encoding="utf-8")
+        names.append(REPORT)
+        (fresh / REPORT).write_text(render(findings), encoding="utf-8")
+        mapping = to_mapping(findings, sha256=sha256, files=names)
+        text = json.dumps(mapping, indent=1, allow_nan=False)
+        (fresh / FINDINGS).write_text(f"{text}\n", encoding="utf-8")
+        for name in _OWN:
+            (directory / name).unlink(missing_ok=True)
+        for name in (*names, FINDINGS):
+            os.replace(fresh / name, directory / name)
+    return mapping
+
+
+def _waiting(text: str) -> Any:
+    """A spinner on standard error where that is a terminal."""
+    if not sys.stderr.isatty():
+        return nullcontext()
+    from rich.console import Console
+
+    return Console(stderr=True).status(text)

@@ -1,0 +1,118 @@
+"""From a joint and the causes found to the extended joint file: effects with their values, intervals in its provenance.
+
+An effect that the joint file has already is replaced by the cause of the same name, so that diagnosing with the extended
+file again does not add the same thing twice. Effects of the torque sensor go into every joint's file. Pure but for
+`write_extended`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+from estimator.parameters import Effect, Joint
+from sysid.diagnosis.findings import Cause, Findings, Value
+from sysid.joint_writer import write_joint
+
+SENSOR: Final = "sensor"
+FILE: Final = "extended.joint.yaml"
+_DIGITS: Final = 7
+"""Significant digits of a written value; no interval is a millionth of it."""
+
+
+def extended(
+    joint: Joint,
+    number: int,
+    findings: Findings,
+    *,
+    sha256: Mapping[str, str],
+    date: str,
+    by: str = "jtq diagnose",
+) -> Joint:
+    """Return the joint with the causes of joint `number` and of the sensor among its effects.
+
+    sha256: hash of each run's file by name; date: ISO 8601. What an effect of a whole class is written as is the first of
+    its class, and the provenance says so: on these runs all of the class fit alike, elsewhere they may not.
+
+    Raises ConfigError for an effect or a value that joint files do not allow.
+    """
+    causes = [cause for cause in findings.causes if cause.joint in (number, SENSOR)]
+    replaced = {cause.name for cause in causes}
+    effects = [effect for effect in joint.effects if effect.name not in replaced]
+    effects += [
+        Effect(cause.name, {name: _rounded(each.value) for name, each in cause.parameters.items()})
+        for cause in causes
+    ]
+    record: dict[str, Any] = {"by": by, "date": date, "verdict": findings.verdict}
+    if causes:
+        record["effects"] = [_record(cause) for cause in causes]
+    gain = findings.gain
+    if causes and gain is not None and math.isfinite(gain.rmse_before_nm + gain.rmse_after_nm):
+        record["gain"] = {
+            "rmse_before_nm": _rounded(gain.rmse_before_nm),
+            "rmse_after_nm": _rounded(gain.rmse_after_nm),
+            "split": gain.split,
+        }
+    record["sha256"] = {name: sha256[name] for name in findings.runs if name in sha256}
+    return replace(joint, effects=tuple(effects), provenance={**joint.provenance, "diagnosis": record})
+
+
+def files(joints: Mapping[int, Joint], findings: Findings) -> dict[str, int]:
+    """Names of the files to write and the joint that each holds.
+
+    extended.joint.yaml is the joint of the largest cause (a cause of the sensor is in every file, so the next one
+    decides; then the joint of the largest gap, then the first). With more joints than one each has its own file as well.
+    """
+    numbers = sorted(joints)
+    first = _first(numbers, findings)
+    names = {FILE: first}
+    if len(numbers) > 1:
+        names |= {f"extended.joint{number}.yaml": number for number in numbers}
+    return names
+
+
+def title(number: int, findings: Findings) -> str:
+    """First line of an extended joint file."""
+    names = [cause.name for cause in findings.causes if cause.joint in (number, SENSOR)]
+    runs = f"{len(findings.runs)} run" + ("s" if len(findings.runs) != 1 else "")
+    what = f"found {', '.join(names)}" if names else "found no effect of this joint to add"
+    return f"Written by jtq diagnose from {runs}: {what} (verdict {findings.verdict})."
+
+
+def write_extended(
+    directory: Path, joints: Mapping[int, Joint], findings: Findings, **origin: Any
+) -> list[str]:
+    """Write all extended joint files into `directory`, each whole or not at all; returns their names.
+
+    origin: sha256 and date of `extended`. Raises ConfigError.
+    """
+    names = files(joints, findings)
+    for name, number in names.items():
+        joint = extended(joints[number], number, findings, **origin)
+        write_joint(directory / name, joint, title(number, findings))
+    return list(names)
+
+
+def _first(numbers: Sequence[int], findings: Findings) -> int:
+    said = [cause.joint for cause in findings.causes] + [gap.joint for gap in findings.gaps]
+    return next((int(number) for number in said if number in numbers), numbers[0])
+
+
+def _record(cause: Cause) -> dict[str, Any]:
+    record: dict[str, Any] = {"name": cause.name, "joint": cause.joint}
+    if len(cause.names) > 1:
+        record["cannot_be_told_from"] = [name for name in cause.names if name != cause.name]
+    record["ci95"] = {name: _interval(each) for name, each in cause.parameters.items()}
+    return record
+
+
+def _interval(value: Value) -> list[float | None]:
+    """Both ends, None where there is none: NaN would not read back as itself."""
+    return [_rounded(end) if math.isfinite(end) else None for end in value.ci95]
+
+
+def _rounded(value: float) -> float:
+    return float(f"{float(value):.{_DIGITS}g}")

@@ -1,0 +1,231 @@
+"""With fewer than four runs: what is named must hold on each run left out, not on all of them together. Pure.
+
+With many runs the sum over runs left out says whether an effect is there. With two or three, one run can carry that sum,
+the runs' own changes are hardly known (their variance is little more than its prior), and what the models get wrong
+passes for an effect. So what the search found is put to a harder rule: with the coefficients of the other runs an
+effect must lower both the deviance and the plain squared error of the torque on each run left out. Where the set as
+a whole does not pass, the search is made again by that error alone. An alternative is ruled out by being worse on
+each run left out, not by their sum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sysid.diagnosis.channel import Channel
+from sysid.diagnosis.classes import WITHIN
+from sysid.diagnosis.columns import Candidate
+from sysid.diagnosis.findings import Cause, JointName
+from sysid.diagnosis.mixed import explained
+from sysid.diagnosis.search import DEEPEST, Hypothesis, Search
+
+if TYPE_CHECKING:
+    from sysid.diagnosis.prepared import Prepared
+
+ENOUGH_RUNS: Final = 4
+"""From here on the sum over runs left out decides, as everywhere else."""
+FALL: Final = 0.05
+"""Part of the squared error of every run left out that an effect must take away."""
+ENOUGH_LEFT: Final = 0.2
+"""Part of the error that effects could explain at all which may be left over on runs left out without a word."""
+_SCALES: Final = frozenset({"torque_constant", "sensor_gain"})
+
+Squares = Mapping[Channel, float]
+
+
+class FewRuns:
+    """What sets of candidates do to each run left out."""
+
+    def __init__(self, prepared: Prepared, search: Search) -> None:
+        self.prepared = prepared
+        self.search = search
+        self._squares: dict[tuple[int, ...], list[Squares]] = {}
+
+    def confirmed(self, found: Hypothesis) -> Hypothesis:
+        """Return the set that was found where it holds, else the best by the error on runs left out that does."""
+        best = self.search.hypothesis(())
+        if self._reached(found):
+            return found
+        for _ in range(DEEPEST):
+            grown = {tuple(c.first for c in h.chosen): h for h in self._children(best)}
+            better = [h for h in grown.values() if self._score(h) < self._score(best) and self.holds(h)]
+            if not better:
+                break
+            best = min(better, key=self._score)
+        return best
+
+    def holds(self, hypothesis: Hypothesis) -> bool:
+        """Return whether each candidate, and all together, help on every run left out."""
+        nothing = self.search.hypothesis(())
+        return self._helps(hypothesis, nothing, hypothesis.chosen) and not self._idle(hypothesis)
+
+    def _reached(self, hypothesis: Hypothesis) -> bool:
+        """Return whether it holds and is reached from nothing by one candidate after another, each set on the way holding:
+        effects that help only together are each other's errors.
+        """
+        if not hypothesis.chosen:
+            return True
+        return self.holds(hypothesis) and any(
+            self._reached(self._without(hypothesis, c)) for c in hypothesis.chosen
+        )
+
+    def rivals(self, best: Hypothesis, cause: Candidate) -> tuple[Candidate, ...]:
+        """Return the candidates (one per effect and joint) that in the place of `cause` help on every run left out and on
+        at least one of them leave no more than FALL more than it, best first; with one joint, torque constant and
+        sensor gain are never told apart, whose difference is a factor on friction and inertia.
+        """
+        others = [c for c in best.chosen if c is not cause]
+        base = self._without(best, cause)
+        found: dict[tuple[str, object], tuple[float, Candidate]] = {}
+        twins = _SCALES if self.search.joints == 1 and cause.effect.name in _SCALES else frozenset()
+        for rival in self._grown(base):
+            new = next(c for c in rival.chosen if c not in others)
+            if new.key == cause.key:
+                continue
+            helps = self._helps(rival, base, (new,), least=0.0)
+            worse = all(fall < -FALL for fall in self._falls(rival, best, (new, cause)))
+            worse = worse or self.search.unread(rival) - self.search.unread(best) > WITHIN
+            if helps and not worse:
+                score = self._score(rival)
+                if score < found.get(new.key, (np.inf, new))[0]:
+                    found[new.key] = score, new
+        for c in self.search.candidates:
+            if c.effect.name in twins and c.key != cause.key:
+                found.setdefault(c.key, (np.inf, c))
+        return tuple(c for _, c in sorted(found.values(), key=lambda pair: pair[0]))
+
+    def unsure(
+        self,
+        found: Hypothesis,
+        best: Hypothesis,
+        classes: Sequence[Sequence[Candidate]],
+        causes: Sequence[Cause],
+    ) -> list[tuple[str, JointName]]:
+        """Return (effect, joint) of what these runs show without confirming it: causes whose interval holds the joint
+        file's value, and, where much is left over, what was found on all runs together but is not named, largest first.
+        """
+        out = [
+            (c.effect.name, c.joint)
+            for c, cause in zip(best.chosen, causes, strict=True)
+            if _holds_nothing(c, cause)
+        ]
+        if self.left_share(best) > ENOUGH_LEFT:
+            there = {c.key for c in best.chosen} | {c.key for rivals in classes for c in rivals}
+            more = [c for c in found.chosen if c.key not in there]
+            out += [c.key for c in sorted(more, key=lambda c: -self.search.size_nm(found, c))]
+        return list(dict.fromkeys(out))
+
+    def doubt(self, unsure: Sequence[tuple[str, JointName]]) -> str:
+        """Return a sentence about what is unsure."""
+        names = ", ".join(f"{n} of {'the sensor' if j == 'sensor' else f'joint {j}'}" for n, j in unsure)
+        return (
+            f"seen on all {self.search.mixed.runs} runs together, but not settled by so few: {names}; "
+            f"expected {ENOUGH_RUNS} runs or more"
+        )
+
+    def left_share(self, best: Hypothesis) -> float:
+        """Return which part of the squared error that effects could explain at all is left on runs left out, 0 to 1."""
+        floors = self.prepared.unexplained
+        before, after = 0.0, 0.0
+        pairs = zip(self.squares(self.search.hypothesis(())), self.squares(best), strict=True)
+        for r, (raw, left) in enumerate(pairs):
+            for channel in raw:
+                least = float(np.nanmean(floors[channel][r] ** 2))
+                before += max(raw[channel] - least, 0.0)
+                after += max(left[channel] - least, 0.0)
+        return min(after / max(before, 1e-30), 1.0)
+
+    def _children(self, parent: Hypothesis) -> list[Hypothesis]:
+        """Return the plausible extensions by one candidate, each also without what it makes superfluous."""
+        out = []
+        for child in self._grown(parent):
+            out.append(child)
+            idle = self._idle(child)
+            if idle and len(idle) < len(child.chosen):
+                out.append(self.search.hypothesis([c for c in child.chosen if c not in idle], child.model))
+        return out
+
+    def _grown(self, parent: Hypothesis) -> list[Hypothesis]:
+        """Return all plausible extensions that lower BIC; by how much is not asked, the runs left out decide."""
+        totals = [self.search.mixed.marginal(v)[0] for v in (parent.model.variances, self.search.mixed.prior)]
+        base = list(parent.model.columns)
+        out = []
+        for c in self.search.candidates:
+            if not self.search.fits_beside(c, parent.chosen):
+                continue
+            drop = max(explained(total, base, list(c.columns)) for total in totals)
+            if drop < self.search.penalty(c):
+                continue
+            child = self.search.hypothesis((*parent.chosen, c), parent.model)
+            if child.bic < parent.bic and self.search.plausible(child):
+                out.append(child)
+        return out
+
+    def _idle(self, hypothesis: Hypothesis) -> list[Candidate]:
+        """Return the candidates without which some run left out does as well."""
+        chosen = hypothesis.chosen
+        return [c for c in chosen if not self._helps(hypothesis, self._without(hypothesis, c), (c,))]
+
+    def _helps(
+        self, hypothesis: Hypothesis, without: Hypothesis, new: Sequence[Candidate], least: float = FALL
+    ) -> bool:
+        if not new:
+            return True
+        drops = self.search.held_out_deviances(without) - self.search.held_out_deviances(hypothesis)
+        return bool(np.all(drops > 0.0)) and min(self._falls(hypothesis, without, new)) >= least
+
+    def _without(self, hypothesis: Hypothesis, candidate: Candidate) -> Hypothesis:
+        return self.search.hypothesis([c for c in hypothesis.chosen if c is not candidate], hypothesis.model)
+
+    def _falls(self, one: Hypothesis, other: Hypothesis, where: Sequence[Candidate]) -> list[float]:
+        """Return per run the part of the other's squared error that `one` takes away, summed over the channels in which
+        the candidates `where` act.
+        """
+        columns = np.array([k for c in where for k in c.columns], np.intp)
+        out = []
+        for run, a, b in zip(self.prepared.runs, self.squares(one), self.squares(other), strict=True):
+            there = [c for c, d in run.channels.items() if np.isin(columns, d.index).any()]
+            out.append(sum(1.0 - a[c] / max(b[c], 1e-30) for c in there))
+        return out
+
+    def _score(self, hypothesis: Hypothesis) -> float:
+        """Return the sum of the logarithms of the squared errors on runs left out."""
+        return sum(float(np.log(max(x, 1e-30))) for run in self.squares(hypothesis) for x in run.values())
+
+    def squares(self, hypothesis: Hypothesis) -> list[Squares]:
+        """Return per run left out the mean squared error of each channel [Nm^2] with the coefficients of the others; the
+        run's own zero and friction stay in, in torsion all but its mean.
+        """
+        key = tuple(c.first for c in hypothesis.chosen)
+        if key not in self._squares:
+            self._squares[key] = self._measured(hypothesis)
+        return self._squares[key]
+
+    def _measured(self, hypothesis: Hypothesis) -> list[Squares]:
+        out: list[Squares] = []
+        columns = list(hypothesis.model.columns)
+        for run, beta in zip(self.prepared.runs, self.search.held_out_beta(hypothesis), strict=True):
+            weight = dict(zip(columns, (float(b) for b in beta), strict=True))
+            squares = {}
+            for channel, d in run.channels.items():
+                mine = np.flatnonzero(np.isin(d.index, columns))
+                rest = d.residual - d.regressors[:, mine] @ np.array([weight[int(d.index[k])] for k in mine])
+                rest = rest[d.valid]
+                if channel.balance == "torsion" and len(rest):
+                    rest = rest - rest.mean()
+                if len(rest):
+                    squares[channel] = float(np.mean(rest**2))
+            out.append(squares)
+        return out
+
+
+def _holds_nothing(candidate: Candidate, cause: Cause) -> bool:
+    """Return whether the intervals of all its parameters hold the values without it."""
+    nothing = candidate.term.combine([0.0] * candidate.size)
+    free = {
+        name: v.ci95 for name, v in cause.parameters.items() if v.ci95[1] > v.ci95[0] and name != "phase_rad"
+    }
+    return all(low <= nothing.get(name, 0.0) <= high for name, (low, high) in free.items())

@@ -1,0 +1,175 @@
+"""What the causes leave over: is it structure, and where. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from estimator.friction import FloatArray
+from estimator.parameters import Joint
+from sysid.diagnosis.channel import Channel, Line
+from sysid.diagnosis.columns import LINE
+from sysid.diagnosis.events import MOST_OF_THE_TIME, Burst, Events, bursts, wandering
+from sysid.diagnosis.lines import frequency_lines, order_lines, sharpened
+from sysid.diagnosis.places import Judge
+from sysid.diagnosis.prepared import Prepared
+from sysid.diagnosis.refine import Refined
+from sysid.diagnosis.structure import SIGNIFICANT, AxisMap, axis_maps
+from sysid.diagnosis.whitening import Noise
+
+_RELEVANT: Final = 6e-4
+"""Part of the rated torque (rms) from which structure counts as a gap."""
+_JUMP: Final = 0.01
+"""Part of the rated torque by which the residual must move for an event."""
+_WANDER: Final = 0.006
+"""Part of the rated torque (rms of means over seconds) from which a residual is not noise."""
+_LINE_RATIO: Final = 25.0
+_HZ_RATIO: Final = 25.0
+
+
+@dataclass(frozen=True)
+class Leftover:
+    """maps: all axes of all channels; found: those whose structure is significant and large enough to matter; judges: by
+    what a channel's events are judged.
+    """
+
+    maps: tuple[AxisMap, ...]
+    found: tuple[AxisMap, ...]
+    bursts: tuple[Burst, ...]
+    lines: tuple[Line, ...]
+    judges: Mapping[Channel, Judge] = field(default_factory=dict)
+
+    @property
+    def significant(self) -> bool:
+        """Whether anything is left that is not noise."""
+        return bool(self.found or self.bursts or self.lines)
+
+    def energy_nm2(self) -> float:
+        """Largest energy per channel that is structure, summed over channels [Nm^2]."""
+        return sum(self.by_channel().values())
+
+    def by_channel(self) -> dict[Channel, float]:
+        """Largest energy that is structure, per channel [Nm^2]."""
+        by_channel: dict[Channel, float] = {}
+        items = [
+            *((m.channel, m.energy_nm2) for m in self.found),
+            *((b.channel, b.excess_nm2) for b in self.bursts),
+            *((line.channel, 0.5 * line.amplitude_nm**2) for line in self.lines),
+        ]
+        for channel, energy in items:
+            by_channel[channel] = max(by_channel.get(channel, 0.0), energy)
+        return by_channel
+
+    def share(self, explained_nm2: float) -> float:
+        """Return left-over structure as a part of all structure; explained_nm2: of the causes, summed over channels."""
+        left = self.energy_nm2()
+        return left / max(left + explained_nm2, 1e-30)
+
+    @property
+    def reasons(self) -> list[str]:
+        """Lines for people."""
+        out = []
+        for m in sorted(self.found, key=lambda m: -m.energy_nm2)[:3]:
+            size, axis = np.sqrt(m.energy_nm2), m.axis.replace("_", " ")
+            out.append(
+                f"joint {m.channel.joint}, {m.channel.balance} balance: {size:.3g} Nm rms follow the {axis}"
+                " in a way that no effect of the library does"
+            )
+        for b in self.bursts:
+            run, t = b.times[0]
+            many = len(b.times)
+            seen = f"{many} events that noise does not make" if b.what == "events" else "seconds that are off"
+            out.append(
+                f"joint {b.channel.joint}, {b.channel.balance} balance: {seen}, the strongest in {run} at {t:.1f} s"
+            )
+        for line in self.lines[:2]:
+            where = (
+                f"at {line.order:.3g} Hz, whatever the motion"
+                if line.unit == "Hz"
+                else f"at order {line.order:.2f} per motor revolution, which is none of gear or motor"
+            )
+            out.append(
+                f"joint {line.channel.joint}, {line.channel.balance} balance: {line.amplitude_nm:.3g} Nm {where}"
+            )
+        return out
+
+
+def less_nuisances(prepared: Prepared, refined: Refined) -> dict[Channel, list[FloatArray]]:
+    """Return what the causes leave, less the runs' own changes but not less strange lines, events with it [run][n]."""
+    use = np.array([g.name != LINE for g in prepared.groups])
+    out: dict[Channel, list[FloatArray]] = {}
+    for r, (run, u) in enumerate(zip(refined.runs, refined.nuisances, strict=True)):
+        for channel, d in run.channels.items():
+            weight = np.where(use[d.families], u[d.families], 0.0)
+            rest = d.residual - d.nuisances @ weight
+            out.setdefault(channel, []).append(np.where(prepared.seen(r, channel), rest, np.nan))
+    return out
+
+
+def events_left(
+    prepared: Prepared, refined: Refined, noise: Noise, joints: Mapping[int, Joint]
+) -> dict[Channel, Events]:
+    """Return rare events where the causes leave any that are large enough to matter, else nothing.
+
+    Whether there are any is asked of what the causes leave. Where they are is asked of what no effect of the library at all
+    explains: causes that are bent by events leave others than those that are there.
+    """
+    if not _bursts(prepared, less_nuisances(prepared, refined), noise, joints):
+        return {}
+    found = _bursts(prepared, prepared.unexplained, noise, joints)
+    return {c: e for c, e in found.items() if e.part < MOST_OF_THE_TIME}
+
+
+def _bursts(
+    prepared: Prepared,
+    residuals: Mapping[Channel, list[FloatArray]],
+    noise: Noise,
+    joints: Mapping[int, Joint],
+) -> dict[Channel, Events]:
+    jumps = {c: _JUMP * joints[c.joint].rated_torque_nm for c in residuals}
+    found = bursts(prepared.runs, residuals, noise.ar, prepared.step_s, jumps)
+    return {c: e for c, e in found.items() if e.burst.excess_nm2 > 0.25 * _least(joints[c.joint])}
+
+
+def _least(joint: Joint) -> float:
+    """Return the energy from which structure is a gap [Nm^2]."""
+    return (_RELEVANT * joint.rated_torque_nm) ** 2
+
+
+def leftover(prepared: Prepared, refined: Refined, noise: Noise, joints: Mapping[int, Joint]) -> Leftover:
+    """Return what is left over when causes and the runs' own changes are taken out."""
+    whole = less_nuisances(prepared, refined)
+    found = _bursts(prepared, whole, noise, joints)
+    # maps and lines of what is no event: a few moments say nothing about a condition
+    residuals = {c: _calm(parts, found.get(c)) for c, parts in whole.items()}
+    maps = axis_maps(refined.runs, residuals, prepared.step_s)
+    significant = tuple(
+        m for m in maps if m.p < SIGNIFICANT and m.energy_nm2 > _least(joints[m.channel.joint])
+    )
+    wander = {c: _WANDER * joints[c.joint].rated_torque_nm for c in whole}
+    burst = tuple(e.burst for e in found.values())
+    burst += tuple(wandering(refined.runs, residuals, prepared.step_s, wander))
+    lines = tuple(
+        sharpened(line, refined.runs, residuals[line.channel], prepared.step_s)
+        for line in (
+            *order_lines(refined.runs, residuals, prepared.step_s),
+            *frequency_lines(refined.runs, residuals, prepared.step_s),
+        )
+        if line.ratio > (_HZ_RATIO if line.unit == "Hz" else _LINE_RATIO)
+        and 0.5 * line.amplitude_nm**2 > _least(joints[line.channel.joint])
+    )
+    judges = {
+        c: Judge(noise.ar[c], prepared.step_s, _JUMP * joints[c.joint].rated_torque_nm, wander[c])
+        for c in whole
+    }
+    return Leftover(tuple(maps), significant, burst, lines, judges)
+
+
+def _calm(parts: Sequence[FloatArray], found: Events | None) -> list[FloatArray]:
+    """Return the residual without its events where they are rare [run][n]."""
+    if found is None or found.part >= MOST_OF_THE_TIME:
+        return list(parts)
+    return [np.where(m, np.nan, x) for m, x in zip(found.masks, parts, strict=True)]

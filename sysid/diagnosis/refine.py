@@ -1,0 +1,254 @@
+"""Parameters of the causes with intervals: Gauss-Newton on the mixed model, all causes and all runs at once. Pure.
+
+The search is linear in its columns; velocities, travels and reference temperatures come from grids there. Here every
+free parameter of every cause moves: the residual is taken at the present parameters, its derivatives by finite
+differences of the effects themselves, and the mixed model solved for the step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from estimator.effects.effect import MOTOR, TORSION, Effect, Parameter
+from estimator.friction import FloatArray
+from estimator.parameters import Joint
+from sysid.diagnosis.channel import Channel
+from sysid.diagnosis.columns import ChannelData, RunData, binned, contribution
+from sysid.diagnosis.findings import JointName
+from sysid.diagnosis.mixed import Mixed, Model
+from sysid.diagnosis.powerless import Row, unpowered, with_readings
+from sysid.diagnosis.prepared import Prepared
+from sysid.diagnosis.search import Hypothesis
+from sysid.diagnosis.signals import JointSignals
+from sysid.diagnosis.whitening import Noise, run_sums
+
+_STEPS: Final = 6
+_MOST_STEPS: Final = 24
+_SETTLED: Final = 0.02
+"""Of a parameter's standard deviation: smaller steps are none. At least _STEPS are made, at most _MOST_STEPS."""
+_AS_GOOD: Final = 1.0
+"""Of the deviance: the last parameters are taken that leave no more than this beyond the least."""
+_LARGEST_STEP: Final = 0.5
+"""Of a parameter's own size or a tenth of its plausible range, whichever is more."""
+
+
+@dataclass(frozen=True)
+class Present:
+    """An effect that is there: parameters by name and which of them are free."""
+
+    effect: Effect
+    joint: JointName
+    values: Mapping[str, float]
+    free: tuple[str, ...]
+
+    def moved(self, step: Sequence[float]) -> Present:
+        """Return it with its free parameters changed."""
+        new = dict(self.values)
+        for name, d in zip(self.free, step, strict=True):
+            p = parameter(self.effect, name)
+            size = max(abs(new[name]), 0.1 * (p.high - p.low) if np.isfinite(p.high - p.low) else 1.0)
+            change = float(np.clip(d, -_LARGEST_STEP * size, _LARGEST_STEP * size))
+            value = new[name] + change
+            new[name] = value if name == "phase_rad" else float(np.clip(value, p.low, p.high))
+        return replace(self, values=new)
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Causes at their best parameters, covariance of all free ones in order, the mixed model's sums (columns: free
+    parameters; last: residual at these parameters), binned runs whose residual is what is left and whose regressors are
+    the derivatives.
+    """
+
+    present: tuple[Present, ...]
+    covariance: FloatArray
+    random_share: FloatArray
+    mixed: Mixed
+    variances: FloatArray
+    nuisances: FloatArray
+    runs: tuple[RunData, ...]
+
+
+def parameter(effect: Effect, name: str) -> Parameter:
+    """Return the parameter of this name."""
+    return next(p for p in effect.parameters if p.name == name)
+
+
+def free_names(effect: Effect, values: Mapping[str, float]) -> tuple[str, ...]:
+    """Return the parameters that a fit may move: not the fixed ones, and not those of a kind that is switched off (at
+    its default of zero, as the temperature part of a drift in time).
+    """
+    return tuple(
+        p.name
+        for p in effect.parameters
+        if not p.fixed
+        and p.name in values
+        and not (
+            p.default is not None and not p.key and values[p.name] == p.default and p.default in (0.0, 25.0)
+        )
+    )
+
+
+@dataclass(frozen=True)
+class _Look:
+    """Causes at some parameters: what is left there, and the step from there; left: the deviance that they leave."""
+
+    present: tuple[Present, ...]
+    mixed: Mixed
+    model: Model
+    data: list[RunData]
+    left: float
+
+
+def refine(prepared: Prepared, present: Sequence[Present], noise: Noise) -> Refined:
+    """Return the refined causes of the prepared runs (their residuals are those at the joint files' values).
+
+    Where steps do not come to rest, the parameters that left the least are taken, not the last ones.
+    """
+    look = best = _look_at(prepared, present, noise)
+    least = look.left
+    for step in range(1, _MOST_STEPS + 1):
+        if not present:
+            break
+        now, settled = _stepped(look)
+        look = _look_at(prepared, now, noise)
+        least = min(least, look.left)
+        if look.left <= least + _AS_GOOD:
+            best = look
+        if step >= _STEPS and settled:
+            break
+    model = best.model
+    for run_signals in prepared.signals:
+        for s in run_signals:
+            _see_torsion(s, best.present)
+    certain = best.mixed.marginal(np.full_like(model.variances, 1e-12))[0]
+    count = len(model.columns)
+    share = np.zeros(count)
+    if count:
+        tight = np.diag(np.linalg.pinv(certain[:count, :count], hermitian=True))
+        share = np.clip(1.0 - tight / np.maximum(np.diag(model.covariance), 1e-300), 0.0, 1.0)
+    return Refined(
+        best.present,
+        model.covariance,
+        share,
+        best.mixed,
+        model.variances,
+        model.nuisances,
+        tuple(best.data),
+    )
+
+
+def _look_at(prepared: Prepared, present: Sequence[Present], noise: Noise) -> _Look:
+    signals, runs, samples, groups = prepared.signals, prepared.runs, prepared.samples, prepared.groups
+    for run_signals in signals:
+        for s in run_signals:
+            _see_torsion(s, present)
+    data = [_at(s, run, present, samples) for s, run in zip(signals, runs, strict=True)]
+    count = sum(len(p.free) for p in present)
+    sums = [run_sums(d, noise, count, len(groups)) for d in data]
+    sums = with_readings(sums, prepared.readings, _unpowered(present, prepared.joints))
+    mixed = Mixed(sums, count, np.array([g.sigma for g in groups]))
+    return _Look(tuple(present), mixed, mixed.fit(range(count)), data, mixed.fit(()).deviance)
+
+
+def _stepped(look: _Look) -> tuple[list[Present], bool]:
+    """Return the causes one step further, and whether that step was none."""
+    now, settled, first = [], True, 0
+    for p in look.present:
+        mine = slice(first, first + len(p.free))
+        moved = p.moved([float(b) for b in look.model.beta[mine]])
+        deviation = np.sqrt(np.maximum(np.diag(look.model.covariance)[mine], 0.0))
+        change = np.array([moved.values[name] - p.values[name] for name in p.free])
+        settled = settled and bool(np.all(np.abs(change) <= _SETTLED * deviation))
+        now.append(moved)
+        first += len(p.free)
+    return now, settled
+
+
+def _see_torsion(s: JointSignals, present: Sequence[Present]) -> None:
+    """Set the torsion that effects see to what it is: that of the encoders for what follows it with memory or play, else
+    what the spring does with the causes, K d = tau + their contributions.
+    """
+    mine = [p for p in present if p.joint in ("sensor", s.number)]
+    if s.twist_rad is not None and any(p.effect.follows_torsion for p in mine):
+        s.state.torsion_rad = s.twist_rad
+        return
+    total = s.state.torque_nm
+    for p in mine:
+        total = total + _of(p, s, p.values).get(TORSION, 0.0)
+    s.state.torsion_rad = total / s.joint.stiffness_nm_per_rad
+
+
+def _at(run: Sequence[JointSignals], base: RunData, present: Sequence[Present], samples: int) -> RunData:
+    """Return the run with what is left at these parameters, and derivatives by each free one, as regressors."""
+    left = {c: d.residual.copy() for c, d in base.channels.items()}
+    columns: dict[Channel, list[tuple[int, FloatArray]]] = {c: [] for c in base.channels}
+    place = 0
+    for p in present:
+        for s in run:
+            if p.joint not in ("sensor", s.number):
+                continue
+            here = _of(p, s, p.values)
+            for balance in (MOTOR, TORSION):
+                channel = Channel(s.number, balance)
+                if channel in left and balance in here:
+                    left[channel] = left[channel] - binned(here[balance], samples)
+            for k, name in enumerate(p.free):
+                size = _difference(p, name)
+                there = _of(p, s, {**p.values, name: p.values[name] + size})
+                for balance, value in there.items():
+                    slope = (value - here[balance]) / size
+                    columns[Channel(s.number, balance)].append((place + k, binned(slope, samples)))
+        place += len(p.free)
+    channels = {}
+    for c, d in base.channels.items():
+        found = columns[c]
+        index = np.array([k for k, _ in found], np.intp)
+        x = np.column_stack([v for _, v in found]) if found else np.empty((len(d.valid), 0))
+        channels[c] = ChannelData(d.valid, left[c], x, index, d.nuisances, d.families)
+    return RunData(base.name, base.time_s, channels, base.axes)
+
+
+def _unpowered(present: Sequence[Present], joints: Mapping[int, Joint]) -> list[Row]:
+    """Return what the causes read without power: the derivatives by the free parameters, and off the residual."""
+    out: list[Row] = []
+    place = 0
+    for p in present:
+        if "current_a" in p.effect.hooks and isinstance(p.joint, int):
+            here = unpowered(p.effect, p.values, joints[p.joint])
+            out.append((p.joint, -1, -here))
+            for k, name in enumerate(p.free):
+                size = _difference(p, name)
+                there = unpowered(p.effect, {**p.values, name: p.values[name] + size}, joints[p.joint])
+                out.append((p.joint, place + k, (there - here) / size))
+        place += len(p.free)
+    return out
+
+
+def _of(p: Present, s: JointSignals, values: Mapping[str, float]) -> dict[str, FloatArray]:
+    return contribution(p.effect, values, s)
+
+
+def _difference(p: Present, name: str) -> float:
+    q = parameter(p.effect, name)
+    if name == "phase_rad":
+        return 1e-4
+    width = q.high - q.low if np.isfinite(q.high - q.low) else 1.0
+    return max(1e-4 * abs(p.values[name]), 1e-6 * width)
+
+
+def present_causes(best: Hypothesis) -> list[Present]:
+    """Return the chosen candidates as effects with parameters."""
+    out = []
+    for c in best.chosen:
+        values = dict(c.term.combine(best.coefficients(c)))
+        for p in c.effect.parameters:
+            if p.default is not None and not math.isnan(p.default):
+                values.setdefault(p.name, p.default)
+        out.append(Present(c.effect, c.joint, values, free_names(c.effect, values)))
+    return out

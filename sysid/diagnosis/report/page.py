@@ -1,0 +1,111 @@
+"""`render`: findings to one self-contained HTML page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import yaml
+
+from estimator.checked import ConfigError
+from estimator.effects.effect import Effect
+from sysid.diagnosis.findings import AMBIGUOUS, CAUSE, INSUFFICIENT, UNEXPLAINED, Findings
+from sysid.diagnosis.report import theme, views
+from sysid.diagnosis.report.gap_views import gap_views
+from sysid.diagnosis.report.pictures import pictures, trace_rows
+from sysid.diagnosis.report.quantities import number
+from sysid.diagnosis.report.words import BADGES, gain_sentence, listed, verdict_sentence
+
+TEMPLATE: Final = "page.html.j2"
+PLAN_FILE: Final = "next_experiment.plan.yaml"
+
+
+def render(findings: Findings, made: str = "", effects: Mapping[str, Effect] | None = None) -> str:
+    """Return the page. The same findings give the same text.
+
+    Args:
+        findings: all that is shown.
+        made: when and by what, one line for the foot of the page.
+        effects: the library, for equations and tell-tales; default: the one that ships.
+
+    Needs jinja2 and matplotlib (ImportError without them).
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("sysid.diagnosis.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    colour, badge = BADGES[findings.verdict]
+    drawn = pictures(findings)
+    evidence = views.evidence_views(findings.candidates)
+    page = environment.get_template(TEMPLATE).render(
+        f=findings,
+        made=made,
+        light=theme.variables(theme.LIGHT),
+        dark=theme.variables(theme.DARK),
+        badge=badge,
+        badge_colour=colour,
+        sentence=verdict_sentence(findings),
+        gain_sentence=gain_sentence(findings),
+        scope=_scope(findings),
+        has_gap=findings.verdict in {CAUSE, AMBIGUOUS, UNEXPLAINED},
+        said=findings.verdict in {UNEXPLAINED, INSUFFICIENT},
+        causes=views.cause_views(findings, library() if effects is None else effects),
+        gaps=gap_views(findings.gaps),
+        evidence=evidence,
+        shown=max(views.SHOWN, sum(1 for row in evidence if row.state)),
+        gains=views.gain_views(findings.gain),
+        reasons=[views.reason_in_words(each) for each in findings.reasons],
+        pictures=drawn,
+        closed=sum(1 for each in drawn if not each.opened),
+        traces=trace_rows(findings),
+        next=_next(findings),
+    )
+    return f"{page}\n"
+
+
+def library() -> Mapping[str, Effect]:
+    """The effects that ship, by name."""
+    from estimator.effects.library import EFFECTS
+
+    return EFFECTS
+
+
+def _scope(findings: Findings) -> str:
+    """What was looked at, e.g. "6 runs, joints 1 and 2"."""
+    count = len(findings.runs)
+    runs = "1 run" if count == 1 else f"{count} runs"
+    if not findings.joints:
+        return runs
+    names = listed([str(j) for j in findings.joints])
+    return f"{runs}, joint{'s' if len(findings.joints) > 1 else ''} {names}"
+
+
+def _next(findings: Findings) -> dict[str, Any] | None:
+    """Why, the plan as YAML, and what it amounts to."""
+    if findings.next_experiment is None:
+        return None
+    plan = findings.next_experiment.get("plan")
+    return {
+        "why": findings.next_experiment["why"],
+        "file": PLAN_FILE,
+        "amount": "" if plan is None else plan_amount(plan),
+        "yaml": "" if plan is None else yaml.safe_dump(plan, sort_keys=False, allow_unicode=True),
+    }
+
+
+def plan_amount(plan: Mapping[str, Any]) -> str:
+    """Return how long a plan is, e.g. "4 runs, 12 minutes of motion"; "" for one that `jtq campaign` would refuse."""
+    from sysid.campaign.plan import Plan
+
+    try:
+        runs = Plan.from_mapping(dict(plan), PLAN_FILE).runs
+    except ConfigError:
+        return ""
+    seconds = sum(run.duration_s for run in runs)
+    length = f"{number(seconds)} s" if seconds < 120.0 else f"{number(seconds / 60.0, 2)} minutes"
+    return f"{len(runs)} run{'s' if len(runs) > 1 else ''}, {length} of motion"

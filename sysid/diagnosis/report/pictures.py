@@ -1,0 +1,226 @@
+"""The residual in time, before and after, as pictures that follow the page's colours and width."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from sysid.diagnosis.findings import Findings, Trace
+from sysid.diagnosis.report.quantities import number
+from sysid.diagnosis.report.theme import LIGHT, by_role
+from sysid.diagnosis.report.words import balance_title
+from sysid.figure_parts import as_svg, thinned
+
+MOST: Final = 6
+"""Pictures on a page; the other runs are in its table."""
+FIRST: Final = 2
+"""Of them, open from the start."""
+WIDE_IN: Final = 9.2
+NARROW_IN: Final = 4.4
+_BUCKETS: Final = {WIDE_IN: 600, NARROW_IN: 260}
+_TELLING: Final = 0.1
+"""A picture that is open from the start shows at least this part of the residual's energy going."""
+_FLOOR_SIGMAS: Final = 2.0
+_LOOK: Final[dict[str, Any]] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "jtq diagnose",
+    "font.size": 9.5,
+    "text.color": LIGHT["ink"],
+    "axes.labelcolor": LIGHT["soft"],
+    "axes.edgecolor": LIGHT["line"],
+    "xtick.color": LIGHT["soft"],
+    "ytick.color": LIGHT["soft"],
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": LIGHT["line"],
+    "grid.linewidth": 0.5,
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+    "savefig.facecolor": "none",
+}
+
+
+@dataclass(frozen=True)
+class TraceRow:
+    """One run, joint and balance in the table: root mean squares [Nm]."""
+
+    run: str
+    joint: int
+    balance: str
+    before: str
+    after: str
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One trace, drawn for a laptop and for a phone; text: what it shows, for those who cannot see it; opened: shown from
+    the start.
+    """
+
+    title: str
+    text: str
+    wide: str
+    narrow: str
+    opened: bool
+
+
+def rms(x: Any) -> float:
+    """Root mean square without NaN; NaN for nothing."""
+    good = np.isfinite(x)
+    return float(np.sqrt(np.mean(np.square(x[good])))) if good.any() else float("nan")
+
+
+def trace_rows(findings: Findings) -> list[TraceRow]:
+    """Return the table of all traces."""
+    return [
+        TraceRow(t.run, t.joint, balance_title(t.balance), number(rms(t.before_nm)), number(rms(t.after_nm)))
+        for t in findings.traces
+    ]
+
+
+def chosen_traces(findings: Findings) -> list[Trace]:
+    """Return the traces to draw: of each balance one run, then of each another, at most MOST.
+
+    Balances come in the order of the gaps. With causes the first run of a balance is the one in the middle by the part
+    of its energy that they take, not the best and not the worst; without, the one with most energy.
+    """
+    groups: dict[tuple[int, str], list[Trace]] = {(g.joint, g.balance): [] for g in findings.gaps}
+    for trace in findings.traces:
+        groups.setdefault((trace.joint, trace.balance), []).append(trace)
+    ranked = [_ranked(group, bool(findings.causes)) for group in groups.values()]
+    most = max((len(group) for group in ranked), default=0)
+    rounds = [group[k] for k in range(most) for group in ranked if k < len(group)]
+    return rounds[:MOST]
+
+
+def _ranked(group: Sequence[Trace], both: bool) -> list[Trace]:
+    if not both:
+        return sorted(group, key=lambda t: -_energy(t.before_nm))
+    ordered = sorted(group, key=lambda t: -_part_taken(t))
+    middle = (len(ordered) - 1) // 2
+    return ordered[middle : middle + 1] + ordered[:middle] + ordered[middle + 1 :]
+
+
+def _energy(values: Any) -> float:
+    return float(np.sum(np.nan_to_num(values) ** 2))
+
+
+def _part_taken(trace: Trace) -> float:
+    """Part of the residual's energy that the causes take away."""
+    there = _energy(trace.before_nm)
+    return 1.0 - _energy(trace.after_nm) / there if there > 0.0 else 0.0
+
+
+def pictures(findings: Findings) -> list[Picture]:
+    """Return the pictures; needs matplotlib."""
+    floors = {(g.joint, g.balance): g.noise_floor_nm for g in findings.gaps}
+    both = bool(findings.causes)
+    traces = chosen_traces(findings)
+    first = {(t.joint, t.balance): k for k, t in reversed(list(enumerate(traces)))}
+    telling = [k for k in sorted(first.values()) if both and _part_taken(traces[k]) > _TELLING]
+    opened = telling[:FIRST] or [0]
+    return [_picture(trace, k, floors, both, k in opened) for k, trace in enumerate(traces)]
+
+
+def _picture(
+    trace: Trace, place: int, floors: Mapping[tuple[int, str], float], both: bool, opened: bool
+) -> Picture:
+    floor = floors.get((trace.joint, trace.balance), float("nan"))
+    text = (
+        f"Residual of joint {trace.joint}, {balance_title(trace.balance)}, over {number(trace.time_s[-1])} s of run "
+        f"{trace.run}: {number(rms(trace.before_nm))} Nm rms"
+    )
+    text += (
+        f" before, {number(rms(trace.after_nm))} Nm rms with the causes in the simulation." if both else "."
+    )
+    wide, narrow = (
+        own_ids(_svg(trace, width, floor, both), f"p{place}{name}")
+        for width, name in ((WIDE_IN, "w"), (NARROW_IN, "n"))
+    )
+    return Picture(
+        f"{trace.run}, joint {trace.joint}, {balance_title(trace.balance)}", text, wide, narrow, opened
+    )
+
+
+def _svg(trace: Trace, width: float, floor: float, both: bool) -> str:
+    """Draw one trace, with settings of its own."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")  # no display is needed
+    with mpl.rc_context(_LOOK):
+        return inherited(by_role(as_svg(_figure(trace, width, floor, both))))
+
+
+def _figure(trace: Trace, width: float, floor: float, both: bool) -> Any:
+    """Panels over time: residual before, after on the same scale, velocity, sensor torque."""
+    curves = [("before", "simulation as it is", trace.before_nm)]
+    if both:
+        curves.append(("after", "with the causes", trace.after_nm))
+    figure, axes = _panels(len(curves), width)
+    top = _limit([values for _, _, values in curves], floor)
+    buckets = _BUCKETS[width]
+    for axis, (role, title, values) in zip(axes, curves, strict=False):
+        if np.isfinite(floor):
+            sigma = _FLOOR_SIGMAS * floor
+            axis.axhspan(-sigma, sigma, color=LIGHT["noise"], linewidth=0.0, zorder=0)
+        (line,) = axis.plot(*thinned(trace.time_s, values, buckets), color=LIGHT[role], linewidth=0.8)
+        line.set_gid(role)
+        axis.set_ylim(-top, top)
+        axis.set_ylabel("[Nm]")
+        axis.set_title(f"{title}: {number(rms(values))} Nm rms", loc="left", fontsize=9.5, color=LIGHT[role])
+    for axis, name, values in zip(
+        axes[len(curves) :],
+        ("velocity [rad/s]", "torque [Nm]"),
+        (trace.velocity_rad_s, trace.torque_nm),
+        strict=True,
+    ):
+        axis.plot(*thinned(trace.time_s, values, buckets // 2), color=LIGHT["soft"], linewidth=0.8)
+        axis.set_title(name, loc="left", fontsize=8.5, color=LIGHT["soft"], pad=2)
+        axis.locator_params(axis="y", nbins=3)
+    axes[-1].set_xlabel("time [s]")
+    axes[-1].set_xlim(trace.time_s[0], trace.time_s[-1])
+    return figure
+
+
+def _panels(curves: int, width: float) -> tuple[Any, Any]:
+    """Return figure and axes: `curves` tall ones, two low ones."""
+    from matplotlib import pyplot as plt
+
+    heights = [3.0] * curves + [1.2, 1.2]
+    height = 0.9 + 0.43 * sum(heights)
+    figure, axes = plt.subplots(len(heights), 1, sharex=True, figsize=(width, height), height_ratios=heights)
+    # margins in inches; a layout engine would draw everything twice
+    figure.subplots_adjust(
+        left=0.62 / width,
+        right=1.0 - 0.12 / width,
+        top=1.0 - 0.24 / height,
+        bottom=0.45 / height,
+        hspace=0.45,
+    )
+    return figure, axes
+
+
+def _limit(curves: Sequence[Any], floor: float) -> float:
+    """Half the height of the residual's axes: all of every curve, the noise band too."""
+    heights = [float(np.nanmax(np.abs(c))) for c in curves if np.isfinite(c).any()]
+    if np.isfinite(floor):
+        heights.append(1.3 * _FLOOR_SIGMAS * floor)
+    return 1.08 * max(heights, default=1.0) or 1.0
+
+
+def own_ids(svg: str, prefix: str) -> str:
+    """Return the picture with ids of its own, so that several fit into one page."""
+    svg = re.sub(r'\bid="', f'id="{prefix}-', svg)
+    return re.sub(r'(url\(#|href="#)', rf"\1{prefix}-", svg)
+
+
+def inherited(svg: str) -> str:
+    """Return the picture with the page's font and coordinates of a tenth of a unit: a third of the size."""
+    svg = re.sub(r"font: (?:[a-z]+ )?([\d.]+px) [^;\"]*", r"font-size: \1", svg)
+    return re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\d+\.\d)\d+", r"\1", path[0]), svg)

@@ -1,0 +1,263 @@
+"""Which effects are there: beam search over the library by BIC, one after another, all refitted jointly. Pure.
+
+BIC = deviance of the mixed model + ln(n_eff) per parameter. An effect enters when it lowers BIC by ENTER and when its
+parameters are physically plausible; it stays when nothing that came later replaces it. Held out: the coefficients
+of all other runs must predict the left-out run better with the effect than without.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from estimator.friction import FloatArray
+from sysid.diagnosis.columns import Candidate
+from sysid.diagnosis.mixed import Mixed, Model, explained, solve
+from sysid.diagnosis.powerless import Readings, Row, misfit
+
+ENTER: Final = 10.0
+"""BIC difference: very strong evidence on the scale of Kass and Raftery 1995, J. Am. Stat. Assoc. 90."""
+HELD_OUT: Final = 0.3
+"""Part of the evidence in sample that must be there on runs left out."""
+DEEPEST: Final = 6
+_BEAM: Final = 3
+_TRIED: Final = 8
+_WAVES: Final = frozenset({"torque_ripple", "cogging", "kinematic_error"})
+"""Effects of which several orders may be there at once."""
+_SCALED: Final = ("nonlinear_stiffness", "torque_constant")
+_ONE_FACTOR: Final = 0.3
+"""Changes that differ by less than this part of themselves are one."""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A set of candidates and its fit; bic as above."""
+
+    chosen: tuple[Candidate, ...]
+    model: Model
+    bic: float
+
+    def coefficients(self, candidate: Candidate) -> list[float]:
+        """Return the coefficients of one of its candidates."""
+        first = 0
+        for one in self.chosen:
+            if one is candidate:
+                return [float(b) for b in self.model.beta[first : first + one.size]]
+            first += one.size
+        raise KeyError(candidate.key)
+
+
+class Search:
+    """The library's candidates on one set of runs.
+
+    column_rms [P]: rms of a unit of every column in the channel where it is largest, Nm; least_nm: contributions below
+    are not called effects, however certain; readings, unpowered: what the currents read without power, per run, and which
+    columns make them read that (`powerless`).
+    """
+
+    def __init__(  # noqa: PLR0917
+        self,
+        mixed: Mixed,
+        candidates: Sequence[Candidate],
+        effective_rows: float,
+        column_rms: FloatArray,
+        least_nm: float,
+        readings: Sequence[Readings] = (),
+        unpowered: Sequence[Row] = (),
+    ) -> None:
+        self.mixed = mixed
+        self.column_rms = column_rms
+        self.least_nm = least_nm
+        self._readings, self._unpowered = readings, unpowered
+        self.candidates = tuple(candidates)
+        self.log_n = math.log(max(effective_rows, 10.0))
+        prior, _ = mixed.marginal(mixed.prior)
+        certain, _ = mixed.marginal(np.full_like(mixed.prior, 1e-12))
+        self._marginal_share = np.clip(np.diag(prior) / np.maximum(np.diag(certain), 1e-300), 0.0, 1.0)
+        terms: dict[tuple[str, object], int] = {}
+        for c in candidates:
+            terms[c.key] = terms.get(c.key, 0) + 1
+        self._choice = {key: 2.0 * math.log(n) for key, n in terms.items()}
+        self._log_n = {c.first: self._rows_that_count(c) for c in candidates}
+        self.joints = len({c.joint for c in candidates} - {"sensor"})
+        self._cache: dict[tuple[int, ...], Hypothesis] = {}
+
+    def penalty(self, candidate: Candidate) -> float:
+        """Return what the candidate costs in BIC: its parameters, and the choice among its terms."""
+        return candidate.size * self._log_n[candidate.first] + self._choice[candidate.key]
+
+    def _rows_that_count(self, candidate: Candidate) -> float:
+        """Return ln n for the BIC of a candidate: of all rows where its uncertainty is noise, of the runs where it is
+        what differs between runs (an offset is measured once per run, however long the run).
+        """
+        share = 1.0 - float(self._marginal_share[candidate.first])
+        return (1.0 - share) * self.log_n + share * math.log(self.mixed.runs + 1.0)
+
+    def hypothesis(self, chosen: Sequence[Candidate], start: Model | None = None) -> Hypothesis:
+        """Return the fit of a set of candidates."""
+        ordered = tuple(sorted(chosen, key=lambda c: c.first))
+        key = tuple(c.first for c in ordered)
+        if key not in self._cache:
+            columns = [k for c in ordered for k in c.columns]
+            model = self.mixed.fit(columns, None if start is None else start.variances)
+            cost = sum(self.penalty(c) for c in ordered)
+            self._cache[key] = Hypothesis(ordered, model, model.deviance + cost)
+        return self._cache[key]
+
+    def plausible(self, hypothesis: Hypothesis) -> bool:
+        """Return whether all parameters lie in their plausible ranges, and all contributions matter."""
+        if units_changed(hypothesis, self.joints):
+            return False
+        return all(
+            within(c, hypothesis.coefficients(c)) and self.size_nm(hypothesis, c) >= self.least_nm
+            for c in hypothesis.chosen
+        )
+
+    def size_nm(self, hypothesis: Hypothesis, candidate: Candidate) -> float:
+        """Return the rms of a candidate's contribution, its columns taken as uncorrelated [Nm]."""
+        sizes = np.array(hypothesis.coefficients(candidate)) * self.column_rms[list(candidate.columns)]
+        return float(np.sqrt(sizes @ sizes))
+
+    def unread(self, hypothesis: Hypothesis) -> float:
+        """Return the sum of squares that what the currents read without power leaves; 0 without such a reading."""
+        beta = dict(zip(hypothesis.model.columns, hypothesis.model.beta, strict=True))
+        read: dict[int, float] = {}
+        for where, column, amperes in self._unpowered:
+            if isinstance(where, int):
+                read[where] = read.get(where, 0.0) + amperes * float(beta.get(column, 0.0))
+        return misfit(self._readings, read)
+
+    def fits_beside(self, candidate: Candidate, chosen: Sequence[Candidate]) -> bool:
+        """Return whether a candidate may be added: an effect is there once, waves once per order."""
+        if not pinned([*chosen, candidate], self.joints):
+            return False
+        for one in chosen:
+            if one.key == candidate.key and (
+                candidate.effect.name not in _WAVES or _order(one) == _order(candidate)
+            ):
+                return False
+        return True
+
+    def run(self) -> Hypothesis:
+        """Return the best set of candidates."""
+        best = self.hypothesis(())
+        beam = [best]
+        for _ in range(DEEPEST):
+            grown: dict[tuple[int, ...], Hypothesis] = {}
+            for parent in beam:
+                for child in self.children(parent):
+                    grown[tuple(c.first for c in child.chosen)] = child
+            if not grown:
+                break
+            beam = sorted(grown.values(), key=lambda h: h.bic)[:_BEAM]
+            best = min((best, beam[0]), key=_with_price)
+        return self.pruned(best)
+
+    def children(self, parent: Hypothesis) -> list[Hypothesis]:
+        """Return the most promising plausible extensions that lower BIC by ENTER."""
+        # at the parent's variances what is common to all runs can hide in them, so the prior's are tried too
+        totals = [self.mixed.marginal(v)[0] for v in (parent.model.variances, self.mixed.prior)]
+        base = list(parent.model.columns)
+        scored = []
+        for candidate in self.candidates:
+            if self.fits_beside(candidate, parent.chosen):
+                drop = max(explained(total, base, list(candidate.columns)) for total in totals)
+                scored.append((drop - self.penalty(candidate), candidate))
+        scored.sort(key=lambda pair: -pair[0])
+        out = []
+        tried = 0
+        for drop, candidate in scored:
+            if drop < ENTER * 0.5 or tried >= _TRIED:
+                break
+            child = self.hypothesis((*parent.chosen, candidate), parent.model)
+            if self.plausible(child):
+                tried += 1
+                if child.bic < parent.bic - ENTER:
+                    out.append(child)
+        return out
+
+    def pruned(self, best: Hypothesis) -> Hypothesis:
+        """Return the set without candidates that are no longer worth their place."""
+        while best.chosen:
+            smaller = [
+                self.hypothesis([c for c in best.chosen if c is not one], best.model) for one in best.chosen
+            ]
+            candidate = min(smaller, key=lambda h: h.bic)
+            if candidate.bic - best.bic >= ENTER or not self.plausible(candidate):
+                return best
+            best = candidate
+        return best
+
+    def held_out(self, hypothesis: Hypothesis, candidate: Candidate) -> float:
+        """Return the drop of the deviance on runs left out that the candidate brings, summed over the runs."""
+        without = self.hypothesis([c for c in hypothesis.chosen if c is not candidate], hypothesis.model)
+        return float(np.sum(self.held_out_deviances(without) - self.held_out_deviances(hypothesis)))
+
+    def held_out_deviances(self, hypothesis: Hypothesis) -> FloatArray:
+        """Return the deviance of each run left out, coefficients from all others: what varies from run to run has its
+        price.
+        """
+        grams, logs = self._per_run(hypothesis)
+        contrasts = [np.append(-beta, 1.0) for beta in self.held_out_beta(hypothesis)]
+        squares = [float(c @ gram @ c) for c, gram in zip(contrasts, grams, strict=True)]
+        return np.asarray(logs + np.array(squares))
+
+    def held_out_beta(self, hypothesis: Hypothesis) -> list[FloatArray]:
+        """Return per run the coefficients of a set of candidates from all other runs."""
+        grams, _ = self._per_run(hypothesis)
+        total = grams.sum(axis=0)
+        return [solve(total - gram, len(hypothesis.model.columns))[0] for gram in grams]
+
+    def _per_run(self, hypothesis: Hypothesis) -> tuple[FloatArray, FloatArray]:
+        """Return per run the normal equations of a set of candidates and the log determinants [r]."""
+        marginals, logs = self.mixed.marginal_runs(hypothesis.model.variances)
+        places = np.array([*hypothesis.model.columns, marginals.shape[1] - 1], np.intp)
+        return marginals[:, places[:, None], places[None, :]], logs
+
+
+def _with_price(hypothesis: Hypothesis) -> float:
+    """Return BIC with ENTER per effect: a set from another branch must be worth its effects as an addition must. Two zeros
+    in the place of one (a sensor's and one joint's for the other joint's) fit as well, and by chance a little better.
+    """
+    return hypothesis.bic + ENTER * len(hypothesis.chosen)
+
+
+def pinned(chosen: Sequence[Candidate], joints: int) -> bool:
+    """Return whether something fixes the scale: with the sensor's gain free, the stiffness (and the torque constant) of
+    at least one joint is not. All of them times the same factor is a change of units, which shrinks the noise too.
+    """
+    names = [c.effect.name for c in chosen]
+    if "sensor_gain" not in names:
+        return True
+    return all(names.count(name) < joints for name in _SCALED)
+
+
+def units_changed(hypothesis: Hypothesis, joints: int) -> bool:
+    """Return whether stiffness and torque constant of every joint change by one factor: the sensor's gain in other words,
+    which is one effect instead of many, and shrinks the noise where the factor is below 1 (see `pinned`).
+    """
+    changes: list[float] = []
+    for candidate in hypothesis.chosen:
+        if candidate.effect.name in _SCALED:
+            values = candidate.term.combine(hypothesis.coefficients(candidate))
+            nothing = candidate.term.combine([0.0] * candidate.size)
+            keyed = next(p.name for p in candidate.effect.parameters if p.key)
+            changes.append(values[keyed] / nothing[keyed] - 1.0)
+    if len(changes) < len(_SCALED) * max(joints, 1):
+        return False
+    spread = max(changes) - min(changes)
+    return bool(spread < _ONE_FACTOR * abs(sum(changes) / len(changes)))
+
+
+def within(candidate: Candidate, coefficients: Sequence[float]) -> bool:
+    """Return whether the parameters of these coefficients are plausible."""
+    values = candidate.term.combine(coefficients)
+    return all(p.low <= values[p.name] <= p.high for p in candidate.effect.parameters if p.name in values)
+
+
+def _order(candidate: Candidate) -> float:
+    return float(candidate.term.basis[0].get("order_per_motor_rev", 0.0))

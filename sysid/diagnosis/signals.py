@@ -1,0 +1,220 @@
+"""What a diagnosis sees of one joint in one run: state for the effects, residuals of both balances, masks. Pure.
+
+The residuals are those of `estimator.effects.effect`: what the simulation with the joint file leaves over. Derivatives
+are central differences of positions, which look one sample ahead: this is for recorded runs. All arrays are later
+averaged over equal bins, residual and regressors alike, so that noise of differences averages out and nothing is
+compared with something filtered in another way.
+
+The torsion that the effects see is tau/K, not the encoders' difference: the residual of the torsion balance is made of
+that difference, and a regressor made of it too would explain it by itself. For the same reason currents and torques in
+regressors are smoothed over a few milliseconds: their noise is also in the residual, and would be explained by
+itself at the frequencies where there is nothing else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from estimator.effects.effect import State
+from estimator.friction import FloatArray
+from estimator.parameters import Joint
+from estimator.run import JointColumns, RunTable
+from sysid.diagnosis.base_loss import BaseLoss
+
+BoolArray = np.ndarray[tuple[int], np.dtype[np.bool_]]
+
+SLOWEST_RAD_S: Final = 0.03
+"""Below it the direction of friction, and so its value, is not known from a velocity measurement."""
+_AFTER_REST_S: Final = 0.03
+"""So long after (and before) such a velocity the transients of sticking are still in the torque."""
+_SMOOTH_S: Final = 0.005
+_COARSE: Final = 3.0
+"""A position whose difference is noisier by this factor than the velocity channel is not used for it."""
+
+
+@dataclass(frozen=True)
+class JointSignals:
+    """One joint of one run, arrays [n] at the run's own rate.
+
+    number: joint; state: what hooks use; motor_nm, torsion_nm: residuals of the two balances [Nm] (torsion None: one
+    encoder only); moving: samples at which friction has a direction; per_torque: by how much the motor residual falls per Nm
+    that the sensor reads too high, 1 where the losses know no load (`sensor_zero`); off: samples at which the power stage is
+    off (None: the run does not tell).
+    """
+
+    run: str
+    number: int
+    joint: Joint
+    time_s: FloatArray
+    state: State
+    motor_nm: FloatArray
+    torsion_nm: FloatArray | None
+    moving: BoolArray
+    sensor_nm: FloatArray
+    per_torque: FloatArray | float = 1.0
+    twist_rad: FloatArray | None = None  # theta_m/G - theta_l less its zero, smoothed
+    off: BoolArray | None = None
+    of_position: bool = (
+        True  # the acceleration is a second difference of the position, else one of the velocity
+    )
+
+    def seen(self, rate_rad_s: FloatArray) -> FloatArray:
+        """Return how much of a torque that swings at this rate [n] the motor balance holds [n].
+
+        A quick torque moves the rotor and nothing else, and samples show less of that acceleration than there is: nothing at
+        the sampling rate, where the regressor alone would be left, standing still.
+        """
+        turn = np.abs(rate_rad_s) * float(np.median(np.diff(self.time_s)))
+        turn = np.maximum(turn, 1e-3)
+        if self.of_position:
+            return np.asarray((30.0 - 32.0 * np.cos(turn) + 2.0 * np.cos(2.0 * turn)) / (12.0 * turn * turn))
+        return np.asarray(np.sin(turn) / turn)
+
+
+class SignalsError(ValueError):
+    """A run cannot serve a diagnosis; one line."""
+
+
+def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: BaseLoss) -> JointSignals:
+    """Return the signals of one joint; raises SignalsError for a column that is missing and cannot be derived."""
+    raw = table.joints[number]
+    columns = table.joint(number, joint.gear_ratio)
+    for name in ("current_a", "torque_nm", "motor_velocity_rad_s"):
+        if getattr(columns, name) is None:
+            raise SignalsError(f"{run}: j{number}.{name}: missing, and nothing it could be derived from")
+    assert columns.current_a is not None
+    assert columns.torque_nm is not None
+    assert columns.motor_position_rad is not None or columns.motor_velocity_rad_s is not None
+    time = table.time_s
+    speed = _motor_speed(time, raw, columns)
+    position = columns.motor_position_rad
+    if position is None:
+        position = np.concatenate(([0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(time))))
+    velocity = speed / joint.gear_ratio
+    of_position = raw.motor_position_rad is not None and speed is not raw.motor_velocity_rad_s
+    # of the position where the velocity is that of the position too
+    acceleration = second_difference(position, time) if of_position else np.gradient(speed, time)
+    both = _two_encoders(raw, joint.gear_ratio)
+    link = columns.link_position_rad if columns.link_position_rad is not None else position / joint.gear_ratio
+    link_acceleration = acceleration / joint.gear_ratio
+    sensor = columns.torque_nm
+    wide = max(1, round(_SMOOTH_S / max(float(np.median(np.diff(time))), 1e-9)))
+    if both:
+        # not of the link encoder, whose noise is K times over in the torsion balance; the spring's part is small
+        torsion_acceleration = second_difference(smooth(sensor, wide), time) / joint.stiffness_nm_per_rad
+        link_acceleration = link_acceleration - torsion_acceleration
+    gear_torque = sensor + joint.link_inertia_kgm2 * link_acceleration
+    calm_torque, calm_current = smooth(gear_torque, wide), smooth(columns.current_a, wide)
+    calm_sensor = smooth(sensor, wide)
+    moving = _moving(time, velocity)
+    state = State(
+        current_a=calm_current,
+        current_rate_a_s=np.gradient(calm_current, time),
+        direction=np.where(np.abs(velocity) > 1e-6, np.sign(velocity), 0.0),
+        link_acceleration_rad_s2=link_acceleration,
+        link_position_rad=link,
+        link_velocity_rad_s=velocity,
+        motor_acceleration_rad_s2=acceleration,
+        motor_position_rad=position,
+        temperature_c=_or_nan(columns.temperature_c, len(time)),
+        time_s=time - time[0],
+        torque_nm=calm_torque,
+        torque_rate_nm_s=np.gradient(calm_sensor, time),
+        torsion_rad=calm_torque / joint.stiffness_nm_per_rad,
+        velocity_rad_s=velocity,
+        coupling_position_rad=link if number != 2 else -link,
+    )
+    motor_torque = joint.gear_ratio * (
+        joint.torque_constant_nm_per_a * columns.current_a - joint.rotor_inertia_kgm2 * acceleration
+    )
+    motor = motor_torque - base.loss(gear_torque, velocity) - gear_torque
+    torsion = bent = None
+    if both:
+        twist = position / joint.gear_ratio - link
+        rate = velocity - np.gradient(link, time)
+        zero = _zero(twist - gear_torque / joint.stiffness_nm_per_rad, calm_torque)
+        torsion = joint.stiffness_nm_per_rad * (twist - zero) + joint.damping_nms_per_rad * rate - gear_torque
+        bent = smooth(twist - zero, wide)
+    off = None if columns.enabled is None else np.asarray(columns.enabled < 0.5)
+    return JointSignals(
+        run,
+        number,
+        joint,
+        time,
+        state,
+        motor,
+        torsion,
+        moving,
+        sensor,
+        twist_rad=bent,
+        off=off,
+        of_position=of_position,
+    )
+
+
+def _zero(apart: FloatArray, torque: FloatArray) -> float:
+    """Return the zero of the torsion [rad]: in the middle between both signs of the load, as play and hysteresis are odd."""
+    sides = [apart[torque > 0.0], apart[torque < 0.0]]
+    if min(map(len, sides)) < 0.1 * len(apart):
+        return float(np.median(apart))
+    return 0.5 * float(np.median(sides[0]) + np.median(sides[1]))
+
+
+def _two_encoders(raw: JointColumns, gear_ratio: float) -> bool:
+    """Return whether both sides of the gear were measured: columns that are each other through the ratio are one encoder."""
+    motor, link = raw.motor_position_rad, raw.link_position_rad
+    if motor is None or link is None:
+        return False
+    apart = motor / gear_ratio - link
+    return float(np.ptp(apart)) > 1e-9 * max(float(np.ptp(link)), 1e-6)
+
+
+def _or_nan(column: FloatArray | None, count: int) -> FloatArray:
+    return np.full(count, np.nan) if column is None else column
+
+
+def _motor_speed(time: FloatArray, raw: JointColumns, columns: JointColumns) -> FloatArray:
+    """Velocity of the motor [rad/s]: of its position where that is fine enough, else the channel itself."""
+    assert columns.motor_velocity_rad_s is not None
+    if raw.motor_position_rad is None:
+        return columns.motor_velocity_rad_s
+    derived: FloatArray = np.gradient(raw.motor_position_rad, time)
+    if raw.motor_velocity_rad_s is None:
+        return derived
+    noise = [float(np.std(np.diff(v, 2))) for v in (derived, raw.motor_velocity_rad_s)]
+    return derived if noise[0] <= _COARSE * max(noise[1], 1e-9) else raw.motor_velocity_rad_s
+
+
+def second_difference(x: FloatArray, time: FloatArray) -> FloatArray:
+    """Return the second derivative [n]: fourth order on even steps, so that a ripple of 80 Hz at 1 kHz keeps its size
+    (two central differences would take 8 % of it); plain differences where steps are uneven; ends held.
+    """
+    steps = np.diff(time)
+    step = float(np.median(steps))
+    if len(x) < 5 or float(np.max(np.abs(steps - step))) > 0.05 * step:
+        return np.asarray(np.gradient(np.gradient(x, time), time))
+    inner = (16.0 * (x[3:-1] + x[1:-3]) - x[4:] - x[:-4] - 30.0 * x[2:-2]) / (12.0 * step * step)
+    return np.pad(inner, 2, mode="edge")
+
+
+def _moving(time: FloatArray, velocity: FloatArray) -> BoolArray:
+    """True where the joint moves and has done so, and will, for _AFTER_REST_S."""
+    slow = np.abs(velocity) < SLOWEST_RAD_S
+    wide = max(1, round(_AFTER_REST_S / max(float(np.median(np.diff(time))), 1e-9)))
+    near = np.convolve(slow, np.ones(2 * wide + 1), "same") > 0.5
+    result: BoolArray = ~near
+    return result
+
+
+def smooth(x: FloatArray, samples: int) -> FloatArray:
+    """Return x twice averaged over `samples` (odd or even, centred together), ends held."""
+    out = x
+    for before in (samples // 2, samples - 1 - samples // 2):
+        padded = np.pad(out, (before, samples - 1 - before), mode="edge")
+        total = np.cumsum(np.concatenate(([0.0], padded)))
+        out = (total[samples:] - total[:-samples]) / samples
+    result: FloatArray = out
+    return result

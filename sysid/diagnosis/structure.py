@@ -1,0 +1,189 @@
+"""What is left over, and where: maps of the residual with tests that need no noise model. Pure.
+
+A residual that has nothing to do with the conditions changes its sign at random from second to second, run to run.
+So its sums over the bins of an axis (velocity, load, angles, ...) are compared with those after flipping the sign of whole
+blocks at random: what is common to many blocks is structure. Beside maps there are `lines` and
+`events`. Everything in Nm^2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from estimator.effects.effect import MOTOR
+from estimator.friction import FloatArray
+from sysid.diagnosis.channel import Channel
+from sysid.diagnosis.columns import RunData
+from sysid.diagnosis.events import BLOCK_S
+
+FLIPS: Final = 9999
+SIGNIFICANT: Final = 2e-4
+"""Some fifty maps are looked at: one in a hundred sets of runs has a map this unlikely by chance."""
+_BINS: Final = 12
+_FEWEST_BLOCKS: Final = 8
+
+
+@dataclass(frozen=True)
+class AxisMap:
+    """One axis of one channel: edges [b+1], time spent in each bin [b] (samples), mean and mean square of the residual
+    per bin, energy between bins that is not chance (>= 0, Nm^2), p value.
+    """
+
+    channel: Channel
+    axis: str
+    unit: str
+    edges: FloatArray
+    count: FloatArray
+    mean_nm: FloatArray
+    square_nm2: FloatArray
+    energy_nm2: float
+    p: float
+
+
+UNITS: Final = {
+    "velocity": "rad/s",
+    "load": "Nm",
+    "current": "A",
+    "quadrant": "",
+    "temperature": "degC",
+    "motor_angle": "rad",
+    "link_angle": "rad",
+    "time": "s",
+    "frequency": "Hz",
+}
+
+
+AXES: Final = (
+    "velocity",
+    "load",
+    "current",
+    "quadrant",
+    "temperature",
+    "motor_angle",
+    "link_angle",
+    "time",
+)
+
+
+def axes_of(channel: Channel) -> tuple[str, ...]:
+    """Return the axes that a channel is drawn over; the spring knows nothing of the current."""
+    return AXES if channel.balance == MOTOR else tuple(a for a in AXES if a != "current")
+
+
+def axis_edges(axis: str, values: FloatArray) -> FloatArray | None:
+    """Return the edges of the bins of an axis, None where it does not vary."""
+    good = values[np.isfinite(values)]
+    if len(good) < 100:
+        return None
+    if axis == "motor_angle":
+        return np.linspace(0.0, 2.0 * np.pi, _BINS + 1)
+    if axis == "quadrant":
+        return np.array([-0.5, 0.5, 1.5, 2.5, 3.5])
+    low, high = float(good.min()), float(good.max())
+    if high - low < 1e-6 or (axis == "temperature" and high - low < 2.0):
+        return None
+    count = 2 * _BINS if axis in ("link_angle", "velocity", "current") else _BINS
+    edges = np.linspace(low, high, count + 1)
+    edges[-1] += 1e-9 * (high - low)
+    return edges
+
+
+def axis_values(axes: Mapping[str, FloatArray], axis: str) -> FloatArray:
+    """Return the coordinate of every bin of a run; angles of the motor within a turn, of the link as they are within
+    one turn or wrapped when the link turns further.
+    """
+    if axis == "quadrant":
+        v, load = axes["velocity"], axes["load"]
+        return np.where(v >= 0.0, np.where(load >= 0.0, 0.0, 1.0), np.where(load >= 0.0, 2.0, 3.0))
+    if axis == "motor_angle":
+        return np.asarray(np.mod(axes[axis], 2.0 * np.pi))
+    if axis == "link_angle":
+        return np.asarray(np.mod(axes[axis] + np.pi, 2.0 * np.pi) - np.pi)
+    return axes[axis]
+
+
+def axis_maps(
+    runs: Sequence[RunData], residuals: Mapping[Channel, list[FloatArray]], step_s: float, seed: int = 0
+) -> list[AxisMap]:
+    """Return the maps of all channels and axes; residuals per channel and run [n], NaN where not valid."""
+    rng = np.random.default_rng(seed)
+    block = max(2, round(BLOCK_S / step_s))
+    out = []
+    for channel, plain in residuals.items():
+        for axis in axes_of(channel):
+            values = [axis_values(run.axes[channel.joint], axis) for run in runs]
+            there = [v[np.isfinite(x)] for v, x in zip(values, plain, strict=True)]
+            edges = axis_edges(axis, np.concatenate(there))
+            if edges is not None:
+                maps = [
+                    axis_map(channel, axis, edges, values, turned(plain, side), block, rng)
+                    for side in directions(runs, channel)
+                ]
+                out.append(max(maps, key=lambda m: (m.p < SIGNIFICANT, m.energy_nm2)))
+    return out
+
+
+def directions(runs: Sequence[RunData], channel: Channel) -> list[list[FloatArray] | None]:
+    """Return the signs in which a channel is looked at: as it is (None); the motor balance also in the direction of motion,
+    because a loss changes its sign with the direction and would cancel in a map of both, and in that of the current, as
+    what a drive loses does.
+    """
+    if channel.balance != MOTOR:
+        return [None]
+    axes = [run.axes[channel.joint] for run in runs]
+    return [None, [np.sign(a["velocity"]) for a in axes], [np.sign(a["current"]) for a in axes]]
+
+
+def turned(parts: Sequence[FloatArray], side: Sequence[FloatArray] | None) -> list[FloatArray]:
+    """Return the residual in these signs [run][n]."""
+    return list(parts) if side is None else [x * d for x, d in zip(parts, side, strict=True)]
+
+
+def axis_map(  # noqa: PLR0917
+    channel: Channel,
+    axis: str,
+    edges: FloatArray,
+    values: Sequence[FloatArray],
+    parts: Sequence[FloatArray],
+    block: int,
+    rng: np.random.Generator,
+) -> AxisMap:
+    """Return the map of one axis; values [run][n]: its coordinate, block: samples whose sign is flipped together."""
+    bins = len(edges) - 1
+    sums, counts, squares = [], np.zeros(bins), np.zeros(bins)
+    for v, x in zip(values, parts, strict=True):
+        good = np.isfinite(x) & np.isfinite(v)
+        place = np.clip(np.searchsorted(edges, v[good], side="right") - 1, 0, bins - 1)
+        number = np.arange(len(x))[good] // block
+        many = int(number.max()) + 1 if len(number) else 0
+        flat = np.bincount(number * bins + place, weights=x[good], minlength=many * bins)
+        sums.append(flat.reshape(many, bins))
+        counts += np.bincount(place, minlength=bins)
+        squares += np.bincount(place, weights=x[good] ** 2, minlength=bins)
+    table = np.vstack(sums)
+    busy = counts > 50
+    weight = np.where(busy, 1.0 / np.maximum(counts, 1.0), 0.0)
+    total = table.sum(axis=0)
+    found = float(np.sum(total**2 * weight))
+    signs = rng.choice((-1.0, 1.0), size=(FLIPS, len(table)))
+    chance = ((signs @ table) ** 2) @ weight
+    p = float((1 + np.sum(chance >= found)) / (FLIPS + 1))
+    n = max(float(counts.sum()), 1.0)
+    energy = max(found - float(chance.mean()), 0.0) / n
+    if len(table) < _FEWEST_BLOCKS:
+        p = 1.0
+    return AxisMap(
+        channel,
+        axis,
+        UNITS[axis],
+        edges,
+        counts,
+        np.where(busy, total * weight, np.nan),
+        np.where(busy, squares * weight, np.nan),
+        energy,
+        p,
+    )

@@ -1,0 +1,332 @@
+"""From the statistics to findings: gaps, causes with classes and intervals, evidence, gain, what is left over. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from estimator.parameters import Joint
+from sysid.diagnosis.channel import Channel
+from sysid.diagnosis.classes import equivalence_class
+from sysid.diagnosis.columns import Candidate, binned, contribution
+from sysid.diagnosis.evidence import candidate_table
+from sysid.diagnosis.experiments import MOST_KINDS, next_experiment
+from sysid.diagnosis.few_runs import ENOUGH_RUNS, FewRuns
+from sysid.diagnosis.findings import (
+    AMBIGUOUS,
+    CAUSE,
+    INSUFFICIENT,
+    NO_GAP,
+    UNEXPLAINED,
+    Cause,
+    Findings,
+    Gap,
+    JointName,
+    Value,
+)
+from sysid.diagnosis.gain import held_out_gain, left_out_steps
+from sysid.diagnosis.gaps import channel_gaps, traces
+from sysid.diagnosis.leftover import Leftover, leftover
+from sysid.diagnosis.minimum import RELEVANT
+from sysid.diagnosis.refine import Present, Refined, parameter, present_causes, refine
+from sysid.diagnosis.rests import offset_at_rest, rest_current
+from sysid.diagnosis.search import Hypothesis, Search
+from sysid.diagnosis.whitening import Noise
+from sysid.friction_fit import student_975
+
+if TYPE_CHECKING:
+    from sysid.diagnosis.prepared import Prepared
+
+UNEXPLAINED_SHARE: Final = 0.2
+"""When what is left over holds more than this part of the structured gap, the causes found do not name it."""
+
+INACCURATE: Final = 0.06
+"""Half width of the 95 % interval, as part of an effect's size, for what the equations here simplify (smoothing, first
+order in a delay): no interval is narrower. Judged by its coverage of known truths (docs/diagnosis.md).
+"""
+BESIDE: Final = 0.02
+"""Part of the largest cause's contribution below which another one is within the model's own inaccuracy."""
+
+
+def conclude(  # noqa: PLR0917
+    prepared: Prepared,
+    search: Search,
+    best: Hypothesis,
+    refined: Refined,
+    noise: Noise,
+    joints: Mapping[int, Joint],
+    names: tuple[str, ...],
+    numbers: tuple[int, ...],
+) -> Findings:
+    """Return the findings of one diagnosis."""
+    best, refined, explained = _relevant(prepared, search, best, refined, noise, joints)
+    left = leftover(prepared, refined, noise, joints)
+    whole, squares = best, sum(r * r for e in explained for r in e.values())
+    few = FewRuns(prepared, search) if search.mixed.runs < ENOUGH_RUNS else None
+    if few is not None:  # what is left over is judged with all that was found, names need more
+        best = few.confirmed(whole)
+        refined = refine(prepared, present_causes(best), noise)
+        best, refined, explained = _relevant(prepared, search, best, refined, noise, joints)
+    gain = held_out_gain(prepared, refined)
+    classes = [
+        few.rivals(best, candidate) if few is not None else equivalence_class(search, best, candidate)
+        for candidate in best.chosen
+    ]
+    best, refined, classes = _settled(prepared, search, best, refined, noise, classes)
+    explained = [_rms_at(prepared, p) for p in refined.present]
+    rivals = {r.key: c.effect.name for c, found in zip(best.chosen, classes, strict=True) for r in found}
+    causes = [
+        _cause(search, best, refined, k, classes[k], *_largest(explained[k])) for k in range(len(classes))
+    ]
+    if few is None:
+        whole, squares = best, sum(r * r for e in explained for r in e.values())
+    share = left.share(squares)
+    unsure = [] if few is None else few.unsure(whole, best, classes, causes)
+    doubt = few.doubt(unsure) if few is not None and unsure else ""
+    reasons: list[str] = []
+    if left.significant and (share > UNEXPLAINED_SHARE or not whole.chosen):
+        verdict = UNEXPLAINED
+        if whole.chosen:
+            reasons.append(
+                f"{share:.0%} of the structured gap is left over by the closest effects of the library ("
+                + ", ".join(f"{c.effect.name} of {_of(c.joint)}" for c in whole.chosen)
+                + "), so they are not named as its cause"
+            )
+        causes = []
+        left, refined = _least_left(prepared, left, refined, noise, joints)
+    elif not causes:
+        verdict = INSUFFICIENT if doubt else NO_GAP
+        reasons += [doubt] if doubt else []
+    else:
+        verdict = CAUSE if all(len(c.names) == 1 for c in causes) and not doubt else AMBIGUOUS
+    reasons += left.reasons if verdict == UNEXPLAINED else []
+    causes.sort(key=lambda c: -c.rms_nm)
+    gaps = channel_gaps(prepared, refined, left if verdict == UNEXPLAINED else None)
+    return Findings(
+        verdict,
+        tuple(reasons or [s for s in (_sentence(verdict, causes, gaps), doubt) if s]),
+        names,
+        numbers,
+        gaps,
+        tuple(causes),
+        candidate_table(search, best, rivals),
+        gain if causes else None,
+        next_experiment=_next(verdict, causes, unsure, joints, prepared),
+        traces=traces(prepared, refined),
+    )
+
+
+def _least_left(
+    prepared: Prepared, left: Leftover, refined: Refined, noise: Noise, joints: Mapping[int, Joint]
+) -> tuple[Leftover, Refined]:
+    """Return what is left over without any cause where that is less: a fit that is bent leaves more than there was, and in
+    other places.
+    """
+    if not refined.present:
+        return left, refined
+    bare = refine(prepared, (), noise)
+    without = leftover(prepared, bare, noise, joints)
+    return (without, bare) if without.energy_nm2() <= left.energy_nm2() else (left, refined)
+
+
+def _settled(  # noqa: PLR0917
+    prepared: Prepared,
+    search: Search,
+    best: Hypothesis,
+    refined: Refined,
+    noise: Noise,
+    classes: list[tuple[Candidate, ...]],
+) -> tuple[Hypothesis, Refined, list[tuple[Candidate, ...]]]:
+    """Return the same without friction asymmetry where the current at rest shows that it is an offset (`rests`)."""
+    pair = {"current_offset", "friction_asymmetry"}
+    for k, cause in enumerate(best.chosen):
+        twin = next(
+            (c for c in classes[k] if c.joint == cause.joint and {c.effect.name, cause.effect.name} == pair),
+            None,
+        )
+        if twin is None or not isinstance(cause.joint, int):
+            continue
+        offset = cause if cause.effect.name == "current_offset" else twin
+        others = [c for c in best.chosen if c is not cause]
+        as_offset = search.hypothesis((*others, offset), best.model)
+        size = offset.term.combine(as_offset.coefficients(offset))["offset_a"]
+        if not offset_at_rest(rest_current(prepared.signals, cause.joint), size):
+            continue
+        rest = tuple(c for c in classes[k] if c is not twin)
+        if cause is not offset:
+            best = search.hypothesis((*others, twin), best.model)
+            refined = refine(prepared, present_causes(best), noise)
+            by_key = {
+                c.key: found for c, found in zip((*others, twin), (*_without(classes, k), rest), strict=True)
+            }
+            return best, refined, [by_key[c.key] for c in best.chosen]
+        classes = [*classes[:k], rest, *classes[k + 1 :]]
+    return best, refined, classes
+
+
+def _without(classes: Sequence[tuple[Candidate, ...]], k: int) -> list[tuple[Candidate, ...]]:
+    return [c for j, c in enumerate(classes) if j != k]
+
+
+def _next(
+    verdict: str,
+    causes: Sequence[Cause],
+    unsure: Sequence[tuple[str, JointName]],
+    joints: Mapping[int, Joint],
+    prepared: Prepared,
+) -> dict[str, Any] | None:
+    """Return the experiment that would settle an ambiguous verdict, or one of too few runs; unsure: what does not hold on
+    every run left out.
+    """
+    if verdict not in (AMBIGUOUS, INSUFFICIENT):
+        return None
+    classes = [tuple(dict.fromkeys(n.split(" of ")[0] for n in c.names)) for c in causes if len(c.names) > 1]
+    known = {s.number: joints[s.number] for s in prepared.signals[0]}
+    warm = bool(np.isfinite(prepared.signals[0][0].state.temperature_c).any())
+    said = [f"{' and '.join(names)} fit these runs equally well" for names in classes]
+    alone = tuple(dict.fromkeys(name for name, _ in unsure))[:MOST_KINDS]
+    if alone:
+        said.append(f"{', '.join(alone)}: seen on all runs together, but not settled by so few")
+    text = "; ".join(said)
+    classes += [(name,) for name in alone]
+    return next_experiment(classes, known, text, temperature=warm)
+
+
+def _relevant(  # noqa: PLR0917
+    prepared: Prepared,
+    search: Search,
+    best: Hypothesis,
+    refined: Refined,
+    noise: Noise,
+    joints: Mapping[int, Joint],
+) -> tuple[Hypothesis, Refined, list[dict[Channel, float]]]:
+    """Return hypothesis and refinement without causes that are too small to matter, and the rms of each in each channel."""
+    rated = max(j.rated_torque_nm for j in joints.values())
+    while True:
+        rms = [_rms_at(prepared, p) for p in refined.present]
+        sizes = [max(r.values(), default=0.0) for r in rms]
+        least = max(RELEVANT * rated, BESIDE * max(sizes, default=0.0))
+        large = [c for c, size in zip(best.chosen, sizes, strict=True) if size >= least]
+        if len(large) == len(best.chosen):
+            return best, refined, rms
+        best = search.hypothesis(large, best.model)
+        refined = refine(prepared, present_causes(best), noise)
+
+
+def _rms_at(prepared: Prepared, present: Present) -> dict[Channel, float]:
+    """Return the rms of one cause's contribution in each channel, Nm, over valid bins; a constant in torsion is none."""
+    sums: dict[Channel, list[float]] = {}
+    for run, data in zip(prepared.signals, prepared.runs, strict=True):
+        for s in run:
+            if present.joint not in ("sensor", s.number):
+                continue
+            for balance, value in contribution(present.effect, present.values, s).items():
+                channel = Channel(s.number, balance)
+                part = binned(value, prepared.samples)[data.channels[channel].valid]
+                if balance == "torsion" and len(part):
+                    part = part - part.mean()
+                total = sums.setdefault(channel, [0.0, 0.0])
+                total[0] += float(part @ part)
+                total[1] += len(part)
+    return {c: float(np.sqrt(a / n)) for c, (a, n) in sums.items() if n}
+
+
+def _largest(rms: Mapping[Channel, float]) -> tuple[float, str]:
+    channel = max(rms, key=lambda c: rms[c])
+    return rms[channel], channel.balance
+
+
+def _of(joint: JointName) -> str:
+    return "the sensor" if joint == "sensor" else f"joint {joint}"
+
+
+def _cause(  # noqa: PLR0917
+    search: Search,
+    best: Hypothesis,
+    refined: Refined,
+    k: int,
+    rivals: Sequence[Candidate],
+    rms_nm: float,
+    balance: str,
+) -> Cause:
+    candidate = best.chosen[k]
+    present = refined.present[k]
+    first = sum(len(p.free) for p in refined.present[:k])
+    values: dict[str, Value] = {}
+    runs = refined.mixed.runs
+    zero = candidate.term.combine([0.0] * candidate.size)
+    for name, value in present.values.items():
+        unit = parameter(present.effect, name).unit
+        if name in present.free:
+            place = first + present.free.index(name)
+            share = float(refined.random_share[place])
+            freedom = min((runs - 1.0) / max(share, 1e-3) ** 2, 1e4)
+            half = student_975(freedom) * float(np.sqrt(refined.covariance[place, place]))
+            # a phase has no size of its own: an angle of the same part of the wave
+            size = 1.0 if name == "phase_rad" else abs(value - zero.get(name, 0.0))
+            half = float(np.hypot(half, INACCURATE * size))
+            if runs < ENOUGH_RUNS:  # no narrower than what the runs say one without the other
+                half = max(half, *(abs(float(step[place])) for step in left_out_steps(refined)))
+            low, high = value - half, value + half
+            if name != "phase_rad":  # nothing is known beyond what the library thinks possible
+                p = parameter(present.effect, name)
+                low, high = max(low, p.low), min(high, p.high)
+            values[name] = Value(value, (low, high), unit)
+        elif parameter(present.effect, name).fixed:
+            values[name] = Value(value, (value, value), unit)
+    without = search.hypothesis([c for c in best.chosen if c is not candidate], best.model)
+    names = [candidate.effect.name]
+    for rival in rivals:
+        label = rival.effect.name
+        if rival.joint != candidate.joint:
+            label += f" of {_of(rival.joint)}"
+        if label not in names:
+            names.append(label)
+    evidence = max(without.model.deviance - best.model.deviance, 1e-9)
+    return Cause(
+        candidate.effect.name,
+        candidate.joint,
+        tuple(names),
+        _normal_phase(values),
+        without.bic - best.bic,
+        search.held_out(best, candidate) / evidence,
+        rms_nm,
+        balance,
+    )
+
+
+def _normal_phase(values: dict[str, Value]) -> dict[str, Value]:
+    """Return the parameters with phases in (-pi, pi] and no negative amplitude."""
+    out = dict(values)
+    phase = out.get("phase_rad")
+    if phase is None:
+        return out
+    turn = 0.0
+    for name in ("amplitude_nm", "amplitude_rad", "moment_nm"):
+        v = out.get(name)
+        if v is not None and v.value < 0.0:
+            out[name] = Value(-v.value, (-v.ci95[1], -v.ci95[0]), v.unit)
+            turn = np.pi
+    value = phase.value + turn
+    shift = value - float(np.angle(np.exp(1j * value)))
+    low, high = phase.ci95
+    out["phase_rad"] = Value(value - shift, (low + turn - shift, high + turn - shift), phase.unit)
+    return out
+
+
+def _sentence(verdict: str, causes: Sequence[Cause], gaps: Sequence[Gap]) -> str:
+    if verdict == NO_GAP:
+        worst = gaps[0]
+        return (
+            f"the simulation agrees with the runs: {worst.rmse_nm:.3g} Nm rms at joint {worst.joint} "
+            f"({worst.balance} balance), of which noise and changes from run to run are {worst.noise_floor_nm:.3g} Nm"
+        )
+    parts = []
+    for c in causes:
+        text = c.name.replace("_", " ")
+        if len(c.names) > 1:
+            text += " (or " + ", ".join(n.replace("_", " ") for n in c.names[1:]) + ")"
+        parts.append(f"{text} of {_of(c.joint)}, {c.rms_nm:.3g} Nm rms")
+    return "the simulation lacks " + "; ".join(parts)

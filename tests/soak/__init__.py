@@ -1,0 +1,1 @@
+"""Soak: jtqd on the emulated bench for long, with faults drawn at random (docs/endurance.md)."""
