@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-here test-guest test-all bench bench-kernel fuzz soak soak-exact lint format clean
+.PHONY: help setup demo test test-here test-guest test-native test-all bench bench-kernel fuzz soak soak-exact lint format clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
@@ -20,14 +20,21 @@ demo: $(VENV)/.installed ## 20 s of jtqd on the emulated bench
 
 test: lint ## everything but the tests marked campaign
 	$(BIN)/python -m sim_can.bench_kernel build --unless-vcan
-	@$(MAKE) --no-print-directory -j2 --output-sync=target test-here test-guest
+	@status=0; \
+	$(MAKE) --no-print-directory -j2 --output-sync=target test-here test-guest || status=$$?; \
+	$(MAKE) --no-print-directory test-native || status=$$?; \
+	exit $$status
 
 # Two lanes side by side: the bench kernel keeps a time of its own, so neither lane feels the other.
 test-here:
-	$(BIN)/python -m pytest -m "not (campaign or socketcan or boots)"
+	$(BIN)/python -m pytest -m "not (campaign or socketcan or boots or native)"
 
 test-guest:
 	$(BIN)/python -m pytest -m "(socketcan or boots) and not campaign"
+
+# Loops of 1 kHz at the pace of this machine's clock: nothing beside them.
+test-native:
+	$(BIN)/python -m pytest -m "native and not (campaign or socketcan or boots)"
 
 test-all: lint ## everything
 	$(BIN)/python -m sim_can.bench_kernel build --unless-vcan

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from sim_can.bench_kernel import build, guest, packages, vcan
+from tests.native_pace import NativePace
 
 FORWARDED = "JTQD_FORWARDED_TESTS"  # set for the guest's pytest: write reports for the host's pytest
 REPORTS = "reports.jsonl"  # in the guest's job directory, where writes reach the host at once
@@ -28,9 +29,9 @@ def pytest_addoption(parser):
     group.addoption(
         "--bench-timeout",
         type=float,
-        default=float(os.environ.get("JTQD_BENCH_TIMEOUT", "1200")),
+        default=float(os.environ.get("JTQD_BENCH_TIMEOUT", "1440")),
         metavar="S",
-        help="wall time for all tests in the bench kernel (default: JTQD_BENCH_TIMEOUT or 1200)",
+        help="wall time for all tests in the bench kernel (default: JTQD_BENCH_TIMEOUT or 1440)",
     )
 
 
@@ -40,6 +41,7 @@ def pytest_configure(config):
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if os.environ.get(guest.MARK) != "1":
         config.pluginmanager.register(SocketCanTests(config), "jtqd-socketcan")
+        config.pluginmanager.register(NativePace(), "jtqd-native-pace")
     elif os.environ.get(FORWARDED) == "1":
         config.pluginmanager.register(ReportWriter(config), "jtqd-reports")
 
@@ -184,7 +186,10 @@ class SocketCanTests:
             said = [
                 f"--- bench kernel: end of {name} ---\n{text[-4000:]}"
                 for name in ("stdout", "stderr", "console.log")
-                if (text := (self.guest.job / name).read_text(errors="replace").strip())
+                if (
+                    file := self.guest.job / name
+                ).exists()  # none where it did not come as far as the command
+                and (text := file.read_text(errors="replace").strip())
             ]
             text = "\n".join([f"bench kernel: {why}; this was the first test without a result", *said])
         else:

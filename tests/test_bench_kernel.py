@@ -11,7 +11,7 @@ import time
 
 import pytest
 
-from sim_can.bench_kernel import build, guest, packages
+from sim_can.bench_kernel import build, guest, packages, source_edits
 
 FRAME = struct.Struct("<IB3x8s")
 SOL_CAN_RAW, CAN_RAW_FILTER, CAN_RAW_ERR_FILTER = 101, 1, 2
@@ -141,8 +141,8 @@ def test_time_out_kills_the_guest_and_says_so():
 # ---- pure parts
 
 
-def test_cache_key_changes_with_every_byte_of_config_and_with_the_version():
-    config, version = build.CONFIG_FILE.read_bytes(), "6.1.1-1"
+def test_cache_key_changes_with_every_byte_of_the_recipe_and_with_the_version():
+    config, version = build.recipe(), "6.1.1-1"
     keys = {build.cache_key(config, version), build.cache_key(config, "6.1.1-2")}
     seed = random.randrange(2**32)
     at = random.Random(seed).randrange(len(config))
@@ -153,13 +153,40 @@ def test_cache_key_changes_with_every_byte_of_config_and_with_the_version():
     assert build.cache_key(b"ab", "c") != build.cache_key(b"a", "bc")
 
 
+def test_the_recipe_holds_configuration_and_edits(monkeypatch):
+    before = build.recipe()
+    assert build.CONFIG_FILE.read_bytes() in before
+    monkeypatch.setattr(build, "EDITS", (*source_edits.EDITS, source_edits.Edit("a", "b", "c")))
+    assert build.recipe() != before
+
+
+def test_an_edit_fits_exactly_or_is_refused(tmp_path):
+    edit = source_edits.Edit("dir/file.c", "size 1;", "size 2;")
+    (tmp_path / "dir").mkdir()
+    for text, count in (("", 0), ("size 1; size 1;", 2)):
+        (tmp_path / edit.file).write_text(text)
+        with pytest.raises(source_edits.EditError, match=f"file.c: `size 1;` found {count} times"):
+            source_edits.apply_edits(tmp_path, (edit,))
+        assert (tmp_path / edit.file).read_text() == text
+    (tmp_path / edit.file).write_text("int size 1; // more")
+    source_edits.apply_edits(tmp_path, (edit,))
+    assert (tmp_path / edit.file).read_text() == "int size 2; // more"
+
+
+def test_options_with_a_number_have_to_arrive_too():
+    assert build.wanted_options("# CONFIG_A=y\nCONFIG_B=y\nCONFIG_C=3\nCONFIG_D=n\n") == [
+        "CONFIG_B=y",
+        "CONFIG_C=3",
+    ]
+
+
 def test_without_source_package_the_newest_kernel_of_the_same_config_serves(tmp_path):
     config = b"CONFIG_CAN=y\n"
 
     def store(version, of, age_s):
         place = tmp_path / f"bench-kernel-{build.cache_key(of, version)}"
         place.mkdir()
-        (place / "config.key").write_text(build.config_key(of) + "\n")
+        (place / "recipe.key").write_text(build.recipe_key(of) + "\n")
         (place / "linux").touch()
         os.utime(place / "linux", (1e9 - age_s, 1e9 - age_s))
         return place / "linux"

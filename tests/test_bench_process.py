@@ -18,6 +18,8 @@ from drivers.hub import Hub
 from sim_can.cli import main
 from sim_can.cost import map_pdos
 
+pytestmark = pytest.mark.native
+
 
 def start(bus, *arguments):
     command = [sys.executable, "-m", "sim_can", "--bus", bus, *arguments]

@@ -21,6 +21,8 @@ from tests.benchmarks.fixture import make_fixture
 from tests.benchmarks.measure import SETTLE_CYCLES, Samples, quantile
 from tests.benchmarks.table import mark
 
+pytestmark = pytest.mark.native
+
 ROOT = Path(__file__).resolve().parents[1]
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
 PERIOD_NS = 1_000_000

@@ -17,6 +17,8 @@ from daemon.supervisor import control
 from daemon.supervisor.control import ControlError, ControlServer
 from daemon.tools.control_command import ask
 
+pytestmark = pytest.mark.native
+
 Handlers = dict[str, Callable[[dict[str, Any]], Any]]
 
 

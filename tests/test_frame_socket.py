@@ -16,6 +16,8 @@ from drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, pack
 from drivers.frame_socket import CanFilter, exact, look_alikes, open_frame_socket
 from drivers.hub import Hub
 
+pytestmark = pytest.mark.native
+
 SEED = 7
 SYNC = pack(0x080, b"\x01")
 TPDO = pack(0x181, bytes(range(8)))

@@ -17,6 +17,8 @@ from drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, FRAME, pack, stuffed_bits
 from drivers.frame_socket import exact, open_frame_socket
 from drivers.hub import MAX_CLIENTS, Hub
 
+pytestmark = pytest.mark.native
+
 SEED = 3
 SYNC = pack(0x080, b"\x01")
 TPDO = pack(0x181, bytes(8))

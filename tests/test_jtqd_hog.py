@@ -24,6 +24,8 @@ HOG_S = 0.2
 INPUTS = FLAG_POSITION | FLAG_MOTION
 HOG = """
 import os, sys, time
+
+pytestmark = pytest.mark.native
 os.sched_setaffinity(0, {int(sys.argv[1])})
 os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(90))
 began = last = time.monotonic_ns()

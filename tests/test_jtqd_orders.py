@@ -18,6 +18,8 @@ from drivers.frame_socket import exact, open_frame_socket
 from drivers.socket_path import reachable
 from tests.slow_bench import slow_configuration
 
+pytestmark = pytest.mark.native
+
 PERIOD_US = 5000
 """Slow: it is not the loop that is tried here."""
 

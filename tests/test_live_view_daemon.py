@@ -20,6 +20,8 @@ from daemon.live.address import Address
 from daemon.live.keeper import LiveKeeper
 from daemon.supervisor.children import Child
 
+pytestmark = pytest.mark.native
+
 _LISTENING = re.compile(r"jtqd: live view: (ws://127\.0\.0\.1:\d+)\n")
 
 

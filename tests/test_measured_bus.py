@@ -20,6 +20,8 @@ from sysid.measured_bus import config_file, record
 from sysid.measured_bus_score import Played, configured, published_torque, score_log
 from tests.cdr_decoder import Definition
 
+pytestmark = pytest.mark.native
+
 RUN = "RunTrajectory1"
 STARTING_CYCLES = 20
 

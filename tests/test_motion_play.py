@@ -25,6 +25,8 @@ from sysid.motion.result import MotionError, Timing
 from sysid.motion.shell import play
 from tests.motion_helpers import plateau
 
+pytestmark = pytest.mark.native
+
 LIMITS = Limits(current_a=20.0, velocity_rad_s=3.3, torque_nm=100.0, travel_rad=60.0, temperature_c=70.0)
 PATIENT = Timing(
     sync_lost_s=1.0, late_s=1.0, stale_cycles=500, heartbeats_missing=20, drive_timeout_s=1.5, ready_s=10.0

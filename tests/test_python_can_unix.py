@@ -20,6 +20,8 @@ import pytest
 from drivers.frame import CAN_ERR_FLAG, pack
 from drivers.hub import Hub
 
+pytestmark = pytest.mark.native
+
 ROOT = Path(__file__).resolve().parents[1]
 NAME = "jtq_unix"
 

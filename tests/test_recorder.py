@@ -31,6 +31,8 @@ from recorder_bench import (
 from daemon.recording.request import RecorderRequest, RequestError
 from daemon.shared import cycle_record as cr
 
+pytestmark = pytest.mark.native
+
 EVENT = DEFINITIONS["jtqd_msgs/msg/Event"].constants
 
 

@@ -9,6 +9,8 @@ from recorder_bench import RecorderProcess, cycles_of, put, record_of, session_o
 
 from daemon.recording.naming import own_files
 
+pytestmark = pytest.mark.native
+
 SAID = {
     "killed_recorder": ["repaired"],
     "killed_everything": [],

@@ -21,6 +21,8 @@ from recorder_bench import (
 
 from daemon.recording.flight import FaultWatch
 
+pytestmark = pytest.mark.native
+
 EVENT = DEFINITIONS["jtqd_msgs/msg/Event"].constants
 STATUS = DEFINITIONS["jtqd_msgs/msg/JointEstimate"].constants
 NS = 1_000_000

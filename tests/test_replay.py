@@ -17,6 +17,8 @@ from daemon.replay.command import main
 from daemon.replay.session import Wishes, replay
 from tests.replay_helpers import GOLDEN, cut, cycles, provenance
 
+pytestmark = pytest.mark.native
+
 VALUES = 4 + 24 + 16
 """Where the 12 numbers of a JointEstimate begin: after encapsulation, stamp and frame_id, cycle and monotonic time."""
 

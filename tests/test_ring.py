@@ -10,6 +10,8 @@ import pytest
 
 from daemon.shared.ring import Ring, RingError, RingReader
 
+pytestmark = pytest.mark.native
+
 SIZE = 64
 
 

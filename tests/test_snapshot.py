@@ -13,6 +13,8 @@ from daemon.shared.snapshot import COUNTERS, INPUT, SIZE, Snapshot, SnapshotErro
 from estimator.status import STALE
 from tests.cycle_helpers import frame, inputs, make, turn
 
+pytestmark = pytest.mark.native
+
 ONE = (1.0, 0.1, 1.1, 1.2, math.nan, 0.9, 0x27, 2, 0, 7, 0)
 TWO = (-2.0, 0.2, -2.1, -2.2, -2.3, math.nan, 0x0F, 5, 1, 0x2403, 0x104)
 

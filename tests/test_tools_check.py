@@ -12,15 +12,18 @@ import pytest
 from rich.console import Console
 
 from daemon.config import Config, load_config
+from daemon.shared.stolen_time import stolen_s
 from daemon.tools.check_bus import check_bus
 from daemon.tools.check_command import main
-from daemon.tools.check_timing import own_timing
+from daemon.tools.check_timing import own_timing, stolen_time
 from daemon.tools.finding import FAIL, GOOD, SKIP, WARN, Finding, show
 from daemon.tools.listener import Timing
 from daemon.tools.tally import Tally
 from daemon.tools.traffic import Traffic, described
 from drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, stuffed_bits
 from tests.hub_helpers import until_it_listens
+
+pytestmark = pytest.mark.native
 
 MS = 1_000_000
 US = 1_000
@@ -227,6 +230,24 @@ def test_own_timing() -> None:
         assert [each.level for each in own_timing(found, MS, [], driven=True)] == [GOOD, level]
     (one,) = own_timing(timing(50, 0), MS, ["SCHED_FIFO priority 80: refused"], driven=False)
     assert one.text.startswith("without real-time scheduling")
+
+
+def test_stolen_time_is_judged_by_its_share_of_one_processor() -> None:
+    found = [stolen_time(stolen, 10.0) for stolen in (0.0, 0.009, 0.01, 3.0)]
+    assert [each.level for each in found] == [GOOD, GOOD, WARN, WARN]
+    assert [bool(each.hint) for each in found] == [False, False, True, True]
+    assert found[-1].text.startswith("30.0% of a processor")
+
+
+def test_stolen_time_is_the_eighth_field_in_ticks(tmp_path: Path) -> None:
+    for text, expected in (
+        ("cpu  1 2 3 4 5 6 7 250 9 10\ncpu0 1 2 3 4 5 6 7 8 9 10\n", 250 / os.sysconf("SC_CLK_TCK")),
+        ("cpu  1 2 3 4\n", 0.0),
+        ("", 0.0),
+    ):
+        (tmp_path / "stat").write_text(text)
+        assert stolen_s(tmp_path / "stat") == expected
+    assert stolen_s(tmp_path / "none") == 0.0
 
 
 def test_tally_quantiles_are_upper_edges_and_the_maximum_is_exact() -> None:

@@ -20,6 +20,8 @@ from daemon.tools.running import find_daemons
 from daemon.tools.status_command import main
 from tests.status_daemon import picture, running
 
+pytestmark = pytest.mark.native
+
 Status = Callable[..., tuple[int, str, str]]
 
 

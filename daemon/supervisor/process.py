@@ -30,6 +30,7 @@ from daemon.shared.notices import FILE as NOTICES
 from daemon.shared.notices import Notices
 from daemon.shared.runtime_dir import claim, instance_name, remove
 from daemon.shared.snapshot import SnapshotReader, View
+from daemon.shared.stolen_time import stolen_s
 from daemon.supervisor.children import Child, ChildError
 from daemon.supervisor.display import Display
 from daemon.supervisor.say import ERROR, WARNING, Say
@@ -177,13 +178,22 @@ class Supervisor:
         self._bus_service.begin(time.monotonic())
         self._report = report
         self._service.open(reader, Reload(self._loop_request(), report, self._child, self._check_reloaded))
+        stolen_before_s = stolen_s()
         result = self._watch(loop, node, reader, bench)
+        stolen = stolen_s() - stolen_before_s
         self._leave()
         failed = result.get("error") or result.get("failed")
         if failed:
             self._say(f"ended: {failed}", ERROR)
         recording = self._recorder.end(failed=bool(failed))
-        return summary_of(reader, result, running["refused"], recording, self._watches.deviations)
+        return summary_of(
+            reader,
+            result,
+            running["refused"],
+            recording,
+            deviations=self._watches.deviations,
+            stolen_s=stolen,
+        )
 
     def _own_description(self) -> About:
         return about(self._config, bus=self._bus, instance=self._instance, log_directory=self._log_directory)

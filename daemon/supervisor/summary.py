@@ -31,6 +31,8 @@ class Summary:
     """Late, lost, duplicate and rejected frames of each PDO by its name."""
     deviations: tuple[int, int]
     """How often each joint's estimate stayed far from the sensor (`daemon/supervisor/deviation_watch.py`)."""
+    stolen_s: float = 0.0
+    """What a hypervisor took from the processors meanwhile (`daemon/shared/stolen_time.py`)."""
 
     @property
     def exit_status(self) -> int:
@@ -50,6 +52,7 @@ class Summary:
             "rmse_nm": {"joint_1": _json(self.rmse_nm[0]), "joint_2": _json(self.rmse_nm[1])},
             "deviations": {"joint_1": self.deviations[0], "joint_2": self.deviations[1]},
             "counters": self.counters,
+            "stolen_s": round(self.stolen_s, 2),
             "not_granted": list(self.refused),
             "inputs": self.inputs,
             "recording": self.recording,
@@ -66,6 +69,10 @@ class Summary:
             ),
             "SYNC lateness p50 {:.0f} us, p99 {:.0f} us, max {:.0f} us".format(*self.late_us),
         ]
+        if self.stolen_s > 0.0:
+            lines.append(
+                f"processors    taken away for {self.stolen_s:.2f} s by the hypervisor (stolen time)"
+            )
         for joint, rmse in enumerate(self.rmse_nm, start=1):
             shown = f"{rmse:.3f} Nm against the sensor while it moves" if isfinite(rmse) else "no reference"
             lines.append(f"RMSE joint {joint}  {shown}")
@@ -132,7 +139,9 @@ def summary_of(
     result: dict[str, Any],
     refused: list[str],
     recording: dict[str, Any] | None,
+    *,
     deviations: tuple[int, int],
+    stolen_s: float,
 ) -> Summary:
     """The summary of a run that has ended.
 
@@ -141,7 +150,7 @@ def summary_of(
         result: last answer of the loop.
         refused: what the kernel did not grant.
         recording: the recorder's account, None where nothing was recorded.
-        deviations: as in `Summary`.
+        deviations, stolen_s: as in `Summary`.
     """
     view = reader.read()
     p50, p99, worst = reader.work_us(0.5, 0.99, 1.0)
@@ -159,4 +168,5 @@ def summary_of(
         error=result.get("error") or result.get("failed"),
         inputs=result.get("counters", {}),
         deviations=deviations,
+        stolen_s=stolen_s,
     )

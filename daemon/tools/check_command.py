@@ -19,9 +19,10 @@ from daemon.config import Config, load_config
 from daemon.loop import realtime
 from daemon.master.boot_request import boot_request
 from daemon.shared.snapshot import SnapshotError, SnapshotReader
+from daemon.shared.stolen_time import stolen_s
 from daemon.supervisor.children import Child, ChildError
 from daemon.tools.check_bus import check_bus
-from daemon.tools.check_timing import loop_timing, own_timing
+from daemon.tools.check_timing import loop_timing, own_timing, stolen_time
 from daemon.tools.finding import FAIL, GOOD, Finding, as_json, exit_status, show
 from daemon.tools.listener import drive, leave, listen, silent
 from daemon.tools.running import Daemon, find_daemons, on_bus
@@ -83,12 +84,14 @@ def main(argv: list[str]) -> int:
         daemon = None if arguments.bus == "sim" else on_bus(find_daemons(), arguments.bus)
         path = arguments.config or (Path(daemon.about.configuration) if daemon else None)
         config = load_config(path)
+        before_s, began_s = stolen_s(), time.monotonic()
         with _bus(arguments.bus, config, daemon) as bus:
             findings = list(
                 _driven(bus, config, arguments.seconds, daemon)
                 if arguments.drive_sync or arguments.bus == "sim"
                 else _heard(bus, config, arguments.seconds, daemon)
             )
+        findings.append(stolen_time(stolen_s() - before_s, time.monotonic() - began_s))
     except (CheckError, ConfigError, BusError, ChildError) as error:
         print(f"jtq check: {error}", file=sys.stderr)
         return 1

@@ -15,6 +15,10 @@ LATE_WARN, LATE_FAIL = 0.1, 0.5
 MISSED_FAIL = 0.01
 ECHO_WARN = 0.3
 """Of the period, p99: at 1 Mbit/s SYNC and a frame that is just being sent take up to 200 us."""
+STOLEN_WARN = 0.001
+_STOLEN_HINT = (
+    "no setting in this machine helps: give it processors of its own, or a machine without a hypervisor"
+)
 _HINT = "`jtq doctor` says what real time lacks on this machine"
 
 
@@ -57,6 +61,17 @@ def loop_timing(before: tuple[int, ...], after: tuple[int, ...], first: View, la
             tally.add((n + 1) * LATE_BIN_NS)
     missed = last.counters["missed"] - first.counters["missed"]
     return _judged("jtqd's timing", tally, missed, round(last.period_s * 1e9), "SYNC's lateness in the loop")
+
+
+def stolen_time(stolen_s: float, seconds: float) -> Finding:
+    """Finding of the processor time that a hypervisor took (`daemon/shared/stolen_time.py`) in `seconds`."""
+    share = stolen_s / max(seconds, 1e-3)
+    text = f"{share:.1%} of a processor taken away by a hypervisor (stolen time)"
+    return (
+        Finding("processors", WARN, text, _STOLEN_HINT)
+        if share >= STOLEN_WARN
+        else Finding("processors", GOOD, text)
+    )
 
 
 def _judged(item: str, tally: Tally, missed: int, period_ns: int, how: str) -> Finding:

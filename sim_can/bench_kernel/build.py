@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import IO
 
 from sim_can.bench_kernel import packages
+from sim_can.bench_kernel.source_edits import EDITS, EditError, apply_edits
 
 CONFIG_FILE = Path(__file__).with_name("bench_kernel.config")
 OVERRIDE = "JTQD_BENCH_KERNEL"
@@ -34,35 +35,39 @@ def cache_root() -> Path:
     return Path(base) / "jtqd"
 
 
-def cache_key(config: bytes, source_version: str) -> str:
-    """Name of a build: changes with every byte of the configuration and with the source package's version."""
-    return hashlib.sha256(config + b"\0" + source_version.encode()).hexdigest()[:16]
+def recipe() -> bytes:
+    """All that makes one build from the same sources differ from another: configuration and edits."""
+    return CONFIG_FILE.read_bytes() + b"\0" + repr(EDITS).encode()
 
 
-def config_key(config: bytes) -> str:
-    """Name of a configuration alone; finds a cached kernel where the source package is not installed."""
-    return hashlib.sha256(config).hexdigest()[:16]
+def cache_key(recipe: bytes, source_version: str) -> str:
+    """Name of a build: changes with every byte of the recipe and with the source package's version."""
+    return hashlib.sha256(recipe + b"\0" + source_version.encode()).hexdigest()[:16]
+
+
+def recipe_key(recipe: bytes) -> str:
+    """Name of a recipe alone; finds a cached kernel where the source package is not installed."""
+    return hashlib.sha256(recipe).hexdigest()[:16]
 
 
 def wanted_options(config: str) -> list[str]:
-    """The lines `CONFIG_X=y` of a configuration (fragment or full)."""
-    return [
-        line.strip() for line in config.splitlines() if line.startswith("CONFIG_") and line.endswith("=y")
-    ]
+    """The lines `CONFIG_X=y` and `CONFIG_X=5` of a configuration (fragment or full)."""
+    lines = (line.strip() for line in config.splitlines())
+    return [line for line in lines if line.startswith("CONFIG_") and not line.endswith("=n")]
 
 
-def cached(config: bytes, source_version: str | None, root: Path) -> Path | None:
-    """The cached binary of this configuration and source version, or None.
+def cached(recipe: bytes, source_version: str | None, root: Path) -> Path | None:
+    """The cached binary of this recipe and source version, or None.
 
-    Without an installed source package (version None) the newest cached kernel of this configuration serves.
+    Without an installed source package (version None) the newest cached kernel of this recipe serves.
     """
     if source_version is not None:
-        binary = root / f"bench-kernel-{cache_key(config, source_version)}" / "linux"
+        binary = root / f"bench-kernel-{cache_key(recipe, source_version)}" / "linux"
         return binary if binary.exists() else None
     same = [
         mark.with_name("linux")
-        for mark in root.glob("bench-kernel-*/config.key")
-        if mark.read_text().strip() == config_key(config) and mark.with_name("linux").exists()
+        for mark in root.glob("bench-kernel-*/recipe.key")
+        if mark.read_text().strip() == recipe_key(recipe) and mark.with_name("linux").exists()
     ]
     return max(same, key=lambda binary: binary.stat().st_mtime, default=None)
 
@@ -74,7 +79,7 @@ def find() -> Path | None:
     """
     override = os.environ.get(OVERRIDE)
     if override is None:
-        return cached(CONFIG_FILE.read_bytes(), _source_version(), cache_root())
+        return cached(recipe(), _source_version(), cache_root())
     if not os.access(override, os.X_OK):
         raise BuildError(f"{OVERRIDE}={override}: no such executable file")
     return Path(override)
@@ -98,11 +103,11 @@ def ensure(*, install: bool = True) -> Path:
         raise BuildError(
             f"{packages.SOURCE_ARCHIVE} is there but dpkg knows no package {packages.SOURCE_PACKAGE}"
         )
-    config, root = CONFIG_FILE.read_bytes(), cache_root()
+    root = cache_root()
     root.mkdir(parents=True, exist_ok=True)
     with _only_builder(root):
-        ready = cached(config, version, root)  # another builder may have finished while this one waited
-        return ready if ready is not None else _build(config, version, root)
+        ready = cached(recipe(), version, root)  # another builder may have finished while this one waited
+        return ready if ready is not None else _build(version, root)
 
 
 def _source_version() -> str | None:
@@ -130,9 +135,9 @@ def _only_builder(root: Path) -> Iterator[None]:
         yield
 
 
-def _build(config: bytes, version: str, root: Path) -> Path:
+def _build(version: str, root: Path) -> Path:
     """Build in a temporary directory beside the final one and move the result in by one rename."""
-    final = root / f"bench-kernel-{cache_key(config, version)}"
+    final = root / f"bench-kernel-{cache_key(recipe(), version)}"
     for stale in root.glob("building-*"):  # of a builder that was killed: this one holds the lock
         shutil.rmtree(stale, ignore_errors=True)
     work = Path(tempfile.mkdtemp(prefix="building-", dir=root))
@@ -141,16 +146,19 @@ def _build(config: bytes, version: str, root: Path) -> Path:
     try:
         with open(log, "w") as out:
             tree = _unpack(work, version, out)
-            _configure(tree, config, out)
+            apply_edits(tree)
+            _configure(tree, CONFIG_FILE.read_bytes(), out)
             _compile(tree, log, out)
         done = work / "done"
         done.mkdir()
         shutil.copy2(tree / "linux", done / "linux")
         shutil.copy2(tree / ".config", done / "config")
         shutil.copy2(log, done / "build.log")
-        (done / "config.key").write_text(config_key(config) + "\n")
+        (done / "recipe.key").write_text(recipe_key(recipe()) + "\n")
         shutil.rmtree(final, ignore_errors=True)
         done.rename(final)
+    except EditError as error:
+        raise BuildError(f"{packages.SOURCE_ARCHIVE} ({version}) does not fit: {error}") from error
     except subprocess.CalledProcessError as error:
         kept = root / f"{final.name}.failed.log"
         shutil.copy2(log, kept)

@@ -1,0 +1,61 @@
+"""The rule for tests at the machine's own pace: only stolen time excuses a failure, and never silently."""
+
+from itertools import count
+
+import pytest
+
+from tests.native_pace import NativePace
+
+pytest_plugins = ["pytester"]
+
+FAILS_UNTIL = """
+    import pytest
+    from pathlib import Path
+
+    @pytest.fixture(scope="module")
+    def shared():
+        count = Path("made")
+        count.write_text(count.read_text() + "x" if count.exists() else "x")
+        return len(count.read_text())
+
+    @pytest.mark.native
+    def test_it(shared):
+        assert shared >= {tries}, "late"
+
+    def test_after_it(shared):
+        pass
+"""
+
+
+@pytest.mark.parametrize(
+    ("tries", "stolen", "outcome"),
+    [
+        (1, 0.5, {"passed": 2}),
+        (2, 0.5, {"passed": 2}),
+        (3, 0.5, {"passed": 2}),
+        (4, 0.5, {"skipped": 1, "passed": 1}),
+        (2, 0.005, {"failed": 1, "passed": 1}),
+        (2, 0.0, {"failed": 1, "passed": 1}),
+    ],
+)
+def test_only_stolen_time_excuses(pytester, tries, stolen, outcome):
+    reads, clock = count(), count()
+    pace = NativePace(lambda: stolen * next(reads), lambda: float(next(clock)))
+    pytester.makepyfile(FAILS_UNTIL.format(tries=tries))
+    pytester.makeini("[pytest]\nmarkers =\n    native: x")
+    result = pytester.inline_run("-p", "no:cacheprovider", plugins=[pace])
+    passed, skipped, failed = result.listoutcomes()
+    found = {"passed": len(passed), "skipped": len(skipped), "failed": len(failed)}
+    assert {name: count for name, count in found.items() if count} == outcome
+    excused = min(tries - 1, 3) if stolen >= 0.01 else 0
+    assert len(pace.told) == excused
+    assert all("test_it: try" in text and "late" in what for text, what in pace.told)
+
+
+def test_an_unmarked_test_is_never_tried_again(pytester):
+    clock = count()
+    pytester.makepyfile("def test_it():\n    assert False")
+    pace = NativePace(lambda: float(next(clock)), lambda: float(next(clock)))
+    result = pytester.inline_run("-p", "no:cacheprovider", plugins=[pace])
+    assert len(result.listoutcomes()[2]) == 1
+    assert pace.told == []
