@@ -25,9 +25,9 @@ test: lint ## everything but the tests marked campaign
 	$(MAKE) --no-print-directory test-native || status=$$?; \
 	exit $$status
 
-# Two lanes side by side: the bench kernel keeps a time of its own, so neither lane feels the other.
+# Two lanes side by side: the bench kernel keeps a time of its own, so neither lane feels the other. One thread each.
 test-here:
-	$(BIN)/python -m pytest -m "not (campaign or socketcan or boots or native)"
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m "not (campaign or socketcan or boots or native)"
 
 test-guest:
 	$(BIN)/python -m pytest -m "(socketcan or boots) and not campaign"

@@ -11,6 +11,8 @@ from viewer_log import Log, bench_log
 
 from daemon.recording import schemas
 
+pytestmark = pytest.mark.native
+
 
 @pytest.fixture(scope="module")
 def log():

@@ -12,6 +12,8 @@ from daemon.jtq import main as jtq
 from daemon.live.layout import layout
 from daemon.recording import schemas
 
+pytestmark = pytest.mark.native
+
 _NUMBERS = {"float64", "int32", "int64", "uint8", "uint16", "uint32", "uint64"}
 _PANELS = {"Plot", "StateTransitions", "DiagnosticSummary", "RosOut", "RawMessages", "Tab"}
 _SCRIPTED = re.compile(r"(/studio_script/\w+)\.(\w+)")
@@ -107,7 +109,15 @@ def test_the_scripts_use_fields_that_exist(made, log):
 def test_the_scripts_make_band_and_residual(made, log):
     topic, fields = scripted(made)["/studio_script/joint_1"]
     assert topic == "/joint/1/state"
-    message = log.decoded(topic, len(log.messages[topic]) // 2)
+    messages = (
+        log.decoded(topic, number)
+        for number in range(len(log.messages[topic]) // 2, len(log.messages[topic]))
+    )
+    message = next(
+        each
+        for each in messages
+        if math.isfinite(each["torque_nm"]) and math.isfinite(each["sensor_torque_nm"])
+    )
     value = {
         name: eval(text, {"NaN": math.nan}, {"message": types.SimpleNamespace(**message)})
         for name, text in fields.items()

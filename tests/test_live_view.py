@@ -17,6 +17,8 @@ from daemon.recording import schemas
 from daemon.recording.messages import CAN_FRAMES_SIZE, JOINT_ESTIMATE_SIZE
 from daemon.shared import cycle_record
 
+pytestmark = pytest.mark.native
+
 
 @pytest.fixture
 def memory(tmp_path):

@@ -14,6 +14,8 @@ from drivers.bus_load import LIMIT, configured_load
 from drivers.devices import drive_tpdo1
 from drivers.frame import worst_case_bits
 
+pytestmark = pytest.mark.native
+
 EMCY = 0x080
 
 

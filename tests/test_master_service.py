@@ -15,6 +15,8 @@ from daemon.master.node_watch import ACTIVE
 from drivers.devices import drive_tpdo1, sensor_tpdo1
 from drivers.frame import CAN_ERR_FLAG
 
+pytestmark = pytest.mark.native
+
 EMCY, SDO = 0x080, 0x580
 
 
