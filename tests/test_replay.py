@@ -136,7 +136,8 @@ def test_lost_cycles_are_counted_and_forgotten(
 
 def test_a_changed_number_is_found(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """One torque in the log is another by one bit."""
-    target = cycles(log)[1200]
+    state = read_topic(log, "/joint/2/state")
+    target = int(state["cycle"][np.isfinite(state["physics_nm"])][1200])
 
     def spoil(topic: str, cycle: int, data: bytes) -> bytes:
         if topic != "/joint/2/state" or cycle != target:
@@ -266,7 +267,7 @@ def test_in_arrays_rounding_is_no_finding(
     assert "  equal to 1e-09 Nm" in capsys.readouterr().out
     (whole,) = replay([log], Wishes(exact=False))
     logged, made = whole.run.joints, tuple(each.copy() for each in whole.joints)
-    row = len(made[0]) - 50
+    row = int(np.flatnonzero(np.isfinite(made[0]["torque_nm"]))[-50])
     made[0]["torque_nm"][row] += 1e-6
     same = difference.identity(logged, made, whole.run.steps(), None, 1e-9)
     (one,) = same.differences
