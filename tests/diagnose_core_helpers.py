@@ -101,7 +101,7 @@ def search_of(
     """A search over these candidates; every nuisance has the prior spread sigma."""
     q = problem.z[0].shape[1]
     rows = float(sum(len(y) for y in problem.y))
-    return Search(problem.mixed([sigma] * q), found, rows, np.ones(problem.x[0].shape[1]), least_nm)
+    return Search(problem.mixed([sigma] * q), found, rows, np.eye(problem.x[0].shape[1])[None], least_nm)
 
 
 def run_data(

@@ -167,6 +167,21 @@ def test_a_temperature_from_before_the_motion_counts(tmp_path: Path) -> None:
     assert table.joints[1].temperature_c.tolist() == [25.0] * 20
 
 
+def test_a_temperature_told_with_the_drive_off_does_not_hold_in_the_motion(tmp_path: Path) -> None:
+    """An emulated day begins when the drives are enabled: what was told before is of the day before."""
+
+    def wanted(n: int) -> tuple[Joint, Joint]:
+        one, two = joints(n)
+        return (one, two) if n >= 20 else (one._replace(statusword=OFF), two)
+
+    cycles = regular(40, wanted)
+    for at, value in ((3, 25.0), (27, 29.0), (35, 29.5)):
+        cycles[at] = cycles[at]._replace(frames=[temperature(1, value)])
+    table = log_to_run(write_log(tmp_path / "a.mcap", cycles)).table
+    assert table.joints[1].temperature_c is not None
+    assert table.joints[1].temperature_c.tolist() == pytest.approx([29.0] * 15 + [29.5] * 5)
+
+
 def test_logs_without_a_motion_are_refused_in_one_line(tmp_path: Path) -> None:
     def off(n: int) -> tuple[Joint, Joint]:
         one, two = joints(n)

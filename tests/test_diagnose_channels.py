@@ -146,6 +146,18 @@ def test_spikes_are_counted_and_kept(run: RunTable) -> None:
     assert np.array_equal(kept, spiky)
 
 
+def test_a_temperature_that_steps_is_not_used(run: RunTable) -> None:
+    def stepped(by: float) -> RunTable:
+        warm = np.where(run.time_s < 0.3, 25.0, 25.0 + by)
+        return changed(run, lambda c: replace(c, temperature_c=warm))
+
+    result = checked(stepped(3.7))
+    assert "joint 1" in result.notes[0] or "j1.temperature_c" in result.notes[0]
+    assert "found a step of 3.7 degC at 0.3" in result.notes[0]
+    assert result.runs[0][1].joints[1].temperature_c is None
+    assert checked(stepped(1.0)).runs[0][1].joints[1].temperature_c is not None, "a coarse thermometer"
+
+
 def test_a_temperature_that_no_joint_has_is_not_used(run: RunTable) -> None:
     result = checked(changed(run, lambda c: replace(c, temperature_c=np.full(len(run.time_s), 298.1))))
     assert "kelvin" in result.notes[0]

@@ -20,13 +20,13 @@ from sysid.diagnosis.columns import (
     all_in_bin,
     bin_samples,
     binned,
-    column_rms,
+    column_moments,
     contribution,
     families,
     gain_columns,
     run_data,
 )
-from sysid.diagnosis.signals import JointSignals, joint_signals, second_difference
+from sysid.diagnosis.signals import JointSignals, joint_signals, second_difference, with_one_sensor
 
 BARE = replace(PLAIN, damping_nms_per_rad=0.0, link_inertia_kgm2=0.0)
 
@@ -198,15 +198,34 @@ def test_what_may_differ_from_run_to_run() -> None:
     assert column(TORSION1, hertz) == pytest.approx(np.cos(2.0 * np.pi * 7.0 * s.state.time_s))
 
 
+def test_the_one_sensor_has_one_temperature() -> None:
+    """That of the first joint, as the plant has it; a joint's own effects go by the joint's."""
+    one, two = made_up(BARE), made_up(BARE, 2, number=2)
+    one.state.temperature_c = np.full(len(one.time_s), 31.0)
+    two.state.temperature_c = np.full(len(two.time_s), 20.0)
+    drift, friction = EFFECTS["sensor_drift"], EFFECTS["temperature_dependent_friction"]
+    p = {"rate_nm_per_s": 0.0, "per_k_nm": 0.1, "reference_c": 25.0}
+    first, second = with_one_sensor([one, two])
+    for s, alone in ((first, 0.6), (second, 0.6), (two, -0.5)):
+        assert contribution(drift, p, s)["torsion"] == pytest.approx(-alone), s.number
+    for term in friction.terms(BARE):
+        assert contribution(friction, term.basis[0], second)["motor"] == pytest.approx(
+            contribution(friction, term.basis[0], two)["motor"]
+        )
+
+
 def test_the_size_of_a_column_is_its_rms_where_it_is_largest() -> None:
     s = joint_signals("run", rigid_run(PLAIN), 1, PLAIN, BaseLoss(PLAIN))
     found = candidates(PLAIN, ("sensor_gain", "sensor", 0), ("sensor_offset", "sensor", 0))
     run = run_data([s], found, 5)
     run.channels[TORSION1].regressors[:, 1] += 5.0
-    rms = column_rms([run, run], 3)
+    moments = column_moments([run, run], 3)
+    rms = np.sqrt(np.diagonal(moments, axis1=1, axis2=2).max(axis=0))
     motor, torsion = run.channels[MOTOR1], run.channels[TORSION1]
     bent = torsion.regressors[:, 0] - torsion.regressors[:, 0].mean()
     by_hand = [np.sqrt(np.mean(x**2)) for x in (motor.regressors[motor.valid, 0], bent)]
     assert rms[0] == pytest.approx(max(by_hand))
     assert rms[1] == pytest.approx(0.1), "a constant counts in the motor balance alone"
     assert rms[2] == 0.0
+    together = np.mean(motor.regressors[motor.valid, 0] * motor.regressors[motor.valid, 1])
+    assert moments[list(run.channels).index(MOTOR1), 0, 1] == pytest.approx(together)

@@ -151,6 +151,20 @@ def test_implausible_and_tiny_effects_are_not_taken() -> None:
     assert names(search_of(whole, LIBRARY, least_nm=0.4).run()) == []
 
 
+def test_the_size_of_an_effect_is_that_of_its_columns_together() -> None:
+    """A slope over the temperature has two columns that are nearly the same: what one takes from the other is not there."""
+    (slope,) = candidates(PLAIN, ("sensor_drift", "sensor", 1))
+    warmth = np.linspace(24.0, 28.0, 100)
+    columns = 0.01 * np.column_stack([warmth - 25.0, warmth - 35.0])
+    moments = (columns.T @ columns / len(columns))[None]
+    made = search_of(problem(7, {}), LIBRARY)
+    search = Search(made.mixed, [slope], 100.0, moments, 0.1)
+    for coefficients in ([3.0, -2.5], [1.0, 1.0], [0.0, 2.0]):
+        model = replace(made.hypothesis(()).model, beta=np.array(coefficients))
+        expected = np.sqrt(np.mean((columns @ coefficients) ** 2))
+        assert search.size_nm(Hypothesis((slope,), model, 0.0), slope) == pytest.approx(expected)
+
+
 def test_an_effect_is_there_once_and_a_wave_once_per_order() -> None:
     search = search_of(problem(8, {}), LIBRARY)
     first, second = LIBRARY[4], LIBRARY[5]

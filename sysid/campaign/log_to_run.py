@@ -166,7 +166,8 @@ def _powered(statusword: NDArray[Any]) -> FloatArray | None:
 def _temperature(frames: Records, node: int, span: slice) -> FloatArray | None:
     """Temperature [n] of a drive's joint over the cycles of `span` [degC] by its TPDO3, held between two; None without any.
 
-    Frames from before the span count: a joint's temperature changes within minutes, its PDO comes twice a second.
+    Before the first frame of the span that frame's value holds: the one before it was told while the drive was off, and an
+    emulated day begins when the drives are enabled. Where the span has no frame, the last one before it counts.
     """
     raw = frames["frames"]
     stored = np.arange(raw.shape[1]) < frames["frame_count"][:, None]
@@ -176,5 +177,7 @@ def _temperature(frames: Records, node: int, span: slice) -> FloatArray | None:
     rows, values = rows[counts != NOT_MEASURED], counts[counts != NOT_MEASURED] * TEMPERATURE_C_PER_UNIT
     if not len(rows):
         return None
-    last = np.searchsorted(rows, np.arange(len(frames))[span], side="right") - 1
-    return np.asarray(values[np.maximum(last, 0)], np.float64)
+    cycles = np.arange(len(frames))[span]
+    last = np.searchsorted(rows, cycles, side="right") - 1
+    first = min(int(np.searchsorted(rows, cycles[0])), int(last[-1]))
+    return np.asarray(values[np.maximum(last, max(first, 0))], np.float64)

@@ -34,6 +34,7 @@ _FASTEST_MOTOR_RAD_S: Final = 1000.0
 _PEAK: Final = 10.0
 """Times rated torque; joints are overloaded two- or threefold."""
 _HOTTEST_C: Final = 150.0
+_STEP_K, _WARMING_K_PER_S = 2.0, 1.0  # between two samples: resolution, and more than any joint warms
 _BLOCK_S: Final = 0.05
 
 
@@ -79,10 +80,18 @@ def unit_findings(time_s: FloatArray, run: JointColumns, joint: Joint, where: st
     )
 
 
-def temperature_finding(run: JointColumns, where: str) -> Finding | None:
-    """A temperature that no joint has."""
+def temperature_finding(time_s: FloatArray, run: JointColumns, where: str) -> Finding | None:
+    """A temperature that no joint has, or a step that none makes: it would be a moment of the run, not its warmth."""
     if run.temperature_c is None:
         return None
+    steps = np.abs(np.diff(run.temperature_c))
+    jumps = np.flatnonzero(steps > _STEP_K + _WARMING_K_PER_S * np.diff(time_s))
+    if len(jumps):
+        return Finding(
+            "temperature_c_step",
+            f"{where}.temperature_c: found a step of {steps[jumps[0]]:.3g} degC at {time_s[jumps[0] + 1]:.3f} s, expected "
+            f"none above {_STEP_K:g}; not used",
+        )
     middle = float(np.median(run.temperature_c))
     if -60.0 < middle < _HOTTEST_C:
         return None

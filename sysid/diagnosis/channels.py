@@ -96,7 +96,7 @@ def _judged(
     if missing is not None:
         return None, [missing], []
     notes = []
-    hot = temperature_finding(columns, where)
+    hot = temperature_finding(table.time_s, columns, where)
     if hot is not None:
         notes.append(hot.text)
         columns = replace(columns, temperature_c=None)

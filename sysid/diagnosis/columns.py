@@ -56,7 +56,7 @@ class Candidate:
 
 def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatArray]:
     """Return what the effect with parameters p leaves in each balance of this joint [n], Nm; absent: nothing."""
-    joint, state, x = s.joint, s.state, Whole()
+    joint, state, x = s.joint, s.state_of(effect, p), Whole()
     out: dict[str, FloatArray] = {}
 
     def add(balance: str, value: FloatArray) -> None:
@@ -272,22 +272,22 @@ def gain_columns(candidates: Sequence[Candidate]) -> set[int]:
     return {k for c in candidates if c.effect.name == "sensor_gain" for k in c.columns}
 
 
-def column_rms(runs: Sequence[RunData], columns: int) -> FloatArray:
-    """Return the rms of every column [columns] in the channel where it is largest, over valid bins of all runs; in a
-    torsion balance without its mean, which the run's own zero takes.
+def column_moments(runs: Sequence[RunData], columns: int) -> FloatArray:
+    """Return the mean products of all columns [channels, columns, columns] over valid bins of all runs; in a torsion balance
+    without their means, which the run's own zero takes.
     """
-    out = np.zeros(columns)
-    for channel in runs[0].channels:
+    out = np.zeros((len(runs[0].channels), columns, columns))
+    for place, channel in zip(out, runs[0].channels, strict=True):
         parts = [
             (r.channels[channel].regressors, r.channels[channel].valid) for r in runs if channel in r.channels
         ]
         index = runs[0].channels[channel].index
-        squares, count = np.zeros(len(index)), 0
+        products, count = np.zeros((len(index), len(index))), 0
         for x, valid in parts:
             good = x[valid]
             if channel.balance == TORSION and len(good):
                 good = good - good.mean(axis=0)
-            squares += np.einsum("ij,ij->j", good, good)
+            products += good.T @ good
             count += len(good)
-        out[index] = np.maximum(out[index], np.sqrt(squares / max(count, 1)))
+        place[np.ix_(index, index)] = products / max(count, 1)
     return out

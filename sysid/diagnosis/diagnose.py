@@ -19,7 +19,7 @@ from sysid.diagnosis.columns import (
     Candidate,
     RunData,
     bin_samples,
-    column_rms,
+    column_moments,
     contribution,
     families,
     gain_columns,
@@ -38,7 +38,7 @@ from sysid.diagnosis.prepared import Prepared
 from sysid.diagnosis.refine import present_causes, refine
 from sysid.diagnosis.search import HELD_OUT, Hypothesis, Search
 from sysid.diagnosis.sensor_zero import about_zero
-from sysid.diagnosis.signals import JointSignals, SignalsError, joint_signals
+from sysid.diagnosis.signals import JointSignals, SignalsError, joint_signals, with_one_sensor
 from sysid.diagnosis.together import one_sensor, together
 from sysid.diagnosis.verdict import conclude
 from sysid.diagnosis.whitening import Noise, noise_model, run_sums, saturated_residuals
@@ -139,6 +139,7 @@ def _usable(
         out = [[s for s in run if s.number in keep] for run in out]
         out = [run for run in out if run]
     _same_balances(out)
+    out = [with_one_sensor(run) for run in out]
     if not out:
         return [], trouble or ["found no run that can serve"]
     if len(out) < FEWEST_RUNS:
@@ -290,7 +291,7 @@ def _searched(prepared: Prepared, least_nm: float) -> tuple[Noise, Search, Hypot
     columns = candidates[-1].columns.stop if candidates else 0
     groups = prepared.groups
     sigma = np.array([g.sigma for g in groups])
-    rms = column_rms(runs, columns)
+    moments = column_moments(runs, columns)
     unpowered = columns_of(candidates, prepared.joints)
     residuals = prepared.unexplained
     for k in range(_PASSES):
@@ -299,7 +300,7 @@ def _searched(prepared: Prepared, least_nm: float) -> tuple[Noise, Search, Hypot
         sums = with_readings(sums, prepared.readings, unpowered)
         mixed = Mixed(sums, columns, sigma)
         effective = mixed.rows / noise.inflation
-        search = Search(mixed, candidates, effective, rms, least_nm, prepared.readings, unpowered)
+        search = Search(mixed, candidates, effective, moments, least_nm, prepared.readings, unpowered)
         best = _held(search, search.run())
         if k + 1 < _PASSES:
             residuals = {c: left_over(runs, best, c) for c in residuals}

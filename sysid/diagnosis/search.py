@@ -54,7 +54,8 @@ class Hypothesis:
 class Search:
     """The library's candidates on one set of runs.
 
-    column_rms [P]: rms of a unit of every column in the channel where it is largest, Nm; least_nm: contributions below
+    moments [channels, P, P]: mean products of a unit of every column, Nm^2; column_rms [P]: by them the rms in the
+    channel where it is largest, Nm; least_nm: contributions below
     are not called effects, however certain; readings, unpowered: what the currents read without power, per run, and which
     columns make them read that (`powerless`).
     """
@@ -64,13 +65,14 @@ class Search:
         mixed: Mixed,
         candidates: Sequence[Candidate],
         effective_rows: float,
-        column_rms: FloatArray,
+        moments: FloatArray,
         least_nm: float,
         readings: Sequence[Readings] = (),
         unpowered: Sequence[Row] = (),
     ) -> None:
         self.mixed = mixed
-        self.column_rms = column_rms
+        self._moments = moments
+        self.column_rms = np.sqrt(np.diagonal(moments, axis1=1, axis2=2).max(axis=0))
         self.least_nm = least_nm
         self._readings, self._unpowered = readings, unpowered
         self.candidates = tuple(candidates)
@@ -118,9 +120,11 @@ class Search:
         )
 
     def size_nm(self, hypothesis: Hypothesis, candidate: Candidate) -> float:
-        """Return the rms of a candidate's contribution, its columns taken as uncorrelated [Nm]."""
-        sizes = np.array(hypothesis.coefficients(candidate)) * self.column_rms[list(candidate.columns)]
-        return float(np.sqrt(sizes @ sizes))
+        """Return the rms of a candidate's contribution in the channel where it is largest [Nm]."""
+        own = slice(candidate.first, candidate.first + candidate.size)
+        beta = np.array(hypothesis.coefficients(candidate))
+        squares = np.einsum("i,cij,j->c", beta, self._moments[:, own, own], beta)
+        return float(np.sqrt(max(squares.max(), 0.0)))
 
     def unread(self, hypothesis: Hypothesis) -> float:
         """Return the sum of squares that what the currents read without power leaves; 0 without such a reading."""

@@ -13,12 +13,13 @@ itself at the frequencies where there is nothing else.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
-from estimator.effects.effect import State
+from estimator.effects.effect import Effect, State, Values
 from estimator.friction import FloatArray
 from estimator.parameters import Joint
 from estimator.run import JointColumns, RunTable
@@ -60,6 +61,16 @@ class JointSignals:
     of_position: bool = (
         True  # the acceleration is a second difference of the position, else one of the velocity
     )
+    sensor_temperature_c: FloatArray | None = None  # None: that of this joint (`with_one_sensor`)
+
+    def state_of(self, effect: Effect, p: Values) -> State:
+        """Return what the hooks of an effect with parameters p use: the one sensor has one temperature, for every joint's
+        balances.
+        """
+        if self.sensor_temperature_c is None or not effect.at_sensor_of(p):
+            return self.state
+        fields = {name: getattr(self.state, name) for name in State.__slots__}
+        return State(**{**fields, "temperature_c": self.sensor_temperature_c})
 
     def seen(self, rate_rad_s: FloatArray) -> FloatArray:
         """Return how much of a torque that swings at this rate [n] the motor balance holds [n].
@@ -72,6 +83,14 @@ class JointSignals:
         if self.of_position:
             return np.asarray((30.0 - 32.0 * np.cos(turn) + 2.0 * np.cos(2.0 * turn)) / (12.0 * turn * turn))
         return np.asarray(np.sin(turn) / turn)
+
+
+def with_one_sensor(run: Sequence[JointSignals]) -> list[JointSignals]:
+    """Return the joints of one run with the sensor at the temperature of the first, as in the plant, which has the sensor's
+    effects in one joint's file.
+    """
+    temperature = run[0].state.temperature_c
+    return [run[0], *(replace(s, sensor_temperature_c=temperature) for s in run[1:])]
 
 
 class SignalsError(ValueError):
