@@ -6,6 +6,7 @@ skipped, loudly. On a machine that keeps its processors nothing is tried twice: 
 """
 
 import time
+from contextlib import suppress
 
 import pytest
 from _pytest.runner import runtestprotocol
@@ -47,7 +48,10 @@ class NativePace:
             crash = getattr(failed.longrepr, "reprcrash", None)
             self.told.append((text, (crash.message if crash else failed.longreprtext).split("\n", 1)[0]))
             # A daemon or a bench that several tests share may be what broke: the next try begins with new ones.
-            item.session._setupstate.teardown_exact(None)
+            with suppress(
+                Exception
+            ):  # of a process that did not end in time, as little a verdict as the failure
+                item.session._setupstate.teardown_exact(None)
             item._initrequest()
         return [self._not_judged(report) for report in reports]
 

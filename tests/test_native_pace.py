@@ -52,6 +52,34 @@ def test_only_stolen_time_excuses(pytester, tries, stolen, outcome):
     assert all("test_it: try" in text and "late" in what for text, what in pace.told)
 
 
+def test_a_fixture_that_cannot_be_torn_down_ends_nothing(pytester):
+    pytester.makepyfile(
+        """
+        import pytest
+        count = []
+
+        @pytest.fixture(scope="module")
+        def shared():
+            count.append(1)
+            yield
+            assert len(count) > 1, "the process did not end in time"
+
+        @pytest.mark.native
+        def test_it(shared):
+            assert len(count) > 1
+
+        def test_after_it(shared):
+            pass
+        """
+    )
+    pytester.makeini("[pytest]\nmarkers =\n    native: x")
+    reads, clock = count(), count()
+    pace = NativePace(lambda: 0.5 * next(reads), lambda: float(next(clock)))
+    result = pytester.inline_run("-p", "no:cacheprovider", plugins=[pace])
+    assert [len(each) for each in result.listoutcomes()] == [2, 0, 0]
+    assert len(pace.told) == 1
+
+
 def test_an_unmarked_test_is_never_tried_again(pytester):
     clock = count()
     pytester.makepyfile("def test_it():\n    assert False")
