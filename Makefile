@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-here test-guest test-native test-all bench bench-kernel fuzz soak soak-exact lint format clean
+.PHONY: help setup demo test test-here test-hidden test-guest test-native test-all bench bench-kernel fuzz soak soak-exact lint format clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
@@ -21,13 +21,19 @@ demo: $(VENV)/.installed ## 20 s of jtqd on the emulated bench
 test: lint ## everything but the tests marked campaign
 	$(BIN)/python -m sim_can.bench_kernel build --unless-vcan
 	@status=0; \
-	$(MAKE) --no-print-directory -j2 --output-sync=target test-here test-guest || status=$$?; \
+	$(MAKE) --no-print-directory -k -j2 --output-sync=target test-here test-guest test-hidden || status=$$?; \
 	$(MAKE) --no-print-directory test-native || status=$$?; \
 	exit $$status
 
-# Two lanes side by side: the bench kernel keeps a time of its own, so neither lane feels the other. One thread each.
+# Two at a time, each with one thread: the bench kernel keeps a time of its own, so neither feels the other.
+ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
+HERE := not (campaign or socketcan or boots or native)
+
 test-here:
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m "not (campaign or socketcan or boots or native)"
+	$(ONE_THREAD) $(BIN)/python -m pytest -m "$(HERE)" --ignore-glob="tests/test_hidden_*.py"
+
+test-hidden:
+	$(ONE_THREAD) $(BIN)/python -m pytest -m "$(HERE)" tests/test_hidden_*.py
 
 test-guest:
 	$(BIN)/python -m pytest -m "(socketcan or boots) and not campaign"

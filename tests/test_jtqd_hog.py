@@ -19,13 +19,13 @@ from daemon.shared.snapshot import SnapshotReader
 from estimator.status import PUBLISHED
 from tests.slow_bench import slow_configuration
 
+pytestmark = pytest.mark.native
+
 PERIOD_US = 5_000
 HOG_S = 0.2
 INPUTS = FLAG_POSITION | FLAG_MOTION
 HOG = """
 import os, sys, time
-
-pytestmark = pytest.mark.native
 os.sched_setaffinity(0, {int(sys.argv[1])})
 os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(90))
 began = last = time.monotonic_ns()
