@@ -12,6 +12,7 @@ from effect_signals import PLAIN, balances, state
 from estimator.effects.library import EFFECTS
 from estimator.parameters import Joint
 from estimator.run import RunTable
+from sysid.diagnosis import diagnose as module
 from sysid.diagnosis.base_loss import BaseLoss
 from sysid.diagnosis.channel import Channel, Line
 from sysid.diagnosis.columns import (
@@ -212,6 +213,17 @@ def test_the_one_sensor_has_one_temperature() -> None:
         assert contribution(friction, term.basis[0], second)["motor"] == pytest.approx(
             contribution(friction, term.basis[0], two)["motor"]
         )
+
+
+def test_a_diagnosis_gives_the_sensor_the_temperature_of_the_first_joint() -> None:
+    columns = rigid_run(PLAIN).joints[1]
+    warm = [replace(columns, temperature_c=np.full(len(rigid_run(PLAIN).time_s), t)) for t in (31.0, 20.0)]
+    table = RunTable(rigid_run(PLAIN).time_s, dict(zip((1, 2), warm, strict=True)))
+    usable, why = module._usable([("a", table), ("b", table)], {1: PLAIN, 2: PLAIN}, (1, 2))
+    assert len(usable) == 2, why
+    for run in usable:
+        at_sensor = [s.state_of(EFFECTS["sensor_drift"], {}).temperature_c[0] for s in run]
+        assert (at_sensor, [s.state.temperature_c[0] for s in run]) == ([31.0, 31.0], [31.0, 20.0])
 
 
 def test_the_size_of_a_column_is_its_rms_where_it_is_largest() -> None:

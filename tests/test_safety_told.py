@@ -132,3 +132,16 @@ def test_the_summary_says_why_there_was_no_torque() -> None:
     assert lines(fault_motor_jump=2, latches=1, overruns=3) == [
         "no torque     overruns 3, motor jump 2, latches 1"
     ]
+
+
+def test_the_summary_tells_stolen_time_where_there_was_any() -> None:
+    us = (1.0, 2.0, 3.0)
+    for stolen_s, lines in (
+        (0.0, []),
+        (0.318, ["processors    taken away for 0.32 s by the hypervisor (stolen time)"]),
+    ):
+        told = Summary(
+            9, 0, 0, us, us, (0.1, 0.1), dict.fromkeys(COUNTERS, 0), (), None, None, {}, (0, 0), stolen_s
+        )
+        assert [line for line in told.text().splitlines() if line.startswith("processors")] == lines
+        assert told.content()["stolen_s"] == round(stolen_s, 2)
