@@ -19,7 +19,7 @@ demo: $(VENV)/.installed ## 20 s of jtqd on the emulated bench
 	$(BIN)/jtqd --bus sim --duration 20
 
 test: lint ## everything but the tests marked campaign
-	$(BIN)/python -m sim_can.bench_kernel build --unless-vcan
+	$(BIN)/python -m jtqd.sim_can.bench_kernel build --unless-vcan
 	@status=0; \
 	$(MAKE) --no-print-directory -k -j2 --output-sync=target test-here test-guest test-hidden || status=$$?; \
 	$(MAKE) --no-print-directory test-native || status=$$?; \
@@ -30,10 +30,10 @@ ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 HERE := not (campaign or socketcan or boots or native)
 
 test-here:
-	$(ONE_THREAD) $(BIN)/python -m pytest -m "$(HERE)" --ignore-glob="tests/test_hidden_*.py"
+	$(ONE_THREAD) $(BIN)/python -m pytest -m "$(HERE)" --ignore=tests/hidden
 
 test-hidden:
-	$(ONE_THREAD) $(BIN)/python -m pytest -m "$(HERE)" tests/test_hidden_*.py
+	$(ONE_THREAD) $(BIN)/python -m pytest -m "$(HERE)" tests/hidden
 
 test-guest:
 	$(BIN)/python -m pytest -m "(socketcan or boots) and not campaign"
@@ -43,7 +43,7 @@ test-native:
 	$(BIN)/python -m pytest -m "native and not (campaign or socketcan or boots)"
 
 test-all: lint ## everything
-	$(BIN)/python -m sim_can.bench_kernel build --unless-vcan
+	$(BIN)/python -m jtqd.sim_can.bench_kernel build --unless-vcan
 	$(BIN)/python -m pytest
 
 lint: $(VENV)/.installed-test ## ruff and mypy
@@ -59,19 +59,19 @@ bench: $(VENV)/.installed-dev ## measure the loop: ratios from one run
 	$(BIN)/python -m tests.benchmarks
 
 fuzz: $(VENV)/.installed-test ## a million frames by both paths, 300 damaged files of each kind, a storm
-	$(BIN)/python -m tests.fuzz frames --count 1000000
-	$(BIN)/python -m tests.fuzz service --count 1000000
-	$(BIN)/python -m tests.fuzz files --count 300
-	$(BIN)/python -m tests.fuzz storm
+	$(BIN)/python -m tests.slow.fuzz frames --count 1000000
+	$(BIN)/python -m tests.slow.fuzz service --count 1000000
+	$(BIN)/python -m tests.slow.fuzz files --count 300
+	$(BIN)/python -m tests.slow.fuzz storm
 
 soak: $(VENV)/.installed-dev ## jtqd for 30 minutes with faults drawn at random
-	$(BIN)/python -m tests.soak --minutes 30
+	$(BIN)/python -m tests.slow.soak --minutes 30
 
 soak-exact: $(VENV)/.installed-dev ## the same in the bench kernel: as much guest time as an hour gives
-	$(BIN)/python -m tests.soak --exact --minutes 1440 --wall 3600
+	$(BIN)/python -m tests.slow.soak --exact --minutes 1440 --wall 3600
 
 bench-kernel: $(VENV)/.installed ## build the kernel with SocketCAN into the cache, once
-	$(BIN)/python -m sim_can.bench_kernel build
+	$(BIN)/python -m jtqd.sim_can.bench_kernel build
 
 clean: ## remove what make made here; the cached bench kernel stays
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

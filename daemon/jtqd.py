@@ -13,8 +13,8 @@ from types import FrameType
 from typing import Any
 
 # What is heavy to load is loaded in `_run`: Ctrl-C must find its handler there, also in the first second.
-from daemon.live.address import NEEDED, Address, address, installed
-from estimator.arguments import seconds
+from jtqd.daemon.live.address import NEEDED, Address, address, installed
+from jtqd.estimator.checked import seconds
 
 _EXAMPLES = """examples:
   jtqd --bus sim --duration 20          emulated bench in its own processes, 20 s, with a live table
@@ -97,11 +97,10 @@ def _run(arguments: argparse.Namespace, told_to_end: list[int]) -> int:
     if arguments.live is not None and not installed():
         print(f"jtqd: {NEEDED}", file=sys.stderr)
         return 1
-    from daemon.config import load_config
-    from daemon.supervisor.process import Supervisor
-    from daemon.supervisor.start import SupervisorError
-    from drivers.errors import BusError
-    from estimator.checked import ConfigError
+    from jtqd.daemon.config import load_config
+    from jtqd.daemon.supervisor.process import Supervisor, SupervisorError
+    from jtqd.drivers.frame_socket import BusError
+    from jtqd.estimator.checked import ConfigError
 
     try:
         config = load_config(arguments.config)

@@ -6,29 +6,66 @@ back and compared; the values found make the node's configuration hash.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
 
-from drivers.boot_error import BootError, mismatch
-from drivers.configuration_hash import configuration_sha256, signature
-from drivers.devices import (
+from jtqd.drivers.devices import (
     EVENT_DRIVEN,
     EVENT_MS,
+    JTQD_NODE,
     OPERATING_MODE_OBJECT,
+    SYNC_COB_ID,
     TEMPERATURE,
     DriveProfile,
     DriveScaling,
-    Key,
+    Identity,
     SensorProfile,
     SensorScaling,
     drive_scaling,
+    parse_key,
     sensor_scaling,
 )
-from drivers.node_objects import NodeObjects, SdoAccess, SdoSilence
-from drivers.pdo import PdoMap
-from drivers.pdo_parameters import CAN_ID, INVALID, NO_RTR
-from drivers.watched_objects import watched_objects
+from jtqd.drivers.pdo import CAN_ID, INVALID, NO_RTR, PdoMap
+from jtqd.drivers.sdo import BootError, Key, NodeObjects, SdoAccess, mismatch
 
-__all__ = ["BootedNode", "BusSettings", "NodeBoot", "Profile", "SdoAccess", "SdoSilence"]
+# A node's configuration as one number: the hash over all that the boot has read back, and what 1020h holds of it. Pure.
+
+
+def configuration_sha256(found: Mapping[Key, int]) -> str:
+    """SHA-256 over every value found, in the order of the objects."""
+    lines = [f"{index:04X}h:{subindex}={value}\n" for (index, subindex), value in sorted(found.items())]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def signature(sha256: str) -> tuple[int, int]:
+    """The two words of 1020h for a configuration: the first 64 bits of its hash, never zero (zero: not configured).
+
+    CiA 301 calls them date and time; CiA 302-2 compares them with what the master expects and nothing else.
+    """
+    words = int(sha256[:8], 16), int(sha256[8:16], 16)
+    return words[0] or 1, words[1] or 1
+
+
+# Which of the objects that a boot has read say what a node's numbers mean: its PDOs and its scaling. Pure.
+#
+# They are read again in service (`daemon/bus/nodes.py`): where one has changed, the node's numbers mean
+# something else than before.
+
+
+_PDO_PARAMETERS = range(0x1800, 0x1C00)
+"""Communication and mapping parameters of TPDOs (CiA 301)."""
+
+
+def watched_objects(found: Mapping[Key, int], scaling: Collection[Key]) -> tuple[tuple[int, int, int], ...]:
+    """(index, sub-index, value) of the objects in `found` that belong to a TPDO, to `scaling` or to a channel's mode."""
+    return tuple(
+        (*key, value)
+        for key, value in sorted(found.items())
+        if key[0] in _PDO_PARAMETERS or key[0] == OPERATING_MODE_OBJECT or key in scaling
+    )
+
 
 Profile = DriveProfile | SensorProfile
 _IDENTITY = (
@@ -76,7 +113,7 @@ class BootedNode:
     signed: bool = False
     """1020h holds the signature of this configuration."""
     watched: tuple[tuple[int, int, int], ...] = ()
-    """Objects that its PDOs and scaling depend on (`drivers/watched_objects.py`)."""
+    """Objects that its PDOs and scaling depend on (`drivers/boot_procedure.py`)."""
     notes: tuple[str, ...] = ()
     """What the operator should know although nothing is wrong."""
 
@@ -285,3 +322,200 @@ def reset_during_boot(node: int) -> BootError:
     """The node sent a boot-up message after it had been configured: its mapping is the default one again."""
     detail = "it restarted during boot (boot-up message): its configuration is lost"
     return BootError(node, "1000h:0", expected="no restart", found="boot-up message", detail=detail)
+
+
+# The boot request as JSON, checked into frozen profiles, and the report as JSON.
+#
+# {"bus": "can0", "master_node": 32, "heartbeat_ms": 100, "master_timeout_ms": 500, "answer_timeout_s": 0.5,
+#  "own_eds": "jtqd.eds",
+#  "sync": {"cob_id": 128, "counter_overflow": 240, "check_foreign": true},
+#  "nodes": [{"node": 1, "kind": "drive", "identity": {"vendor": 1953, "product": 1026}},
+#            {"node": 2, "kind": "drive", "given": {"6091h:1": 100}, "temperature": true},
+#            {"node": 3, "kind": "sensor", "channels": [1], "unit_words": {"0x00560000": 1.0}}]}
+#
+# Only "bus" and "nodes" with "node" and "kind" are needed. `given` replaces objects that are then not read;
+# `temperature` of a drive asks for TPDO3 with 3001h; a node that is not `mandatory` may be absent. "error_behaviour"
+# is 1029h:1; without it the nodes keep theirs.
+
+
+_TOP = {
+    "bus",
+    "nodes",
+    "master_node",
+    "own_eds",
+    "sync",
+    "heartbeat_ms",
+    "master_timeout_ms",
+    "answer_timeout_s",
+    "error_behaviour",
+}
+_NODE = {"node", "kind", "identity", "channels", "given", "unit_words", "temperature", "mandatory"}
+_OPTIONAL_TIMEOUT_S = 0.5
+"""An optional node is not waited for any longer: it is booted again when it appears."""
+_SYNC = {"cob_id", "counter_overflow", "check_foreign"}
+
+
+class RequestError(ValueError):
+    """The request itself is wrong."""
+
+
+@dataclass(frozen=True)
+class BootRequest:
+    """Which nodes to boot on which bus.
+
+    `check_foreign_sync` is off when jtqd's own SYNC already runs. `own_eds` is a data sheet to be read for the
+    caller, who then does without the parser: its entries are in the report as "own_entries".
+    """
+
+    bus: str
+    profiles: tuple[Profile, ...]
+    settings: BusSettings
+    check_foreign_sync: bool = True
+    answer_timeout_s: float = 0.5
+    own_eds: str | None = None
+    optional: frozenset[int] = frozenset()
+
+    def timeout_s(self, node: int) -> float:
+        """How long a node may take for an answer."""
+        return (
+            min(self.answer_timeout_s, _OPTIONAL_TIMEOUT_S)
+            if node in self.optional
+            else self.answer_timeout_s
+        )
+
+
+def parse_request(raw: object) -> BootRequest:
+    """Checked request; RequestError names the key, what was found and what is expected."""
+    top = _mapping(raw, "request", _TOP)
+    bus = top.get("bus")
+    if not isinstance(bus, str) or not bus:
+        raise RequestError(f"bus: found {bus!r}, expected a name like can0 or unix:PATH")
+    nodes = top.get("nodes")
+    if not isinstance(nodes, list) or not nodes:
+        raise RequestError(f"nodes: found {nodes!r}, expected a list of at least one node")
+    profiles = tuple(_profile(node, f"nodes[{position}]") for position, node in enumerate(nodes))
+    numbers = [profile.node_id for profile in profiles]
+    master = _integer(top, "master_node", 1, 127, JTQD_NODE)
+    if len({*numbers, master}) != len(numbers) + 1:
+        raise RequestError(f"nodes: {numbers} and master {master}, expected different node numbers")
+    sync = _mapping(top.get("sync", {}), "sync", _SYNC)
+    overflow = None
+    if sync.get("counter_overflow") is not None:
+        overflow = _integer(sync, "counter_overflow", 0, 240, 0)
+    settings = BusSettings(
+        master_node=master,
+        master_timeout_ms=_integer(top, "master_timeout_ms", 1, 0xFFFF, 500),
+        heartbeat_ms=_integer(top, "heartbeat_ms", 1, 0xFFFF, 100),
+        sync_cob_id=_integer(sync, "cob_id", 1, 0x7FF, SYNC_COB_ID),
+        counter_overflow=overflow,
+        error_behaviour=None
+        if top.get("error_behaviour") is None
+        else _integer(top, "error_behaviour", 0, 2, 0),
+    )
+    timeout = top.get("answer_timeout_s", 0.5)
+    if isinstance(timeout, bool) or not isinstance(timeout, int | float) or not 0 < timeout <= 60:
+        raise RequestError(f"answer_timeout_s: found {timeout!r}, expected seconds above 0 and at most 60")
+    own_eds = top.get("own_eds")
+    if own_eds is not None and not isinstance(own_eds, str):
+        raise RequestError(f"own_eds: found {own_eds!r}, expected a path")
+    optional = frozenset(
+        profile.node_id
+        for profile, node in zip(profiles, nodes, strict=True)
+        if not _truth(node, "mandatory", default=True)
+    )
+    foreign = bool(sync.get("check_foreign", True))
+    return BootRequest(bus, profiles, settings, foreign, float(timeout), own_eds, optional)
+
+
+def _profile(raw: object, where: str) -> Profile:
+    node = _mapping(raw, where, _NODE)
+    number = _integer(node, "node", 1, 127, None, where=where)
+    identity = _identity(node.get("identity"), f"{where}.identity")
+    try:
+        given = {
+            parse_key(key): value for key, value in _integers(node.get("given"), f"{where}.given").items()
+        }
+    except ValueError as error:
+        raise RequestError(f"{where}.given: {error}") from error
+    kind = node.get("kind")
+    if kind == "drive":
+        return DriveProfile(number, identity, given, _truth(node, "temperature", default=False, where=where))
+    if kind != "sensor":
+        raise RequestError(f"{where}.kind: found {kind!r}, expected 'drive' or 'sensor'")
+    channels = node.get("channels", [1])
+    if channels not in ([1], [1, 2]):
+        raise RequestError(f"{where}.channels: found {channels!r}, expected [1] or [1, 2]")
+    return SensorProfile(number, identity, tuple(channels), given, _unit_words(node, where))
+
+
+def _identity(raw: object, where: str) -> Identity:
+    fields = set(asdict(Identity()))
+    mapping = dict(_mapping({} if raw is None else raw, where, fields))
+    software = mapping.pop("software", None)
+    if software is not None and not isinstance(software, str):
+        raise RequestError(f"{where}.software: found {software!r}, expected a text")
+    return Identity(**_integers(mapping, where, fields), software=software)
+
+
+def _truth(mapping: Mapping[str, Any], key: str, *, default: bool, where: str = "node") -> bool:
+    value = mapping.get(key, default)
+    if not isinstance(value, bool):
+        raise RequestError(f"{where}.{key}: found {value!r}, expected true or false")
+    return value
+
+
+def _unit_words(node: Mapping[str, Any], where: str) -> dict[int, float]:
+    words = _mapping(node.get("unit_words", {}), f"{where}.unit_words", None)
+    try:
+        return {int(word, 0): float(nm) for word, nm in words.items()}
+    except (TypeError, ValueError) as error:
+        raise RequestError(f"{where}.unit_words: {error}, expected words and Nm per unit") from error
+
+
+def _mapping(raw: object, where: str, known: set[str] | None) -> Mapping[str, Any]:
+    if not isinstance(raw, dict):
+        raise RequestError(f"{where}: found {raw!r}, expected a mapping")
+    unknown = sorted(set(raw) - known) if known is not None else []
+    if unknown:
+        raise RequestError(f"{where}: unknown key {unknown[0]!r}, expected one of {sorted(known or ())}")
+    return raw
+
+
+def _integer(
+    mapping: Mapping[str, Any], key: str, low: int, high: int, default: int | None, *, where: str = ""
+) -> int:
+    value = mapping.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        path = f"{where}.{key}" if where else key
+        raise RequestError(f"{path}: found {value!r}, expected a whole number {low}..{high}")
+    return value
+
+
+def _integers(raw: object, where: str, known: set[str] | None = None) -> dict[str, int]:
+    """A mapping of 32-bit numbers; null entries are left out."""
+    mapping = _mapping({} if raw is None else raw, where, known)
+    kept = {key: value for key, value in mapping.items() if value is not None}
+    return {key: _integer(kept, key, 0, 0xFFFF_FFFF, None, where=where) for key in kept}
+
+
+def node_report(node: BootedNode) -> dict[str, object]:
+    """One node of the report; `scaling` holds the fields of DriveScaling or SensorScaling."""
+    return {
+        "name": node.name,
+        "device_type": node.device_type,
+        "serial": node.serial,
+        "scaling": asdict(node.scaling),
+        "gear_ratio": node.gear_ratio,
+        "tpdos": [
+            {
+                "cob_id": pdo.cob_id,
+                "transmission_type": pdo.transmission_type,
+                "words": list(pdo.words),
+            }
+            for pdo in node.tpdos
+        ],
+        "configuration_sha256": node.configuration_sha256,
+        "signed": node.signed,
+        "watched": [list(each) for each in node.watched],
+        "notes": list(node.notes),
+    }

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from drivers.devices import (
+from jtqd.drivers.devices import (
     EVENT_MS,
     JTQD_NODE,
     SYNC_COB_ID,
@@ -20,8 +20,8 @@ from drivers.devices import (
     sensor_tpdo1,
     sensor_tpdo2,
 )
-from drivers.frame import unstuffed_bits, worst_case_bits
-from drivers.pdo import LAST_SYNC_TYPE, PdoMap
+from jtqd.drivers.frame import unstuffed_bits, worst_case_bits
+from jtqd.drivers.pdo import LAST_SYNC_TYPE, PdoMap
 
 LIMIT = 0.95
 BITRATE = 1_000_000

@@ -10,15 +10,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from drivers.boot_error import label, mismatch
-from drivers.pdo import MappedObject, PdoMap
+from jtqd.drivers.pdo import MappedObject, PdoMap
+from jtqd.drivers.sdo import Key, label, mismatch
 
 JTQD_NODE = 0x20
 COMMANDER_NODE = 0x21
 """Who may command the drives beside jtqd; they watch its heartbeat by 1016h:2."""
 SYNC_COB_ID = 0x080
-
-Key = tuple[int, int]
 
 # Objects that scale a drive's numbers, with the largest value that makes sense. All must be at least 1.
 DRIVE_SCALING_OBJECTS: dict[Key, tuple[str, int]] = {

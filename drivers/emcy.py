@@ -5,6 +5,9 @@ from __future__ import annotations
 import struct
 from typing import NamedTuple
 
+from jtqd.drivers.object_dictionary import ObjectStore
+from jtqd.drivers.sdo import VALUE_RANGE, SdoAbort
+
 EMCY = struct.Struct("<HB5s")
 """Error code, error register (1001h), manufacturer's field."""
 NO_ERROR = 0x0000
@@ -141,3 +144,33 @@ def describe(emergency: Emergency) -> str:
     if any(manufacturer):
         text += f", {manufacturer.hex(' ')}"
     return text if length == 8 else f"{text}, a frame of {length} bytes"
+
+
+# Pre-defined error field 1003h: the newest error first, bounded, cleared by writing 0 (CiA 301, 7.5.2.4).
+
+
+INDEX = 0x1003
+
+
+class ErrorHistory:
+    """Keeps 1003h of a store; its depth is the number of sub-indices the EDS gives it."""
+
+    def __init__(self, store: ObjectStore) -> None:
+        self._store = store
+        self._depth = max(subindex for index, subindex in store.entries if index == INDEX)
+        store.on_write(INDEX, 0, self._clear)
+
+    def push(self, error: int) -> None:
+        """Put an error first (EMCY code in the low word); the oldest falls out when the field is full."""
+        count = self._store.number(INDEX, 0)
+        kept = [self._store.number(INDEX, subindex) for subindex in range(1, count + 1)]
+        recent = [error, *kept][: self._depth]
+        for subindex, value in enumerate(recent, 1):
+            self._store.set_number(INDEX, subindex, value)
+        self._store.set_number(INDEX, 0, len(recent))
+
+    def _clear(self, data: bytes) -> None:
+        if data != b"\0":
+            raise SdoAbort(VALUE_RANGE)
+        for subindex in range(1, self._depth + 1):
+            self._store.set_number(INDEX, subindex, 0)

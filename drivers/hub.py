@@ -1,24 +1,203 @@
-"""Hub of a unix bus: `python -m drivers.hub unix:PATH [--bitrate 1000000]`, or embedded beside local nodes.
+"""Hub of a unix bus: `python -m jtqd.drivers.hub unix:PATH [--bitrate 1000000]`, or embedded beside local nodes.
 
 A client is an AF_UNIX SOCK_SEQPACKET connection; one message is one 16-byte `struct can_frame`. What a member
 sends, every other member receives; the sender too when it asks for the echo (bit 0 of byte 5). All members
-see the same order of frames. With a bit rate, frames first cross a modelled wire (drivers.wire).
+see the same order of frames. With a bit rate, frames first cross a modelled wire (jtqd.drivers.hub).
 """
 
+from __future__ import annotations
+
+import argparse
+import ctypes
 import errno
 import os
 import select
+import signal
 import socket
+import stat
+import sys
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
+from types import FrameType
+from typing import NamedTuple
 
-from drivers.frame import CAN_ERR_FLAG, ECHO_BIT, FRAME_SIZE, is_frame
-from drivers.listen import listen
-from drivers.receive import NOTHING_YET, SO_TIMESTAMPNS, FrameReceiver
-from drivers.unix_socket import BUFFER_BYTES
-from drivers.wire import WireModel
+from jtqd.drivers.frame import (
+    CAN_ERR_FLAG,
+    ECHO_BIT,
+    FRAME,
+    FRAME_SIZE,
+    arbitration_key,
+    is_frame,
+    stuffed_bits,
+)
+from jtqd.drivers.frame_socket import BUFFER_BYTES, PREFIX, BusError, reachable, require_directory
+from jtqd.drivers.receive import NOTHING_YET, SO_TIMESTAMPNS, FrameReceiver
+
+# Model of a classic CAN wire: one frame at a time, the highest priority first, exact stuffed length. Pure.
+#
+# Each sender is a controller with a first-in first-out queue: the head of its queue takes part in arbitration.
+# Times are integer nanoseconds on any one clock; nothing here reads a clock.
+
+
+_NS_PER_S = 1_000_000_000
+
+
+class _Waiting(NamedTuple):
+    """A frame in a transmit queue."""
+
+    key: int
+    submitted_ns: int
+    order: int
+    bits: int
+    frame: bytes
+    sender: Hashable
+
+
+class WireModel:
+    """A wire of `bitrate` bit/s.
+
+    A frame starts when the wire is free and somebody has one; whatever had been submitted by then arbitrates.
+    Submissions may be told late (a hub reads its sockets late, with the kernel's stamp of the send): only a
+    frame already started by an earlier `advance` keeps the wire. `queue_limit` bounds each sender's queue.
+    Counters: `bits` and `frames` transmitted.
+    """
+
+    def __init__(self, bitrate: int, queue_limit: int = 128) -> None:
+        if bitrate <= 0:
+            raise ValueError(f"bit rate must be positive, not {bitrate}")
+        self.bitrate = bitrate
+        self.bits = 0
+        self.frames = 0
+        self._queue_limit = queue_limit
+        self._queues: dict[Hashable, deque[_Waiting]] = {}
+        self._free_ns = 0
+        self._on_wire: tuple[_Waiting, int] | None = None
+        self._order = 0
+
+    def duration_ns(self, bits: int) -> int:
+        """Return the time of `bits` on the wire, rounded up to ns."""
+        return -(-bits * _NS_PER_S // self.bitrate)
+
+    def pending(self, sender: Hashable) -> int:
+        """Return how many frames of `sender` wait for the wire."""
+        queue = self._queues.get(sender)
+        return len(queue) if queue else 0
+
+    def submit(self, sender: Hashable, frame: bytes, t_ns: int) -> bool:
+        """Queue the 16-byte `frame` of `sender` at time t_ns; False when its queue is full.
+
+        Times of one sender must not decrease; one that does counts as the time before it.
+        """
+        queue = self._queues.get(sender)
+        if queue is None:
+            queue = self._queues[sender] = deque()
+        elif len(queue) >= self._queue_limit:
+            return False
+        elif queue:
+            t_ns = max(t_ns, queue[-1].submitted_ns)
+        can_id, length, data = FRAME.unpack(frame)
+        bits = stuffed_bits(can_id, data[:length])
+        self._order += 1
+        queue.append(_Waiting(arbitration_key(can_id), t_ns, self._order, bits, frame, sender))
+        return True
+
+    def next_end(self) -> int | None:
+        """Return when the next transmission ends if nothing else is submitted; None for an idle wire."""
+        if self._on_wire is not None:
+            return self._on_wire[1]
+        following = self._following()
+        if following is None:
+            return None
+        start, winner = following
+        return start + self.duration_ns(winner.bits)
+
+    def advance(self, t_ns: int) -> list[tuple[Hashable, bytes, int]]:
+        """Let time pass to t_ns; return (sender, frame, end_ns) of each transmission that ended by then.
+
+        A frame that starts before t_ns is on the wire for good. One that would start at t_ns itself still
+        arbitrates against what is submitted for that moment afterwards.
+        """
+        ended: list[tuple[Hashable, bytes, int]] = []
+        while True:
+            if self._on_wire is None:
+                following = self._following()
+                if following is None or following[0] >= t_ns:
+                    return ended
+                start, winner = following
+                queue = self._queues[winner.sender]
+                queue.popleft()
+                if not queue:
+                    del self._queues[winner.sender]
+                self._on_wire = (winner, start + self.duration_ns(winner.bits))
+            sent, end = self._on_wire
+            if end > t_ns:
+                return ended
+            self._on_wire = None
+            self._free_ns = end
+            self.bits += sent.bits
+            self.frames += 1
+            ended.append((sent.sender, sent.frame, end))
+
+    def _following(self) -> tuple[int, _Waiting] | None:
+        """Return (start, winner) of the next arbitration; equal fields go in order of submission."""
+        if not self._queues:
+            return None
+        heads = [queue[0] for queue in self._queues.values()]
+        start = max(self._free_ns, min(head.submitted_ns for head in heads))
+        return start, min(head for head in heads if head.submitted_ns <= start)
+
+
+# The listening socket of a unix bus and the life of its file.
+
+
+def listen(path: str, backlog: int) -> socket.socket:
+    """Return a listening socket at `path`, mode 0600; the file of a dead hub is replaced.
+
+    Raises BusError: a live hub or another file is there, or the path is unusable.
+    """
+    bus = PREFIX + path
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    umask = os.umask(0o177)
+    try:
+        with reachable(path) as address:
+            try:
+                sock.bind(address)
+            except OSError as error:
+                if error.errno != errno.EADDRINUSE:
+                    raise
+                _remove_dead(path, address)
+                sock.bind(address)
+        sock.listen(backlog)
+        sock.setblocking(False)
+    except BusError:
+        sock.close()
+        raise
+    except OSError as error:
+        sock.close()
+        require_directory(path)
+        raise BusError(f"{bus}: cannot make the bus: {error.strerror or error}") from None
+    finally:
+        os.umask(umask)
+    return sock
+
+
+def _remove_dead(path: str, address: str) -> None:
+    """Remove the socket file of a hub that no longer listens. Raises BusError for anything else."""
+    if not stat.S_ISSOCK(os.lstat(path).st_mode):
+        raise BusError(f"{PREFIX}{path}: a file that is no socket is there")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(address)
+        except ConnectionRefusedError:
+            os.unlink(path)
+            return
+        except OSError:
+            pass  # a full backlog or another kind of socket: somebody lives there
+    raise BusError(f"{PREFIX}{path}: another hub is running there")
+
 
 OnFrame = Callable[[bytes, int], None]
 """Called with a frame and the time it was sent (modelled wire: end of transmission), CLOCK_REALTIME ns."""
@@ -49,7 +228,7 @@ class HubCounters:
 class LocalPort:
     """A node in the hub's own process."""
 
-    def __init__(self, hub: "Hub", on_frame: OnFrame) -> None:
+    def __init__(self, hub: Hub, on_frame: OnFrame) -> None:
         self._hub = hub
         self._on_frame = on_frame
 
@@ -293,9 +472,58 @@ _ERROR_BYTE = CAN_ERR_FLAG >> 24
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a hub until SIGINT or SIGTERM; see the module's docstring. Returns the exit status."""
-    from drivers.hub_command import run  # argparse and signal only for the command
 
     return run(arguments)
+
+
+# Command line of the hub.
+
+
+_PR_SET_TIMERSLACK = 29
+
+
+class _StopError(Exception):
+    """SIGINT or SIGTERM."""
+
+
+def _stop(_number: int, _frame: FrameType | None) -> None:
+    raise _StopError
+
+
+def run(arguments: list[str] | None) -> int:
+    """Run a hub until SIGINT or SIGTERM; exit status 0, or 1 when the bus cannot be made."""
+    parser = argparse.ArgumentParser(
+        prog="python -m jtqd.drivers.hub",
+        description="CAN bus on a unix socket",
+        epilog="example: python -m jtqd.drivers.hub unix:/tmp/bus --bitrate 1000000",
+    )
+    parser.add_argument("bus", help="unix:PATH")
+    parser.add_argument(
+        "--bitrate", type=int, help="model the wire at this many bit/s; default: pass at once"
+    )
+    options = parser.parse_args(arguments)
+    if not options.bus.startswith(PREFIX) or options.bus == PREFIX:
+        parser.error(f"found {options.bus!r}, expected unix:PATH")
+    if options.bitrate is not None and options.bitrate <= 0:
+        parser.error(f"--bitrate must be positive, not {options.bitrate}")
+    signal.signal(signal.SIGTERM, _stop)
+    signal.signal(signal.SIGINT, _stop)
+    # The default slack of 50 us on every timeout is one short frame at 1 Mbit/s.
+    ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0)
+    hub = None
+    try:
+        hub = Hub(options.bus.removeprefix(PREFIX), options.bitrate)
+        print(f"hub: {options.bus} is up", flush=True)
+        while True:
+            hub.run_once(None)
+    except _StopError:
+        return 0
+    except BusError as error:
+        print(f"hub: {error}", file=sys.stderr)
+        return 1
+    finally:
+        if hub is not None:
+            hub.close()
 
 
 if __name__ == "__main__":

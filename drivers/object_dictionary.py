@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from drivers.sdo_abort import (
+from jtqd.drivers.sdo import (
     LENGTH_MISMATCH,
     LENGTH_TOO_HIGH,
     LENGTH_TOO_LOW,

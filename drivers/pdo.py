@@ -8,7 +8,11 @@ refused when the map is made.
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass, field
+
+from jtqd.drivers.object_dictionary import ObjectStore
+from jtqd.drivers.sdo import DEVICE_STATE, NOT_MAPPABLE, PDO_TOO_LONG, VALUE_RANGE, SdoAbort
 
 MAX_PDO_BYTES = 8
 MAX_ENTRIES = 8  # whole bytes only: 8 entries fill a frame
@@ -102,3 +106,143 @@ class PdoMap:
 def split_word(word: int) -> tuple[int, int, int]:
     """(index, subindex, bits) of a mapping entry 0xIIIISSLL."""
     return word >> 16 & 0xFFFF, word >> 8 & 0xFF, word & 0xFF
+
+
+# PDO parameters of a node's own object dictionary: the rules for changing them, and the maps in force.
+#
+# CiA 301, 7.5.2.33 to 7.5.2.38. Re-mapping goes: COB-ID bit 31 set (the PDO is destroyed), number of entries
+# 0, entries, number of entries n, COB-ID with bit 31 clear. A write out of that order is refused with
+# 08000022h, an object that is not there with 06020000h, one that may not be mapped with 06040041h, more than 8
+# bytes with 06040042h, a COB-ID or transmission type that cannot be with 06090030h.
+
+
+INVALID = 0x8000_0000  # COB-ID bit 31: the PDO does not exist
+EXTENDED = 0x2000_0000  # COB-ID bit 29: 29-bit identifier, not supported here
+NO_RTR = 0x4000_0000  # COB-ID bit 30 of a TPDO
+CAN_ID = 0x7FF
+_RPDO, _TPDO = 0x1400, 0x1800
+_MAPPING_OFFSET = 0x200  # 1400h -> 1600h, 1800h -> 1A00h
+_EVENT_TYPES = (254, 255)
+_TPDO_ACCESS = ("ro", "rw", "rwr", "const")
+_RPDO_ACCESS = ("wo", "rw", "rww")
+# Sub-indices of the communication parameter that may change only while the PDO does not exist
+_INHIBIT_TIME, _SYNC_START = 3, 6
+
+
+class PdoParameters:
+    """Guards the PDO parameters of `store` and reads the active maps from it.
+
+    `generation` grows with each accepted write: who keeps the maps reads them anew when it differs.
+    """
+
+    def __init__(self, store: ObjectStore) -> None:
+        self._store = store
+        self.generation = 0
+        self.tpdo_indices = _communication_indices(store, _TPDO)
+        self.rpdo_indices = _communication_indices(store, _RPDO)
+        for index in (*self.tpdo_indices, *self.rpdo_indices):
+            self._guard_communication(index)
+            self._guard_mapping(index)
+
+    def tpdos(self) -> list[PdoMap]:
+        """TPDOs that exist and map something, in the order of their number."""
+        return self._active(self.tpdo_indices)
+
+    def rpdos(self) -> list[PdoMap]:
+        """RPDOs that exist and map something."""
+        return self._active(self.rpdo_indices)
+
+    def _active(self, indices: tuple[int, ...]) -> list[PdoMap]:
+        found = (self.active_map(index) for index in indices)
+        return [pdo for pdo in found if pdo is not None]
+
+    def active_map(self, communication_index: int) -> PdoMap | None:
+        """Map of one PDO (1400h.., 1800h..); None when it is switched off or empty."""
+        store = self._store
+        cob_id = store.number(communication_index, 1)
+        mapping = communication_index + _MAPPING_OFFSET
+        count = store.number(mapping, 0)
+        if cob_id & INVALID or count == 0:
+            return None
+        mapped = tuple(self._mapped(store.number(mapping, entry)) for entry in range(1, count + 1))
+        return PdoMap(cob_id & CAN_ID, mapped, store.number(communication_index, 2))
+
+    def _mapped(self, word: int) -> MappedObject:
+        index, subindex, bits = split_word(word)
+        entry = self._store.entry(index, subindex)
+        return MappedObject(index, subindex, bits, entry.signed, entry.name)
+
+    # Rules --------------------------------------------------------------------------------------------------
+
+    def _exists(self, communication_index: int) -> bool:
+        return not self._store.number(communication_index, 1) & INVALID
+
+    def _guard_communication(self, index: int) -> None:
+        self._hook(index, 1, lambda value: self._check_cob_id(index, value))
+        self._hook(index, 2, self._check_transmission)
+        for subindex in (_INHIBIT_TIME, _SYNC_START):
+            if self._store.has(index, subindex):
+                self._hook(index, subindex, lambda _value: self._require_destroyed(index))
+
+    def _guard_mapping(self, index: int) -> None:
+        mapping = index + _MAPPING_OFFSET
+        access = _TPDO_ACCESS if index >= _TPDO else _RPDO_ACCESS
+        self._hook(mapping, 0, lambda count: self._check_count(index, count))
+        for subindex in range(1, 256):
+            if not self._store.has(mapping, subindex):
+                break
+            self._hook(mapping, subindex, lambda word: self._check_entry(index, word, access))
+
+    def _hook(self, index: int, subindex: int, check: Callable[[int], None]) -> None:
+        def on_write(data: bytes) -> None:
+            check(int.from_bytes(data, "little"))
+            self.generation += 1
+
+        self._store.on_write(index, subindex, on_write)
+
+    def _check_cob_id(self, index: int, value: int) -> None:
+        present = self._store.number(index, 1)
+        if value & EXTENDED or not LOWEST_PDO_ID <= value & CAN_ID <= HIGHEST_PDO_ID or value & 0x1FFF_F800:
+            raise SdoAbort(VALUE_RANGE)
+        both_exist = not (present | value) & INVALID
+        if both_exist and (present ^ value) & CAN_ID:
+            raise SdoAbort(VALUE_RANGE)  # bits 0..29 may not change while the PDO exists
+
+    def _check_transmission(self, value: int) -> None:
+        if not (
+            value <= LAST_SYNC_TYPE or value in _EVENT_TYPES
+        ):  # 252, 253 are RTR-only, which is not offered
+            raise SdoAbort(VALUE_RANGE)
+
+    def _require_destroyed(self, index: int) -> None:
+        if self._exists(index):
+            raise SdoAbort(DEVICE_STATE)
+
+    def _check_count(self, index: int, count: int) -> None:
+        self._require_destroyed(index)
+        mapping = index + _MAPPING_OFFSET
+        bits = 0
+        for entry in range(1, count + 1):
+            if not self._store.has(mapping, entry):
+                raise SdoAbort(PDO_TOO_LONG)
+            word = self._store.number(mapping, entry)
+            if word == 0:
+                raise SdoAbort(NOT_MAPPABLE)
+            bits += word & 0xFF
+        if bits > 8 * MAX_PDO_BYTES:
+            raise SdoAbort(PDO_TOO_LONG)
+
+    def _check_entry(self, index: int, word: int, access: tuple[str, ...]) -> None:
+        self._require_destroyed(index)
+        if self._store.number(index + _MAPPING_OFFSET, 0) != 0:
+            raise SdoAbort(DEVICE_STATE)
+        if word == 0:
+            return
+        mapped_index, subindex, bits = split_word(word)
+        entry = self._store.entry(mapped_index, subindex)  # aborts 06020000h or 06090011h when absent
+        if not entry.mappable or not entry.is_integer or entry.access not in access or entry.bits != bits:
+            raise SdoAbort(NOT_MAPPABLE)
+
+
+def _communication_indices(store: ObjectStore, base: int) -> tuple[int, ...]:
+    return tuple(index for index in range(base, base + _MAPPING_OFFSET) if store.has(index, 1))

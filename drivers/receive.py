@@ -8,7 +8,7 @@ import errno
 import struct
 from collections.abc import Sequence
 
-from drivers.frame import FRAME_SIZE
+from jtqd.drivers.frame import FRAME_SIZE
 
 SO_TIMESTAMPNS = 35  # asm-generic/socket.h; SCM_TIMESTAMPNS is the same number
 SO_RXQ_OVFL = 40

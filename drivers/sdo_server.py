@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import struct
 
-from drivers.object_dictionary import ObjectStore
-from drivers.sdo_abort import (
+from jtqd.drivers.object_dictionary import ObjectStore
+from jtqd.drivers.sdo import (
     LENGTH_TOO_HIGH,
     LENGTH_TOO_LOW,
     OUT_OF_MEMORY,

@@ -18,9 +18,9 @@ from typing import Final
 
 import numpy as np
 
-from estimator.friction import FloatArray
-from estimator.fused_parameters import FusedSigma
-from estimator.lanes import fading_maximum
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.joint import FusedSigma
+from jtqd.estimator.whole_observers import fading_maximum
 
 SLOW_RAD_S: Final = 0.05
 FAST_RAD_S: Final = 0.2

@@ -7,20 +7,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimator.checked import ConfigError
-from estimator.extended_estimator import ExtendedEstimator, corrected_by_steps
-from estimator.extended_inputs import acting, needs_torque, plain_joint
-from estimator.extended_run import extended_run
-from estimator.friction import FloatArray
-from estimator.fused_estimator import FusedEstimator, fused_parts
-from estimator.fused_network import FusedNetwork
-from estimator.fused_run import estimate_observed, observe_run
-from estimator.joint_estimator import JointEstimator
-from estimator.network import TorqueNetwork
-from estimator.parameters import Joint
-from estimator.run import JointColumns
-from estimator.settings import EstimatorSettings
-from estimator.whole_run import EstimateRun, estimate_run
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.corrections import acting, needs_torque, plain_joint
+from jtqd.estimator.estimator import (
+    ExtendedEstimator,
+    FusedEstimator,
+    JointEstimator,
+    corrected_by_steps,
+    fused_parts,
+)
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.network import FusedNetwork, TorqueNetwork
+from jtqd.estimator.run import JointColumns
+from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.whole_run import EstimateRun, estimate_observed, estimate_run, extended_run, observe_run
 
 AnyEstimator = JointEstimator | FusedEstimator | ExtendedEstimator
 AnyNetwork = TorqueNetwork | FusedNetwork

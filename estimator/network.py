@@ -7,14 +7,81 @@ feature), sigma_nm (held-out standard deviation), joint (name), data_sha256 (tra
 from __future__ import annotations
 
 import os
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 
-from estimator.friction import FloatArray
-from estimator.onnx_graph import NetworkError, OnnxGraph, finite
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.onnx_graph import OnnxGraph, finite
+from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.validity import Envelope, Trust
 
-__all__ = ["FEATURES", "NetworkError", "TorqueNetwork"]
+# How a network is attached to a joint: what it must offer, whether it fits, how far it is trusted.
+
+
+class NetworkModel(Protocol):
+    """What is needed of a network; jtqd.estimator.network.TorqueNetwork has it."""
+
+    @property
+    def joint(self) -> str:
+        """Name of the joint it was trained for."""
+
+    @property
+    def envelope_low(self) -> tuple[float, ...]:
+        """Lower end of the training range per feature."""
+
+    @property
+    def envelope_high(self) -> tuple[float, ...]:
+        """Upper end of the training range per feature."""
+
+    @property
+    def sigma_nm(self) -> float:
+        """Held-out standard deviation."""
+
+    def run_one(  # noqa: PLR0917
+        self, x0: float, x1: float, x2: float, x3: float, x4: float, x5: float
+    ) -> float:
+        """Return the torque of one sample."""
+
+    def run_many(self, features: FloatArray) -> FloatArray:
+        """Return the torques [n] of samples [n, 6]."""
+
+
+def checked_network(
+    joint: Joint, settings: EstimatorSettings, network: NetworkModel | None
+) -> NetworkModel | None:
+    """Return the network that the method uses, if it uses one; ConfigError when the three do not fit."""
+    if settings.method == "fused":
+        raise ConfigError(
+            f"joint {joint.name}: found method 'fused', which FusedEstimator applies, not this one"
+        )
+    if joint.effects:
+        names = ", ".join(effect.name for effect in joint.effects)
+        raise ConfigError(
+            f"joint {joint.name}: found effects ({names}), which `make_estimator` applies, not this class"
+        )
+    if settings.method == "efficiency" and joint.efficiency is None:
+        raise ConfigError(
+            f"joint {joint.name}: found no efficiency, which method 'efficiency' needs; 'tob' works without"
+        )
+    if settings.method != "network":
+        return None
+    if network is None:
+        raise ConfigError(f"joint {joint.name}: found no network, which method 'network' needs")
+    if network.joint != joint.name:
+        raise ConfigError(
+            f"joint {joint.name}: found a network of joint '{network.joint}', expected one of '{joint.name}'"
+        )
+    return network
+
+
+def trust_of(joint: Joint, settings: EstimatorSettings, network: NetworkModel) -> Trust:
+    """Return the weight function of a network on a joint."""
+    limit = settings.network_limit * joint.rated_torque_nm
+    return Trust(network.envelope_low, network.envelope_high, settings.envelope_margin, limit)
+
 
 FEATURES: Final = (
     "current_a",
@@ -58,4 +125,85 @@ class TorqueNetwork:
 
     def run_many(self, features: FloatArray) -> FloatArray:
         """Return torques [n] of samples [n, 6]; equal to run_one to rounding."""
+        return self._graph.run_many(features)
+
+
+# The fused estimator's network: a correction to the physics from speed, load, torsion and ripple angles.
+#
+# Metadata, each value JSON: features, envelope (`fused_trust.Envelope`), sigma_scale (4, quadrants in QUADRANTS'
+# order, factor on the physics' standard deviation where the network is in charge), input_low and input_high (range of
+# the training data per feature), joint, data_sha256.
+
+
+FUSED_FEATURES: Final = (
+    "joint_velocity_rad_s",
+    "motor_torque_nm",
+    "torsion_minus_current_nm",
+    "cos_2_motor_filtered",
+    "sin_2_motor_filtered",
+    "cos_4_motor_filtered",
+    "sin_4_motor_filtered",
+)
+"""The last four are waves: an absolute angle, or one that turns as slowly as the link, would tell which run it is."""
+
+_FUSED_KEYS: Final = ("envelope", "sigma_scale", "input_low", "input_high", "joint", "data_sha256")
+
+
+class FusedNetworkModel(Protocol):
+    """What the estimator needs of a network; FusedNetwork has it."""
+
+    @property
+    def joint(self) -> str:
+        """Name of the joint it was trained for."""
+
+    @property
+    def envelope(self) -> Envelope:
+        """Where it was trained."""
+
+    @property
+    def sigma_scale(self) -> tuple[float, float, float, float]:
+        """Factor on the physics' standard deviation per quadrant."""
+
+    def run_one(self, *x: float) -> float:
+        """Return the correction of one sample [Nm]."""
+
+    def run_many(self, features: FloatArray) -> FloatArray:
+        """Return the corrections [n] of samples [n, 7]."""
+
+
+class FusedNetwork:
+    """A loaded and checked network; arguments and errors as `jtqd.estimator.network.TorqueNetwork`.
+
+    Public: `name`, `sha256`, `envelope`, `sigma_scale`, `joint`, `data_sha256`, `bound`; `run_one(x0..x6)` correction
+    of one sample [Nm], `run_many([n, 7])` of many.
+    """
+
+    def __init__(self, source: bytes | str | os.PathLike[str], sha256: str | None = None) -> None:
+        graph = OnnxGraph(source, sha256, FUSED_FEATURES, _FUSED_KEYS)
+        self._graph: Final = graph
+        self.name: Final = graph.name
+        self.sha256: Final = graph.sha256
+        try:
+            self.envelope: Final = Envelope.from_mapping(graph.metadata["envelope"])
+        except ValueError as error:
+            raise graph.error(f"metadata 'envelope': {error}") from None
+        a, b, c, d = graph.numbers("sigma_scale", 4)
+        if min(a, b, c, d) <= 0.0:
+            raise graph.error(f"metadata 'sigma_scale': found {[a, b, c, d]}, expected numbers > 0")
+        self.sigma_scale: Final = (a, b, c, d)
+        self.joint: Final = graph.text("joint")
+        self.data_sha256: Final = graph.text("data_sha256")
+        width = len(FUSED_FEATURES)
+        lows, highs = graph.numbers("input_low", width), graph.numbers("input_high", width)
+        for name, low, high in zip(FUSED_FEATURES, lows, highs, strict=True):
+            if low > high:
+                raise graph.error(
+                    f"metadata range of {name}: found input_low {low:g} above input_high {high:g}"
+                )
+        graph.prepare(np.array(lows), np.array(highs))
+        self.bound: Final = graph.bound
+        self.run_one: Final = graph.run_one
+
+    def run_many(self, features: FloatArray) -> FloatArray:
+        """Return the corrections [n] of samples [n, 7]; equal to run_one to rounding."""
         return self._graph.run_many(features)

@@ -20,7 +20,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from estimator.friction import FloatArray
+from jtqd.estimator.arrays import FloatArray
 
 _PROBES: Final = (0.25, -0.5)  # two different inputs: the binding must see the second one
 _WARM_UP: Final = 50

@@ -24,8 +24,8 @@ from dataclasses import dataclass, fields
 from math import nan
 from typing import Final
 
-from estimator.checked import ConfigError, Section
-from estimator.parameters import Joint
+from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.joint import Joint
 
 MOTOR_JUMP: Final = 0x04
 LINK_JUMP: Final = 0x08

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from estimator.friction import FloatArray
+from jtqd.estimator.arrays import FloatArray
 
 
 class RunTableError(ValueError):

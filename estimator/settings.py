@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, fields
 from typing import Any, Final
 
-from estimator.checked import ConfigError, Section
+from jtqd.estimator.checked import ConfigError, Section
 
 METHODS: Final = ("tob", "efficiency", "network", "fused")
 """tob: Eq. (4) with additive friction; efficiency: Eq. (7); network: the paper's section III on top; fused: ours."""

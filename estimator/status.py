@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Final
+from math import nan
+from typing import Final, NamedTuple
 
 OFF: Final = 0
 STARTING: Final = 1
@@ -28,3 +29,27 @@ NAMES: Final = {
 
 PUBLISHED: Final = frozenset((VALID, DEGRADED, STANDSTILL))
 """Only with these may a torque number leave the estimator."""
+
+
+# One step's result, whatever the method.
+
+
+class Estimate(NamedTuple):
+    """One step's result [Nm, joint side]; NaN where not computed or not to be published.
+
+    torque_nm, sigma_nm are numbers with status VALID, DEGRADED and STANDSTILL only; tob_nm (classical
+    observer), physics_nm (with losses, before any network) and network_nm are stages, for the record.
+    """
+
+    torque_nm: float
+    sigma_nm: float
+    status: int
+    tob_nm: float
+    physics_nm: float
+    network_nm: float
+
+
+STARTING_ESTIMATE: Final = Estimate(nan, nan, STARTING, nan, nan, nan)
+INVALID_ESTIMATE: Final = Estimate(nan, nan, INVALID, nan, nan, nan)
+OFF_ESTIMATE: Final = Estimate(nan, nan, OFF, nan, nan, nan)
+"""What a joint that is not estimated shows."""

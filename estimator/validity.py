@@ -11,15 +11,17 @@ Everything exists twice: plain floats for the loop, arrays (suffix _many) for wh
 
 from __future__ import annotations
 
-from math import sqrt
-from typing import Final
+from dataclasses import dataclass
+from math import isnan, sqrt
+from typing import Any, Final
 
 import numpy as np
 
-from estimator.friction import FloatArray, FrictionModel
-from estimator.losses import LossModel
-from estimator.parameters import Joint
-from estimator.settings import EstimatorSettings
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.losses import FrictionModel, LossModel
+from jtqd.estimator.onnx_graph import finite
+from jtqd.estimator.settings import EstimatorSettings
 
 FADE_START: Final = 0.75
 """Part of the network's limit from which it fades into physics; at the limit nothing of it is left."""
@@ -149,4 +151,179 @@ class Trust:
         near = (self._limit - np.abs(difference_nm)) * self._inverse_fade
         result: FloatArray = np.clip(np.minimum(weight, near), 0.0, 1.0)
         result[np.isnan(result)] = 0.0
+        return result
+
+
+# Where the fused estimator's network was trained: a map over speed and motor torque, and two simple ranges.
+#
+# A box per feature would count fast and heavy as known when the data has only fast or heavy. So the share of
+# trust is a table over (v, tau_raw), 1 in cells that several training runs have visited and 0 in others, bilinear
+# between cell centres; times 1 inside the training range of temperature and of the distance between torsion and
+# current, falling to 0 beside it. Outside of all this nothing of the network is left.
+
+
+TEMPERATURE_MARGIN_K: Final = 1.0
+"""Beside the range of temperatures over which trust is lost."""
+
+DISTANCE_MARGIN: Final = 0.25
+"""Part of the range beyond which a larger distance between torsion and current counts as unknown."""
+
+
+_LEAST: Final = 1e-6
+_MOST: Final = 1e6
+"""Limits of steps and distance, far beyond any joint: their reciprocals stay numbers."""
+
+
+@dataclass(frozen=True, slots=True)
+class Envelope:
+    """What the training data covered.
+
+    velocity_step_rad_s, torque_step_nm: distance of cell centres; known: [2 nv + 1][2 nt + 1] of 0 and 1 over velocity
+    and motor torque, its middle cell at zero; distance_nm: largest |torsion - current path|; temperature_c: lowest
+    and highest, None where the joint reports none.
+    """
+
+    velocity_step_rad_s: float
+    torque_step_nm: float
+    known: tuple[tuple[int, ...], ...]
+    distance_nm: float
+    temperature_c: tuple[float, float] | None
+
+    @classmethod
+    def from_mapping(cls, mapping: Any) -> Envelope:
+        """Build from the network's metadata; raises ValueError with what was found and expected."""
+        keys = ("velocity_step_rad_s", "torque_step_nm", "known", "distance_nm", "temperature_c")
+        if not isinstance(mapping, dict) or set(mapping) != set(keys):
+            raise ValueError(f"found {str(mapping)[:80]}, expected the keys {', '.join(keys)}")
+        for key in ("velocity_step_rad_s", "torque_step_nm", "distance_nm"):
+            if not finite(mapping[key]) or not _LEAST <= mapping[key] <= _MOST:
+                raise ValueError(f"{key}: found {mapping[key]!r}, expected {_LEAST:g} to {_MOST:g}")
+        return cls(
+            float(mapping["velocity_step_rad_s"]),
+            float(mapping["torque_step_nm"]),
+            _checked_map(mapping["known"]),
+            float(mapping["distance_nm"]),
+            _checked_range(mapping["temperature_c"]),
+        )
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        return {
+            "velocity_step_rad_s": self.velocity_step_rad_s,
+            "torque_step_nm": self.torque_step_nm,
+            "known": [list(row) for row in self.known],
+            "distance_nm": self.distance_nm,
+            "temperature_c": None if self.temperature_c is None else list(self.temperature_c),
+        }
+
+
+def _checked_map(known: Any) -> tuple[tuple[int, ...], ...]:
+    """Return the map; ValueError unless it is a table with a middle cell, of 0 and 1."""
+    if not (isinstance(known, list) and known and all(isinstance(row, list) for row in known)):
+        raise ValueError(f"known: found {str(known)[:40]}, expected a list of rows")
+    widths = {len(row) for row in known}
+    if len(widths) != 1 or len(known) % 2 == 0 or min(widths) % 2 == 0:
+        found = f"{len(known)} rows of {', '.join(map(str, sorted(widths)))} cells"
+        raise ValueError(f"known: found {found}, expected odd numbers of rows and of cells in each row")
+    if not all(finite(cell) and cell in (0, 1) for row in known for cell in row):
+        raise ValueError("known: found other cells, expected 0 and 1")
+    return tuple(tuple(int(cell) for cell in row) for row in known)
+
+
+def _checked_range(value: Any) -> tuple[float, float] | None:
+    """Return the range of temperatures; ValueError unless it is None or two numbers that do not fall."""
+    if value is None:
+        return None
+    if isinstance(value, list) and len(value) == 2 and all(map(finite, value)) and value[0] <= value[1]:
+        return float(value[0]), float(value[1])
+    raise ValueError(f"temperature_c: found {str(value)[:40]}, expected null or [lowest, highest]")
+
+
+class FusedTrust:
+    """Weight of the network in [0, 1], continuous in all arguments."""
+
+    __slots__ = (
+        "_distance",
+        "_high",
+        "_inverse_fade",
+        "_inverse_torque",
+        "_inverse_velocity",
+        "_low",
+        "_map",
+        "_table",
+        "_torque_0",
+        "_torque_last",
+        "_velocity_0",
+        "_velocity_last",
+        "_with_temperature",
+    )
+
+    def __init__(self, envelope: Envelope) -> None:
+        self._inverse_velocity: Final = 1.0 / envelope.velocity_step_rad_s
+        self._inverse_torque: Final = 1.0 / envelope.torque_step_nm
+        # a frame of zeros: the interpolation needs no border, and beyond the map nothing is known
+        self._table: Final = np.pad(np.array(envelope.known, np.float64), 1)
+        rows: list[list[float]] = self._table.tolist()
+        self._map: Final = tuple(tuple(row) for row in rows)
+        self._velocity_last: Final = len(rows) - 1
+        self._torque_last: Final = len(rows[0]) - 1
+        self._velocity_0: Final = self._velocity_last / 2
+        self._torque_0: Final = self._torque_last / 2
+        self._distance: Final = envelope.distance_nm
+        self._inverse_fade: Final = 1.0 / (DISTANCE_MARGIN * envelope.distance_nm)
+        self._with_temperature: Final = envelope.temperature_c is not None
+        self._low, self._high = envelope.temperature_c or (0.0, 0.0)
+
+    def weight(self, velocity_rad_s: float, raw_nm: float, distance_nm: float, temperature_c: float) -> float:
+        """Return the share of trust; a temperature of NaN is unknown, hence 0 where the data had one.
+
+        raw_nm: motor torque; distance_nm: torsion less current path; finite both, as is the velocity.
+        """
+        x = velocity_rad_s * self._inverse_velocity + self._velocity_0
+        y = raw_nm * self._inverse_torque + self._torque_0
+        if not (0.0 <= x < self._velocity_last and 0.0 <= y < self._torque_last):
+            return 0.0
+        m = int(x)
+        n = int(y)
+        x -= m
+        y -= n
+        near, far = self._map[m], self._map[m + 1]
+        a = near[n]
+        a += y * (near[n + 1] - a)
+        b = far[n]
+        b += y * (far[n + 1] - b)
+        weight = a + x * (b - a)
+        distance = distance_nm if distance_nm >= 0.0 else -distance_nm
+        if distance > self._distance:
+            weight *= max(0.0, 1.0 - (distance - self._distance) * self._inverse_fade)
+        if self._low <= temperature_c <= self._high or not self._with_temperature:
+            return weight
+        if isnan(temperature_c):
+            return 0.0
+        beyond = max(self._low - temperature_c, temperature_c - self._high)
+        return weight * max(0.0, 1.0 - beyond * (1.0 / TEMPERATURE_MARGIN_K))
+
+    def weight_many(
+        self, velocity: FloatArray, raw: FloatArray, distance: FloatArray, temperature: FloatArray
+    ) -> FloatArray:
+        """Vectorised twin of `weight`, arrays [n] without NaN but in temperature."""
+        x = velocity * self._inverse_velocity + self._velocity_0
+        y = raw * self._inverse_torque + self._torque_0
+        inside = (x >= 0.0) & (x < self._velocity_last) & (y >= 0.0) & (y < self._torque_last)
+        x, y = np.where(inside, x, 0.0), np.where(inside, y, 0.0)
+        m, n = x.astype(np.intp), y.astype(np.intp)
+        x, y = x - m, y - n
+        width = self._table.shape[1]
+        table, at = self._table.ravel(), m * width + n
+        a, b = table[at], table[at + width]
+        a += y * (table[at + 1] - a)
+        b += y * (table[at + width + 1] - b)
+        weight: FloatArray = np.where(inside, a + x * (b - a), 0.0)
+        excess = np.maximum(np.abs(distance) - self._distance, 0.0)
+        weight = weight * np.maximum(0.0, 1.0 - excess * self._inverse_fade)
+        if not self._with_temperature:
+            return weight
+        beyond = np.maximum(np.maximum(self._low - temperature, temperature - self._high), 0.0)
+        share = np.maximum(0.0, 1.0 - beyond * (1.0 / TEMPERATURE_MARGIN_K))
+        result: FloatArray = weight * np.where(np.isnan(share), 0.0, share)
         return result

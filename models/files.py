@@ -9,8 +9,8 @@ from typing import Any, Final
 
 import yaml
 
-from estimator.checked import ConfigError
-from estimator.parameters import Joint
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.joint import Joint
 
 _LARGEST_YAML: Final = 1_000_000
 """Bytes; ours have 3000. A log given by mistake must not keep the parser busy for minutes."""

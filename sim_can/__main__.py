@@ -1,5 +1,5 @@
 """`python -m sim_can`: the same as `jtq sim`."""
 
-from sim_can.cli import main
+from jtqd.sim_can.command import main
 
 raise SystemExit(main())

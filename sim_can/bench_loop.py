@@ -1,4 +1,4 @@
-"""Shell of the bench: the bus, the clocks and the signals around `sim_can.bench.Bench`."""
+"""Shell of the bench: the bus, the clocks and the signals around `jtqd.sim_can.bench.Bench`."""
 
 import ctypes
 import gc
@@ -9,12 +9,10 @@ from pathlib import Path
 from types import FrameType
 from typing import Protocol
 
-from drivers.errors import BusDown, BusError
-from drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, FRAME_SIZE, MAX_LENGTH
-from drivers.frame_socket import open_frame_socket
-from drivers.hub import Hub
-from drivers.unix_socket import PREFIX
-from sim_can.bench import Bench, bench_filters
+from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, FRAME_SIZE, MAX_LENGTH
+from jtqd.drivers.frame_socket import PREFIX, BusDown, BusError, open_frame_socket
+from jtqd.drivers.hub import Hub
+from jtqd.sim_can.bench import Bench, bench_filters
 
 _PR_SET_TIMERSLACK = 29
 _RETRY_S = 0.2  # how often an interface that is down is looked at again

@@ -6,17 +6,196 @@ list of 16-byte frames. What frames arrive is nobody's promise: wrong lengths an
 ignored or answered as CiA 301 says, never raised.
 """
 
-from collections.abc import Callable
+from __future__ import annotations
 
-from drivers.frame import pack
-from drivers.object_dictionary import ObjectStore
-from drivers.pdo import LAST_SYNC_TYPE, PdoMap
-from drivers.pdo_parameters import PdoParameters
-from drivers.sdo_abort import SdoAbort
-from drivers.sdo_server import SdoServer
-from sim_can.emergency import COMMUNICATION, Emergency
-from sim_can.heartbeat_consumer import HeartbeatConsumer
-from sim_can.transmit_pdo import NEVER_NS, Getter, TransmitPdo, compile_tpdos
+import struct
+from collections.abc import Callable, Mapping, Set
+from functools import partial
+
+from jtqd.drivers.emcy import ErrorHistory
+from jtqd.drivers.frame import FRAME, pack
+from jtqd.drivers.object_dictionary import ObjectStore
+from jtqd.drivers.pdo import LAST_SYNC_TYPE, PdoMap, PdoParameters
+from jtqd.drivers.sdo import SdoAbort
+from jtqd.drivers.sdo_server import SdoServer
+
+# One TPDO of an emulated device, compiled once from its mapping: packing it is a few getters and one
+# `struct` call. Pure.
+
+
+NEVER_NS = 1 << 62
+
+Getter = Callable[[], int]
+
+
+class TransmitPdo:
+    """One TPDO with everything that its packing needs."""
+
+    __slots__ = (
+        "cob_id",
+        "count",
+        "due_ns",
+        "getters",
+        "last",
+        "length",
+        "pack",
+        "period_ns",
+        "start",
+        "timed_only",
+        "type",
+    )
+
+    def __init__(
+        self, pdo: PdoMap, getters: tuple[Getter, ...], start: int, period_ms: int, timed_only: bool
+    ) -> None:
+        self.cob_id = pdo.cob_id
+        self.type = pdo.transmission_type
+        self.length = pdo.length
+        self.pack = pdo.layout.pack
+        self.getters = getters
+        self.start = start  # wait for this SYNC counter first (18xxh:6); 0: no waiting
+        self.count = 0
+        self.last = b""
+        self.period_ns = period_ms * 1_000_000  # event timer, types 254 and 255
+        self.timed_only = timed_only  # no change of its values is an event
+        self.due_ns = NEVER_NS
+
+    def frame(self) -> bytes:
+        """The PDO with its present values."""
+        return FRAME.pack(self.cob_id, self.length, self.pack(*[get() for get in self.getters]))
+
+
+def compile_tpdos(
+    store: ObjectStore,
+    pdos: PdoParameters,
+    getters: Mapping[tuple[int, int], Getter],
+    quiet: Set[tuple[int, int]] = frozenset(),
+) -> list[TransmitPdo]:
+    """All TPDOs that exist and map something; objects without a getter are read from the store.
+
+    quiet: objects whose change is no event; a TPDO that maps nothing else is sent by its event timer alone.
+    """
+
+    def getter(index: int, subindex: int) -> Getter:
+        return getters.get((index, subindex)) or (lambda: store.number(index, subindex))
+
+    compiled = []
+    for index in pdos.tpdo_indices:
+        pdo = pdos.active_map(index)
+        if pdo is not None:
+            found = tuple(getter(mapped.index, mapped.subindex) for mapped in pdo.objects)
+            timed_only = all((mapped.index, mapped.subindex) in quiet for mapped in pdo.objects)
+            start, period_ms = store.number(index, 6), store.number(index, 5)
+            compiled.append(TransmitPdo(pdo, found, start, period_ms, timed_only))
+    return compiled
+
+
+# Heartbeat consumer of an emulated device: 1016h, one entry per watched node (CiA 301, 7.2.8.3.2.2). Pure.
+#
+# An entry holds the node in bits 16..22 and the time in ms in bits 0..15; both must be set. Watching starts
+# with the node's first heartbeat, and anew after the entry was written.
+
+
+_CONSUMER = 0x1016
+_MS = 1_000_000
+
+
+class HeartbeatConsumer:
+    """Which of the watched nodes are missing. `due_ns`: when the next one will be."""
+
+    def __init__(self, store: ObjectStore) -> None:
+        self._store = store
+        self._entries = range(1, store.number(_CONSUMER, 0) + 1)
+        self._due_ns: dict[int, int] = {}  # by entry, of those that were heard
+        self._missing: set[int] = set()
+        self.due_ns = NEVER_NS
+        for entry in self._entries:
+            store.on_write(_CONSUMER, entry, partial(self._on_write, entry))
+
+    def heard(self, node: int, t_ns: int) -> bool:
+        """A heartbeat of `node`; True when that node is watched and none of the watched ones is missing."""
+        watched = False
+        for entry in self._entries:
+            word = self._store.number(_CONSUMER, entry)
+            period_ns = (word & 0xFFFF) * _MS
+            if word >> 16 & 0x7F == node and period_ns:
+                self._due_ns[entry] = t_ns + period_ns
+                self._missing.discard(entry)
+                watched = True
+        self._plan()
+        return watched and not self._missing
+
+    def lost(self, t_ns: int) -> bool:
+        """True when a watched node has become missing since the last call."""
+        late = {entry for entry, due_ns in self._due_ns.items() if t_ns >= due_ns}
+        for entry in late:
+            del self._due_ns[entry]  # watching starts again with its next heartbeat
+        self._missing |= late
+        self._plan()
+        return bool(late)
+
+    def forget(self) -> None:
+        """NMT reset: nobody was heard, nobody is missing."""
+        self._due_ns.clear()
+        self._missing.clear()
+        self._plan()
+
+    def _on_write(self, entry: int, _data: bytes) -> None:
+        self._due_ns.pop(entry, None)
+        self._missing.discard(entry)
+        self._plan()
+
+    def _plan(self) -> None:
+        self.due_ns = min(self._due_ns.values(), default=NEVER_NS)
+
+
+# EMCY producer of an emulated device: present errors, error register 1001h, error history 1003h, the
+# messages. Pure.
+
+
+_EMCY = struct.Struct("<HB5x")  # error code, error register, manufacturer's field
+ERROR_RESET = 0x0000
+GENERIC = 0x01  # bit 0 of 1001h is set with every error
+CURRENT, COMMUNICATION = 0x02, 0x10
+
+
+class Emergency:
+    """Errors of one device. An error is told when it comes and not again while it lasts (CiA 301, 7.2.7)."""
+
+    def __init__(self, store: ObjectStore) -> None:
+        self._store = store
+        self._history = ErrorHistory(store)
+        self._present: dict[int, int] = {}  # EMCY code -> bits of the error register
+
+    def present(self, code: int) -> bool:
+        """The error has come and has not gone."""
+        return code in self._present
+
+    def come(self, code: int, register: int) -> list[bytes]:
+        """A new error: into 1001h and 1003h, and the frame that tells it; nothing when it is known."""
+        if code in self._present:
+            return []
+        self._present[code] = register | GENERIC
+        self._history.push(code)
+        return [self._message(code)]
+
+    def gone(self, *codes: int) -> list[bytes]:
+        """These errors are over: EMCY 0000h with what is left in the register, if one of them was present."""
+        over = [code for code in codes if self._present.pop(code, None) is not None]
+        return [self._message(ERROR_RESET)] if over else []
+
+    def forget(self) -> None:
+        """NMT reset: no error is present; nothing is told."""
+        self._present.clear()
+        self._store.set_number(0x1001, 0, 0)
+
+    def _message(self, code: int) -> bytes:
+        register = 0
+        for bits in self._present.values():
+            register |= bits
+        self._store.set_number(0x1001, 0, register)
+        return pack(0x080 + self._store.node_id, _EMCY.pack(code, register))
+
 
 STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0x04, 0x05, 0x7F
 _START, _STOP, _ENTER_PRE_OPERATIONAL, _RESET_NODE, _RESET_COMMUNICATION = 1, 2, 128, 129, 130
@@ -24,7 +203,7 @@ HEARTBEAT_LOST = 0x8130
 PDO_TOO_SHORT = 0x8210
 SYNC_LENGTH = 0x8240
 _VERIFY, _DOWNLOADED = 0x1020, 0x60
-_MS = 1_000_000
+_CANOPEN_NODE_MS = 1_000_000
 
 Handler = Callable[[int], None]
 
@@ -248,7 +427,7 @@ class CanopenNode:
         self._consumer.forget()
 
     def _plan_heartbeat(self, t_ns: int) -> None:
-        self._heartbeat_ns = self.store.number(0x1017) * _MS
+        self._heartbeat_ns = self.store.number(0x1017) * _CANOPEN_NODE_MS
         self._heartbeat_due_ns = t_ns + self._heartbeat_ns if self._heartbeat_ns else NEVER_NS
 
     def _on_heartbeat(self, node: int, data: bytes, t_ns: int) -> list[bytes]:

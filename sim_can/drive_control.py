@@ -4,8 +4,8 @@ plain floats.
 
 import math
 
-from sim_can.plant_parameters import JointPlant
-from sim_can.source import CURRENT, OFF, VELOCITY
+from jtqd.sim_can.plant_file import JointPlant
+from jtqd.sim_can.source import CURRENT, OFF, VELOCITY
 
 
 class DriveControl:

@@ -5,17 +5,15 @@ the entries over as JSON, while this process loads everything else.
 """
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
 
-import drivers.eds
-from drivers.object_dictionary import Entry, entries_from_json, entries_to_json, read_eds
+from jtqd.drivers import eds
+from jtqd.drivers.object_dictionary import Entry, entries_from_json, entries_to_json, read_eds
 
-FOLDER = Path(drivers.eds.__file__).parent
+FOLDER = Path(eds.__file__).parent
 FILES = {1: "drive.eds", 2: "drive.eds", 3: "torque_sensor.eds"}
-_ROOT = Path(__file__).resolve().parent.parent
 _CHILD_S = 20.0
 _cache: dict[int, list[Entry]] = {}
 
@@ -31,14 +29,11 @@ class EdsChild:
     """The child that reads; begin it early, `take` its result before the nodes are made."""
 
     def __init__(self) -> None:
-        paths = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "sim_can.eds_entries"],
+            [sys.executable, "-m", "jtqd.sim_can.eds_entries"],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            env=environment,
         )
 
     def take(self) -> None:

@@ -1,4 +1,4 @@
-"""The plant of `sim_can.plant` for joints whose files have effects: the same equations with the effects in them.
+"""The plant of `jtqd.sim_can.plant` for joints whose files have effects: the same equations with the effects in them.
 
 Per joint, with the sums of the hooks of estimator/effects/effect.py (b: twist by position alone, u: other twist):
 
@@ -13,10 +13,10 @@ without effects must not pay; with effects of size zero both give the same numbe
 
 import math
 
-from estimator.checked import ConfigError
-from sim_can.joint_effects import EffectFriction, JointEffects, total
-from sim_can.plant import Plant, _Constants
-from sim_can.plant_parameters import STEEPEST_KINEMATIC_ERROR, PlantParameters, substep_limit
+from jtqd.estimator.checked import ConfigError
+from jtqd.sim_can.losses import EffectFriction, JointEffects, total
+from jtqd.sim_can.plant import Plant, _Constants
+from jtqd.sim_can.plant_file import STEEPEST_KINEMATIC_ERROR, PlantParameters, substep_limit
 
 
 class _Side:
@@ -221,7 +221,7 @@ class EffectPlant(Plant):
 
 
 def _relaxed(side: _Side) -> float:
-    """Motor angle without torsion at link angle zero, as `sim_can.plant._relaxed`."""
+    """Motor angle without torsion at link angle zero, as `jtqd.sim_can.plant._relaxed`."""
     c = side.constants
     angle = 0.0
     for _ in range(60):

@@ -12,12 +12,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.run import JointColumns, RunTable
-from sim_can.plant_parameters import PlantParameters
-from sim_can.plant_source import PlantSource
-from sim_can.run_to_run import NOMINAL_DAY, Day
-from sim_can.run_to_run import day as day_of
-from sim_can.source import CURRENT, OFF, VELOCITY, DriveRatings
+from jtqd.estimator.run import JointColumns, RunTable
+from jtqd.sim_can.days import NOMINAL_DAY, Day
+from jtqd.sim_can.days import day as day_of
+from jtqd.sim_can.plant_file import PlantParameters
+from jtqd.sim_can.plant_source import PlantSource
+from jtqd.sim_can.source import CURRENT, OFF, VELOCITY, DriveRatings
 
 SENSOR_NM_PER_UNIT = 0.001  # 6132h:1 = 3 decimal digits
 TEMPERATURE_C_PER_UNIT = 0.1  # 3001h

@@ -25,12 +25,11 @@ import math
 from dataclasses import replace
 from typing import NamedTuple
 
-from estimator.losses import LossModel
-from sim_can.drive_control import DriveControl
-from sim_can.loss_table import JointFriction, LossTable
-from sim_can.plant_parameters import JointPlant, PlantParameters, substep_limit
-from sim_can.run_to_run import NOMINAL_DAY, Day
-from sim_can.thermal import JointTemperature
+from jtqd.estimator.losses import LossModel
+from jtqd.sim_can.days import NOMINAL_DAY, Day, JointTemperature
+from jtqd.sim_can.drive_control import DriveControl
+from jtqd.sim_can.losses import JointFriction, LossTable
+from jtqd.sim_can.plant_file import JointPlant, PlantParameters, substep_limit
 
 CONTROL_CYCLE_S = 0.001
 
@@ -111,7 +110,7 @@ class Plant:
 
     Public state (may be set before a run): motor_position, motor_velocity (lists of two, motor side),
     link_position, link_velocity, slip (z of both joints); `drives` are the control loops, `temperatures` the
-    joints' thermal states. Joint files with effects need `sim_can.effect_plant.EffectPlant` (ValueError here).
+    joints' thermal states. Joint files with effects need `jtqd.sim_can.effect_plant.EffectPlant` (ValueError here).
     """
 
     def __init__(self, parameters: PlantParameters) -> None:
@@ -158,7 +157,7 @@ class Plant:
         )
 
     def command(self, drive: int, mode: int, target: float) -> None:
-        """Mode and target of drive 0 or 1 from now on; see `sim_can.source`."""
+        """Mode and target of drive 0 or 1 from now on; see `jtqd.sim_can.source`."""
         self.drives[drive].command(mode, target, self.motor_velocity[drive])
 
     def step(self, dt_s: float) -> None:

@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.parameters import Joint
-from estimator.run import RunTableError
-from models.files import load_joint, shipped
-from sim_can.run_files import ColumnMap, RunError, RunFile, read_run
-from sim_can.source import ChannelSignal, DriveRatings, DriveSignals
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.run import RunTableError
+from jtqd.models.files import load_joint, shipped
+from jtqd.sim_can.source import ChannelSignal, DriveRatings, DriveSignals
+from jtqd.sysid.runs.files import ColumnMap, RunError, RunFile, read_run
 
 COLUMN_MAP_NAME = "columns.yaml"
 

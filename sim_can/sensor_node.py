@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 
-from drivers.object_dictionary import ObjectStore
-from drivers.sdo_abort import VALUE_RANGE, SdoAbort
-from sim_can.canopen_node import CanopenNode
-from sim_can.eds_entries import entries_of
-from sim_can.source import ChannelSignal, Source
+from jtqd.drivers.object_dictionary import ObjectStore
+from jtqd.drivers.sdo import VALUE_RANGE, SdoAbort
+from jtqd.sim_can.canopen_node import CanopenNode
+from jtqd.sim_can.eds_entries import entries_of
+from jtqd.sim_can.source import ChannelSignal, Source
 
 AUTOZERO = 0x6F72_657A  # "zero" in 6125h
 MAX_DECIMALS = 9

@@ -14,7 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from sim_can.bench_kernel import build, guest, packages, vcan
+from jtqd.sim_can.bench_kernel import build, guest, vcan
+from jtqd.sim_can.bench_kernel import build as packages
 from tests.native_pace import NativePace
 
 FORWARDED = "JTQD_FORWARDED_TESTS"  # set for the guest's pytest: write reports for the host's pytest

@@ -11,7 +11,7 @@ from contextlib import suppress
 import pytest
 from _pytest.runner import runtestprotocol
 
-from daemon.shared.stolen_time import stolen_s
+from jtqd.daemon.loop.realtime import stolen_s
 
 TRIES = 3
 SHARE = 0.01

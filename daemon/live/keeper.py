@@ -9,11 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from daemon.config import Config
-from daemon.live.address import Address
-from daemon.recording.contents import nodes_of
-from daemon.shared.notices import FILE as NOTICES
-from daemon.supervisor.children import Child, ChildError
+from jtqd.daemon.config import Config
+from jtqd.daemon.live.address import Address
+from jtqd.daemon.recording.request import nodes_of
+from jtqd.daemon.shared.child_process import Child, ChildError
+from jtqd.daemon.shared.notices import FILE as NOTICES
 
 _STARTS = 5
 """A live view that dies more often than this in a minute is not started again."""
@@ -88,7 +88,9 @@ class LiveKeeper:
     def _run(self) -> None:
         now = time.monotonic()
         self._starts = [*(start for start in self._starts if now - start < 60.0), now]
-        self._child = self._start_child("daemon.live.process", [json.dumps(self._request)], "the live view")
+        self._child = self._start_child(
+            "jtqd.daemon.live.process", [json.dumps(self._request)], "the live view"
+        )
 
 
 def _say(text: str) -> None:

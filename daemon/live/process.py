@@ -1,4 +1,4 @@
-"""The live view's process: `python -m daemon.live.process REQUEST` reads the loop's shared memory and serves viewers.
+"""The live view's process: `python -m jtqd.daemon.live.process REQUEST` reads the loop's shared memory and serves viewers.
 
 It maps ring, snapshot and notices read-only, and nothing that a viewer sends goes anywhere: the server has no capability
 (no publishing, no parameters, no services). A viewer that is too slow loses its oldest messages, not others theirs.
@@ -18,21 +18,223 @@ import signal
 import socket
 import sys
 import time
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
-from daemon.live.address import Address
-from daemon.live.stream import LiveStream, Message
-from daemon.recording.diagnostics import Node
-from daemon.shared import cycle_record
-from daemon.shared.notices import NoticesError, NoticesReader
-from daemon.shared.ring import RingError, RingReader
-from daemon.shared.snapshot import SnapshotError, SnapshotReader
+import foxglove
 
-if TYPE_CHECKING:
-    from daemon.live.server import LiveServer
+from jtqd.daemon.live.address import Address
+from jtqd.daemon.recording import schemas
+from jtqd.daemon.recording.diagnostics import Diagnostics, Node
+from jtqd.daemon.recording.messages import (
+    BLOCK_PARTS,
+    JointStateMessage,
+    cycle_block,
+    diagnostics,
+    event,
+    log,
+)
+from jtqd.daemon.shared import cycle_record
+from jtqd.daemon.shared import cycle_record as cycle
+from jtqd.daemon.shared.notices import Notice, NoticesError, NoticesReader
+from jtqd.daemon.shared.ring import RingError, RingReader
+from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader, View
+
+# What the live view sends of the cycles: the log's messages, fewer of them. Pure.
+#
+# One set of the cycle's messages per 20 ms; a change of status and a missed slot are seen in every cycle and sent
+# as events, so that nothing that lasts less than 20 ms stays unseen. Bytes as in the log (`jtqd.daemon.recording.messages`).
+
+
+PERIOD_NS = 20_000_000
+"""50 Hz."""
+_RECORD_HEAD = 31
+"""Bytes before the payload of an MCAP Message record, as `cycle_block` makes it."""
+_INFO, _WARN = 20, 30
+_QUIET_STATUSES = (1, 2, 6)
+"""Starting, valid and standstill are what a healthy joint goes through."""
+
+_SCAN = cycle.selection(
+    ("cycle", "sync_monotonic_ns", "sync_realtime_ns", "flags", "missed", "sync_counter", "frame_count"),
+    ("status",),
+)
+
+
+class Message(NamedTuple):
+    """One message on its way to the viewers. `topic` is the channel number of `jtqd.daemon.recording.schemas`."""
+
+    topic: int
+    time_ns: int
+    payload: bytes
+
+
+class LiveStream:
+    """Thins out the cycles of one run.
+
+    Args:
+        bus: name of the bus, for /diagnostics.
+        nodes: whose heartbeats /diagnostics shows.
+        names: of joint 1 and 2.
+        gear_ratios: motor revolutions per joint revolution; None where not known.
+        period_ns: one set of messages in each such stretch of CLOCK_MONOTONIC [ns].
+    """
+
+    def __init__(
+        self,
+        bus: str,
+        nodes: Sequence[Node],
+        names: Sequence[str],
+        gear_ratios: Sequence[float | None],
+        period_ns: int = PERIOD_NS,
+    ) -> None:
+        self._diagnostics = Diagnostics(bus, names, nodes)
+        self._overview = JointStateMessage(names, gear_ratios)
+        self._period_ns = period_ns
+        self._newest = (0, 0)
+        self.forget()
+
+    def forget(self) -> None:
+        """Nobody has looked for a while: what was before must not show as a change."""
+        self._slot = -1
+        self._statuses: tuple[int, int] | None = None
+        self._missed: int | None = None
+
+    def take(self, records: Iterable[bytes]) -> list[Message]:
+        """Messages that these cycle records give, in the order of time."""
+        made: list[Message] = []
+        for record in records:
+            index, monotonic, realtime, flags, missed, counter, count, *statuses = _SCAN.unpack_from(record)
+            realtime = max(realtime, 0)
+            self._newest = (index, realtime)
+            made += self._changes((statuses[0], statuses[1]), missed)
+            slot = monotonic // self._period_ns
+            if slot == self._slot:
+                continue
+            self._slot = slot
+            frames = min(count, cycle.FRAME_CAPACITY)
+            block = cycle_block(record, index, realtime, flags=flags, sync_counter=counter, frames=frames)
+            starts = [start for _, start in BLOCK_PARTS]
+            for (topic, start), end in zip(BLOCK_PARTS, [*starts[1:], len(block)], strict=True):
+                made.append(Message(topic, realtime, block[start + _RECORD_HEAD : end]))
+            overview = self._overview.payload(record, realtime)
+            made.append(Message(schemas.JOINT_STATES.number, realtime, overview))
+        return made
+
+    def _changes(self, statuses: tuple[int, int], missed: int) -> list[Message]:
+        made: list[Message] = []
+        before, self._statuses = self._statuses, statuses
+        for joint, (old, new) in enumerate(zip(before or statuses, statuses, strict=True), start=1):
+            if old != new:
+                names = [schemas.STATUS_NAMES.get(code, str(code)) for code in (old, new)]
+                text = f"joint {joint}: {names[0]} -> {names[1]}"
+                level = _INFO if new in _QUIET_STATUSES else _WARN
+                made += self.note(schemas.STATUS_CHANGED, text, level, joint=joint, change=(old, new))
+        slots = missed - (missed if self._missed is None else self._missed)
+        self._missed = missed
+        if slots > 0:
+            made += self.note(schemas.SLOTS_MISSED, f"the loop missed {slots} slots", _WARN, count=slots)
+        return made
+
+    def notices(self, news: Iterable[Notice]) -> list[Message]:
+        """What the supervisor had to say."""
+        made: list[Message] = []
+        for notice in news:
+            made += self.note(
+                schemas.NOTICE, notice.text, notice.level, time_ns=notice.realtime_ns, count=notice.node
+            )
+        return made
+
+    def note(
+        self,
+        kind: int,
+        text: str,
+        level: int,
+        *,
+        time_ns: int | None = None,
+        count: int = 0,
+        joint: int = 0,
+        change: tuple[int, int] = (0, 0),
+    ) -> list[Message]:
+        """One occurrence as a message on /events and one on /log, at the time of the newest cycle unless one is given."""
+        index, newest = self._newest
+        when = newest if time_ns is None else time_ns
+        payload = event(when, kind, text, index=index, count=count, joint=joint, change=change)
+        return [
+            Message(schemas.EVENTS.number, when, payload),
+            Message(schemas.LOG.number, when, log(when, level, text)),
+        ]
+
+    def diagnose(
+        self, view: View, work_us: Sequence[float], late_us: Sequence[float], now_ns: int
+    ) -> Message:
+        """The once-per-second /diagnostics of loop, bus, joints and nodes; what the recorder does is in the log only.
+
+        Args:
+            view: of the loop's counters.
+            work_us, late_us: p50, p99 and maximum of the work per cycle and of the SYNC's lateness [us].
+            now_ns: CLOCK_REALTIME.
+        """
+        statuses = self._diagnostics.of_the_loop(view, work_us=work_us, late_us=late_us, now_ns=now_ns)
+        return Message(schemas.DIAGNOSTICS.number, now_ns, diagnostics(now_ns, statuses))
+
+
+# The websocket server of the live view: foxglove-sdk, with the log's topics and nothing that a viewer could change.
+
+
+_BACKLOG = 512
+"""Messages kept for a slow viewer: 2.5 s of all topics."""
+
+
+class LiveServer:
+    """Serves one channel per topic of the log, with the log's schema.
+
+    Args:
+        name: what viewers show.
+        address: where it listens.
+
+    Raises:
+        RuntimeError, OSError: it cannot listen there.
+    """
+
+    def __init__(self, name: str, address: Address) -> None:
+        self._context = context = foxglove.Context()  # server and channels hold it only weakly
+        self._channels = {
+            topic.number: foxglove.Channel(
+                topic.name,
+                message_encoding="cdr",
+                schema=foxglove.Schema(
+                    name=topic.schema, encoding="ros2msg", data=schemas.SCHEMAS[topic.schema].encode()
+                ),
+                context=context,
+            )
+            for topic in schemas.TOPICS
+        }
+        self._server = foxglove.start_server(
+            name=name,
+            host=address.host,
+            port=address.port,
+            capabilities=[],  # read only: no publishing, no parameters, no services
+            context=context,
+            message_backlog_size=_BACKLOG,
+        )
+        self.address = Address(address.host, self._server.port)
+
+    @property
+    def watched(self) -> bool:
+        """Somebody has subscribed to something."""
+        return any(channel.has_sinks() for channel in self._channels.values())
+
+    def send(self, message: Message) -> None:
+        """To every viewer that has subscribed to the topic; a slow one loses its oldest messages."""
+        self._channels[message.topic].log(message.payload, log_time=message.time_ns)
+
+    def stop(self) -> None:
+        """End it."""
+        self._server.stop()
+
 
 _POLL_S = 0.02
 _DIAGNOSIS_S = 1.0
@@ -134,8 +336,6 @@ def main(arguments: list[str] | None = None) -> int:
         _answer(failed=f"{address.host}:{address.port}: {problem}")
         return 1
     try:
-        from daemon.live.server import LiveServer
-
         source = Source(request)
         server = LiveServer(f"jtqd on {request['bus']}", address)
     except (ImportError, RingError, SnapshotError, RuntimeError, OSError, ValueError) as error:

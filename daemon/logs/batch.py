@@ -9,8 +9,8 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from daemon.logs.chunks import heads_at
-from daemon.logs.records import HEAD, MAX_SMALL, MESSAGE_BODY, Source
+from jtqd.daemon.logs.chunks import heads_at
+from jtqd.daemon.logs.records import HEAD, MAX_SMALL, MESSAGE_BODY, Source
 
 
 class Batch(NamedTuple):

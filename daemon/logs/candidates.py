@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 
-from daemon.logs.records import CHUNK, HEAD
+from jtqd.daemon.logs.records import CHUNK, HEAD
 
 _NAMES = (re.compile(rb"\x03\x00\x00\x00lz4"), re.compile(rb"\x04\x00\x00\x00zstd"))
 """Length and name of a chunk's compression. Each on its own: the search for plain bytes is the fast one."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from daemon.logs.can_frames import ERROR, EXTENDED, REMOTE, Frames
+from jtqd.daemon.logs.can_frames import ERROR, EXTENDED, REMOTE, Frames
 
 
 def candump_lines(frames: Frames, interface: str) -> Iterator[str]:

@@ -1,6 +1,6 @@
 """Generic decoder of CDR messages by their ros2msg schema: for texts and sequences whose lengths change.
 
-Slow beside `daemon.logs.layout`: every field is read on its own. Nothing in a message is believed: a length beyond
+Slow beside `jtqd.daemon.logs.layout`: every field is read on its own. Nothing in a message is believed: a length beyond
 its end is a LogError.
 """
 
@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from daemon.logs.errors import LogError
-from daemon.logs.layout import MAX_DEPTH
-from daemon.logs.ros2msg import PRIMITIVES, Field, Types
+from jtqd.daemon.logs.errors import LogError
+from jtqd.daemon.logs.layout import MAX_DEPTH
+from jtqd.daemon.logs.ros2msg import PRIMITIVES, Field, Types
 
 _LETTERS = {
     "u1": "B",

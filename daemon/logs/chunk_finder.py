@@ -17,7 +17,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Schema
 from numpy.typing import NDArray
 
-from daemon.logs.chunks import (
+from jtqd.daemon.logs.chunks import (
     HEAD_SIZE,
     MAX_CHUNK,
     ChunkError,
@@ -27,9 +27,9 @@ from daemon.logs.chunks import (
     unpack_data,
     walk,
 )
-from daemon.logs.definitions import Definition, Definitions
-from daemon.logs.records import CHUNK, HEAD, MAX_SMALL, MESSAGE_BODY, Source, parse
-from daemon.recording.mcap_bytes import bytes_of
+from jtqd.daemon.logs.definitions import Definition, Definitions
+from jtqd.daemon.logs.records import CHUNK, HEAD, MAX_SMALL, MESSAGE_BODY, Source, parse
+from jtqd.daemon.recording.mcap_file import bytes_of
 
 _KINDS = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
 

@@ -13,7 +13,7 @@ from lz4.frame import LZ4FrameDecompressor
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from daemon.logs.records import CHUNK, HEAD, MESSAGE_BODY
+from jtqd.daemon.logs.records import CHUNK, HEAD, MESSAGE_BODY
 
 MAX_CHUNK = 256 << 20
 """[byte] largest chunk that is taken, packed or unpacked. Writers make chunks of 1 to 10 MB."""

@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from daemon.logs.can_frames import can_topics, iter_frames
-from daemon.logs.candump import candump_lines
-from daemon.logs.errors import LogError
-from daemon.logs.export_table import ColumnsChangedError, RunTable, topic_blocks, topic_table
-from daemon.logs.reader import log_parts, read_attachments
-from daemon.logs.table_files import whole_file, write_csv, write_parquet
+from jtqd.daemon.logs.can_frames import can_topics, iter_frames
+from jtqd.daemon.logs.candump import candump_lines
+from jtqd.daemon.logs.errors import LogError
+from jtqd.daemon.logs.export_table import ColumnsChangedError, RunTable, topic_blocks, topic_table
+from jtqd.daemon.logs.reader import log_parts, read_attachments
+from jtqd.daemon.logs.table_files import whole_file, write_csv, write_parquet
 
 _EXAMPLES = """examples:
   jtq export csv run.mcap --out run.csv.gz              the run table: time_s, j1.current_a, ...
@@ -132,7 +132,7 @@ def _span(logs: Path | Sequence[Path], start: float | None, end: float | None) -
     """Log times of a span given in seconds from the first message on."""
     if start is None and end is None:
         return {}
-    from daemon.logs.log_file import LogFile
+    from jtqd.daemon.logs.log_file import LogFile
 
     with LogFile(log_parts(logs)[0]) as log:
         first = log.start_ns
@@ -186,8 +186,8 @@ def _dbc(logs: Sequence[Path], config: Path | None, out: Path | None) -> dict[st
 
 
 def _dbc_of_configuration(path: Path) -> str:
-    from daemon.config import load_config
-    from daemon.recording.dbc import dbc_text
+    from jtqd.daemon.config import load_config
+    from jtqd.daemon.recording.dbc import dbc_text
 
     try:
         return dbc_text(load_config(path), None)

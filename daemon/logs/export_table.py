@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.logs.errors import LogError
-from daemon.logs.reader import Messages, Records, iter_messages, iter_topics, read_messages
+from jtqd.daemon.logs.errors import LogError
+from jtqd.daemon.logs.reader import Messages, iter_messages, iter_topics, read_messages
+from jtqd.daemon.logs.rows import Records
 
 Columns = dict[str, NDArray[Any]]
 """Name -> values, all of one length."""
@@ -40,7 +41,7 @@ class RunTable:
     A column without any value is left out, and so is a cycle in which one of the others is missing.
 
     Args:
-        path: as for `daemon.logs.reader.read_topics`.
+        path: as for `jtqd.daemon.logs.reader.read_topics`.
         start_ns, end_ns: log times.
         all_cycles: keep every cycle; what is missing is NaN.
 

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from mcap.records import AttachmentIndex, Header, MetadataIndex
 
-from daemon.logs.chunk_finder import FoundChunk
-from daemon.logs.definitions import Definitions
+from jtqd.daemon.logs.chunk_finder import FoundChunk
+from jtqd.daemon.logs.definitions import Definitions
 
 
 class Gap(NamedTuple):

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from daemon.logs.errors import LogError
-from daemon.logs.ros2msg import PRIMITIVES, Field, Types
+from jtqd.daemon.logs.errors import LogError
+from jtqd.daemon.logs.ros2msg import PRIMITIVES, Field, Types
 
 MAX_DEPTH = 32
 """Levels of nested types."""

@@ -16,10 +16,10 @@ import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, Header, Metadata, Schema
 
-from daemon.logs.batch import Batch, ChunkPlace, believed, between, read_index
-from daemon.logs.chunks import HEAD_SIZE, MAX_CHUNK, ChunkError, chunk_head, heads_at, unpack, walk
-from daemon.logs.errors import LogError
-from daemon.logs.records import (
+from jtqd.daemon.logs.batch import Batch, ChunkPlace, believed, between, read_index
+from jtqd.daemon.logs.chunks import HEAD_SIZE, MAX_CHUNK, ChunkError, chunk_head, heads_at, unpack, walk
+from jtqd.daemon.logs.errors import LogError
+from jtqd.daemon.logs.records import (
     HEAD,
     MAX_SMALL,
     MESSAGE_BODY,
@@ -28,9 +28,9 @@ from daemon.logs.records import (
     attachment_index,
     parse,
 )
-from daemon.logs.tail import footer_of, read_summary
-from daemon.recording.mcap_bytes import MAGIC
-from daemon.recording.naming import ACTIVE
+from jtqd.daemon.logs.tail import footer_of, read_summary
+from jtqd.daemon.recording.mcap_file import MAGIC
+from jtqd.daemon.recording.parts import ACTIVE
 
 _FLAT_PIECE = 8 << 20
 """[byte] messages outside chunks are read in pieces of this size."""

@@ -15,26 +15,12 @@ import numpy as np
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
-from daemon.logs.batch import Batch
-from daemon.logs.errors import LogError
-from daemon.logs.log_file import LogFile
-from daemon.logs.rows import Collector, Records
-from daemon.logs.seam import Seam
-from daemon.recording.naming import ACTIVE, PART_PATTERN
-
-__all__ = [
-    "LogError",
-    "Messages",
-    "Records",
-    "iter_messages",
-    "iter_topics",
-    "log_parts",
-    "read_attachments",
-    "read_messages",
-    "read_topic",
-    "read_topics",
-    "topics_of",
-]
+from jtqd.daemon.logs.batch import Batch
+from jtqd.daemon.logs.errors import LogError
+from jtqd.daemon.logs.log_file import LogFile
+from jtqd.daemon.logs.rows import Collector, Records
+from jtqd.daemon.logs.seam import Seam
+from jtqd.daemon.recording.parts import ACTIVE, PART_PATTERN
 
 _ENDINGS = (".mcap", f".mcap{ACTIVE}")
 

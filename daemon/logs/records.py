@@ -14,7 +14,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, McapRecord
 
-from daemon.recording.mcap_bytes import bytes_of
+from jtqd.daemon.recording.mcap_file import bytes_of
 
 HEAD = struct.Struct("<BQ")
 """Opcode, and the length of what follows."""

@@ -1,6 +1,6 @@
 """Repair an MCAP file in place: one left by a crash, torn at its end, or damaged somewhere within.
 
-The file is scanned first (`daemon.logs.scan`), what must change is worked out (`daemon.logs.repair`), and only then is
+The file is scanned first (`logs.scan`), what must change is worked out (`logs.repair`), and only then is
 anything written: room for the new end is taken before the first change, so that a full disk leaves the file as it was.
 """
 
@@ -14,14 +14,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from daemon.logs.errors import LogError
-from daemon.logs.found import Scan
-from daemon.logs.records import Source
-from daemon.logs.repair import plan_repair
-from daemon.logs.repair_plan import Plan
-from daemon.logs.scan import scan
-from daemon.logs.tail import read_summary
-from daemon.recording.naming import ACTIVE
+from jtqd.daemon.logs.errors import LogError
+from jtqd.daemon.logs.found import Scan
+from jtqd.daemon.logs.records import Source
+from jtqd.daemon.logs.repair import plan_repair
+from jtqd.daemon.logs.repair_plan import Plan
+from jtqd.daemon.logs.scan import scan
+from jtqd.daemon.logs.tail import read_summary
+from jtqd.daemon.recording.parts import ACTIVE
 
 _ROUNDS = 3
 """What one repair uncovers (a message index that has its chunk again) the next one settles."""

@@ -9,11 +9,11 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from daemon.logs.errors import LogError
-from daemon.logs.records import Source
-from daemon.logs.recover import Recovery, recover
-from daemon.logs.tail import footer_of
-from daemon.recording.naming import ACTIVE
+from jtqd.daemon.logs.errors import LogError
+from jtqd.daemon.logs.records import Source
+from jtqd.daemon.logs.recover import Recovery, recover
+from jtqd.daemon.logs.tail import footer_of
+from jtqd.daemon.recording.parts import ACTIVE
 
 _ENDINGS = (".mcap", ".mcap" + ACTIVE)
 _EXAMPLES = """examples:

@@ -9,15 +9,15 @@ from __future__ import annotations
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Header, Statistics
 
-from daemon.logs.chunk_finder import FoundChunk, index_entries
-from daemon.logs.chunks import unpack, walk
-from daemon.logs.definitions import Definition
-from daemon.logs.errors import LogError
-from daemon.logs.found import Gap, Scan
-from daemon.logs.records import HEAD, Source, private
-from daemon.logs.repair_plan import Plan, torn_seconds
-from daemon.logs.tail import FOOTER_SIZE, Summary, agrees, footer_of
-from daemon.recording.mcap_bytes import MAGIC, bytes_of
+from jtqd.daemon.logs.chunk_finder import FoundChunk, index_entries
+from jtqd.daemon.logs.chunks import unpack, walk
+from jtqd.daemon.logs.definitions import Definition
+from jtqd.daemon.logs.errors import LogError
+from jtqd.daemon.logs.found import Gap, Scan
+from jtqd.daemon.logs.records import HEAD, Source, private
+from jtqd.daemon.logs.repair_plan import Plan, torn_seconds
+from jtqd.daemon.logs.tail import FOOTER_SIZE, Summary, agrees, footer_of
+from jtqd.daemon.recording.mcap_file import MAGIC, bytes_of
 
 
 def plan_repair(source: Source, found: Scan, own: Summary | None) -> Plan:

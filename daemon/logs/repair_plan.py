@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 from mcap.opcode import Opcode
 
-from daemon.logs.chunks import HEAD_SIZE, chunk_head
-from daemon.logs.found import Scan
-from daemon.logs.records import Source
-from daemon.recording.mcap_bytes import MAGIC
+from jtqd.daemon.logs.chunks import HEAD_SIZE, chunk_head
+from jtqd.daemon.logs.found import Scan
+from jtqd.daemon.logs.records import Source
+from jtqd.daemon.recording.mcap_file import MAGIC
 
 _GUESS_LIMIT_S = 600.0
 """A torn chunk whose head says that it is longer than this is not believed."""

@@ -6,7 +6,7 @@ import re
 from functools import cached_property, lru_cache
 from typing import NamedTuple
 
-from daemon.logs.errors import LogError
+from jtqd.daemon.logs.errors import LogError
 
 PRIMITIVES = {
     "bool": "?",

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.logs.batch import Batch
-from daemon.logs.cdr import Decoder
-from daemon.logs.chunks import MESSAGE_HEAD, pieces
-from daemon.logs.errors import LogError
-from daemon.logs.layout import Layout, VariableLayoutError, message_layout
-from daemon.logs.ros2msg import Types, types_of
+from jtqd.daemon.logs.batch import Batch
+from jtqd.daemon.logs.cdr import Decoder
+from jtqd.daemon.logs.chunks import MESSAGE_HEAD, pieces
+from jtqd.daemon.logs.errors import LogError
+from jtqd.daemon.logs.layout import Layout, VariableLayoutError, message_layout
+from jtqd.daemon.logs.ros2msg import Types, types_of
 
 Records = NDArray[np.void]
 

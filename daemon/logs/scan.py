@@ -12,11 +12,11 @@ from collections.abc import Sequence
 from mcap.opcode import Opcode
 from mcap.records import Channel, Header, MessageIndex, Metadata, MetadataIndex, Schema
 
-from daemon.logs.candidates import other_records, packed_chunks
-from daemon.logs.chunk_finder import ChunkFinder
-from daemon.logs.chunks import HEAD_SIZE
-from daemon.logs.found import Gap, Scan
-from daemon.logs.records import (
+from jtqd.daemon.logs.candidates import other_records, packed_chunks
+from jtqd.daemon.logs.chunk_finder import ChunkFinder
+from jtqd.daemon.logs.chunks import HEAD_SIZE
+from jtqd.daemon.logs.found import Gap, Scan
+from jtqd.daemon.logs.records import (
     HEAD,
     MAX_SMALL,
     MESSAGE_BODY,
@@ -26,8 +26,8 @@ from daemon.logs.records import (
     attachment_index,
     parse,
 )
-from daemon.logs.tail import Summary
-from daemon.recording.mcap_bytes import MAGIC
+from jtqd.daemon.logs.tail import Summary
+from jtqd.daemon.recording.mcap_file import MAGIC
 
 _WINDOW = 1 << 20
 _CHAIN = 3

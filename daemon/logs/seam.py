@@ -10,8 +10,8 @@ from collections import defaultdict, deque
 
 import numpy as np
 
-from daemon.logs.batch import Batch
-from daemon.logs.chunks import MESSAGE_HEAD
+from jtqd.daemon.logs.batch import Batch
+from jtqd.daemon.logs.chunks import MESSAGE_HEAD
 
 _SEQUENCE = 11
 """[byte] offset of a record's sequence number, behind opcode, length and channel."""

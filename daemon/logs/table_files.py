@@ -14,7 +14,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.logs.errors import LogError
+from jtqd.daemon.logs.errors import LogError
 
 Columns = Mapping[str, NDArray[Any]]
 """Name -> values, all of one length."""

@@ -17,8 +17,8 @@ from mcap.records import (
     Statistics,
 )
 
-from daemon.logs.records import HEAD, MAX_SMALL, Source, parse
-from daemon.recording.mcap_bytes import MAGIC, bytes_of, tail_bytes
+from jtqd.daemon.logs.records import HEAD, MAX_SMALL, Source, parse
+from jtqd.daemon.recording.mcap_file import MAGIC, bytes_of, tail_bytes
 
 FOOTER_SIZE = HEAD.size + 20
 _KINDS: dict[int, type[McapRecord]] = {

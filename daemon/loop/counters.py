@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from daemon.loop.intake import Intake
-from daemon.shared import cycle_record as cr
-from daemon.shared.snapshot import (
+from jtqd.daemon.loop.intake import Intake
+from jtqd.daemon.shared import cycle_record as cr
+from jtqd.daemon.shared.snapshot import (
     COUNTERS,
     INPUT,
     LATE_BIN_NS,
@@ -14,8 +14,8 @@ from daemon.shared.snapshot import (
     WORK_BINS,
     Snapshot,
 )
-from drivers.frame import worst_case_bits
-from drivers.frame_socket import FrameSocket
+from jtqd.drivers.frame import worst_case_bits
+from jtqd.drivers.frame_socket import FrameSocket
 
 _INDEX = {name: n for n, name in enumerate(COUNTERS)}
 _WORK_MAX, _LATE_MAX = _INDEX["work_max_ns"], _INDEX["late_max_ns"]

@@ -11,28 +11,129 @@ No stage raises because of what is on the bus; a bus that is down is a counter a
 
 from __future__ import annotations
 
+import struct
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from operator import attrgetter
 
-from daemon.loop import estimate_pdo
-from daemon.loop.configured_nodes import ConfiguredNodes
-from daemon.loop.counters import LoopCounters
-from daemon.loop.cycle_frames import CycleFrames
-from daemon.loop.grid import Grid
-from daemon.loop.intake import Intake
-from daemon.loop.joint_cycle import JointCycle, JointInputs
-from daemon.loop.joint_safety import JointSafety
-from daemon.loop.network_budget import NetworkBudget
-from daemon.loop.wake_up import WakeUp
-from daemon.shared import cycle_record as cr
-from daemon.shared.ring import Ring
-from daemon.shared.snapshot import Snapshot
-from drivers.errors import BusDown
-from drivers.frame import pack
-from drivers.frame_socket import FrameSocket
-from estimator import status as st
-from estimator.methods import AnyEstimator
+from jtqd.daemon.loop import estimate_pdo
+from jtqd.daemon.loop.counters import LoopCounters
+from jtqd.daemon.loop.intake import Intake
+from jtqd.daemon.loop.joint import JointCycle, JointInputs
+from jtqd.daemon.loop.joint_status import JointSafety
+from jtqd.daemon.loop.schedule import Grid, NetworkBudget, WakeUp
+from jtqd.daemon.shared import cycle_record as cr
+from jtqd.daemon.shared.ring import Ring
+from jtqd.daemon.shared.snapshot import Snapshot
+from jtqd.drivers.frame import pack
+from jtqd.drivers.frame_socket import BusDown, FrameSocket
+from jtqd.estimator import status as st
+from jtqd.estimator.methods import AnyEstimator
+
+# Nodes that restarted, are in doubt or were absent at the start count (again) once the supervisor has configured them.
+
+
+class ConfiguredNodes:
+    """Looks at the snapshot's `configured` while a node waits.
+
+    What counts is a configuration that was noted after the node had begun to wait: one that was only stopped is configured
+    again without ever waiting, and that must not answer for its next restart. And it must have begun after the node's last
+    boot-up message: a node may restart when its boot has just ended and is not yet noted.
+    """
+
+    def __init__(self, snapshot: Snapshot, intake: Intake, joints: Sequence[JointCycle]) -> None:
+        self._snapshot, self._intake, self._joints = snapshot, intake, joints
+        self._since = {node: snapshot.configured[node] for node in intake.unconfigured}
+        self._doubts = list(snapshot.doubts)
+
+    def look(self) -> None:
+        """Between the inputs of a cycle and its estimate."""
+        intake, snapshot = self._intake, self._snapshot
+        for node in intake.unconfigured:
+            now = snapshot.configured[node]
+            if self._since.setdefault(node, now) == now:
+                continue
+            if snapshot.configured_for[node] != intake.nodes.restarts.get(node, 0):
+                self._since[node] = now
+                continue
+            del self._since[node]
+            intake.configured(node)
+            snapshot.unconfigured[node] = 0
+            for joint in self._joints:
+                if intake.pdos[joint.inputs.position].node_id == node:
+                    joint.begin_again()
+                joint.rescale(node, snapshot.factors(node))
+
+    def doubt(self) -> None:
+        """Between two cycles: nothing more of the nodes that the supervisor has found to be configured otherwise."""
+        told = self._snapshot.doubts
+        for node, (before, now) in enumerate(zip(self._doubts, told, strict=True)):
+            if now != before:
+                self._doubts[node] = now
+                self._intake.nodes.doubt(node)
+
+
+# Frames of a cycle, copied into its record as they came: 16 bytes each beside their stamps.
+
+
+class CycleFrames:
+    """Fills the frame part of one record after the other.
+
+    Attributes:
+        slot: record of the current cycle in the ring.
+        count: frames stored in it.
+        left_out: frames of the cycle that found no room.
+    """
+
+    def __init__(self, slot: memoryview) -> None:
+        self.slot = slot
+        self.count = self.left_out = 0
+        self._held: list[tuple[bytes, int]] = []
+        self._stamps = [struct.Struct(f"<{n}q") for n in range(cr.FRAME_CAPACITY + 1)]
+
+    def begin(self, slot: memoryview) -> None:
+        """The next frames belong to this record."""
+        self.slot = slot
+        self.count = self.left_out = 0
+        if self._held:
+            for frame, stamp_ns in self._held:
+                self.keep_one(frame, stamp_ns)
+            self._held.clear()
+
+    def hold(
+        self, frames: bytearray, stamps_ns: Sequence[int], count: int, identifiers: Collection[int]
+    ) -> None:
+        """Keep frames of a slot without a record for the next one that has one: those with these identifiers."""
+        for n in range(count):
+            frame = bytes(frames[16 * n : 16 * n + 16])
+            if int.from_bytes(frame[:4], "little") in identifiers:
+                self._held.append((frame, stamps_ns[n]))
+
+    def keep(self, frames: bytearray, stamps_ns: Sequence[int], count: int) -> None:
+        """Copy `count` received frames; `stamps_ns` are CLOCK_REALTIME."""
+        stored = self.count
+        room = cr.FRAME_CAPACITY - stored
+        if count > room:
+            self.left_out += count - room
+            count = room
+        if count <= 0:
+            return
+        start = cr.FRAMES_OFFSET + 16 * stored
+        self.slot[start : start + 16 * count] = memoryview(frames)[: 16 * count]
+        self._stamps[count].pack_into(self.slot, cr.STAMPS_OFFSET + 8 * stored, *stamps_ns[:count])
+        self.count = stored + count
+
+    def keep_one(self, frame: bytes, stamp_ns: int) -> None:
+        """Copy one frame; of our own, `stamp_ns` (CLOCK_REALTIME) is when it was handed to the socket."""
+        stored = self.count
+        if stored >= cr.FRAME_CAPACITY:
+            self.left_out += 1
+            return
+        start = cr.FRAMES_OFFSET + 16 * stored
+        self.slot[start : start + 16] = frame
+        self._stamps[1].pack_into(self.slot, cr.STAMPS_OFFSET + 8 * stored, stamp_ns)
+        self.count = stored + 1
+
 
 STARTING_CYCLES = 20
 """Cycles at the start that are published as "starting": the arrival bands and the filters see their first inputs."""

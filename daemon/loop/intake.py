@@ -20,10 +20,10 @@ the same PDO can still be under way:
   then the input is not used in that cycle;
 * a wrong length, a 29-bit identifier or a remote frame under one of our identifiers is rejected and counted;
 * a SYNC that is not our own echo makes every input of the cycle doubtful: none is used;
-* the PDOs of a node that is not believed (`daemon/loop/node_trust.py`) are not used.
+* the PDOs of a node that is not believed (`daemon/loop/intake.py`) are not used.
 
 A joint's temperature (TPDO3) is not bound to SYNC: it belongs to no cycle, nobody waits for it, and none of the above but
-the last two rules concerns it (`daemon/loop/temperature.py`).
+the last two rules concerns it (`daemon/loop/input_pdos.py`).
 
 Pure: bytes and stamps in, values and counters out; no clock, no socket.
 """
@@ -33,14 +33,130 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 
-from daemon.loop.gaps import Gaps
-from daemon.loop.input_state import InputPdo, InputState
-from daemon.loop.node_trust import NodeTrust
-from daemon.loop.temperature import JointTemperature
-from drivers.devices import SYNC_COB_ID
-from drivers.frame import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_RTR_FLAG
+from jtqd.daemon.loop.input_pdos import InputPdo, InputState, JointTemperature
+from jtqd.drivers.devices import SYNC_COB_ID
+from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_RTR_FLAG
 
-__all__ = ["InputPdo", "Intake"]
+# Slots without SYNC: what comes in one is late, and what has not come by the end of a silent one was lost. Plain state.
+#
+# The rule is in `daemon/loop/intake.py`; it asks for a gap where the delay of a frame does not tell whether it is a late
+# one.
+
+
+_LONGEST = 10
+"""Slots; after that SYNC goes on and the debts stay."""
+_PAUSE = 20
+"""Cycles between two gaps: a bus that loses frames all the time must not lose its SYNC as well."""
+
+
+class Gaps:
+    """Gaps so far, and the one that is open.
+
+    Attributes:
+        count: slots without SYNC so far.
+        wanted: the next slot shall pass without SYNC.
+        open: the last slot did.
+        arrivals: late frames in the last slot.
+        pause: cycles before the next gap.
+        length: slots of the present gap.
+    """
+
+    __slots__ = ("arrivals", "count", "length", "open", "pause", "wanted")
+
+    def __init__(self) -> None:
+        self.count = self.arrivals = self.pause = self.length = 0
+        self.wanted = self.open = False
+
+    def pass_slot(self) -> None:
+        """This slot has no SYNC."""
+        self.count += 1
+        self.wanted, self.open = False, True
+        self.arrivals = 0
+        self.length += 1
+        self.pause = _PAUSE
+
+    @property
+    def may_go_on(self) -> bool:
+        """Late frames came in the slot that has just passed, and one slot more is not too many."""
+        return self.open and self.arrivals > 0 and self.length < _LONGEST
+
+
+# Which nodes may be believed: what their heartbeats say, who has restarted, who has been configured since. Pure.
+#
+# A node that sent its boot-up message has lost its PDO mapping. None of its PDOs is used or waited for until
+# `configured`. The same holds for one that was found to be configured otherwise (`doubt`), and for an optional one that
+# is absent.
+
+
+_HEARTBEAT_BASE = 0x700
+_BOOT_UP = 0
+_NMT_STATES = frozenset((_BOOT_UP, 4, 5, 127))
+"""What a heartbeat may say (CiA 301): boot-up, stopped, operational, pre-operational."""
+
+
+class NodeTrust:
+    """The producers of the input PDOs.
+
+    Args:
+        pdos: states of all input PDOs; `wanted` of each is kept here.
+
+    Attributes:
+        heartbeats: node-ID by COB-ID of its heartbeat.
+        wanted: number of PDOs whose node is believed.
+        unconfigured: nodes that are not, because they restarted, are in doubt or absent.
+        absent: those of them that are missed by nobody.
+        states: last heartbeat state of each node (CiA 301: 0 boot-up, 4 stopped, 5 operational, 127 pre-operational).
+        heard_ns: kernel stamp of that heartbeat, CLOCK_REALTIME.
+        boot_ups: boot-up messages of all nodes.
+        restarts: boot-up messages of each node that has sent one.
+    """
+
+    def __init__(self, pdos: Sequence[InputState]) -> None:
+        self._pdos = tuple(pdos)
+        self.heartbeats = {_HEARTBEAT_BASE + state.pdo.node_id: state.pdo.node_id for state in pdos}
+        self.wanted = len(self._pdos)
+        self.unconfigured: frozenset[int] = frozenset()
+        self.absent: frozenset[int] = frozenset()
+        self.states: dict[int, int] = {}
+        self.heard_ns: dict[int, int] = {}
+        self.boot_ups = 0
+        self.restarts: dict[int, int] = {}
+
+    def heartbeat(self, node_id: int, state: int, stamp_ns: int) -> bool:
+        """A heartbeat of one byte; False for one that says an impossible state: it is none."""
+        if state not in _NMT_STATES:
+            return False
+        self.states[node_id] = state
+        self.heard_ns[node_id] = stamp_ns
+        if state == _BOOT_UP:  # the mapping is back to the device's default
+            self.boot_ups += 1
+            self.restarts[node_id] = self.restarts.get(node_id, 0) + 1
+            self.doubt(node_id)
+        return True
+
+    def configured(self, node_id: int) -> None:
+        """The node's mapping has been written and read back: its PDOs count from the next cycle on."""
+        self.absent -= {node_id}
+        self._set(node_id, self.unconfigured - {node_id}, wanted=1)
+
+    def leave_out(self, node_id: int) -> None:
+        """An optional node that was not there at the start: like one that restarted, but its PDOs are not missed."""
+        self.absent |= {node_id}
+        self.doubt(node_id)
+
+    def doubt(self, node_id: int) -> None:
+        """Nothing of this node is used from now on."""
+        self._set(node_id, self.unconfigured | {node_id}, wanted=0)
+
+    def _set(self, node_id: int, unconfigured: frozenset[int], *, wanted: int) -> None:
+        self.unconfigured = unconfigured
+        for state in self._pdos:
+            if state.pdo.node_id == node_id:
+                state.wanted = wanted
+                state.debt = 0
+                state.probation = False
+        self.wanted = sum(state.wanted for state in self._pdos)
+
 
 _HEAD = struct.Struct("<IB")
 _QUARANTINE = 5

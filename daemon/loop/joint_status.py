@@ -11,18 +11,74 @@ The statuses have an order, from good to bad:
   had to wait) waits twice as long each time, at most MOST times as long: an input that comes and goes makes a joint that is
   stale, not one that flickers. A single lost frame costs little.
 - A fault that is latched (`safety.latch`) stays until `reset_latch()`: its status, or a worse one, is published whatever
-  the inputs say. Status 5, 4 or 15, see `daemon.shared.faults.status_of`.
+  the inputs say. Status 5, 4 or 15, see `jtqd.daemon.shared.cycle_record.status_of`.
 
 No clock and no randomness: the same statuses and faults give the same answer again, in the loop and from a log.
 """
 
 from __future__ import annotations
 
-from typing import Final
+from math import inf, isnan
+from typing import Any, Final, Protocol
 
-from daemon.safety_settings import SafetySettings
-from daemon.shared import faults
-from estimator import status as st
+from jtqd.daemon.config import Config, SafetySettings
+from jtqd.daemon.shared import cycle_record as faults
+from jtqd.daemon.shared.snapshot import COUNTERS
+from jtqd.estimator import status as st
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.plausibility import Plausibility
+from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.status import Estimate
+
+# What the loop, or a replay of its log, needs of one joint to keep the rules of docs/safety.md; made once.
+
+
+TORQUE_RANGE_NM: Final = 327.67
+"""Of the field of the estimate PDO."""
+
+
+class JointSafety:
+    """Limits and checks of one joint. Without a joint there is no check that needs its parameters.
+
+    Attributes:
+        settings: as configured.
+        plausibility: checks of its inputs, None for none.
+        torque_limit_nm: a torque beyond it is never published.
+        network_limit_nm: a network further from physics than this has been dropped by the estimator.
+        deviation_cycles: length of the fault `deviation`, 0 where it is not latched.
+    """
+
+    __slots__ = ("deviation_cycles", "network_limit_nm", "plausibility", "settings", "torque_limit_nm")
+
+    def __init__(
+        self,
+        settings: SafetySettings | None = None,
+        estimator: EstimatorSettings | None = None,
+        joint: Joint | None = None,
+        period_ns: int = 1_000_000,
+    ) -> None:
+        self.settings: Final = settings or SafetySettings()
+        self.plausibility: Plausibility | None = None
+        self.torque_limit_nm, self.network_limit_nm = TORQUE_RANGE_NM, inf
+        self.deviation_cycles = 0
+        if self.settings.latch & faults.DEVIATION:
+            self.deviation_cycles = max(1, round(self.settings.deviation_s * 1e9 / period_ns))
+        if joint is None or estimator is None:
+            return
+        self.torque_limit_nm = min(TORQUE_RANGE_NM, estimator.torque_limit * joint.rated_torque_nm)
+        self.network_limit_nm = estimator.network_limit * joint.rated_torque_nm
+        if self.settings.plausibility is not None:
+            self.plausibility = Plausibility(
+                joint, estimator.torque_limit, self.settings.plausibility, period_ns * 1e-9
+            )
+
+
+def safety_of(config: Config) -> list[JointSafety]:
+    """Of joint 1 and 2, as configured."""
+    return [
+        JointSafety(config.safety, config.estimator, joint.joint, config.period_ns) for joint in config.joints
+    ]
+
 
 NEEDED: Final = {
     st.DEGRADED: 100,
@@ -56,7 +112,7 @@ class JointStatus:
     """State of one joint.
 
     Attributes:
-        latched: bits of the faults that are latched (`daemon/shared/faults.py`).
+        latched: bits of the faults that are latched (`daemon/shared/cycle_record.py`).
         reasons: faults since a number was last published; 0 while one is.
         news, latches: faults that began, and how often one was latched, since whoever counts them set these to 0.
     """
@@ -95,7 +151,7 @@ class JointStatus:
         self._latching, self._stale_limit = settings.latch, settings.stale_latch_cycles
 
     def update(self, status: int, found: int = 0) -> int:
-        """Status to publish in a cycle that asks for `status` and has the faults `found` (`daemon/shared/faults.py`)."""
+        """Status to publish in a cycle that asks for `status` and has the faults `found` (`shared/cycle_record.py`)."""
         self._since += 1
         if status == self._held and not found and not self.latched and _RANK[status] <= _WITH_NUMBER:
             self._calm = self._run = self._found = 0
@@ -175,3 +231,231 @@ class JointStatus:
 
 def _worse(a: int, b: int) -> int:
     return a if _RANK[a] >= _RANK[b] else b
+
+
+# What one joint counts: why its network was dropped, its faults, and its squared errors against the sensor.
+
+
+FLAG_NETWORK_SKIPPED, FLAG_LATCHED = 0x10, 0x20
+"""Bits of `input_flags`: no time for the network; a fault is latched. Bits 8 to 15: low byte of
+`daemon/shared/cycle_record.py`."""
+
+_FALLBACKS, _LATCHES = COUNTERS.index("network_fallbacks"), COUNTERS.index("latches")
+_NOT_FINITE, _FAR, _OUTSIDE, _NO_TIME = (
+    COUNTERS.index(f"network_{why}") for why in ("not_finite", "far", "outside", "no_time")
+)
+_FAULTS: Final = tuple((bit, COUNTERS.index(f"fault_{faults.NAMES[bit]}")) for bit in faults.COUNTED)
+
+
+class JointCounts(Protocol):
+    """Where a joint counts: the loop's snapshot, or two lists in a replay.
+
+    Attributes:
+        counters: in the order of `jtqd.daemon.shared.snapshot.COUNTERS`.
+        errors: sum of squared errors and number of samples of each joint.
+    """
+
+    counters: Any
+    errors: Any
+
+
+class JointTally:
+    """Counts of joint `number` (0 or 1)."""
+
+    __slots__ = ("_counters", "_errors", "_number")
+
+    def __init__(self, number: int, tally: JointCounts) -> None:
+        self._counters, self._errors = tally.counters, tally.errors
+        self._number = number
+
+    def faults(self, state: JointStatus) -> int:
+        """Count the faults that are new in this cycle; return the flags that tell why there is no number."""
+        counters = self._counters
+        new = state.news
+        if new:
+            for bit, index in _FAULTS:
+                if new & bit:
+                    counters[index] += 1
+            state.news = 0
+        flags = (state.reasons & 0xFF) << 8
+        if state.latched:
+            counters[_LATCHES] += state.latches
+            state.latches = 0
+            flags |= FLAG_LATCHED | (state.latched & 0xFF) << 8
+        return flags
+
+    def network(
+        self, status: int, wanted: bool, network_nm: float, physics_nm: float, limit_nm: float
+    ) -> None:
+        """A cycle in which the network is not, or not alone, in charge (status 3), or gave no number."""
+        counters = self._counters
+        if status == st.DEGRADED:
+            counters[_FALLBACKS] += 1
+        if not wanted:
+            counters[_NO_TIME] += 1
+        elif network_nm - network_nm != 0.0:
+            counters[_NOT_FINITE] += 1
+        elif abs(network_nm - physics_nm) > limit_nm:
+            counters[_FAR] += 1
+        else:
+            counters[_OUTSIDE] += 1
+
+    def error(self, difference_nm: float) -> None:
+        """A published estimate minus the sensor's torque."""
+        number, errors = self._number, self._errors
+        errors[2 * number] += difference_nm**2
+        errors[2 * number + 1] += 1.0
+
+
+# What of a joint's estimate may be published: the rules of docs/safety.md, applied to one cycle after the other. Pure.
+#
+#     estimate and inputs  ->  faults of this cycle  ->  status (`joint_status.py`)  ->  status and flags
+#
+# A number leaves only through `JointRules.judge`. Everything that it needs beside the estimate comes from the log again: the
+# inputs, `cr.FLAG_WITHDRAWN` (`late`), `cr.FLAG_RESET` (`reset_latch`), `FLAG_NETWORK_SKIPPED`. So a replay gives the same.
+
+
+_POWERED = {0x27, 0x07}
+"""Operation enabled and quick stop active (6041h masked with 6Fh): the states in which the motor carries current."""
+_JOINT_RULES_FAULTS = {0x0F, 0x08}
+"""Fault reaction active and fault (6041h masked with 4Fh)."""
+_USUAL: Final = frozenset((st.VALID, st.STANDSTILL))
+_PUBLISHED, _INVALID, _STARTING = frozenset(st.PUBLISHED), st.INVALID, st.STARTING
+
+
+def drive_status(statusword: int) -> int | None:
+    """Status that a drive's statusword (6041h) puts in place of any other; None for a motor that carries current."""
+    if statusword & 0x6F in _POWERED:
+        return None
+    return st.DRIVE_FAULT if statusword & 0x4F in _JOINT_RULES_FAULTS else st.OFF
+
+
+def _no_check(_dt_s: float, _motor: float, _speed: float, _link: float, _current: float) -> int:
+    return 0
+
+
+class JointRules:
+    """State of joint `number` (0 or 1): what is held and what is latched.
+
+    Args:
+        number, tally: where it counts.
+        safety: limits and checks.
+        with_network: the estimator uses one.
+
+    Attributes:
+        error: counts a published estimate minus the sensor's torque [Nm].
+    """
+
+    __slots__ = (
+        "_check",
+        "_deviates",
+        "_limit",
+        "_safety",
+        "_state",
+        "_tally",
+        "_usual",
+        "_with_network",
+        "error",
+    )
+
+    def __init__(self, number: int, tally: JointCounts, safety: JointSafety, with_network: bool) -> None:
+        self._tally = JointTally(number, tally)
+        self.error = self._tally.error
+        self._state = JointStatus(safety.settings)
+        self.use(safety, with_network)
+
+    def use(self, safety: JointSafety, with_network: bool) -> None:
+        """From now on these limits; what is held and latched stays."""
+        self._safety, self._with_network = safety, with_network
+        self._check = _no_check if safety.plausibility is None else safety.plausibility.step
+        self._limit = safety.torque_limit_nm
+        # Nearly all cycles have one of these, and then nothing more has to be looked at.
+        self._usual = frozenset() if safety.deviation_cycles else _USUAL
+        self._state.use(safety.settings)
+        self._deviates = 0
+
+    def begin_again(self) -> None:
+        """The drive restarted: where its encoders stood means nothing any more."""
+        self._deviates = 0
+        if self._safety.plausibility is not None:
+            self._safety.plausibility.reset()
+
+    def judge(  # noqa: PLR0917 - once per cycle: a call with names costs three times one without
+        self,
+        estimate: Estimate,
+        dt_s: float,
+        motor_position_rad: float,
+        motor_velocity_rad_s: float,
+        link_position_rad: float,
+        current_a: float,
+        sensor_nm: float,
+        statusword: int,
+        starting: bool,
+        network_wanted: bool,
+    ) -> tuple[int, int]:
+        """Status to publish and bits of `input_flags`.
+
+        Time step to current: what the estimate was made of; `sensor_nm` NaN where unknown; while `starting`, an estimate
+        with a number has status 1 instead.
+        """
+        found = self._check(dt_s, motor_position_rad, motor_velocity_rad_s, link_position_rad, current_a)
+        torque, sigma, status, _, _, network = estimate
+        flags = 0 if network_wanted or not self._with_network else FLAG_NETWORK_SKIPPED
+        state, limit = self._state, self._limit
+        if statusword & 0x6F not in _POWERED:
+            status = drive_status(statusword) or st.OFF
+        elif status in _PUBLISHED:
+            if not (
+                status in self._usual
+                and -limit <= torque <= limit
+                and 0.0 <= sigma < inf
+                and (network - network == 0.0 or not self._with_network)
+            ):
+                found |= self._numbers(estimate, sensor_nm, network_wanted)
+            if starting:
+                status = _STARTING
+        elif status == _INVALID:
+            found |= faults.OUT_OF_RANGE
+        status = state.update(status, found)
+        if state.reasons or state.latched:
+            flags |= self._tally.faults(state)
+        return status, flags
+
+    def stale(self) -> tuple[int, int]:
+        """An input of this cycle is missing: status to publish and bits of `input_flags`."""
+        state = self._state
+        status = state.update(st.STALE)
+        return status, self._tally.faults(state) if state.reasons or state.latched else 0
+
+    def late(self) -> int:
+        """The estimate that `judge` has seen, or the missing one, was not ready in time: status to publish."""
+        return self._state.late()
+
+    @property
+    def latched(self) -> int:
+        """Bits of the faults that are latched (`shared/cycle_record.py`)."""
+        return self._state.latched
+
+    def reset_latch(self) -> bool:
+        """Release what is latched; True if anything was."""
+        return self._state.reset_latch()
+
+    def _numbers(self, estimate: Estimate, sensor_nm: float, network_wanted: bool) -> int:
+        """Faults of numbers that the estimator takes for good."""
+        torque, sigma, status, _, physics, network = estimate
+        safety = self._safety
+        limit = safety.torque_limit_nm
+        found = 0
+        if not (-limit <= torque <= limit and 0.0 <= sigma < inf):  # so that NaN fails too
+            finite = torque - torque == 0.0 and 0.0 <= sigma < inf
+            found = faults.OUT_OF_RANGE if finite else faults.NOT_FINITE
+        if self._with_network and (status == st.DEGRADED or network - network != 0.0):
+            self._tally.network(status, network_wanted, network, physics, safety.network_limit_nm)
+        if safety.deviation_cycles:
+            if abs(torque - sensor_nm) <= safety.settings.deviation_sigmas * sigma:
+                self._deviates = 0
+            elif not isnan(sensor_nm):
+                self._deviates += 1
+            if self._deviates >= safety.deviation_cycles:
+                found |= faults.DEVIATION
+        return found

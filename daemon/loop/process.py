@@ -1,6 +1,6 @@
 """The loop process: everything is made and warmed up first, then one cycle after the other until told to stop.
 
-Started by the supervisor as `python -m daemon.loop.process` with a JSON request as its only argument. It answers on
+Started by the supervisor as `python -m jtqd.daemon.loop.process` with a JSON request as its only argument. It answers on
 standard output with one JSON line when it is ready, reads the boot report as one JSON line from standard input, runs, and
 ends with one JSON line of results. It has no second thread, logs nothing while it runs, and shares only memory with
 other processes.
@@ -21,28 +21,92 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from daemon.config import Config, JointConfig, load_config
-from daemon.loop import realtime
-from daemon.loop.counters import frame_counts
-from daemon.loop.cycle import Cycle
-from daemon.loop.duties import Duties
-from daemon.loop.grid import Grid
-from daemon.loop.input_pdos import input_pdos, joint_temperatures, sensor_index
-from daemon.loop.intake import Intake
-from daemon.loop.joint_cycle import JointInputs
-from daemon.loop.joint_safety import safety_of
-from daemon.reload.handover import Giver
-from daemon.shared.cycle_record import RECORD_SIZE
-from daemon.shared.ring import Ring
-from daemon.shared.snapshot import Snapshot
-from daemon.supervisor.notify import LoopWatchdog, Notifier, watchdog_seconds
-from drivers.can_filter import CanFilter, look_alikes
-from drivers.devices import SYNC_COB_ID
-from drivers.errors import BusError, BusGone
-from drivers.frame_socket import FrameSocket, open_frame_socket
-from estimator.checked import ConfigError
-from estimator.methods import AnyEstimator, load_network, make_estimator
-from estimator.network import NetworkError
+from jtqd.daemon.config import Config, JointConfig, load_config
+from jtqd.daemon.loop import realtime
+from jtqd.daemon.loop.counters import frame_counts
+from jtqd.daemon.loop.cycle import Cycle
+from jtqd.daemon.loop.input_pdos import input_pdos, joint_temperatures, sensor_index
+from jtqd.daemon.loop.intake import Intake
+from jtqd.daemon.loop.joint import JointInputs
+from jtqd.daemon.loop.joint_status import safety_of
+from jtqd.daemon.loop.schedule import Grid
+from jtqd.daemon.reload.handover import Giver
+from jtqd.daemon.shared.cycle_record import RECORD_SIZE
+from jtqd.daemon.shared.ring import Ring
+from jtqd.daemon.shared.snapshot import Snapshot
+from jtqd.daemon.shared.systemd import LoopWatchdog, Notifier, watchdog_seconds
+from jtqd.drivers.devices import SYNC_COB_ID
+from jtqd.drivers.filters import CanFilter, look_alikes
+from jtqd.drivers.frame_socket import BusError, BusGone, FrameSocket, open_frame_socket
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.methods import AnyEstimator, load_network, make_estimator
+from jtqd.estimator.onnx_graph import NetworkError
+
+# What the loop does in the pause after a cycle, beside its work: the watchdog, orders of the supervisor, a hand-over.
+#
+# Costs one call per cycle and, every n-th cycle, one datagram and one look at shared memory (docs/deployment.md).
+
+
+_ORDERS_EVERY = 16
+"""Cycles between two looks at the orders."""
+
+
+class Duties:
+    """Call it once after each cycle; True: the bus belongs to the successor, leave without a word.
+
+    Args:
+        cycle: the loop's.
+        watchdog: to be fed.
+        giver: hands the bus over when SIGUSR2 has asked for it.
+        tell: says to the supervisor why a hand-over came to nothing.
+    """
+
+    def __init__(
+        self, cycle: Cycle, watchdog: LoopWatchdog, giver: Giver, tell: Callable[[str], None]
+    ) -> None:
+        self._cycle, self._orders = cycle, cycle.snapshot.orders
+        self._advanced = watchdog.advanced
+        self._giver, self._tell = giver, tell
+        self._left = _ORDERS_EVERY
+        self._wanted = self._giving = False
+        signal.signal(signal.SIGUSR2, self._on_signal)
+
+    def __call__(self) -> bool:
+        """One more cycle has ended."""
+        self._advanced()
+        self._left -= 1
+        if self._left == 0:
+            self._left = _ORDERS_EVERY
+            orders = self._orders
+            if orders[0] != orders[1]:
+                self._reset()
+            if orders[2] != orders[3]:
+                self._doubt()
+        if self._wanted:
+            self._wanted, self._giving = False, True
+            self._giver.begin()
+        return self._giving and self._give()
+
+    def _give(self) -> bool:
+        given = self._giver.step()
+        if given is None:
+            self._giving = False
+            self._tell(self._giver.refused or "")
+        return bool(given)
+
+    def _reset(self) -> None:
+        number = self._orders[0]
+        self._cycle.reset_faults()
+        self._orders[1] = number
+
+    def _doubt(self) -> None:
+        number = self._orders[2]
+        self._cycle.configured_nodes.doubt()
+        self._orders[3] = number
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self._wanted = True
+
 
 _WARM_UP_STEPS = 300
 _DRIVE_FACTORS = ("motor_rad_per_count", "motor_rad_s_per_unit", "link_rad_per_count", "ampere_per_unit")
@@ -135,7 +199,7 @@ def run(
         cycle, grid: state of the loop; the first cycle is that of the grid's slot.
         stop: asked before each cycle.
         end_ns: no cycle begins from here on; None: without end.
-        after: see `daemon.loop.duties`.
+        after: see `jtqd.daemon.loop.process`.
         after_sync: called once, when the first SYNC has been sent and nobody waits for anything yet.
 
     Returns:
@@ -276,7 +340,7 @@ def main(argv: list[str]) -> int:
     request = json.loads(argv[0])
     try:
         if "handover" in request:
-            from daemon.reload.successor import succeed
+            from jtqd.daemon.reload.successor import succeed
 
             return succeed(request)
         return serve(request)

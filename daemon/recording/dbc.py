@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from daemon.loop.estimate_pdo import NO_TORQUE, SIGMA_UNIT_NM, SIGMA_UNKNOWN, TORQUE_UNIT_NM
-from daemon.recording.schemas import STATUS_NAMES
-from drivers.devices import (
+from jtqd.daemon.loop.estimate_pdo import NO_TORQUE, SIGMA_UNIT_NM, SIGMA_UNKNOWN, TORQUE_UNIT_NM
+from jtqd.daemon.recording.schemas import STATUS_NAMES
+from jtqd.drivers.devices import (
     NOT_MEASURED,
     TEMPERATURE,
     TEMPERATURE_C_PER_UNIT,
@@ -22,10 +22,10 @@ from drivers.devices import (
     sensor_tpdo1,
     sensor_tpdo2,
 )
-from drivers.pdo import PdoMap
+from jtqd.drivers.pdo import PdoMap
 
 if TYPE_CHECKING:
-    from daemon.config import Config
+    from jtqd.daemon.config import Config
 
 SYNC_ID, EMCY_BASE, HEARTBEAT_BASE = 0x080, 0x080, 0x700
 _NMT_STATES = {0: "boot_up", 4: "stopped", 5: "operational", 127: "pre_operational"}
@@ -137,7 +137,7 @@ def _pdo_signals(pdo: PdoMap, quantities: Mapping[Key, Quantity]) -> list[_Signa
 
 
 def estimate_quantities(cob_id: int) -> dict[Key, Quantity]:
-    """The estimate PDO; see `daemon.loop.estimate_pdo`."""
+    """The estimate PDO; see `jtqd.daemon.loop.estimate_pdo`."""
     torque = Quantity(TORQUE_UNIT_NM, "Nm", {NO_TORQUE: "no_torque"})
     sigma = Quantity(SIGMA_UNIT_NM, "Nm", {SIGMA_UNKNOWN: "unknown"})
     names = {code: name.lower() for code, name in STATUS_NAMES.items()}

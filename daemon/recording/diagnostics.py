@@ -8,12 +8,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from daemon.recording import schemas
-from daemon.recording.messages import Status
-from daemon.recording.progress import Account
-from daemon.recording.space import MEGABYTE
-from daemon.shared.snapshot import View
-from daemon.shared.snapshot_view import BUS_COUNTERS
+from jtqd.daemon.recording import schemas
+from jtqd.daemon.recording.messages import Status
+from jtqd.daemon.recording.parts import MEGABYTE
+from jtqd.daemon.recording.progress import Account
+from jtqd.daemon.shared.snapshot import BUS_COUNTERS, View
 
 OK, WARN, ERROR, STALE = range(4)
 _OF_THE_BUS = (*BUS_COUNTERS, "bits_worst_case")

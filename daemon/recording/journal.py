@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from daemon.recording import schemas
-from daemon.recording.chunk import ChunkBuilder
-from daemon.recording.messages import event, log
+from jtqd.daemon.recording import schemas
+from jtqd.daemon.recording.mcap_file import ChunkBuilder
+from jtqd.daemon.recording.messages import event, log
 
 _PER_CHUNK = 50
 """A status that flaps every cycle must not fill the disk; what is left out is counted."""

@@ -10,10 +10,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from daemon.recording.naming import free_run, own_files
-from daemon.recording.progress import Account, ProgressFile
-from daemon.shared.snapshot import SnapshotReader
-from daemon.supervisor.children import Child, ChildError
+from jtqd.daemon.recording.parts import free_run, own_files
+from jtqd.daemon.recording.progress import Account, ProgressFile
+from jtqd.daemon.shared.child_process import Child, ChildError
+from jtqd.daemon.shared.snapshot import SnapshotReader
 
 _STARTS = 5
 """A recorder that has been started more often than this in a minute waits for `_LONG_PAUSE_S`."""
@@ -45,7 +45,7 @@ class Keeper:
         self._result: dict[str, Any] | None = None
 
     def start(self, request: dict[str, Any]) -> None:
-        """Begin to record what `daemon.recording.contents.recording_request` asks for. Raises OSError."""
+        """Begin to record what `jtqd.daemon.recording.request.recording_request` asks for. Raises OSError."""
         self._directory, self._prefix = Path(request["directory"]), str(request["prefix"])
         self._run_name = free_run(self._directory, self._prefix, time.time_ns())
         request = request | {"run": self._run_name}
@@ -125,7 +125,9 @@ class Keeper:
         # Told to end before it has set up its handlers, it must still record what there is: it unblocks this by itself.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
         try:
-            self._child = self._start_child("daemon.recording.recorder", [str(self._request)], "the recorder")
+            self._child = self._start_child(
+                "jtqd.daemon.recording.recorder", [str(self._request)], "the recorder"
+            )
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 

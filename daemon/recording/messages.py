@@ -1,4 +1,4 @@
-"""CDR bytes of every recorded message, by the definitions of `daemon.recording.schemas`. Pure.
+"""CDR bytes of every recorded message, by the definitions of `jtqd.daemon.recording.schemas`. Pure.
 
 A CDR payload is the encapsulation header 00 01 00 00 (plain CDR, little endian) followed by the fields, each
 aligned to its own size counted from the first byte after that header (OMG DDSI-RTPS, section 10; DDS-XTypes,
@@ -6,7 +6,7 @@ section 7.4). Every topic's messages have one constant size: strings are filled 
 reader may take a whole chunk as one array of records.
 
 The three messages of every cycle are made by one `struct` call. The definitions were laid out for that: whole
-stretches of the cycle record go into the message as they lie in memory (see `daemon.shared.cycle_record`).
+stretches of the cycle record go into the message as they lie in memory (see `jtqd.daemon.shared.cycle_record`).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import struct
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from daemon.recording import schemas
-from daemon.shared import cycle_record as cycle
+from jtqd.daemon.recording import schemas
+from jtqd.daemon.shared import cycle_record as cycle
 
 CDR_HEADER = b"\x00\x01\x00\x00"
 _NS = 1_000_000_000

@@ -1,14 +1,17 @@
 """Message definitions and topics of the recorded MCAP files: ros2msg texts with every nested definition.
 
 Names, fields and units here are what Foxglove, PlotJuggler, Rerun, rosbags and `ros2 bag` show. The bytes
-that follow these definitions are made in `daemon.recording.messages`; the tests decode them by these texts alone.
+that follow these definitions are made in `jtqd.daemon.recording.messages`; the tests decode them by these texts alone.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
-from daemon.shared.cycle_record import FRAME_CAPACITY
+from mcap.records import Channel, Schema
+
+from jtqd.daemon.shared.cycle_record import FRAME_CAPACITY
 
 STATUS_NAMES = {
     0: "OFF",
@@ -231,3 +234,25 @@ DIAGNOSTICS = Topic(5, "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 EVENTS = Topic(6, "/events", "jtqd_msgs/msg/Event")
 LOG = Topic(7, "/log", "rcl_interfaces/msg/Log")
 TOPICS = (JOINT_1, JOINT_2, CAN_FRAMES, JOINT_STATES, DIAGNOSTICS, EVENTS, LOG)
+
+
+# MCAP schema and channel records of every topic.
+
+
+def definitions(metadata: Mapping[str, Mapping[str, str]] | None) -> tuple[list[Schema], list[Channel]]:
+    """Schema and channel records of every topic; `metadata` adds to a topic's own."""
+    numbers = {name: number for number, name in enumerate(SCHEMAS, start=1)}
+    channels = [
+        Channel(
+            id=topic.number,
+            topic=topic.name,
+            message_encoding="cdr",
+            metadata={str(key): str(text) for key, text in (metadata or {}).get(topic.name, {}).items()},
+            schema_id=numbers[topic.schema],
+        )
+        for topic in TOPICS
+    ]
+    return [
+        Schema(id=numbers[name], name=name, encoding="ros2msg", data=text.encode())
+        for name, text in SCHEMAS.items()
+    ], channels

@@ -25,10 +25,9 @@ from typing import Any
 _SCALARS = frozenset((int, float, bool, str, type(None)))
 _LONGEST = 128
 """Longer ones are tables made at the start, not something learned."""
-_PACKAGE = "daemon."
-_CONFIGURED = frozenset(
-    ("daemon.config", "daemon.config_nodes", "daemon.loop.joint_safety", "daemon.safety_settings")
-)
+_PACKAGE = "jtqd.daemon."
+_CONFIGURED = "jtqd.daemon.config"
+_CONFIGURED_CLASS = "JointSafety"
 """What comes from configuration and joint files is not learned."""
 _SKIP = object()
 
@@ -231,8 +230,10 @@ def _still(value: Any) -> bool:
 
 
 def _own(value: Any) -> bool:
-    module = type(value).__module__
-    return module.startswith(_PACKAGE) and module not in _CONFIGURED and not isinstance(value, type)
+    kind = type(value)
+    if not kind.__module__.startswith(_PACKAGE) or kind.__module__ == _CONFIGURED:
+        return False
+    return kind.__name__ != _CONFIGURED_CLASS and kind is not type
 
 
 def _frozen(value: Any) -> bool:

@@ -15,9 +15,9 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from daemon.config import Config, load_config
-from daemon.supervisor.children import Child, ChildError
-from estimator.checked import ConfigError
+from jtqd.daemon.config import Config, load_config
+from jtqd.daemon.shared.child_process import Child, ChildError
+from jtqd.estimator.checked import ConfigError
 
 SOCKET = "handover"
 """Name of the successor's socket in the runtime directory."""
@@ -98,7 +98,7 @@ class Reload:
             "config_sha256": new.files_sha256,
             "handover": str(Path(self._request["ring"]).with_name(SOCKET)),
         }
-        self._child = self._start_child("daemon.loop.process", [json.dumps(request)], "the new loop")
+        self._child = self._start_child("jtqd.daemon.loop.process", [json.dumps(request)], "the new loop")
         self._stage, self._until_s = "to be built", time.monotonic() + READY_S
 
     @property

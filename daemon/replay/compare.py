@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from daemon.replay.whole import fields
-from estimator.status import NAMES
-
-Records = npt.NDArray[np.void]
-Floats = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
+from jtqd.daemon.replay.estimates import fields
+from jtqd.daemon.replay.runs import CUT, Steps
+from jtqd.estimator.arrays import BoolArray, FloatArray, RecordArray
+from jtqd.estimator.status import NAMES, STANDSTILL
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,7 @@ class Comparison:
         }
 
 
-def compare(number: int, logged: Records, replayed: Records, taken: Flags) -> Comparison:
+def compare(number: int, logged: RecordArray, replayed: RecordArray, taken: BoolArray) -> Comparison:
     """Compare joint `number` (1 or 2) over the cycles `taken` [n]."""
     logged, replayed = logged[taken], replayed[taken]
     both = np.isfinite(logged["torque_nm"]) & np.isfinite(replayed["torque_nm"])
@@ -92,19 +91,19 @@ def compare(number: int, logged: Records, replayed: Records, taken: Flags) -> Co
     )
 
 
-def pdo_equal(logged: Records, replayed: Records) -> Flags:
+def pdo_equal(logged: RecordArray, replayed: RecordArray) -> BoolArray:
     """Whether a joint's fields of the estimate PDO are the same [n]."""
     one, two = (
         fields(each["torque_nm"], each["sigma_nm"], each["status"].astype(np.uint16))
         for each in (logged, replayed)
     )
-    equal: Flags = np.ones(len(logged), np.bool_)
+    equal: BoolArray = np.ones(len(logged), np.bool_)
     for a, b in zip(one, two, strict=True):
         equal &= a == b
     return equal
 
 
-def _rms(values: Floats) -> float:
+def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else np.nan
 
 
@@ -117,3 +116,227 @@ def _changes(before: npt.NDArray[np.uint16], after: npt.NDArray[np.uint16]) -> t
         for (a, b), count in zip(pairs.tolist(), counts.tolist(), strict=True)
     ]
     return tuple(sorted(found, key=lambda each: -each.cycles))
+
+
+# Whether a replay is what was logged: bit for bit, cycle by cycle, and where not, since when and why. Pure.
+
+
+SETTLED_CYCLES = 200
+"""So many cycles with inputs in a row that are identical: what was not known has been forgotten (40 time constants of the
+observer at 200 rad/s), and a difference after that has another reason."""
+_FIELDS = ("torque_nm", "status", "sigma_nm", "physics_nm", "network_nm", "tob_nm")
+"""In this order a difference is named by the first that shows it."""
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """Cycles of one joint whose state no log tells: from `first_cycle` on, `cycles` of them, until it was forgotten.
+
+    `until_end`: the replay did not become identical before the log or the next such place came.
+    """
+
+    joint: int
+    first_cycle: int
+    cycles: int
+    reason: str
+    until_end: bool
+
+
+@dataclass(frozen=True)
+class Difference:
+    """First cycle of one joint that differs without a reason."""
+
+    joint: int
+    cycle: int
+    cycles: int
+    field: str
+    logged: float
+    replayed: float
+    largest_nm: float
+
+
+@dataclass(frozen=True)
+class Identity:
+    """How much of a log came out again.
+
+    Attributes:
+        cycles: replayed.
+        identical: of these, bit for bit in every number of both joints and in the bytes of the estimate PDO.
+        pdos, pdos_equal: estimate PDOs in the frames of the log, and those of the same bytes.
+        unknown: where the state was not known.
+        differences: what has no reason.
+        from_cycle: all cycles from this one on are identical; None where the last one is not.
+        tolerance_nm: numbers that differ by no more count as identical in all of this but `identical`; 0: bits.
+    """
+
+    cycles: int
+    identical: int
+    pdos: int
+    pdos_equal: int
+    unknown: tuple[Unknown, ...]
+    differences: tuple[Difference, ...]
+    from_cycle: int | None
+    tolerance_nm: float = 0.0
+
+    @property
+    def whole(self) -> bool:
+        """Every cycle is identical."""
+        return self.identical == self.cycles
+
+    @property
+    def explained(self) -> bool:
+        """What differs was not known to begin with, and became identical."""
+        return not self.differences and not any(each.until_end for each in self.unknown)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {**asdict(self), "bit_identical": self.whole, "explained": self.explained}
+
+
+def bits_equal(logged: npt.NDArray[Any], replayed: npt.NDArray[Any]) -> BoolArray:
+    """Equal bit for bit [n]; not a number is equal to itself, whatever its bits."""
+    if logged.dtype.kind != "f":
+        return np.asarray(logged == replayed)
+    same = np.ascontiguousarray(logged).view(np.int64) == np.ascontiguousarray(replayed).view(np.int64)
+    return np.asarray(same | (np.isnan(logged) & np.isnan(replayed)))
+
+
+def identity(
+    logged: Sequence[RecordArray],
+    replayed: Sequence[RecordArray],
+    steps: Sequence[Steps],
+    estimate: tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8], BoolArray] | None = None,
+    tolerance_nm: float = 0.0,
+) -> Identity:
+    """Compare n cycles of both joints, all fields of `replayed`.
+
+    `estimate`: bytes of the estimate PDO [n, 8] in the frames and replayed, and whether the log has it [n]; None: the
+    frames were not read. `tolerance_nm`: what rounding may do to a replay in arrays.
+    """
+    cycle = logged[0]["cycle"].astype(np.int64)
+    same = [_same(one, two, tolerance_nm) for one, two in zip(logged, replayed, strict=True)]
+    bits = [_same(one, two, 0.0) for one, two in zip(logged, replayed, strict=True)] if tolerance_nm else same
+    told = pdo = np.ones(len(cycle), np.bool_)
+    if estimate is None:
+        told = ~pdo
+    else:
+        sent, made, told = estimate
+        pdo = ~told | (sent == made).all(axis=1)
+    unknown: list[Unknown] = []
+    differences: list[Difference] = []
+    for n in (0, 1):
+        parts = _segments(len(cycle), steps[n])
+        for first, end, reason in parts:
+            settled = _settled(same[n], steps[n].used, first, end) if reason else first
+            if reason and not (reason == CUT and settled == first):
+                after = cycle[settled] if settled < end else cycle[end - 1] + 1
+                count = int(after - cycle[first])
+                unknown.append(Unknown(n + 1, int(cycle[first]), count, reason, settled >= end))
+            wrong = np.flatnonzero(~same[n][settled:end]) + settled
+            if len(wrong):
+                differences.append(_difference(n, logged[n], replayed[n], wrong, tolerance_nm))
+    every = same[0] & same[1] & pdo
+    if not (pdo | ~same[0] | ~same[1]).all():
+        row = int(np.argmin(pdo | ~same[0] | ~same[1]))
+        differences.append(
+            Difference(0, int(cycle[row]), int((~pdo).sum()), "estimate PDO", np.nan, np.nan, 0.0)
+        )
+    last = np.flatnonzero(~every)
+    start = 0 if not len(last) else int(last[-1]) + 1
+    return Identity(
+        len(cycle),
+        int((bits[0] & bits[1] & pdo).sum()),
+        int(told.sum()),
+        int((told & pdo).sum()),
+        tuple(sorted(unknown, key=lambda each: (each.first_cycle, each.joint))),
+        tuple(_first_of_each(differences)),
+        int(cycle[start]) if start < len(cycle) else None,
+        tolerance_nm,
+    )
+
+
+def _same(logged: RecordArray, replayed: RecordArray, tolerance: float) -> BoolArray:
+    same = np.ones(len(logged), np.bool_)
+    for name in replayed.dtype.names or ():
+        same &= _equal(logged, replayed, name, tolerance)
+    return same
+
+
+def _equal(logged: RecordArray, replayed: RecordArray, name: str, tolerance: float) -> BoolArray:
+    """Equal bit for bit in this field, or, where there is a tolerance, numbers that are so near to each other [n].
+
+    Sigma at standstill is then not compared: its scale is that of a quadrant by the sign of a speed that is all rounding.
+    """
+    one, two = logged[name], replayed[name]
+    same = bits_equal(one, two)
+    if tolerance and one.dtype.kind == "f":
+        with np.errstate(invalid="ignore"):
+            same |= np.abs(one - two) <= tolerance
+        if name == "sigma_nm":
+            same |= (logged["status"] == STANDSTILL) & (replayed["status"] == STANDSTILL)
+    return same
+
+
+def _segments(count: int, steps: Steps) -> list[tuple[int, int, str]]:
+    """(first row, row after the last, reason or "") between the places where a joint's state is known or lost."""
+    places = {int(row): "" for row in steps.begins} | dict(steps.breaks)
+    if 0 not in places:
+        places[0] = ""
+    rows = sorted(places)
+    return [(row, end, places[row]) for row, end in zip(rows, [*rows[1:], count], strict=True)]
+
+
+def _settled(same: BoolArray, used: BoolArray, first: int, end: int) -> int:
+    """Row after the last difference before SETTLED_CYCLES identical cycles with inputs in a row; `end`: never."""
+    wrong = np.flatnonzero(~same[first:end]) + first
+    if not len(wrong):
+        return first
+    counts = np.concatenate(([0], np.cumsum(used)))
+    after = np.append(wrong[1:], end)
+    long_enough = np.flatnonzero(counts[after] - counts[wrong + 1] >= SETTLED_CYCLES)
+    if len(long_enough):
+        return int(wrong[long_enough[0]]) + 1
+    return int(wrong[-1]) + 1 if counts[end] > counts[wrong[-1] + 1] else end
+
+
+def _difference(
+    number: int, logged: RecordArray, replayed: RecordArray, wrong: npt.NDArray[np.intp], tolerance: float
+) -> Difference:
+    row = int(wrong[0])
+    names = [name for name in _FIELDS if name in (replayed.dtype.names or ())]
+    names += [name for name in replayed.dtype.names or () if name not in names]
+    field = next(
+        name
+        for name in names
+        if not _equal(logged[row : row + 1], replayed[row : row + 1], name, tolerance)[0]
+    )
+    with np.errstate(invalid="ignore"):
+        apart = np.abs(logged["torque_nm"][wrong] - replayed["torque_nm"][wrong])
+    largest = float(np.nanmax(apart)) if np.isfinite(apart).any() else 0.0
+    return Difference(
+        number + 1,
+        int(logged["cycle"][row]),
+        len(wrong),
+        field,
+        float(logged[field][row]),
+        float(replayed[field][row]),
+        largest,
+    )
+
+
+def _first_of_each(differences: Sequence[Difference]) -> list[Difference]:
+    """One entry per joint: its first difference, with all of its cycles counted."""
+    result = []
+    for number in sorted({each.joint for each in differences}):
+        those = sorted((each for each in differences if each.joint == number), key=lambda each: each.cycle)
+        first = those[0]
+        result.append(
+            Difference(
+                **{
+                    **asdict(first),
+                    "cycles": sum(each.cycles for each in those),
+                    "largest_nm": max(each.largest_nm for each in those),
+                }
+            )
+        )
+    return result

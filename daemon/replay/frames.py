@@ -2,7 +2,7 @@
 the estimate PDO that went out. Pure, in arrays.
 
 The frames of a record are in order of arrival, late ones of the cycle before first. Of an input that counted, the last frame
-with its identifier and length is therefore the one that was used (see `daemon.loop.intake`); whether it counted is what the
+with its identifier and length is therefore the one that was used (see `loop.intake`); whether it counted is what the
 log's `input_flags` say. Where a record had no room for all frames, the integers come from the SI values beside it.
 """
 
@@ -14,15 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from daemon.loop.input_pdos import input_pdos, joint_temperatures
-from daemon.loop.intake import InputPdo
-from daemon.loop.joint_cycle import FLAG_MOTION, FLAG_POSITION, FLAG_SENSOR, JointInputs
-from daemon.replay.origin import Origin
-
-Records = npt.NDArray[np.void]
-Floats = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
+from jtqd.daemon.loop.input_pdos import InputPdo, input_pdos, joint_temperatures
+from jtqd.daemon.loop.joint import FLAG_MOTION, FLAG_POSITION, FLAG_SENSOR, JointInputs
+from jtqd.daemon.replay.origin import Origin
+from jtqd.estimator.arrays import BoolArray, FloatArray, IntegerArray, RecordArray
 
 _ESTIMATE_LENGTH = 8
 _HALF, _FULL = 1 << 31, 1 << 32
@@ -32,8 +27,8 @@ _HALF, _FULL = 1 << 31, 1 << 32
 class Pdo:
     """One input PDO over n cycles: integers by the order of its mapping, and whether it counted."""
 
-    values: tuple[Integers, ...]
-    fresh: Flags
+    values: tuple[IntegerArray, ...]
+    fresh: BoolArray
 
 
 @dataclass(frozen=True)
@@ -50,21 +45,21 @@ class Frames:
     pdos: tuple[Pdo, ...]
     temperatures: tuple[tuple[tuple[int, bytes], ...], ...]
     estimate: npt.NDArray[np.uint8]
-    told: Flags
+    told: BoolArray
     from_si: int
 
 
 class _Table:
     """All frames of the records [n, capacity], those that are not there masked."""
 
-    def __init__(self, records: Records) -> None:
+    def __init__(self, records: RecordArray) -> None:
         frames = records["frames"]
         self.count, self.capacity = frames.shape
         there = np.arange(self.capacity) < records["frame_count"][:, None]
         self.ids = np.where(there, frames["id"], np.uint32(0xFFFF_FFFF))
         self.lengths, self.data = frames["length"], frames["data"]
 
-    def last(self, cob_id: int, length: int) -> tuple[Flags, npt.NDArray[np.uint8]]:
+    def last(self, cob_id: int, length: int) -> tuple[BoolArray, npt.NDArray[np.uint8]]:
         """Whether a cycle has the frame [n], and the data of its last one [n, 8]."""
         match = (self.ids == cob_id) & (self.lengths == length)
         place = self.capacity - 1 - np.argmax(match[:, ::-1], axis=1)
@@ -81,7 +76,7 @@ class _Table:
         )
 
 
-def decode(origin: Origin, records: Records, joints: Sequence[Records]) -> Frames:
+def decode(origin: Origin, records: RecordArray, joints: Sequence[RecordArray]) -> Frames:
     """What the raw frames `records` (/can/frames) say, beside the joints' states of the same cycles."""
     table = _Table(records)
     left_out = records["frames_left_out"] > 0
@@ -106,9 +101,9 @@ def decode(origin: Origin, records: Records, joints: Sequence[Records]) -> Frame
     )
 
 
-def _fresh(index: int, inputs: Sequence[JointInputs], joints: Sequence[Records]) -> Flags:
+def _fresh(index: int, inputs: Sequence[JointInputs], joints: Sequence[RecordArray]) -> BoolArray:
     """Whether PDO `index` counted, by the flags of the joints that use it [n]."""
-    fresh: Flags = np.zeros(len(joints[0]), np.bool_)
+    fresh: BoolArray = np.zeros(len(joints[0]), np.bool_)
     for each, records in zip(inputs, joints, strict=True):
         for place, flag in (
             (each.position, FLAG_POSITION),
@@ -120,7 +115,7 @@ def _fresh(index: int, inputs: Sequence[JointInputs], joints: Sequence[Records])
     return fresh
 
 
-def _unpack(pdo: InputPdo, data: npt.NDArray[np.uint8]) -> list[Integers]:
+def _unpack(pdo: InputPdo, data: npt.NDArray[np.uint8]) -> list[IntegerArray]:
     """Mapped integers of frames [n, 8], one array per object."""
     letters = pdo.layout.format.lstrip("<")
     layout = np.dtype([(f"f{n}", f"<{letter}") for n, letter in enumerate(letters)])
@@ -128,8 +123,8 @@ def _unpack(pdo: InputPdo, data: npt.NDArray[np.uint8]) -> list[Integers]:
     return [rows[name].astype(np.int64) for name in layout.names or ()]
 
 
-def _counts(index: int, inputs: Sequence[JointInputs], joints: Sequence[Records]) -> list[Integers]:
-    """Integers of PDO `index` by the SI values that the log has beside the frames."""
+def _counts(index: int, inputs: Sequence[JointInputs], joints: Sequence[RecordArray]) -> list[IntegerArray]:
+    """IntegerArray of PDO `index` by the SI values that the log has beside the frames."""
     for each, records in zip(inputs, joints, strict=True):
         if index == each.position:
             motor = _whole(records["motor_position_rad"], each.motor_rad_per_count)
@@ -145,19 +140,19 @@ def _counts(index: int, inputs: Sequence[JointInputs], joints: Sequence[Records]
     raise AssertionError("every PDO has a joint")
 
 
-def _whole(values: Floats, unit: float) -> Integers:
+def _whole(values: FloatArray, unit: float) -> IntegerArray:
     """Counts of SI values; 0 for those that are not known."""
     with np.errstate(all="ignore"):
         counts = np.rint(values / unit)
     return np.where(np.isfinite(counts), counts, 0.0).astype(np.int64)
 
 
-def _rolled(counts: Integers) -> Integers:
+def _rolled(counts: IntegerArray) -> IntegerArray:
     """As a 32-bit position that has rolled over."""
     return (counts + _HALF) % _FULL - _HALF
 
 
-def offsets(pdo: Pdo, records: Records, each: JointInputs, row: int) -> tuple[int, int]:
+def offsets(pdo: Pdo, records: RecordArray, each: JointInputs, row: int) -> tuple[int, int]:
     """Whole ranges [counts] that motor and link position had rolled over by `row`: the log says where they were."""
     found = []
     for column, name, unit in (

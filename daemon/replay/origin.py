@@ -13,14 +13,63 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import yaml
 
-from daemon.config import Config, load_config
-from daemon.logs.errors import LogError
-from daemon.loop.joint_cycle import JointInputs
-from daemon.loop.process import joint_inputs
-from estimator.checked import ConfigError
-from models.files import load_yaml
+from jtqd.daemon.config import Config, load_config
+from jtqd.daemon.logs.errors import LogError
+from jtqd.daemon.loop.joint import JointInputs
+from jtqd.daemon.loop.process import joint_inputs
+from jtqd.daemon.shared import cycle_record as cr
+from jtqd.estimator.checked import ConfigError
+from jtqd.models.files import load_yaml
+
+# What a replay needs of a log's messages: names and types. A log of another version may have others.
+
+
+SAMPLE = np.dtype(
+    [
+        (name, "<f8" if code == "d" else "<u2")
+        for name, code in zip(cr.JointRecord._fields, 12 * "d" + 4 * "H", strict=True)
+    ]
+)
+"""What the loop records of a joint: the fields of `cycle_record.JointRecord`."""
+
+STAMP = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])
+JOINT: dict[str, np.dtype[Any]] = {
+    "header.stamp": STAMP,
+    "cycle": np.dtype("<u8"),
+    "sync_monotonic_ns": np.dtype("<i8"),
+    "sync_counter": np.dtype("u1"),
+    "cycle_flags": np.dtype("u1"),
+    **{name: SAMPLE[name] for name in SAMPLE.names or ()},
+}
+"""Of /joint/N/state: path -> type."""
+FRAMES: dict[str, np.dtype[Any]] = {
+    "cycle": np.dtype("<u8"),
+    "frame_count": np.dtype("u1"),
+    "frames_left_out": np.dtype("u1"),
+    "frames.id": np.dtype("<u4"),
+    "frames.length": np.dtype("u1"),
+    "frames.data": np.dtype(("u1", 8)),
+}
+"""Of /can/frames: path -> type of each element."""
+
+
+def check_fields(
+    records: npt.NDArray[np.void], needed: Mapping[str, np.dtype[Any]], path: Path, topic: str
+) -> None:
+    """Raises LogError where a field is missing or is of another type."""
+    for name, expected in needed.items():
+        found: np.dtype[Any] = records.dtype
+        for step in name.split("."):
+            if step not in (found.base.names or ()):
+                raise LogError(f"{path}: {topic}: found no field {name}, expected one as this jtqd writes it")
+            found = found.base[step]
+        if found != expected:
+            raise LogError(f"{path}: {topic}: found {name} of type {found}, expected {expected}")
+
 
 CONFIGURATION, PROVENANCE = "configuration.yaml", "provenance.json"
 
@@ -31,7 +80,7 @@ class Origin:
 
     Attributes:
         config: as it was in force; its paths lead into the private directory.
-        inputs: indices of each joint's PDOs among `daemon.loop.input_pdos.input_pdos`, and the devices' scaling.
+        inputs: indices of each joint's PDOs among `jtqd.daemon.loop.input_pdos.input_pdos`, and the devices' scaling.
         hashes: of the configuration, then joint file and network of each joint.
         versions: of the programs that made the log, e.g. {"numpy": "2.4.6"}.
         machine: kind of processor, e.g. "x86_64"; empty where the log does not say.

@@ -16,14 +16,106 @@ import numpy as np
 import numpy.typing as npt
 from numpy.lib.recfunctions import repack_fields
 
-from daemon.logs.errors import LogError
-from daemon.logs.log_file import LogFile
-from daemon.logs.reader import iter_messages, iter_topics, read_attachments, read_topic, read_topics
-from daemon.replay.breaks import Steps, steps_of
-from daemon.replay.fields import FRAMES, JOINT, check_fields
-from daemon.replay.origin import Origin, open_origin
+from jtqd.daemon.config import Config
+from jtqd.daemon.logs.errors import LogError
+from jtqd.daemon.logs.log_file import LogFile
+from jtqd.daemon.logs.reader import iter_messages, iter_topics, read_attachments, read_topic, read_topics
+from jtqd.daemon.loop.joint import FLAG_MOTION, FLAG_POSITION
+from jtqd.daemon.replay.origin import FRAMES, JOINT, Origin, check_fields, open_origin
+from jtqd.estimator.arrays import RecordArray
 
-Records = npt.NDArray[np.void]
+# Where the state of an estimator is known and where it is not: a log may begin in the middle, or have lost cycles. Pure.
+#
+# The time step that a joint used is the time since its last inputs. A step of 0 says that it began anew: from there on
+# everything about it is known. A step that is not the time since the last inputs *in the log* says that inputs are
+# missing from the log.
+
+
+_BOTH = FLAG_POSITION | FLAG_MOTION
+BEGINS, LOST = "the log begins in the middle of the run", "cycles are missing from the log"
+CUT = "a long run is replayed in stretches"
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Time steps of one joint over n cycles.
+
+    Attributes:
+        used: cycles with both inputs [n].
+        dt_ns: time since the last inputs, by the log [n]; 0: began anew or not used.
+        begins: rows where it began anew.
+        breaks: rows before which inputs are missing, with the reason.
+    """
+
+    used: npt.NDArray[np.bool_]
+    dt_ns: npt.NDArray[np.int64]
+    begins: npt.NDArray[np.intp]
+    breaks: tuple[tuple[int, str], ...]
+
+    def part(self, first: int, end: int) -> Steps:
+        """The same of rows `first` to `end` only, counted from `first`."""
+        begins = self.begins[(self.begins >= first) & (self.begins < end)] - first
+        breaks = tuple((row - first, why) for row, why in self.breaks if first <= row < end)
+        return Steps(self.used[first:end], self.dt_ns[first:end], begins, breaks)
+
+
+def cut_before(steps: Steps) -> Steps:
+    """The same where the state at the first row is not quite known."""
+    return replace(steps, breaks=((0, CUT), *(each for each in steps.breaks if each[0])))
+
+
+def steps_of(records: RecordArray, config: Config) -> Steps:
+    """Time steps of one joint's states (/joint/N/state), in the order of the cycles."""
+    used = (records["input_flags"] & _BOTH) == _BOTH
+    rows = np.flatnonzero(used)
+    dt_ns = np.zeros(len(records), np.int64)
+    told = np.rint(records["dt_s"][rows] * 1e9)
+    dt_ns[rows] = np.where(np.isfinite(told), told, 0.0).astype(np.int64)
+    begins = rows[dt_ns[rows] == 0]
+    if not len(rows):
+        return Steps(used, dt_ns, begins, ())
+    breaks: list[tuple[int, str]] = []
+    if dt_ns[rows[0]] != 0:
+        breaks.append((int(rows[0]), BEGINS))
+        dt_ns[rows[0]] = 0
+    # The call that sends a SYNC may be late, the other clock may be stepped: the step was measured by one of them.
+    between = np.diff(records["sync_monotonic_ns"][rows])
+    stamps = np.diff(_stamps(records)[rows])
+    here = dt_ns[rows[1:]]
+    apart = np.minimum(np.abs(between - here), np.abs(stamps - here)) > config.period_ns // 2
+    holes = np.diff(np.cumsum(_holes(records, config.counter_overflow))[rows]) > 0
+    for at in np.flatnonzero((here != 0) & apart & holes).tolist():
+        row = int(rows[at + 1])
+        breaks.append((row, LOST))
+        dt_ns[row] = max(int(between[at]), 0)
+    return Steps(used, dt_ns, begins, tuple(breaks))
+
+
+def _stamps(records: RecordArray) -> npt.NDArray[np.int64]:
+    """Send time of each SYNC [ns], CLOCK_REALTIME [n]."""
+    stamp = records["header"]["stamp"]
+    seconds: npt.NDArray[np.int64] = stamp["sec"].astype(np.int64)
+    return seconds * 1_000_000_000 + stamp["nanosec"].astype(np.int64)
+
+
+def _holes(records: RecordArray, overflow: int) -> npt.NDArray[np.int64]:
+    """Cycles that are missing before each row [n], as many at least: whole rounds of the SYNC counter do not show.
+
+    Slots without SYNC do not count; but a pause of a whole round and more may be a hole, and counts as one cycle.
+    """
+    counter: npt.NDArray[np.int64] = records["sync_counter"].astype(np.int64)
+    cycle: npt.NDArray[np.int64] = records["cycle"].astype(np.int64)
+    found = np.zeros(len(records), np.int64)
+    slots = cycle[1:] - cycle[:-1]
+    lost = np.remainder(counter[1:] - counter[:-1] - 1, overflow)
+    found[1:] = np.where(slots > overflow, np.maximum(lost, 1), np.minimum(lost, slots - 1))
+    return found
+
+
+def lost_cycles(records: RecordArray, overflow: int) -> int:
+    """Cycles that are missing between those in the log, by the SYNC counter (1..overflow)."""
+    return int(_holes(records, overflow).sum())
+
 
 JOINT_TOPICS = ("/joint/1/state", "/joint/2/state")
 FRAMES_TOPIC = "/can/frames"
@@ -42,10 +134,10 @@ class Part:
 
     path: Path
     origin: Origin
-    joints: tuple[Records, Records]
+    joints: tuple[RecordArray, RecordArray]
     piece: bool = False
 
-    def frames(self) -> Records:
+    def frames(self) -> RecordArray:
         """Messages of /can/frames of the same cycles. Raises LogError, OSError."""
         cycles = self.joints[0]["cycle"]
         if self.piece:
@@ -75,12 +167,14 @@ class Run:
     """
 
     parts: tuple[Part, ...]
-    joints: tuple[Records, Records]
+    joints: tuple[RecordArray, RecordArray]
     number: int = 0
-    before: tuple[Records, Records] | None = None
+    before: tuple[RecordArray, RecordArray] | None = None
 
     @classmethod
-    def of(cls, parts: Sequence[Part], number: int = 0, before: tuple[Records, Records] | None = None) -> Run:
+    def of(
+        cls, parts: Sequence[Part], number: int = 0, before: tuple[RecordArray, RecordArray] | None = None
+    ) -> Run:
         """Run, or stretch, of parts that follow one another."""
         one, two = (_joined([part.joints[n] for part in parts]) for n in (0, 1))
         ends = np.cumsum([len(part.joints[0]) for part in parts]).tolist()
@@ -98,7 +192,7 @@ class Run:
         """Number of cycles in the logs."""
         return len(self.joints[0])
 
-    def widened(self) -> tuple[tuple[Records, Records], tuple[Steps, Steps], int]:
+    def widened(self) -> tuple[tuple[RecordArray, RecordArray], tuple[Steps, Steps], int]:
         """States with those kept of the stretch before in front of them, their time steps, and how many those are."""
         kept = self.before or (self.joints[0][:0], self.joints[1][:0])
         one, two = (
@@ -116,7 +210,7 @@ class Run:
         return one.part(kept, len(records)), two.part(kept, len(records))
 
 
-def _joined(every: Sequence[Records]) -> Records:
+def _joined(every: Sequence[RecordArray]) -> RecordArray:
     return every[0] if len(every) == 1 else np.concatenate(every)
 
 
@@ -132,7 +226,7 @@ def read_pieces(path: Path, directory: Path, limit: int = STRETCH_CYCLES) -> Ite
         yield read_part(path, directory)
         return
     origin = open_origin(path, read_attachments(path), directory)
-    kept: dict[str, list[Records]] = {topic: [] for topic in JOINT_TOPICS}
+    kept: dict[str, list[RecordArray]] = {topic: [] for topic in JOINT_TOPICS}
     count, made = 0, False
     for found in iter_topics(path, JOINT_TOPICS):
         for topic, messages in found.items():
@@ -152,7 +246,7 @@ def _most_cycles(path: Path) -> int:
         return max(counts) if log.counts and counts else path.stat().st_size // _LEAST_BYTES
 
 
-def _piece(path: Path, origin: Origin, kept: dict[str, list[Records]]) -> Part:
+def _piece(path: Path, origin: Origin, kept: dict[str, list[RecordArray]]) -> Part:
     """A part of what was kept; what one joint has of a cycle in the next chunk, which the other's is in, stays."""
     joined = {}
     for topic, chunks in kept.items():
@@ -168,7 +262,7 @@ def _piece(path: Path, origin: Origin, kept: dict[str, list[Records]]) -> Part:
     return replace(_part(path, origin, joined), piece=True)
 
 
-def _frames_between(path: Path, first: int, last: int) -> Records:
+def _frames_between(path: Path, first: int, last: int) -> RecordArray:
     """Messages of /can/frames of these cycles."""
     found = []
     for messages in iter_messages(path, FRAMES_TOPIC):
@@ -182,7 +276,7 @@ def _frames_between(path: Path, first: int, last: int) -> Records:
     return _joined(found)
 
 
-def _part(path: Path, origin: Origin, found: dict[str, Records]) -> Part:
+def _part(path: Path, origin: Origin, found: dict[str, RecordArray]) -> Part:
     one, two = (found[topic] for topic in JOINT_TOPICS)
     for topic, records in zip(JOINT_TOPICS, (one, two), strict=True):
         check_fields(records, JOINT, path, topic)
@@ -214,7 +308,7 @@ class _Open:
 
     number: int
     parts: list[Part]
-    before: tuple[Records, Records] | None = field(default=None)
+    before: tuple[RecordArray, RecordArray] | None = field(default=None)
 
     def close(self, *following: Part) -> Run:
         """The stretch so far; the next one begins with `following`."""
@@ -271,7 +365,7 @@ def _behind(before: Part, part: Part) -> Part:
     return replace(part, joints=(part.joints[0][new], part.joints[1][new]))
 
 
-def _packed(records: Records) -> bytes:
+def _packed(records: RecordArray) -> bytes:
     """Bits of all fields; what lies between them is not copied along by numpy and says nothing."""
-    packed: Records = repack_fields(records, recurse=True)
+    packed: RecordArray = repack_fields(records, recurse=True)
     return packed.tobytes()

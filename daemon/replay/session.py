@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,20 +15,143 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from daemon.logs.errors import LogError
-from daemon.logs.reader import log_parts
-from daemon.replay.breaks import Steps, cut_before, lost_cycles
-from daemon.replay.compare import Comparison, compare
-from daemon.replay.difference import Identity, identity
-from daemon.replay.exact import ExactReplay
-from daemon.replay.frames import decode
-from daemon.replay.models import Models, logged_models, other_models
-from daemon.replay.runs import STRETCH_CYCLES, Part, Run, in_order, read_pieces, stretches
-from daemon.replay.whole import WHOLE, replay_whole
-from estimator.checked import ConfigError
-from estimator.onnx_graph import NetworkError
+from jtqd.daemon.config import Config
+from jtqd.daemon.logs.errors import LogError
+from jtqd.daemon.logs.reader import log_parts
+from jtqd.daemon.loop.joint_status import JointSafety
+from jtqd.daemon.replay.compare import Comparison, Identity, compare, identity
+from jtqd.daemon.replay.estimates import ExactReplay, Model, replay_whole
+from jtqd.daemon.replay.frames import decode
+from jtqd.daemon.replay.origin import Origin
+from jtqd.daemon.replay.runs import (
+    STRETCH_CYCLES,
+    Part,
+    Run,
+    Steps,
+    cut_before,
+    in_order,
+    lost_cycles,
+    read_pieces,
+    stretches,
+)
+from jtqd.estimator.arrays import RecordArray
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.methods import AnyEstimator, AnyNetwork, load_network, make_estimator
+from jtqd.estimator.onnx_graph import NetworkError
+from jtqd.models.files import load_joint
 
-Records = npt.NDArray[np.void]
+# What a log is replayed with: the files it carries, or others from a directory.
+
+
+AS_LOGGED = "as logged"
+_WITH_NETWORK = ("network", "fused")
+_ANY_JOINT = "extended.joint.yaml"
+
+
+@dataclass(frozen=True)
+class Models:
+    """Models of joint 1 and 2, and the files they come from, with hashes; "as logged" for those of the log."""
+
+    joints: tuple[Model, Model]
+    files: tuple[str, ...]
+
+    def safety(self, config: Config) -> list[JointSafety]:
+        """Limits of both joints by the log's configuration and these joint files."""
+        return [
+            JointSafety(config.safety, each.settings, each.joint, config.period_ns) for each in self.joints
+        ]
+
+    def estimators(self) -> list[AnyEstimator]:
+        """New estimators, warmed up by nobody. Raises ConfigError."""
+        return [make_estimator(each.joint, each.settings, each.network) for each in self.joints]
+
+
+def logged_models(origin: Origin) -> Models:
+    """What the log was recorded with. Raises ConfigError, NetworkError."""
+    settings = origin.config.estimator
+    made = []
+    for each in origin.config.joints:
+        network = None
+        if each.network is not None:
+            network = load_network(settings.method, str(each.network.path), each.network.sha256)
+        made.append(Model(each.joint, settings, network))
+        make_estimator(each.joint, settings, network)  # refused here, and not when the arrays are half done
+    return Models((made[0], made[1]), (AS_LOGGED, AS_LOGGED))
+
+
+def other_models(origin: Origin, directory: Path | None, method: str | None) -> Models:
+    """The log's models with what `directory` has in their place, and another method. Raises ConfigError, NetworkError.
+
+    Joint files are `jointN.yaml` or `extended.jointN.yaml`, or `extended.joint.yaml` for the joint of that name;
+    networks `jointN.fused.onnx` for method fused, `jointN.onnx` for network. What is not there stays as logged.
+    """
+    settings = origin.config.estimator
+    if method is not None:
+        settings = replace(settings, method=method)
+    taken = 0
+    made, files = [], []
+    for number, each in enumerate(origin.config.joints, start=1):
+        joint, network, said = each.joint, None, []
+        path = None if directory is None else _joint_file(directory, number, each.joint)
+        if path is not None:
+            joint = load_joint(path)
+            said.append(_named(path))
+        network_path = None if directory is None else _network_file(directory, number, settings.method)
+        if network_path is not None:
+            network = load_network(settings.method, str(network_path))
+            said.append(_named(network_path))
+        elif settings.method in _WITH_NETWORK:
+            network = _logged_network(origin, number, settings.method)
+        taken += len(said)
+        make_estimator(joint, settings, network)  # refused here, and not when the arrays are half done
+        made.append(Model(joint, settings, network))
+        files.append(", ".join(said) or AS_LOGGED)
+    if directory is not None and not taken:
+        names = ", ".join([*_joint_names(1), *_joint_names(2), _ANY_JOINT])
+        raise ConfigError(
+            f"{directory}: found no file for these joints, expected one of {names} or a network"
+        )
+    return Models((made[0], made[1]), tuple(files))
+
+
+def _named(path: Path) -> str:
+    return f"{path} ({hashlib.sha256(path.read_bytes()).hexdigest()[:12]})"
+
+
+def _joint_names(number: int) -> tuple[str, ...]:
+    return f"joint{number}.yaml", f"extended.joint{number}.yaml"
+
+
+def _joint_file(directory: Path, number: int, logged: Joint) -> Path | None:
+    """File of joint `number` in the directory, None without. Raises ConfigError for two of them."""
+    if not directory.is_dir():
+        raise ConfigError(f"{directory}: not a directory, expected one with joint files and networks")
+    found = [directory / name for name in _joint_names(number) if (directory / name).is_file()]
+    if len(found) > 1:
+        raise ConfigError(f"{directory}: found {found[0].name} and {found[1].name}, expected one of them")
+    if found:
+        return found[0]
+    path = directory / _ANY_JOINT
+    if path.is_file() and load_joint(path).name == logged.name:
+        return path
+    return None
+
+
+def _network_file(directory: Path, number: int, method: str) -> Path | None:
+    if method not in _WITH_NETWORK:
+        return None
+    path = directory / (f"joint{number}.fused.onnx" if method == "fused" else f"joint{number}.onnx")
+    return path if path.is_file() else None
+
+
+def _logged_network(origin: Origin, number: int, method: str) -> AnyNetwork | None:
+    """The log's network where the method is still the same; another method cannot read it."""
+    file = origin.config.joints[number - 1].network
+    if file is None or method != origin.config.estimator.method:
+        return None
+    return load_network(method, str(file.path), file.sha256)
+
 
 SHORT_CYCLES = 120_000
 """Up to so many cycles a replay with the logged models is exact without being asked: some seconds."""
@@ -87,7 +211,7 @@ class Result:
     temperatures_from_log: int
     identity: Identity | None
     comparisons: tuple[Comparison, Comparison]
-    joints: tuple[Records, Records]
+    joints: tuple[RecordArray, RecordArray]
 
     @property
     def good(self) -> bool:
@@ -242,7 +366,7 @@ def _tell(progress: Progress, before: int, total: int, row: int) -> None:
 class _Exact:
     """Results of all parts, one after the other."""
 
-    joints: tuple[Records, Records]
+    joints: tuple[RecordArray, RecordArray]
     sent: npt.NDArray[np.uint8]
     made: npt.NDArray[np.uint8]
     told: npt.NDArray[np.bool_]
@@ -292,6 +416,3 @@ def _exact(run: Run, replayer: ExactReplay, steps: Sequence[Steps], progress: Pr
         from_si,
         temperatures,
     )
-
-
-__all__ = ["SHORT_CYCLES", "WHOLE", "Progress", "Result", "Wishes", "replay", "replay_each"]

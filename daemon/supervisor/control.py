@@ -20,7 +20,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from drivers.socket_path import reachable
+from jtqd.drivers.frame_socket import reachable
 
 FILE = "control"
 """Name of the socket in the runtime directory."""

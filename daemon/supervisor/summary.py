@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Any
 
-from daemon.shared.snapshot import SnapshotReader
-from daemon.supervisor.deviation_watch import FAR, LASTING_S
+from jtqd.daemon.shared.snapshot import SnapshotReader
+from jtqd.daemon.supervisor.health import FAR, LASTING_S
 
 _REFUSED = ("overruns", "latches", "latch_resets")
 """Counters beside those of the faults (docs/safety.md)."""
@@ -30,9 +30,9 @@ class Summary:
     inputs: dict[str, dict[str, int]]
     """Late, lost, duplicate and rejected frames of each PDO by its name."""
     deviations: tuple[int, int]
-    """How often each joint's estimate stayed far from the sensor (`daemon/supervisor/deviation_watch.py`)."""
+    """How often each joint's estimate stayed far from the sensor (`daemon/supervisor/health.py`)."""
     stolen_s: float = 0.0
-    """What a hypervisor took from the processors meanwhile (`daemon/shared/stolen_time.py`)."""
+    """What a hypervisor took from the processors meanwhile (`daemon/loop/realtime.py`)."""
 
     @property
     def exit_status(self) -> int:

@@ -1,4 +1,4 @@
-"""Writes drive.eds, torque_sensor.eds and jtqd.eds beside this file: `python -m drivers.eds.generate`.
+"""Writes drive.eds, torque_sensor.eds and jtqd.eds beside this file: `python -m jtqd.drivers.eds.generate`.
 
 The files are what ships and what a configuration tool reads; these tables are how they are kept right, and a
 test compares the two. The vendor number is an emulation's, not one that CiA has assigned: a real drive or
@@ -8,27 +8,295 @@ sensor brings its own EDS.
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.eds import communication as comm
-from drivers.eds.own_objects import BUS_FIELDS, COUNTERS, JOINT_PARAMETERS, NODES, VERSION
-from drivers.eds.schema import (
-    ARRAY,
-    I8,
-    I16,
-    I32,
-    REAL32,
-    TEXT,
-    U8,
-    U16,
-    U32,
-    Entries,
-    Sheet,
-    Var,
-    array,
-    record,
-    render,
-)
+from jtqd.drivers.eds.own_objects import BUS_FIELDS, COUNTERS, JOINT_PARAMETERS, NODES, VERSION
+
+# Writes an electronic data sheet by CiA 306 from a table of objects (the tables: `jtqd.drivers.eds.generate`).
+
+
+I8, I16, I32, U8, U16, U32, REAL32, TEXT = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x09
+VAR, ARRAY, RECORD = 7, 8, 9
+BIT_RATES = (10, 20, 50, 125, 250, 500, 800, 1000)
+MANDATORY = (0x1000, 0x1001, 0x1018)
+
+
+@dataclass(frozen=True)
+class Var:
+    """One variable: a whole object or a sub-index. `default` is a number or text such as "$NODEID+0x80"."""
+
+    name: str
+    data_type: int
+    access: str
+    default: int | float | str | None = None
+    pdo: bool = False
+    low: int | None = None
+    high: int | None = None
+    comment: str = ""
+
+
+@dataclass(frozen=True)
+class Entries:
+    """An array or a record. Sub-index 0 says the highest sub-index present, unless `sub0` is given."""
+
+    name: str
+    object_type: int
+    members: dict[int, Var]
+    sub0: Var | None = None
+
+    @property
+    def first(self) -> Var:
+        """Sub-index 0."""
+        return self.sub0 or Var("Highest sub-index supported", U8, "const", max(self.members))
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """One EDS file."""
+
+    file_name: str
+    description: str
+    product_name: str
+    product_number: int
+    revision_number: int
+    order_code: str
+    objects: dict[int, Var | Entries]
+    comments: Sequence[str] = ()
+    vendor_name: str = "jtqd emulation"
+    vendor_number: int = 0x07A1
+
+
+def array(
+    name: str,
+    data_type: int,
+    access: str,
+    members: Sequence[tuple[str, int | float | str | None]],
+    pdo: bool = False,
+) -> Entries:
+    """An array of one type; `members` are (name, default) of sub-index 1 onwards."""
+    return Entries(name, ARRAY, {i: Var(n, data_type, access, d, pdo) for i, (n, d) in enumerate(members, 1)})
+
+
+def record(name: str, *members: Var) -> Entries:
+    """A record whose sub-indices run without a gap."""
+    return Entries(name, RECORD, dict(enumerate(members, 1)))
+
+
+def render(sheet: Sheet) -> str:
+    """Text of the EDS file."""
+    indices = sorted(sheet.objects)
+    mandatory = [i for i in indices if i in MANDATORY]
+    manufacturer = [i for i in indices if 0x2000 <= i <= 0x5FFF]
+    optional = [i for i in indices if i not in mandatory and i not in manufacturer]
+    lines = [*_file_info(sheet), *_device_info(sheet, indices), *_section("DummyUsage", _dummies())]
+    lines += _section(
+        "Comments",
+        [("Lines", len(sheet.comments)), *((f"Line{n}", c) for n, c in enumerate(sheet.comments, 1))],
+    )
+    for title, group in (("Mandatory", mandatory), ("Optional", optional), ("Manufacturer", manufacturer)):
+        numbered = [(str(n), f"0x{i:04X}") for n, i in enumerate(group, 1)]
+        lines += _section(f"{title}Objects", [("SupportedObjects", len(group)), *numbered])
+        for index in group:
+            lines += _object(index, sheet.objects[index])
+    return "\n".join(lines)
+
+
+def _section(title: str, pairs: Sequence[tuple[str, object]]) -> list[str]:
+    return [f"[{title}]", *(f"{key}={value}" for key, value in pairs), ""]
+
+
+def _file_info(sheet: Sheet) -> list[str]:
+    when = [("CreationTime", "09:00AM"), ("CreationDate", "01-05-2026"), ("CreatedBy", sheet.vendor_name)]
+    changed = [
+        ("ModificationTime", "09:00AM"),
+        ("ModificationDate", "01-05-2026"),
+        ("ModifiedBy", sheet.vendor_name),
+    ]
+    head = [("FileName", sheet.file_name), ("FileVersion", 1), ("FileRevision", 0), ("EDSVersion", "4.0")]
+    return _section("FileInfo", [*head, ("Description", sheet.description), *when, *changed])
+
+
+def _device_info(sheet: Sheet, indices: list[int]) -> list[str]:
+    names: list[tuple[str, object]] = [
+        ("VendorName", sheet.vendor_name),
+        ("VendorNumber", f"0x{sheet.vendor_number:08X}"),
+        ("ProductName", sheet.product_name),
+        ("ProductNumber", f"0x{sheet.product_number:08X}"),
+        ("RevisionNumber", f"0x{sheet.revision_number:08X}"),
+        ("OrderCode", sheet.order_code),
+    ]
+    rates: list[tuple[str, object]] = [(f"BaudRate_{rate}", int(rate == 1000)) for rate in BIT_RATES]
+    features: list[tuple[str, object]] = [
+        ("SimpleBootUpMaster", 0),
+        ("SimpleBootUpSlave", 1),
+        ("Granularity", 8),  # PDO mapping in whole bytes
+        ("DynamicChannelsSupported", 0),
+        ("CompactPDO", 0),
+        ("GroupMessaging", 0),
+        ("NrOfRXPDO", sum(0x1400 <= i < 0x1600 for i in indices)),
+        ("NrOfTXPDO", sum(0x1800 <= i < 0x1A00 for i in indices)),
+        ("LSS_Supported", 0),
+    ]
+    return _section("DeviceInfo", [*names, *rates, *features])
+
+
+def _dummies() -> list[tuple[str, object]]:
+    return [(f"Dummy{number:04d}", 0) for number in range(1, 8)]
+
+
+def _object(index: int, described: Var | Entries) -> list[str]:
+    if isinstance(described, Var):
+        return _variable(f"{index:04X}", described)
+    members = {0: described.first, **described.members}
+    head = [
+        ("ParameterName", described.name),
+        ("ObjectType", f"0x{described.object_type:X}"),
+        ("SubNumber", len(members)),
+    ]
+    lines = _section(f"{index:04X}", head)
+    for subindex, member in sorted(members.items()):
+        lines += _variable(f"{index:04X}sub{subindex:X}", member)
+    return lines
+
+
+def _variable(title: str, variable: Var) -> list[str]:
+    pairs: list[tuple[str, object]] = [
+        ("ParameterName", variable.name),
+        ("ObjectType", f"0x{VAR:X}"),
+        ("DataType", f"0x{variable.data_type:04X}"),
+        ("AccessType", variable.access),
+    ]
+    if variable.low is not None:
+        pairs.append(("LowLimit", variable.low))
+    if variable.high is not None:
+        pairs.append(("HighLimit", variable.high))
+    if variable.default is not None:
+        pairs.append(("DefaultValue", _number(variable)))
+    pairs.append(("PDOMapping", int(variable.pdo)))
+    lines = _section(title, pairs)
+    return [f"; {variable.comment}", *lines] if variable.comment else lines
+
+
+def _number(variable: Var) -> str:
+    default = variable.default
+    if isinstance(default, int) and variable.data_type == U32 and default > 0xFFFF:
+        return f"0x{default:08X}"
+    return str(default)
+
+
+# Objects of the communication profile (CiA 301, 1000h..1FFFh) that the data sheets share.
+
+
+NO_RTR = 0x4000_0000  # bit 30 of a TPDO's COB-ID
+SYNC_PRODUCER = 0x4000_0000  # bit 30 of 1005h
+
+
+def device(device_type: int, name: str, hardware: str, software: str) -> dict[int, Var | Entries]:
+    """Device type, error register, names."""
+    return {
+        0x1000: Var("Device type", U32, "ro", device_type),
+        0x1001: Var("Error register", U8, "ro", 0, pdo=True),
+        0x1008: Var("Manufacturer device name", TEXT, "const", name),
+        0x1009: Var("Manufacturer hardware version", TEXT, "const", hardware),
+        0x100A: Var("Manufacturer software version", TEXT, "const", software),
+    }
+
+
+def identity(vendor: int, product: int, revision: int) -> dict[int, Var | Entries]:
+    """1018h; the serial number is each device's own."""
+    members = [
+        ("Vendor-ID", vendor),
+        ("Product code", product),
+        ("Revision number", revision),
+        ("Serial number", 0),
+    ]
+    return {0x1018: record("Identity object", *(Var(name, U32, "ro", value) for name, value in members))}
+
+
+def errors(behaviour_access: str = "rw", behaviour: int = 0, inhibit: int = 0) -> dict[int, Var | Entries]:
+    """Error history, EMCY and error behaviour."""
+    history = {i: Var(f"Standard error field {i}", U32, "ro", 0) for i in range(1, 9)}
+    return {
+        0x1003: Entries(
+            "Pre-defined error field", ARRAY, history, Var("Number of errors", U8, "rw", 0, low=0, high=8)
+        ),
+        0x1014: Var("COB-ID EMCY", U32, "const", "$NODEID+0x80"),
+        0x1015: Var("Inhibit time EMCY", U16, "rw", inhibit, comment="100 us"),
+        0x1029: array("Error behaviour", U8, behaviour_access, [("Communication error", behaviour)]),
+    }
+
+
+def verify_configuration(access: str) -> dict[int, Var | Entries]:
+    """1020h: the master's signature of the configuration; 0 when it was changed since, or never written."""
+    names = ("Configuration date", "Configuration time")
+    return {0x1020: array("Verify configuration", U32, access, [(name, 0) for name in names])}
+
+
+def heartbeat(producer_ms: int = 0, consumed: int = 1) -> dict[int, Var | Entries]:
+    """Heartbeats consumed (the master's first), one produced."""
+    watched = [(f"Consumer heartbeat time {n}", 0) for n in range(1, consumed + 1)]
+    return {
+        0x1016: array("Consumer heartbeat time", U32, "rw", watched),
+        0x1017: Var("Producer heartbeat time", U16, "rw", producer_ms, comment="ms"),
+    }
+
+
+def sync_consumer() -> dict[int, Var | Entries]:
+    """SYNC as its receiver sees it; 1019h says whether a counter byte is expected."""
+    return {
+        0x1005: Var("COB-ID SYNC message", U32, "const", 0x80),
+        0x1019: Var("Synchronous counter overflow value", U8, "rw", 0, low=0, high=240),
+    }
+
+
+def sdo_server() -> dict[int, Var | Entries]:
+    """The default SDO channel."""
+    to_server = Var("COB-ID client to server", U32, "ro", "$NODEID+0x600")
+    to_client = Var("COB-ID server to client", U32, "ro", "$NODEID+0x580")
+    return {0x1200: record("SDO server parameter", to_server, to_client)}
+
+
+def rpdo(number: int, base: int, mapping: Sequence[int]) -> dict[int, Var | Entries]:
+    """RPDO `number` (1..4), valid from power-on, event-driven."""
+    communication = record(
+        "RPDO communication parameter",
+        Var("COB-ID used by RPDO", U32, "rw", f"$NODEID+0x{base:X}"),
+        Var("Transmission type", U8, "rw", 255),
+    )
+    return {0x1400 + number - 1: communication, 0x1600 + number - 1: _mapping("RPDO", mapping, "rw")}
+
+
+def tpdo(
+    number: int,
+    base: int,
+    mapping: Sequence[int],
+    *,
+    transmission: int = 255,
+    fixed: bool = False,
+    event_ms: int = 0,
+) -> dict[int, Var | Entries]:
+    """TPDO `number` (1..4), valid from power-on. Sub-index 4 is reserved and absent."""
+    access = "const" if fixed else "rw"
+    members = {
+        1: Var("COB-ID used by TPDO", U32, access, f"$NODEID+0x{NO_RTR + base:08X}"),
+        2: Var("Transmission type", U8, access, transmission),
+        3: Var("Inhibit time", U16, access, 0, comment="100 us"),
+        5: Var("Event timer", U16, access, event_ms, comment="ms"),
+        6: Var("SYNC start value", U8, access, 0, low=0, high=240),
+    }
+    communication = Entries("TPDO communication parameter", RECORD, members)
+    return {0x1800 + number - 1: communication, 0x1A00 + number - 1: _mapping("TPDO", mapping, access)}
+
+
+def _mapping(kind: str, mapping: Sequence[int], access: str) -> Entries:
+    present = len(mapping) if access == "const" else 8
+    words = [*mapping, *[0] * (present - len(mapping))]
+    entries = {i: Var(f"Mapping entry {i}", U32, access, word) for i, word in enumerate(words, 1)}
+    count = Var("Number of mapped objects", U8, access, len(mapping), low=0, high=8)
+    return Entries(f"{kind} mapping parameter", RECORD, entries, count)
+
 
 VENDOR = 0x07A1
 REVISION = 0x0001_0000  # major 1 (CANopen behaviour), minor 0
@@ -38,18 +306,18 @@ FOLDER = Path(__file__).parent
 def drive() -> Sheet:
     """CiA 402 servo drive with encoders on both sides of the gear."""
     objects: dict[int, Var | Entries] = {
-        **comm.device(0x0002_0192, "emulated joint drive", "1.0", "1.0"),
-        **comm.errors(),
-        **comm.heartbeat(consumed=2),  # the master's, and that of a node which commands beside it
-        **comm.verify_configuration("rw"),
-        **comm.identity(VENDOR, 0x402, REVISION),
-        **comm.sync_consumer(),
-        **comm.sdo_server(),
-        **comm.rpdo(1, 0x200, [0x6040_0010, 0x6071_0010]),
-        **comm.rpdo(2, 0x300, [0x60FF_0020]),
-        **comm.tpdo(1, 0x180, [0x6041_0010]),
-        **comm.tpdo(2, 0x280, [0x6064_0020, 0x606C_0020]),
-        **comm.tpdo(3, 0x380, [0x3001_0010], event_ms=500),
+        **device(0x0002_0192, "emulated joint drive", "1.0", "1.0"),
+        **errors(),
+        **heartbeat(consumed=2),  # the master's, and that of a node which commands beside it
+        **verify_configuration("rw"),
+        **identity(VENDOR, 0x402, REVISION),
+        **sync_consumer(),
+        **sdo_server(),
+        **rpdo(1, 0x200, [0x6040_0010, 0x6071_0010]),
+        **rpdo(2, 0x300, [0x60FF_0020]),
+        **tpdo(1, 0x180, [0x6041_0010]),
+        **tpdo(2, 0x280, [0x6064_0020, 0x606C_0020]),
+        **tpdo(3, 0x380, [0x3001_0010], event_ms=500),
         0x3001: Var("Joint temperature", I16, "ro", 0, pdo=True, comment="0.1 degC; 8000h: not measured"),
         0x603F: Var("Error code", U16, "ro", 0, pdo=True),
         0x6040: Var("Controlword", U16, "rww", 0, pdo=True),
@@ -120,14 +388,14 @@ def torque_sensor() -> Sheet:
         )
 
     objects: dict[int, Var | Entries] = {
-        **comm.device(0x0002_0194, "emulated torque sensor", "1.0", "1.0"),
-        **comm.errors(),
-        **comm.heartbeat(),
-        **comm.identity(VENDOR, 0x404, REVISION),
-        **comm.sync_consumer(),
-        **comm.sdo_server(),
-        **comm.tpdo(1, 0x180, [0x7130_0110]),
-        **comm.tpdo(2, 0x280, [0x7130_0210]),
+        **device(0x0002_0194, "emulated torque sensor", "1.0", "1.0"),
+        **errors(),
+        **heartbeat(),
+        **identity(VENDOR, 0x404, REVISION),
+        **sync_consumer(),
+        **sdo_server(),
+        **tpdo(1, 0x180, [0x7130_0110]),
+        **tpdo(2, 0x280, [0x7130_0210]),
         0x6110: channels("AI sensor type", U16, "rw", 0, 0),
         0x6112: channels("AI operating mode", U8, "rw", 1, 1),
         0x6114: channels("AI ADC sample rate", U32, "rw", 1000, 1000),
@@ -162,17 +430,17 @@ def jtqd() -> Sheet:
     joints = [("Joint 1", 0), ("Joint 2", 0)]
     nodes = [(name, 0) for name in ("Joint 1", "Joint 2", "Sensor")]
     objects: dict[int, Var | Entries] = {
-        **comm.device(0, "jtqd", "none", VERSION),
-        **comm.errors(behaviour_access="const", behaviour=1, inhibit=100),
-        0x1005: Var("COB-ID SYNC message", U32, "const", comm.SYNC_PRODUCER + 0x80),
+        **device(0, "jtqd", "none", VERSION),
+        **errors(behaviour_access="const", behaviour=1, inhibit=100),
+        0x1005: Var("COB-ID SYNC message", U32, "const", SYNC_PRODUCER + 0x80),
         0x1006: Var("Communication cycle period", U32, "const", 1000, comment="us"),
         0x1016: array("Consumer heartbeat time", U32, "ro", [(f"Node {n}", 0) for n in range(1, NODES + 1)]),
         0x1017: Var("Producer heartbeat time", U16, "const", 100, comment="ms"),
-        **comm.identity(VENDOR, 0x001, REVISION),
+        **identity(VENDOR, 0x001, REVISION),
         0x1019: Var("Synchronous counter overflow value", U8, "const", 240, low=0, high=240),
-        **comm.verify_configuration("ro"),
-        **comm.sdo_server(),
-        **comm.tpdo(
+        **verify_configuration("ro"),
+        **sdo_server(),
+        **tpdo(
             1,
             0x180,
             [0x2100_0110, 0x2100_0210, 0x2101_0108, 0x2101_0208, 0x2102_0008, 0x2103_0008],
@@ -216,7 +484,7 @@ def main() -> int:
     """Write the three files; takes no argument."""
     if len(sys.argv) > 1:
         print(
-            "usage: python -m drivers.eds.generate   (writes the data sheets beside this file)",
+            "usage: python -m jtqd.drivers.eds.generate   (writes the data sheets beside this file)",
             file=sys.stderr,
         )
         return 0 if sys.argv[1] in ("-h", "--help") else 2

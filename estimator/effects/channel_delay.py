@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
-from estimator.effects.regression import full, linear
+from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.regression import full, linear
 
 if TYPE_CHECKING:
-    from estimator.parameters import Joint
+    from jtqd.estimator.joint import Joint
 
 SENSOR, CURRENT, LINK = 0.0, 1.0, 2.0
 """Codes of `channel`."""
 
 
 class ChannelDelay(Effect):
-    """See the equation; symbols as in `estimator.effects.effect`."""
+    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "channel_delay"
     group = "measurement"

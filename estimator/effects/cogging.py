@@ -6,18 +6,18 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
-from estimator.effects.regression import Wave
+from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.regression import Wave
 
 if TYPE_CHECKING:
-    from estimator.parameters import Joint
+    from jtqd.estimator.joint import Joint
 
 ORDERS = (6.0, 12.0, 18.0, 24.0, 36.0, 42.0, 48.0, 60.0, 72.0, 84.0)
 """Usual lcm(poles, slots) and harmonics of the pole pairs; any other order: `term_of_order`."""
 
 
 class Cogging(Effect):
-    """See the equation; symbols as in `estimator.effects.effect`."""
+    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "cogging"
     group = "actuator"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 if TYPE_CHECKING:
-    from estimator.friction import FloatArray
+    from jtqd.estimator.arrays import FloatArray
 
 
 class Scalar:

@@ -8,13 +8,13 @@ from __future__ import annotations
 import importlib
 import math
 import pkgutil
+import sys
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import Any, Final
 
-import estimator.effects
-from estimator.checked import REQUIRED, ConfigError, Section
-from estimator.effects.effect import Effect, Parameter
+from jtqd.estimator.checked import REQUIRED, ConfigError, Section
+from jtqd.estimator.effects.effect import Effect, Parameter
 
 HOOKS: Final = ("loss_nm", "twist_rad", "load_nm", "current_a", "link_rad", "sensor_nm")
 GROUPS: Final = ("friction", "transmission", "actuator", "measurement", "load")
@@ -56,10 +56,10 @@ def found() -> dict[str, Effect]:
     not exist, and when one of NAMES is missing: mistakes of a programmer, seen at the first import.
     """
     effects: dict[str, Effect] = {}
-    for module in pkgutil.iter_modules(estimator.effects.__path__):
+    for module in pkgutil.iter_modules(sys.modules[__package__].__path__):
         if module.name == "library":
             continue
-        effect = getattr(importlib.import_module(f"estimator.effects.{module.name}"), "EFFECT", None)
+        effect = getattr(importlib.import_module(f"jtqd.estimator.effects.{module.name}"), "EFFECT", None)
         if effect is not None:
             effects[module.name] = _complete(effect, module.name)
     missing = [name for name in NAMES if name not in effects]

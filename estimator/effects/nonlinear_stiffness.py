@@ -6,15 +6,15 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
-from estimator.effects.regression import Linear
+from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.regression import Linear
 
 if TYPE_CHECKING:
-    from estimator.parameters import Joint
+    from jtqd.estimator.joint import Joint
 
 
 class NonlinearStiffness(Effect):
-    """See the equation; symbols as in `estimator.effects.effect`."""
+    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "nonlinear_stiffness"
     group = "transmission"

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from estimator.effects.effect import Term, Values
+from jtqd.estimator.effects.effect import Term, Values
 
 if TYPE_CHECKING:
-    from estimator.parameters import Joint
+    from jtqd.estimator.joint import Joint
 
 FALLBACK_C: Final = 25.0
 """Reference temperature of a joint file that names none."""

@@ -6,15 +6,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
-from estimator.effects.regression import linear
+from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.regression import linear
 
 if TYPE_CHECKING:
-    from estimator.parameters import Joint
+    from jtqd.estimator.joint import Joint
 
 
 class RotorInertia(Effect):
-    """See the equation; symbols as in `estimator.effects.effect`."""
+    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "rotor_inertia"
     group = "actuator"

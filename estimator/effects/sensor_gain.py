@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
 
 if TYPE_CHECKING:
-    from estimator.parameters import Joint
+    from jtqd.estimator.joint import Joint
 
 STEP = 0.01
 """1 - 1/g of the column."""
@@ -31,7 +31,7 @@ class _Gain:
 
 
 class SensorGain(Effect):
-    """See the equation; symbols as in `estimator.effects.effect`."""
+    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "sensor_gain"
     group = "measurement"

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
-from estimator.effects.regression import linear
+from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.regression import linear
 
 if TYPE_CHECKING:
-    from estimator.parameters import Joint
+    from jtqd.estimator.joint import Joint
 
 VELOCITIES_RAD_S = (0.02, 0.035, 0.05, 0.08, 0.12, 0.2)
 """Grid of the search, the joint file's own beside it; the fit refines it."""
@@ -43,7 +43,7 @@ class _Merged:
 
 
 class StribeckFriction(Effect):
-    """See the equation; symbols as in `estimator.effects.effect`."""
+    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "stribeck_friction"
     group = "friction"

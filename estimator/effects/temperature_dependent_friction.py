@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
-from estimator.effects.regression import SPAN_K, above, reference_of
+from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.regression import SPAN_K, above, reference_of
 
 if TYPE_CHECKING:
-    from estimator.parameters import Joint
+    from jtqd.estimator.joint import Joint
 
 RATES_PER_K = (0.003, 0.015, 0.03)
 """Grid of the search: how curved the fall over temperature is; the fit refines it."""
@@ -54,7 +54,7 @@ class _Exponential:
 
 
 class TemperatureDependentFriction(Effect):
-    """See the equation; symbols as in `estimator.effects.effect`."""
+    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "temperature_dependent_friction"
     group = "friction"

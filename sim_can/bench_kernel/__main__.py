@@ -1,25 +1,26 @@
-"""Command line: python -m sim_can.bench_kernel build | path | run."""
+"""Command line: python -m jtqd.sim_can.bench_kernel build | path | run."""
 
 import argparse
 import signal
 import sys
 from typing import NoReturn
 
-from sim_can.bench_kernel import build, guest, packages, vcan
+from jtqd.sim_can.bench_kernel import build, guest, vcan
+from jtqd.sim_can.bench_kernel import build as packages
 
 EXIT_TIMEOUT, EXIT_NO_GUEST = 124, 125  # as timeout(1) and env(1) have them
 
 EXAMPLES = """examples:
-  python -m sim_can.bench_kernel build
-  python -m sim_can.bench_kernel run -- candump -n 1 vcan0
-  python -m sim_can.bench_kernel run --time-travel --out out -- jtqd --bus vcan0 --record out --duration 10
+  python -m jtqd.sim_can.bench_kernel build
+  python -m jtqd.sim_can.bench_kernel run -- candump -n 1 vcan0
+  python -m jtqd.sim_can.bench_kernel run --time-travel --out out -- jtqd --bus vcan0 --record out --duration 10
 """
 
 
 def parser() -> argparse.ArgumentParser:
     """The command line's grammar."""
     top = argparse.ArgumentParser(
-        prog="python -m sim_can.bench_kernel",
+        prog="python -m jtqd.sim_can.bench_kernel",
         description="Real SocketCAN in a user-mode kernel, for machines whose own kernel has none.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -68,7 +69,7 @@ def _build(options: argparse.Namespace) -> int:
 def _path(_options: argparse.Namespace) -> int:
     found = build.find()
     if found is None:
-        print("bench kernel: not built yet; run: python -m sim_can.bench_kernel build", file=sys.stderr)
+        print("bench kernel: not built yet; run: python -m jtqd.sim_can.bench_kernel build", file=sys.stderr)
         return 1
     print(found)
     return 0

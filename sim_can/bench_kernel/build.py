@@ -1,5 +1,7 @@
 """Build the bench kernel once and keep it in the user's cache, outside the checkout."""
 
+from __future__ import annotations
+
 import fcntl
 import hashlib
 import os
@@ -9,13 +11,152 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
-from sim_can.bench_kernel import packages
-from sim_can.bench_kernel.source_edits import EDITS, EditError, apply_edits
+# What the bench kernel changes in the sources of Linux before it is compiled, and why.
+
+
+@dataclass(frozen=True)
+class Edit:
+    """In `file`, below the kernel's tree, `found` stands exactly once and becomes `put`."""
+
+    file: str
+    found: str
+    put: str
+
+
+EDITS = (
+    # The host's ptrace takes a thread's FPU registers back only whole (EFAULT otherwise), and on a processor with AMX they
+    # are 11 008 bytes: `userspace - ptrace set fp regs failed, errno = 14`, and the first process of the guest is dead.
+    # The same buffer lies below the kernel stack, which is why the configuration asks for CONFIG_KERNEL_STACK_ORDER=3.
+    Edit(
+        "arch/x86/um/user-offsets.c",
+        "DEFINE_LONGS(HOST_FP_SIZE, 2696);",
+        "DEFINE_LONGS(HOST_FP_SIZE, 12288);",
+    ),
+)
+
+
+class EditError(RuntimeError):
+    """The sources are not those that an edit was made for."""
+
+
+def apply_edits(tree: Path, edits: tuple[Edit, ...] = EDITS) -> None:
+    """Change the sources below `tree`. Raises EditError."""
+    for edit in edits:
+        path = tree / edit.file
+        text = path.read_text() if path.is_file() else ""
+        if text.count(edit.found) != 1:
+            raise EditError(
+                f"{edit.file}: `{edit.found}` found {text.count(edit.found)} times, expected once"
+            )
+        path.write_text(text.replace(edit.found, edit.put))
+
+
+# Debian packages that the bench kernel needs: which are missing, and their installation.
+
+
+SOURCE_PACKAGE = "linux-source-6.1"
+SOURCE_ARCHIVE = f"/usr/src/{SOURCE_PACKAGE}.tar.xz"
+
+
+class Requirement(NamedTuple):
+    """One Debian package and the program (bare name) or file (absolute path) that shows it is there."""
+
+    package: str
+    proof: str
+
+
+BUILD = (
+    Requirement(SOURCE_PACKAGE, SOURCE_ARCHIVE),
+    Requirement("gcc", "gcc"),
+    Requirement("libc6-dev", "/usr/include/stdio.h"),
+    Requirement("make", "make"),
+    Requirement("flex", "flex"),
+    Requirement("bison", "bison"),
+    Requirement("bc", "bc"),
+    Requirement("libelf-dev", "/usr/include/libelf.h"),
+    Requirement("xz-utils", "xz"),
+)
+GUEST = (Requirement("iproute2", "ip"),)
+TESTS = (Requirement("can-utils", "candump"),)
+SYSTEMD = (
+    Requirement("systemd", "/lib/systemd/systemd"),
+    Requirement("udev", "/lib/systemd/systemd-udevd"),
+    Requirement("dbus", "/usr/bin/dbus-daemon"),
+    Requirement("python3-venv", "/usr/bin/python3"),
+)
+
+
+class MissingPackagesError(RuntimeError):
+    """Packages are needed that are not installed and may not be installed by this user."""
+
+    def __init__(self, packages: Iterable[str]) -> None:
+        self.packages = tuple(packages)
+        super().__init__(
+            "the bench kernel needs Debian packages that are not installed: "
+            f"{' '.join(self.packages)}; install them with: sudo apt-get install {' '.join(self.packages)}"
+        )
+
+
+def find_program(name: str) -> str | None:
+    """Path of a program; looks into the sbin directories too, which are not in every user's PATH."""
+    return shutil.which(name, path=os.environ.get("PATH", "") + ":/usr/sbin:/sbin:/usr/bin:/bin")
+
+
+def missing(
+    requirements: Iterable[Requirement],
+    which: Callable[[str], str | None] = find_program,
+    exists: Callable[[str], bool] = os.path.exists,
+) -> list[str]:
+    """Names of the packages whose program or file is not there, in the order of `requirements`."""
+    return [
+        need.package
+        for need in requirements
+        if not (exists(need.proof) if need.proof.startswith("/") else which(need.proof))
+    ]
+
+
+def require(requirements: Iterable[Requirement], *, install: bool = True) -> None:
+    """Make sure that all packages are there; as root, install what is not.
+
+    Raises MissingPackagesError when packages are missing and this user may not install them (or `install` is
+    false), RuntimeError when apt-get fails.
+    """
+    wanted = tuple(requirements)
+    lacking = missing(wanted)
+    if not lacking:
+        return
+    if not install or os.geteuid() != 0 or find_program("apt-get") is None:
+        raise MissingPackagesError(lacking)
+    print(f"bench kernel: apt-get install {' '.join(lacking)}", file=sys.stderr, flush=True)
+    _apt_get("update")
+    # Recommended packages are left out: those of linux-source alone are several hundred megabytes.
+    _apt_get("install", "-y", "--no-install-recommends", *lacking)
+    still = missing(wanted)
+    if still:
+        raise MissingPackagesError(still)
+
+
+def _apt_get(*arguments: str) -> None:
+    done = subprocess.run(
+        ["apt-get", "-q", *arguments],
+        env={**os.environ, "DEBIAN_FRONTEND": "noninteractive"},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
+        check=False,
+    )
+    if done.returncode != 0:
+        last = "\n".join(done.stdout.splitlines()[-15:])
+        raise RuntimeError(f"apt-get {' '.join(arguments)} failed with status {done.returncode}:\n{last}")
+
 
 CONFIG_FILE = Path(__file__).with_name("bench_kernel.config")
 OVERRIDE = "JTQD_BENCH_KERNEL"
@@ -93,16 +234,14 @@ def ensure(*, install: bool = True) -> Path:
     """
     ready = find()
     if ready is not None:
-        packages.require(packages.GUEST, install=install)
+        require(GUEST, install=install)
         return ready
     if platform.machine() != "x86_64":
         raise BuildError(f"the bench kernel is built for x86_64 only, this machine is {platform.machine()}")
-    packages.require((*packages.BUILD, *packages.GUEST), install=install)
+    require((*BUILD, *GUEST), install=install)
     version = _source_version()
     if version is None:
-        raise BuildError(
-            f"{packages.SOURCE_ARCHIVE} is there but dpkg knows no package {packages.SOURCE_PACKAGE}"
-        )
+        raise BuildError(f"{SOURCE_ARCHIVE} is there but dpkg knows no package {SOURCE_PACKAGE}")
     root = cache_root()
     root.mkdir(parents=True, exist_ok=True)
     with _only_builder(root):
@@ -112,10 +251,10 @@ def ensure(*, install: bool = True) -> Path:
 
 def _source_version() -> str | None:
     """Installed version of the kernel source package, or None."""
-    if packages.find_program("dpkg-query") is None:
+    if find_program("dpkg-query") is None:
         return None
     done = subprocess.run(
-        ["dpkg-query", "-W", "-f", "${db:Status-Status} ${Version}", packages.SOURCE_PACKAGE],
+        ["dpkg-query", "-W", "-f", "${db:Status-Status} ${Version}", SOURCE_PACKAGE],
         capture_output=True,
         text=True,
         check=False,
@@ -158,7 +297,7 @@ def _build(version: str, root: Path) -> Path:
         shutil.rmtree(final, ignore_errors=True)
         done.rename(final)
     except EditError as error:
-        raise BuildError(f"{packages.SOURCE_ARCHIVE} ({version}) does not fit: {error}") from error
+        raise BuildError(f"{SOURCE_ARCHIVE} ({version}) does not fit: {error}") from error
     except subprocess.CalledProcessError as error:
         kept = root / f"{final.name}.failed.log"
         shutil.copy2(log, kept)
@@ -172,14 +311,14 @@ def _build(version: str, root: Path) -> Path:
 
 
 def _unpack(work: Path, version: str, out: IO[str]) -> Path:
-    _say(f"unpacking {packages.SOURCE_ARCHIVE} ({version})")
+    _say(f"unpacking {SOURCE_ARCHIVE} ({version})")
     subprocess.run(
-        ["tar", "-xJf", packages.SOURCE_ARCHIVE, "-C", str(work)],
+        ["tar", "-xJf", SOURCE_ARCHIVE, "-C", str(work)],
         stdout=out,
         stderr=subprocess.STDOUT,
         check=True,
     )
-    return work / packages.SOURCE_PACKAGE
+    return work / SOURCE_PACKAGE
 
 
 def _configure(tree: Path, config: bytes, out: IO[str]) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Self
 
-from sim_can.bench_kernel import build
+from jtqd.sim_can.bench_kernel import build
 
 INIT = Path(__file__).with_name("init.sh")
 JOB_DIRECTORY = "JTQD_JOB"

@@ -1,4 +1,4 @@
-"""`python -m sysid.batch.child PID COMMAND ...`: a `jtq` command that ends with its parent PID, however that ends."""
+"""`python -m jtqd.sysid.batch.child PID COMMAND ...`: a `jtq` command that ends with its parent PID, however that ends."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 
-from daemon.jtq import main
+from jtqd.daemon.jtq import main
 
 _PR_SET_PDEATHSIG = 1
 

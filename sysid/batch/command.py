@@ -11,19 +11,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from estimator.arguments import count, seconds
-from estimator.checked import ConfigError
-from sim_can.run_files import RunError
-from sysid.batch.executors import ClusterError, executor
-from sysid.batch.figures import DIAGNOSE, REPLAY, REPORT
-from sysid.batch.groups import BY_DIRECTORY, BY_RUN, WAYS, Found, GroupError, find_groups
-from sysid.batch.options import Passed, passed_to_diagnose, passed_to_replay
-from sysid.batch.progress import Progress
-from sysid.batch.run import Batch, BatchError, Job, Row
-from sysid.batch.store import Store, StoreError, write_whole
-from sysid.batch.summary import counts, render, to_mapping
-from sysid.batch.tool import tool_version
-from sysid.diagnosis.run_inputs import LOGS, TABLES, UsageError
+from jtqd.estimator.checked import ConfigError, count, seconds
+from jtqd.sysid.batch.executors import ClusterError, executor
+from jtqd.sysid.batch.figures import DIAGNOSE, REPLAY, REPORT
+from jtqd.sysid.batch.groups import BY_DIRECTORY, BY_RUN, WAYS, Found, GroupError, find_groups
+from jtqd.sysid.batch.options import Passed, passed_to_diagnose, passed_to_replay
+from jtqd.sysid.batch.progress import Progress
+from jtqd.sysid.batch.run import Batch, BatchError, Job, Row
+from jtqd.sysid.batch.store import Store, StoreError, write_whole
+from jtqd.sysid.batch.summary import counts, render, to_mapping
+from jtqd.sysid.batch.tool import tool_version
+from jtqd.sysid.runs.files import RunError
+from jtqd.sysid.runs.sources import LOGS, TABLES, UsageError
 
 BY: Final = "jtq batch"
 PAGE, SUMMARY = "index.html", "summary.json"

@@ -8,7 +8,7 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
-from sysid.batch.task import allow_running, end_running
+from jtqd.sysid.batch.task import allow_running, end_running
 
 _CONNECT_S = 10.0
 _RETRIES = 0
@@ -32,7 +32,7 @@ def executor(scheduler: str | None, jobs: int | None) -> Iterator[tuple[Executor
     """
     if scheduler is None:
         count = jobs or len(os.sched_getaffinity(0))
-        # A thread waits for each process: `sysid.batch.task` gives every task one of its own.
+        # A thread waits for each process: `jtqd.sysid.batch.task` gives every task one of its own.
         local = ThreadPoolExecutor(count)
         try:
             yield local, f"this machine, {count} at a time"

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from daemon.recording.naming import ACTIVE
+from jtqd.daemon.recording.parts import ACTIVE
 
 _UNFINISHED: Final = f".mcap{ACTIVE}"
 """Ending of a log that is being written, or was left by a crash."""
 _PART: Final = re.compile(r"-\d{4,}(?=\.mcap$)", re.ASCII)
-"""Number of the part at the end of a log's name (`daemon.recording.naming`)."""
+"""Number of the part at the end of a log's name (`jtqd.daemon.recording.parts`)."""
 BY_RUN, BY_DIRECTORY, BY_FILE = "run", "directory", "file"
 WAYS: Final = (BY_RUN, BY_DIRECTORY, BY_FILE)
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from estimator.checked import ConfigError
-from sim_can.run_files import ColumnMap
-from sysid.diagnosis.run_inputs import joint_files
+from jtqd.estimator.checked import ConfigError
+from jtqd.sysid.runs.files import ColumnMap
+from jtqd.sysid.runs.sources import joint_files
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
-from sysid.batch.run import FAILED, Row
+from jtqd.sysid.batch.run import FAILED, Row
 
 
 class Progress:

@@ -8,9 +8,9 @@ from concurrent.futures import CancelledError, Executor, Future
 from dataclasses import dataclass
 from typing import Any, Final
 
-from sysid.batch.groups import Group
-from sysid.batch.store import Store, key_of
-from sysid.batch.task import Outcome, Task, hash_files, run_task
+from jtqd.sysid.batch.groups import Group
+from jtqd.sysid.batch.store import Store, key_of
+from jtqd.sysid.batch.task import Outcome, Task, hash_files, run_task
 
 DONE, KEPT, FAILED = "done", "kept", "failed"
 """Done now; finished by an earlier batch; failed, and tried again the next time."""
@@ -30,7 +30,7 @@ class Job:
         arguments: of the command, besides the logs, --json and --out.
         parameters: the same with files replaced by their hashes: part of a result's name.
         writes: the command takes --out DIR.
-        tool: version and code of jtqd (`sysid.batch.tool`).
+        tool: version and code of jtqd (`jtqd.sysid.batch.tool`).
         timeout_s: of one task; None: none.
         again: do it again although it is finished.
     """
@@ -46,7 +46,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Row:
-    """What became of one group. `content` is the stored result (`sysid.batch.store`), None where it failed."""
+    """What became of one group. `content` is the stored result (`jtqd.sysid.batch.store`), None where it failed."""
 
     group: Group
     state: str

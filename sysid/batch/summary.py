@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from sysid.batch.figures import FAILED_BADGE, GAP, HEADINGS, Figures, figures_of
-from sysid.batch.run import FAILED, Job, Row
-from sysid.diagnosis.report import theme
+from jtqd.sysid.batch.figures import FAILED_BADGE, GAP, HEADINGS, Figures, figures_of
+from jtqd.sysid.batch.run import FAILED, Job, Row
+from jtqd.sysid.diagnosis.report import theme
 
 SCHEMA: Final = "jtq.batch/1"
 TEMPLATE: Final = "page.html.j2"
@@ -90,7 +90,7 @@ def render(job: Job, rows: Sequence[Row], where: str, made: str, links: Mapping[
 
     environment = Environment(
         loader=ChoiceLoader(
-            [PackageLoader("sysid.batch", "."), PackageLoader("sysid.diagnosis.report", ".")]
+            [PackageLoader("jtqd.sysid.batch", "."), PackageLoader("jtqd.sysid.diagnosis.report", ".")]
         ),
         autoescape=True,
         undefined=StrictUndefined,

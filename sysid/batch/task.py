@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from sysid.batch.tool import tool_version
+from jtqd.sysid.batch.tool import tool_version
 
 _ENDED_WELL: Final = (0, 3)
 _THREADS: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
@@ -61,7 +61,7 @@ class Outcome:
         result: what it printed, where it ended well.
         error: one line, empty where it ended well.
         seconds: how long it took.
-        tool: version and code of jtqd that did it (`sysid.batch.tool`).
+        tool: version and code of jtqd that did it (`jtqd.sysid.batch.tool`).
         files: what it wrote, by name.
     """
 
@@ -107,7 +107,7 @@ def run_task(task: Task) -> Outcome:
 def _run(arguments: Sequence[str], timeout_s: float | None) -> tuple[int, bytes, bytes]:
     """Exit status, standard output and standard error. Raises subprocess.TimeoutExpired."""
     with subprocess.Popen(
-        [sys.executable, "-P", "-m", "sysid.batch.child", str(os.getpid()), *arguments],
+        [sys.executable, "-P", "-m", "jtqd.sysid.batch.child", str(os.getpid()), *arguments],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -8,7 +8,14 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
-_PACKAGES: Final = ("daemon", "drivers", "estimator", "models", "sim_can", "sysid")
+_PACKAGES: Final = (
+    "jtqd.daemon",
+    "jtqd.drivers",
+    "jtqd.estimator",
+    "jtqd.models",
+    "jtqd.sim_can",
+    "jtqd.sysid",
+)
 _CODE: Final = (".py", ".j2", ".css", ".eds")
 """Everything in the packages that takes part in a result; joint files and networks are parameters of the batch."""
 

@@ -3,32 +3,235 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import logging
+import math
 import shutil
 import signal
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
+from dataclasses import fields, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any, Final
 
-from estimator.checked import ConfigError
-from models.files import shipped
-from sysid.campaign import dry_run
-from sysid.campaign.bench_config import BenchConfig
-from sysid.campaign.fourier_runs import seed_of
-from sysid.campaign.one_run import Bench, attempt
-from sysid.campaign.options import EMULATED, PLANT, emulated, misuse, parser, recipe, scale_of, wanted_plan
-from sysid.campaign.plan import Plan
-from sysid.campaign.processes import EmulatedBench, ProcessError, StopAsked, unix_bus
-from sysid.campaign.progress import Designing, Reporter
-from sysid.campaign.runner import Outcome, go_through
-from sysid.campaign.segments import check_plan
-from sysid.campaign.state import DONE, CampaignDirectory, StateError
-from sysid.motion.setpoints import Setpoints
+import numpy as np
+
+from jtqd.drivers.bus_load import LIMIT, BusLoad
+from jtqd.estimator.checked import ConfigError, count, natural, seconds
+from jtqd.estimator.joint import Joint
+from jtqd.models.files import shipped
+from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Plan, check_plan, load_plan, travel_rad
+from jtqd.sysid.campaign.plans import KINDS, Scale, Tried, make_plan, seed_of
+from jtqd.sysid.campaign.processes import EmulatedBench, ProcessError, StopAsked, unix_bus
+from jtqd.sysid.campaign.runner import Bench, BenchConfig, Outcome, attempt, go_through
+from jtqd.sysid.campaign.state import (
+    BETWEEN_RUNS_S,
+    DONE,
+    CampaignDirectory,
+    Designing,
+    Reporter,
+    StateError,
+    clock_text,
+)
+from jtqd.sysid.motion.setpoints import Limits, Setpoints
+
+# Options of `jtq campaign`, and the plan that they ask for.
+
+
+EMULATED: Final = "sim"
+PLANT: Final = "campaign_plant.yaml"
+LIMIT_NAMES: Final = tuple(item.name for item in fields(Limits))
+_SCALING: Final = ("runs", "seconds", "hold_s", "seed", "evaluations", "quick")
+_EXAMPLES: Final = """examples:
+  jtq campaign efficiency --dry-run
+  jtq campaign efficiency --bus sim --out campaigns/efficiency
+  jtq campaign excitation --bus can0 --config arm.yaml --out campaigns/excitation
+  jtq campaign my.plan.yaml --bus can0 --config arm.yaml --out campaigns/mine"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """All options; what goes together with what is the matter of `misuse`."""
+    made = argparse.ArgumentParser(
+        prog="jtq campaign",
+        description="Drive both joints through a campaign of runs, record and check each; go on where it was interrupted.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = made.add_argument
+    add("plan", metavar="PLAN", help="efficiency, excitation, validate, or a plan file (jtq.plan/1)")
+    add("--bus", help="can0, unix:PATH, sim (the emulated bench), or sim:BUS (the same on that bus)")
+    add("--out", type=Path, metavar="DIR", help="the campaign's directory; made if missing")
+    add("--dry-run", action="store_true", help="print the plan, its length and the bus load; move nothing")
+    add(
+        "--config",
+        "--joint-config",
+        type=Path,
+        metavar="FILE",
+        help="configuration of jtqd: nodes and joint files (default: the bench that ships)",
+    )
+    add(
+        "--limit",
+        action="append",
+        type=_limit,
+        default=[],
+        metavar="NAME=VALUE",
+        help=f"another limit than the plan's: {', '.join(LIMIT_NAMES)} (temperature_c=none: not supervised)",
+    )
+    add("--keep-going", action="store_true", help="go on with the next run after a limit was exceeded")
+    add("--json", action="store_true", help="print the result (or the plan) as JSON")
+    add("--plant", type=Path, metavar="FILE", help=f"with --bus sim: bench to emulate (default {PLANT})")
+    size = made.add_argument_group("size of a campaign that is not a file").add_argument
+    size("--quick", action="store_true", help="a small one: every kind of run, few of each")
+    size("--runs", type=count, metavar="N", help="Fourier runs (default 24)")
+    size("--seconds", type=seconds, metavar="S", help="length of a Fourier run (default 24; validate 12)")
+    size("--hold", dest="hold_s", type=seconds, metavar="S", help="hold of a constant point (default 2.1)")
+    size(
+        "--seed", type=natural, default=0, metavar="N", help="of trajectories and emulated bench (default 0)"
+    )
+    size("--evaluations", type=count, metavar="N", help="of the genetic algorithm, per trajectory")
+    return made
+
+
+def misuse(options: argparse.Namespace) -> str:
+    """What is wrong with the combination of options; empty when nothing is."""
+    if options.plan not in KINDS:
+        if not options.plan.endswith((".yaml", ".yml")):
+            return f"found plan {options.plan!r}, expected {', '.join(KINDS)} or a .yaml file"
+        given = [name for name in _SCALING if name != "seed" and getattr(options, name) not in (None, False)]
+        if given:
+            return f"--{given[0].removesuffix('_s')} belongs to {', '.join(KINDS)}, not to a plan file"
+    if options.plant is not None and not emulated(options.bus):
+        return "--plant belongs to --bus sim"
+    if not options.dry_run and (options.bus is None or options.out is None):
+        missing = "--bus" if options.bus is None else "--out"
+        return f"{missing} is missing, for example --bus sim --out campaigns/{Path(options.plan).stem}"
+    return ""
+
+
+def emulated(bus: str | None) -> bool:
+    """Whether the campaign brings its own bench."""
+    return bus is not None and (bus == EMULATED or bus.startswith(f"{EMULATED}:"))
+
+
+def recipe(options: argparse.Namespace, joints: tuple[Joint, Joint]) -> dict[str, Any]:
+    """What the plan is made from, as plain values; the same recipe is the same plan. Raises ConfigError."""
+    limits = {name: None if math.isinf(value) else value for name, value in options.limit}
+    if options.plan not in KINDS:
+        return {"plan_sha256": load_plan(Path(options.plan)).sha256, "limits": limits}
+    return {
+        "kind": options.plan,
+        **{name: getattr(options, name) for name in _SCALING},
+        "limits": limits,
+        "joints_sha256": hashlib.sha256(repr(joints).encode()).hexdigest(),
+    }
+
+
+def scale_of(options: argparse.Namespace, joints: tuple[Joint, Joint]) -> Scale:
+    """Size of a campaign that is not a file."""
+    scale = {name: getattr(options, name) for name in _SCALING}
+    return Scale(**scale, limits=replace(DEFAULT_LIMITS, **dict(options.limit)), joints=joints)
+
+
+def wanted_plan(
+    options: argparse.Namespace, joints: tuple[Joint, Joint], on_progress: Tried | None = None
+) -> Plan:
+    """Read or make the plan; `joints` are those of the bench. Raises ConfigError."""
+    if options.plan not in KINDS:
+        plan = load_plan(Path(options.plan))
+        return replace(plan, limits=replace(plan.limits, **dict(options.limit)))
+    return make_plan(options.plan, scale_of(options, joints), on_progress)
+
+
+def _limit(text: str) -> tuple[str, float]:
+    """NAME=VALUE. Raises argparse.ArgumentTypeError."""
+    name, _, value = text.partition("=")
+    if name not in LIMIT_NAMES:
+        raise argparse.ArgumentTypeError(f"found {name!r}, expected one of {', '.join(LIMIT_NAMES)}")
+    if name == "temperature_c" and value == "none":
+        return name, math.inf
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if not 0.0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"found {name}={value}, expected a number > 0")
+    return name, number
+
+
+# What a campaign would do: its runs, how long they take, and what the bus would carry. Pure.
+
+
+def rows(plan: Plan, setpoints: Mapping[str, Setpoints]) -> list[dict[str, Any]]:
+    """One row per run: name, velocity joint, segments, seconds, peaks of velocity and current, travel."""
+    result = []
+    for run in plan.runs:
+        points = setpoints[run.name]
+        result.append(
+            {
+                "run": run.name,
+                "velocity_joint": run.velocity_joint,
+                "segments": len(run.segments),
+                "seconds": round(points.duration_s, 3),
+                "peak_velocity_rad_s": round(float(np.abs(points.velocity_rad_s).max()), 4),
+                "peak_current_a": round(float(np.abs(points.current_a).max()), 4),
+                "travel_rad": round(travel_rad(points), 4),
+            }
+        )
+    return result
+
+
+def total_s(setpoints: Mapping[str, Setpoints]) -> float:
+    """Expected length of the whole campaign, with what lies between the runs."""
+    return sum(points.duration_s + BETWEEN_RUNS_S for points in setpoints.values())
+
+
+def content(plan: Plan, setpoints: Mapping[str, Setpoints], load: BusLoad) -> dict[str, Any]:
+    """For a program."""
+    return {
+        "schema": "jtq.campaign_plan/1",
+        "name": plan.name,
+        "plan_sha256": plan.sha256,
+        "runs": rows(plan, setpoints),
+        "motion_s": round(sum(points.duration_s for points in setpoints.values()), 3),
+        "expected_s": round(total_s(setpoints), 1),
+        "bus_load_worst": load.worst,
+        "bus_load_limit": LIMIT,
+    }
+
+
+def text(plan: Plan, setpoints: Mapping[str, Setpoints], load: BusLoad) -> str:
+    """For people."""
+    table = rows(plan, setpoints)
+    width = max(len("run"), *(len(row["run"]) for row in table))
+    lines = [
+        f"{'run':<{width}}  {'velocity joint':>14}  {'segments':>8}  {'seconds':>7}  {'peak rad/s':>10}  "
+        f"{'peak A':>6}  {'travel rad':>10}"
+    ]
+    lines += [
+        f"{row['run']:<{width}}  {row['velocity_joint']:>14}  {row['segments']:>8}  {row['seconds']:>7.1f}  "
+        f"{row['peak_velocity_rad_s']:>10.2f}  {row['peak_current_a']:>6.2f}  {row['travel_rad']:>10.1f}"
+        for row in table
+    ]
+    motion_s = sum(points.duration_s for points in setpoints.values())
+    limits = plan.limits
+    lines += [
+        f"{len(table)} runs, {clock_text(motion_s)} of motion, about {clock_text(total_s(setpoints))} in all",
+        f"limits: {limits.current_a:g} A, {limits.velocity_rad_s:g} rad/s, {limits.torque_nm:g} Nm, "
+        f"{limits.travel_rad:g} rad, "
+        + (
+            f"{limits.temperature_c:g} °C"
+            if math.isfinite(limits.temperature_c)
+            else "temperature not supervised"
+        ),
+        f"bus load {load.worst:.1%} in the worst case, {load.worst * load.capacity_bits:.0f} of {load.capacity_bits:.0f} "
+        f"bits in a cycle, limit {LIMIT:.0%}",
+    ]
+    return "\n".join(lines)
+
 
 _MASTER_GONE: Final = "fault 8130h"
 """Drives watch jtqd's heartbeat (1016h:1): when jtqd ended with the run before, they went to this fault, powered off."""
@@ -72,9 +275,9 @@ def _dry(options: argparse.Namespace) -> int:
     plan = _made(options, config)
     setpoints = _checked(plan, options)
     if options.json:
-        print(json.dumps(dry_run.content(plan, setpoints, load)))
+        print(json.dumps(content(plan, setpoints, load)))
     else:
-        print(dry_run.text(plan, setpoints, load))
+        print(text(plan, setpoints, load))
     return 0
 
 
@@ -150,7 +353,7 @@ class _Said(logging.Handler):
 
 @contextmanager
 def _commander_says(reporter: Reporter) -> Iterator[None]:
-    logger, handler = logging.getLogger("sysid.motion"), _Said(reporter)
+    logger, handler = logging.getLogger("jtqd.sysid.motion"), _Said(reporter)
     logger.addHandler(handler)
     propagate, logger.propagate = logger.propagate, False
     try:

@@ -2,16 +2,300 @@
 
 from __future__ import annotations
 
+import hashlib
+import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from sysid.campaign import constant_velocity as constant
-from sysid.campaign import fourier_runs
-from sysid.campaign.fourier_runs import Joints, Tried
-from sysid.campaign.plan import DEFAULT_LIMITS, Plan, Run
-from sysid.excitation_design import STARTS
-from sysid.genetic import POPULATION
-from sysid.motion.limits import Limits
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.joint import Joint
+from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Fourier, Plan, Plateau, Rest, Run, Segment
+from jtqd.sysid.excitation.design import POPULATION, STARTS, Design, design, draw
+from jtqd.sysid.excitation.model import ExcitationLimits
+from jtqd.sysid.motion.setpoints import Limits
+
+# Runs at constant velocity and load: section II of the paper (efficiency) and its section IV.A (validation). Pure.
+#
+# Signs. Each joint has its own frame; the links turn oppositely, and a positive current of either joint gives a positive
+# torque in the sensor. So with equal signs of the velocity joint's velocity and the other joint's current, the velocity
+# joint drives forward (its own current and velocity have the same sign) and the other joint is driven back. "forward_1"
+# means that joint 1 is the velocity joint, "back_1" that joint 2 is: for joint 2 the names read the other way round, and
+# every run serves both.
+
+
+VELOCITIES_RAD_S: Final = (0.2, 0.6, 1.0, 1.4, 1.8, 2.2, 2.6, 3.0)
+"""Section II of the paper."""
+CURRENTS_A: Final = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
+FAST_RAD_S: Final = 1.8
+"""Above it the paper leaves out 5 A, because of the nominal output torque."""
+VALIDATION_POINTS: Final = {0.5: (0.5, 1.5, 2.5), 1.5: (1.5, 2.5, 3.5), 2.5: (2.5, 3.5, 4.5)}
+"""Section IV.A: velocity [rad/s] -> currents [A]."""
+DRIVES: Final = {"forward_1": 1, "back_1": 2}
+"""Kind of drive, as seen from joint 1 -> velocity joint."""
+
+RAMP_S: Final = 0.4
+HOLD_S: Final = 2.1
+_RAMP_PER_RAD_S: Final = 0.35
+"""Longer ramps for larger steps: 5.4 rad/s^2 at most, 7.5 Nm for both rotors of the bench, which come on top of the load."""
+_EDGE_S: Final = 0.5
+_TRAVEL_SHARE: Final = 0.95
+"""Part of the travel limit that is used: the joint overshoots a little."""
+
+Point = tuple[float, float]
+"""(velocity [rad/s], current [A])"""
+
+
+def currents_of(velocity_rad_s: float) -> tuple[float, ...]:
+    """Magnitudes of the driving joint's currents [A] at a velocity, by section II."""
+    return CURRENTS_A if abs(velocity_rad_s) <= FAST_RAD_S else CURRENTS_A[:-1]
+
+
+def ladder(
+    name: str, velocity_joint: int, points: Iterable[Point], hold_s: float, travel_rad: float = math.inf
+) -> Run:
+    """One run: from rest over all points, each held for hold_s after its ramp, back to rest.
+
+    Before a point that would take the joint further than travel_rad from where the run began (with some room to stop
+    in), it turns back there without load; a smooth ramp covers the mean of its two velocities times its length.
+    """
+    segments: list[Segment] = [Rest(_EDGE_S, 0.0)]
+    velocity = position = 0.0
+    for target, current in points:
+        ramp_s = _ramp_s(target - velocity)
+        step = 0.5 * (velocity + target) * ramp_s + target * hold_s
+        to_stop = 0.5 * target * _ramp_s(target)
+        if position and abs(position + step + to_stop) > _TRAVEL_SHARE * travel_rad:
+            back = -math.copysign(abs(target), position)
+            ramp_s = _ramp_s(back - velocity)
+            position += 0.5 * (velocity + back) * ramp_s
+            ramp_out_s = _ramp_s(target - back)
+            hold_back_s = max(round(-(position + 0.5 * (back + target) * ramp_out_s) / back, 3), 0.0)
+            segments.append(Plateau(back, 0.0, hold_back_s, ramp_s))
+            position += back * hold_back_s
+            velocity, ramp_s = back, ramp_out_s
+            step = 0.5 * (velocity + target) * ramp_s + target * hold_s
+        segments.append(Plateau(target, current, hold_s, ramp_s))
+        position += step
+        velocity = target
+    segments.append(Rest(_EDGE_S, _ramp_s(velocity)))
+    return Run(name, velocity_joint, tuple(segments))
+
+
+def efficiency_runs(
+    velocities_rad_s: Sequence[float] = VELOCITIES_RAD_S,
+    hold_s: float = HOLD_S,
+    currents_a: Sequence[float] | None = None,
+    travel_rad: float = math.inf,
+) -> tuple[Run, ...]:
+    """Section II: a run per velocity, direction and kind of drive, each over the currents (default: the paper's).
+
+    Slow and fast take turns, so that the joints' warming does not look like an effect of velocity; so do both
+    directions and both joints, so that the bench does not wander off.
+    """
+    runs = []
+    for velocity in slow_and_fast(velocities_rad_s):
+        currents = currents_of(velocity) if currents_a is None else currents_a
+        for drive, joint in DRIVES.items():
+            for letter, sign in (("p", 1.0), ("n", -1.0)):
+                points = [(sign * velocity, sign * current + 0.0) for current in currents]  # no "-0.0"
+                runs.append(ladder(f"{drive}_{letter}{velocity:g}", joint, points, hold_s, travel_rad))
+    return tuple(runs)
+
+
+def validation_runs(hold_s: float = HOLD_S) -> tuple[Run, ...]:
+    """Section IV.A: a run per velocity and kind of drive; every current in both directions, one after the other."""
+    return tuple(
+        ladder(
+            f"constant_{drive}_{velocity:g}",
+            joint,
+            [(sign * velocity, sign * current) for current in currents for sign in (1.0, -1.0)],
+            hold_s,
+        )
+        for velocity, currents in VALIDATION_POINTS.items()
+        for drive, joint in DRIVES.items()
+    )
+
+
+def slow_and_fast(velocities: Sequence[float]) -> list[float]:
+    """Smallest, largest, second smallest, second largest, ...: a fixed order without a trend."""
+    rising = sorted(velocities)
+    return [rising[n // 2] if n % 2 == 0 else rising[-1 - n // 2] for n in range(len(rising))]
+
+
+def _ramp_s(step_rad_s: float) -> float:
+    return max(RAMP_S, round(_RAMP_PER_RAD_S * abs(step_rad_s), 3))
+
+
+# Runs at varying velocity and load: Fourier trajectories to train on, and others to judge by. Pure.
+#
+# The trajectories come from `jtqd.sysid.excitation.design`. Those of `excitation_runs` are optimised for what they tell
+# about the losses; those of `variable_runs` are drawn, because a judge must not be chosen by what it is to judge.
+
+
+Joints = tuple[Joint, Joint] | None
+"""Velocity joint and driving joint of the design; None: those that ship. Either order serves, the joints being alike."""
+Tried = Callable[[int], None]
+"""Told the number of motions that have been tried since the last call."""
+
+FULL_RAD_S: Final = 3.0
+MEDIUM_RAD_S: Final = 1.2
+SLOW_RAD_S: Final = 0.3
+"""Most of a trajectory with this peak lies below 0.2 rad/s, where friction is most of what is to be learned."""
+CURRENT_A: Final = 5.0
+JOINT_CURRENT_A: Final = 8.0
+"""Of the velocity joint, by the model of the design: rated current of the bench's drives, which limit theirs at 9 A."""
+_LIMIT_SHARE: Final = 0.9
+"""Planned peaks as a part of the plan's limits: a controller overshoots, and a limit that is met ends the run."""
+
+EDGE_S: Final = 1.0
+BETWEEN_S: Final = 2.0
+"""At rest between two trajectories: section III of the paper."""
+SHORTEST_S: Final = 2.0
+"""Of one trajectory: below it, acceleration limits leave nothing of the velocity."""
+HARMONICS: Final = 5
+
+_SECOND_LEVELS: Final = (SLOW_RAD_S, MEDIUM_RAD_S, FULL_RAD_S)
+
+
+def excitation_runs(
+    limits: Limits,
+    count: int,
+    run_s: float,
+    *,
+    seed: int,
+    evaluations: int,
+    joints: Joints = None,
+    on_progress: Tried | None = None,
+) -> tuple[Run, ...]:
+    """Section III: `count` runs of two trajectories each with 2 s of rest between; run_s [s] is a run's length.
+
+    The first trajectory of a run uses all of the velocity, the second one is slow, medium or fast in turn; the velocity
+    joint alternates.
+
+    Raises:
+        ConfigError: runs too short for two trajectories.
+    """
+    duration_s = _trajectory_s(run_s, (2.0 * EDGE_S + BETWEEN_S), 2)
+    levels = [FULL_RAD_S] * count + [_second_level(k) for k in range(count)]
+    fourier: dict[int, Fourier] = {}
+    for level in dict.fromkeys(levels):
+        places = [k for k, each in enumerate(levels) if each == level]
+        chosen = seed_of("excitation", level, seed)
+        made = design(
+            _design_limits(limits, level),
+            count=len(places),
+            duration_s=duration_s,
+            harmonics=HARMONICS,
+            seed=chosen,
+            evaluations=evaluations,
+            joints=joints,
+            on_progress=on_progress,
+        )
+        fourier.update(zip(places, map(_segment, made), strict=True))
+    return tuple(
+        Run(
+            f"excitation_{k + 1:02d}",
+            1 + k % 2,
+            (*_rests(EDGE_S), fourier[k], *_rests(BETWEEN_S), fourier[count + k], *_rests(EDGE_S)),
+        )
+        for k in range(count)
+    )
+
+
+def variable_runs(
+    limits: Limits, count: int, run_s: float, *, seed: int, joints: Joints = None
+) -> tuple[Run, ...]:
+    """Section IV.B: `count` runs of one trajectory each, never to be trained on; the velocity joint alternates.
+
+    Raises:
+        ConfigError: runs too short for a trajectory.
+    """
+    duration_s = _trajectory_s(run_s, 2.0 * EDGE_S, 1)
+    chosen = seed_of("variable", FULL_RAD_S, seed)
+    made = draw(
+        _design_limits(limits, FULL_RAD_S),
+        count=count,
+        duration_s=duration_s,
+        harmonics=HARMONICS,
+        seed=chosen,
+        joints=joints,
+    )
+    return tuple(
+        Run(f"variable_{k + 1:02d}", 1 + k % 2, (*_rests(EDGE_S), _segment(one), *_rests(EDGE_S)))
+        for k, one in enumerate(made)
+    )
+
+
+def outside_runs(
+    limits: Limits, count: int, run_s: float, *, seed: int, joints: Joints = None
+) -> tuple[Run, ...]:
+    """Runs with half as much load again as any other campaign has: what no model has been trained on.
+
+    Raises:
+        ConfigError: runs too short for a trajectory.
+    """
+    wanted = ExcitationLimits(
+        velocity_rad_s=FULL_RAD_S,
+        travel_rad=_LIMIT_SHARE * limits.travel_rad,
+        current_a=1.5 * CURRENT_A,
+        joint_current_a=1.5 * JOINT_CURRENT_A,
+        torque_nm=_LIMIT_SHARE * limits.torque_nm,
+    )
+    chosen = seed_of("outside", FULL_RAD_S, seed)
+    made = draw(
+        wanted,
+        count=count,
+        duration_s=_trajectory_s(run_s, 2.0 * EDGE_S, 1),
+        harmonics=HARMONICS,
+        seed=chosen,
+        joints=joints,
+    )
+    return tuple(
+        Run(f"outside_{k + 1:02d}", 1 + k % 2, (*_rests(EDGE_S), _segment(one), *_rests(EDGE_S)))
+        for k, one in enumerate(made)
+    )
+
+
+def seed_of(purpose: str, level: float, seed: int) -> int:
+    """A seed of 32 bits for each purpose and level: no two of them share their random numbers, whatever `seed` is."""
+    digest = hashlib.sha256(f"{purpose}/{level!r}/{seed}".encode()).digest()
+    return int.from_bytes(digest[:4], "big")
+
+
+def _second_level(run: int) -> float:
+    """Changes after each pair of runs, so that either joint is the velocity joint at every level."""
+    return _SECOND_LEVELS[run // 2 % len(_SECOND_LEVELS)]
+
+
+def _trajectory_s(run_s: float, rests_s: float, trajectories: int) -> float:
+    duration_s = round((run_s - rests_s) / trajectories, 3)
+    if duration_s < SHORTEST_S:
+        raise ConfigError(
+            f"--seconds: found {run_s:g}, expected at least {rests_s + trajectories * SHORTEST_S:g} "
+            f"({trajectories} of {SHORTEST_S:g} s and {rests_s:g} s of rest)"
+        )
+    return duration_s
+
+
+def _rests(hold_s: float) -> tuple[Segment, ...]:
+    return (Rest(hold_s, 0.0),)  # it begins at rest: nothing to ramp
+
+
+def _segment(made: Design) -> Fourier:
+    return Fourier(made.velocity, made.current)
+
+
+def _design_limits(limits: Limits, peak_rad_s: float) -> ExcitationLimits:
+    """Well within the plan's limits, so that none of them ends a run."""
+    return ExcitationLimits(
+        velocity_rad_s=min(peak_rad_s, _LIMIT_SHARE * limits.velocity_rad_s),
+        travel_rad=_LIMIT_SHARE * limits.travel_rad,
+        current_a=min(CURRENT_A, _LIMIT_SHARE * limits.current_a),
+        joint_current_a=min(JOINT_CURRENT_A, _LIMIT_SHARE * limits.current_a),
+        torque_nm=_LIMIT_SHARE * limits.torque_nm,
+    )
+
 
 KINDS: Final = ("efficiency", "excitation", "validate")
 RUNS: Final = 24
@@ -73,14 +357,14 @@ def make_plan(kind: str, scale: Scale, on_progress: Tried | None = None) -> Plan
 
 
 def _efficiency(scale: Scale) -> tuple[Run, ...]:
-    hold_s = scale.or_else("hold_s", constant.HOLD_S, 1.0)
+    hold_s = scale.or_else("hold_s", HOLD_S, 1.0)
     if scale.quick:
-        return constant.efficiency_runs(_QUICK_VELOCITIES, hold_s, _QUICK_CURRENTS, scale.limits.travel_rad)
-    return constant.efficiency_runs(hold_s=hold_s, travel_rad=scale.limits.travel_rad)
+        return efficiency_runs(_QUICK_VELOCITIES, hold_s, _QUICK_CURRENTS, scale.limits.travel_rad)
+    return efficiency_runs(hold_s=hold_s, travel_rad=scale.limits.travel_rad)
 
 
 def _excitation(scale: Scale, on_progress: Tried | None) -> tuple[Run, ...]:
-    return fourier_runs.excitation_runs(
+    return excitation_runs(
         scale.limits,
         scale.or_else("runs", RUNS, QUICK_RUNS),
         scale.or_else("seconds", 24.0, 10.0),
@@ -92,9 +376,7 @@ def _excitation(scale: Scale, on_progress: Tried | None) -> tuple[Run, ...]:
 
 
 def _validate(scale: Scale) -> tuple[Run, ...]:
-    return constant.validation_runs(
-        scale.or_else("hold_s", constant.HOLD_S, 1.0)
-    ) + fourier_runs.variable_runs(
+    return validation_runs(scale.or_else("hold_s", HOLD_S, 1.0)) + variable_runs(
         scale.limits,
         scale.or_else("runs", RUNS, QUICK_RUNS),
         scale.or_else("seconds", 12.0, 6.0),

@@ -14,9 +14,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
-from drivers.errors import BusError
-from drivers.frame_socket import exact, open_frame_socket
-from drivers.unix_socket import PREFIX
+from jtqd.drivers.filters import exact
+from jtqd.drivers.frame_socket import PREFIX, BusError, open_frame_socket
 
 READY_S: Final = 60.0
 """Longest time until a process is at work; a small controller loads its libraries from a slow card."""
@@ -173,7 +172,7 @@ class Jtqd:
         except BusError as error:
             raise ProcessError(str(error)) from None
         with self._output.open("wb") as output:
-            self._process = _start("daemon.jtqd", self._arguments, self.said, stdout=output)
+            self._process = _start("jtqd.daemon.jtqd", self._arguments, self.said, stdout=output)
         try:
             self._wait(socket.wait)
         except BaseException:

@@ -2,16 +2,438 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from pathlib import Path
+from typing import Any, Final, NamedTuple
 
-from sysid.campaign.one_run import Attempt
-from sysid.campaign.plan import Plan, Run
-from sysid.campaign.processes import Interrupted
-from sysid.campaign.progress import Reporter
-from sysid.campaign.state import DONE, FAILED, PENDING, STOPPED, CampaignDirectory, RunState
-from sysid.motion.setpoints import Setpoints
+import numpy as np
+
+from jtqd.daemon.logs.errors import LogError
+from jtqd.drivers.boot_procedure import RequestError, parse_request
+from jtqd.drivers.bus_load import BusLoad, BusLoadError, Row, check_bus_load, configured_load, heartbeat_row
+from jtqd.drivers.devices import COMMANDER_NODE, DriveProfile, SensorProfile
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.joint import Joint
+from jtqd.models.files import load_joint, load_yaml, shipped
+from jtqd.sysid.campaign.plan import Plan, Run
+from jtqd.sysid.campaign.processes import Interrupted, Jtqd, ProcessError, StopAsked, on_time
+from jtqd.sysid.campaign.state import (
+    DONE,
+    FAILED,
+    PARTS,
+    PENDING,
+    STOPPED,
+    CampaignDirectory,
+    Reporter,
+    RunState,
+)
+from jtqd.sysid.motion.setpoints import PERIOD_S, Limits, MotionError, MotionResult, Setpoints, Timing
+from jtqd.sysid.motion.shell import Progress, play
+from jtqd.sysid.runs.checks import check_channels
+from jtqd.sysid.runs.files import write_run
+from jtqd.sysid.runs.logs import LoggedRun, log_to_run
+
+# What a campaign needs to know of jtqd's configuration, and the load of the bus with the commander on it.
+
+
+DEFAULT_CONFIG: Final = "bench.yaml"
+PERIOD_US: Final = 1000
+_SETPOINT_RPDO: Final = 0x200  # or 300h+n: either way four bytes
+_RPDO_BYTES: Final = 4
+"""RPDO1: 6040h and 6071h; RPDO2: 60FFh."""
+
+
+@dataclass(frozen=True)
+class BenchConfig:
+    """The part of jtqd's configuration that concerns the bench.
+
+    Attributes:
+        path: the file. drives: of joint 1 and 2. joints: their joint files.
+        sensor: None without one. master: jtqd's own node-ID.
+    """
+
+    path: Path
+    drives: tuple[DriveProfile, DriveProfile]
+    joints: tuple[Joint, Joint]
+    sensor: SensorProfile | None
+    master: int
+    heartbeat_ms: int
+    bitrate: int
+
+    @classmethod
+    def load(cls, path: Path | None) -> BenchConfig:
+        """Read a configuration of jtqd (None: the one that ships); what is not asked for here jtqd checks itself.
+
+        Raises:
+            ConfigError: naming file, key, found and expected; also for a period of SYNC other than 1 ms.
+        """
+        path = path if path is not None else shipped(DEFAULT_CONFIG)
+        mapping, _ = load_yaml(path)
+        top = Section(mapping, str(path))
+        sync = top.section("sync", optional=True)
+        if sync is not None:
+            sync.integer("period_us", low=PERIOD_US, high=PERIOD_US, default=PERIOD_US)
+        sections = [top.required(f"joint_{number}") for number in (1, 2)]
+        files = [load_joint(path.parent / joint.text("file")) for joint in sections]
+        nodes = [_node(joint, "drive") for joint in sections]
+        sensor = top.section("sensor", optional=True)
+        if sensor is not None:
+            nodes.append(_node(sensor, "sensor"))
+        master = top.integer("node_id", low=1, high=127)
+        try:
+            request = parse_request({"bus": "-", "nodes": nodes, "master_node": master})
+        except RequestError as error:
+            raise ConfigError(f"{path}: {error}") from None
+        one, two = (each for each in request.profiles if isinstance(each, DriveProfile))
+        timing = top.section("nodes", optional=True)
+        return cls(
+            path=path,
+            drives=(one, two),
+            joints=(files[0], files[1]),
+            sensor=next((each for each in request.profiles if isinstance(each, SensorProfile)), None),
+            master=master,
+            heartbeat_ms=100 if timing is None else timing.integer("heartbeat_ms", low=10, default=100),
+            bitrate=top.integer("bitrate", low=10_000, high=1_000_000, default=1_000_000),
+        )
+
+    @property
+    def nodes(self) -> tuple[int, int]:
+        """Node-IDs of drive 1 and 2."""
+        return self.drives[0].node_id, self.drives[1].node_id
+
+    @property
+    def estimate_cob_id(self) -> int:
+        """COB-ID of jtqd's estimate: it is publishing when this is on the bus."""
+        return 0x180 + self.master
+
+    def load_with_commander(self) -> BusLoad:
+        """Load of the bus during a campaign: jtqd's configuration, and what the commander and its drives add.
+
+        Set-points go to the two drives in turn, so that a cycle holds one RPDO.
+
+        Raises:
+            ConfigError: above 95 % in the worst case, or two users of one COB-ID.
+        """
+        extra = [heartbeat_row("commander", COMMANDER_NODE, round(Timing().own_heartbeat_s * 1e3))]
+        # either drive may be the velocity joint: both RPDOs have four bytes, so one row stands for both
+        extra += [
+            Row(_SETPOINT_RPDO + node, f"set-points of drive {node}", _RPDO_BYTES, 0.5) for node in self.nodes
+        ]
+        try:
+            return check_bus_load(
+                configured_load(
+                    self.nodes,
+                    {} if self.sensor is None else {self.sensor.node_id: self.sensor.channels},
+                    temperatures=self.nodes,  # the commander switches TPDO3 on where jtqd does not
+                    heartbeat_ms=self.heartbeat_ms,
+                    master=self.master,
+                    extra=extra,
+                    bitrate=self.bitrate,
+                    period_s=1e-6 * PERIOD_US,
+                )
+            )
+        except BusLoadError as error:
+            raise ConfigError(f"{self.path}: with the commander's set-points: {error}") from None
+
+
+def _node(section: Section, kind: str) -> dict[str, Any]:
+    """A node of the configuration as the boot takes it: the commander asks of it what jtqd's boot asks."""
+    node = {"node": section.integer("node", low=1, high=127), "kind": kind}
+    node |= {key: section.raw(key) for key in ("identity", "given", "unit_words") if section.has(key)}
+    if kind == "sensor":
+        node["channels"] = list(range(1, section.integer("channels", low=1, high=2, default=1) + 1))
+    return node
+
+
+# Is this run what it was meant to be? Looks at a run table beside its set-points and names what is wrong. Pure.
+#
+# Nothing here judges a model. What is found are missing cycles, broken channels, wrong wiring, and motions that did not
+# take place.
+
+
+LONGEST_GAP_S: Final = 0.0095
+"""A longer step, of 10 cycles or more: the table would be refused by whoever reads it (jtqd.sysid.runs.files)."""
+LOST_SHARE: Final = 0.01
+FOLLOW_VELOCITY: Final = (0.05, 0.05)
+FOLLOW_CURRENT: Final = (0.1, 0.05)
+"""RMS that is allowed between set-point and measurement: rad/s or A, and a part of the peak."""
+OPPOSITE_TOLERANCE: Final = 0.02
+MOVED_RAD: Final = 1.0
+"""Least motion of a link from which the other one's says anything."""
+
+
+def unusable(logged: LoggedRun) -> str | None:
+    """Why a table cannot be kept at all, or None."""
+    if logged.longest_gap_s > LONGEST_GAP_S:
+        time_s = logged.table.time_s
+        at = time_s[int(np.argmax(np.diff(time_s)))]
+        return (
+            f"found a gap of {logged.longest_gap_s * 1e3:.1f} ms in the log at {at:.3f} s, "
+            f"expected at most {LONGEST_GAP_S * 1e3:.1f} ms"
+        )
+    return None
+
+
+def findings(
+    logged: LoggedRun, setpoints: Setpoints, joints: tuple[Joint, Joint], *, sensor: bool
+) -> tuple[str, ...]:
+    """What is wrong with a run, a line each; empty when nothing is.
+
+    Args:
+        logged: whose first row belongs to the first set-point.
+        joints: as jtqd was told. sensor: the bench has a torque sensor.
+    """
+    table = logged.table
+    channels = [
+        item.text
+        for number, joint in zip((1, 2), joints, strict=True)
+        for item in check_channels(table.time_s, table.joints[number], joint, f"j{number}")
+    ]
+    return (
+        *_lost(logged),
+        *(_no_sensor(logged) if sensor else ()),
+        *channels,
+        *_followed(logged, setpoints, joints),
+        *_opposite(logged),
+    )
+
+
+def _lost(logged: LoggedRun) -> Iterator[str]:
+    if logged.lost_share <= LOST_SHARE:
+        return
+    by = ", ".join(f"{name} {count}" for name, count in logged.incomplete_by.items() if count)
+    yield (
+        f"cycles: found {logged.lost_share:.1%} missing ({logged.missed} without a cycle, {logged.incomplete} incomplete"
+        f"{': ' + by if by else ''}), expected at most {LOST_SHARE:.0%}"
+    )
+
+
+def _no_sensor(logged: LoggedRun) -> Iterator[str]:
+    for number, columns in logged.table.joints.items():
+        if columns.torque_nm is None:
+            yield f"j{number}.torque_nm: found no value in the whole run, expected the sensor's: dead channel"
+
+
+def _followed(logged: LoggedRun, setpoints: Setpoints, joints: tuple[Joint, Joint]) -> Iterator[str]:
+    """The velocity joint against its velocity, the other one against its current."""
+    table = logged.table
+    place = np.minimum(np.round(table.time_s / PERIOD_S).astype(np.intp), len(setpoints) - 1)
+    mover, driver = setpoints.velocity_joint, setpoints.current_joint
+    velocity, current = table.joints[mover].motor_velocity_rad_s, table.joints[driver].current_a
+    assert velocity is not None  # log_to_run sees to it that these are there
+    assert current is not None
+    joint_side = velocity / joints[mover - 1].gear_ratio
+    yield from _follows(
+        joint_side,
+        setpoints.velocity_rad_s[place],
+        FOLLOW_VELOCITY,
+        f"j{mover}.motor_velocity_rad_s: through the gear",
+        "rad/s",
+    )
+    yield from _follows(current, setpoints.current_a[place], FOLLOW_CURRENT, f"j{driver}.current_a:", "A")
+
+
+def _follows(
+    found: FloatArray, wanted: FloatArray, allowed: tuple[float, float], what: str, unit: str
+) -> Iterator[str]:
+    rms = float(np.sqrt(np.mean((found - wanted) ** 2)))
+    limit = allowed[0] + allowed[1] * float(np.abs(wanted).max())
+    if rms <= limit:
+        return
+    opposite = float(np.sqrt(np.mean((found + wanted) ** 2))) <= limit
+    yield (
+        f"{what} found {rms:.3g} {unit} rms off the set-point, expected at most {limit:.3g} {unit}"
+        f"{': it has the opposite sign' if opposite else ''}"
+    )
+
+
+def _opposite(logged: LoggedRun) -> Iterator[str]:
+    """The links are one body: in their own frames they turn oppositely."""
+    one, two = (logged.table.joints[number].link_position_rad for number in (1, 2))
+    assert one is not None
+    assert two is not None
+    if max(float(np.ptp(one)), float(np.ptp(two))) < MOVED_RAD:
+        return
+    dx: FloatArray = one - one.mean()
+    variance = float(dx @ dx)
+    slope = float(dx @ (two - two.mean())) / variance if variance else np.inf
+    if abs(slope + 1.0) > OPPOSITE_TOLERANCE:
+        yield f"j2.link_position_rad: found it turning {slope:.4g} times as far as j1's, expected -1"
+
+
+# One run of a campaign: jtqd started, the motion played, jtqd ended, its log turned into the run's files.
+
+
+_BUS_WAS_LATE: Final = re.compile(
+    r"SYNC missing|missing for \d+ cycles|no heartbeat for|no temperature for|late by|transmit queue"
+)
+_SIGNALLED: Final = re.compile(r"SIGINT|SIGTERM")
+
+Play = Callable[[Setpoints], MotionResult]
+"""The motion itself: `jtqd.sysid.motion.shell.play` on the bench, or what a test puts in its place. Raises MotionError."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Where the runs take place: bus, jtqd's configuration (None: the one that ships) and what is in it."""
+
+    bus: str
+    config_path: Path | None
+    config: BenchConfig
+
+    def play(self, limits: Limits, on_progress: Progress) -> Play:
+        """The commander on this bench."""
+
+        def motion(setpoints: Setpoints) -> MotionResult:
+            with on_time():
+                return play(
+                    self.bus,
+                    setpoints,
+                    limits,
+                    on_progress=on_progress,
+                    drives=self.config.drives,
+                    sensor=self.config.sensor,
+                )
+
+        return motion
+
+
+class Attempt(NamedTuple):
+    """How an attempt at a run ended.
+
+    Attributes:
+        state: to be kept. again: another attempt may fare better, because nothing but time was against this one.
+        begun: the joints were moved; otherwise the bench itself is not ready. signalled: the operator ended it.
+    """
+
+    state: RunState
+    again: bool = False
+    begun: bool = True
+    signalled: bool = False
+
+
+class Recorded(NamedTuple):
+    """What jtqd left of a run: parts of the log, summary; and where the run's files go."""
+
+    log: tuple[Path, ...]
+    summary: dict[str, Any]
+    out: Path
+
+
+def attempt(
+    run: Run, setpoints: Setpoints, bench: Bench, out: Path, *, motion: Play, stop_asked: StopAsked
+) -> Attempt:
+    """Play a run and leave its files in `out`: all of a run that is done, the log of one that is not.
+
+    Raises:
+        Interrupted: a signal came before the motion had begun.
+        OSError: the files cannot be written.
+    """
+    if stop_asked():
+        raise Interrupted
+    folder = out / (run.name + PARTS)
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    jtqd = Jtqd(
+        bench.bus,
+        bench.config_path,
+        folder,
+        setpoints.duration_s,
+        estimate_cob_id=bench.config.estimate_cob_id,
+        stop_asked=stop_asked,
+    )
+    try:
+        try:
+            with jtqd:
+                result = motion(setpoints)
+            log, summary = jtqd.log()
+        except (ProcessError, MotionError) as error:
+            _keep([jtqd.said], out, run.name, ".jtqd.log")
+            return Attempt(RunState(FAILED, str(error)), again=isinstance(error, MotionError), begun=False)
+        if result.status == "stopped":
+            _keep(log, out, run.name, ".stopped.mcap")
+            return _stopped(result)
+        state = RunState(played_s=result.played_s)
+        return _kept(run, setpoints, bench.config, Recorded(log, summary, out), state)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _stopped(result: MotionResult) -> Attempt:
+    signalled = bool(_SIGNALLED.search(result.reason))
+    return Attempt(
+        RunState(STOPPED, result.reason, played_s=result.played_s),
+        again=not signalled and bool(_BUS_WAS_LATE.search(result.reason)),
+        signalled=signalled,
+    )
+
+
+def _kept(
+    run: Run, setpoints: Setpoints, config: BenchConfig, recorded: Recorded, state: RunState
+) -> Attempt:
+    """Run table, marks and log of a motion that was played to its end."""
+    log, out = recorded.log, recorded.out
+    state = replace(state, status=FAILED)
+    lost = int((recorded.summary.get("recording") or {}).get("lost", 0))
+    try:
+        logged = log_to_run(log, nodes=config.nodes, sensor=config.sensor is not None)
+    except LogError as error:
+        _keep(log, out, run.name, ".failed.mcap")
+        return Attempt(replace(state, reason=str(error)), again=True)
+    state = replace(
+        state,
+        rows=len(logged.table.time_s),
+        missed=logged.missed,
+        incomplete=logged.incomplete,
+        incomplete_by=dict(logged.incomplete_by),
+        findings=findings(logged, setpoints, config.joints, sensor=config.sensor is not None),
+    )
+    if lost:
+        state = replace(state, findings=(f"log: found {lost} cycles lost by the recorder", *state.findings))
+    why = unusable(logged)
+    if why is not None:
+        _keep(log, out, run.name, ".failed.mcap")
+        return Attempt(replace(state, reason=why), again=True)
+    sha256 = write_run(out / f"{run.name}.csv.gz", logged.table)
+    (out / f"{run.name}.json").write_text(json.dumps(marks_of(run, setpoints), indent=1) + "\n")
+    _keep(log, out, run.name, ".mcap")
+    return Attempt(replace(state, status=DONE, sha256=sha256))
+
+
+def marks_of(run: Run, setpoints: Setpoints) -> dict[str, Any]:
+    """Content of NAME.json: which segment was when, in seconds of the run table (to about a cycle)."""
+    return {
+        "run": run.name,
+        "velocity_joint": run.velocity_joint,
+        "segments": [
+            {
+                "kind": mark.kind,
+                "start_s": mark.start_s,
+                "end_s": mark.end_s,
+                "velocity_joint": run.velocity_joint,
+                "velocity_rad_s": mark.velocity_rad_s,
+                "current_a": mark.current_a,
+            }
+            for mark in setpoints.marks
+        ],
+    }
+
+
+def _keep(paths: Sequence[Path], out: Path, run: str, ending: str) -> None:
+    """Move files out of the run's own directory, as far as they are there; both lie in the same file system.
+
+    The first becomes RUN.ENDING, the second RUN@2.ENDING and so on (no name has a @): a long run's log has several parts.
+    """
+    for number, path in enumerate(paths, start=1):
+        if path.exists():
+            os.replace(path, out / (run + ("" if number == 1 else f"@{number}") + ending))
+
 
 ATTEMPTS: Final = 3
 

@@ -15,18 +15,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from estimator.checked import ConfigError
-from estimator.parameters import Joint
-from estimator.run import RunTableError
-from sim_can.run_files import ColumnMap, RunError
-from sysid.campaign.plan import Plan
-from sysid.diagnosis.channels import Checked, check_runs
-from sysid.diagnosis.extended_joint import FILE, write_extended
-from sysid.diagnosis.findings import INSUFFICIENT, NO_GAP, Findings
-from sysid.diagnosis.findings_json import to_mapping
-from sysid.diagnosis.run_inputs import UsageError, joint_files, joints_of, read_all
-from sysid.diagnosis.summary import summary_lines
-from sysid.fit_inputs import InputRun
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.run import RunTableError
+from jtqd.sysid.campaign.plan import Plan
+from jtqd.sysid.diagnosis.extended_joint import FILE, write_extended
+from jtqd.sysid.diagnosis.findings import INSUFFICIENT, NO_GAP, Findings, summary_lines, to_mapping
+from jtqd.sysid.runs.channels import Checked, check_runs
+from jtqd.sysid.runs.files import ColumnMap, RunError
+from jtqd.sysid.runs.inputs import InputRun
+from jtqd.sysid.runs.sources import UsageError, joint_files, joints_of, read_all
 
 BY: Final = "jtq diagnose"
 _NEEDED: Final = ("matplotlib", "jinja2")
@@ -87,7 +85,7 @@ def diagnosed(runs: Sequence[InputRun], joints: Mapping[int, Joint]) -> Findings
             channel_notes=notes,
         )
     with _waiting(f"diagnosing {len(checked.runs)} runs"):
-        from sysid.diagnosis.diagnose import diagnose
+        from jtqd.sysid.diagnosis.diagnose import diagnose
 
         left = {number: joint for number, joint in joints.items() if number not in checked.lost}
         findings = diagnose(checked.runs, left)
@@ -174,7 +172,7 @@ def _write(
     They are made in a directory beside first: what fails on the way leaves the earlier results as they were. Then what
     an earlier diagnosis wrote goes, so that no plan or joint file of it stays beside the new findings.
     """
-    from sysid.diagnosis.report import render
+    from jtqd.sysid.diagnosis.report.page import render
 
     date = dt.datetime.now().astimezone().date().isoformat()
     with tempfile.TemporaryDirectory(prefix=".diagnosis.", dir=directory) as made:

@@ -8,15 +8,31 @@ from typing import Final
 
 import numpy as np
 
-from estimator.effects.effect import Effect
-from estimator.effects.library import EFFECTS
-from estimator.friction import FloatArray
-from estimator.parameters import Joint
-from estimator.run import RunTable
-from sysid.diagnosis.base_loss import BaseLoss
-from sysid.diagnosis.channel import Channel, Line
-from sysid.diagnosis.columns import (
-    Candidate,
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.effects.effect import Effect
+from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.run import RunTable
+from jtqd.sysid.diagnosis.events import Prepared, without_events
+from jtqd.sysid.diagnosis.evidence import RELEVANT
+from jtqd.sysid.diagnosis.extended_joint import fold
+from jtqd.sysid.diagnosis.findings import (
+    AMBIGUOUS,
+    CAUSE,
+    INSUFFICIENT,
+    NO_GAP,
+    UNEXPLAINED,
+    Findings,
+    JointName,
+)
+from jtqd.sysid.diagnosis.leftover import events_left
+from jtqd.sysid.diagnosis.mixed_model import Mixed
+from jtqd.sysid.diagnosis.next_experiment import next_experiment
+from jtqd.sysid.diagnosis.noise import Noise, noise_model, run_sums, saturated_residuals
+from jtqd.sysid.diagnosis.powerless import columns_of, readings, with_readings
+from jtqd.sysid.diagnosis.refine import present_causes, refine
+from jtqd.sysid.diagnosis.regressors import (
+    EffectCandidate,
     RunData,
     bin_samples,
     column_moments,
@@ -25,23 +41,58 @@ from sysid.diagnosis.columns import (
     gain_columns,
     run_data,
 )
-from sysid.diagnosis.events import without_events
-from sysid.diagnosis.experiments import next_experiment
-from sysid.diagnosis.findings import INSUFFICIENT, Findings, JointName
-from sysid.diagnosis.fold import fold
-from sysid.diagnosis.leftover import events_left
-from sysid.diagnosis.lines import frequency_lines, order_lines, sharpened
-from sysid.diagnosis.minimum import RELEVANT
-from sysid.diagnosis.mixed import Mixed
-from sysid.diagnosis.powerless import columns_of, readings, with_readings
-from sysid.diagnosis.prepared import Prepared
-from sysid.diagnosis.refine import present_causes, refine
-from sysid.diagnosis.search import HELD_OUT, Hypothesis, Search
-from sysid.diagnosis.sensor_zero import about_zero
-from sysid.diagnosis.signals import JointSignals, SignalsError, joint_signals, with_one_sensor
-from sysid.diagnosis.together import one_sensor, together
-from sysid.diagnosis.verdict import conclude
-from sysid.diagnosis.whitening import Noise, noise_model, run_sums, saturated_residuals
+from jtqd.sysid.diagnosis.search import HELD_OUT, Hypothesis, Search
+from jtqd.sysid.diagnosis.signals import (
+    BaseLoss,
+    Channel,
+    JointSignals,
+    Line,
+    SignalsError,
+    about_zero,
+    joint_signals,
+    with_one_sensor,
+)
+from jtqd.sysid.diagnosis.structure import frequency_lines, order_lines, sharpened
+from jtqd.sysid.diagnosis.verdict import conclude
+
+# Joints that have a torque sensor each: diagnosed one by one, reported together. Pure.
+
+
+_WORST_FIRST: Final = (UNEXPLAINED, AMBIGUOUS, CAUSE, INSUFFICIENT, NO_GAP)
+
+
+def one_sensor(runs: Sequence[tuple[str, RunTable]], numbers: Sequence[int]) -> bool:
+    """Return whether the joints' torque columns are the same measurement in every run that has them all."""
+    for _, table in runs:
+        columns = [table.joints[n].torque_nm for n in numbers if n in table.joints]
+        there = [c for c in columns if c is not None]
+        for other in there[1:]:
+            scale = max(float(np.abs(there[0]).max()), 1e-9)
+            if float(np.abs(there[0] - other).max()) > 1e-6 * scale:
+                return False
+    return True
+
+
+def together(parts: Sequence[Findings]) -> Findings:
+    """Return the findings of several joints as one: the verdict that asks for most, the gain of the largest cause."""
+    verdict = min((f.verdict for f in parts), key=_WORST_FIRST.index)
+    with_gain = [f for f in parts if f.gain is not None]
+    leading = max(with_gain, key=lambda f: f.causes[0].rms_nm) if with_gain else None
+    plans = [f.next_experiment for f in parts if f.next_experiment is not None]
+    return Findings(
+        verdict,
+        tuple(f"joint {n}: {reason}" for f in parts for n in f.joints[:1] for reason in f.reasons),
+        parts[0].runs,
+        tuple(n for f in parts for n in f.joints),
+        tuple(sorted((g for f in parts for g in f.gaps), key=lambda g: g.noise_floor_nm**2 - g.rmse_nm**2)),
+        tuple(sorted((c for f in parts for c in f.causes), key=lambda c: -c.rms_nm)),
+        tuple(sorted((c for f in parts for c in f.candidates), key=lambda c: -c.delta_bic)),
+        None if leading is None else leading.gain,
+        channel_notes=tuple(dict.fromkeys(note for f in parts for note in f.channel_notes)),
+        next_experiment=plans[0] if plans else None,
+        traces=tuple(t for f in parts for t in f.traces),
+    )
+
 
 FEWEST_RUNS: Final = 2
 SHORTEST_MOVING_S: Final = 5.0
@@ -192,9 +243,9 @@ def _prepared(signals: list[list[JointSignals]], joints: Mapping[int, Joint]) ->
 
 def library_candidates(
     signals: Sequence[Sequence[JointSignals]], joints: Mapping[int, Joint]
-) -> list[Candidate]:
+) -> list[EffectCandidate]:
     """Return every term of every effect that these runs have the channels for, columns numbered."""
-    out: list[Candidate] = []
+    out: list[EffectCandidate] = []
     first = 0
     numbers = [s.number for s in signals[0]]
     for effect in EFFECTS.values():
@@ -210,7 +261,7 @@ def library_candidates(
                 size = max((float(np.abs(v).max()) for found in shown for v in found.values()), default=0.0)
                 if size > 0.0 and np.isfinite(size):
                     out.append(
-                        Candidate(effect, where, term, first, effect.largest(joints[n], term.basis[-1]))
+                        EffectCandidate(effect, where, term, first, effect.largest(joints[n], term.basis[-1]))
                     )
                     first += len(term.basis)
     return out
@@ -230,11 +281,11 @@ def _seen(effect: Effect, signals: Sequence[Sequence[JointSignals]], number: int
 def _found_orders(
     signals: Sequence[Sequence[JointSignals]],
     joints: Mapping[int, Joint],
-    candidates: Sequence[Candidate],
-) -> list[Candidate]:
+    candidates: Sequence[EffectCandidate],
+) -> list[EffectCandidate]:
     """Return cogging at integer orders that stand out of the residual's order spectrum."""
     first = candidates[-1].columns.stop if candidates else 0
-    out: list[Candidate] = []
+    out: list[EffectCandidate] = []
     step = float(np.median(np.diff(signals[0][0].time_s)))
     every = max(1, round(ORDER_STEP_S / step))
     step *= every
@@ -253,14 +304,17 @@ def _found_orders(
                 term = EFFECTS["cogging"].term_of_order(float(order))
                 if term is None:
                     continue
-                out.append(Candidate(EFFECTS["cogging"], s.number, term, first))
+                out.append(EffectCandidate(EFFECTS["cogging"], s.number, term, first))
                 first += len(term.basis)
                 there.add(order)
     return out
 
 
 def strange_lines(
-    signals: Sequence[Sequence[JointSignals]], candidates: Sequence[Candidate], samples: int, step_s: float
+    signals: Sequence[Sequence[JointSignals]],
+    candidates: Sequence[EffectCandidate],
+    samples: int,
+    step_s: float,
 ) -> list[Line]:
     """Return strong lines of the residuals at orders and frequencies that no candidate has; no sidelobes of others."""
     bare = [run_data(run, [], samples) for run in signals]

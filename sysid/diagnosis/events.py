@@ -8,17 +8,50 @@ Everything in Nm^2 unless a name says otherwise.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 
-from estimator.friction import FloatArray
-from sysid.diagnosis.channel import Channel
-from sysid.diagnosis.columns import RunData, gain_columns
-from sysid.diagnosis.prepared import Prepared
-from sysid.diagnosis.signals import BoolArray
-from sysid.diagnosis.whitening import past_valid, saturated_residuals, whiten
+from jtqd.estimator.arrays import BoolArray, FloatArray
+from jtqd.estimator.joint import Joint
+from jtqd.sysid.diagnosis.noise import past_valid, saturated_residuals, whiten
+from jtqd.sysid.diagnosis.powerless import Readings
+from jtqd.sysid.diagnosis.regressors import EffectCandidate, Family, RunData, gain_columns
+from jtqd.sysid.diagnosis.signals import Channel, JointSignals, Line
+
+# Runs as the statistics see them.
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """signals [run][joint]; runs: the same binned, `samples` to a bin of step_s seconds; the library's candidates;
+    unexplained: what none of them explains, per channel and run [n]; groups: nuisances; lines: those among them that are
+    lines at orders or frequencies of no effect; readings: per run what the current reads without power; events: what is not
+    valid in `runs` only because it is an event, per channel and run [n].
+    """
+
+    signals: list[list[JointSignals]]
+    runs: list[RunData]
+    candidates: list[EffectCandidate]
+    samples: int
+    step_s: float
+    unexplained: dict[Channel, list[FloatArray]]
+    groups: list[Family]
+    lines: list[Line]
+    readings: Sequence[Readings] = ()
+    events: Mapping[Channel, Sequence[BoolArray]] = field(default_factory=dict)
+
+    @property
+    def joints(self) -> dict[int, Joint]:
+        """The joint files by number, their own effects taken off the residuals already."""
+        return {s.number: s.joint for s in self.signals[0]}
+
+    def seen(self, run: int, channel: Channel) -> BoolArray:
+        """Return where a channel of a run is valid or in an event [n]."""
+        valid = self.runs[run].channels[channel].valid
+        return valid | self.events[channel][run] if channel in self.events else valid
+
 
 BLOCK_S: Final = 1.0
 _BURST_S: Final = 0.05

@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sysid.diagnosis.channel import Channel
-from sysid.diagnosis.classes import WITHIN
-from sysid.diagnosis.columns import Candidate
-from sysid.diagnosis.findings import Cause, JointName
-from sysid.diagnosis.mixed import explained
-from sysid.diagnosis.search import DEEPEST, Hypothesis, Search
+from jtqd.sysid.diagnosis.evidence import WITHIN
+from jtqd.sysid.diagnosis.findings import Cause, JointName
+from jtqd.sysid.diagnosis.mixed_model import explained
+from jtqd.sysid.diagnosis.regressors import EffectCandidate
+from jtqd.sysid.diagnosis.search import DEEPEST, Hypothesis, Search
+from jtqd.sysid.diagnosis.signals import Channel
 
 if TYPE_CHECKING:
-    from sysid.diagnosis.prepared import Prepared
+    from jtqd.sysid.diagnosis.events import Prepared
 
 ENOUGH_RUNS: Final = 4
 """From here on the sum over runs left out decides, as everywhere else."""
@@ -72,14 +72,14 @@ class FewRuns:
             self._reached(self._without(hypothesis, c)) for c in hypothesis.chosen
         )
 
-    def rivals(self, best: Hypothesis, cause: Candidate) -> tuple[Candidate, ...]:
+    def rivals(self, best: Hypothesis, cause: EffectCandidate) -> tuple[EffectCandidate, ...]:
         """Return the candidates (one per effect and joint) that in the place of `cause` help on every run left out and on
         at least one of them leave no more than FALL more than it, best first; with one joint, torque constant and
         sensor gain are never told apart, whose difference is a factor on friction and inertia.
         """
         others = [c for c in best.chosen if c is not cause]
         base = self._without(best, cause)
-        found: dict[tuple[str, object], tuple[float, Candidate]] = {}
+        found: dict[tuple[str, object], tuple[float, EffectCandidate]] = {}
         twins = _SCALES if self.search.joints == 1 and cause.effect.name in _SCALES else frozenset()
         for rival in self._grown(base):
             new = next(c for c in rival.chosen if c not in others)
@@ -101,7 +101,7 @@ class FewRuns:
         self,
         found: Hypothesis,
         best: Hypothesis,
-        classes: Sequence[Sequence[Candidate]],
+        classes: Sequence[Sequence[EffectCandidate]],
         causes: Sequence[Cause],
     ) -> list[tuple[str, JointName]]:
         """Return (effect, joint) of what these runs show without confirming it: causes whose interval holds the joint
@@ -164,23 +164,23 @@ class FewRuns:
                 out.append(child)
         return out
 
-    def _idle(self, hypothesis: Hypothesis) -> list[Candidate]:
+    def _idle(self, hypothesis: Hypothesis) -> list[EffectCandidate]:
         """Return the candidates without which some run left out does as well."""
         chosen = hypothesis.chosen
         return [c for c in chosen if not self._helps(hypothesis, self._without(hypothesis, c), (c,))]
 
     def _helps(
-        self, hypothesis: Hypothesis, without: Hypothesis, new: Sequence[Candidate], least: float = FALL
+        self, hypothesis: Hypothesis, without: Hypothesis, new: Sequence[EffectCandidate], least: float = FALL
     ) -> bool:
         if not new:
             return True
         drops = self.search.held_out_deviances(without) - self.search.held_out_deviances(hypothesis)
         return bool(np.all(drops > 0.0)) and min(self._falls(hypothesis, without, new)) >= least
 
-    def _without(self, hypothesis: Hypothesis, candidate: Candidate) -> Hypothesis:
+    def _without(self, hypothesis: Hypothesis, candidate: EffectCandidate) -> Hypothesis:
         return self.search.hypothesis([c for c in hypothesis.chosen if c is not candidate], hypothesis.model)
 
-    def _falls(self, one: Hypothesis, other: Hypothesis, where: Sequence[Candidate]) -> list[float]:
+    def _falls(self, one: Hypothesis, other: Hypothesis, where: Sequence[EffectCandidate]) -> list[float]:
         """Return per run the part of the other's squared error that `one` takes away, summed over the channels in which
         the candidates `where` act.
         """
@@ -222,7 +222,7 @@ class FewRuns:
         return out
 
 
-def _holds_nothing(candidate: Candidate, cause: Cause) -> bool:
+def _holds_nothing(candidate: EffectCandidate, cause: Cause) -> bool:
     """Return whether the intervals of all its parameters hold the values without it."""
     nothing = candidate.term.combine([0.0] * candidate.size)
     free = {

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
-from estimator.friction import FloatArray
+import numpy as np
+
+from jtqd.estimator.arrays import FloatArray
 
 SCHEMA: Final = "jtq.findings/1"
 NO_GAP: Final = "no_gap"
@@ -44,7 +47,7 @@ class Cause:
 
 
 @dataclass(frozen=True)
-class Candidate:
+class CandidateEvidence:
     """Evidence of one effect against the baseline alone; why it was not chosen, and the smallest size detectable."""
 
     name: str
@@ -133,8 +136,186 @@ class Findings:
     joints: tuple[int, ...]
     gaps: tuple[Gap, ...] = ()
     causes: tuple[Cause, ...] = ()
-    candidates: tuple[Candidate, ...] = ()
+    candidates: tuple[CandidateEvidence, ...] = ()
     gain: Gain | None = None
     channel_notes: tuple[str, ...] = ()
     next_experiment: Mapping[str, Any] | None = None  # {"why": text, "plan": mapping of jtq.plan/1}
     traces: tuple[Trace, ...] = field(default=(), repr=False)
+
+
+# Findings as plain values for findings.json, schema jtq.findings/1. Pure.
+#
+# The keys of the schema are always there, whatever the verdict: a program that reads `gap.rmse_nm` need not ask first. What
+# has no value is null; NaN and infinity, which JSON does not have, are null as well (an unlimited interval, an effect that
+# no size would make visible). Keys beside those of the schema say more and may be ignored.
+
+
+_NO_GAP_MEASURED: Final[dict[str, Any]] = {
+    "joint": None,
+    "rmse_nm": None,
+    "noise_floor_nm": None,
+    "localisation": [],
+}
+_NO_GAIN_MEASURED: Final = {"rmse_before_nm": None, "rmse_after_nm": None, "split": None, "ci95": None}
+
+
+def to_mapping(
+    findings: Findings, *, sha256: Mapping[str, str] | None = None, files: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Return dicts, lists, texts and finite numbers only.
+
+    sha256: hash of each run's file by the run's name; files: names of what was written beside findings.json.
+    """
+    mapping = {
+        "schema": SCHEMA,
+        "verdict": findings.verdict,
+        "gap": _gap(findings.gaps[0]) if findings.gaps else _NO_GAP_MEASURED,
+        "causes": [_cause(each) for each in findings.causes],
+        "gain": _NO_GAIN_MEASURED if findings.gain is None else _gain(findings.gain),
+        "next_experiment": findings.next_experiment,
+        "reasons": findings.reasons,
+        "joints": findings.joints,
+        "runs": [{"name": name, "sha256": (sha256 or {}).get(name)} for name in findings.runs],
+        "gaps": [_gap(each) for each in findings.gaps],
+        "candidates": [_candidate(each) for each in findings.candidates],
+        "channel_notes": findings.channel_notes,
+        "files": list(files),
+    }
+    result: dict[str, Any] = plain(mapping)
+    return result
+
+
+def plain(value: Any) -> Any:
+    """The same value with what JSON knows: numpy's numbers and arrays become plain, NaN and infinity None.
+
+    Raises TypeError for anything else.
+    """
+    if isinstance(value, np.generic | np.ndarray):
+        value = value.tolist()
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, Iterable):
+        return [plain(item) for item in value]
+    raise TypeError(f"found {type(value).__name__} in findings, expected plain values")
+
+
+def _gap(gap: Gap) -> dict[str, Any]:
+    return {
+        "joint": gap.joint,
+        "rmse_nm": gap.rmse_nm,
+        "noise_floor_nm": gap.noise_floor_nm,
+        "localisation": [_place(each) for each in gap.localisation],
+        "balance": gap.balance,
+        "floor_from": gap.floor_from,
+    }
+
+
+def _place(place: Place) -> dict[str, Any]:
+    return {
+        "axis": place.axis,
+        "bin": place.bin,
+        "share": place.share,
+        "low": place.low,
+        "high": place.high,
+        "unit": place.unit,
+        "rms_nm": place.rms_nm,
+    }
+
+
+def _cause(cause: Cause) -> dict[str, Any]:
+    return {
+        "name": cause.name,
+        "joint": cause.joint,
+        "class": list(cause.names),
+        "parameters": _values(cause.parameters),
+        "evidence": {"delta_bic": cause.delta_bic, "held_out_gain": cause.held_out_gain},
+        "rms_nm": cause.rms_nm,
+        "balance": cause.balance,
+    }
+
+
+def _values(values: Mapping[str, Value]) -> dict[str, Any]:
+    return {
+        name: {"value": each.value, "ci95": each.ci95, "unit": each.unit} for name, each in values.items()
+    }
+
+
+def _candidate(candidate: CandidateEvidence) -> dict[str, Any]:
+    return {
+        "name": candidate.name,
+        "joint": candidate.joint,
+        "evidence": {"delta_bic": candidate.delta_bic, "held_out_gain": candidate.held_out_gain},
+        "shared": candidate.shared,
+        "minimum": {
+            name: {"value": each.value, "unit": each.unit} for name, each in candidate.minimum.items()
+        },
+        "reason": candidate.reason,
+    }
+
+
+def _gain(gain: Gain) -> dict[str, Any]:
+    return {
+        "rmse_before_nm": gain.rmse_before_nm,
+        "rmse_after_nm": gain.rmse_after_nm,
+        "split": gain.split,
+        "ci95": gain.ci95,
+        "free_run_before_rad_s": gain.free_run_before,
+        "free_run_after_rad_s": gain.free_run_after,
+        "runs": [each._asdict() for each in gain.runs],
+    }
+
+
+# Findings in a few lines for a terminal. Pure.
+
+
+_SAID: Final = {
+    NO_GAP: "the simulation explains these runs down to their noise",
+    CAUSE: "the gap has a cause that these runs name",
+    AMBIGUOUS: "the gap has a cause, but these runs cannot tell which of a class",
+    UNEXPLAINED: "there is a gap that no effect of the library explains",
+    INSUFFICIENT: "these runs cannot be judged",
+}
+
+
+def summary_lines(findings: Findings) -> list[str]:
+    """Return verdict, gap, causes with intervals, gain, next experiment: one line each."""
+    lines = [f"{findings.verdict}: {_SAID.get(findings.verdict, '')}"]
+    lines += [f"  {reason}" for reason in findings.reasons]
+    for gap in findings.gaps[:1]:
+        lines.append(
+            f"gap: joint {gap.joint}, {gap.balance} balance: {gap.rmse_nm:.3g} Nm rms, "
+            f"noise {gap.noise_floor_nm:.3g} Nm ({gap.floor_from})"
+        )
+        if findings.verdict != NO_GAP:
+            lines += [f"  {each.share:4.0%} of it at {each.axis} {each.bin}" for each in gap.localisation[:3]]
+    lines += [_summary_cause(each) for each in findings.causes]
+    gain = findings.gain
+    if gain is not None and math.isfinite(gain.rmse_before_nm):
+        low, high = gain.ci95
+        lines.append(
+            f"gain on runs left out: {gain.rmse_before_nm:.3g} -> {gain.rmse_after_nm:.3g} Nm rms "
+            f"(less by {low:.3g} to {high:.3g} Nm)"
+        )
+    if findings.next_experiment:
+        lines.append(f"next experiment: {findings.next_experiment['why']}")
+    return lines
+
+
+def _summary_cause(cause: Cause) -> str:
+    at = "sensor" if cause.joint == "sensor" else f"joint {cause.joint}"
+    values = ", ".join(_value(name, each) for name, each in cause.parameters.items())
+    others = [name for name in cause.names if name != cause.name]
+    either = f"; cannot be told from {', '.join(others)}" if others else ""
+    return f"cause: {cause.name} of {at}: {values} ({cause.rms_nm:.3g} Nm rms){either}"
+
+
+def _value(name: str, value: Value) -> str:
+    low, high = value.ci95
+    unit = f" {value.unit}" if value.unit else ""
+    if not math.isfinite(low + high) or low == high:
+        return f"{name} {value.value:.4g}{unit}"
+    return f"{name} {value.value:.4g} [{low:.4g}, {high:.4g}]{unit}"

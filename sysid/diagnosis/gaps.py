@@ -7,16 +7,14 @@ from typing import Final
 
 import numpy as np
 
-from estimator.friction import FloatArray
-from sysid.diagnosis.channel import Channel, Line
-from sysid.diagnosis.columns import LINE
-from sysid.diagnosis.events import Burst
-from sysid.diagnosis.findings import Gap, Place, Trace
-from sysid.diagnosis.leftover import Leftover, less_nuisances
-from sysid.diagnosis.places import MOST, Told, places_told
-from sysid.diagnosis.prepared import Prepared
-from sysid.diagnosis.refine import Refined
-from sysid.diagnosis.structure import SIGNIFICANT, AxisMap, axis_maps
+from jtqd.estimator.arrays import FloatArray
+from jtqd.sysid.diagnosis.events import Burst, Prepared
+from jtqd.sysid.diagnosis.findings import Gap, Place, Trace
+from jtqd.sysid.diagnosis.leftover import MOST, Leftover, Told, less_nuisances, places_told
+from jtqd.sysid.diagnosis.refine import Refined
+from jtqd.sysid.diagnosis.regressors import LINE
+from jtqd.sysid.diagnosis.signals import Channel, Line
+from jtqd.sysid.diagnosis.structure import SIGNIFICANT, AxisMap, axis_maps
 
 _SAME: Final = 0.02
 """Two runs whose velocities and loads differ by less than this part of their rms are repetitions."""

@@ -14,18 +14,17 @@ from typing import Final
 
 import numpy as np
 
-from estimator.effects.effect import MOTOR, TORSION, Effect, Parameter
-from estimator.friction import FloatArray
-from estimator.parameters import Joint
-from sysid.diagnosis.channel import Channel
-from sysid.diagnosis.columns import ChannelData, RunData, binned, contribution
-from sysid.diagnosis.findings import JointName
-from sysid.diagnosis.mixed import Mixed, Model
-from sysid.diagnosis.powerless import Row, unpowered, with_readings
-from sysid.diagnosis.prepared import Prepared
-from sysid.diagnosis.search import Hypothesis
-from sysid.diagnosis.signals import JointSignals
-from sysid.diagnosis.whitening import Noise, run_sums
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.effects.effect import MOTOR, TORSION, Effect, Parameter
+from jtqd.estimator.joint import Joint
+from jtqd.sysid.diagnosis.events import Prepared
+from jtqd.sysid.diagnosis.findings import JointName
+from jtqd.sysid.diagnosis.mixed_model import Mixed, Model
+from jtqd.sysid.diagnosis.noise import Noise, run_sums
+from jtqd.sysid.diagnosis.powerless import Row, unpowered, with_readings
+from jtqd.sysid.diagnosis.regressors import ChannelData, RunData, binned, contribution
+from jtqd.sysid.diagnosis.search import Hypothesis
+from jtqd.sysid.diagnosis.signals import Channel, JointSignals
 
 _STEPS: Final = 6
 _MOST_STEPS: Final = 24

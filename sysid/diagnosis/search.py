@@ -14,10 +14,10 @@ from typing import Final
 
 import numpy as np
 
-from estimator.friction import FloatArray
-from sysid.diagnosis.columns import Candidate
-from sysid.diagnosis.mixed import Mixed, Model, explained, solve
-from sysid.diagnosis.powerless import Readings, Row, misfit
+from jtqd.estimator.arrays import FloatArray
+from jtqd.sysid.diagnosis.mixed_model import Mixed, Model, explained, solve
+from jtqd.sysid.diagnosis.powerless import Readings, Row, misfit
+from jtqd.sysid.diagnosis.regressors import EffectCandidate
 
 ENTER: Final = 10.0
 """BIC difference: very strong evidence on the scale of Kass and Raftery 1995, J. Am. Stat. Assoc. 90."""
@@ -37,11 +37,11 @@ _ONE_FACTOR: Final = 0.3
 class Hypothesis:
     """A set of candidates and its fit; bic as above."""
 
-    chosen: tuple[Candidate, ...]
+    chosen: tuple[EffectCandidate, ...]
     model: Model
     bic: float
 
-    def coefficients(self, candidate: Candidate) -> list[float]:
+    def coefficients(self, candidate: EffectCandidate) -> list[float]:
         """Return the coefficients of one of its candidates."""
         first = 0
         for one in self.chosen:
@@ -63,7 +63,7 @@ class Search:
     def __init__(  # noqa: PLR0917
         self,
         mixed: Mixed,
-        candidates: Sequence[Candidate],
+        candidates: Sequence[EffectCandidate],
         effective_rows: float,
         moments: FloatArray,
         least_nm: float,
@@ -88,18 +88,18 @@ class Search:
         self.joints = len({c.joint for c in candidates} - {"sensor"})
         self._cache: dict[tuple[int, ...], Hypothesis] = {}
 
-    def penalty(self, candidate: Candidate) -> float:
+    def penalty(self, candidate: EffectCandidate) -> float:
         """Return what the candidate costs in BIC: its parameters, and the choice among its terms."""
         return candidate.size * self._log_n[candidate.first] + self._choice[candidate.key]
 
-    def _rows_that_count(self, candidate: Candidate) -> float:
+    def _rows_that_count(self, candidate: EffectCandidate) -> float:
         """Return ln n for the BIC of a candidate: of all rows where its uncertainty is noise, of the runs where it is
         what differs between runs (an offset is measured once per run, however long the run).
         """
         share = 1.0 - float(self._marginal_share[candidate.first])
         return (1.0 - share) * self.log_n + share * math.log(self.mixed.runs + 1.0)
 
-    def hypothesis(self, chosen: Sequence[Candidate], start: Model | None = None) -> Hypothesis:
+    def hypothesis(self, chosen: Sequence[EffectCandidate], start: Model | None = None) -> Hypothesis:
         """Return the fit of a set of candidates."""
         ordered = tuple(sorted(chosen, key=lambda c: c.first))
         key = tuple(c.first for c in ordered)
@@ -119,7 +119,7 @@ class Search:
             for c in hypothesis.chosen
         )
 
-    def size_nm(self, hypothesis: Hypothesis, candidate: Candidate) -> float:
+    def size_nm(self, hypothesis: Hypothesis, candidate: EffectCandidate) -> float:
         """Return the rms of a candidate's contribution in the channel where it is largest [Nm]."""
         own = slice(candidate.first, candidate.first + candidate.size)
         beta = np.array(hypothesis.coefficients(candidate))
@@ -135,7 +135,7 @@ class Search:
                 read[where] = read.get(where, 0.0) + amperes * float(beta.get(column, 0.0))
         return misfit(self._readings, read)
 
-    def fits_beside(self, candidate: Candidate, chosen: Sequence[Candidate]) -> bool:
+    def fits_beside(self, candidate: EffectCandidate, chosen: Sequence[EffectCandidate]) -> bool:
         """Return whether a candidate may be added: an effect is there once, waves once per order."""
         if not pinned([*chosen, candidate], self.joints):
             return False
@@ -196,7 +196,7 @@ class Search:
             best = candidate
         return best
 
-    def held_out(self, hypothesis: Hypothesis, candidate: Candidate) -> float:
+    def held_out(self, hypothesis: Hypothesis, candidate: EffectCandidate) -> float:
         """Return the drop of the deviance on runs left out that the candidate brings, summed over the runs."""
         without = self.hypothesis([c for c in hypothesis.chosen if c is not candidate], hypothesis.model)
         return float(np.sum(self.held_out_deviances(without) - self.held_out_deviances(hypothesis)))
@@ -230,7 +230,7 @@ def _with_price(hypothesis: Hypothesis) -> float:
     return hypothesis.bic + ENTER * len(hypothesis.chosen)
 
 
-def pinned(chosen: Sequence[Candidate], joints: int) -> bool:
+def pinned(chosen: Sequence[EffectCandidate], joints: int) -> bool:
     """Return whether something fixes the scale: with the sensor's gain free, the stiffness (and the torque constant) of
     at least one joint is not. All of them times the same factor is a change of units, which shrinks the noise too.
     """
@@ -257,11 +257,11 @@ def units_changed(hypothesis: Hypothesis, joints: int) -> bool:
     return bool(spread < _ONE_FACTOR * abs(sum(changes) / len(changes)))
 
 
-def within(candidate: Candidate, coefficients: Sequence[float]) -> bool:
+def within(candidate: EffectCandidate, coefficients: Sequence[float]) -> bool:
     """Return whether the parameters of these coefficients are plausible."""
     values = candidate.term.combine(coefficients)
     return all(p.low <= values[p.name] <= p.high for p in candidate.effect.parameters if p.name in values)
 
 
-def _order(candidate: Candidate) -> float:
+def _order(candidate: EffectCandidate) -> float:
     return float(candidate.term.basis[0].get("order_per_motor_rev", 0.0))

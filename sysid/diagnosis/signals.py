@@ -1,6 +1,6 @@
 """What a diagnosis sees of one joint in one run: state for the effects, residuals of both balances, masks. Pure.
 
-The residuals are those of `estimator.effects.effect`: what the simulation with the joint file leaves over. Derivatives
+The residuals are those of `jtqd.estimator.effects.effect`: what the simulation with the joint file leaves over. Derivatives
 are central differences of positions, which look one sample ahead: this is for recorded runs. All arrays are later
 averaged over equal bins, residual and regressors alike, so that noise of differences averages out and nothing is
 compared with something filtered in another way.
@@ -13,19 +13,112 @@ itself at the frequencies where there is nothing else.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from estimator.effects.effect import Effect, State, Values
-from estimator.friction import FloatArray
-from estimator.parameters import Joint
-from estimator.run import JointColumns, RunTable
-from sysid.diagnosis.base_loss import BaseLoss
+from jtqd.estimator.arrays import BoolArray, FloatArray
+from jtqd.estimator.effects.effect import Effect, State, Values
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.losses import DRIVING_CURRENT_MAX_A, LossModel
+from jtqd.estimator.run import JointColumns, RunTable
+from jtqd.sim_can.losses import TORQUE_STEPS, LossTable
+from jtqd.sim_can.plant_file import plant_of_joint
 
-BoolArray = np.ndarray[tuple[int], np.dtype[np.bool_]]
+# A channel of the diagnosis, and a line found in its residual.
+
+
+class Channel(NamedTuple):
+    """One balance ("motor" or "torsion") of one joint."""
+
+    joint: int
+    balance: str
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line in a residual: at `order` per motor revolution, or at `order` Hz where the unit says so; ratio: its power
+    against the median of the neighbourhood.
+    """
+
+    channel: Channel
+    order: float
+    amplitude_nm: float
+    ratio: float
+    unit: str = "1/rev"
+
+
+# Losses of the joint file as the simulation has them: a function of transmitted torque and velocity, whole runs at once.
+#
+# The law of the emulated plant for this file (`jtqd.sim_can.plant_file.plant_of_joint`): with an efficiency the table of
+# `jtqd.sim_can.losses` and the file's Stribeck peak, else the file's friction. The direction of friction is known: samples
+# near rest, where a simulation's smoothing would matter, are not used by the diagnosis. Pure.
+
+
+_SLOPE_NM: Final = 0.3
+
+
+class BaseLoss:
+    """loss0(tau, v) of one joint file, signed like the velocity [Nm, joint side]."""
+
+    def __init__(self, joint: Joint) -> None:
+        self._friction: Final = joint.friction
+        self._rows: tuple[FloatArray, FloatArray] | None = None
+        if joint.efficiency is not None:
+            highest = max(DRIVING_CURRENT_MAX_A, 9.0)
+            table = LossTable(
+                LossModel(joint).loss_many, joint.gear_ratio, joint.torque_constant_nm_per_a, highest
+            )
+            self._rows = (np.array(table.forward), np.array(table.reverse))
+            self._limit = table.torque_limit
+            self._per_torque = table.per_torque_step
+            self._per_velocity = table.per_velocity_step
+            self._last = table.last_row
+            true = plant_of_joint(joint).joints[0].deviations
+            self._peak = true.stribeck_nm, true.stribeck_velocity_rad_s
+
+    @property
+    def depends_on_load(self) -> bool:
+        """Whether the joint file has an efficiency."""
+        return self._rows is not None
+
+    def loss(self, torque_nm: FloatArray, velocity_rad_s: FloatArray) -> FloatArray:
+        """Return the loss [n] at torque_nm [n] and velocity_rad_s [n]."""
+        v = velocity_rad_s
+        if self._rows is None:
+            f = self._friction
+            peak = f.stribeck_nm * np.exp(-((v / f.stribeck_velocity_rad_s) ** 2))
+            result: FloatArray = np.sign(v) * (f.coulomb_nm + peak) + f.viscous_nms_per_rad * v
+            return result
+        x = np.minimum(np.abs(v) * self._per_velocity, self._last + 1.0)
+        k = np.minimum(x.astype(np.intp), self._last)
+        y = np.clip((torque_nm + self._limit) * self._per_torque, 0.0, TORQUE_STEPS - 1e-9)
+        m = y.astype(np.intp)
+        x, y = x - k, y - m
+        out = np.empty_like(v)
+        for rows, here in ((self._rows[0], v >= 0.0), (self._rows[1], v < 0.0)):
+            a, b, p, q = k[here], m[here], x[here], y[here]
+            low = rows[a, b] + q * (rows[a, b + 1] - rows[a, b])
+            high = rows[a + 1, b] + q * (rows[a + 1, b + 1] - rows[a + 1, b])
+            out[here] = low + p * (high - low)
+        height, vs = self._peak
+        signed: FloatArray = np.sign(v) * (out + height * np.exp(-((v / vs) ** 2)))
+        return signed
+
+    def slope(self, torque_nm: FloatArray, velocity_rad_s: FloatArray) -> FloatArray:
+        """Return d loss / d torque [n]: torque that is wrong by e leaves a loss wrong by slope times e.
+
+        Zero without efficiency: such losses know no load. Taken over +-_SLOPE_NM, as wide as zeros of torque sensors are,
+        so that the grid of the table does not show.
+        """
+        if self._rows is None:
+            return np.zeros_like(velocity_rad_s)
+        ahead = self.loss(torque_nm + _SLOPE_NM, velocity_rad_s)
+        behind = self.loss(torque_nm - _SLOPE_NM, velocity_rad_s)
+        return (ahead - behind) / (2.0 * _SLOPE_NM)
+
 
 SLOWEST_RAD_S: Final = 0.03
 """Below it the direction of friction, and so its value, is not known from a velocity measurement."""
@@ -237,3 +330,66 @@ def smooth(x: FloatArray, samples: int) -> FloatArray:
         out = (total[samples:] - total[:-samples]) / samples
     result: FloatArray = out
     return result
+
+
+# Motor residuals where the losses depend on the load: expanded about the sensor's zero of the run. Pure.
+#
+# The simulation takes its losses at the measured torque, so a zero z of the sensor is in the residual twice: as -z, and
+# as the losses' error. Driving with an efficiency of a half that doubles it, driven back it takes part of it away:
+#
+#     motor = .. - loss0(tau) - tau = .. - z - (loss0(tau) - loss0(tau - z))  ~  .. - z (1 + loss0')
+#
+# A zero of 0.3 Nm is not small where the efficiency turns from driving to driven back, within 2 Nm. So loss0 is expanded
+# about a first guess z0 of each run's zero and not about 0; the residual still holds the whole of z, now linearly. A bad
+# guess does no harm but that of none.
+
+
+_LARGEST_NM: Final = 2.0
+_TURNS: Final = 2
+
+
+def about_zero(run: Sequence[JointSignals], bases: Mapping[int, BaseLoss]) -> list[JointSignals]:
+    """Return the signals of one run's joints with motor residual and `per_torque` expanded about the run's zero."""
+    if not any(bases[s.number].depends_on_load for s in run):
+        return list(run)
+    out = [_expanded(s, bases[s.number], 0.0) for s in run]
+    for _ in range(_TURNS):
+        guess = _first_guess(out)
+        out = [_expanded(s, bases[s.number], guess) for s in run]
+    return out
+
+
+def _expanded(s: JointSignals, base: BaseLoss, zero_nm: float) -> JointSignals:
+    torque, velocity = s.state.torque_nm, s.state.velocity_rad_s
+    true = torque - zero_nm
+    slope = base.slope(true, velocity)
+    less = base.loss(torque, velocity) - base.loss(true, velocity) - slope * zero_nm
+    return replace(s, motor_nm=s.motor_nm + less, per_torque=1.0 + slope)
+
+
+def _first_guess(run: Sequence[JointSignals]) -> float:
+    """Return the zero [Nm] that fits all motor balances best, beside friction, inertia and gain of each joint."""
+    rows: list[FloatArray] = []
+    rest: list[FloatArray] = []
+    for k, s in enumerate(run):
+        good, state = s.moving, s.state
+        if not good.any():
+            continue
+        own = np.column_stack(
+            (
+                state.direction,
+                state.velocity_rad_s,
+                state.current_a,
+                state.motor_acceleration_rad_s2,
+                state.torque_nm,
+            )
+        )[good]
+        wide = np.zeros((len(own), 1 + 5 * len(run)))
+        wide[:, 0] = -np.broadcast_to(s.per_torque, good.shape)[good]
+        wide[:, 1 + 5 * k : 6 + 5 * k] = own
+        rows.append(wide)
+        rest.append(s.motor_nm[good])
+    if not rows:
+        return 0.0
+    found = np.linalg.lstsq(np.concatenate(rows), np.concatenate(rest), rcond=None)[0]
+    return float(np.clip(found[0], -_LARGEST_NM, _LARGEST_NM))

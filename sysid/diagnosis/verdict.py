@@ -7,14 +7,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from estimator.parameters import Joint
-from sysid.diagnosis.channel import Channel
-from sysid.diagnosis.classes import equivalence_class
-from sysid.diagnosis.columns import Candidate, binned, contribution
-from sysid.diagnosis.evidence import candidate_table
-from sysid.diagnosis.experiments import MOST_KINDS, next_experiment
-from sysid.diagnosis.few_runs import ENOUGH_RUNS, FewRuns
-from sysid.diagnosis.findings import (
+from jtqd.estimator.joint import Joint
+from jtqd.sysid.diagnosis.evidence import RELEVANT, candidate_table, equivalence_class
+from jtqd.sysid.diagnosis.few_runs import ENOUGH_RUNS, FewRuns
+from jtqd.sysid.diagnosis.findings import (
     AMBIGUOUS,
     CAUSE,
     INSUFFICIENT,
@@ -26,18 +22,20 @@ from sysid.diagnosis.findings import (
     JointName,
     Value,
 )
-from sysid.diagnosis.gain import held_out_gain, left_out_steps
-from sysid.diagnosis.gaps import channel_gaps, traces
-from sysid.diagnosis.leftover import Leftover, leftover
-from sysid.diagnosis.minimum import RELEVANT
-from sysid.diagnosis.refine import Present, Refined, parameter, present_causes, refine
-from sysid.diagnosis.rests import offset_at_rest, rest_current
-from sysid.diagnosis.search import Hypothesis, Search
-from sysid.diagnosis.whitening import Noise
-from sysid.friction_fit import student_975
+from jtqd.sysid.diagnosis.gain import held_out_gain, left_out_steps
+from jtqd.sysid.diagnosis.gaps import channel_gaps, traces
+from jtqd.sysid.diagnosis.leftover import Leftover, leftover
+from jtqd.sysid.diagnosis.next_experiment import MOST_KINDS, next_experiment
+from jtqd.sysid.diagnosis.noise import Noise
+from jtqd.sysid.diagnosis.powerless import offset_at_rest, rest_current
+from jtqd.sysid.diagnosis.refine import Present, Refined, parameter, present_causes, refine
+from jtqd.sysid.diagnosis.regressors import EffectCandidate, binned, contribution
+from jtqd.sysid.diagnosis.search import Hypothesis, Search
+from jtqd.sysid.diagnosis.signals import Channel
+from jtqd.sysid.fit.friction import student_975
 
 if TYPE_CHECKING:
-    from sysid.diagnosis.prepared import Prepared
+    from jtqd.sysid.diagnosis.events import Prepared
 
 UNEXPLAINED_SHARE: Final = 0.2
 """When what is left over holds more than this part of the structured gap, the causes found do not name it."""
@@ -137,8 +135,8 @@ def _settled(  # noqa: PLR0917
     best: Hypothesis,
     refined: Refined,
     noise: Noise,
-    classes: list[tuple[Candidate, ...]],
-) -> tuple[Hypothesis, Refined, list[tuple[Candidate, ...]]]:
+    classes: list[tuple[EffectCandidate, ...]],
+) -> tuple[Hypothesis, Refined, list[tuple[EffectCandidate, ...]]]:
     """Return the same without friction asymmetry where the current at rest shows that it is an offset (`rests`)."""
     pair = {"current_offset", "friction_asymmetry"}
     for k, cause in enumerate(best.chosen):
@@ -166,7 +164,7 @@ def _settled(  # noqa: PLR0917
     return best, refined, classes
 
 
-def _without(classes: Sequence[tuple[Candidate, ...]], k: int) -> list[tuple[Candidate, ...]]:
+def _without(classes: Sequence[tuple[EffectCandidate, ...]], k: int) -> list[tuple[EffectCandidate, ...]]:
     return [c for j, c in enumerate(classes) if j != k]
 
 
@@ -247,7 +245,7 @@ def _cause(  # noqa: PLR0917
     best: Hypothesis,
     refined: Refined,
     k: int,
-    rivals: Sequence[Candidate],
+    rivals: Sequence[EffectCandidate],
     rms_nm: float,
     balance: str,
 ) -> Cause:

@@ -12,17 +12,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from estimator.checked import ConfigError
-from estimator.onnx_graph import NetworkError
-from sim_can.run_files import RunError
-from sysid.evaluate.evaluation import Evaluation, evaluate
-from sysid.evaluate.inputs import Inputs, read_inputs
-from sysid.evaluate.loop_time import loop_time
-from sysid.evaluate.mapping import as_mapping
-from sysid.evaluate.methods import JointModels, load_models
-from sysid.evaluate.text import text_lines
-from sysid.findings import Finding
-from sysid.fit_inputs import progress
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.onnx_graph import NetworkError
+from jtqd.sysid.evaluate.evaluation import Evaluation, evaluate
+from jtqd.sysid.evaluate.inputs import Inputs, read_inputs
+from jtqd.sysid.evaluate.loop_time import loop_time
+from jtqd.sysid.evaluate.methods import JointModels, load_models
+from jtqd.sysid.evaluate.report import as_mapping, text_lines
+from jtqd.sysid.runs.checks import RunIssue
+from jtqd.sysid.runs.files import RunError
+from jtqd.sysid.runs.inputs import progress
 
 BY: Final = "jtq evaluate"
 _NEEDED: Final = ("matplotlib", "jinja2", "onnx")
@@ -127,9 +126,9 @@ def _distinct(inputs: Inputs, outside: Inputs) -> tuple:  # type: ignore[type-ar
     return inputs.runs
 
 
-def _silent(models: tuple[JointModels, ...]) -> list[Finding]:
+def _silent(models: tuple[JointModels, ...]) -> list[RunIssue]:
     return [
-        Finding(
+        RunIssue(
             "training_runs_unknown",
             f"{name}: found no runs in its metadata, expected names and SHA-256 of what it was trained on: whether it has "
             "seen these runs cannot be told",
@@ -141,7 +140,7 @@ def _silent(models: tuple[JointModels, ...]) -> list[Finding]:
 
 def _write(options: argparse.Namespace, result: Evaluation) -> None:
     """evaluation.json and evaluation.html, each whole or not at all; then the table or the JSON on standard output."""
-    from sysid.evaluate.report import report_html
+    from jtqd.sysid.evaluate.report import report_html
 
     mapping = as_mapping(result)
     text = json.dumps(mapping, indent=1, allow_nan=False)

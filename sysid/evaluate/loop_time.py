@@ -13,10 +13,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from estimator.methods import make_estimator
-from estimator.settings import EstimatorSettings
-from sysid.evaluate.inputs import JudgedRun
-from sysid.evaluate.methods import OURS, PAPERS, JointModels
+from jtqd.estimator.methods import make_estimator
+from jtqd.estimator.settings import EstimatorSettings
+from jtqd.sysid.evaluate.inputs import JudgedRun
+from jtqd.sysid.evaluate.methods import OURS, PAPERS, JointModels
 
 METHODS: Final = ("tob", PAPERS, OURS)
 SAMPLES: Final = 3000

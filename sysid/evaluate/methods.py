@@ -6,26 +6,111 @@ leaves its methods out, by name.
 
 from __future__ import annotations
 
+import gzip
 import hashlib
+import json
 import re
+import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from estimator.checked import ConfigError
-from estimator.friction import FloatArray
-from estimator.fused_run import ObservedRun, estimate_observed, observe_run
-from estimator.methods import AnyNetwork, estimate_columns, load_network
-from estimator.parameters import Joint
-from estimator.run import JointColumns
-from estimator.settings import EstimatorSettings
-from estimator.whole_run import EstimateRun
-from models.files import load_joint
-from sysid.evaluate.provenance import TrainingRuns, joint_training_runs, network_training_runs
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.methods import AnyNetwork, estimate_columns, load_network
+from jtqd.estimator.run import JointColumns
+from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
+from jtqd.estimator.whole_run import EstimateRun, ObservedRun, estimate_observed, observe_run, quadrant_many
+from jtqd.models.files import load_joint
+from jtqd.sysid.fit.signals import same_age
+
+# Leakage guard: which runs the models were made from, by the hashes that models carry; a run among them judges nothing.
+#
+# Joint files name them in `provenance` (every mapping of a section's `sha256`), networks in the metadata key `runs` and
+# in a card jointN.json or jointN.fused.json beside them.
+
+
+KEY: Final = "runs"
+_COMPRESSION: Final = 6
+"""Of run files as this toolbox writes them (jtqd.sysid.runs.files)."""
+
+
+@dataclass(frozen=True)
+class TrainingRuns:
+    """sources: SHA-256 of a run file -> names of the models made from it; silent: models that name no runs at all."""
+
+    sources: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    silent: tuple[str, ...] = ()
+
+    def and_those_of(self, other: TrainingRuns) -> TrainingRuns:
+        """Return both together."""
+        merged = dict(self.sources)
+        for sha256, names in other.sources.items():
+            merged[sha256] = tuple(dict.fromkeys((*merged.get(sha256, ()), *names)))
+        return TrainingRuns(merged, tuple(dict.fromkeys((*self.silent, *other.silent))))
+
+
+def joint_training_runs(name: str, joint: Joint) -> TrainingRuns:
+    """Return the runs that sections of a joint file were fitted to; a file with nominal values has none, rightly."""
+    sources: dict[str, tuple[str, ...]] = {}
+    for section, record in joint.provenance.items():
+        if isinstance(record, Mapping):
+            for key in ("sha256", KEY):
+                sources |= dict.fromkeys(_hashes(record.get(key)), (f"{name} ({section})",))
+    return TrainingRuns(sources)
+
+
+def network_training_runs(path: Path) -> TrainingRuns:
+    """Return the runs that a network was trained on; one that does not say so is `silent`."""
+    import onnx
+
+    model = onnx.load_model(str(path), load_external_data=False)
+    found = {entry.key: entry.value for entry in model.metadata_props}
+    hashes = _hashes(_json(found.get(KEY, "")))
+    card = path.with_suffix(".json")
+    if card.is_file():
+        content = _json(card.read_text(encoding="utf-8", errors="replace"))
+        hashes |= _hashes(content.get(KEY) if isinstance(content, dict) else None)
+    if not hashes:
+        return TrainingRuns({}, (path.name,))
+    return TrainingRuns(dict.fromkeys(hashes, (path.name,)))
+
+
+def run_hashes(path: Path) -> tuple[str, ...]:
+    """Return the SHA-256 of a run file, and that of the same data packed or unpacked: a copy is the same data."""
+    data = path.read_bytes()
+    hashes = [hashlib.sha256(data).hexdigest()]
+    try:
+        other = (
+            gzip.decompress(data) if path.name.endswith(".gz") else gzip.compress(data, _COMPRESSION, mtime=0)
+        )
+    except (OSError, EOFError, zlib.error):  # not a run, as its reader will say
+        return tuple(hashes)
+    return (*hashes, hashlib.sha256(other).hexdigest())
+
+
+def _json(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return None
+
+
+def _hashes(value: Any) -> set[str]:
+    """Hex SHA-256 in a mapping name -> hash or in a list; everything else is none."""
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    if not isinstance(value, list):
+        return set()
+    return {text.lower() for text in value if isinstance(text, str) and len(text) == 64}
+
 
 TITLES: Final = MappingProxyType(
     {
@@ -139,3 +224,83 @@ def _joint_models(directory: Path, number: int) -> JointModels:
     methods = tuple(method for method in TITLES if method not in missing)
     ordered = {method: missing[method] for method in TITLES if method in missing}
     return JointModels(number, joint, networks, methods, ordered, training, files)
+
+
+# One joint of one run: every method's estimate beside the sensor of the same age, and which samples count. Pure.
+#
+# Only samples at which all methods move and have a value are scored, the same ones for each: a method must not look better
+# because it was silent where the others were wrong.
+
+
+SETTLE_S: Final = 0.1
+"""From the first sample on for so long the filters' starts are still in the data."""
+
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Arrays [n] of one joint (`number`) in one run (`run`).
+
+    sensor_nm: torque sensor, filtered like the estimates; raw_nm: G Kt i less the rotor's share, whose sign with the
+    velocity's [rad/s, joint side] makes the quadrant (index into QUADRANTS); estimate_nm, sigma_nm, status: by method;
+    scored: all methods move and have a value; standing: all have a value and stand still; missing: settled, but some
+    method has no value; temperature_c: NaN where the run has none; bare_nm: the paper's network by itself, without the
+    guard around it, NaN where there is none.
+    """
+
+    run: str
+    number: int
+    rated_nm: float
+    time_s: FloatArray
+    sensor_nm: FloatArray
+    raw_nm: FloatArray
+    velocity_rad_s: FloatArray
+    temperature_c: FloatArray
+    quadrant: NDArray[np.intp]
+    estimate_nm: Mapping[str, FloatArray]
+    sigma_nm: Mapping[str, FloatArray]
+    status: Mapping[str, NDArray[np.uint8]]
+    scored: Flags
+    standing: Flags
+    missing: Flags
+    bare_nm: FloatArray
+
+    def error_nm(self, method: str) -> FloatArray:
+        """Estimate less sensor [n] [Nm]."""
+        return self.estimate_nm[method] - self.sensor_nm
+
+
+def take_samples(run: str, models: JointModels, time_s: FloatArray, columns: JointColumns) -> Samples:
+    """Estimate one joint of a run by every method.
+
+    columns: all inputs and the sensor [n]; finite (`RunTable` is). Raises ConfigError and ValueError as the estimators.
+    """
+    runs, seen = models.estimate(time_s, columns)
+    if columns.torque_nm is None:
+        raise ValueError(f"{run}: j{models.number}.torque_nm: missing")
+    dt = np.diff(time_s, prepend=time_s[0])
+    sensor = same_age(columns.torque_nm, dt, EstimatorSettings().bandwidth_rad_s)
+    settled = time_s - time_s[0] >= SETTLE_S
+    published = settled & np.logical_and.reduce([np.isfinite(each.torque_nm) for each in runs.values()])
+    moving = np.logical_and.reduce([np.isin(each.status, (VALID, DEGRADED)) for each in runs.values()])
+    standing = np.logical_and.reduce([each.status == STANDSTILL for each in runs.values()])
+    paper = runs.get("network")
+    return Samples(
+        run=run,
+        number=models.number,
+        rated_nm=models.joint.rated_torque_nm,
+        time_s=time_s,
+        sensor_nm=sensor,
+        raw_nm=seen.raw_nm,
+        velocity_rad_s=seen.velocity_rad_s,
+        temperature_c=seen.temperature_c,
+        quadrant=quadrant_many(seen.raw_nm, seen.velocity_rad_s),
+        estimate_nm={method: each.torque_nm for method, each in runs.items()},
+        sigma_nm={method: each.sigma_nm for method, each in runs.items()},
+        status={method: each.status for method, each in runs.items()},
+        scored=published & moving,
+        standing=published & standing,
+        missing=settled & ~published,
+        bare_nm=np.full_like(sensor, np.nan) if paper is None else paper.network_nm,
+    )

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import Final
 
-from drivers.devices import COMMANDER_NODE, drive_rpdo1, drive_rpdo2
-from drivers.frame import FRAME, pack
-from sysid.motion.cia402_client import ENABLE_OPERATION, QUICK_STOP_WORD
-from sysid.motion.drive_setup import DriveUnits
-from sysid.motion.result import MotionError
-from sysid.motion.setpoints import Setpoints
+from jtqd.drivers.devices import COMMANDER_NODE, drive_rpdo1, drive_rpdo2
+from jtqd.drivers.frame import FRAME, pack
+from jtqd.sysid.motion.cia402 import ENABLE_OPERATION, QUICK_STOP_WORD
+from jtqd.sysid.motion.setpoints import MotionError, Setpoints
+from jtqd.sysid.motion.setup import DriveUnits
 
 _COMMAND, _VELOCITY = drive_rpdo1(1).layout, drive_rpdo2(1).layout
 _BOOT_UP: Final = b"\x00"

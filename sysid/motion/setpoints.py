@@ -2,12 +2,86 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+import math
+from dataclasses import dataclass, fields
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
-from estimator.friction import FloatArray
+from jtqd.estimator.arrays import FloatArray
+
+# What a motion ended with, how it can be refused, and the times it is supervised with.
+
+
+class MotionError(Exception):
+    """The motion was refused before anything moved; one line for the operator."""
+
+
+class MotionResult(NamedTuple):
+    """How a motion ended. Both joints are disabled in either case, or `reason` says what could not be confirmed.
+
+    Attributes:
+        status: "done", or "stopped" before its end.
+        reason: one line: joint, quantity, found, limit; "" when done.
+        played_s: length of the set-points that were sent.
+    """
+
+    status: Literal["done", "stopped"]
+    reason: str
+    played_s: float
+
+
+class Violation(NamedTuple):
+    """Why the motion must end.
+
+    Attributes:
+        reason: one line: joint, quantity, found, limit.
+        hard: the joints cannot be led to a stop any more (drive or SYNC lost): each drive brakes by itself, now.
+    """
+
+    reason: str
+    hard: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """Times of the supervision in seconds. ValueError for one that is not positive.
+
+    Attributes:
+        sync_lost_s: longest time without SYNC.
+        late_s: longest time from SYNC to its set-point.
+        stale_cycles: SYNCs that a TPDO may be missing.
+        heartbeats_missing: heartbeats of a node (1017h) that may be missing.
+        temperature_s: longest time between two temperatures (TPDO3 comes every 500 ms).
+        own_heartbeat_s: period of ours.
+        drive_timeout_s: 1016h:2 of the drives: without our heartbeat for so long they stop by themselves.
+        setpoint_delay_s: from SYNC to the set-point. The TPDOs have crossed the wire by then, so that the RPDO, whose
+            identifier is lower than that of TPDO2, does not delay them.
+        ready_s: for SYNC, all inputs and standstill to be there at the start.
+        still_s: standstill required before the joints are enabled.
+        enable_s, quick_stop_s, disable_s: for the drives to change their state.
+    """
+
+    sync_lost_s: float = 0.02
+    late_s: float = 0.02
+    stale_cycles: int = 5
+    heartbeats_missing: int = 3
+    temperature_s: float = 2.0
+    own_heartbeat_s: float = 0.1
+    drive_timeout_s: float = 0.3
+    setpoint_delay_s: float = 0.7e-3
+    ready_s: float = 3.0
+    still_s: float = 0.15
+    enable_s: float = 1.0
+    quick_stop_s: float = 1.0
+    disable_s: float = 0.5
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if not value > 0:
+                raise ValueError(f"timing: {item.name} is {value!r}, expected a positive number")
+
 
 PERIOD_S: Final = 1e-3
 """Time from one set-point to the next: the period of SYNC."""
@@ -106,3 +180,134 @@ class Setpoints:
     def time_s(self) -> FloatArray:
         """Time [n] of each set-point from the first one."""
         return np.arange(len(self), dtype=np.float64) * PERIOD_S
+
+
+# Limits of a motion: of what is measured (`Monitor`) and of what is planned (`check_setpoints`). Pure.
+#
+# Every refusal is one line that names joint, quantity, what was found, and the limit.
+
+
+STEEPEST_VELOCITY_RAD_S2: Final = 50.0
+"""Steepest planned velocity, joint side: 0.05 rad/s from one set-point to the next."""
+STEEPEST_CURRENT_A_S: Final = 500.0
+"""Steepest planned current: 0.5 A from one set-point to the next."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Largest magnitudes, for both joints alike; ValueError for one that is not a positive number.
+
+    Attributes:
+        current_a: motor current.
+        velocity_rad_s: joint side (motor encoder through the gear).
+        torque_nm: at the sensor between the joints.
+        travel_rad: joint side, from where the motion began, by either encoder.
+        temperature_c: of the joint; math.inf where the drives do not tell it.
+    """
+
+    current_a: float
+    velocity_rad_s: float
+    torque_nm: float
+    travel_rad: float
+    temperature_c: float = math.inf
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            if not number or not value > 0 or (math.isinf(value) and item.name != "temperature_c"):
+                raise ValueError(f"limits.{item.name}: found {value!r}, expected a positive number")
+
+
+class JointSample(NamedTuple):
+    """What was measured of one joint in one cycle: motor current, joint side velocity and travel, temperature.
+
+    `temperature_c` is nan as long as none has come.
+    """
+
+    current_a: float
+    velocity_rad_s: float
+    travel_rad: float
+    temperature_c: float
+
+
+class Sample(NamedTuple):
+    """What was measured in one cycle: joints 1 and 2, and the torque [Nm] of each sensor channel in use."""
+
+    one: JointSample
+    two: JointSample
+    torque_nm: tuple[float, ...]
+
+
+class Monitor:
+    """Compares samples with the limits. It keeps no state: the same sample gives the same answer."""
+
+    __slots__ = ("_limits",)
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+
+    def check(self, sample: Sample) -> str | None:
+        """Return what is beyond its limit, the first found; None when nothing is. A nan is beyond every limit but
+        temperature's, which has its own supervision.
+        """
+        limits = self._limits
+        current, velocity, travel = limits.current_a, limits.velocity_rad_s, limits.travel_rad
+        for joint in (sample.one, sample.two):
+            if not (
+                -current <= joint.current_a <= current
+                and -velocity <= joint.velocity_rad_s <= velocity
+                and -travel <= joint.travel_rad <= travel
+            ) or (joint.temperature_c > limits.temperature_c):
+                return self._joint_reason(1 if joint is sample.one else 2, joint)
+        for channel, torque in enumerate(sample.torque_nm, 1):
+            if not -limits.torque_nm <= torque <= limits.torque_nm:
+                who = "joints 1 and 2" if len(sample.torque_nm) == 1 else f"joint {channel}"
+                return f"{who}: torque at the sensor {torque:.2f} Nm, limit {limits.torque_nm:g} Nm"
+        return None
+
+    def _joint_reason(self, number: int, joint: JointSample) -> str:
+        limits = self._limits
+        for name, found, limit, unit in (
+            ("current", joint.current_a, limits.current_a, "A"),
+            ("velocity", joint.velocity_rad_s, limits.velocity_rad_s, "rad/s"),
+            ("travel", joint.travel_rad, limits.travel_rad, "rad"),
+        ):
+            if not -limit <= found <= limit:
+                return f"joint {number}: {name} {found:.3f} {unit}, limit {limit:g} {unit}"
+        return f"joint {number}: temperature {joint.temperature_c:.1f} °C, limit {limits.temperature_c:g} °C"
+
+
+def check_setpoints(setpoints: Setpoints, limits: Limits) -> None:
+    """Refuse a plan that cannot be kept within the limits, or that jumps; before anything moves.
+
+    Travel is that of the velocity joint; the other one turns with it. The first set-point is compared with
+    standstill. Raises MotionError naming joint, quantity, time, found and limit.
+    """
+    one, other = setpoints.velocity_joint, setpoints.current_joint
+    travel = np.cumsum(setpoints.velocity_rad_s) * PERIOD_S
+    _below(setpoints.velocity_rad_s, limits.velocity_rad_s, f"velocity of joint {one}", "rad/s")
+    _below(setpoints.current_a, limits.current_a, f"current of joint {other}", "A")
+    _below(travel, limits.travel_rad, f"travel of joint {one}", "rad")
+    _smooth(
+        setpoints.velocity_rad_s, STEEPEST_VELOCITY_RAD_S2 * PERIOD_S, f"velocity of joint {one}", "rad/s"
+    )
+    _smooth(setpoints.current_a, STEEPEST_CURRENT_A_S * PERIOD_S, f"current of joint {other}", "A")
+
+
+def _below(series: FloatArray, limit: float, what: str, unit: str) -> None:
+    beyond = np.flatnonzero(np.abs(series) > limit)
+    if beyond.size:
+        found, time_s = series[beyond[0]], beyond[0] * PERIOD_S
+        raise MotionError(f"plan: {what} {found:.3f} {unit} at {time_s:.3f} s, limit {limit:g} {unit}")
+
+
+def _smooth(series: FloatArray, limit: float, what: str, unit: str) -> None:
+    """`series` must not change by more than `limit` from one set-point to the next, nor begin with more."""
+    steps = np.diff(series, prepend=0.0)
+    jumps = np.flatnonzero(np.abs(steps) > limit * (1.0 + 1e-9))
+    if jumps.size:
+        where = "starts with a jump" if jumps[0] == 0 else f"jumps at {jumps[0] * PERIOD_S:.3f} s"
+        raise MotionError(
+            f"plan: {what} {where} of {steps[jumps[0]]:.3f} {unit}, limit {limit:g} {unit} per ms"
+        )

@@ -16,15 +16,13 @@ from contextlib import closing, contextmanager
 from types import FrameType
 from typing import Final
 
-from drivers.devices import DriveProfile, SensorProfile
-from drivers.errors import BusError
-from drivers.frame import FRAME, FRAME_SIZE
-from drivers.frame_socket import CAPACITY, FrameSocket, exact, open_frame_socket
-from sysid.motion.bench_setup import BenchSetup
-from sysid.motion.commander import Commander, Frame
-from sysid.motion.limits import Limits, check_setpoints
-from sysid.motion.result import MotionError, MotionResult, Timing
-from sysid.motion.setpoints import Setpoints
+from jtqd.drivers.devices import DriveProfile, SensorProfile
+from jtqd.drivers.filters import exact
+from jtqd.drivers.frame import FRAME, FRAME_SIZE
+from jtqd.drivers.frame_socket import CAPACITY, BusError, FrameSocket, open_frame_socket
+from jtqd.sysid.motion.commander import Commander, Frame
+from jtqd.sysid.motion.setpoints import Limits, MotionError, MotionResult, Setpoints, Timing, check_setpoints
+from jtqd.sysid.motion.setup import BenchSetup
 
 Progress = Callable[[float, float], None]
 """Called with (played, total) seconds a few times per second, between two cycles: it must return at once."""

@@ -8,15 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon.config import Config, load_config
-from daemon.loop import joint_cycle, joint_status
-from daemon.shared import cycle_record
-from estimator.losses import BLEND_CURRENT_A, LossModel
-from estimator.parameters import Joint
-from estimator.settings import EstimatorSettings
-from estimator.status import DEGRADED
-from estimator.tracking import LINK_SPEED_LIMIT_RAD_S, RAW_LIMIT
-from estimator.validity import FADE_START
+from jtqd.daemon.config import Config, load_config
+from jtqd.daemon.loop import joint as joint_cycle
+from jtqd.daemon.loop import joint_status
+from jtqd.daemon.shared import cycle_record
+from jtqd.estimator.guard import LINK_SPEED_LIMIT_RAD_S, RAW_LIMIT
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.losses import BLEND_CURRENT_A, LossModel
+from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.status import DEGRADED
+from jtqd.estimator.validity import FADE_START
 from tests.benchmarks.fixture import (
     ENVELOPE_HIGH,
     ENVELOPE_LOW,

@@ -16,14 +16,14 @@ from typing import Any
 
 import canopen
 
-from daemon.config import load_config
-from daemon.loop import estimate_pdo
-from daemon.loop import process as loop
-from daemon.loop.grid import Grid
-from drivers.devices import drive_tpdo1, drive_tpdo2, sensor_tpdo1
-from drivers.pdo import PdoMap
-from drivers.python_can_unix import UnixBus
-from estimator.status import OFF, PUBLISHED, STALE
+from jtqd.daemon.config import load_config
+from jtqd.daemon.loop import estimate_pdo
+from jtqd.daemon.loop import process as loop
+from jtqd.daemon.loop.schedule import Grid
+from jtqd.drivers.can_unix import UnixBus
+from jtqd.drivers.devices import drive_tpdo1, drive_tpdo2, sensor_tpdo1
+from jtqd.drivers.pdo import PdoMap
+from jtqd.estimator.status import OFF, PUBLISHED, STALE
 from tests.benchmarks.contender import ROOT, Task, serve
 from tests.benchmarks.fixture import Fixture
 from tests.benchmarks.measure import CycleMeter, punctual

@@ -1,4 +1,4 @@
-"""Contender: jtqd's own loop, the code of daemon.loop.process and daemon.loop.cycle as it ships."""
+"""Contender: jtqd's own loop, the code of jtqd.daemon.loop.process and jtqd.daemon.loop.cycle as it ships."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import sys
 import time
 from typing import Any
 
-from daemon.config import Config, load_config
-from daemon.loop import process as loop
-from daemon.loop import realtime
-from daemon.loop.cycle import Cycle
-from daemon.loop.grid import Grid
-from daemon.shared.cycle_record import FLAG_PUBLISHED
-from drivers.frame_socket import FrameSocket, open_frame_socket
-from estimator.methods import AnyEstimator
-from estimator.status import PUBLISHED
+from jtqd.daemon.config import Config, load_config
+from jtqd.daemon.loop import process as loop
+from jtqd.daemon.loop import realtime
+from jtqd.daemon.loop.cycle import Cycle
+from jtqd.daemon.loop.schedule import Grid
+from jtqd.daemon.shared.cycle_record import FLAG_PUBLISHED
+from jtqd.drivers.frame_socket import FrameSocket, open_frame_socket
+from jtqd.estimator.methods import AnyEstimator
+from jtqd.estimator.status import PUBLISHED
 from tests.benchmarks.contender import Task, serve
 from tests.benchmarks.fixture import Fixture
 from tests.benchmarks.measure import CycleMeter
@@ -36,7 +36,7 @@ class JtqdLoop:
         realtime.freeze()
 
     def connect(self) -> tuple[Cycle, Grid, FrameSocket]:
-        """A cycle on the bus, as `daemon.loop.process.serve` builds it."""
+        """A cycle on the bus, as `jtqd.daemon.loop.process.serve` builds it."""
         request = {
             "ring": str(self.task.directory / "jtqd.ring"),
             "snapshot": str(self.task.directory / "jtqd.snapshot"),
@@ -61,7 +61,7 @@ class JtqdLoop:
 
 
 def loop_start(grid: Grid) -> None:
-    """Put the first slot two periods ahead, as daemon.loop.process does."""
+    """Put the first slot two periods ahead, as jtqd.daemon.loop.process does."""
     grid.slot_ns = time.monotonic_ns() + 2 * grid.period_ns
 
 

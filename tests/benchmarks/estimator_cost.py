@@ -7,20 +7,17 @@ same code costs more; the stage table (`python -m tests.benchmarks stages`) show
 from __future__ import annotations
 
 import gc
-import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
-
-from estimator.joint_estimator import METHODS, EstimatorSettings, estimate_run
-from estimator.losses import LossModel
-from estimator.methods import load_network, make_estimator
-from estimator.network import TorqueNetwork
+from jtqd.estimator.losses import LossModel
+from jtqd.estimator.methods import load_network, make_estimator
+from jtqd.estimator.network import TorqueNetwork
+from jtqd.estimator.settings import METHODS, EstimatorSettings
+from jtqd.estimator.whole_run import estimate_run
 from tests.benchmarks.table import mark
-from tests.estimator_helpers import joint1, motion, small_network
-from tests.fused_configuration import joint_of, network_of
+from tests.estimator.estimator_helpers import joint1, motion, small_network
+from tests.estimator.fused_configuration import joint_of, network_of
 
 SAMPLES = 60_000
 JOINTS = 2

@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from estimator.network import FEATURES
-from models.files import load_joint, shipped
-from sysid.onnx_export import FloatArray, Layer, export_network
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.network import FEATURES
+from jtqd.models.files import load_joint, shipped
+from jtqd.sysid.train.network import Layer, export_network
 from tests.benchmarks.traffic import SCALING, SENSOR_NM_PER_UNIT
 
 _HIDDEN = (20, 40, 10)
@@ -51,7 +52,7 @@ class Fixture:
 
 @dataclass(frozen=True)
 class SmallNetwork:
-    """Weights (W [inputs, outputs], b [outputs]) per layer; input and output are normalised as in sysid.onnx_export."""
+    """Weights (W [inputs, outputs], b [outputs]) per layer; input and output are normalised as in sysid.train.network."""
 
     layers: tuple[Layer, ...]
     input_mean: FloatArray

@@ -21,13 +21,13 @@ from typing import Any
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from daemon.recording import schemas
-from daemon.recording.messages import BLOCK_PARTS, BLOCK_SIZE, cycle_block
-from daemon.recording.progress import Account
-from daemon.recording.request import RecorderRequest
-from daemon.recording.session import Session
-from daemon.shared import cycle_record
-from daemon.shared.ring import RingReader
+from jtqd.daemon.recording import schemas
+from jtqd.daemon.recording.messages import BLOCK_PARTS, BLOCK_SIZE, cycle_block
+from jtqd.daemon.recording.progress import Account
+from jtqd.daemon.recording.recorder import Session
+from jtqd.daemon.recording.request import RecorderRequest
+from jtqd.daemon.shared import cycle_record
+from jtqd.daemon.shared.ring import RingReader
 from tests.benchmarks.contender import ROOT
 from tests.benchmarks.table import mark, table
 
@@ -62,7 +62,7 @@ def run(directory: Path, *, seconds: float = 30.0, rounds: int = 3) -> dict[str,
 def _daemon(directory: Path, disk: Path, seconds: float) -> tuple[dict[str, Any], list[bytes]]:
     environment = {key: value for key, value in os.environ.items() if key != "RUNTIME_DIRECTORY"}
     environment |= {"XDG_RUNTIME_DIR": str(directory), "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-P", "-m", "daemon.jtqd", "--bus", "sim", "--json"]
+    command = [sys.executable, "-P", "-m", "jtqd.daemon.jtqd", "--bus", "sim", "--json"]
     command += ["--duration", f"{seconds + _SETTLE_S + 1.0:g}", "--record", str(disk / "logs")]
     daemon = subprocess.Popen(
         command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
@@ -105,7 +105,7 @@ def _recorder(daemon: subprocess.Popen[str]) -> int:
     while time.monotonic() < deadline and daemon.poll() is None:
         for pid in Path(f"/proc/{daemon.pid}/task/{daemon.pid}/children").read_text().split():
             with suppress(OSError):
-                if b"daemon.recording.recorder" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                if b"jtqd.daemon.recording.recorder" in Path(f"/proc/{pid}/cmdline").read_bytes():
                     return int(pid)
         time.sleep(0.05)
     raise RuntimeError("the daemon started no recorder")

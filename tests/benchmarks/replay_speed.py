@@ -13,15 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from daemon.replay.breaks import steps_of
-from daemon.replay.exact import ExactReplay
-from daemon.replay.frames import decode
-from daemon.replay.models import Models, logged_models
-from daemon.replay.runs import Part, read_part
-from daemon.replay.whole import replay_whole
+from jtqd.daemon.replay.estimates import ExactReplay, replay_whole
+from jtqd.daemon.replay.frames import decode
+from jtqd.daemon.replay.runs import Part, read_part, steps_of
+from jtqd.daemon.replay.session import Models, logged_models
 from tests.benchmarks.table import table
+from tests.paths import GOLDEN
 
-GOLDEN = Path(__file__).resolve().parent.parent / "golden"
 METHODS = ("tob", "efficiency", "network", "fused")
 TARGET = 500.0
 _ROUNDS = 3

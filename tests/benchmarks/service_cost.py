@@ -10,13 +10,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from daemon.loop.cycle import Cycle
-from daemon.loop.duties import Duties
-from daemon.reload import handover
-from daemon.reload.carry import Fill, Walk
-from daemon.reload.handover import Giver
-from daemon.supervisor.notify import LoopWatchdog, Notifier
-from tests.cycle_helpers import inputs, make, turn
+from jtqd.daemon.loop.cycle import Cycle
+from jtqd.daemon.loop.process import Duties
+from jtqd.daemon.reload import handover
+from jtqd.daemon.reload.carry import Fill, Walk
+from jtqd.daemon.reload.handover import Giver
+from jtqd.daemon.shared.systemd import LoopWatchdog, Notifier
+from tests.daemon.loop.cycle_helpers import inputs, make, turn
 
 LIMIT_NS = 1_000.0
 """Of the duties, on average per cycle."""

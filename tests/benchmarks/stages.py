@@ -14,9 +14,9 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
-from daemon.loop import estimate_pdo
-from daemon.loop import process as loop
-from estimator.methods import AnyEstimator, load_network, make_estimator
+from jtqd.daemon.loop import estimate_pdo
+from jtqd.daemon.loop import process as loop
+from jtqd.estimator.methods import AnyEstimator, load_network, make_estimator
 from tests.benchmarks.contender import serve
 from tests.benchmarks.contender_jtqd import JtqdLoop, _never, loop_start, measured
 from tests.benchmarks.measure import SETTLE_CYCLES, CycleMeter, quantile
@@ -33,8 +33,8 @@ STAGES = {
 }
 
 
-cycle_module: Any = importlib.import_module("daemon.loop.cycle")
-joint_module: Any = importlib.import_module("daemon.loop.joint_cycle")
+cycle_module: Any = importlib.import_module("jtqd.daemon.loop.cycle")
+joint_module: Any = importlib.import_module("jtqd.daemon.loop.joint")
 """Their names `estimate_pdo` and `time` are exchanged for timed ones during a round."""
 
 

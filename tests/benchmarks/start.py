@@ -10,11 +10,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from daemon.loop.estimate_pdo import LAYOUT
-from daemon.shared.runtime_dir import instance_name
-from drivers.errors import BusError
-from drivers.frame_socket import FrameSocket, exact, open_frame_socket
-from estimator.status import PUBLISHED
+from jtqd.daemon.loop.estimate_pdo import LAYOUT
+from jtqd.daemon.shared.runtime_dir import instance_name
+from jtqd.drivers.filters import exact
+from jtqd.drivers.frame_socket import BusError, FrameSocket, open_frame_socket
+from jtqd.estimator.status import PUBLISHED
 from tests.benchmarks.contender import ROOT
 from tests.benchmarks.table import mark, table
 
@@ -28,7 +28,16 @@ def run(directory: Path, *, duration_s: float = 4.0) -> dict[str, Any]:
     """Start the daemon once, its files in `directory`. Raises RuntimeError when it does not come up."""
     environment = {key: value for key, value in os.environ.items() if key != "RUNTIME_DIRECTORY"}
     environment |= {"XDG_RUNTIME_DIR": str(directory), "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-P", "-m", "daemon.jtqd", "--bus", "sim", "--duration", f"{duration_s:g}"]
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "jtqd.daemon.jtqd",
+        "--bus",
+        "sim",
+        "--duration",
+        f"{duration_s:g}",
+    ]
     command += ["--record", str(directory / "log")]
     path = directory / f"jtqd-{os.getuid()}-{instance_name('sim')}" / "bus"
     started = time.monotonic()

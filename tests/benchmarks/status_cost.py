@@ -6,12 +6,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-from daemon.config import load_config
-from daemon.loop.counters import LoopCounters
-from daemon.loop.input_pdos import input_pdos
-from daemon.loop.intake import Intake
-from daemon.shared import cycle_record as cr
-from daemon.shared.snapshot import STATUS_CODES, Snapshot
+from jtqd.daemon.config import load_config
+from jtqd.daemon.loop.counters import LoopCounters
+from jtqd.daemon.loop.input_pdos import input_pdos
+from jtqd.daemon.loop.intake import Intake
+from jtqd.daemon.shared import cycle_record as cr
+from jtqd.daemon.shared.snapshot import STATUS_CODES, Snapshot
 
 EVERY = 8
 """Cycles between two snapshots."""

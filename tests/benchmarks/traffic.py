@@ -11,8 +11,8 @@ import struct
 import sys
 from math import cos, pi, sin
 
-from drivers.frame import pack
-from drivers.hub import Hub
+from jtqd.drivers.frame import pack
+from jtqd.drivers.hub import Hub
 from tests.benchmarks.measure import punctual
 
 CYCLES = 4000

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from daemon.replay.session import Result, Wishes, replay
-from estimator.status import NAMES
+from jtqd.daemon.replay.session import Result, Wishes, replay
+from jtqd.estimator.status import NAMES
 
 HERE = Path(__file__).resolve().parent
 TOLERANCE_NM = 2e-6

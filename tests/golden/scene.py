@@ -18,7 +18,7 @@ from pathlib import Path
 
 import yaml
 
-from models.files import shipped
+from jtqd.models.files import shipped
 
 INTERFACE = os.environ.get("JTQD_CAN_INTERFACE", "vcan0")
 
@@ -104,7 +104,7 @@ def play(name: str, out: Path) -> Path:
         logs = Path(scratch) / "logs"
         daemon = subprocess.Popen(
             [
-                *(sys.executable, "-m", "daemon.jtqd", "--bus", INTERFACE),
+                *(sys.executable, "-m", "jtqd.daemon.jtqd", "--bus", INTERFACE),
                 *("--config", str(configuration(scene, Path(scratch)))),
                 *("--duration", str(scene.seconds), "--record", str(logs)),
             ],

@@ -11,7 +11,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from sim_can.bench_kernel import guest
+from jtqd.sim_can.bench_kernel import guest
 from tests.golden.reference import HERE, difference, logs, replayed, store, stored
 from tests.golden.scene import SCENES
 

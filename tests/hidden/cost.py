@@ -24,7 +24,7 @@ pickle.dump(case, open(sys.argv[1], "wb"))
 """
 _DIAGNOSE: Final = """
 import json, pickle, resource, sys, time
-from sysid.diagnosis.diagnose import diagnose
+from jtqd.sysid.diagnosis.diagnose import diagnose
 from tests.hidden.trials import joint_files, tables
 case = pickle.load(open(sys.argv[1], "rb"))
 runs, joints = tables(case.runs), joint_files(case)

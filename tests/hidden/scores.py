@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from sysid.diagnosis.findings import Cause, Findings, Gap, Place
+from jtqd.sysid.diagnosis.findings import Cause, Findings, Gap, Place
 from tests.hidden.profiles import RUN_S
 
 LARGEST_CLASS: Final = 3

@@ -12,16 +12,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from estimator.effects.library import EFFECTS
-from estimator.parameters import Joint
-from estimator.run import COLUMN_NAMES, JointColumns, RunTable
-from sysid.campaign.plan import Plan
-from sysid.campaign.segments import check_plan
-from sysid.diagnosis.base_loss import BaseLoss
-from sysid.diagnosis.columns import all_in_bin, bin_samples, binned, contribution
-from sysid.diagnosis.diagnose import diagnose
-from sysid.diagnosis.findings import Candidate, Findings
-from sysid.diagnosis.signals import joint_signals
+from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
+from jtqd.sysid.campaign.plan import Plan, check_plan
+from jtqd.sysid.diagnosis.diagnose import diagnose
+from jtqd.sysid.diagnosis.findings import CandidateEvidence, Findings
+from jtqd.sysid.diagnosis.regressors import all_in_bin, bin_samples, binned, contribution
+from jtqd.sysid.diagnosis.signals import BaseLoss, joint_signals
 from tests.hidden.case import Case, draw_many, follow_up
 from tests.hidden.menu import MENU, SENSOR, base_value, scaled
 from tests.hidden.order import Hidden, Order
@@ -106,7 +104,7 @@ def _orders(  # noqa: PLR0917
 
 def _pick(
     name: str, rng: np.random.Generator, plain: Case, findings: Findings
-) -> tuple[Candidate, Mapping[str, float]] | None:
+) -> tuple[CandidateEvidence, Mapping[str, float]] | None:
     """Return an evidence of this effect and its parameters at the minimum, one of the visible ones at random."""
     options = [
         (row, values) for row in findings.candidates if row.name == name for values in minima(row, plain)
@@ -114,7 +112,7 @@ def _pick(
     return options[int(rng.integers(len(options)))] if options else None
 
 
-def minima(row: Candidate, plain: Case) -> list[Mapping[str, float]]:
+def minima(row: CandidateEvidence, plain: Case) -> list[Mapping[str, float]]:
     """Return the parameters at the minimum detectable size, one entry per way of looking, absolute as in a joint file."""
     complete = getattr(row, "at_minimum", ())
     if complete:
@@ -144,7 +142,7 @@ def _plausible(name: str, values: Mapping[str, float]) -> bool:
 
 
 def _sized(
-    row: Candidate, minimum: Mapping[str, float], factor: float, rng: np.random.Generator, plain: Case
+    row: CandidateEvidence, minimum: Mapping[str, float], factor: float, rng: np.random.Generator, plain: Case
 ) -> Hidden:
     nominal = plain.joints[row.joint if isinstance(row.joint, int) else 1]
     joint = row.joint if isinstance(row.joint, int) else SENSOR

@@ -1,5 +1,5 @@
 """The report of a diagnosis: one HTML page from the findings alone, nothing else needed to read it."""
 
-from sysid.diagnosis.report.page import render
+from jtqd.sysid.diagnosis.report.page import render
 
 __all__ = ["render"]

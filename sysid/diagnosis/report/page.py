@@ -7,14 +7,13 @@ from typing import Any, Final
 
 import yaml
 
-from estimator.checked import ConfigError
-from estimator.effects.effect import Effect
-from sysid.diagnosis.findings import AMBIGUOUS, CAUSE, INSUFFICIENT, UNEXPLAINED, Findings
-from sysid.diagnosis.report import theme, views
-from sysid.diagnosis.report.gap_views import gap_views
-from sysid.diagnosis.report.pictures import pictures, trace_rows
-from sysid.diagnosis.report.quantities import number
-from sysid.diagnosis.report.words import BADGES, gain_sentence, listed, verdict_sentence
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.effects.effect import Effect
+from jtqd.sysid.diagnosis.findings import AMBIGUOUS, CAUSE, INSUFFICIENT, UNEXPLAINED, Findings
+from jtqd.sysid.diagnosis.report import theme, views
+from jtqd.sysid.diagnosis.report.pictures import pictures, trace_rows
+from jtqd.sysid.diagnosis.report.views import gap_views
+from jtqd.sysid.diagnosis.report.words import BADGES, gain_sentence, listed, number, verdict_sentence
 
 TEMPLATE: Final = "page.html.j2"
 PLAN_FILE: Final = "next_experiment.plan.yaml"
@@ -33,7 +32,7 @@ def render(findings: Findings, made: str = "", effects: Mapping[str, Effect] | N
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
-        loader=PackageLoader("sysid.diagnosis.report", "."),
+        loader=PackageLoader("jtqd.sysid.diagnosis.report", "."),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -70,7 +69,7 @@ def render(findings: Findings, made: str = "", effects: Mapping[str, Effect] | N
 
 def library() -> Mapping[str, Effect]:
     """The effects that ship, by name."""
-    from estimator.effects.library import EFFECTS
+    from jtqd.estimator.effects.library import EFFECTS
 
     return EFFECTS
 
@@ -100,7 +99,7 @@ def _next(findings: Findings) -> dict[str, Any] | None:
 
 def plan_amount(plan: Mapping[str, Any]) -> str:
     """Return how long a plan is, e.g. "4 runs, 12 minutes of motion"; "" for one that `jtq campaign` would refuse."""
-    from sysid.campaign.plan import Plan
+    from jtqd.sysid.campaign.plan import Plan
 
     try:
         runs = Plan.from_mapping(dict(plan), PLAN_FILE).runs

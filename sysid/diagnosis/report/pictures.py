@@ -9,11 +9,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from sysid.diagnosis.findings import Findings, Trace
-from sysid.diagnosis.report.quantities import number
-from sysid.diagnosis.report.theme import LIGHT, by_role
-from sysid.diagnosis.report.words import balance_title
-from sysid.figure_parts import as_svg, thinned
+from jtqd.sysid.diagnosis.findings import Findings, Trace
+from jtqd.sysid.diagnosis.report.theme import LIGHT, by_role
+from jtqd.sysid.diagnosis.report.words import balance_title, number
+from jtqd.sysid.figures import as_svg, thinned
 
 MOST: Final = 6
 """Pictures on a page; the other runs are in its table."""

@@ -1,0 +1,256 @@
+"""Nodes that restart, stop, appear or lose their configuration in service: configured before their data is used.
+
+One after the other, each by a boot process of its own beside the running loop; a node that fails is tried again later and
+keeps no other one waiting.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from jtqd.daemon.config import Config
+from jtqd.daemon.shared.child_process import Child
+from jtqd.daemon.shared.log_lines import RateLimit
+from jtqd.daemon.shared.snapshot import SnapshotReader, View
+from jtqd.drivers.bus_load import BusLoad, configured_load
+
+# What the boot process is asked to do: `python -m jtqd.drivers.boot` gets this as JSON.
+
+
+_OWN_EDS = Path(__file__).resolve().parents[2] / "drivers" / "eds" / "jtqd.eds"
+
+
+def boot_request(config: Config, bus: str, only: int | None = None) -> dict[str, Any]:
+    """Request for all nodes, or for the one that came back while our own SYNC is running."""
+    nodes: list[dict[str, Any]] = [
+        {
+            "node": joint.node_id,
+            "kind": "drive",
+            "identity": asdict(joint.identity),
+            "given": joint.given,
+            "temperature": joint.temperature,
+            "mandatory": joint.mandatory or only is not None,
+        }
+        for joint in config.joints
+    ]
+    if config.sensor is not None:
+        sensor = config.sensor
+        nodes.append(
+            {
+                "node": sensor.node_id,
+                "kind": "sensor",
+                "identity": asdict(sensor.identity),
+                "channels": list(sensor.channels),
+                "given": sensor.given,
+                "unit_words": sensor.unit_words,
+                "mandatory": sensor.mandatory or only is not None,
+            }
+        )
+    return {
+        "bus": bus,
+        "nodes": [node for node in nodes if only in (None, node["node"])],
+        "master_node": config.node_id,
+        "own_eds": str(_OWN_EDS),
+        "heartbeat_ms": config.heartbeat_ms,
+        "error_behaviour": config.error_behaviour,
+        # Drives that watch our heartbeat allow two to be lost.
+        "master_timeout_ms": min(max(500, 3 * config.heartbeat_ms), 0xFFFF),
+        # In service the node has just been heard.
+        "answer_timeout_s": config.boot_timeout_s if only is None else min(config.boot_timeout_s, 0.5),
+        "sync": {"counter_overflow": config.counter_overflow, "check_foreign": only is None},
+    }
+
+
+# Bus load of a configuration.
+
+
+def bus_load_of(config: Config) -> BusLoad:
+    """Load of everything that the configuration puts on the bus; nothing is checked here."""
+    return configured_load(
+        [joint.node_id for joint in config.joints],
+        {config.sensor.node_id: config.sensor.channels} if config.sensor else {},
+        temperatures=[joint.node_id for joint in config.joints if joint.temperature],
+        heartbeat_ms=config.heartbeat_ms,
+        master=config.node_id,
+        bitrate=config.bitrate,
+        period_s=config.period_ns * 1e-9,
+    )
+
+
+_RETRY_S, _LONGEST_RETRY_S = 0.5, 8.0
+_NOT_OPERATIONAL = (4, 127)
+"""Heartbeat states stopped and pre-operational (CiA 301)."""
+_SAY_AGAIN_S = 60.0
+"""Between two lines that say the same about a boot that fails."""
+_SETTLED_S = 0.3
+"""After its boot a node's last heartbeat may still say pre-operational."""
+
+Say = Callable[[str, int, str], None]
+"""Takes topic, node and a line for the operator."""
+
+
+class ReturningNodes:
+    """Boots nodes that the loop reports as restarted, that are not operational, that were absent at the start, or for which
+    `request` asks.
+
+    A node that comes back with another scaling than at the start stays out: the loop's factors are those of the start.
+
+    Args:
+        config, bus: as for the first boot.
+        report: report of the first boot; nodes that are booted later are added.
+        start_child: makes a child process from (module, arguments, name).
+        say: what the operator is told.
+
+    Attributes:
+        busy: node that is being booted; 0: none.
+        absent: optional nodes that have not been booted yet.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        bus: str,
+        report: dict[str, Any],
+        start_child: Callable[[str, list[str], str], Child],
+        say: Say,
+    ) -> None:
+        self._config, self._bus, self._report = config, bus, report
+        self._start_child, self._say = start_child, say
+        self._child: Child | None = None
+        self._restarts = 0
+        """`View.restarts` of the node that is being booted, before that began."""
+        self.busy = 0
+        self.absent = {int(node) for node in report.get("absent", {})}
+        self._requested: dict[int, str] = {}
+        self._not_before: dict[int, float] = {}
+        self._retry_s: dict[int, float] = {}
+        self._limit = RateLimit(_SAY_AGAIN_S)
+
+    def request(self, node: int, why: str) -> None:
+        """Boot this node again; `why` goes into the line that tells it."""
+        self._requested[node] = why
+
+    def waiting(self, view: View, now_s: float) -> list[int]:
+        """Nodes that need a boot and may be tried now, the one that has waited longest first."""
+        idle = [
+            int(node) for node in self._report["nodes"] if view.node_states[int(node)] in _NOT_OPERATIONAL
+        ]
+        wanted = dict.fromkeys((*view.unconfigured, *idle, *self._requested, *self.absent))
+        due = [node for node in wanted if now_s >= self._not_before.get(node, 0.0)]
+        return sorted(due, key=lambda node: self._not_before.get(node, 0.0))
+
+    def watch(
+        self, view: View, present: Callable[[int], bool], reader: SnapshotReader, now_s: float
+    ) -> dict[str, Any] | None:
+        """Call often. Returns the report of a node that has just been configured: {"node": number, ...}.
+
+        Args:
+            view: last reading of the snapshot.
+            present: whether a node was heard of lately; nothing is started for one that is not there.
+            reader: tells the loop that a node may be believed (again).
+            now_s: CLOCK_MONOTONIC.
+        """
+        if self._child is not None:
+            running = self._child.alive()  # asked first: what it said before its end is then there to be read
+            answer = self._child.poll_answer()
+            if answer is None and running:
+                return None
+            node, self._child, self.busy = self.busy, None, 0
+            # One that has restarted meanwhile may have lost what was written to it.
+            if view.restarts[node] != self._restarts:
+                self._refuse(node, f"node {node} restarted while it was being configured: once more", now_s)
+                booted = None
+            else:
+                booted = self._accepted(node, answer, now_s)
+            if booted is None:
+                self._put_off(node, now_s)
+                return None
+            self._take_in(node, booted, reader, now_s)
+            return {"node": node, **booted}
+        for node in self.waiting(view, now_s):
+            if present(node):
+                self._start(node, view.restarts[node])
+                break
+        return None
+
+    def _start(self, node: int, restarts: int) -> None:
+        self.busy, self._restarts = node, restarts
+        self._child = self._start_child("jtqd.drivers.boot", [], f"the boot of node {node}")
+        self._child.tell(boot_request(self._config, self._bus, only=node))
+        self._child.end_of_input()
+
+    def _put_off(self, node: int, now_s: float) -> None:
+        retry_s = self._retry_s.get(node, _RETRY_S)
+        self._retry_s[node] = min(2.0 * retry_s, _LONGEST_RETRY_S)
+        self._not_before[node] = now_s + retry_s
+
+    def _take_in(self, node: int, booted: dict[str, Any], reader: SnapshotReader, now_s: float) -> None:
+        key = str(node)
+        if key not in self._report["nodes"]:
+            reader.note_factors(node, _factors(booted["scaling"]))
+        self._report["nodes"][key] = booted
+        reader.note_configured(node, self._restarts)
+        self._retry_s.pop(node, None)
+        self._not_before[node] = now_s + _SETTLED_S
+        why = self._requested.pop(node, None)
+        if node in self.absent:
+            self.absent.discard(node)
+            self._say("boot", node, f"node {node} has appeared and is configured")
+        else:
+            text = f"node {node} was away and is configured again"
+            self._say("boot", node, text if why is None else f"node {node} is configured again: {why}")
+        for note in booted.get("notes", ()):
+            self._say("boot", node, f"node {node}: {note}")
+
+    def _accepted(self, node: int, answer: dict[str, Any] | None, now_s: float) -> dict[str, Any] | None:
+        """The node's part of the report, if it may be used."""
+        if answer is None or not answer["ok"]:
+            reason = "its boot ended without a word" if answer is None else answer["error"]["message"]
+            self._refuse(node, f"boot in service: {reason}", now_s)
+            return None
+        now: dict[str, Any] = answer["nodes"][str(node)]
+        then = self._report["nodes"].get(str(node))
+        if then is None:
+            return self._accepted_first(node, now, now_s)
+        for key in ("scaling", "gear_ratio"):
+            if now[key] != then[key]:
+                text = f"node {node} has another {key} than at the start: expected {then[key]}, found {now[key]}: not used"
+                self._refuse(node, text, now_s)
+                return None
+        if now["serial"] != then["serial"]:
+            text = f"another device: serial number {now['serial']:08X}h, before {then['serial']:08X}h"
+            self._say("boot", node, f"node {node}: {text}")
+        return now
+
+    def _accepted_first(self, node: int, now: dict[str, Any], now_s: float) -> dict[str, Any] | None:
+        """Of a node that was absent at the start: what else would have been checked then."""
+        wrong = gear_ratio_error(self._config, node, now.get("gear_ratio"))
+        if wrong is None:
+            return now
+        self._refuse(node, wrong, now_s)
+        return None
+
+    def _refuse(self, node: int, text: str, now_s: float) -> None:
+        if self._limit.may_say(text, now_s) is not None:
+            self._say("boot", node, text)
+
+
+def gear_ratio_error(config: Config, node: int, found: float | None) -> str | None:
+    """A drive that tells another gear ratio (6091h) than the joint file belongs to another joint."""
+    for joint in config.joints:
+        expected = joint.joint.gear_ratio
+        if joint.node_id == node and found and abs(found - expected) > 0.005 * expected:
+            where = f"{joint.joint_path}, joint {joint.number}"
+            return f"node {node}: 6091h gear ratio: expected {expected:g} ({where}), found {found:g}"
+    return None
+
+
+def _factors(scaling: dict[str, Any]) -> tuple[float, ...]:
+    """In the order of `SnapshotReader.note_factors`."""
+    if "nm_per_unit" in scaling:
+        return tuple(scaling["nm_per_unit"][channel] for channel in sorted(scaling["nm_per_unit"]))
+    names = ("motor_rad_per_count", "motor_rad_s_per_unit", "link_rad_per_count", "ampere_per_unit")
+    return tuple(scaling[name] for name in names)

@@ -1,0 +1,364 @@
+"""Errors that the loop has counted or noted in the snapshot, as EMCY of jtqd and lines for the operator. Pure.
+
+Deadlines and lengths of PDOs (`daemon/loop/input_pdos.py`), faults of the joints, another SYNC producer, lost frames.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import deque
+from collections.abc import Callable, Collection, Iterable
+from math import inf
+from typing import NamedTuple
+
+from jtqd.daemon.config import Config
+from jtqd.daemon.loop.input_pdos import PdoWatch, watched_pdos
+from jtqd.daemon.shared.log_lines import RateLimit
+from jtqd.daemon.shared.snapshot import View
+from jtqd.drivers import emcy
+from jtqd.drivers.devices import SYNC_COB_ID
+from jtqd.drivers.eds.own_objects import BUS_FIELDS
+from jtqd.drivers.emcy import COMMUNICATION, EMCY, GENERIC, NO_ERROR, Emergency, ErrorHistory, describe, parse
+from jtqd.drivers.object_dictionary import ObjectStore
+
+# State of the CAN controller, from the error messages of its driver (linux/can/error.h). Pure: bytes in.
+#
+# The kernel's driver sends them as frames with CAN_ERR_FLAG to those who ask for them: error warning, error passive, bus-
+# off and restart, lost arbitration, missing acknowledge, protocol errors, overruns, and where it can the two error
+# counters. vcan and the unix hub make none by themselves, but carry those that somebody sends.
+
+
+ACTIVE, WARNING, PASSIVE, BUS_OFF, DOWN = 0, 1, 2, 3, 4
+STATE_NAMES = ("error active", "error warning", "error passive", "bus-off", "interface down")
+
+# Classes of the error message, in its identifier
+_TX_TIMEOUT, _LOST_ARBITRATION, _CONTROLLER, _PROTOCOL, _TRANSCEIVER = 0x01, 0x02, 0x04, 0x08, 0x10
+_NO_ACK, _BUS_OFF, _BUS_ERROR, _RESTARTED, _COUNTERS = 0x20, 0x40, 0x80, 0x100, 0x200
+# data[1] of _CONTROLLER
+_OVERFLOW, _WARNING_BITS, _PASSIVE_BITS, _ACTIVE_BIT = 0x03, 0x0C, 0x30, 0x40
+
+
+class BusChange(NamedTuple):
+    """The state has changed from `before` to `after`."""
+
+    before: int
+    after: int
+
+
+class BusState:
+    """Counts of one interface, by the names of `BUS_FIELDS`."""
+
+    def __init__(self) -> None:
+        self.counts = dict.fromkeys(BUS_FIELDS, 0)
+
+    @property
+    def state(self) -> int:
+        """ACTIVE .. DOWN."""
+        return self.counts["state"]
+
+    def values(self) -> tuple[int, ...]:
+        """In the order of `BUS_FIELDS`."""
+        return tuple(self.counts.values())
+
+    def error_frame(self, can_id: int, data: bytes) -> BusChange | None:
+        """One message of the driver; the change of state that it tells, if any. A short one is taken as far as it goes."""
+        counts = self.counts
+        data = data.ljust(8, b"\0")
+        for bit, name in (
+            (_TX_TIMEOUT, "tx_timeouts"),
+            (_LOST_ARBITRATION, "arbitration_lost"),
+            (_TRANSCEIVER, "transceiver"),
+            (_NO_ACK, "no_acknowledge"),
+        ):
+            counts[name] += bool(can_id & bit)
+        counts["protocol_errors"] += bool(can_id & (_PROTOCOL | _BUS_ERROR))
+        if can_id & _COUNTERS:
+            counts["tx_errors"], counts["rx_errors"] = data[6], data[7]
+        if can_id & _CONTROLLER and data[1] & _OVERFLOW:
+            counts["overruns"] += 1
+        if can_id & _RESTARTED:
+            counts["restarts"] += 1
+            return self._become(ACTIVE)
+        if can_id & _BUS_OFF:
+            return self._become(BUS_OFF)
+        if can_id & _CONTROLLER:
+            return self._controller(data[1])
+        return None
+
+    def down(self) -> BusChange | None:
+        """The interface is down (ENETDOWN)."""
+        return self._become(DOWN)
+
+    def alive(self) -> BusChange | None:
+        """A frame of somebody else has come: the interface is up, and its controller is not bus-off (any more).
+
+        Some drivers tell no restart, and an interface that was set up starts error active without a word.
+        """
+        return self._become(ACTIVE) if self.state in (BUS_OFF, DOWN) else None
+
+    def _controller(self, bits: int) -> BusChange | None:
+        if bits & _PASSIVE_BITS:
+            return self._become(PASSIVE)
+        if bits & _WARNING_BITS:
+            return self._become(WARNING)
+        return self._become(ACTIVE) if bits & _ACTIVE_BIT else None
+
+    def _become(self, state: int) -> BusChange | None:
+        before = self.state
+        if state == before:
+            return None
+        self.counts["state"] = state
+        name = {WARNING: "warnings", PASSIVE: "passives", BUS_OFF: "bus_offs", DOWN: "downs"}.get(state)
+        if name is not None:
+            self.counts[name] += 1
+        return BusChange(before, state)
+
+
+# EMCY messages of the nodes: a bounded history of each, and few lines for the operator. Pure: bytes and times in.
+#
+# Every message is kept in the ring of its node and counted. A line is said at once for the first message of a code; what
+# repeats is counted and told with the next line (`daemon/shared/log_lines.py`), so that a storm is a few lines in five
+# seconds.
+
+
+DEPTH = 32
+"""Messages kept of each node."""
+
+
+class Kept(NamedTuple):
+    """One message in the history; `time_s` is CLOCK_MONOTONIC."""
+
+    time_s: float
+    emergency: Emergency
+
+
+class _Node:
+    def __init__(self) -> None:
+        self.history: deque[Kept] = deque(maxlen=DEPTH)
+        self.count = 0
+        self.limit = RateLimit()
+
+
+class EmcyLog:
+    """Histories of these nodes; a message of any other is passed over."""
+
+    def __init__(self, nodes: Iterable[int]) -> None:
+        self._nodes = {node: _Node() for node in nodes}
+        self.count = 0
+        """Messages of all nodes."""
+
+    def receive(self, node: int, data: bytes, now_s: float) -> str | None:
+        """Take a message; the line to be said, if any."""
+        seen = self._nodes.get(node)
+        if seen is None:
+            return None
+        emergency = parse(data)
+        self.count += 1
+        seen.count += 1
+        seen.history.append(Kept(now_s, emergency))
+        unsaid = seen.limit.may_say((emergency.code, emergency.register), now_s)
+        if unsaid is None:
+            return None
+        over = emergency.code == NO_ERROR and not emergency.register
+        what = "EMCY 0000h: no error any more" if over else describe(emergency)
+        return f"node {node}: {what}" + (f" ({unsaid} more before)" if unsaid else "")
+
+    def history(self, node: int) -> list[Kept]:
+        """Messages of a node, the oldest first, `DEPTH` at most."""
+        return list(self._nodes[node].history)
+
+    def count_of(self, node: int) -> int:
+        """How many messages a node has sent."""
+        return self._nodes[node].count
+
+    def last(self, node: int) -> Emergency | None:
+        """Its last message; None: none yet."""
+        history = self._nodes[node].history
+        return history[-1].emergency if history else None
+
+
+# jtqd's own errors: what is present, 1001h, 1003h, and the EMCY messages that tell it, with inhibit time. Pure.
+#
+# An error is a code with a detail (which PDO, which node); each is told when it comes and when it has gone, and not between.
+# The end of one is EMCY 0000h with the register of what is left; the manufacturer's field names the code and detail:
+#
+#     bytes 0..1  error code, 0000h for an end
+#     byte  2     error register 1001h
+#     bytes 3..4  the code that ended (0000h only), else 0
+#     bytes 5..6  detail: COB-ID or node-ID
+#     byte  7     joints concerned: bit 0 joint 1, bit 1 joint 2
+#
+# Between two messages passes the inhibit time 1015h. What comes meanwhile waits, in order; an error that has come and gone
+# before it could be told is not told, but it is in the history.
+
+
+_FIELD = struct.Struct("<HHB")
+_INHIBIT = 0x1015
+_INHIBIT_UNIT_S = 1e-4
+_WAITING = 64
+"""Errors that may wait; there are fewer different ones than that."""
+
+Error = tuple[int, int]
+"""(code, detail)"""
+
+
+class OwnErrors:
+    """Errors of jtqd's own node.
+
+    Args:
+        store: its object dictionary; 1001h, 1003h and 1015h are kept and read there.
+    """
+
+    def __init__(self, store: ObjectStore) -> None:
+        self._store = store
+        self._history = ErrorHistory(store)
+        self._present: dict[Error, tuple[int, int]] = {}  # -> register, joints
+        self._told: set[Error] = set()
+        self._queue: dict[Error, int] = {}  # errors with something to tell -> joints
+        self._not_before = -inf
+
+    def present(self, code: int, detail: int = 0) -> bool:
+        """It has come and not gone."""
+        return (code, detail) in self._present
+
+    def come(self, code: int, detail: int = 0, *, joints: int = 0, register: int = COMMUNICATION) -> bool:
+        """An error; False when it is known already."""
+        error = code, detail
+        if error in self._present:
+            return False
+        self._present[error] = register | GENERIC, joints
+        self._store.set_number(0x1001, 0, self.register)
+        self._history.push(code | detail << 16)
+        if error in self._told:
+            self._queue.pop(
+                error, None
+            )  # its end had not been told: nothing has changed for those who listen
+        elif len(self._queue) < _WAITING:
+            self._queue[error] = joints
+        return True
+
+    def gone(self, code: int, detail: int = 0) -> bool:
+        """It is over; False when it was not present."""
+        error = code, detail
+        if error not in self._present:
+            return False
+        _, joints = self._present.pop(error)
+        self._store.set_number(0x1001, 0, self.register)
+        if error in self._told:
+            self._queue[error] = joints
+        else:
+            self._queue.pop(error, None)
+        return True
+
+    def happened(self, code: int, detail: int = 0, *, joints: int = 0, register: int = COMMUNICATION) -> None:
+        """Something that does not last, as a recovery from bus-off: told as an error and in the history."""
+        if self.come(code, detail, joints=joints, register=register):
+            del self._present[code, detail]
+            self._store.set_number(0x1001, 0, self.register)
+
+    def tick(self, now_s: float) -> bytes | None:
+        """The message that is due: 8 bytes for COB-ID 080h + node-ID. It counts as told."""
+        if not self._queue or now_s < self._not_before:
+            return None
+        error, joints = next(iter(self._queue.items()))
+        del self._queue[error]
+        self._not_before = now_s + self._store.number(_INHIBIT) * _INHIBIT_UNIT_S
+        code, detail = error
+        if error in self._told and error not in self._present:
+            self._told.discard(error)
+            return EMCY.pack(NO_ERROR, self.register, _FIELD.pack(code, detail & 0xFFFF, joints))
+        if error in self._present:
+            self._told.add(error)
+        return EMCY.pack(code, self.register | GENERIC, _FIELD.pack(0, detail & 0xFFFF, joints))
+
+    def all_present(self) -> list[Error]:
+        """Every error that has come and not gone, in order."""
+        return list(self._present)
+
+    @property
+    def register(self) -> int:
+        """1001h."""
+        register = 0
+        for bits, _ in self._present.values():
+            register |= bits
+        return register
+
+
+_QUIET_S = 1.0
+"""An error that shows by a counter is over when the counter has stood still for so long."""
+_OVERRUN_RX, _OVERRUN_TX = 1, 2
+
+
+class LoopErrors:
+    """Call `watch` with each reading of the snapshot.
+
+    Args:
+        config: in force.
+        errors: where they come and go.
+        say: takes topic, node and line for the operator.
+    """
+
+    def __init__(self, config: Config, errors: OwnErrors, say: Callable[[str, int, str], None]) -> None:
+        self._config, self._errors, self._say = config, errors, say
+        self._pdos = PdoWatch(watched_pdos(config))
+        self._limit = RateLimit()
+        self._counted: dict[str, int] = {}
+        self._counter_until: dict[tuple[int, int], float] = {}
+
+    def watch(self, view: View, absent: Collection[int], now_s: float) -> bool:
+        """True when the loop's calls have met an interface that is down; PDOs of `absent` nodes are not missed."""
+        self._watch_pdos(view, absent, now_s)
+        self._watch_counters(view, now_s)
+        self._watch_faults(view)
+        return self._rose(view, "bus_errors")
+
+    def _watch_pdos(self, view: View, absent: Collection[int], now_s: float) -> None:
+        for code, pdo, present in self._pdos.events(view.inputs, absent, now_s):
+            if not present:
+                self._errors.gone(code, pdo.cob_id)
+                continue
+            new = self._errors.come(code, pdo.cob_id, joints=pdo.joints)
+            # What is missing the operator is told by joint (`daemon/supervisor/health.py`).
+            if (
+                new
+                and code != emcy.PDO_TIMEOUT
+                and self._limit.may_say((code, pdo.cob_id), now_s) is not None
+            ):
+                self._say("pdo", pdo.node, f"{pdo.name}: {emcy.name_of(code)} ({code:04X}h): it is not used")
+
+    def _watch_faults(self, view: View) -> None:
+        """EMCY of the joints' faults; the operator is told by `daemon/supervisor/health.py`."""
+        for n, (joint, seen) in enumerate(zip(self._config.joints, view.joints, strict=True)):
+            for code, bits in (
+                (emcy.JOINT_FAULT, seen.input_flags >> 8 | seen.latched),
+                (emcy.FAULT_LATCHED, seen.latched),
+            ):
+                if bits:
+                    self._errors.come(code, joint.node_id, joints=1 << n, register=emcy.MANUFACTURER)
+                else:
+                    self._errors.gone(code, joint.node_id)
+
+    def _watch_counters(self, view: View, now_s: float) -> None:
+        """Errors that show by a counter of the loop."""
+        foreign = "another SYNC producer: no input of its cycles is used"
+        self._counter_error(view, "foreign_sync", emcy.COB_ID_COLLISION, SYNC_COB_ID, foreign, now_s)
+        lost = "received frames were lost: the loop's socket was read too late"
+        self._counter_error(view, "rx_dropped", emcy.CAN_OVERRUN, _OVERRUN_RX, lost, now_s)
+        full = "frames could not be sent: the transmit queue is full"
+        self._counter_error(view, "tx_dropped", emcy.CAN_OVERRUN, _OVERRUN_TX, full, now_s)
+
+    def _rose(self, view: View, name: str) -> bool:
+        value = view.counters[name]
+        before, self._counted[name] = self._counted.get(name, 0), value
+        return value > before
+
+    def _counter_error(  # noqa: PLR0917 - a table row
+        self, view: View, name: str, code: int, detail: int, text: str, now_s: float
+    ) -> None:
+        error = code, detail
+        if self._rose(view, name):
+            self._counter_until[error] = now_s + _QUIET_S
+            if self._errors.come(code, detail, joints=3) and self._limit.may_say(error, now_s) is not None:
+                self._say("sync" if name == "foreign_sync" else "bus", 0, f"bus: {text}")
+        elif now_s >= self._counter_until.get(error, 0.0):
+            self._errors.gone(code, detail)

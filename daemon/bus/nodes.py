@@ -1,0 +1,475 @@
+"""The nodes in service: who needs a boot and is there, and is everybody still configured as at the boot.
+
+It owns the SDO queues of the nodes. Pure but for the boot processes that `returning_nodes` starts: replies and times in,
+requests out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from math import inf
+from typing import Any, NamedTuple
+
+from jtqd.daemon.bus.boot import ReturningNodes
+from jtqd.daemon.shared.log_lines import RateLimit
+from jtqd.daemon.shared.snapshot import SnapshotReader, View
+from jtqd.drivers.boot_procedure import VERIFY_CONFIGURATION, signature
+from jtqd.drivers.sdo import NO_OBJECT, NO_SUBINDEX, SdoQueue, SdoResult
+
+# Heartbeat consumers of all nodes (CiA 301, 7.2.8.3.2.2), with the boot timeout that the standard lacks. Pure.
+#
+# A node is watched from the moment it is configured. One that is not heard within the timeout from then on is reported as
+# well as one that was heard and is not any more: a consumer that waits for the first heartbeat would never miss it. What
+# is not one byte, or says a state that does not exist, is counted and does not count as a heartbeat. Two producers with
+# one node-ID show by a rate of nearly twice what was configured.
+
+
+NOT_WATCHED, WAITING, ACTIVE, LOST = 0, 1, 2, 3
+"""States of a watch, as in CANopenNode: unconfigured, unknown, active, timeout."""
+_STATES = {0: "boot-up", 4: "stopped", 5: "operational", 127: "pre-operational"}
+_WINDOW = 20
+"""Heartbeats over which the rate is taken."""
+_TWICE = 0.65
+"""Share of the regular time in which a window may pass before there are two producers: with two it is a half."""
+_LATE = 5.0
+"""Heartbeats after which a reader was away for too long: what has queued up meanwhile says nothing about the rate."""
+_OTHERS = 16
+"""Foreign nodes that are told."""
+
+
+class NodeEvent(NamedTuple):
+    """Something to tell. `kind`: lost, never, back, restarted, state, doubled, malformed, foreign; `line` may be None."""
+
+    kind: str
+    node: int
+    line: str | None
+
+
+class _Watch:
+    def __init__(self, limit: RateLimit) -> None:
+        self.state = NOT_WATCHED
+        self.heard_s = -inf
+        self.since_s = 0.0
+        self.lost_s = 0.0
+        self.said: int | None = None
+        self.window: list[float] = []
+        self.doubled = False
+        self.limit = limit
+
+
+class NodeWatch:
+    """Watches the heartbeats of the nodes of the configuration.
+
+    Args:
+        nodes: their node-IDs.
+        known: other node-IDs that may be heard without a word (jtqd's own, the commander's).
+        heartbeat_s: what was written to 1017h.
+        timeout_s: silence after which a node is lost; also how long it may take for its first heartbeat.
+
+    Attributes:
+        lost_count: how often nodes were lost.
+        malformed: heartbeats with a wrong length or an impossible state.
+    """
+
+    def __init__(
+        self, nodes: tuple[int, ...], known: tuple[int, ...], heartbeat_s: float, timeout_s: float
+    ) -> None:
+        self._watches = {node: _Watch(RateLimit()) for node in nodes}
+        self._known = set(known)
+        self._heartbeat_s, self._timeout_s = heartbeat_s, timeout_s
+        self._ticked_s = inf
+        self.lost_count = self.malformed = 0
+
+    def watch(self, node: int, now_s: float) -> None:
+        """The node has been configured and started."""
+        watch = self._watches[node]
+        if watch.state == NOT_WATCHED:
+            watch.state = WAITING
+        watch.since_s = now_s
+        watch.window.clear()
+
+    def state(self, node: int) -> int:
+        """NOT_WATCHED, WAITING, ACTIVE or LOST."""
+        return self._watches[node].state
+
+    def states(self) -> dict[int, int]:
+        """The same of all nodes."""
+        return {node: watch.state for node, watch in self._watches.items()}
+
+    def heard_within(self, node: int, span_s: float, now_s: float) -> bool:
+        """A heartbeat or boot-up message came in the last `span_s` seconds."""
+        return now_s - self._watches[node].heard_s <= span_s
+
+    def receive(self, node: int, data: bytes, now_s: float) -> list[NodeEvent]:
+        """A frame 700h + node; what it changes."""
+        watch = self._watches.get(node)
+        if watch is None:
+            return self._foreign(node, data)
+        if len(data) != 1 or data[0] not in _STATES:
+            self.malformed += 1
+            found = f"{len(data)} bytes" if len(data) != 1 else f"state {data[0]:02X}h"
+            return [
+                self._event("malformed", node, watch, now_s, lambda: f"a heartbeat that is none ({found})")
+            ]
+        events = []
+        watch.heard_s = now_s
+        if data[0] == 0:
+            watch.window.clear()
+            events.append(
+                self._event("restarted", node, watch, now_s, lambda: "it has restarted (boot-up message)")
+            )
+        elif watch.state == LOST:
+            away = now_s - watch.lost_s
+            events.append(
+                self._event("back", node, watch, now_s, lambda: f"heartbeat is back after {away:.1f} s")
+            )
+        if watch.state in (WAITING, LOST):
+            watch.state = ACTIVE
+        if data[0] and watch.said is not None and data[0] != watch.said:
+            said = _STATES[data[0]]
+            events.append(self._event("state", node, watch, now_s, lambda: f"it is {said} now"))
+        watch.said = data[0] or None
+        if data[0]:
+            events += self._rate(node, watch, now_s)
+        return events
+
+    def tick(self, now_s: float) -> list[NodeEvent]:
+        """Call after all frames that have arrived were given: a reader that was late must not miss what was there."""
+        self._ticked_s = now_s
+        events = []
+        for node, watch in self._watches.items():
+            if (
+                watch.state not in (WAITING, ACTIVE)
+                or now_s - max(watch.heard_s, watch.since_s) <= self._timeout_s
+            ):
+                continue
+            never = watch.state == WAITING
+            watch.state, watch.lost_s = LOST, max(watch.heard_s, watch.since_s)
+            watch.window.clear()
+            self.lost_count += 1
+            what = "no heartbeat at all" if never else "no heartbeat"
+            text = f"{what} for {self._timeout_s:g} s"
+            events.append(self._event("never" if never else "lost", node, watch, now_s, partial(str, text)))
+        return events
+
+    def _rate(self, node: int, watch: _Watch, now_s: float) -> list[NodeEvent]:
+        if now_s - self._ticked_s > _LATE * self._heartbeat_s:
+            watch.window.clear()
+            return []
+        watch.window.append(now_s)
+        if len(watch.window) <= _WINDOW:
+            return []
+        passed = watch.window[-1] - watch.window[0]
+        watch.window = [now_s]
+        doubled = passed < _TWICE * _WINDOW * self._heartbeat_s
+        if doubled == watch.doubled:
+            return []
+        watch.doubled = doubled
+        if not doubled:
+            return [NodeEvent("single", node, None)]
+        text = f"{_WINDOW} heartbeats in {passed:.1f} s: are there two nodes with this node-ID?"
+        return [self._event("doubled", node, watch, now_s, lambda: text)]
+
+    def _foreign(self, node: int, data: bytes) -> list[NodeEvent]:
+        """CiA 302-2, status A: not in the network list. Said once."""
+        if node in self._known or len(self._known) > _OTHERS or len(data) != 1:
+            return []
+        self._known.add(node)
+        line = f"node {node}: it is on the bus and not in the configuration (status A)"
+        return [NodeEvent("foreign", node, line)]
+
+    @staticmethod
+    def _event(kind: str, node: int, watch: _Watch, now_s: float, text: Callable[[], str]) -> NodeEvent:
+        unsaid = watch.limit.may_say(kind, now_s)
+        if unsaid is None:
+            return NodeEvent(kind, node, None)
+        return NodeEvent(
+            kind, node, f"node {node}: {text()}" + (f" ({unsaid} more before)" if unsaid else "")
+        )
+
+
+# Is a node still configured as it was at its boot? Its objects are read again in service, one at a time. Pure.
+#
+# A node with 1020h says itself whether anybody has written to its configuration: the object holds the signature that the
+# boot wrote, until somebody does (CiA 301). It need not cover the scaling, and a value may change by other ways than an
+# SDO. So all objects are read, one after the other and again from the beginning, that the meaning of its PDOs depends on
+# (`drivers/boot_procedure.py`): COB-ID, transmission type and mapping of the TPDOs, rated current, encoder resolutions,
+# gear ratio, the sensor's unit and decimals. The signature is read between them, in every `SIGNATURE_EVERY`th reading.
+#
+# A signature that is gone while these are unchanged is somebody else's business (the commander maps RPDOs) and is said once.
+# The mode of operation that a drive displays (6061h) means nothing for the estimate; a change of it is said.
+
+
+SIGNATURE_EVERY = 4
+_CAN_ID, _INVALID, _ALL = 0x7FF, 0x8000_0000, 0xFFFF_FFFF
+_COB_IDS = range(0x1800, 0x1A00)
+_PROFILE, _UNIT = 0x6000, 0x6131
+_MODE_DISPLAY = 0x6061
+
+
+@dataclass(frozen=True)
+class Check:
+    """One object, the bits of it that count, and what they must be (None: whatever they are at first)."""
+
+    index: int
+    subindex: int
+    mask: int
+    expected: int | None
+
+    def text(self, value: int) -> str:
+        """A value as people know it: bit fields in hexadecimal digits, numbers of the profile in decimal ones."""
+        return str(value) if self.index >= _PROFILE and self.index != _UNIT else f"0x{value:X}"
+
+
+class ConfigurationMismatch(NamedTuple):
+    """What a reading has shown: with `changed`, the node is not to be used before a new boot; else it is only told."""
+
+    changed: bool
+    text: str
+
+
+def checks_of(node: Mapping[str, Any]) -> list[Check]:
+    """The objects of one node of a boot report that the meaning of its PDOs depends on, and a drive's mode."""
+    checks = []
+    for index, subindex, value in node["watched"]:
+        mask = _ALL
+        if (
+            index in _COB_IDS and subindex == 1
+        ):  # bit 30 is the device's own; of a PDO that is off nothing else matters
+            mask = _INVALID if value & _INVALID else _CAN_ID | _INVALID
+        checks.append(Check(index, subindex, mask, value & mask))
+    if node["gear_ratio"] is not None:
+        checks.append(Check(_MODE_DISPLAY, 0, 0xFF, None))
+    return checks
+
+
+class ConfigurationWatch:
+    """One node. `next` says what to read, `result` takes it.
+
+    Args:
+        report: the node's part of the boot report.
+    """
+
+    def __init__(self, report: Mapping[str, Any]) -> None:
+        self._objects = checks_of(report)
+        first, _ = signature(report["configuration_sha256"])
+        self._signature = Check(VERIFY_CONFIGURATION, 1, _ALL, first) if report["signed"] else None
+        self._position = self._turn = 0
+        self._mode: int | None = None
+
+    def next(self) -> Check:
+        """The object to be read now; the same until `result` is called."""
+        if self._signature is not None and self._turn % SIGNATURE_EVERY == 0:
+            return self._signature
+        return self._objects[self._position]
+
+    def result(self, value: bytes | None, refusal: int | None = None) -> ConfigurationMismatch | None:
+        """What was read from the object that `next` named; None: as it should be.
+
+        Args:
+            value: of the object; None where there was none.
+            refusal: abort code of a node that refused; None with `value` None: no answer.
+        """
+        check = self.next()
+        self._turn += 1
+        if check is not self._signature:
+            self._position = (self._position + 1) % len(self._objects)
+        if value is None:
+            return self._missing(check) if refusal in (NO_OBJECT, NO_SUBINDEX) else None
+        found = int.from_bytes(value[:4], "little")
+        if check.expected is None:
+            return self._mode_now(found)
+        if found & check.mask == check.expected:
+            return None
+        return self._finding(check, check.text(found))
+
+    def _finding(self, check: Check, found: str) -> ConfigurationMismatch:
+        assert check.expected is not None
+        text = f"{check.index:04X}h:{check.subindex}: expected {check.text(check.expected)}, found {found}"
+        if check is not self._signature:
+            return ConfigurationMismatch(True, f"its configuration was changed ({text})")
+        self._signature, self._position = None, 0
+        return ConfigurationMismatch(False, f"its configuration was written to by somebody else ({text})")
+
+    def _missing(self, check: Check) -> ConfigurationMismatch | None:
+        if check.expected is not None:
+            return self._finding(check, "no such object")
+        self._objects.remove(check)
+        self._position = 0
+        return None
+
+    def _mode_now(self, found: int) -> ConfigurationMismatch | None:
+        before, self._mode = self._mode, found
+        if before is None or found == before:
+            return None
+        now, then = (int.from_bytes(bytes([mode & 0xFF]), signed=True) for mode in (found, before))
+        return ConfigurationMismatch(False, f"its mode of operation (6061h) is {now} now, {then} before")
+
+
+_CHECK_S = 0.1
+"""Between two objects read to check a node's configuration: two frames, 0.27 % of 1 Mbit/s at most."""
+_PROBE_S = 0.25
+"""Between two questions whether a node that needs a boot is there."""
+_PRESENT_S = 1.0
+_OTHERS_S = 1.0
+"""A node whose SDO server somebody else uses (it serves one client) is not asked for so long."""
+_SDO_TIMEOUT_S = 0.3
+
+
+class NodeCare:
+    """Call `turn` often, and the others for what arrives.
+
+    Args:
+        nodes: their node-IDs.
+        reader: tells the loop which nodes may be believed.
+        returning: boots nodes.
+        heartbeats: who is heard; nodes are watched from their boot on.
+        say: takes topic, node and line for the operator.
+
+    Attributes:
+        changed: nodes that were found to be configured otherwise and have not been configured since.
+    """
+
+    def __init__(
+        self,
+        nodes: Iterable[int],
+        reader: SnapshotReader,
+        returning: ReturningNodes,
+        heartbeats: NodeWatch,
+        say: Callable[[str, int, str], None],
+    ) -> None:
+        self._reader, self._returning, self._heartbeats, self._say = reader, returning, heartbeats, say
+        self._queues = {node: SdoQueue() for node in nodes}
+        self._out: list[tuple[int, bytes]] = []
+        self._checks: dict[int, ConfigurationWatch] = {}
+        self._present_until: dict[int, float] = {}
+        self._others_until: dict[int, float] = {}
+        self._check_due = self._probe_due = self._boot_ended = 0.0
+        self._check_turn = 0
+        self.changed: set[int] = set()
+
+    @property
+    def busy(self) -> int:
+        """Node that is being booted; 0: none."""
+        return self._returning.busy
+
+    @property
+    def absent(self) -> set[int]:
+        """Optional nodes that have not been configured yet."""
+        return self._returning.absent
+
+    def is_booting(self, now_s: float) -> bool:
+        """A boot is under way, or has just ended: NMT commands may be its."""
+        return bool(self._returning.busy) or now_s < self._boot_ended
+
+    def on_reply(self, node: int, data: bytes, now_s: float) -> None:
+        """A frame 580h + node. Whoever it was that asked: the node is there."""
+        self._present_until[node] = now_s + _PRESENT_S
+        if node != self._returning.busy:
+            self._out += [(node, request) for request in self._queues[node].on_reply(data, now_s)]
+
+    def on_foreign_request(self, node: int, now_s: float) -> None:
+        """A frame 600h + node that is not ours."""
+        self._others_until[node] = now_s + _OTHERS_S
+
+    def configured(self, node: int, report: dict[str, Any], now_s: float) -> None:
+        """The node has been booted, with its part of the boot report."""
+        self.changed.discard(node)
+        self._heartbeats.watch(node, now_s)
+        self._checks[node] = ConfigurationWatch(report)
+
+    def restarted(self, node: int) -> None:
+        """A boot-up message: there is no configuration to check."""
+        self._checks.pop(node, None)
+
+    def turn(self, view: View, now_s: float) -> list[tuple[int, bytes]]:
+        """What is due; returns (node, SDO request) to be sent."""
+        self._watch_nodes(view, now_s)
+        for node, queue in self._queues.items():
+            if node != self._returning.busy:
+                self._out += [(node, request) for request in queue.tick(now_s)]
+        out, self._out = self._out, []
+        return out
+
+    def state(self, node: int, view: View) -> tuple[int, int, int]:
+        """NMT state, heartbeat (`jtqd.daemon.bus.nodes`) and whether it is configured."""
+        configured = node not in view.unconfigured and node not in self._returning.absent
+        return view.node_states[node], self._heartbeats.state(node), int(configured)
+
+    def sdo_counts(self, node: int) -> dict[str, int]:
+        """Requests to a node that were repeated, not answered, refused; answers to none of them."""
+        queue = self._queues[node]
+        return {
+            "repeats": queue.repeats,
+            "silences": queue.silences,
+            "refusals": queue.refusals,
+            "ignored": queue.ignored,
+        }
+
+    def _watch_nodes(self, view: View, now_s: float) -> None:
+        """Boot what needs it, ask whether it is there, and check the configuration of the others."""
+        returning = self._returning
+        was_busy = returning.busy
+        booted = returning.watch(view, lambda node: self._present(node, now_s), self._reader, now_s)
+        if was_busy and not returning.busy:
+            self._boot_ended = now_s + _PROBE_S
+        if returning.busy and returning.busy != was_busy:
+            self._queues[returning.busy].clear()
+        if booted is not None:
+            self.configured(booted["node"], booted, now_s)
+        if now_s >= self._probe_due and not returning.busy:
+            self._probe_due = now_s + _PROBE_S
+            for node in returning.waiting(view, now_s):
+                queue = self._queues.get(node)
+                if queue is not None and not queue.busy and not self._others_talk_to(node, now_s):
+                    queue.read(0x1000, 0, _nothing, _SDO_TIMEOUT_S)
+        if now_s >= self._check_due:
+            self._check_due = now_s + _CHECK_S
+            self._check_one(view, now_s)
+
+    def _present(self, node: int, now_s: float) -> bool:
+        return self._present_until.get(node, 0.0) > now_s or self._heartbeats.heard_within(
+            node, _PRESENT_S, now_s
+        )
+
+    def _others_talk_to(self, node: int, now_s: float) -> bool:
+        return now_s < self._others_until.get(node, 0.0)
+
+    def _check_one(self, view: View, now_s: float) -> None:
+        """One object of one node that is operational and left alone."""
+        waiting = {*self._returning.waiting(view, now_s), self._returning.busy, *view.unconfigured}
+        nodes = [
+            node
+            for node in self._checks
+            if node not in waiting
+            and not self._queues[node].busy
+            and not self._others_talk_to(node, now_s)
+            and self._heartbeats.state(node) != LOST
+        ]
+        if not nodes:
+            return
+        self._check_turn += 1
+        node = nodes[self._check_turn % len(nodes)]
+        check, watch = self._checks[node].next(), self._checks[node]
+        self._queues[node].read(
+            check.index, check.subindex, partial(self._on_check, node, watch), _SDO_TIMEOUT_S
+        )
+
+    def _on_check(self, node: int, watch: ConfigurationWatch, result: SdoResult) -> None:
+        if self._checks.get(node) is not watch:
+            return
+        finding = watch.result(result.value, result.refusal)
+        if finding is None:
+            return
+        self._say("boot", node, f"node {node}: {finding.text}")
+        if finding.changed:
+            del self._checks[node]
+            self.changed.add(node)
+            self._reader.note_doubt(node)
+            self._returning.request(node, finding.text)
+
+
+def _nothing(_result: SdoResult) -> None:
+    """Of a question whose answer matters only by coming."""

@@ -1,0 +1,139 @@
+"""jtqd as a CANopen node (20h): its object dictionary, readable by any master.
+
+The loop sends the node's PDO and heartbeat; this part answers SDO requests from the snapshot, from what the supervisor sees
+of the bus, and from the configuration. It runs in the supervisor, so that no SDO client can delay a cycle.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from math import inf, isfinite, nan
+
+from jtqd.daemon.config import Config
+from jtqd.daemon.loop.estimate_pdo import field
+from jtqd.daemon.shared.snapshot import SnapshotReader
+from jtqd.drivers.boot_procedure import signature
+from jtqd.drivers.eds.own_objects import BUS_FIELDS, COUNTERS, JOINT_PARAMETERS, NODES, VERSION
+from jtqd.drivers.object_dictionary import ObjectStore
+from jtqd.drivers.sdo_server import SdoServer
+from jtqd.estimator.status import STALE
+
+_STANDSTILL_S = 0.2
+"""A loop whose snapshot has not moved for so long is not running (it moves every 8 cycles)."""
+_MS_TO_INHIBIT = 10
+"""1015h is in 100 us."""
+
+
+class OwnNode:
+    """Object dictionary and SDO server.
+
+    Args:
+        store: object dictionary from jtqd.eds.
+        config: configuration in force; its joints' parameters are readable in 2202h and 2203h.
+        reader: snapshot of the loop.
+
+    Attributes:
+        recorder_lost: cycles that are in no log.
+        bus: values of 2205h, in the order of `own_objects.BUS_FIELDS`.
+        nodes: value of 2206h by node-ID: NMT state, heartbeat (`jtqd.daemon.bus.nodes`), configured.
+        emergencies: value of 2207h by node-ID: code, register, number of messages.
+    """
+
+    def __init__(self, store: ObjectStore, config: Config, reader: SnapshotReader) -> None:
+        self._reader = reader
+        self._store = store
+        self._server = SdoServer(store)
+        self._last_cycle, self._last_change = -1, time.monotonic()
+        self.recorder_lost = self._asked = 0
+        self.bus: Callable[[], tuple[int, ...]] = lambda: (0,) * len(BUS_FIELDS)
+        self.nodes: Callable[[int], tuple[int, int, int]] = lambda _node: (0, 0, 0)
+        self.emergencies: Callable[[int], tuple[int, int, int]] = lambda _node: (0, 0, 0)
+        self._watched = [joint.node_id for joint in config.joints]
+        self._watched += [config.sensor.node_id] if config.sensor is not None else []
+        self._connect_objects()
+        self.set_parameters(config)
+
+    def answer(self, request: bytes) -> bytes | None:
+        """SDO answer to what came under 600h + node-ID; None: nothing to say."""
+        return self._server.handle(request)
+
+    def watch(self, cycle: int) -> None:
+        """Cycle number of each reading of the snapshot: values of a loop that stands still are not shown as new."""
+        if cycle != self._last_cycle:
+            self._last_cycle, self._last_change = cycle, time.monotonic()
+
+    def _connect_objects(self) -> None:
+        store = self._store
+        for joint in (0, 1):
+            store.on_read(0x2100, joint + 1, partial(self._field, joint, 0))
+            store.on_read(0x2101, joint + 1, partial(self._field, joint, 1))
+            store.on_read(0x2104, joint + 1, partial(self._latched, joint))
+        store.on_read(0x2102, 0, lambda: self._field(0, 2) | self._field(1, 2) << 4)
+        store.on_read(0x2103, 0, lambda: self._reader.read().sync_counter)
+        store.on_read(0x2110, 0, lambda: int(self._asked > self._reader.resets_done))
+        store.on_write(0x2110, 0, self._reset)
+        for sub, name in enumerate(COUNTERS, start=1):
+            store.on_read(0x2200, sub, partial(self._counter, name))
+        for sub, share in enumerate((0.5, 0.99, 1.0), start=1):
+            store.on_read(0x2201, sub, partial(self._work_us, share))
+        for sub in range(len(BUS_FIELDS)):
+            store.on_read(0x2205, sub + 1, partial(self._bus, sub))
+        for position, node in zip(range(NODES), self._watched, strict=False):
+            store.on_read(0x2206, position + 1, partial(self._node, node))
+            store.on_read(0x2207, position + 1, partial(self._emergency, node))
+
+    def _field(self, joint: int, part: int) -> int:
+        """Torque (0), sigma (1) or status (2) of a joint as on the bus."""
+        view = self._reader.read()
+        if view.cycle == self._last_cycle and time.monotonic() - self._last_change > _STANDSTILL_S:
+            return field(nan, inf, STALE)[part]  # the loop stands still: what it said last is old
+        last = view.joints[joint]
+        return field(last.torque_nm, last.sigma_nm, last.status)[part]
+
+    def _latched(self, joint: int) -> int:
+        """Bits of `daemon/shared/cycle_record.py`."""
+        return self._reader.read().joints[joint].latched
+
+    def _reset(self, data: bytes) -> None:
+        """2110h: 1 releases latched faults, as `jtq control reset` does."""
+        if data == b"\x01":
+            self._asked = self._reader.ask_reset()
+
+    def _counter(self, name: str) -> int:
+        value = self.recorder_lost if name == "recorder_lost" else self._reader.read().counters[name]
+        return value & 0xFFFF_FFFF if name == "bits_worst_case" else min(value, 0xFFFF_FFFF)
+
+    def _work_us(self, share: float) -> int:
+        value = self._reader.work_us(share)[0]
+        return round(value) if isfinite(value) else 0
+
+    def _bus(self, position: int) -> int:
+        return min(self.bus()[position], 0xFFFF_FFFF)
+
+    def _node(self, node: int) -> int:
+        state, heartbeat, configured = self.nodes(node)
+        return node << 24 | configured << 16 | heartbeat << 8 | state
+
+    def _emergency(self, node: int) -> int:
+        code, register, count = self.emergencies(node)
+        return min(count, 0xFF) << 24 | register << 16 | code
+
+    def set_parameters(self, config: Config) -> None:
+        """Objects that show the configuration; called again when another one has come into force."""
+        """What the objects say of the configuration in force."""
+        store = self._store
+        store.set_text(0x100A, 0, VERSION)
+        store.set_number(0x1006, 0, config.period_ns // 1000)
+        store.set_number(0x1015, 0, config.emcy_inhibit_ms * _MS_TO_INHIBIT)
+        for sub, node in enumerate(self._watched, start=1):
+            store.set_number(0x1016, sub, node << 16 | config.heartbeat_timeout_ms)
+        store.set_number(0x1017, 0, config.heartbeat_ms)
+        store.set_number(0x1019, 0, config.counter_overflow)
+        for sub, word in enumerate(signature(config.sha256), start=1):
+            store.set_number(0x1020, sub, word)
+        store.set_text(0x2204, 0, config.sha256)
+        for index, joint in zip((0x2202, 0x2203), config.joints, strict=True):
+            for sub, name in enumerate(JOINT_PARAMETERS, start=1):
+                store.set_number(index, sub, getattr(joint.joint, name))

@@ -1,0 +1,327 @@
+"""What jtqd does on the bus beside the loop: own node, EMCY, heartbeats, bus state, nodes that return, checks in service.
+
+Runs in the supervisor, on a frame socket of its own. No frame of a cycle passes here, and nothing here can delay one. The
+parts are pure and tested by themselves; this one only moves frames, times and lines between them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from jtqd.daemon.bus.boot import ReturningNodes
+from jtqd.daemon.bus.errors import (
+    ACTIVE,
+    BUS_OFF,
+    DOWN,
+    PASSIVE,
+    STATE_NAMES,
+    BusChange,
+    BusState,
+    EmcyLog,
+    LoopErrors,
+    OwnErrors,
+)
+from jtqd.daemon.bus.nodes import NodeCare, NodeEvent, NodeWatch
+from jtqd.daemon.bus.own_node import OwnNode
+from jtqd.daemon.config import Config
+from jtqd.daemon.shared.log_lines import RateLimit
+from jtqd.daemon.shared.snapshot import SnapshotReader, View
+from jtqd.drivers import emcy
+from jtqd.drivers.devices import COMMANDER_NODE
+from jtqd.drivers.emcy import describe, name_of
+from jtqd.drivers.filters import CanFilter, exact
+from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, pack
+from jtqd.drivers.frame_socket import BusDown, FrameSocket
+from jtqd.drivers.object_dictionary import ObjectStore
+
+# What the supervisor sees of the bus, as a small JSON file in the runtime directory: for `jtq status` and people.
+#
+# `bus.json`, replaced as a whole twice a second:
+#     {"state": "error active", "counts": {2205h by name}, "foreign_nmt": 0,
+#      "nodes": {"1": {"heartbeat": "heard", "emcy": 2, "last_emcy": "EMCY 2310h (...)", "absent": false, "sdo": {...}}},
+#      "errors": [{"code": "8250h", "name": "RPDO timeout", "detail": "181h"}], "error_register": 17}
+
+
+FILE = "bus.json"
+_HEARTBEATS = ("not watched", "awaited", "heard", "lost")
+
+
+class BusReport:
+    """Writes the file into `directory`; what cannot be written is left out, as nothing depends on it."""
+
+    def __init__(self, directory: Path) -> None:
+        self._path = directory / FILE
+        self._new = directory / (FILE + ".new")
+        self._last = ""
+
+    def write(self, service: BusService) -> None:
+        """Replace the file when something has changed."""
+        text = json.dumps(content(service))
+        if text == self._last:
+            return
+        with suppress(OSError):
+            self._new.write_text(text, encoding="utf-8")
+            self._new.chmod(0o640)
+            self._new.replace(self._path)
+            self._last = text
+
+
+def content(service: BusService) -> dict[str, Any]:
+    """The same as plain data."""
+    nodes = {}
+    for node, state in service.heartbeats.states().items():
+        last = service.emergencies.last(node)
+        nodes[str(node)] = {
+            "heartbeat": _HEARTBEATS[state],
+            "emcy": service.emergencies.count_of(node),
+            "last_emcy": None if last is None else describe(last),
+            "absent": node in service.care.absent,
+            "sdo": service.care.sdo_counts(node),
+        }
+    errors = [
+        {"code": f"{code:04X}h", "name": name_of(code), "detail": f"{detail:03X}h"}
+        for code, detail in service.errors.all_present()
+    ]
+    return {
+        "state": STATE_NAMES[service.bus.state],
+        "counts": {name: value for name, value in service.bus.counts.items() if name != "state"},
+        "foreign_nmt": service.foreign_nmt,
+        "malformed_heartbeats": service.heartbeats.malformed,
+        "nodes": nodes,
+        "errors": errors,
+        "error_register": service.errors.register,
+    }
+
+
+_BATCHES = 8
+"""Calls of `receive` in one turn: a storm of frames waits in the kernel's queue, and what overflows there is counted."""
+_REPORT_S = 0.5
+_NMT = {1: "start", 2: "stop", 128: "enter pre-operational", 129: "reset node", 130: "reset communication"}
+
+Say = Callable[[str, int, str], None]
+
+
+def service_filters(config: Config) -> list[CanFilter]:
+    """SDO requests to the own node, those of others to the nodes and the answers, EMCY, all heartbeats, NMT commands."""
+    heartbeats = CanFilter(0x700, 0x780 | CAN_EFF_FLAG | CAN_RTR_FLAG)
+    nodes = [base + node for node in nodes_of(config) for base in (0x080, 0x580, 0x600)]
+    return [exact(0x600 + config.node_id), exact(0x000), heartbeats, *(exact(cob_id) for cob_id in nodes)]
+
+
+def nodes_of(config: Config) -> list[int]:
+    """Node-IDs of the configuration: joint 1, joint 2, the sensor."""
+    return [
+        *(joint.node_id for joint in config.joints),
+        *([config.sensor.node_id] if config.sensor is not None else []),
+    ]
+
+
+class BusService:
+    """Call `turn` about twenty times a second, and whenever the socket has frames.
+
+    Args:
+        socket: frame socket with `service_filters` and error messages.
+        config: in force.
+        report: of the first boot.
+        reader: snapshot of the loop.
+        store: object dictionary of the own node.
+        returning: boots nodes in service.
+        say: takes topic, node and line for the operator.
+        directory: where `bus_report.FILE` is kept up to date; None: nowhere.
+    """
+
+    def __init__(
+        self,
+        socket: FrameSocket,
+        config: Config,
+        report: dict[str, Any],
+        *,
+        reader: SnapshotReader,
+        store: ObjectStore,
+        returning: ReturningNodes,
+        say: Say,
+        directory: Path | None = None,
+    ) -> None:
+        self.socket = socket
+        self._config, self._say = config, say
+        self._nodes = nodes = nodes_of(config)
+        self.bus, self.emergencies = BusState(), EmcyLog(nodes)
+        self.heartbeats = NodeWatch(
+            tuple(nodes),
+            (config.node_id, COMMANDER_NODE),
+            config.heartbeat_ms * 1e-3,
+            config.heartbeat_timeout_ms * 1e-3,
+        )
+        self.errors = OwnErrors(store)
+        self.own = OwnNode(store, config, reader)
+        self.own.bus, self.own.nodes, self.own.emergencies = (
+            self.bus.values,
+            lambda node: self.care.state(node, self._view),
+            self._emergency,
+        )
+        self.care = NodeCare(nodes, reader, returning, self.heartbeats, say)
+        self._loop = LoopErrors(config, self.errors, say)
+        self._limit = RateLimit()
+        self._report_due = 0.0
+        self._view = reader.read()
+        self.foreign_nmt = 0
+        self._heard = False
+        self._report = None if directory is None else BusReport(directory)
+        self._first = report
+
+    def begin(self, now_s: float) -> None:
+        """The nodes are operational: what was received during the boot is old, all but EMCY and requests to the own node."""
+        with suppress(BusDown):
+            while count := self.socket.receive():
+                for can_id, data in self._frames(count):
+                    if 0x080 < can_id <= 0x0FF:
+                        self._on_emergency(can_id - 0x080, data, now_s)
+                    elif can_id == 0x600 + self._config.node_id:
+                        self._on_request(data)
+        for number, node in self._first["nodes"].items():
+            self.care.configured(int(number), node, now_s)
+            for note in node.get("notes", ()):
+                self._say("boot", int(number), f"node {number}: {note}")
+        for number, error in self._first.get("absent", {}).items():
+            text = f"{error['message']}: it is optional; jtqd goes on, and configures it when it appears"
+            self._say("boot", int(number), text)
+
+    def turn(self, view: View, now_s: float) -> None:
+        """Take what has arrived and send what is due. Raises BusGone."""
+        self._view = view
+        try:
+            all_taken = self._receive(now_s)
+        except BusDown:
+            all_taken = False
+            self._bus_change(self.bus.down(), now_s)
+        self.own.watch(view.cycle)
+        if all_taken:
+            self._node_events(self.heartbeats.tick(now_s))
+        failed = self._loop.watch(view, self.care.absent, now_s)
+        if failed and not self._heard:
+            self._bus_change(self.bus.down(), now_s)
+        requests = self.care.turn(view, now_s)
+        self._node_changes()
+        with suppress(BusDown):
+            for node, request in requests:
+                self.socket.send(pack(0x600 + node, request))
+            if self.bus.state not in (BUS_OFF, DOWN):
+                message = self.errors.tick(now_s)
+                if message is not None:
+                    self.socket.send(pack(0x080 + self._config.node_id, message))
+        if self._report is not None and now_s >= self._report_due:
+            self._report_due = now_s + _REPORT_S
+            self._report.write(self)
+
+    # Frames ---------------------------------------------------------------------------------------------------------------
+
+    def _receive(self, now_s: float) -> bool:
+        """False: there is more than one turn takes."""
+        self._heard = False
+        for _ in range(_BATCHES):
+            count = self.socket.receive()
+            if not count:
+                return True
+            for can_id, data in self._frames(count):
+                self._on_frame(can_id, data, now_s)
+        return False
+
+    def _frames(self, count: int) -> list[tuple[int, bytes]]:
+        frames = self.socket.frames
+        unpacked = (FRAME.unpack_from(frames, 16 * n) for n in range(count))
+        return [(can_id, data[:length]) for can_id, length, data in unpacked]
+
+    def _on_frame(self, can_id: int, data: bytes, now_s: float) -> None:
+        if can_id & CAN_ERR_FLAG:
+            self._bus_change(self.bus.error_frame(can_id, data), now_s)
+            return
+        self._heard = True
+        self._bus_change(self.bus.alive(), now_s)
+        if can_id == 0x600 + self._config.node_id:
+            self._on_request(data)
+        elif can_id >= 0x700:
+            self._node_events(self.heartbeats.receive(can_id - 0x700, data, now_s))
+        elif can_id >= 0x600:
+            self.care.on_foreign_request(can_id - 0x600, now_s)
+        elif can_id >= 0x580:
+            self.care.on_reply(can_id - 0x580, data, now_s)
+        elif can_id == 0x000:
+            self._on_nmt(data, now_s)
+        else:
+            self._on_emergency(can_id - 0x080, data, now_s)
+
+    def _on_request(self, data: bytes) -> None:
+        answer = self.own.answer(data)
+        if answer is not None:
+            with suppress(BusDown):
+                self.socket.send(pack(0x580 + self._config.node_id, answer))
+
+    def _on_emergency(self, node: int, data: bytes, now_s: float) -> None:
+        line = self.emergencies.receive(node, data, now_s)
+        if line is not None:
+            self._say("emcy", node, line)
+
+    def _on_nmt(self, data: bytes, now_s: float) -> None:
+        """jtqd is the NMT master; a command that is not of its own boots comes from somebody else."""
+        if self.care.is_booting(now_s):
+            return
+        self.foreign_nmt += 1
+        if len(data) == 2 and self._limit.may_say(("nmt", data), now_s) is not None:
+            command = _NMT.get(data[0], f"{data[0]:02X}h")
+            whom = f"node {data[1]}" if data[1] else "all nodes"
+            self._say("nmt", data[1] & 0x7F, f"NMT command '{command}' to {whom} from somebody else")
+
+    def _bus_change(self, change: BusChange | None, now_s: float) -> None:
+        if change is None:
+            return
+        before, after = change
+        counts = self.bus.counts
+        if after == PASSIVE:
+            self.errors.come(emcy.CAN_PASSIVE)
+        elif before == PASSIVE:
+            self.errors.gone(emcy.CAN_PASSIVE)
+        if before == BUS_OFF and after == ACTIVE:
+            self.errors.happened(emcy.BUS_OFF_RECOVERED)
+        if self._limit.may_say(("bus", before, after), now_s) is not None:
+            numbers = f"TEC {counts['tx_errors']}, REC {counts['rx_errors']}"
+            detail = f" ({numbers})" if counts["tx_errors"] or counts["rx_errors"] else ""
+            self._say("bus", 0, f"bus: {STATE_NAMES[after]}, before: {STATE_NAMES[before]}{detail}")
+
+    # Nodes ----------------------------------------------------------------------------------------------------------------
+
+    def _node_events(self, events: list[NodeEvent]) -> None:
+        for kind, node, line in events:
+            if kind in ("lost", "never"):
+                self.errors.come(emcy.HEARTBEAT_LOST, node, joints=self._joints_of(node))
+            elif kind == "back":
+                self.errors.gone(emcy.HEARTBEAT_LOST, node)
+            elif kind == "doubled":
+                self.errors.come(emcy.COB_ID_COLLISION, 0x700 + node)
+            elif kind == "single":
+                self.errors.gone(emcy.COB_ID_COLLISION, 0x700 + node)
+            if kind == "restarted":
+                self.care.restarted(node)
+                self.errors.gone(emcy.HEARTBEAT_LOST, node)
+            if line is not None and not (kind in ("restarted", "state") and node == self.care.busy):
+                self._say("heartbeat", node, line)
+
+    def _node_changes(self) -> None:
+        for node in self._nodes:
+            if node in self.care.changed:
+                joints = self._joints_of(node)
+                self.errors.come(emcy.NODE_CHANGED, node, joints=joints, register=emcy.MANUFACTURER)
+            else:
+                self.errors.gone(emcy.NODE_CHANGED, node)
+
+    def _joints_of(self, node: int) -> int:
+        return sum(1 << n for n, joint in enumerate(self._config.joints) if joint.node_id == node)
+
+    # What the own node shows ----------------------------------------------------------------------------------------------
+
+    def _emergency(self, node: int) -> tuple[int, int, int]:
+        last = self.emergencies.last(node)
+        return (0, 0, 0) if last is None else (last.code, last.register, self.emergencies.count_of(node))

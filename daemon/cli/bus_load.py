@@ -1,0 +1,64 @@
+"""`jtq bus-load`: what a configuration costs on the wire, before it is run."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from jtqd.daemon.bus.boot import bus_load_of
+from jtqd.daemon.config import load_config
+from jtqd.drivers.bus_load import LIMIT
+from jtqd.estimator.checked import ConfigError
+
+_EXAMPLES = """examples:
+  jtq bus-load                                  of the bench that ships
+  jtq bus-load --config /etc/jtqd/can0.yaml     before it is run: jtqd refuses one above 95 %
+  jtq bus-load --json | jq '.rows[] | [.cob_id, .share]'
+
+What really is on a bus is measured by `jtq check`.
+exit status: 0 it fits, 1 it does not or cannot be read, 2 usage"""
+
+
+def main(argv: list[str]) -> int:
+    """Print the table; exit status 0 it fits, 1 it does not or cannot be read, 2 usage."""
+    parser = argparse.ArgumentParser(
+        prog="jtq bus-load",
+        description="Worst-case load of the bus by a configuration; jtqd refuses one above 95 %.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--config", type=Path, metavar="FILE", help="configuration (default: the bench that ships)"
+    )
+    parser.add_argument("--json", action="store_true", help="print as JSON")
+    arguments = parser.parse_args(argv)
+    try:
+        config = load_config(arguments.config)
+    except ConfigError as error:
+        print(f"jtq bus-load: {error}", file=sys.stderr)
+        return 1
+    load = bus_load_of(config)
+    fits = load.worst <= LIMIT
+    if arguments.json:
+        content = {
+            "worst": load.worst,
+            "unstuffed": load.unstuffed,
+            "limit": LIMIT,
+            "fits": fits,
+            "rows": load.table(),
+        }
+        print(json.dumps(content))
+    else:
+        print(f"{'COB-ID':<7} {'bytes':>5} {'per cycle':>9} {'worst bits':>10} {'share':>7}  who")
+        for row in load.table():
+            print(
+                f"{row['cob_id']:<7} {row['bytes']:>5} {row['per_cycle']:>9.3g} {row['worst_bits']:>10.1f} "
+                f"{row['share']:>7.2%}  {row['who']}"
+            )
+        print(
+            f"worst case {load.worst:.1%}, without stuff bits {load.unstuffed:.1%}, limit {LIMIT:.0%}", end=""
+        )
+        print("" if fits else ": does not fit")
+    return 0 if fits else 1

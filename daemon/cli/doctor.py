@@ -1,0 +1,277 @@
+"""`jtq doctor`: is this machine fit for jtqd? Kernel, rights, CAN interface, files, directories, packages."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import re
+import shutil
+import sys
+from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, requires
+from pathlib import Path
+
+from rich.console import Console
+
+from jtqd.daemon.bus.boot import bus_load_of
+from jtqd.daemon.cli.checks import (
+    FAIL,
+    GOOD,
+    SKIP,
+    WARN,
+    CheckResult,
+    as_json,
+    exit_status,
+    share,
+    show,
+    size,
+)
+from jtqd.daemon.cli.machine import can_findings, kernel_findings
+from jtqd.daemon.cli.reading import Found, find_daemons, places
+from jtqd.daemon.config import Config, load_config
+from jtqd.daemon.loop.process import build_estimator
+from jtqd.daemon.shared.runtime_dir import installed
+from jtqd.drivers.bus_load import BusLoadError, check_bus_load
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.onnx_graph import NetworkError
+
+# Files that jtqd needs and directories that it writes, packages, the unit, and what dead daemons have left.
+
+
+_UNITS = (
+    "/etc/systemd/system",
+    "/run/systemd/system",
+    "/usr/local/lib/systemd/system",
+    "/usr/lib/systemd/system",
+    "/lib/systemd/system",
+)
+_UNIT = "jtqd@.service"
+_LOG_FREE = 10 << 30
+"""A working day of recording."""
+_SHM_FREE = 64 << 20
+_BYTES_AN_HOUR = 1.1e9
+
+
+def file_findings(config: Config) -> Iterator[CheckResult]:
+    """Configuration, joint files, models and their hashes; the configuration has been read already."""
+    load = bus_load_of(config)
+    yield CheckResult(
+        "configuration", GOOD, f"{config.path}, sha256 {config.sha256[:12]}, method {config.estimator.method}"
+    )
+    try:
+        check_bus_load(load)
+        yield CheckResult("bus load", GOOD, f"{share(load.worst)} in the worst case (`jtq bus-load`)")
+    except BusLoadError as error:
+        yield CheckResult("bus load", FAIL, str(error), "`jtq bus-load` shows who takes how much")
+    for joint in config.joints:
+        item = f"joint {joint.number}"
+        shown = f"{joint.joint_path.name} {hashlib.sha256(joint.joint_path.read_bytes()).hexdigest()[:12]}"
+        network = (
+            f", {joint.network.path.name} {joint.network.sha256[:12]}" if joint.network else ", no network"
+        )
+        try:
+            build_estimator(config, joint).step(1e-3, 0.1, 0.0, 1.0, 0.0, 25.0)
+        except (ConfigError, NetworkError) as error:
+            yield CheckResult(item, FAIL, str(error), "jtqd will not start with it")
+        else:
+            yield CheckResult(item, GOOD, f"{joint.joint.name}: {shown}{network}: loads and runs")
+
+
+def directory_findings(log: Path | None, roots: list[Path]) -> Iterator[CheckResult]:
+    """Where logs and shared memory go, for this user; `log` None: where none has been said and none is usual."""
+    if log is None:
+        yield CheckResult(
+            "log directory", SKIP, "jtqd writes to ./logs unless told: --record DIR, $LOGS_DIRECTORY"
+        )
+    else:
+        yield _directory(
+            "log directory", log, _LOG_FREE, f"an hour takes up to {size(round(_BYTES_AN_HOUR))}"
+        )
+    yield _directory("shared memory", roots[0], _SHM_FREE, "ring and snapshot of a daemon take 3 MB")
+
+
+def _directory(item: str, path: Path, wanted: int, what: str) -> CheckResult:
+    existing = next(
+        each for each in (path, *path.absolute().parents) if os.path.exists(each)
+    )  # not in a closed one
+    free = shutil.disk_usage(existing).free
+    text = f"{path}: {size(free)} free, {what}"
+    if not os.access(existing, os.W_OK | os.X_OK):
+        return CheckResult(
+            item, FAIL, f"{path}: this user may not write there", "owner and mode; LogsDirectory= in the unit"
+        )
+    if existing != path:
+        text += "; it will be made"
+    if free < wanted:
+        return CheckResult(
+            item, WARN, text, f"less than {size(wanted)}: recording ends when the disk is full"
+        )
+    return CheckResult(item, GOOD, text)
+
+
+def package_findings() -> Iterator[CheckResult]:
+    """Installed versions against what jtqd's own package asks for."""
+    try:
+        wanted = [each for each in requires("jtqd") or () if "extra ==" not in each]
+    except PackageNotFoundError:
+        yield CheckResult(
+            "packages",
+            WARN,
+            "jtqd is not installed as a package: its requirements are unknown",
+            "pip install .",
+        )
+        return
+    found, wrong = [], []
+    for line in wanted:
+        name, limits = requirement(line)
+        version = installed(name)
+        found.append(f"{name} {version}")
+        if version is None:
+            wrong.append(f"{name} is missing")
+        elif not all(fits(version, *limit) for limit in limits):
+            wrong.append(f"{name} {version}, wanted {line.removeprefix(name)}")
+    text = f"jtqd {installed('jtqd')}, " + ", ".join(found)
+    if wrong:
+        yield CheckResult(
+            "packages", FAIL, "; ".join(wrong), "pip install --upgrade jtqd, in its own environment"
+        )
+    else:
+        yield CheckResult("packages", GOOD, text)
+
+
+def requirement(line: str) -> tuple[str, list[tuple[str, str]]]:
+    """Name and limits of a requirement: "mcap>=1.3,<2" is ("mcap", [(">=", "1.3"), ("<", "2")])."""
+    name = re.split(r"[^A-Za-z0-9_.-]", line, maxsplit=1)[0]
+    return name, re.findall(r"(>=|<=|==|<|>)\s*([0-9][0-9A-Za-z.]*)", line.partition(";")[0])
+
+
+def fits(version: str, operator: str, limit: str) -> bool:
+    """Compare the numbers of two versions; what is not a number ends them."""
+    have, want = _numbers(version), _numbers(limit)
+    length = max(len(have), len(want))
+    have, want = have + (0,) * (length - len(have)), want + (0,) * (length - len(want))
+    return {">=": have >= want, "<=": have <= want, "==": have == want, "<": have < want, ">": have > want}[
+        operator
+    ]
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    found = re.match(r"\d+(?:\.\d+)*", version)
+    return tuple(map(int, found[0].split("."))) if found else ()
+
+
+def unit_finding() -> CheckResult:
+    """The systemd unit."""
+    if not Path("/run/systemd/system").exists():
+        return CheckResult("systemd unit", SKIP, "systemd does not run here")
+    for directory in _UNITS:
+        path = Path(directory) / _UNIT
+        if path.exists():
+            return CheckResult("systemd unit", GOOD, str(path))
+    return CheckResult(
+        "systemd unit", WARN, "not installed", "docs/deployment.md; jtqd then does not start with the machine"
+    )
+
+
+def left_over_findings(log: Path | None, found: Found) -> Iterator[CheckResult]:
+    """Logs without an end and runtime directories of daemons that were killed."""
+    running = [each.about for each in found.daemons]
+    text = ", ".join(f"{each.instance} (process {each.pid})" for each in running) or "none"
+    yield CheckResult("running jtqd", GOOD, text)
+    directories = {Path(each.log_directory) for each in running if each.log_directory} | (
+        {log} if log else set()
+    )
+    growing = tuple(each.log_prefix for each in running)
+    files = [
+        path
+        for directory in sorted(directories)
+        for path in sorted(directory.glob("*.mcap.active"))
+        if not (growing and path.name.startswith(growing))
+    ]
+    if files:
+        names = ", ".join(str(path) for path in files[:3]) + (
+            f" and {len(files) - 3} more" if len(files) > 3 else ""
+        )
+        yield CheckResult("unended logs", WARN, names, "left by a crash: jtq recover FILE")
+    else:
+        yield CheckResult("unended logs", GOOD, "none")
+    if found.left_over:
+        yield CheckResult(
+            "left over",
+            WARN,
+            ", ".join(map(str, found.left_over)),
+            "of daemons that were killed; the next start on the same bus takes it over, or remove it",
+        )
+
+
+SCHEMA = "jtq.doctor/1"
+_EXAMPLES = """examples:
+  jtq doctor                                          this machine, all its CAN interfaces, the shipped configuration
+  jtq doctor --bus can0 --config /etc/jtqd/can0.yaml
+  sudo -u jtqd jtq doctor --bus can0                  as the user that jtqd runs as: rights are those of the caller
+  jtq doctor --json | jq '.items[] | select(.level == "FAIL")'
+
+exit status: 0 all good, 3 warnings, 1 failures, 2 usage"""
+_USUAL_LOGS = Path("/var/log/jtqd")
+
+
+def parser() -> argparse.ArgumentParser:
+    """Options of `jtq doctor`."""
+    made = argparse.ArgumentParser(
+        prog="jtq doctor",
+        description="Is this machine fit for jtqd? GOOD, WARN or FAIL for each item, and what to do. It changes nothing.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    made.add_argument("--bus", help="interface, unix:PATH or sim (default: every CAN interface)")
+    made.add_argument(
+        "--config", type=Path, metavar="FILE", help="configuration (default: the bench that ships)"
+    )
+    made.add_argument("--record", type=Path, metavar="DIR", help="directory of the logs (default: as jtqd's)")
+    made.add_argument("--json", action="store_true", help="print as JSON")
+    return made
+
+
+def main(argv: list[str]) -> int:
+    """Examine; returns the exit status."""
+    arguments = parser().parse_args(argv)
+    findings = list(examine(arguments.bus, arguments.config, arguments.record or _log_directory()))
+    if arguments.json:
+        print(json.dumps(as_json(SCHEMA, findings, bus=arguments.bus)))
+    else:
+        show(Console(), findings)
+    return exit_status(findings)
+
+
+def examine(bus: str | None, path: Path | None, log: Path | None) -> Iterator[CheckResult]:
+    """Every item. A configuration that cannot be read is one, and the shipped one then stands in for it."""
+    broken = None
+    try:
+        config = load_config(path)
+    except ConfigError as error:
+        broken, config = str(error), load_config(None)
+    needs_can = bus is None or not (bus == "sim" or bus.startswith("unix:"))
+    yield from kernel_findings(config.realtime, can=needs_can)
+    yield from can_findings(bus, config)
+    if broken:
+        yield CheckResult("configuration", FAIL, broken, "jtqd will not start with it")
+    else:
+        yield from file_findings(config)
+    yield from directory_findings(log, places())
+    yield from package_findings()
+    yield unit_finding()
+    yield from left_over_findings(log, find_daemons())
+
+
+def _log_directory() -> Path | None:
+    """Where jtqd would write, as far as that does not depend on the directory it is started in."""
+    named = os.environ.get("LOGS_DIRECTORY", "").split(":")[0]
+    if named:
+        return Path(named)
+    return _USUAL_LOGS if _USUAL_LOGS.exists() else None
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,527 @@
+"""`jtq status`: how a running jtqd is doing. It reads shared memory and can never slow the loop."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from math import isfinite, nan
+from typing import Any
+
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.live import Live
+from rich.measure import Measurement
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+from jtqd.daemon.cli.checks import NOTHING, duration, histogram, number, share, size
+from jtqd.daemon.cli.reading import (
+    NMT_STATES,
+    RUNNING,
+    CurrentLog,
+    Daemon,
+    Found,
+    Reading,
+    Watch,
+    drive_state,
+    find_daemons,
+    on_bus,
+    reason,
+    silent_s,
+)
+from jtqd.daemon.shared.notices import ERROR, WARNING, Notice
+from jtqd.daemon.shared.runtime_dir import About
+from jtqd.daemon.shared.snapshot import BUS_COUNTERS, LATE_BIN_NS, WORK_BIN_NS, SnapshotReader, View
+from jtqd.daemon.supervisor.table import COLOURS, bus_load, plain_line
+from jtqd.estimator.status import NAMES, PUBLISHED
+
+# A reading as plain data for JSON: `jtq status --json`.
+
+
+SCHEMA = "jtq.status/1"
+
+
+def content(reading: Reading) -> dict[str, Any]:
+    """Everything the picture shows; null where a number is not known."""
+    about, view = reading.daemon.about, reading.view
+    found: dict[str, Any] = {
+        "schema": SCHEMA,
+        "bus": about.bus,
+        "instance": about.instance,
+        "pid": about.pid,
+        "state": reading.state,
+        "why": reading.why or None,
+        "started": about.started,
+        "configuration": {"path": about.configuration, "sha256": about.configuration_sha256},
+        "method": about.method,
+        "versions": about.versions,
+    }
+    if view is None or reading.earlier is None:
+        return found
+    found |= {
+        "cycle": view.cycle,
+        "joints": [_joint(reading, number) for number in (1, 2)],
+        "inputs": [
+            {"name": name}
+            | {
+                "age_s": (view.sync_monotonic_ns - each.used_ns) * 1e-9 if each.used_ns else None,
+                "after_sync_us": each.delay_ns / 1000 if each.used_ns else None,
+                "usual_us": [each.low_ns / 1000, each.high_ns / 1000]
+                if each.low_ns <= each.high_ns
+                else None,
+                "late": each.late,
+                "lost": each.lost,
+                "duplicates": each.duplicates,
+                "rejected": each.rejected,
+            }
+            for name, each in zip(about.inputs, view.inputs, strict=False)
+        ],
+        "work_us": _quantiles(reading.work_us),
+        "late_us": _quantiles(reading.late_us),
+        "bus_load": {
+            "now": _number(bus_load(reading.earlier, view, about.bitrate)),
+            "worst_case": view.worst_load,
+        },
+        "counters": view.counters,
+        "nodes": [
+            {
+                "node": node,
+                "what": what,
+                "state": NMT_STATES.get(view.node_states[node]) if view.node_heard_ns[node] else None,
+                "heartbeat_age_s": (view.sync_realtime_ns - view.node_heard_ns[node]) * 1e-9
+                if view.node_heard_ns[node]
+                else None,
+                "configured": node not in view.unconfigured,
+            }
+            for node, what in sorted(about.nodes.items())
+        ],
+    }
+    found["notices"] = [
+        {
+            "realtime_ns": each.realtime_ns,
+            "level": each.level,
+            "node": each.node or None,
+            "topic": each.topic,
+            "text": each.text,
+        }
+        for each in reading.notices
+    ]
+    log = reading.log
+    found["recorder"] = log and {
+        "path": str(log.path) if log.path else None,
+        "bytes": log.size,
+        "written": log.account.written,
+        "lost": log.account.lost,
+        "let_go": log.account.let_go,
+        "disk_free": log.disk_free,
+        "disk_size": log.disk_size,
+    }
+    return found
+
+
+def _joint(reading: Reading, number: int) -> dict[str, Any]:
+    about, view, earlier = reading.daemon.about, reading.view, reading.earlier
+    assert view is not None
+    assert earlier is not None
+    n = number - 1
+    seen, measured = view.joints[n], view.measured[n]
+    known = seen.status in PUBLISHED and reading.state == RUNNING
+    return {
+        "joint": number,
+        "name": about.joints[n].name,
+        "status": NAMES.get(seen.status, str(seen.status)),
+        "reason": reason(about, number, view, earlier) or None,
+        "since_s": (view.cycle - view.status_since[n]) * view.period_s,
+        "torque_nm": _number(seen.torque_nm if known else nan),
+        "sigma_nm": _number(seen.sigma_nm if known else nan),
+        "physics_nm": _number(seen.physics_nm),
+        "network_nm": _number(seen.network_nm),
+        "sensor_nm": _number(seen.sensor_nm),
+        "current_a": _number(measured.current_a),
+        "motor_velocity_rad_s": _number(measured.motor_velocity_rad_s),
+        "temperature_c": _number(measured.temperature_c),
+        "drive": drive_state(seen.statusword),
+        "cycles": {
+            NAMES.get(code, str(code)): count for code, count in enumerate(view.status_cycles[n]) if count
+        },
+    }
+
+
+def _quantiles(values: tuple[float, float, float]) -> dict[str, float | None]:
+    return dict(zip(("p50", "p99", "max"), map(_number, values), strict=True))
+
+
+def _number(value: float) -> float | None:
+    return value if isfinite(value) else None
+
+
+# The picture of `jtq status`: joints, inputs, loop, bus, nodes and recorder of one daemon, at the width of the terminal.
+
+
+_HEAD = "bold"
+_HEADING = 9
+"""Width of the headings of lines."""
+_FAULTS = (
+    "stale_inputs",
+    "published_late",
+    *BUS_COUNTERS,
+    "network_fallbacks",
+    "overruns",
+    "latches",
+)
+"""Counters shown when they are not zero."""
+_OPERATIONAL = 5
+_LAST_NOTICES = 4
+
+
+class StatusView:
+    """Renderable of one reading."""
+
+    def __init__(self, reading: Reading) -> None:
+        self._reading = reading
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Called by rich with the width of the terminal."""
+        reading, width = self._reading, options.max_width
+        yield _title(reading)
+        if reading.state != RUNNING:
+            yield Text(f"NOT RUNNING: {reading.why}" if reading.view else reading.why, style="bold red")
+        if reading.view is None or reading.earlier is None:
+            return
+        about, view = reading.daemon.about, reading.view
+        still = reading.state != RUNNING
+        yield ""
+        yield _joints(about, view, still=still)
+        if not still:
+            yield from _reasons(about, view, reading.earlier)
+        yield ""
+        yield _inputs(about, view)
+        yield ""
+        yield _loop(reading, view, width)
+        yield _bus(about, view, reading.earlier)
+        faults = [
+            f"{name.replace('_', ' ')} {view.counters[name]}" for name in _FAULTS if view.counters[name]
+        ]
+        if faults:
+            yield _line("counted", ", ".join(faults))
+        yield ""
+        yield _nodes(about, view)
+        yield ""
+        yield from _log(reading.log)
+        yield from _notices(reading.notices)
+
+
+def _title(reading: Reading) -> Text:
+    about, view = reading.daemon.about, reading.view
+    text = Text(f"jtqd on {about.instance}", style=_HEAD)
+    text.append(f"  node {about.node:02X}h  {about.method}  pid {about.pid}", style="")
+    if view is not None:
+        text.append(f"  cycle {view.cycle}  up {duration(view.cycle * view.period_s)}", style="")
+    text.append(f"\n{about.configuration}  {about.configuration_sha256[:8]}", style="dim")
+    text.overflow = "fold"
+    return text
+
+
+class Columns:
+    """A table whose columns go, in the order of `dispensable`, where the terminal is too narrow for all; nothing is cut."""
+
+    def __init__(self, headings: dict[str, str], dispensable: tuple[str, ...] = ()) -> None:
+        self._headings = headings
+        self._dispensable = dispensable
+        self._rows: list[dict[str, str | Text]] = []
+
+    def add(self, *cells: str | Text) -> None:
+        """One row, a cell for each heading."""
+        self._rows.append(dict(zip(self._headings, cells, strict=True)))
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Called by rich with the width of the terminal."""
+        unlimited = options.update(max_width=1000)
+        for dropped in range(len(self._dispensable) + 1):
+            table = self._table([name for name in self._headings if name not in self._dispensable[:dropped]])
+            if Measurement.get(console, unlimited, table).maximum <= options.max_width:
+                break
+        yield table
+
+    def _table(self, names: list[str]) -> Table:
+        table = Table(
+            box=None, pad_edge=False, padding=(0, 2, 0, 0), collapse_padding=True, header_style=_HEAD
+        )
+        for name in names:
+            right = self._headings[name] == "right"
+            table.add_column(name, justify="right" if right else "left", no_wrap=True)
+        for row in self._rows:
+            table.add_row(*(row[name] for name in names))
+        return table
+
+
+def _quantity(value: float, unit: str, digits: int = 2) -> str:
+    text = number(value, digits)
+    return text if text == NOTHING else f"{text} {unit}"
+
+
+def _joints(about: About, view: View, *, still: bool) -> Columns:
+    headings = {"joint": "left", "status": "left"} | dict.fromkeys(
+        ("torque", "sigma", "sensor", "current", "motor", "temp.", "with a number"), "right"
+    )
+    table = Columns(headings, ("with a number", "motor", "temp.", "current", "sensor", "sigma"))
+    for n, (joint, seen) in enumerate(zip(about.joints, view.joints, strict=True)):
+        known = seen.status in PUBLISHED and not still
+        measured, spent = view.measured[n], view.status_cycles[n]
+        name = NAMES.get(seen.status, str(seen.status))
+        table.add(
+            f"{joint.number} {joint.name}",
+            Text(name, style="dim" if still else COLOURS.get(name, "bold red")),
+            _quantity(seen.torque_nm if known else nan, "Nm"),
+            _quantity(seen.sigma_nm if known else nan, "Nm"),
+            _quantity(seen.sensor_nm, "Nm"),
+            _quantity(measured.current_a, "A"),
+            _quantity(measured.motor_velocity_rad_s, "rad/s", 1),
+            _quantity(measured.temperature_c, "°C", 1),
+            share(sum(spent[code] for code in PUBLISHED) / max(1, sum(spent))),
+        )
+    return table
+
+
+def _reasons(about: About, view: View, earlier: View) -> Iterator[Text]:
+    """Always a line for each joint, so that the picture does not jump."""
+    for joint, seen, since in zip(about.joints, view.joints, view.status_since, strict=True):
+        why = reason(about, joint.number, view, earlier)
+        name = NAMES.get(seen.status, str(seen.status))
+        lasting = duration((view.cycle - since) * view.period_s)
+        yield Text.assemble(
+            f"joint {joint.number} ",
+            (f"{name} for {lasting}", COLOURS.get(name, "bold red")),
+            f": {why}" if why else "",
+        )
+
+
+def _inputs(about: About, view: View) -> Columns:
+    headings = {"input": "left"} | dict.fromkeys(
+        ("age", "after SYNC", "usual", "missed", "late", "lost", "twice", "wrong"), "right"
+    )
+    table = Columns(headings, ("wrong", "twice", "usual", "lost", "late"))
+    for name, each in zip(about.inputs, view.inputs, strict=False):
+        age_s = (view.sync_monotonic_ns - each.used_ns) * 1e-9 if each.used_ns else nan
+        old = not age_s <= 2 * 8 * view.period_s  # looked at every 8th cycle
+        band = f"{each.low_ns / 1000:.0f}..{each.high_ns / 1000:.0f} us"
+        table.add(
+            name,
+            Text("never" if not each.used_ns else duration(age_s), style="bold red" if old else ""),
+            f"{each.delay_ns / 1000:.0f} us" if each.used_ns else NOTHING,
+            band if each.low_ns <= each.high_ns else NOTHING,
+            *map(str, (each.missed, each.late, each.lost, each.duplicates, each.rejected)),
+        )
+    return table
+
+
+def _line(heading: str, text: str | Text) -> RenderableType:
+    """A heading of a fixed width, and text that wraps beside it."""
+    grid = Table.grid(padding=(0, 1))
+    grid.add_column(width=_HEADING, no_wrap=True, style=_HEAD)
+    grid.add_column(overflow="fold")
+    grid.add_row(heading, text)
+    return grid
+
+
+def _loop(reading: Reading, view: View, width: int) -> RenderableType:
+    grid = Table.grid(padding=(0, 1))
+    grid.add_column(width=_HEADING, no_wrap=True, style=_HEAD)
+    grid.add_column()
+    for name, values, bins, bin_ns in (
+        ("work", reading.work_us, reading.work, WORK_BIN_NS),
+        ("lateness", reading.late_us, reading.late, LATE_BIN_NS),
+    ):
+        p50, p99, worst = values
+        text = f"p50 {number(p50, 0)}  p99 {number(p99, 0)}  max {number(worst, 0)} us"
+        columns = min(60, max(10, width - 66))
+        grid.add_row(name, Text.assemble(text.ljust(31), (histogram(bins, bin_ns / 1000, columns), "cyan")))
+    counters = view.counters
+    slots = max(1, counters["cycles"] + counters["missed"])
+    missed = Text(f"{counters['missed']} of {slots} cycles", style="yellow" if counters["missed"] else "")
+    short = counters["cycles"] - counters["complete"]
+    missed.append(f", an input missing in {short}", style="yellow" if short else "default")
+    grid.add_row("missed", missed)
+    return grid
+
+
+def _bus(about: About, view: View, earlier: View) -> RenderableType:
+    now = bus_load(earlier, view, about.bitrate)
+    return _line(
+        "bus load",
+        f"{share(now)} now, counted with every stuff bit; {share(view.worst_load)} by configuration",
+    )
+
+
+def _nodes(about: About, view: View) -> Columns:
+    table = Columns({"node": "left", "what": "left", "state": "left", "heartbeat": "right"}, ("what",))
+    for node, what in sorted(about.nodes.items()):
+        heard = view.node_heard_ns[node]
+        silence = silent_s(view, node, about.heartbeat_ms)
+        state = Text(NMT_STATES.get(view.node_states[node], "?") if heard else "no heartbeat yet")
+        if silence is not None:
+            state = Text(f"silent, was {state.plain}", style="bold red")
+        elif node in view.unconfigured:
+            state = Text("restarted, not configured yet", style="bold red")
+        elif heard and view.node_states[node] != _OPERATIONAL:
+            state.stylize("yellow")
+        age = duration(max(0, view.sync_realtime_ns - heard) * 1e-9) + " ago" if heard else NOTHING
+        table.add(f"{node:02X}h", what, state, age)
+    return table
+
+
+def _log(log: CurrentLog | None) -> Iterator[RenderableType]:
+    if log is None:
+        yield _line("recorder", "no recording")
+        return
+    lost = Text(f"{log.account.lost} lost", style="bold red" if log.account.lost else "")
+    held = f", {log.account.let_go} let go (flight recorder)" if log.account.let_go else ""
+    yield _line(
+        "recorder",
+        Text.assemble(
+            f"{log.account.written} cycles written, ", lost, f"{held}, {size(log.size)} in this file"
+        ),
+    )
+    yield _line("", str(log.path) if log.path else "no file is being written")
+    yield _line("disk", f"{size(log.disk_free)} free of {size(log.disk_size)}")
+
+
+def _notices(notices: Sequence[Notice]) -> Iterator[RenderableType]:
+    if notices:
+        yield ""
+    for each in notices[-_LAST_NOTICES:]:
+        when = time.strftime("%H:%M:%S", time.localtime(each.realtime_ns * 1e-9))
+        style = "bold red" if each.level >= ERROR else "yellow" if each.level >= WARNING else ""
+        yield _line(when, Text(each.text, style=style))
+
+
+def clock() -> RenderableType:
+    """The line below a live view."""
+    return Padding(
+        Text(time.strftime("%H:%M:%S  Ctrl-C ends this view; jtqd goes on"), style="dim"), (1, 0, 0, 0)
+    )
+
+
+_EXAMPLES = """examples:
+  jtq status                     live view of the daemon that runs here; Ctrl-C ends the view
+  jtq status --bus can0          of the one on can0, where there are several
+  jtq status --once              one picture, also into a file or a mail
+  jtq status --json | jq '.joints[].torque_nm'
+
+exit status: 0 it runs, 1 no daemon runs (or none that you may look at), 2 usage, 3 it does not advance, or is still starting
+what you may look at: your own daemons, and those whose group you are in (usermod -a -G jtqd YOU)"""
+_PERIOD_S = 0.2
+_PLAIN_PERIOD_S = 1.0
+_BETWEEN_S = 0.3
+"""Between the two readings of one picture: bus load and causes need what has changed."""
+
+
+class _NotOneError(Exception):
+    """No daemon to look at, or more than one; the message is for the operator."""
+
+    def __init__(self, message: str, exit_status: int) -> None:
+        super().__init__(message)
+        self.exit_status = exit_status
+
+
+def parser() -> argparse.ArgumentParser:
+    """Options of `jtq status`."""
+    made = argparse.ArgumentParser(
+        prog="jtq status",
+        description="How a running jtqd is doing: torque, status with its reason, inputs, timing, bus, nodes, log.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    made.add_argument("--bus", help="whose daemon: can0, unix:PATH or sim (default: the only one that runs)")
+    made.add_argument("--once", action="store_true", help="one picture, then end")
+    made.add_argument("--json", action="store_true", help="one reading as JSON, then end")
+    return made
+
+
+def main(argv: list[str]) -> int:
+    """Show it; returns the exit status."""
+    arguments = parser().parse_args(argv)
+    try:
+        daemon = _chosen(find_daemons(), arguments.bus)
+        if arguments.json or arguments.once:
+            return _once(daemon, as_json=arguments.json)
+        os.nice(5)
+        console = Console()
+        return _live(console, daemon) if console.is_terminal else _lines(daemon)
+    except _NotOneError as error:
+        print(f"jtq status: {error}", file=sys.stderr)
+        return error.exit_status
+    except KeyboardInterrupt:
+        return 0
+
+
+def _chosen(found: Found, bus: str | None) -> Daemon:
+    if bus is not None:
+        daemon = on_bus(found, bus)
+        if daemon is None:
+            raise _NotOneError(f"no jtqd runs on {bus}{_others(found)}{_closed(found)}", 1)
+        return daemon
+    if not found.daemons:
+        raise _NotOneError(f"no jtqd runs here{_closed(found)}", 1)
+    if len(found.daemons) > 1:
+        raise _NotOneError(f"several daemons run: which one?{_others(found)}", 2)
+    return found.daemons[0]
+
+
+def _others(found: Found) -> str:
+    return "".join(f"\n  --bus {each.about.instance:<24} pid {each.about.pid}" for each in found.daemons)
+
+
+def _closed(found: Found) -> str:
+    return "".join(f"\n  {path} belongs to others: join its group to look at it" for path in found.closed)
+
+
+def _twice(daemon: Daemon) -> Reading:
+    watch = Watch(daemon)
+    watch.read()
+    time.sleep(_BETWEEN_S)
+    return watch.read()
+
+
+def _once(daemon: Daemon, *, as_json: bool) -> int:
+    reading = _twice(daemon)
+    if as_json:
+        print(json.dumps(content(reading)))
+    else:
+        Console().print(StatusView(reading))
+    return 0 if reading.state == RUNNING else 3
+
+
+def _live(console: Console, daemon: Daemon) -> int:
+    """Until Ctrl-C, or the daemon ends; one that is started again is found again."""
+    watch = Watch(daemon)
+    with Live(console=console, screen=True, auto_refresh=False) as live:
+        while True:
+            if daemon.about.running():
+                live.update(Group(StatusView(watch.read()), clock()), refresh=True)
+            else:
+                live.update(
+                    f"jtqd on {daemon.about.instance} has ended; waiting for its return", refresh=True
+                )
+                again = on_bus(find_daemons(), daemon.about.instance)
+                if again is not None:
+                    daemon, watch = again, Watch(again)
+            time.sleep(_PERIOD_S)
+
+
+def _lines(daemon: Daemon) -> int:
+    """Not a terminal: a line a second, until the daemon ends."""
+    watch = Watch(daemon)
+    while daemon.about.running():
+        reading = watch.read()
+        if reading.state != RUNNING or reading.view is None or reading.earlier is None:
+            print(f"not running: {reading.why}", flush=True)
+        else:
+            reader = SnapshotReader(daemon.directory / "snapshot")
+            print(plain_line(reader, reading.earlier, reading.view, daemon.about.bitrate), flush=True)
+        time.sleep(_PLAIN_PERIOD_S)
+    return 0

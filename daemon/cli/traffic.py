@@ -1,0 +1,398 @@
+"""What goes over a bus, frame by frame, counted against a configuration. Pure: stamps and bytes in, counts out.
+
+A cycle runs from one SYNC to the next. It is complete when every input PDO came in it exactly once, before the deadline. The
+cycle that was running when listening began and the one that was running when it ended count for nothing.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+
+from jtqd.daemon.bus.boot import bus_load_of
+from jtqd.daemon.config import Config
+from jtqd.daemon.loop import estimate_pdo
+from jtqd.daemon.loop.input_pdos import input_pdos
+from jtqd.daemon.loop.schedule import Grid
+from jtqd.drivers.frame import (
+    CAN_EFF_FLAG,
+    CAN_EFF_MASK,
+    CAN_ERR_FLAG,
+    CAN_RTR_FLAG,
+    CAN_SFF_MASK,
+    FRAME,
+    FRAME_SIZE,
+    pack,
+    stuffed_bits,
+)
+from jtqd.drivers.frame_socket import BusDown, FrameSocket
+
+# A histogram of times that may run for hours: bins of fixed width, exact maximum. Pure.
+
+
+_BIN_NS = 2_000
+_BINS = 5_000
+
+
+class TimeHistogram:
+    """Times in ns, below zero counted as zero; above 10 ms the bins are exact to their maximum only."""
+
+    __slots__ = ("_bins", "count", "largest_ns")
+
+    def __init__(self) -> None:
+        self._bins = [0] * _BINS
+        self.count = 0
+        self.largest_ns = 0
+
+    def add(self, ns: int) -> None:
+        """One more."""
+        self.count += 1
+        self.largest_ns = max(self.largest_ns, ns)
+        self._bins[min(max(ns, 0) // _BIN_NS, _BINS - 1)] += 1
+
+    def quantile_us(self, share: float) -> float:
+        """Upper edge of the bin that holds this share of them [us], at most the maximum; NaN without data."""
+        wanted, seen = share * self.count, 0
+        for n, count in enumerate(self._bins):
+            seen += count
+            if count and seen >= wanted:
+                edge_ns = self.largest_ns if n == _BINS - 1 else (n + 1) * _BIN_NS
+                return min(edge_ns, max(self.largest_ns, 0)) / 1000.0
+        return float("nan")
+
+
+SYNC = 0x080
+_HEARTBEAT, _EMCY = 0x700, 0x080
+_SERVICES = (0x000, 0x100, 0x7E4, 0x7E5)
+"""NMT, TIME, LSS: of nobody in particular."""
+_LATE = 1000
+"""Added to the frames of a cycle for each that is late: more than a cycle has room for."""
+
+
+@dataclass
+class PdoCount:
+    """One synchronous PDO."""
+
+    name: str
+    length: int
+    frames: int = 0
+    in_cycle: int = 0
+    counted: int = 0
+    """Frames in whole cycles."""
+    missing: int = 0
+    """Cycles without it."""
+    late: int = 0
+    """... and those in which it came after the deadline."""
+    twice: int = 0
+    wrong_length: int = 0
+    delays: TimeHistogram = field(default_factory=TimeHistogram)
+    """Arrival after SYNC."""
+
+
+@dataclass
+class NodeCount:
+    """One node's heartbeat and emergencies."""
+
+    name: str
+    heartbeats: int = 0
+    last_ns: int = 0
+    longest_gap_ns: int = 0
+    state: int | None = None
+    boot_ups: int = 0
+    emergencies: int = 0
+    last_emergency: int = 0
+
+
+class Traffic:
+    """Counts of one bus.
+
+    Args:
+        config: what should be on it.
+
+    Attributes:
+        inputs: the input PDOs by COB-ID.
+        estimate: jtqd's own PDO.
+        nodes: by node-ID, jtqd's own included.
+        strangers: frames by identifier that no configured node sends.
+        errors: error messages of the driver, by class bit.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._period_ns, self._deadline_ns = config.period_ns, config.input_deadline_ns
+        self._overflow = config.counter_overflow
+        self.inputs = {pdo.cob_id: PdoCount(pdo.name, pdo.length) for pdo in input_pdos(config)}
+        self._estimate_id = 0x180 + config.node_id
+        self.estimate = PdoCount(f"{self._estimate_id:03X}h jtqd estimate", 8)
+        names = {joint.node_id: f"drive {joint.node_id}" for joint in config.joints}
+        if config.sensor is not None:
+            names[config.sensor.node_id] = f"sensor {config.sensor.node_id}"
+        self.nodes = {node: NodeCount(name) for node, name in names.items()}
+        self.nodes[config.node_id] = NodeCount("jtqd")
+        known = {row.cob_id for row in bus_load_of(config).rows}
+        services = {base + node for node in self.nodes for base in (0x080, 0x580, 0x600)}
+        self._known = known | services | {*_SERVICES, SYNC}
+        self.frames = self.bits = 0
+        self.first_ns = self.last_ns = 0
+        self.cycles = self.complete = 0
+        self.syncs = self.counter_jumps = 0
+        self.sync_jitter = TimeHistogram()
+        """Distance of two SYNCs from the period, absolute."""
+        self._first_sync_ns = self._sync_ns = 0
+        self._counter: int | None = None
+        self.strangers: Counter[int] = Counter()
+        self.errors: Counter[int] = Counter()
+        self.statuses: tuple[Counter[int], Counter[int]] = (Counter(), Counter())
+
+    @property
+    def seconds(self) -> float:
+        """From the first frame to the last."""
+        return (self.last_ns - self.first_ns) * 1e-9
+
+    @property
+    def sync_rate(self) -> float:
+        """SYNCs per second."""
+        span_ns = self._sync_ns - self._first_sync_ns
+        return self.cycles / span_ns * 1e9 if span_ns else 0.0
+
+    @property
+    def slots(self) -> int:
+        """Periods from the first SYNC to the last: as many cycles should there be."""
+        return round((self._sync_ns - self._first_sync_ns) / self._period_ns)
+
+    def feed(self, can_id: int, data: bytes, stamp_ns: int) -> None:
+        """One frame in the order of arrival; `can_id` with its flags, the stamp is the kernel's."""
+        if can_id & CAN_ERR_FLAG:
+            for bit in range(29):
+                if can_id >> bit & 1:
+                    self.errors[1 << bit] += 1
+            return
+        self.frames += 1
+        self.bits += stuffed_bits(can_id, data)
+        self.first_ns = self.first_ns or stamp_ns
+        self.last_ns = stamp_ns
+        pdo = self.inputs.get(can_id)
+        if pdo is not None:
+            self._input(pdo, data, stamp_ns)
+        elif can_id == SYNC:
+            self._sync(data, stamp_ns)
+        elif can_id == self._estimate_id:
+            self._input(self.estimate, data, stamp_ns)
+            if len(data) == 8:
+                for count, status in zip(self.statuses, estimate_pdo.decode(data).status, strict=True):
+                    count[status] += 1
+        elif can_id not in self._known:
+            self.strangers[can_id] += 1
+        else:
+            self._node(can_id, data, stamp_ns)
+
+    def end(self, now_ns: int) -> None:
+        """Listening ended at this time (the clock of the stamps): silence since then counts."""
+        for node in self.nodes.values():
+            if node.last_ns:
+                node.longest_gap_ns = max(node.longest_gap_ns, now_ns - node.last_ns)
+
+    def _input(self, pdo: PdoCount, data: bytes, stamp_ns: int) -> None:
+        pdo.frames += 1
+        if len(data) != pdo.length:
+            pdo.wrong_length += 1
+            return
+        if not self._sync_ns:
+            return
+        pdo.in_cycle += 1
+        delay_ns = stamp_ns - self._sync_ns
+        pdo.delays.add(delay_ns)
+        if pdo is not self.estimate and delay_ns > self._deadline_ns:
+            pdo.late += 1
+            pdo.in_cycle += _LATE  # not complete, whatever else comes
+
+    def _sync(self, data: bytes, stamp_ns: int) -> None:
+        self.syncs += 1
+        if self._sync_ns:
+            self._close()
+            self.sync_jitter.add(abs(stamp_ns - self._sync_ns - self._period_ns))
+        for pdo in (*self.inputs.values(), self.estimate):
+            pdo.in_cycle = 0
+        counter = data[0] if data else None
+        if None not in (counter, self._counter):
+            assert self._counter is not None
+            self.counter_jumps += counter != self._counter % self._overflow + 1
+        self._counter = counter
+        self._first_sync_ns = self._first_sync_ns or stamp_ns
+        self._sync_ns = stamp_ns
+
+    def _close(self) -> None:
+        self.cycles += 1
+        complete = True
+        for pdo in self.inputs.values():
+            if pdo.in_cycle != 1:
+                complete = False
+                pdo.missing += pdo.in_cycle == 0
+                pdo.twice += pdo.in_cycle % _LATE > 1
+        self.estimate.missing += self.estimate.in_cycle == 0
+        for pdo in (*self.inputs.values(), self.estimate):
+            pdo.counted += pdo.in_cycle % _LATE
+        self.complete += complete
+
+    def _node(self, can_id: int, data: bytes, stamp_ns: int) -> None:
+        node = self.nodes.get(can_id & 0x7F)
+        if node is None:
+            return
+        function = can_id & 0x780
+        if function == _HEARTBEAT and len(data) == 1:
+            if node.last_ns:
+                node.longest_gap_ns = max(node.longest_gap_ns, stamp_ns - node.last_ns)
+            node.heartbeats += 1
+            node.last_ns, node.state = stamp_ns, data[0]
+            node.boot_ups += data[0] == 0
+        elif function == _EMCY and len(data) == 8:
+            node.emergencies += 1
+            node.last_emergency = int.from_bytes(data[:2], "little")
+
+
+def described(can_id: int) -> str:
+    """An identifier for people: "181h", "18FF00A0h (29 bit)", "181h (remote)"."""
+    extended = bool(can_id & CAN_EFF_FLAG)
+    identifier = can_id & (CAN_EFF_MASK if extended else CAN_SFF_MASK)
+    marks = [word for word, is_so in (("29 bit", extended), ("remote", can_id & CAN_RTR_FLAG)) if is_so]
+    return f"{identifier:0{8 if extended else 3}X}h" + (f" ({', '.join(marks)})" if marks else "")
+
+
+# The shell of `jtq check`: takes frames from a bus on an absolute time grid, and sends SYNC and heartbeat when it may.
+
+
+_OPERATIONAL = b"\x05"
+_NMT_PRE_OPERATIONAL = 0x80
+
+
+@dataclass
+class Timing:
+    """How punctual this process was woken, and how long a SYNC took from the call to its echo."""
+
+    lateness: TimeHistogram = field(default_factory=TimeHistogram)
+    missed: int = 0
+    echo: TimeHistogram = field(default_factory=TimeHistogram)
+    unsent: int = 0
+    """SYNCs that a full queue, or a bus that is down, refused."""
+
+
+def listen(
+    socket: FrameSocket, traffic: Traffic, seconds: float, period_ns: int, *, timed: bool
+) -> Timing | None:
+    """Hear everything for `seconds`. Raises BusError.
+
+    Args:
+        socket: without filters.
+        traffic: counts the frames.
+        seconds: how long.
+        period_ns: time grid of the wake-ups.
+        timed: measure the wake-ups. Beside a daemon this is left out: its own loop is what counts, and a
+            tenth as many wake-ups do.
+    """
+    timing = Timing()
+    for _ in _slots(seconds, period_ns if timed else 10 * period_ns, timing):
+        _take(socket, traffic)
+    traffic.end(time.time_ns())
+    return timing if timed else None
+
+
+def drive(socket: FrameSocket, traffic: Traffic, seconds: float, config: Config) -> Timing:
+    """Send SYNC and the own heartbeat for `seconds` and hear the answers; the nodes have been booted. Raises BusError.
+
+    The socket must give back own frames, so that SYNC's own echo stands among the answers in the order of arrival.
+    """
+    timing = Timing()
+    syncs = [pack(SYNC, bytes((n,))) for n in range(config.counter_overflow + 1)]
+    heartbeat = pack(0x700 + config.node_id, _OPERATIONAL)
+    every = max(1, config.heartbeat_ms * 1_000_000 // config.period_ns)
+    counter, sent_ns = 0, 0
+    for slot in _slots(seconds, config.period_ns, timing):
+        _take(socket, traffic, timing.echo, sent_ns)
+        counter = counter % config.counter_overflow + 1
+        sent_ns = time.time_ns()
+        timing.unsent += not _send(socket, syncs[counter])
+        if slot % every == 0:
+            _send(socket, heartbeat)
+    time.sleep(config.period_ns * 1e-9)
+    _take(socket, traffic, timing.echo, sent_ns)
+    traffic.end(time.time_ns())
+    return timing
+
+
+def leave(socket: FrameSocket, config: Config) -> None:
+    """Put the nodes back to pre-operational, as jtqd does at its end. Raises BusError."""
+    nodes = [joint.node_id for joint in config.joints]
+    nodes += [config.sensor.node_id] if config.sensor else []
+    for node in nodes:
+        socket.send(pack(0x000, bytes((_NMT_PRE_OPERATIONAL, node))))
+
+
+def silent(socket: FrameSocket, seconds: float) -> bool:
+    """True when nobody sends SYNC for so long. Raises BusError."""
+    until = time.monotonic() + seconds
+    while (left := until - time.monotonic()) > 0:
+        if not socket.wait(left):
+            return True
+        for n in range(socket.receive()):
+            if int.from_bytes(socket.frames[FRAME_SIZE * n : FRAME_SIZE * n + 4], "little") == SYNC:
+                return False
+    return True
+
+
+class _slots:  # noqa: N801 - a generator with a name of its own
+    """Slots of an absolute grid, each when its time has come; those that are too late are counted and skipped."""
+
+    def __init__(self, seconds: float, period_ns: int, timing: Timing) -> None:
+        start_ns = time.monotonic_ns() + period_ns
+        self._grid, self._end_ns = Grid(start_ns, period_ns), start_ns + round(seconds * 1e9)
+        self._timing = timing
+        self._number = -1
+
+    def __iter__(self) -> _slots:
+        return self
+
+    def __next__(self) -> int:
+        grid = self._grid
+        if self._number >= 0:
+            grid.advance(time.monotonic_ns())
+        self._number += 1
+        while grid.slot_ns < self._end_ns:
+            pause_ns = grid.slot_ns - time.monotonic_ns()
+            if pause_ns > 0:
+                time.sleep(pause_ns * 1e-9)
+            now_ns = time.monotonic_ns()
+            self._timing.lateness.add(now_ns - grid.slot_ns)
+            if not grid.too_late(now_ns):
+                return self._number
+            grid.missed += (
+                1  # as the loop does: a SYNC that late would leave its successor less than half a cycle
+            )
+            grid.advance(now_ns)
+        self._timing.missed = grid.missed
+        raise StopIteration
+
+
+def _send(socket: FrameSocket, frame: bytes) -> bool:
+    try:
+        return socket.send(frame)
+    except BusDown:
+        return False
+
+
+def _take(socket: FrameSocket, traffic: Traffic, echo: TimeHistogram | None = None, sent_ns: int = 0) -> None:
+    """Everything that has arrived."""
+    while True:
+        try:
+            count = socket.receive()
+        except BusDown:
+            return
+        if not count:
+            return
+        unpack, frames, stamps, own = FRAME.unpack_from, socket.frames, socket.stamps_ns, socket.own
+        for n in range(count):
+            can_id, length, data = unpack(frames, FRAME_SIZE * n)
+            if can_id & CAN_RTR_FLAG and not can_id & CAN_ERR_FLAG:
+                data = b""
+            if echo is not None and own[n] and can_id == SYNC:
+                echo.add(stamps[n] - sent_ns)
+            traffic.feed(can_id, data[:length], stamps[n])

@@ -1,0 +1,402 @@
+"""Replay of whole runs in arrays, by the vectorised twins of the estimators: the same numbers to rounding, much faster.
+
+Inputs are the SI values of the log, which the exact replay compares with the raw frames. What the loop decides after the
+estimate (starting, drive off or in fault, too late, what fits the field of the PDO) is decided here again, in arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from math import isnan
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from jtqd.daemon.config import SafetySettings
+from jtqd.daemon.loop import estimate_pdo
+from jtqd.daemon.loop.cycle import STARTING_CYCLES
+from jtqd.daemon.loop.input_pdos import JointTemperature, input_pdos, joint_temperatures
+from jtqd.daemon.loop.intake import Intake
+from jtqd.daemon.loop.joint import FLAG_TEMPERATURE, JointCycle
+from jtqd.daemon.loop.joint_status import (
+    FLAG_LATCHED,
+    FLAG_NETWORK_SKIPPED,
+    JointSafety,
+    JointStatus,
+    drive_status,
+)
+from jtqd.daemon.replay.frames import Frames, Pdo, offsets
+from jtqd.daemon.replay.origin import SAMPLE, Origin
+from jtqd.daemon.replay.runs import Steps
+from jtqd.daemon.shared import cycle_record as cr
+from jtqd.daemon.shared import cycle_record as faults
+from jtqd.daemon.shared.snapshot import COUNTERS
+from jtqd.estimator.arrays import CodeArray, FloatArray, RecordArray
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.methods import AnyEstimator, AnyNetwork, estimate_steps
+from jtqd.estimator.run import JointColumns
+from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.status import DEGRADED, INVALID, OFF, PUBLISHED, STALE, STANDSTILL, STARTING, VALID
+from jtqd.estimator.whole_run import EstimateRun
+
+# Replay cycle by cycle through the loop's own code (`jtqd.daemon.loop.joint.JointCycle`).
+#
+# What comes out is bit for bit what the loop had, or something is different.
+#
+# Taken from the log is what only the loop could know: which inputs counted, how long a step was, that an estimate was ready
+# too late. Everything else (positions that roll over, temperatures and their age, estimate, status, the bytes of the
+# estimate PDO) is computed from the raw frames again.
+
+
+@dataclass
+class _Tally:
+    """What the loop counts in shared memory; nobody reads it here."""
+
+    counters: list[int] = field(default_factory=lambda: [0] * len(COUNTERS))
+    errors: list[float] = field(default_factory=lambda: [0.0] * 4)
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """Result over n cycles.
+
+    Attributes:
+        joints: of joint 1 and 2, `SAMPLE` [n].
+        estimate: bytes of the estimate PDO [n, 8].
+        temperatures_from_log: cycles whose temperature the frames alone do not tell.
+    """
+
+    joints: tuple[RecordArray, RecordArray]
+    estimate: npt.NDArray[np.uint8]
+    temperatures_from_log: int
+
+
+class ExactReplay:
+    """Keeps the joints from one part of a log to the next.
+
+    Args:
+        origin: configuration and scaling.
+        estimators, safety: of joint 1 and 2.
+    """
+
+    def __init__(
+        self, origin: Origin, estimators: Sequence[AnyEstimator], safety: Sequence[JointSafety]
+    ) -> None:
+        config = origin.config
+        self._origin = origin
+        self._intake = Intake(input_pdos(config), joint_temperatures(config))
+        tally = _Tally()
+        self._joints = [
+            JointCycle(
+                n,
+                inputs,
+                estimator,
+                intake=self._intake,
+                snapshot=tally,
+                period_ns=config.period_ns,
+                safety=limits,
+            )
+            for n, (inputs, estimator, limits) in enumerate(
+                zip(origin.inputs, estimators, safety, strict=True)
+            )
+        ]
+        self._time_ns = [1 << 60, 1 << 60]  # any but 0, which would mean that there was no sample yet
+
+    def run(
+        self,
+        joints: Sequence[RecordArray],
+        frames: Frames,
+        steps: Sequence[Steps],
+        progress: Callable[[int], None] = lambda _: None,
+    ) -> Replayed:
+        """Replay the cycles of one part; `joints` are its states as logged. `progress` is told the cycles done."""
+        count = len(joints[0])
+        views = self._intake.views()
+        feeds = [_feed(each) for each in frames.pdos]
+        temperatures = _Temperatures(self._origin, self._intake.temperatures, frames, joints)
+        cycles = joints[0]["cycle"].tolist()
+        counters = joints[0]["sync_counter"].tolist()
+        withdrawn = ((joints[0]["cycle_flags"] & cr.FLAG_WITHDRAWN) != 0).tolist()
+        marks = [self._marks(n, joints[n], frames, steps[n]) for n in (0, 1)]
+        wanted = [((each["input_flags"] & FLAG_NETWORK_SKIPPED) == 0).tolist() for each in joints]
+        plans = list(zip(self._joints, [each.dt_ns.tolist() for each in steps], marks, wanted, strict=True))
+        out: tuple[list[tuple[float, ...]], list[tuple[float, ...]]] = ([], [])
+        pdos = bytearray()
+        one, two = self._joints
+        times = self._time_ns
+        for row, (cycle, counter) in enumerate(zip(cycles, counters, strict=True)):
+            for view, (fresh, values) in zip(views, feeds, strict=True):
+                view.fresh = fresh[row]
+                view.values = next(values)
+            temperatures.at(row, cycle)
+            starting = cycle < STARTING_CYCLES
+            for n, (joint, dt_ns, mark, network) in enumerate(plans):
+                if row in mark:
+                    for happens in mark[row]:
+                        happens()
+                times[n] += dt_ns[row]
+                joint.observe(times[n], starting, network[row])
+                if withdrawn[row]:
+                    joint.withdraw()
+                out[n].append(joint.sample)
+            pdos += estimate_pdo.encode(one.published, two.published, counter)
+            if not row & 0x3FFF:
+                progress(row)
+        progress(count)
+        return Replayed(
+            (np.array(out[0], SAMPLE), np.array(out[1], SAMPLE)),
+            np.frombuffer(bytes(pdos), np.uint8).reshape(-1, 8),
+            temperatures.from_log,
+        )
+
+    def _marks(
+        self, number: int, records: RecordArray, frames: Frames, steps: Steps
+    ) -> dict[int, list[Callable[[], object]]]:
+        """What happens to one joint before a row: faults are reset, it begins anew, the log goes on after a hole."""
+        joint, each = self._joints[number], self._origin.inputs[number]
+        marks: dict[int, list[Callable[[], object]]] = {}
+        for row in np.flatnonzero(records["cycle_flags"] & cr.FLAG_RESET).tolist():
+            marks.setdefault(row, []).append(joint.reset_latch)
+        for row in steps.begins.tolist():
+            marks.setdefault(row, []).append(joint.begin_again)
+        for row, _ in steps.breaks:
+            found = offsets(frames.pdos[each.position], records, each, row)
+            marks.setdefault(row, []).append(partial(joint.resume, *found))
+        return marks
+
+
+def _feed(pdo: Pdo) -> tuple[list[bool], Iterator[tuple[int, ...]]]:
+    values = zip(*(column.tolist() for column in pdo.values), strict=True)
+    return pdo.fresh.tolist(), values
+
+
+class _Temperatures:
+    """The joints' temperatures from cycle to cycle, by their frames.
+
+    A node that restarted is not believed until it is configured, and a frame may have found no room in its record: where
+    the log says something else than the frames do, and there is such a reason, the log is right.
+    """
+
+    def __init__(
+        self,
+        origin: Origin,
+        temperatures: Sequence[JointTemperature],
+        frames: Frames,
+        joints: Sequence[RecordArray],
+    ) -> None:
+        self.from_log = 0
+        self._all = []
+        for each, events in zip(temperatures, frames.temperatures, strict=True):
+            number = next(
+                n
+                for n, inputs in enumerate(origin.inputs)
+                if inputs.temperature is not None and temperatures[inputs.temperature] is each
+            )
+            records = joints[number]
+            due: dict[int, list[bytes]] = {}
+            for row, frame in events:
+                due.setdefault(row, []).append(frame)
+            known = (records["input_flags"] & FLAG_TEMPERATURE) != 0
+            logged = np.where(known, records["temperature_c"], np.nan).tolist()
+            self._all.append((each, due, logged))
+
+    def at(self, row: int, cycle: int) -> None:
+        """The inputs of this cycle have been taken."""
+        for temperature, due, logged in self._all:
+            if row in due:
+                for frame in due[row]:
+                    temperature.receive(bytearray(frame), 0)
+            temperature.at(cycle)
+            said = logged[row]
+            if temperature.celsius != said and not (isnan(said) and isnan(temperature.celsius)):
+                self.from_log += 1
+                temperature.celsius = said
+
+
+def published_bytes(joints: Sequence[RecordArray]) -> npt.NDArray[np.uint8]:
+    """Estimate PDO [n, 8] by the states in a log: the bytes that the loop sent, as they follow from what it recorded."""
+    parts = [
+        zip(each["torque_nm"].tolist(), each["sigma_nm"].tolist(), each["status"].tolist(), strict=True)
+        for each in joints
+    ]
+    data = bytearray()
+    for first, second, counter in zip(*parts, joints[0]["sync_counter"].tolist(), strict=True):
+        data += estimate_pdo.encode(estimate_pdo.field(*first), estimate_pdo.field(*second), counter)
+    return np.frombuffer(bytes(data), np.uint8).reshape(-1, 8)
+
+
+def logged_samples(records: RecordArray) -> RecordArray:
+    """The same fields of a log's states, `SAMPLE` [n]."""
+    out = np.zeros(len(records), SAMPLE)
+    for name in SAMPLE.names or ():
+        out[name] = records[name]
+    return out
+
+
+WHOLE = np.dtype(
+    [
+        *((name, "<f8") for name in ("torque_nm", "sigma_nm", "tob_nm", "physics_nm", "network_nm")),
+        ("status", "<u2"),
+    ]
+)
+"""What the estimator makes of a cycle."""
+_STAGES = ("torque_nm", "sigma_nm", "tob_nm", "physics_nm", "network_nm")
+_IS_PUBLISHED = np.isin(np.arange(16), [*PUBLISHED])
+_STEADY = frozenset((VALID, STANDSTILL, DEGRADED, OFF))
+"""A status that is asked for and published stays as it is while the same is asked for."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """What one joint is estimated with."""
+
+    joint: Joint
+    settings: EstimatorSettings
+    network: AnyNetwork | None
+
+
+def replay_whole(model: Model, safety: JointSafety, records: RecordArray, steps: Steps) -> RecordArray:
+    """Estimates [n] of the states `records` of one joint, fields as `WHOLE`. Raises ConfigError where nothing fits.
+
+    Faults of the inputs, and those that are latched, are taken from the log.
+    """
+    rows: npt.NDArray[np.intp] | slice = slice(None) if steps.used.all() else np.flatnonzero(steps.used)
+    flags, word, cycle = (records[name][rows] for name in ("input_flags", "statusword", "cycle"))
+    columns = JointColumns(
+        current_a=records["current_a"][rows].copy(),
+        motor_position_rad=records["motor_position_rad"][rows].copy(),
+        motor_velocity_rad_s=records["motor_velocity_rad_s"][rows].copy(),
+        link_position_rad=records["link_position_rad"][rows].copy(),
+        temperature_c=np.where(flags & FLAG_TEMPERATURE, records["temperature_c"][rows], np.nan),
+    )
+    values = {name: np.full(len(records), np.nan) for name in _STAGES}
+    status = np.full(len(records), STALE, np.uint16)
+    found = np.zeros(len(records), np.int64)
+    if len(flags):
+        dt_s = steps.dt_ns[rows].astype(np.float64) * 1e-9
+        made = _estimates(model, dt_s, columns, (flags & FLAG_NETWORK_SKIPPED) != 0)
+        for name in _STAGES:
+            values[name][rows] = getattr(made, name)
+        asked = made.status.astype(np.uint16)
+        status[rows], found[rows] = _asked(
+            made.torque_nm, made.sigma_nm, asked, _Cycles(flags, word, cycle), safety
+        )
+    status = status_many(status, found, records, safety.settings)
+    fits = fields(values["torque_nm"], values["sigma_nm"], status)[0] != estimate_pdo.NO_TORQUE
+    values["torque_nm"][~fits] = values["sigma_nm"][~fits] = np.nan
+    out = np.empty(len(records), WHOLE)
+    for name, column in values.items():
+        out[name] = column
+    out["status"] = status
+    return out
+
+
+class _Cycles(NamedTuple):
+    """Flags of the inputs, statusword and number of the cycles [n]."""
+
+    flags: CodeArray
+    statusword: CodeArray
+    cycle: npt.NDArray[np.uint64]
+
+
+def _estimates(
+    model: Model, dt_s: FloatArray, columns: JointColumns, skipped: npt.NDArray[np.bool_]
+) -> EstimateRun:
+    """Estimates [n]; in the samples `skipped` there was no time for the network, and they are physics only."""
+    made = estimate_steps(model.joint, model.settings, model.network, dt_s, columns)
+    if model.network is None or not skipped.any():
+        return made
+    alone = model.settings
+    if alone.method == "network":
+        alone = replace(alone, method="tob" if model.joint.efficiency is None else "efficiency")
+    physics = estimate_steps(model.joint, alone, None, dt_s, columns)
+    status = np.where(
+        skipped & (physics.status == VALID), DEGRADED, np.where(skipped, physics.status, made.status)
+    )
+    return EstimateRun(
+        np.where(skipped, physics.torque_nm, made.torque_nm),
+        np.where(skipped, physics.sigma_nm, made.sigma_nm),
+        status.astype(np.uint8),
+        made.tob_nm,
+        made.physics_nm,
+        np.where(skipped, np.nan, made.network_nm),
+        made.features,
+    )
+
+
+def _asked(
+    torque_nm: FloatArray, sigma_nm: FloatArray, status: CodeArray, cycles: _Cycles, safety: JointSafety
+) -> tuple[CodeArray, npt.NDArray[np.int64]]:
+    """Status that each cycle asks for, and its faults [n]: twin of what `JointCycle.observe` does with an estimate."""
+    found = np.where(cycles.flags & FLAG_LATCHED, 0, cycles.flags >> 8).astype(np.int64)
+    found &= ~(faults.OUT_OF_RANGE | faults.NOT_FINITE)
+    found[status == INVALID] |= faults.OUT_OF_RANGE
+    powered = np.ones(len(status), np.bool_)
+    for word in np.flatnonzero(
+        np.bincount(cycles.statusword)
+    ).tolist():  # there are few different ones in a run
+        said = drive_status(word)
+        if said is not None:
+            here = cycles.statusword == word
+            status[here], powered[here], found[here] = said, False, found[here] & ~faults.OUT_OF_RANGE
+    publishable = powered & _IS_PUBLISHED[status]
+    limit = safety.torque_limit_nm
+    with np.errstate(invalid="ignore"):
+        sigma_good = (sigma_nm >= 0.0) & np.isfinite(sigma_nm)
+        good = (np.abs(torque_nm) <= limit) & sigma_good
+        finite = np.isfinite(torque_nm) & sigma_good
+    found[publishable & ~good & finite] |= faults.OUT_OF_RANGE
+    found[publishable & ~good & ~finite] |= faults.NOT_FINITE
+    status[publishable & (cycles.cycle < STARTING_CYCLES)] = STARTING
+    return status, found
+
+
+def status_many(
+    asked: CodeArray, found: npt.NDArray[np.int64], records: RecordArray, settings: SafetySettings
+) -> CodeArray:
+    """Status to publish [n]: `JointStatus` over a whole run, which is asked only where something changes."""
+    state = JointStatus(settings)
+    latched = (records["input_flags"] & FLAG_LATCHED) != 0
+    key = asked.astype(np.int64) | found << 8 | latched.astype(np.int64) << 24
+    key |= (records["cycle_flags"] & (cr.FLAG_WITHDRAWN | cr.FLAG_RESET)).astype(np.int64) << 25
+    starts = np.concatenate(([0], np.flatnonzero(np.diff(key)) + 1))
+    out = asked.copy()
+    for start, end in zip(starts.tolist(), [*starts[1:].tolist(), len(key)], strict=True):
+        if latched[start]:
+            out[start:end] = records["status"][start:end]
+            continue
+        status, faulty = int(asked[start]), int(found[start])
+        flags = int(records["cycle_flags"][start])
+        row = start
+        while row < end:
+            if flags & cr.FLAG_RESET:
+                state.reset_latch()
+            said = state.update(status, faulty)
+            if flags & cr.FLAG_WITHDRAWN:
+                said = state.late()
+            out[row] = said
+            row += 1
+            if said == status and not faulty and not flags & cr.FLAG_WITHDRAWN and status in _STEADY:
+                state.pass_over(end - row)
+                out[row:end] = said
+                break
+    return out
+
+
+def fields(
+    torque_nm: FloatArray, sigma_nm: FloatArray, status: CodeArray
+) -> tuple[npt.NDArray[np.int16], npt.NDArray[np.uint8], CodeArray]:
+    """Twin of `estimate_pdo.field` [n]: integers of torque, sigma and status."""
+    limit = -estimate_pdo.NO_TORQUE - 1
+    publishable = _IS_PUBLISHED[status]
+    with np.errstate(invalid="ignore"):
+        counts = torque_nm * 100.0
+        fits = publishable & (np.abs(counts) <= limit) & (sigma_nm >= 0.0) & (sigma_nm < np.inf)
+        known = fits & (sigma_nm <= 12.7)
+    whole = np.where(fits, np.rint(np.where(fits, counts, 0.0)), estimate_pdo.NO_TORQUE).astype(np.int16)
+    widths = np.ceil(np.where(known, sigma_nm, 0.0) * 20.0 - 1e-9)
+    sigma = np.where(known, widths, estimate_pdo.SIGMA_UNKNOWN).astype(np.uint8)
+    return whole, sigma, np.where(publishable & ~fits, INVALID, status).astype(np.uint16)

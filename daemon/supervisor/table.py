@@ -1,0 +1,165 @@
+"""How the loop is doing, for whoever looks: a live table on a terminal, a line every few seconds elsewhere."""
+
+from __future__ import annotations
+
+import time
+from math import isfinite
+from types import TracebackType
+
+from rich.box import HEAVY_HEAD, Box
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.live import Live
+from rich.measure import Measurement
+from rich.table import Table
+from rich.text import Text
+
+from jtqd.daemon.shared.log_lines import INFO, Say
+from jtqd.daemon.shared.snapshot import JointView, SnapshotReader, View
+from jtqd.estimator.status import NAMES, PUBLISHED
+
+# The table that `jtqd` shows while it runs: torque, sigma and status of both joints, and how the loop is doing.
+
+
+COLOURS = {"valid": "green", "degraded": "yellow", "standstill": "cyan", "starting": "blue", "off": "dim"}
+"""Style of a status; what is not here is bad news."""
+
+_COLUMNS = {
+    "joint": 5,
+    "torque [Nm]": 10,
+    "sigma [Nm]": 10,
+    "sensor [Nm]": 10,
+    "error [Nm]": 10,
+    "status": max(map(len, NAMES.values())),
+}
+"""Heading and least width, so that the table does not jump when a value gets longer."""
+_DISPENSABLE = ("sensor [Nm]", "error [Nm]", "sigma [Nm]")
+
+
+def bus_load(previous: View, now: View, bitrate: int) -> float:
+    """Share of the bus that the frames between two views took with worst-case stuffing; NaN without time in between."""
+    seconds = (now.sync_realtime_ns - previous.sync_realtime_ns) * 1e-9
+    bits = now.counters["bits_worst_case"] - previous.counters["bits_worst_case"]
+    return bits / seconds / bitrate if previous.sync_realtime_ns and seconds > 0 else float("nan")
+
+
+class LiveTable:
+    """One picture of the running loop, as wide as the terminal allows: the status is there at any width.
+
+    In a narrow terminal columns go in the order of `_DISPENSABLE`, then the frame, and in the end each joint is a line.
+    """
+
+    def __init__(self, reader: SnapshotReader, previous: View, view: View, bitrate: int, title: str) -> None:
+        self._title = title
+        self._line = loop_line(reader, previous, view, bitrate)
+        self._rows = [_cells(number, joint) for number, joint in enumerate(view.joints, start=1)]
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Called by rich with the width of the terminal."""
+        yield self._widest_that_fits(console, options)
+        yield Text(self._line)
+
+    def _widest_that_fits(self, console: Console, options: ConsoleOptions) -> RenderableType:
+        unlimited = options.update(max_width=1000)
+        for dropped in range(len(_DISPENSABLE) + 1):
+            for box in (HEAVY_HEAD, None) if dropped == len(_DISPENSABLE) else (HEAVY_HEAD,):
+                table = self._table([name for name in _COLUMNS if name not in _DISPENSABLE[:dropped]], box)
+                if Measurement.get(console, unlimited, table).maximum <= options.max_width:
+                    return table
+        lines = (
+            Text.assemble(f"{row['joint']}: {row['torque [Nm]']} Nm ", row["status"]) for row in self._rows
+        )
+        return Group(self._title, *lines)
+
+    def _table(self, names: list[str], box: Box | None) -> Table:
+        table = Table(title=self._title, title_justify="left", box=box, pad_edge=box is not None)
+        for name in names:
+            table.add_column(
+                name, justify="right" if "[Nm]" in name else "left", min_width=_COLUMNS[name], no_wrap=True
+            )
+        for row in self._rows:
+            table.add_row(*(row[name] for name in names))
+        return table
+
+
+def _cells(number: int, joint: JointView) -> dict[str, str | Text]:
+    """What stands in the columns for one joint."""
+    name = NAMES.get(joint.status, str(joint.status))
+    known = joint.status in PUBLISHED
+    return {
+        "joint": str(number),
+        "torque [Nm]": _number(joint.torque_nm) if known else "-",
+        "sigma [Nm]": _number(joint.sigma_nm) if known else "-",
+        "sensor [Nm]": _number(joint.sensor_nm),
+        "error [Nm]": _number(joint.torque_nm - joint.sensor_nm) if known else "-",
+        "status": Text(name, style=COLOURS.get(name, "bold red")),
+    }
+
+
+def loop_line(reader: SnapshotReader, previous: View, view: View, bitrate: int) -> str:
+    """Cycle time, missed cycles and bus load in one line."""
+    p50, p99, worst = reader.work_us(0.5, 0.99, 1.0)
+    counters = view.counters
+    load = bus_load(previous, view, bitrate)
+    load_text = f"{100 * load:.1f} %" if isfinite(load) else "-"
+    return (
+        f"cycle {counters['cycles']}  work p50 {p50:.0f} us, p99 {p99:.0f} us, max {worst:.0f} us  "
+        f"missed {counters['missed']}  stale inputs {counters['stale_inputs']}  bus load {load_text}"
+    )
+
+
+def plain_line(reader: SnapshotReader, previous: View, view: View, bitrate: int) -> str:
+    """The same for a log: one line without control characters."""
+    joints = "  ".join(
+        f"joint {n} {_number(joint.torque_nm)} Nm +- {_number(joint.sigma_nm)} {NAMES.get(joint.status, joint.status)}"
+        for n, joint in enumerate(view.joints, start=1)
+    )
+    return f"{joints}  {loop_line(reader, previous, view, bitrate)}"
+
+
+def _number(value: float) -> str:
+    return f"{value:.2f}" if isfinite(value) else "-"
+
+
+_TABLE_PERIOD_S = 0.2
+_LOG_PERIOD_S = 5.0
+
+
+class Display:
+    """Use it as a context manager; `turn` whenever there is time.
+
+    Args:
+        reader: of the loop's snapshot.
+        bitrate: of the bus [bit/s].
+        title: of the table.
+        say: takes the lines.
+    """
+
+    def __init__(self, reader: SnapshotReader, bitrate: int, title: str, say: Say) -> None:
+        console = Console(stderr=True)
+        self._terminal = console.is_terminal
+        self._live = Live(console=console, auto_refresh=False, transient=False)
+        self._reader, self._bitrate, self._title, self._say = reader, bitrate, title, say
+        self._previous = reader.read()
+        self._shown = time.monotonic()
+
+    def __enter__(self) -> Display:
+        self._live.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._live.__exit__(kind, error, trace)
+
+    def turn(self, now: float) -> None:
+        """Show what is due at `now` (CLOCK_MONOTONIC [s])."""
+        if now - self._shown < (_TABLE_PERIOD_S if self._terminal else _LOG_PERIOD_S):
+            return
+        view = self._reader.read()
+        if self._terminal:
+            table = LiveTable(self._reader, self._previous, view, self._bitrate, self._title)
+            self._live.update(table, refresh=True)
+        else:
+            line = plain_line(self._reader, self._previous, view, self._bitrate)
+            self._say(line.removeprefix("jtqd: "), INFO)
+        self._previous, self._shown = view, now

@@ -1,0 +1,357 @@
+"""Files of the hidden-effect run: the secret bench, jtqd's configurations, the plans. docs/diagnosis.md says what it is for.
+
+The secret bench differs from the nominal joint files by one effect of joint 1 alone; noise, drives and the days
+(`run_to_run`) are those of the campaign's bench. Its joints are otherwise what `jtq sim --plant` makes of their files.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import yaml
+
+from jtqd.daemon.logs.errors import LogError
+from jtqd.daemon.logs.reader import read_topics
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.checked import ConfigError, count, natural, seconds
+from jtqd.estimator.joint import Effect, Joint
+from jtqd.estimator.methods import estimate_columns
+from jtqd.estimator.run import RunTable
+from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.status import VALID
+from jtqd.models.files import load_joint, load_yaml, shipped
+from jtqd.sim_can.plant_file import plant_of_joint
+from jtqd.sysid.campaign.emulated import emulated
+from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Plan
+from jtqd.sysid.campaign.plans import variable_runs
+from jtqd.sysid.fit.friction import low_pass
+from jtqd.sysid.fit.joint_writer import write_joint
+from jtqd.sysid.measured.bus import published_torque, reference_torque, sync_time
+from jtqd.sysid.runs.files import RunError, read_run, write_run
+
+NUMBERS: Final = (1, 2)
+SECRET_JOINT: Final = 1
+_PLANT: Final = "campaign_plant.yaml"
+_KT_LOW: Final = 0.94
+_FRESH_SEED: Final = 1000
+"""Added to the seed: no motion of the fresh runs is one of the diagnosed runs."""
+
+
+def nominal_file(number: int) -> Path:
+    """Joint file that campaign, diagnosis and jtqd begin with."""
+    return shipped(f"joint{number}.yaml")
+
+
+def secrets(joint: Joint) -> Mapping[str, Effect]:
+    """Effects that can be hidden in `joint`, by name."""
+    made = (
+        Effect(
+            "torque_constant", {"torque_constant_nm_per_a": _KT_LOW * joint.torque_constant_nm_per_a}
+        ),  # 6 % low
+        Effect("torque_ripple", {"amplitude_nm": 0.8, "order_per_motor_rev": 2.0, "phase_rad": 0.7}),
+        Effect("kinematic_error", {"amplitude_rad": 1.0e-4, "order_per_motor_rev": 2.0, "phase_rad": 0.9}),
+    )
+    return {effect.name: effect for effect in made}
+
+
+NAMES: Final = ("torque_constant", "torque_ripple", "kinematic_error")
+
+
+def write_secret(directory: Path, name: str) -> Path:
+    """Write the plant file of the secret bench and its joint files; returns its path. Raises ConfigError, OSError."""
+    directory.mkdir(parents=True, exist_ok=True)
+    mapping: dict[str, Any] = load_yaml(shipped(_PLANT))[0]
+    for number in NUMBERS:
+        joint = load_joint(nominal_file(number))
+        effects = (secrets(joint)[name],) if number == SECRET_JOINT else ()
+        file = f"joint{number}.yaml"
+        write_joint(directory / file, replace(joint, effects=effects), "Joint of the secret bench.")
+        own = plant_of_joint(joint).joints[0].deviations
+        peak = {"torque_nm": own.stribeck_nm, "velocity_rad_s": own.stribeck_velocity_rad_s}
+        part: dict[str, Any] = mapping[f"joint_{number}"]
+        mapping[f"joint_{number}"] = {
+            "joint": file,
+            "deviations": {"stribeck": peak},
+            **{key: part[key] for key in ("drive", "measurement")},
+        }
+    path = directory / "plant.yaml"
+    path.write_text(yaml.safe_dump(mapping, sort_keys=False), encoding="utf-8")
+    return path
+
+
+def write_config(path: Path, joint_files: Mapping[int, Path], method: str) -> Path:
+    """Write a configuration of jtqd for the bench: these joint files, this method, no network. Raises OSError."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    mapping: dict[str, Any] = load_yaml(shipped("bench.yaml"))[0]
+    mapping["estimator"] = {**mapping["estimator"], "method": method}
+    for number, file in joint_files.items():
+        joint = mapping[f"joint_{number}"]
+        joint["file"] = str(file.resolve())
+        joint.pop("network", None)
+    path.write_text(yaml.safe_dump(mapping, sort_keys=False), encoding="utf-8")
+    return path
+
+
+def plans(runs: int, fresh: int, seconds: float, seed: int) -> tuple[Plan, Plan]:
+    """Plans of the runs to diagnose and of the fresh ones: drawn Fourier motions, none in both. Raises ConfigError."""
+    joints = (load_joint(nominal_file(1)), load_joint(nominal_file(2)))
+    limits = DEFAULT_LIMITS
+    return (
+        Plan("hidden effect", limits, variable_runs(limits, runs, seconds, seed=seed, joints=joints)),
+        Plan(
+            "hidden effect fresh",
+            limits,
+            variable_runs(limits, fresh, seconds, seed=seed + _FRESH_SEED, joints=joints),
+        ),
+    )
+
+
+# Error of the estimate against the torque sensor: as jtqd published it, from its logs, or offline from run tables.
+
+
+_DRIVE_ON: Final = 0x27
+_DRIVE_MASK: Final = 0x6F
+
+
+def log_rmse(logs: Sequence[Path], number: int, settings: EstimatorSettings) -> float:
+    """Return the RMSE [Nm] of what joint `number` published in all logs while its drive was on and the joint moved.
+
+    The sensor is filtered like the estimate. A joint that stands has an interval and no value, so it is not judged.
+    Raises LogError.
+    """
+    return _rms([_log_errors(log, number, settings.bandwidth_rad_s) for log in logs], f"{number}")
+
+
+def table_rmse(tables: Sequence[RunTable], number: int, joint: Joint, settings: EstimatorSettings) -> float:
+    """Return the same of the whole-run estimate of run tables. Raises LogError."""
+    errors = []
+    for table in tables:
+        columns = table.joint(number, joint.gear_ratio)
+        result = estimate_columns(joint, settings, None, table.time_s, columns)
+        assert columns.torque_nm is not None
+        steps = np.diff(table.time_s, prepend=table.time_s[0])
+        error = result.torque_nm - low_pass(columns.torque_nm, steps, settings.bandwidth_rad_s)
+        errors.append(error[(result.status == VALID) & np.isfinite(error)])
+    return _rms(errors, f"{number}")
+
+
+def _rms(errors: Sequence[FloatArray], joint: str) -> float:
+    whole = np.concatenate(errors) if errors else np.empty(0)
+    if not len(whole):
+        raise LogError(f"joint {joint}: found no estimate in motion, expected some")
+    return float(np.sqrt(np.mean(np.square(whole))))
+
+
+def _log_errors(log: Path, number: int, bandwidth_rad_s: float) -> FloatArray:
+    state, frames = read_topics(log, (f"/joint/{number}/state", "/can/frames")).values()
+    if not np.array_equal(state["cycle"], frames["cycle"]):
+        raise LogError(f"{log}: found cycles in one topic that are not in the other, expected the same")
+    sensor = reference_torque(state, sync_time(state["header"]["stamp"]), bandwidth_rad_s)
+    error = published_torque(frames, number - 1) - sensor
+    on = (state["statusword"] & _DRIVE_MASK) == _DRIVE_ON
+    return np.asarray(error[on & (state["status"] == VALID) & np.isfinite(error)], np.float64)
+
+
+# An effect hidden in the emulated bench, found over the bus, and what the extended model is then worth in jtqd.
+#
+#     python -m examples.hidden_effect --effect torque_constant --out DIR
+#     python -m jtqd.sim_can.bench_kernel run --time-travel --out DIR -- python -m examples.hidden_effect         --effect
+# torque_constant --bus sim:vcan0 --out DIR
+#
+# A secret plant file -> `jtq campaign` on the bench that it makes -> `jtq diagnose` with the nominal joint files -> jtqd
+# with the nominal and with the extended joint files on fresh motions of the same bench -> `jtq diagnose` once more, with
+# the extended files. Every step is a command of its own, printed before it runs. docs/diagnosis.md, "End to end over the
+# bus".
+
+
+NO_BUS: Final = "none"
+_FINDINGS: Final = 3
+_STDERR: Final = 2
+_METHODS: Final = ("efficiency", "tob")
+Row = tuple[str, float, float]
+"""What is judged, and its error before and after [Nm]."""
+
+
+class StepError(RuntimeError):
+    """A command of the toolbox failed; it has said why."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run all steps and print the table; exit status 0 done, 1 failure, 2 usage."""
+    options = _parser().parse_args(arguments)
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+        result = run(options)
+    except (StepError, ConfigError, RunError, LogError) as error:
+        print(f"hidden_effect_demo: {error}", file=sys.stderr)
+        return 1
+    except OSError as error:
+        print(
+            f"hidden_effect_demo: {error.filename or options.out}: {error.strerror or error}", file=sys.stderr
+        )
+        return 1
+    print(json.dumps(result, indent=1) if options.json else "\n".join(lines(result)))
+    return 0
+
+
+def run(options: argparse.Namespace) -> dict[str, Any]:
+    """All steps; what they showed. Raises StepError, ConfigError, RunError, LogError, OSError."""
+    out: Path = options.out
+    nominal = {number: nominal_file(number) for number in NUMBERS}
+    plant = write_secret(out / "secret", options.effect)
+    diagnosed, fresh = plans(options.runs, options.fresh_runs, options.seconds, options.seed)
+    bench = _Bench(options, plant)
+    bench.play(diagnosed, "runs", nominal)
+    found = _diagnose(out / "runs", nominal, out / "diagnosis")
+    extended = {number: out / "diagnosis" / f"extended.joint{number}.yaml" for number in NUMBERS}
+    before = bench.play(fresh, "fresh_nominal", nominal)
+    after = bench.play(fresh, "fresh_extended", extended)
+    fresh_before = _diagnose(out / "fresh_nominal", nominal, out / "diagnosis_fresh_nominal")
+    fresh_after = _diagnose(out / "fresh_extended", extended, out / "diagnosis_fresh_extended")
+    again = _diagnose(out / "runs", extended, out / "diagnosis_extended")
+    hidden = secrets(load_joint(nominal[SECRET_JOINT]))[options.effect]
+    return {
+        "hidden": {"name": hidden.name, "joint": SECRET_JOINT, "parameters": dict(hidden.parameters)},
+        "verdict": found["verdict"],
+        "causes": found["causes"],
+        "gain": found["gain"],
+        "simulation": {
+            number: {
+                balance: (_gap(fresh_before, number, balance), _gap(fresh_after, number, balance))
+                for balance in ("motor", "torsion")
+            }
+            for number in NUMBERS
+        },
+        "jtqd": {number: (before[number], after[number]) for number in NUMBERS},
+        "method": options.method,
+        "bus": options.bus,
+        "extended_on_the_same_runs": _said(again),
+        "extended_on_fresh_runs": _said(fresh_after),
+    }
+
+
+def lines(result: Mapping[str, Any]) -> list[str]:
+    """The result as text: hidden, found, and errors before and after."""
+    hidden, gain = result["hidden"], result["gain"]
+    values = ", ".join(f"{name} {value:.4g}" for name, value in hidden["parameters"].items())
+    out = [
+        f"hidden  {hidden['name']} of joint {hidden['joint']}: {values}",
+        f"found   verdict {result['verdict']}",
+    ]
+    for cause in result["causes"]:
+        told = ", ".join(
+            f"{name} {each['value']:.4g}{_interval(each)}" for name, each in cause["parameters"].items()
+        )
+        out.append(f"        {' or '.join(cause['class'])} of joint {cause['joint']}: {told}")
+    where = "jtqd on fresh runs" if result["bus"] != NO_BUS else "estimator on fresh runs"
+    rows: list[Row] = []
+    if gain["rmse_before_nm"] is not None:
+        rows.append((f"promised: {gain['split']}", gain["rmse_before_nm"], gain["rmse_after_nm"]))
+    for number, balances in result["simulation"].items():
+        rows += [
+            (f"simulation on fresh runs: joint {number}, {b} balance", *both) for b, both in balances.items()
+        ]
+    rows += [(f"{where}: joint {n}, method {result['method']}", *both) for n, both in result["jtqd"].items()]
+    wide = max(len(row[0]) for row in rows)
+    out += ["", f"{'error against the sensor, Nm rms':<{wide}}  before   after  taken away"]
+    out += [f"{what:<{wide}}  {b:6.3f}  {a:6.3f}  {_taken(b, a):10.3f}" for what, b, a in rows]
+    out += ["", f"extended files, same runs:  {result['extended_on_the_same_runs']}"]
+    out += [f"extended files, fresh runs: {result['extended_on_fresh_runs']}"]
+    return out
+
+
+class _Bench:
+    """Where the motions take place: the secret bench on a bus, with jtqd; or without a bus, with the estimator alone."""
+
+    def __init__(self, options: argparse.Namespace, plant: Path) -> None:
+        self._options = options
+        self._plant = plant
+        self._settings = EstimatorSettings(method=options.method)
+
+    def play(self, plan: Plan, name: str, joints: Mapping[int, Path]) -> dict[int, float]:
+        """Play a plan into out/name while jtqd estimates with these joint files; its error per joint [Nm rms]."""
+        out: Path = self._options.out / name
+        if self._options.bus == NO_BUS:
+            out.mkdir(exist_ok=True)
+            tables = emulated(plan, self._plant, self._options.seed)
+            for run_name, table in tables.items():
+                write_run(out / f"{run_name}.csv.gz", table)
+            kept = [read_run(out / f"{run_name}.csv.gz").table for run_name in tables]
+            return {n: table_rmse(kept, n, load_joint(file), self._settings) for n, file in joints.items()}
+        file = self._options.out / f"{plan.name.replace(' ', '_')}.plan.yaml"
+        file.write_text(plan.to_yaml(), encoding="utf-8")
+        config = write_config(self._options.out / f"{name}.jtqd.yaml", joints, self._options.method)
+        bench = ("--bus", self._options.bus, "--plant", str(self._plant), "--seed", str(self._options.seed))
+        _jtq("campaign", str(file), *bench, "--config", str(config), "--out", str(out))
+        logs = [out / f"{each.name}.mcap" for each in plan.runs]
+        return {number: log_rmse(logs, number, self._settings) for number in joints}
+
+
+def _diagnose(runs: Path, joints: Mapping[int, Path], out: Path) -> dict[str, Any]:
+    files = [part for number, file in joints.items() for part in ("--joint", f"{number}={file}")]
+    _jtq("diagnose", str(runs), *files, "--out", str(out), "--force")
+    found: dict[str, Any] = json.loads((out / "findings.json").read_text())
+    return found
+
+
+def _jtq(*arguments: str) -> None:
+    """Run a command of the toolbox; its results go to standard error. Raises StepError."""
+    print(f"$ jtq {' '.join(arguments)}", file=sys.stderr, flush=True)
+    command = [sys.executable, "-m", "jtqd.daemon.jtq", *arguments]
+    status = subprocess.run(command, check=False, stdout=_STDERR).returncode
+    if status not in (0, _FINDINGS):
+        raise StepError(f"jtq {arguments[0]} ended with exit status {status}")
+
+
+def _gap(findings: Mapping[str, Any], joint: int, balance: str) -> float:
+    for gap in findings["gaps"]:
+        if (gap["joint"], gap["balance"]) == (joint, balance):
+            return float(gap["rmse_nm"])
+    return math.nan
+
+
+def _said(findings: Mapping[str, Any]) -> str:
+    names = ", ".join(f"{each['name']} of {each['joint']}" for each in findings["causes"])
+    return f"{findings['verdict']}{f' ({names})' if names else ''}"
+
+
+def _interval(value: Mapping[str, Any]) -> str:
+    low, high = value["ci95"]
+    return "" if low is None or high is None or low == high else f" [{low:.4g}, {high:.4g}]"
+
+
+def _taken(before: float, after: float) -> float:
+    """Rms of what is gone: independent errors add in squares, so this can be compared where what is left differs."""
+    return math.copysign(math.sqrt(abs(before**2 - after**2)), before - after)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m examples.hidden_effect",
+        description="Hide an effect in the emulated bench, find it from a campaign, and measure what jtqd gains by it.",
+        epilog="example: python -m examples.hidden_effect --effect torque_ripple --out hidden",
+    )
+    add = parser.add_argument
+    add("--effect", choices=NAMES, required=True, help="what is hidden in joint 1")
+    add("--out", type=Path, required=True, metavar="DIR", help="everything goes there; made if missing")
+    add("--bus", default="sim", help=f"sim, sim:BUS, or {NO_BUS}: the bench without a bus (default sim)")
+    add("--method", choices=_METHODS, default=_METHODS[0], help="of jtqd (default efficiency)")
+    add("--runs", type=count, default=6, metavar="N", help="runs to diagnose (default 6)")
+    add("--fresh-runs", type=count, default=4, metavar="N", help="fresh runs (default 4)")
+    add("--seconds", type=seconds, default=16.0, metavar="S", help="length of a run (default 16)")
+    add("--seed", type=natural, default=0, help="of motions, days and noise (default 0)")
+    add("--json", action="store_true", help="print the result as JSON")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

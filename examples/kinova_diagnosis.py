@@ -1,0 +1,287 @@
+"""Diagnose all seven joints of the measured Kinova Gen3 arm: what its rigid model with friction gets wrong.
+
+    python -m examples.kinova_diagnosis --out DIR [--json]
+
+Every joint is diagnosed by itself on both runs, with the joint file that one can write down without measuring
+(models/kinova_gen3). Printed are verdict, gap, causes with their classes, and the gain on the run left out; written are
+findings.json and report.html of each joint, and the figures of docs/measured_diagnosis.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib import pyplot as plt
+
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.run import RunTable, RunTableError
+from jtqd.models.files import load_joint, shipped
+from jtqd.sysid import figures as parts
+from jtqd.sysid.diagnosis.command import diagnosed
+from jtqd.sysid.diagnosis.findings import Cause, Findings, Gap, Value, to_mapping
+from jtqd.sysid.runs.files import ColumnMap, RunError, read_run
+from jtqd.sysid.runs.inputs import InputRun
+
+RUNS: Final = ("opti_traj_testing1", "RunTrajectory1")
+JOINTS: Final = range(1, 8)
+BY: Final = "measured_diagnosis"
+
+
+@dataclass(frozen=True)
+class Diagnosed:
+    """One joint of the arm: number, joint file as shipped, findings over both runs."""
+
+    number: int
+    joint: Joint
+    findings: Findings
+
+
+def measured_runs() -> list[InputRun]:
+    """Return both runs as shipped, with the encoder counted once. Raises RunError, ConfigError."""
+    columns = ColumnMap.load(shipped("kinova_gen3/columns.yaml"))
+    runs = []
+    for name in RUNS:
+        file = read_run(shipped(f"kinova_gen3/{name}.csv.gz"), columns)
+        runs.append(InputRun(name, one_encoder(file.table), file.notes, file.sha256))
+    return runs
+
+
+def one_encoder(table: RunTable) -> RunTable:
+    """Return the run without motor positions, which the column map makes from the joint's: there is one encoder.
+
+    As a second encoder they would say that no joint ever twists under its load.
+    """
+    joints = {number: replace(columns, motor_position_rad=None) for number, columns in table.joints.items()}
+    return RunTable(table.time_s, joints)
+
+
+def only(run: InputRun, number: int) -> InputRun:
+    """Return the run with one joint's columns and notes."""
+    notes = tuple(note for note in run.notes if note.startswith(f"j{number}.") or not note.startswith("j"))
+    return run._replace(table=RunTable(run.table.time_s, {number: run.table.joints[number]}), notes=notes)
+
+
+def diagnose_all(numbers: Sequence[int] = JOINTS) -> list[Diagnosed]:
+    """Diagnose each joint by itself on both runs. Raises RunError, ConfigError."""
+    runs = measured_runs()
+    result = []
+    for number in numbers:
+        joint = load_joint(shipped(f"kinova_gen3/joint{number}.yaml"))
+        findings = diagnosed([only(run, number) for run in runs], {number: joint})
+        result.append(Diagnosed(number, joint, findings))
+    return result
+
+
+def table_lines(results: Sequence[Diagnosed]) -> list[str]:
+    """Return the results as the rows of a Markdown table."""
+    lines = [
+        "| joint | verdict | gap: RMSE, noise floor [Nm] | causes (and what they cannot be told from) | "
+        "held-out RMSE before, after [Nm] |",
+        "|---|---|---|---|---|",
+    ]
+    for one in results:
+        cells = (str(one.number), one.findings.verdict, _gap(one), _causes(one.findings), _gain(one.findings))
+        lines.append("| " + " | ".join(cells) + " |")
+    return lines
+
+
+def run_lines(results: Sequence[Diagnosed]) -> list[str]:
+    """Return what is named as worth on each run left out, the rows of a Markdown table."""
+    lines = ["| joint | left out | joint file [Nm rms] | with what is named |", "|---|---|---|---|"]
+    for one in results:
+        lines += [
+            f"| {one.number} | {run.run} | {run.rmse_before_nm:.2f} | {run.rmse_after_nm:.2f} |"
+            for run in (one.findings.gain.runs if one.findings.gain is not None else ())
+        ]
+    return lines
+
+
+def largest_gap(findings: Findings) -> Gap | None:
+    """Return the gap of the motor's balance, the only one that one encoder gives; None where there is none."""
+    return next((gap for gap in findings.gaps if gap.balance == "motor"), None)
+
+
+def _gap(one: Diagnosed) -> str:
+    gap = largest_gap(one.findings)
+    if gap is None:
+        return "-"
+    rated = one.joint.rated_torque_nm
+    return f"{gap.rmse_nm:.2f} ({gap.rmse_nm / rated:.1%} of rated), {gap.noise_floor_nm:.2f}"
+
+
+def _causes(findings: Findings) -> str:
+    if not findings.causes:
+        return "; ".join(findings.reasons) or "-"
+    return "; ".join(cause_text(cause) for cause in findings.causes)
+
+
+def cause_text(cause: Cause) -> str:
+    """Return name, class and parameters of a cause in a line."""
+    others = [name for name in cause.names if name != cause.name]
+    alike = f" (or {', '.join(others)})" if others else ""
+    values = ", ".join(f"{name} {_value(value)}" for name, value in cause.parameters.items())
+    return f"{cause.name}{alike}: {values}"
+
+
+def _value(value: Value) -> str:
+    half = 0.5 * (value.ci95[1] - value.ci95[0])
+    spread = f" +- {half:.2g}" if math.isfinite(half) and half > 0.0 else ""
+    return f"{value.value:.3g}{spread} {value.unit}".rstrip()
+
+
+def _gain(findings: Findings) -> str:
+    gain = findings.gain
+    if gain is None:
+        return "-"
+    return f"{gain.rmse_before_nm:.2f}, {gain.rmse_after_nm:.2f}"
+
+
+def as_mapping(results: Sequence[Diagnosed], sha256: Mapping[str, str]) -> dict[str, Any]:
+    """Return the findings of all joints for a program."""
+    joints = [{"joint": one.number, "findings": to_mapping(one.findings, sha256=sha256)} for one in results]
+    return {"schema": "jtq.measured_diagnosis/1", "joints": joints}
+
+
+def write(directory: Path, results: Sequence[Diagnosed], sha256: Mapping[str, str]) -> None:
+    """Write findings.json and report.html of each joint and the figures; says on standard error what. Raises OSError."""
+    from jtqd.sysid.diagnosis.report.page import render
+
+    for one in results:
+        folder = directory / f"joint{one.number}"
+        folder.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(to_mapping(one.findings, sha256=sha256), indent=1, allow_nan=False)
+        (folder / "findings.json").write_text(f"{text}\n", encoding="utf-8")
+        (folder / "report.html").write_text(render(one.findings), encoding="utf-8")
+    for name, draw in (("residuals", draw_residuals), ("loads", draw_loads)):
+        path = directory / f"measured_diagnosis_{name}.png"
+        draw(results, path)
+        print(f"{BY}: wrote {path}", file=sys.stderr)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line; results on stdout, log on stderr. Exit status 0 done, 1 failure, 2 usage."""
+    parser = argparse.ArgumentParser(
+        prog=f"python -m sysid.{BY}",
+        description="Diagnose the seven joints of the measured Kinova Gen3 arm and draw the figures of the docs page.",
+        epilog=f"example:\n  python -m sysid.{BY} --out measured_diagnosis",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where reports and figures go")
+    parser.add_argument("--json", action="store_true", help="print the findings of all joints as JSON")
+    options = parser.parse_args(arguments)
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+        sha256 = {run.name: run.sha256 for run in measured_runs()}
+        results = diagnose_all()
+        write(options.out, results, sha256)
+    except (RunError, RunTableError, ConfigError) as error:
+        print(f"{BY}: {error}", file=sys.stderr)
+        return 1
+    except OSError as error:
+        print(f"{BY}: {error.filename or options.out}: {error.strerror or error}", file=sys.stderr)
+        return 1
+    if options.json:
+        print(json.dumps(as_mapping(results, sha256), indent=1, allow_nan=False))
+    else:
+        print("\n".join((*table_lines(results), "", *run_lines(results))))
+    return 0
+
+
+# Figures of examples.kinova_diagnosis: what the simulation leaves over in time, and over the load.
+
+
+mpl.use("Agg")  # files only; a display is not needed
+
+_RUN_COLOURS: Final = ("#7a4fa3", "#2a8a5a")
+_COLUMNS: Final = 3
+_SLOW_RAD_S: Final = 0.03
+"""Below it the direction of friction is not known, and the residual is not the model's fault."""
+
+
+def draw_residuals(results: Sequence[Diagnosed], path: Path) -> None:
+    """One row per joint that has traces, one column per run: residual of the motor balance over time, before and after."""
+    rows = [one for one in results if _traces(one)]
+    runs = list(dict.fromkeys(trace.run for one in rows for trace in _traces(one)))
+    figure, axes = plt.subplots(
+        max(len(rows), 1),
+        max(len(runs), 1),
+        figsize=(5.6 * max(len(runs), 1), 1.7 * max(len(rows), 1)),
+        squeeze=False,
+    )
+    for line, one in zip(axes, rows, strict=False):
+        for axis, run in zip(line, runs, strict=True):
+            parts.plain(axis)
+            trace = next((t for t in _traces(one) if t.run == run), None)
+            if trace is None:
+                axis.text(0.5, 0.5, "no usable sensor", transform=axis.transAxes, ha="center", fontsize=8)
+                continue
+            axis.plot(trace.time_s, trace.before_nm, color=parts.BEFORE, linewidth=0.9, label="before")
+            if one.findings.causes:
+                axis.plot(trace.time_s, trace.after_nm, color=parts.AFTER, linewidth=0.9, label="after")
+            axis.axhline(0.0, color=parts.SENSOR, linewidth=0.8)
+            axis.set_title(f"joint {one.number}, {run}: {one.findings.verdict}", fontsize=9)
+        line[0].set_ylabel("residual [Nm]")
+    if rows:
+        parts.legend(axes[0][0])
+        for axis in axes[-1]:
+            axis.set_xlabel("time [s]")
+    _save(figure, path)
+
+
+def draw_loads(results: Sequence[Diagnosed], path: Path) -> None:
+    """One panel per joint: residual times the direction of motion over the load along the motion, before anything is added.
+
+    Coulomb and viscous friction that are right leave zero; a loss that grows with the load makes a V, a wrong torque
+    constant a straight line through zero.
+    """
+    shown = [one for one in results if _traces(one)]
+    count = max(len(shown), 1)
+    lines = -(-count // _COLUMNS)
+    figure, axes = plt.subplots(lines, _COLUMNS, figsize=(3.4 * _COLUMNS, 2.9 * lines), squeeze=False)
+    for axis in axes.flat[len(shown) :]:
+        axis.set_visible(False)
+    for axis, one in zip(axes.flat, shown, strict=False):
+        parts.plain(axis)
+        for colour, trace in zip(_RUN_COLOURS, _traces(one), strict=False):
+            s = np.sign(trace.velocity_rad_s)
+            moving = (np.abs(trace.velocity_rad_s) > _SLOW_RAD_S) & np.isfinite(trace.before_nm)
+            axis.plot(
+                (trace.torque_nm * s)[moving],
+                (trace.before_nm * s)[moving],
+                ".",
+                color=colour,
+                markersize=2.5,
+                label=trace.run,
+            )
+        axis.axhline(0.0, color=parts.SENSOR, linewidth=0.8)
+        axis.set_title(f"joint {one.number}", fontsize=9)
+        axis.set_xlabel("load along the motion [Nm]")
+    for line in axes:
+        line[0].set_ylabel("loss missed [Nm]")
+    if shown:
+        parts.legend(axes[0][0])
+    _save(figure, path)
+
+
+def _traces(one: Diagnosed) -> list[Any]:
+    return [trace for trace in one.findings.traces if trace.balance == "motor" and trace.joint == one.number]
+
+
+def _save(figure: Any, path: Path) -> None:
+    figure.tight_layout()
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

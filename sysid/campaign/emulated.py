@@ -1,0 +1,122 @@
+"""`python -m jtqd.sysid.campaign.emulated`: runs of a campaign on the emulated bench without a bus, faster than real time.
+
+Run tables and marks as a campaign leaves them, each run on a day of its own. No bus, no loop, no missing cycles: for
+questions that need hundreds of days, such as how often an interval covers. What jtqd itself would have recorded comes
+from `jtq campaign --bus sim`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.checked import ConfigError, count, natural, seconds
+from jtqd.estimator.run import RunTable
+from jtqd.models.files import load_joint, shipped
+from jtqd.sim_can.emulated_run import JointCommand, TimeFunction, emulate_run
+from jtqd.sim_can.plant_file import PlantParameters, load_plant
+from jtqd.sysid.campaign.plan import Plan, Run, expand
+from jtqd.sysid.campaign.plans import Scale, make_plan
+from jtqd.sysid.campaign.runner import marks_of
+from jtqd.sysid.runs.files import write_run
+from jtqd.sysid.runs.inputs import progress
+
+PLANT: Final = "campaign_plant.yaml"
+_RECIPE: Final = "emulated_runs.json"
+_HZ: Final = 1000.0
+_EXAMPLE = (
+    "example: python -m jtqd.sysid.campaign.emulated --runs 384 --seconds 8 --hold 1.6 --seed 7 --out days"
+)
+
+
+def emulated(plan: Plan, plant: Path, seed: int) -> dict[str, RunTable]:
+    """Return the run tables of a plan on the bench of `plant`, each on a day of its own. Raises ConfigError."""
+    bench = load_plant(plant)
+    return {run.name: emulated_run(bench, seed, day, run) for day, run in enumerate(plan.runs)}
+
+
+def emulated_run(bench: PlantParameters, seed: int, day: int, run: Run) -> RunTable:
+    """Return the table of one run on this day of the seed."""
+    points = expand(run)
+    commands = (
+        JointCommand.velocity(_told(points.velocity_rad_s)),
+        JointCommand.current(_told(points.current_a)),
+    )
+    one, two = commands if points.velocity_joint == 1 else (commands[1], commands[0])
+    return emulate_run(bench, (one, two), len(points) / _HZ, seed, day=day)
+
+
+def _told(values: FloatArray) -> TimeFunction:
+    """What a drive is told, one value per millisecond."""
+    each = values.tolist()
+
+    def at(time_s: float) -> float:
+        return float(each[round(_HZ * time_s)])
+
+    return at
+
+
+def _written(out: Path, plant: Path, seed: int, numbered: tuple[int, Run]) -> str:
+    day, run = numbered
+    write_run(out / f"{run.name}.csv.gz", emulated_run(load_plant(plant), seed, day, run))
+    (out / f"{run.name}.json").write_text(json.dumps(marks_of(run, expand(run)), indent=1) + "\n")
+    return run.name
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Write the runs of a validation campaign. Returns the exit status."""
+    parser = argparse.ArgumentParser(
+        prog="python -m jtqd.sysid.campaign.emulated", description=__doc__, epilog=_EXAMPLE
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="made, or gone on with")
+    parser.add_argument("--plant", type=Path, default=shipped(PLANT), help=f"bench (default {PLANT})")
+    parser.add_argument("--runs", type=count, metavar="N", help="Fourier runs (default 24)")
+    parser.add_argument("--seconds", type=seconds, metavar="S", help="length of a Fourier run (default 12)")
+    parser.add_argument("--hold", type=seconds, metavar="S", help="hold of a constant point (default 2.1)")
+    parser.add_argument("--seed", type=natural, default=0, help="of trajectories and days (default 0)")
+    options = parser.parse_args(arguments)
+    joints = (load_joint(shipped("joint1.yaml")), load_joint(shipped("joint2.yaml")))
+    scale = Scale(options.runs, options.seconds, options.hold, options.seed, joints=joints)
+    try:
+        plan = make_plan("validate", scale)
+        load_plant(options.plant)
+        _claim(options.out, plan, options.plant, options.seed)
+        _emulate(options.out, plan, options.plant, options.seed)
+    except (ConfigError, OSError) as error:
+        print(f"emulated_runs: {error}", file=sys.stderr)
+        return 1
+    print(f"{len(plan.runs)} runs in {options.out}")
+    return 0
+
+
+def _emulate(out: Path, plan: Plan, plant: Path, seed: int) -> None:
+    """Write what is not there yet, on all processors."""
+    left = [(day, run) for day, run in enumerate(plan.runs) if not (out / f"{run.name}.json").exists()]
+    with ProcessPoolExecutor() as pool:
+        made: Iterable[str] = pool.map(partial(_written, out, plant, seed), left)
+        for _ in zip(progress(left, "runs"), made, strict=True):
+            pass
+
+
+def _claim(out: Path, plan: Plan, plant: Path, seed: int) -> None:
+    """Make the directory, or see that it holds runs of the same recipe. Raises ConfigError, OSError."""
+    recipe = {"plan": plan.sha256, "plant": hashlib.sha256(plant.read_bytes()).hexdigest(), "seed": seed}
+    file = out / _RECIPE
+    if file.is_file():
+        if json.loads(file.read_text(encoding="utf-8")) != recipe:
+            raise ConfigError(f"{out}: found runs of another plan, bench or seed, expected a new directory")
+        return
+    out.mkdir(parents=True)
+    file.write_text(json.dumps(recipe, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,295 @@
+"""Regressors of all effects, averaged over bins: what each hidden effect would leave in the residuals of the balances. Pure.
+
+A channel is one balance of one joint: up to four with two joints. An effect of joint j shows in the motor balance, the
+torsion balance or both of that joint; an effect of the sensor in all channels at once. That pattern is what tells many
+of them apart (the isolability matrix of fault diagnosis).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from jtqd.estimator.arrays import BoolArray, FloatArray
+from jtqd.estimator.effects.effect import MOTOR, TORSION, Effect, Term, Values
+from jtqd.estimator.effects.functions import Whole
+from jtqd.sysid.diagnosis.findings import JointName
+from jtqd.sysid.diagnosis.signals import Channel, JointSignals, Line, second_difference
+
+BIN_S: Final = 0.005
+LONG_S: Final = 600.0
+"""Of all runs and joints together; beyond, bins grow so that memory does not."""
+
+
+@dataclass(frozen=True)
+class EffectCandidate:
+    """One way in which one effect of one joint (or of the sensor) could be there: columns first..first+size; largest: see
+    `Effect.largest`.
+    """
+
+    effect: Effect
+    joint: JointName
+    term: Term
+    first: int
+    largest: float = math.inf
+
+    @property
+    def size(self) -> int:
+        """Number of columns."""
+        return len(self.term.basis)
+
+    @property
+    def columns(self) -> range:
+        """Their numbers."""
+        return range(self.first, self.first + self.size)
+
+    @property
+    def key(self) -> tuple[str, JointName]:
+        """Effect and joint, whatever the term."""
+        return self.effect.name, self.joint
+
+
+def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatArray]:
+    """Return what the effect with parameters p leaves in each balance of this joint [n], Nm; absent: nothing."""
+    joint, state, x = s.joint, s.state_of(effect, p), Whole()
+    out: dict[str, FloatArray] = {}
+
+    def add(balance: str, value: FloatArray) -> None:
+        out[balance] = out[balance] + value if balance in out else value
+
+    hooks = effect.hooks
+    if "loss_nm" in hooks:
+        order = p.get("order_per_motor_rev", 0.0)
+        add(
+            MOTOR,
+            effect.loss_nm(p, state, joint, x) * s.seen(order * joint.gear_ratio * state.velocity_rad_s),
+        )
+    if "current_a" in hooks:
+        scale = joint.gear_ratio * joint.torque_constant_nm_per_a
+        add(MOTOR, scale * effect.current_a(p, state, joint, x))
+    for hook, sign in (("load_nm", 1.0), ("sensor_nm", -1.0)):
+        if hook in hooks:
+            value = sign * getattr(effect, hook)(p, state, joint, x)
+            add(MOTOR, s.per_torque * value)
+            add(TORSION, value)
+    for hook in ("twist_rad", "link_rad"):
+        if hook in hooks:
+            angle = getattr(effect, hook)(p, state, joint, x)
+            add(TORSION, -joint.stiffness_nm_per_rad * angle)
+            if hook == "link_rad" or effect.geometric:
+                add(TORSION, -joint.damping_nms_per_rad * np.gradient(angle, s.time_s))
+            if hook == "link_rad" and effect.at_motor_of(p) and s.torsion_nm is not None:
+                # velocity and acceleration are of that encoder; with no other one beside it, it is not looked for
+                bent = second_difference(angle, s.time_s)
+                inertia = joint.rotor_inertia_kgm2 * joint.gear_ratio**2
+                viscous = joint.friction.viscous_nms_per_rad * np.gradient(angle, s.time_s)
+                add(MOTOR, (inertia + s.per_torque * joint.link_inertia_kgm2) * bent + viscous)
+                add(TORSION, joint.link_inertia_kgm2 * bent)
+            if effect.geometric:
+                # the link's acceleration is taken from motor and torque (`signals`); an error of the teeth adds its own
+                bent = joint.link_inertia_kgm2 * second_difference(angle, s.time_s)
+                add(MOTOR, s.per_torque * bent)
+                add(TORSION, bent)
+    if s.torsion_nm is None:
+        out.pop(TORSION, None)
+    count = len(s.time_s)
+    return {k: np.broadcast_to(np.asarray(v, np.float64), (count,)) for k, v in out.items()}
+
+
+def bin_samples(signals: Iterable[JointSignals]) -> int:
+    """Return how many samples make a bin."""
+    total, step = 0.0, 0.0
+    for s in signals:
+        total += float(s.time_s[-1] - s.time_s[0])
+        step = max(step, float(np.median(np.diff(s.time_s))))
+    width = BIN_S * max(1.0, total / LONG_S)
+    return max(1, round(width / step))
+
+
+def binned(x: FloatArray, samples: int) -> FloatArray:
+    """Return means over whole bins [n // samples]."""
+    count = len(x) // samples
+    result: FloatArray = x[: count * samples].reshape(count, samples).mean(axis=1)
+    return result
+
+
+def all_in_bin(good: BoolArray, samples: int) -> BoolArray:
+    """Return whether every sample of the bin is good [n // samples]."""
+    count = len(good) // samples
+    return np.asarray(good[: count * samples].reshape(count, samples).all(axis=1), np.bool_)
+
+
+@dataclass
+class ChannelData:
+    """One channel of one run, binned: valid [n], residual [n], regressors [n, p] of columns `index` [p], nuisances
+    [n, q] of families `families` [q].
+    """
+
+    valid: BoolArray
+    residual: FloatArray
+    regressors: FloatArray
+    index: np.ndarray[tuple[int], np.dtype[np.intp]]
+    nuisances: FloatArray
+    families: np.ndarray[tuple[int], np.dtype[np.intp]]
+
+
+@dataclass
+class RunData:
+    """One run: its channels, and what the maps need per joint, binned [n]."""
+
+    name: str
+    time_s: FloatArray
+    channels: dict[Channel, ChannelData]
+    axes: dict[int, dict[str, FloatArray]]
+
+
+class Family(NamedTuple):
+    """A family of nuisances: what may differ from run to run without being anybody's fault, one coefficient per run.
+
+    joint 0: common to all channels. Waves (order per motor revolution, or Hz) act in one balance: lines that are no
+    effect's, found in the residual beforehand, so that no effect is bent to explain them.
+    """
+
+    name: str
+    joint: int
+    sigma: float
+    balance: str = MOTOR
+    order: float = 0.0
+    hz: float = 0.0
+    phase_rad: float = 0.0
+
+
+_SIGMA: Final = {"zero": 0.15, "smooth": 0.3, "viscous": 0.08, "coulomb": 0.02, "torsion_zero": 1e3}
+"""Prior standard deviations: Nm; shares of the file's Coulomb, viscous, Coulomb friction; Nm. All but `zero` per joint."""
+
+LINE: Final = "line"
+
+
+def families(joints: Sequence[int], lines: Sequence[Line] = ()) -> list[Family]:
+    """Return the families of nuisances of these joints and lines."""
+    out = [Family("zero", 0, _SIGMA["zero"])]
+    out += [Family(name, j, sigma) for name, sigma in _SIGMA.items() if name != "zero" for j in joints]
+    for line in lines:
+        wave = {"hz": line.order} if line.unit == "Hz" else {"order": line.order}
+        for phase in (0.0, 0.5 * np.pi):
+            c = line.channel
+            out.append(Family(LINE, c.joint, line.amplitude_nm, c.balance, phase_rad=phase, **wave))
+    return out
+
+
+def _nuisance(s: JointSignals, balance: str, family: Family) -> FloatArray | None:
+    """Return the column of one family in one channel, None where it has none."""
+    if family.name == "zero":
+        return np.full(len(s.time_s), -1.0) * (s.per_torque if balance == MOTOR else 1.0)
+    if family.joint != s.number:
+        return None
+    if family.name == LINE:
+        if family.balance != balance:
+            return None
+        turn = family.order * s.state.motor_position_rad + 2.0 * np.pi * family.hz * s.state.time_s
+        return np.asarray(np.cos(turn - family.phase_rad))
+    friction = s.joint.friction
+    v, d = s.state.velocity_rad_s, s.state.direction
+    if balance == TORSION:
+        return np.ones(len(s.time_s)) if family.name == "torsion_zero" else None
+    made: dict[str, FloatArray] = {
+        "smooth": max(friction.coulomb_nm, 0.1) * d * (1.0 - np.tanh(np.abs(v) / 0.02)),
+        "viscous": max(friction.viscous_nms_per_rad, 0.5) * v,
+        "coulomb": max(friction.coulomb_nm, 0.5) * d,
+    }
+    return made.get(family.name)
+
+
+def run_data(
+    run: Sequence[JointSignals],
+    candidates: Sequence[EffectCandidate],
+    samples: int,
+    groups: Sequence[Family] = (),
+) -> RunData:
+    """Return one run's binned residuals and regressors; `run`: its joints; groups: nuisances, the usual ones if empty."""
+    groups = groups or families([s.number for s in run])
+    channels: dict[Channel, ChannelData] = {}
+    for s in run:
+        for balance in (MOTOR, TORSION):
+            residual = s.motor_nm if balance == MOTOR else s.torsion_nm
+            if residual is None:
+                continue
+            valid = all_in_bin(s.moving if balance == MOTOR else np.ones(len(residual), bool), samples)
+            nuisances = [(k, _nuisance(s, balance, g)) for k, g in enumerate(groups)]
+            there = [(k, binned(c, samples)) for k, c in nuisances if c is not None]
+            channels[Channel(s.number, balance)] = ChannelData(
+                valid,
+                binned(residual, samples),
+                np.empty((len(valid), 0)),
+                np.empty(0, np.intp),
+                np.column_stack([c for _, c in there]),
+                np.array([k for k, _ in there], np.intp),
+            )
+    _fill(channels, run, candidates, samples)
+    axes = {s.number: _axes(s, samples) for s in run}
+    return RunData(run[0].run, binned(run[0].time_s, samples), channels, axes)
+
+
+def _fill(
+    channels: dict[Channel, ChannelData],
+    run: Sequence[JointSignals],
+    candidates: Sequence[EffectCandidate],
+    samples: int,
+) -> None:
+    """Put the regressors of all candidates into the channels."""
+    found: dict[Channel, list[tuple[int, FloatArray]]] = {c: [] for c in channels}
+    for candidate in candidates:
+        for s in run:
+            if candidate.joint not in ("sensor", s.number):
+                continue
+            for column, p in zip(candidate.columns, candidate.term.basis, strict=True):
+                for balance, value in contribution(candidate.effect, p, s).items():
+                    found[Channel(s.number, balance)].append((column, binned(value, samples)))
+    for channel, columns in found.items():
+        if columns:
+            channels[channel].index = np.array([k for k, _ in columns], np.intp)
+            channels[channel].regressors = np.column_stack([c for _, c in columns])
+
+
+def _axes(s: JointSignals, samples: int) -> dict[str, FloatArray]:
+    """Return what the maps are drawn over, binned; angles unwrapped."""
+    state = s.state
+    return {
+        "velocity": binned(state.velocity_rad_s, samples),
+        "load": binned(state.torque_nm, samples),
+        "temperature": binned(state.temperature_c, samples),
+        "motor_angle": binned(state.motor_position_rad, samples),
+        "link_angle": binned(state.link_position_rad, samples),
+        "time": binned(state.time_s, samples),
+        "current": binned(state.current_a, samples),
+    }
+
+
+def gain_columns(candidates: Sequence[EffectCandidate]) -> set[int]:
+    """Return the columns of the torque sensor's gain (see `whitening.saturated_residuals`)."""
+    return {k for c in candidates if c.effect.name == "sensor_gain" for k in c.columns}
+
+
+def column_moments(runs: Sequence[RunData], columns: int) -> FloatArray:
+    """Return the mean products of all columns [channels, columns, columns] over valid bins of all runs; in a torsion balance
+    without their means, which the run's own zero takes.
+    """
+    out = np.zeros((len(runs[0].channels), columns, columns))
+    for place, channel in zip(out, runs[0].channels, strict=True):
+        parts = [
+            (r.channels[channel].regressors, r.channels[channel].valid) for r in runs if channel in r.channels
+        ]
+        index = runs[0].channels[channel].index
+        products, count = np.zeros((len(index), len(index))), 0
+        for x, valid in parts:
+            good = x[valid]
+            if channel.balance == TORSION and len(good):
+                good = good - good.mean(axis=0)
+            products += good.T @ good
+            count += len(good)
+        place[np.ix_(index, index)] = products / max(count, 1)
+    return out

@@ -1,0 +1,448 @@
+"""`jtq fit`: which part of a joint file is to be fitted; each kind has a module of its own."""
+
+from __future__ import annotations
+
+import argparse
+import datetime as dt
+import difflib
+import importlib.util
+import json
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.joint import CONVENTIONS, Joint
+from jtqd.estimator.run import RunTableError
+from jtqd.estimator.settings import EstimatorSettings
+from jtqd.models.files import load_joint
+from jtqd.sysid.fit.efficiency import (
+    EfficiencyFit,
+    default_current_min,
+    efficiency_findings,
+    eta_points,
+    fit_efficiency,
+    written_findings,
+)
+from jtqd.sysid.fit.efficiency_report import EfficiencyResult, as_mapping, plateau_mapping, report_lines
+from jtqd.sysid.fit.friction import FitError
+from jtqd.sysid.fit.fused import FusedFit, fit_fused
+from jtqd.sysid.fit.joint_writer import with_fit, write_joint
+from jtqd.sysid.fit.losses import LossFitError
+from jtqd.sysid.fit.no_load import NoLoadFit, fit_no_load, no_load
+from jtqd.sysid.fit.plateaus import Plateau, PlateauError, PlateauRules
+from jtqd.sysid.fit.signals import RunSignals, run_signals
+from jtqd.sysid.fit.torsion import TorsionError
+from jtqd.sysid.runs.files import RunError
+from jtqd.sysid.runs.inputs import InputRun, channel_findings, joint_number, plateaus_of, progress, read_runs
+
+# What all kinds of `jtq fit` ask for on the command line.
+
+
+def fit_parser(kind: str, description: str, examples: str) -> argparse.ArgumentParser:
+    """Parser with RUNS, --joint, --number, --out, --columns and --json; the kind adds its own."""
+    parser = argparse.ArgumentParser(
+        prog=f"jtq fit {kind}",
+        description=description,
+        epilog=f"examples:\n{examples}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "runs", nargs="+", type=Path, metavar="RUNS", help="run files (.csv, .csv.gz) or directories of them"
+    )
+    parser.add_argument("--joint", type=Path, required=True, metavar="FILE", help="joint file to start from")
+    parser.add_argument(
+        "--number",
+        type=int,
+        choices=range(1, 8),
+        metavar="N",
+        help="which joint of the runs it is (default: the number its name ends in)",
+    )
+    parser.add_argument("--out", type=Path, metavar="FILE", help="joint file to write; none: only the report")
+    parser.add_argument(
+        "--columns", type=Path, metavar="FILE", help="column map for other names, units and signs"
+    )
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    return parser
+
+
+def add_plateau_options(parser: argparse.ArgumentParser) -> None:
+    """--min-hold and --min-current of the fits that rest on plateaus."""
+    parser.add_argument(
+        "--min-hold",
+        type=positive,
+        default=PlateauRules().shortest_s,
+        metavar="S",
+        help="shortest plateau in seconds (default %(default)s)",
+    )
+    parser.add_argument(
+        "--min-current",
+        type=positive,
+        metavar="A",
+        help="current below which eta is not formed (default: what overcomes the joint's own static friction)",
+    )
+
+
+def parse_fit(parser: argparse.ArgumentParser, argv: list[str]) -> argparse.Namespace:
+    """Parse; the joint file that is read is never the one that is written."""
+    options = parser.parse_args(argv)
+    if options.out is not None and options.out.resolve() == options.joint.resolve():
+        parser.error(f"--out: found {options.out}, the joint file itself, expected a new file")
+    return options
+
+
+def positive(text: str) -> float:
+    """argparse type: a finite number > 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a number > 0")
+    return value
+
+
+def today() -> str:
+    """The date of a fit, ISO 8601, local time."""
+    return dt.datetime.now().astimezone().date().isoformat()
+
+
+# `jtq fit efficiency`: plateaus of the runs, eta by quadrant, Eq. (8), and a new joint file.
+
+
+EFFICIENCY_BY = "jtq fit efficiency"
+
+
+def efficiency_main(argv: list[str]) -> int:
+    """Fit and write; exit status 0 done, 1 failure, 2 usage, 3 findings (then nothing is written)."""
+    options = parse_fit(_parser(), argv)
+    if options.plot is not None and importlib.util.find_spec("matplotlib") is None:
+        print(
+            f"{EFFICIENCY_BY}: --plot: matplotlib is not installed (it is in the extra 'train')",
+            file=sys.stderr,
+        )
+        return 1
+    try:
+        joint = load_joint(options.joint)
+        runs = read_runs(options.runs, options.columns)
+        number = joint_number(options.number, joint, runs)
+        result = analyse(joint, runs, number, options)
+        written = None if result.findings else _new_joint(joint, result, options)
+        if written is not None:
+            result = replace(result, findings=tuple(written_findings(written, result.points, result.fits[0])))
+        print(json.dumps(as_mapping(result), indent=1) if options.json else "\n".join(report_lines(result)))
+        if options.plot is not None and result.fits:
+            _draw(joint, result, options.plot)
+        if result.findings or written is None:
+            return _refuse(result, options)
+        if options.out is not None:
+            write_joint(options.out, written, f"Written by {EFFICIENCY_BY} from {len(runs)} runs.")
+            print(f"{EFFICIENCY_BY}: wrote {options.out}", file=sys.stderr)
+    except (ConfigError, RunError, RunTableError, PlateauError, OSError) as error:
+        print(f"{EFFICIENCY_BY}: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def analyse(joint: Joint, runs: list[InputRun], number: int, options: argparse.Namespace) -> EfficiencyResult:
+    """Everything but files: channels, plateaus, points, fits.
+
+    A run whose channels contradict each other ends it there: what follows from them is not worth a look. Raises
+    PlateauError and RunTableError.
+    """
+    hashes = {run.name: run.sha256 for run in runs}
+    current_min = options.min_current or default_current_min(joint)
+    found = channel_findings(runs, number, joint)
+    if found:
+        return EfficiencyResult(joint.name, number, hashes, (), (), current_min, (), tuple(found))
+    plateaus = plateaus_of(runs, number, joint, PlateauRules(shortest_s=options.min_hold))
+    points, left_out = eta_points(plateaus, joint, current_min)
+    found = efficiency_findings(points, joint)
+    fits: list[EfficiencyFit] = []
+    if not found:
+        written = options.convention, options.weighted
+        kinds = [written, (options.convention, not options.weighted), (CONVENTIONS[0], options.weighted)]
+        fits = [fit_efficiency(points, c, joint, weighted=w) for c, w in dict.fromkeys(kinds)]
+    return EfficiencyResult(
+        joint.name, number, hashes, tuple(points), tuple(left_out), current_min, tuple(fits), tuple(found)
+    )
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = fit_parser(
+        "efficiency",
+        "Fit the paper's Eq. (8) to the plateaus of measured runs, quadrant by quadrant.",
+        "  jtq fit efficiency campaigns/efficiency --joint joint1.yaml --out joint1.fitted.yaml --plot fig6.png\n"
+        "  jtq fit efficiency runs/*.csv --joint joint2.yaml --number 2 --json",
+    )
+    add_plateau_options(parser)
+    parser.add_argument(
+        "--convention",
+        choices=CONVENTIONS,
+        default=CONVENTIONS[0],
+        help="eta = tau_j/(G Kt i) as in Table I (default), or its reciprocal as in Eq. (6)",
+    )
+    parser.add_argument(
+        "--weighted",
+        action="store_true",
+        help="weight plateaus by their standard errors and the sensor's zero",
+    )
+    parser.add_argument(
+        "--allow-missing",
+        action="store_true",
+        help="quadrants that cannot be fitted keep the joint file's own coefficients",
+    )
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="picture like Fig. 6 (png, svg, pdf)")
+    return parser
+
+
+def _new_joint(joint: Joint, result: EfficiencyResult, options: argparse.Namespace) -> Joint | None:
+    """The joint with its new efficiency; None when a quadrant is refused and that was not allowed."""
+    fit = result.fits[0]
+    if fit.refused and not options.allow_missing:
+        return None
+    try:
+        efficiency = fit.efficiency(joint.efficiency if options.allow_missing else None)
+    except ValueError as error:
+        raise ConfigError(f"{options.joint}: {error}") from None
+    notes: dict[str, object] = {"weighted": fit.weighted, "plateaus": len(result.points)}
+    if fit.refused:
+        notes["kept_from_joint_file"] = list(fit.refused)
+    return with_fit(
+        replace(joint, efficiency=efficiency),
+        "efficiency",
+        by=EFFICIENCY_BY,
+        runs=result.runs,
+        date=today(),
+        temperature_c=result.temperature_c,
+        notes=notes,
+    )
+
+
+def _refuse(result: EfficiencyResult, options: argparse.Namespace) -> int:
+    """Say on standard error why nothing was written."""
+    nothing = f"nothing was written to {options.out}" if options.out is not None else "not fitted"
+    if result.findings:
+        count = len(result.findings)
+        print(f"{EFFICIENCY_BY}: {count} finding{'s' if count > 1 else ''}, {nothing}", file=sys.stderr)
+        return 3
+    for text in result.fits[0].refused.values():
+        print(
+            f"{EFFICIENCY_BY}: {text} (--allow-missing keeps the joint file's own); {nothing}",
+            file=sys.stderr,
+        )
+    return 1
+
+
+def _draw(joint: Joint, result: EfficiencyResult, path: Path) -> None:
+    from jtqd.sysid.fit.efficiency_report import draw_fit
+
+    title = f"{joint.name}: measured efficiency and Eq. (8), convention {result.fits[0].convention}"
+    try:
+        draw_fit(result.points, result.fits[0], title, path)
+    except ValueError as error:  # matplotlib's own: an ending that it does not know
+        raise ConfigError(f"--plot {path}: {error}") from None
+    print(f"{EFFICIENCY_BY}: wrote {path}", file=sys.stderr)
+
+
+# `jtq fit friction`: Coulomb and viscous friction at no load, from plateaus, into a new joint file.
+
+
+FRICTION_BY = "jtq fit friction"
+
+
+def friction_main(argv: list[str]) -> int:
+    """Fit and write; exit status 0 done, 1 failure, 2 usage, 3 findings (then nothing is written)."""
+    parser = fit_parser(
+        "friction",
+        "Fit Coulomb and viscous friction to the plateaus at no load: motor current or joint torque next to zero.",
+        "  jtq fit friction campaigns/efficiency --joint joint1.yaml --out joint1.friction.yaml",
+    )
+    add_plateau_options(parser)
+    options = parse_fit(parser, argv)
+    try:
+        joint = load_joint(options.joint)
+        runs = read_runs(options.runs, options.columns)
+        number = joint_number(options.number, joint, runs)
+        found = channel_findings(runs, number, joint)
+        if found:
+            for item in found:
+                print(f"{item.kind}: {item.text}")
+            print(f"{FRICTION_BY}: {len(found)} findings, not fitted", file=sys.stderr)
+            return 3
+        plateaus = plateaus_of(runs, number, joint, PlateauRules(shortest_s=options.min_hold))
+        chosen = no_load(plateaus, joint, options.min_current or default_current_min(joint))
+        fit = fit_no_load(chosen, joint)
+        if options.json:
+            print(json.dumps(_friction_mapping(joint, number, fit, chosen), indent=1))
+        else:
+            print("\n".join([f"{joint.name} (j{number}): friction at no load", *fit.lines()]))
+        if options.out is not None:
+            temperatures = [p.temperature_c for p in chosen if math.isfinite(p.temperature_c)]
+            new = with_fit(
+                replace(joint, friction=fit.friction),
+                "friction",
+                by=FRICTION_BY,
+                runs={run.name: run.sha256 for run in runs},
+                date=today(),
+                temperature_c=float(np.mean(temperatures)) if temperatures else math.nan,
+                notes={"plateaus": fit.plateaus},
+            )
+            write_joint(options.out, new, f"Written by {FRICTION_BY} from {len(runs)} runs.")
+            print(f"{FRICTION_BY}: wrote {options.out}", file=sys.stderr)
+    except (ConfigError, RunError, RunTableError, PlateauError, FitError, OSError) as error:
+        print(f"{FRICTION_BY}: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _friction_mapping(
+    joint: Joint, number: int, fit: NoLoadFit, plateaus: Sequence[Plateau]
+) -> dict[str, Any]:
+    return {
+        "schema": "jtq.friction/1",
+        "joint": joint.name,
+        "number": number,
+        "friction": asdict(fit.friction),
+        "terms": [{"name": t.name, "value": t.value, "ci95": t.ci95} for t in fit.terms],
+        "rmse_nm": fit.rmse_nm,
+        "warnings": list(fit.warnings),
+        "plateaus": [plateau_mapping(plateau) for plateau in plateaus],
+    }
+
+
+# `jtq fit losses`: additive loss, torsion and standard deviations from whole runs: section `fused` of a joint file.
+
+
+LOSSES_BY = "jtq fit losses"
+_EXAMPLE = (
+    "  jtq fit losses campaigns/excitation --joint joint1.yaml --out joint1.fused.yaml\n"
+    "Runs that excite load, speed and both directions are needed: jtq campaign excitation records such."
+)
+
+
+def losses_main(argv: list[str]) -> int:
+    """Fit and write; exit status 0 done, 1 failure, 2 usage, 3 findings (then nothing is written)."""
+    options = parse_fit(
+        fit_parser(
+            "losses", "Additive loss over load, speed, direction and temperature; torsion; sigma.", _EXAMPLE
+        ),
+        argv,
+    )
+    try:
+        joint = load_joint(options.joint)
+        runs = read_runs(options.runs, options.columns)
+        number = joint_number(options.number, joint, runs)
+        findings = channel_findings(runs, number, joint)
+        if findings:
+            for finding in findings:
+                print(f"{LOSSES_BY}: {finding.text}", file=sys.stderr)
+            return 3
+        fit = fit_fused(signals_of(runs, number, joint), joint.friction)
+        written = _with_fused(joint, fit, runs)
+        print(json.dumps(_losses_mapping(fit), indent=1) if options.json else "\n".join(_lines(joint, fit)))
+        if options.out is not None:
+            write_joint(options.out, written, f"Written by {LOSSES_BY} from {len(runs)} runs.")
+            print(f"{LOSSES_BY}: wrote {options.out}", file=sys.stderr)
+    except (ConfigError, RunError, RunTableError, LossFitError, TorsionError, ValueError, OSError) as error:
+        print(f"{LOSSES_BY}: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def signals_of(runs: list[InputRun], number: int, joint: Joint) -> list[RunSignals]:
+    """Return what fits of the fused estimator see of one joint in all runs, with a progress bar on a terminal."""
+    settings = EstimatorSettings(method="fused")
+    return [
+        run_signals(run.name, joint, settings, run.table.time_s, run.table.joint(number, joint.gear_ratio))
+        for run in progress(runs, f"observing {joint.name}")
+    ]
+
+
+def _with_fused(joint: Joint, fit: FusedFit, runs: list[InputRun]) -> Joint:
+    return with_fit(
+        replace(joint, fused=fit.fused),
+        "fused",
+        by=LOSSES_BY,
+        runs={Path(run.name).name: run.sha256 for run in runs},
+        date=today(),
+        temperature_c=fit.fused.loss.temperature_c,
+        notes={"unseen_rmse_nm": round(_unseen(fit), 4)},
+    )
+
+
+def _unseen(fit: FusedFit) -> float:
+    return float(np.sqrt(np.mean(np.square(fit.unseen_rmse_nm))))
+
+
+def _losses_mapping(fit: FusedFit) -> dict[str, object]:
+    return {
+        "schema": "jtq.fit_losses/1",
+        "unseen_rmse_nm": list(fit.unseen_rmse_nm),
+        "samples": fit.loss.samples,
+        "viscous_per_k_sigma": fit.loss.viscous_per_k_sigma,
+        "fused": fit.fused.to_mapping(),
+    }
+
+
+def _lines(joint: Joint, fit: FusedFit) -> list[str]:
+    sigma, torsion, loss = fit.fused.sigma, fit.fused.torsion, fit.fused.loss
+    lines = [
+        f"{joint.name}: physics on runs the fit had not seen: RMSE {_unseen(fit):.3f} Nm "
+        f"({100 * _unseen(fit) / joint.rated_torque_nm:.2f} % of rated), worst run {max(fit.unseen_rmse_nm):.3f} Nm",
+        f"  loss: {fit.loss.samples} samples, viscous friction falls {100 * loss.viscous_per_k:.1f} "
+        f"+- {196 * fit.loss.viscous_per_k_sigma:.1f} % per kelvin",
+        f"  sigma of the current path {sigma.current_nm:.2f} Nm, {sigma.viscous_nms_per_rad:.2f} Nms/rad, "
+        f"{100 * sigma.load:.1f} % of load; of the torsion {sigma.torsion_nm:.2f} Nm; of the sensor's zero "
+        f"{sigma.reference_nm:.2f} Nm",
+    ]
+    if torsion is not None:
+        amplitude = np.hypot(torsion.cos_rad, torsion.sin_rad) * 1e6
+        lines.append(
+            f"  stiffness {torsion.stiffness_nm_per_rad:.0f} Nm/rad (file: {joint.stiffness_nm_per_rad:.0f}), kinematic "
+            f"error {amplitude[0]:.0f} urad at 2 per motor revolution, {amplitude[1]:.0f} at 4"
+        )
+    return lines
+
+
+KINDS: Final = {
+    "efficiency": (efficiency_main, "Eq. (8) per quadrant, from plateaus: efficiency"),
+    "friction": (
+        friction_main,
+        "Coulomb and viscous friction at no load, from plateaus: friction",
+    ),
+    "losses": (losses_main, "additive loss over load and velocity, from whole runs: losses"),
+}
+"""Kind -> (its `main(argv) -> int`, one line of help)."""
+
+
+def main(argv: list[str]) -> int:
+    """Hand over to the kind's command; exit status 0 done, 1 failure, 2 usage, 3 done with findings."""
+    if not argv or argv[0] in ("-h", "--help", "help"):
+        print(_help(), end="")
+        return 0 if argv else 2
+    kind = KINDS.get(argv[0])
+    if kind is None:
+        near = difflib.get_close_matches(argv[0], KINDS, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        print(f"jtq fit: found {argv[0]!r}, expected one of {', '.join(KINDS)}{hint}", file=sys.stderr)
+        return 2
+    return kind[0](argv[1:])
+
+
+def _help() -> str:
+    width = max(map(len, KINDS))
+    rows = "\n".join(f"  {name:<{width}}  {text}" for name, (_, text) in KINDS.items())
+    return (
+        "usage: jtq fit KIND RUNS... --joint JOINT.yaml --out NEW_JOINT.yaml ...\n\n"
+        "Fit one section of a joint file to measured runs and write a new joint file.\n\n"
+        f"kinds:\n{rows}\n\n"
+        "examples:\n"
+        "  jtq fit efficiency campaigns/efficiency --joint joint1.yaml --out joint1.fitted.yaml --plot fig6.png\n"
+        "  jtq fit KIND --help\n"
+    )

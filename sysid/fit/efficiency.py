@@ -1,0 +1,395 @@
+"""What cannot be: a joint that gives energy instead of losing it, and coefficients written under the wrong name.
+
+At every plateau the loss (G Kt i - tau_j) sign(v) is positive: eta = tau_j/(G Kt i) is below 1 when driving, above 1
+when back-driven, never negative. A measurement that says otherwise by more than its standard errors and the sensor's
+zero is not a joint with odd friction but a wrong number in the joint file or a wrong channel, and is not fitted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.joint import CONVENTIONS, QUADRANTS, Efficiency, Joint, QuadrantPolynomial
+from jtqd.estimator.losses import (
+    BACKDRIVING_CURRENT_MAX_A,
+    BLEND_CURRENT_A,
+    DRIVING_CURRENT_MAX_A,
+    VELOCITY_RANGE_RAD_S,
+    LossModel,
+    static_friction,
+)
+from jtqd.sysid.fit.plateaus import Plateau
+from jtqd.sysid.runs.checks import RunIssue
+
+# Least squares of the paper's Eq. (8) to measured plateaus, one polynomial per quadrant of (i, omega_m).
+#
+#     eta = p00 + p10 i + p01 v + p20 i^2 + p11 i v + p02 v^2        v = omega_m/G [rad/s], i [A], both signed
+#
+# eta has two names, and this file carries both: "joint_over_motor", tau_j/(G Kt i), as in Table I; "motor_over_joint",
+# G Kt i/tau_j, as in Eq. (6). A point is measured once, as tau_j and i; its eta in either convention follows from these.
+#
+# At constant velocity the motor's inertia carries nothing, so G Kt i = tau_j + loss, and the loss has the sign of v. Below
+# the current that overcomes the joint's own friction, (Fc + Fs)/(G Kt), the torque of a driving joint may be of either
+# sign and eta goes through 0/0: such points are left out and counted.
+
+
+COEFFICIENTS: Final = ("p00", "p10", "p01", "p20", "p11", "p02")
+FEWEST_DISTINCT: Final = len(COEFFICIENTS) + 1
+"""Operating points per quadrant: six coefficients, and one more to judge them by."""
+HIGHEST_CONDITION: Final = 3000.0
+"""Of the columns scaled to unit length: 30 to 60 for the points of section II. Beyond this the data do not span Eq. (8)."""
+SAME_VELOCITY_RAD_S: Final = 0.03
+SAME_CURRENT_A: Final = 0.1
+"""Plateaus closer than both of these are the same operating point measured again."""
+ZERO_SHARE: Final = 0.01
+"""Share of rated torque by which the sensor's zero may be off from day to day: 0.4 Nm of 40 Nm."""
+
+
+@dataclass(frozen=True)
+class EtaPoint:
+    """One plateau with its quadrant. `ratio` is tau_j/(G Kt i) whatever the convention of the fit.
+
+    se: of the ratio by the standard errors of torque and current; motor_nm: G Kt i; loss_nm: energy lost per angle,
+    (G Kt i - tau_j) sign(v), positive in every real joint; loss_se: of that.
+    """
+
+    plateau: Plateau
+    quadrant: str
+    ratio: float
+    se: float
+    motor_nm: float
+    loss_nm: float
+    loss_se: float
+
+    def eta(self, convention: str) -> float:
+        """Eta in the named convention."""
+        return self.ratio if convention == "joint_over_motor" else 1.0 / self.ratio
+
+    def eta_se(self, convention: str) -> float:
+        """Its standard error, to first order."""
+        return self.se if convention == "joint_over_motor" else self.se / self.ratio**2
+
+    @property
+    def driving(self) -> bool:
+        """Current and velocity of one sign."""
+        return self.quadrant in QUADRANTS[:2]
+
+
+@dataclass(frozen=True)
+class QuadrantFit:
+    """One quadrant. rmse = sqrt(SSE/(n - 6)); rmse_nm the same error as joint torque; errors: of the coefficients."""
+
+    polynomial: QuadrantPolynomial
+    errors: Mapping[str, float]
+    rmse: float
+    rmse_nm: float
+    plateaus: int
+    distinct: int
+    condition: float
+    current_range_a: tuple[float, float]
+    velocity_range_rad_s: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class EfficiencyFit:
+    """All quadrants in one convention; those that could not be fitted are in `refused` with the reason."""
+
+    convention: str
+    weighted: bool
+    quadrants: Mapping[str, QuadrantFit]
+    refused: Mapping[str, str]
+
+    def efficiency(self, kept: Efficiency | None = None) -> Efficiency:
+        """For the joint file; refused quadrants are those of `kept`, which must be of the same convention.
+
+        Raises:
+            ValueError: a quadrant is missing and there is nothing to keep in this convention.
+        """
+        if self.refused and (kept is None or kept.convention != self.convention):
+            have = "no efficiency" if kept is None else f"one in the convention {kept.convention}"
+            raise ValueError(
+                f"found no fit of {', '.join(self.refused)}, and the joint file has {have}, expected all four "
+                f"quadrants or a joint file whose own, in the convention {self.convention}, can be kept"
+            )
+        polynomials = {
+            name: self.quadrants[name].polynomial if name in self.quadrants else getattr(kept, name)
+            for name in QUADRANTS
+        }
+        return Efficiency(self.convention, **polynomials)
+
+
+def default_current_min(joint: Joint) -> float:
+    """The current [A] that overcomes the joint's own static friction; below it the sign of the torque is open."""
+    return static_friction(joint.friction) / (joint.gear_ratio * joint.torque_constant_nm_per_a)
+
+
+def quadrant_of(current_a: float, velocity_rad_s: float) -> str:
+    """Name of the quadrant; neither argument may be zero."""
+    return f"i_{'pos' if current_a > 0.0 else 'neg'}_w_{'pos' if velocity_rad_s > 0.0 else 'neg'}"
+
+
+def eta_points(
+    plateaus: Iterable[Plateau], joint: Joint, current_min_a: float
+) -> tuple[list[EtaPoint], list[Plateau]]:
+    """Split plateaus into points with an eta and those left out because |i| < current_min_a [A] (eta is 0/0 there)."""
+    nm_per_a = joint.gear_ratio * joint.torque_constant_nm_per_a
+    points, left_out = [], []
+    for plateau in plateaus:
+        i, v, tau = plateau.current, plateau.velocity, plateau.torque
+        if abs(i.value) < current_min_a or i.value == 0.0 or tau.value == 0.0:
+            left_out.append(plateau)
+            continue
+        motor_nm = nm_per_a * i.value
+        ratio = tau.value / motor_nm
+        se = math.hypot(tau.se / motor_nm, ratio * i.se / i.value)
+        loss = math.copysign(1.0, v.value) * (motor_nm - tau.value)
+        quadrant = quadrant_of(i.value, v.value)
+        loss_se = math.hypot(nm_per_a * i.se, tau.se)
+        points.append(EtaPoint(plateau, quadrant, ratio, se, motor_nm, loss, loss_se))
+    return points, left_out
+
+
+def fit_efficiency(
+    points: Sequence[EtaPoint], convention: str, joint: Joint, *, weighted: bool = False
+) -> EfficiencyFit:
+    """Fit Eq. (8) to the points of each quadrant in the named convention.
+
+    weighted: by 1/variance, of the plateau's own standard error and of the sensor's zero (ZERO_SHARE of rated torque),
+    which is the same torque at any load: an error of eta at a small load then counts as the little torque it is.
+    Raises ValueError for a convention that has no name.
+    """
+    if convention not in CONVENTIONS:
+        raise ValueError(f"convention: found {convention!r}, expected one of {', '.join(CONVENTIONS)}")
+    fits, refused = {}, {}
+    for name in QUADRANTS:
+        own = [point for point in points if point.quadrant == name]
+        try:
+            fits[name] = _fit_quadrant(own, convention, joint, weighted)
+        except ValueError as error:
+            refused[name] = f"{name}: {error}"
+    return EfficiencyFit(convention, weighted, fits, refused)
+
+
+def distinct_points(points: Sequence[EtaPoint]) -> int:
+    """Number of different operating points: a plateau measured again near (i, v) of another adds none."""
+    seen: list[tuple[float, float]] = []
+    for point in points:
+        i, v = point.plateau.current.value, point.plateau.velocity.value
+        if not any(abs(i - a) < SAME_CURRENT_A and abs(v - b) < SAME_VELOCITY_RAD_S for a, b in seen):
+            seen.append((i, v))
+    return len(seen)
+
+
+def design_matrix(current_a: FloatArray, velocity_rad_s: FloatArray) -> FloatArray:
+    """Columns [n, 6] of Eq. (8) in the order of COEFFICIENTS."""
+    i, v = current_a, velocity_rad_s
+    return np.column_stack((np.ones_like(i), i, v, i * i, i * v, v * v))
+
+
+def operating_points(points: Sequence[EtaPoint]) -> tuple[FloatArray, FloatArray]:
+    """Current [A] and velocity [rad/s] of the points, each [n]."""
+    current = np.array([point.plateau.current.value for point in points])
+    return current, np.array([point.plateau.velocity.value for point in points])
+
+
+def _fit_quadrant(points: Sequence[EtaPoint], convention: str, joint: Joint, weighted: bool) -> QuadrantFit:
+    """Raises ValueError with the reason why these points carry no fit."""
+    distinct = distinct_points(points)
+    if distinct < FEWEST_DISTINCT:
+        raise ValueError(
+            f"found {distinct} distinct operating points ({len(points)} plateaus), expected at least {FEWEST_DISTINCT}"
+        )
+    current, velocity = operating_points(points)
+    eta = np.array([point.eta(convention) for point in points])
+    columns = design_matrix(current, velocity)
+    lengths = np.linalg.norm(columns, axis=0)
+    condition = float(np.linalg.cond(columns / lengths))
+    if not condition < HIGHEST_CONDITION:
+        raise ValueError(
+            f"found a condition number of {condition:.0f} (currents {_span(current)} A, velocities {_span(velocity)} "
+            f"rad/s), expected below {HIGHEST_CONDITION:.0f}: at least three currents at three velocities"
+        )
+    weights = np.ones_like(eta)
+    if weighted:
+        zero_nm = ZERO_SHARE * joint.rated_torque_nm
+        spread = [
+            math.hypot(p.se, zero_nm / p.motor_nm) * (1.0 if p.eta(convention) == p.ratio else p.ratio**-2)
+            for p in points
+        ]
+        weights = 1.0 / np.array(spread)
+        weights /= math.sqrt(float(np.mean(weights**2)))
+    scaled = columns * weights[:, None]
+    values = np.linalg.lstsq(scaled / lengths, eta * weights, rcond=None)[0] / lengths
+    residual = eta - columns @ values
+    freedom = len(points) - len(values)
+    variance = float(np.sum((weights * residual) ** 2)) / freedom
+    covariance = (
+        variance * np.linalg.inv((scaled / lengths).T @ (scaled / lengths)) / np.outer(lengths, lengths)
+    )
+    rmse = math.sqrt(float(residual @ residual) / freedom)
+    return QuadrantFit(
+        QuadrantPolynomial(
+            **dict(zip(COEFFICIENTS, np.round(values, 6).tolist(), strict=True)), rmse=round(rmse, 6)
+        ),
+        dict(zip(COEFFICIENTS, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
+        rmse,
+        math.sqrt(float(np.mean(_torque_error(points, columns @ values, convention) ** 2))),
+        len(points),
+        distinct,
+        condition,
+        (float(current.min()), float(current.max())),
+        (float(velocity.min()), float(velocity.max())),
+    )
+
+
+def _torque_error(points: Sequence[EtaPoint], eta: FloatArray, convention: str) -> FloatArray:
+    """Fitted minus measured joint torque [n] in Nm."""
+    ratio = eta if convention == "joint_over_motor" else 1.0 / eta
+    motor = np.array([point.motor_nm for point in points])
+    error: FloatArray = ratio * motor - np.array([point.plateau.torque.value for point in points])
+    return error
+
+
+def _span(values: FloatArray) -> str:
+    return f"{float(values.min()):.3g} to {float(values.max()):.3g}"
+
+
+# Numbers of the paper: Table I, the fitted efficiency of its integrated joint.
+#
+# Table I holds eta = tau_j/(G Kt i), below 1 when driving: the reciprocal of the paper's Eq. (6), so that its
+# Eq. (7) must multiply by it. Velocity is omega_m/G [rad/s], 0.2 to 3; current in A.
+
+
+TABLE_I: Final = Efficiency(
+    convention="joint_over_motor",
+    i_pos_w_pos=QuadrantPolynomial(0.2530, 0.1493, -0.0820, -0.0117, 0.0060, 0.0066, rmse=0.01963),
+    i_neg_w_neg=QuadrantPolynomial(0.2850, -0.1430, 0.0839, -0.0114, 0.0059, 0.0060, rmse=0.01719),
+    i_neg_w_pos=QuadrantPolynomial(1.8830, 0.4870, 0.2602, 0.0658, 0.0435, -0.0168, rmse=0.05599),
+    i_pos_w_neg=QuadrantPolynomial(1.8660, -0.4769, -0.2342, 0.0645, 0.04295, -0.0101, rmse=0.05504),
+)
+
+
+STANDARD_ERRORS: Final = 3.0
+"""How many of them a plateau may be beyond the border, besides the sensor's zero."""
+
+
+def efficiency_findings(points: Sequence[EtaPoint], joint: Joint) -> list[RunIssue]:
+    """Return what the plateaus say against the joint file or the channels; an empty list is good."""
+    zero_nm = ZERO_SHARE * joint.rated_torque_nm
+    against = [
+        p
+        for p in points
+        if p.ratio < 0.0 and abs(p.plateau.torque.value) > _reach(p.plateau.torque.se, zero_nm)
+    ]
+    if against:
+        return [_against_current(against, points)]
+    kinds = {driving: [p for p in points if p.driving is driving] for driving in (True, False)}
+    gaining = {
+        driving: [p for p in own if p.loss_nm < -_reach(p.loss_se, zero_nm)] for driving, own in kinds.items()
+    }
+    # More than half of both: then it is not a scale, which moves eta of both kinds the same way.
+    mirrored = all(2 * len(gaining[driving]) > len(own) for driving, own in kinds.items())
+    found = []
+    if gaining[True]:
+        worst = max(gaining[True], key=lambda p: p.ratio)
+        cause = _MIRRORED if mirrored else _SCALE.format("small", 100.0 * (worst.ratio - 1.0), "much")
+        expected = "at most 1 when driving"
+        found.append(
+            _finding("eta_above_1_driving", gaining[True], kinds[True], worst, expected=expected, cause=cause)
+        )
+    if gaining[False]:
+        worst = min(gaining[False], key=lambda p: p.ratio)
+        cause = _MIRRORED if mirrored else _SCALE.format("large", 100.0 * (1.0 / worst.ratio - 1.0), "little")
+        expected = "at least 1 when back-driven"
+        found.append(
+            _finding(
+                "eta_below_1_back_driven", gaining[False], kinds[False], worst, expected=expected, cause=cause
+            )
+        )
+    return found
+
+
+_MIRRORED: Final = (
+    "swapped sign of the velocity (or of current and torque together), or torque and motor torque exchanged, as eta in "
+    "the wrong convention would be"
+)
+_SCALE: Final = (
+    "G Kt of the joint file is too {} by {:.0f} % or more (gear ratio, torque constant), or the torque channel reads too "
+    "{} (gain, unit)"
+)
+
+
+def written_findings(written: Joint, points: Sequence[EtaPoint], fit: EfficiencyFit) -> list[RunIssue]:
+    """Compare the joint as it will be written, through the estimator's own loss law, with the measured torque.
+
+    The law holds eta outside its range and inside its bounds, so only points in its range are asked. Coefficients
+    of one convention under the name of the other give another torque altogether.
+    """
+    model = LossModel(written)
+    asked = [p for p in points if p.quadrant in fit.quadrants and _in_range(p)]
+    if not asked:
+        return []
+    current, velocity = operating_points(asked)
+    motor = np.array([p.motor_nm for p in asked])
+    measured = np.array([p.plateau.torque.value for p in asked])
+    by_law = motor - model.loss_many(current, velocity)
+    rms_nm = math.sqrt(float(np.mean((by_law - measured) ** 2)))
+    fitted_nm = max(fit.quadrants[p.quadrant].rmse_nm for p in asked)
+    if rms_nm <= 2.0 * fitted_nm + ZERO_SHARE * written.rated_torque_nm:
+        return []
+    convention = "no efficiency" if written.efficiency is None else written.efficiency.convention
+    return [
+        RunIssue(
+            "convention",
+            f"{written.name}: the coefficients under the name '{convention}' miss the measured torque by {rms_nm:.2f} Nm "
+            f"(RMS of {len(asked)} plateaus), expected about {fitted_nm:.2f} Nm as in the fit: wrong convention of eta",
+        )
+    ]
+
+
+def _in_range(point: EtaPoint) -> bool:
+    i, v = abs(point.plateau.current.value), abs(point.plateau.velocity.value)
+    most = DRIVING_CURRENT_MAX_A if point.driving else BACKDRIVING_CURRENT_MAX_A
+    slack = 1e-3  # a commanded 0.2 rad/s may come out as 0.1999
+    return 3.0 * BLEND_CURRENT_A < i <= most and (
+        VELOCITY_RANGE_RAD_S[0] - slack <= v <= VELOCITY_RANGE_RAD_S[1] + slack
+    )
+
+
+def _reach(standard_error_nm: float, zero_nm: float) -> float:
+    return STANDARD_ERRORS * standard_error_nm + zero_nm
+
+
+def _against_current(points: Sequence[EtaPoint], of: Sequence[EtaPoint]) -> RunIssue:
+    worst = max(points, key=lambda p: abs(p.plateau.torque.value))
+    # Losses are positive: with the sign of the swapped channel put right the energy balance comes out so.
+    if_torque = sum(
+        math.copysign(1.0, p.plateau.velocity.value) * (p.motor_nm + p.plateau.torque.value) for p in points
+    )
+    swapped = "torque" if if_torque > 0.0 else "current"
+    cause = f"swapped sign of the {swapped} (then the joint loses energy, as it must)"
+    return _finding("torque_against_current", points, of, worst, expected="a positive eta", cause=cause)
+
+
+def _finding(
+    kind: str,
+    points: Sequence[EtaPoint],
+    of: Sequence[EtaPoint],
+    worst: EtaPoint,
+    *,
+    expected: str,
+    cause: str,
+) -> RunIssue:
+    p = worst.plateau
+    return RunIssue(
+        kind,
+        f"{len(points)} of {len(of)} plateaus: found eta {worst.ratio:.3f} +- {worst.se:.3f} at i = "
+        f"{p.current.value:.2f} A, v = {p.velocity.value:.2f} rad/s ({p.run} at {p.start_s:.1f} s), expected {expected}. "
+        f"Likely: {cause}",
+    )

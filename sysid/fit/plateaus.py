@@ -1,0 +1,257 @@
+"""Plateaus of a run, found by the data alone: where velocity and load had settled, and what they were on average.
+
+Means over whole ripple periods (`ripple_cells`) may be asked whether they agree. The longest stretch of them in which
+velocity, torque and motor torque G Kt i each stay within a band is a plateau; then the longest of what is left, and so
+on. What the ends still carry of the settling is cut off. No marks, no set-points, no threshold on the derivative of
+a noisy signal.
+
+Standard errors are those of means of coloured noise: the standard deviation without the ripple over the square root of
+the effective number of samples, by their autocorrelation. Noise with a memory of a twentieth of the plateau still gets
+an error that is right within a third; at a tenth it is 1.7 times too small, because so slow a noise cannot be told from
+the level. A channel that moves by less than its own resolution is known to resolution/sqrt(12), not better.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.run import JointColumns
+from jtqd.sysid.fit.friction import effective_samples
+from jtqd.sysid.runs.checks import Cells, cut_cells, integral, means_between
+
+RIPPLE_ORDERS: Final = (1.0, 2.0, 4.0)
+"""Orders per motor revolution that are taken out of the samples before their noise is judged."""
+
+
+class PlateauError(ValueError):
+    """A run lacks a column, or nothing in it ever settled; one line with what was found and expected."""
+
+
+@dataclass(frozen=True)
+class PlateauRules:
+    """What counts as settled.
+
+    Attributes:
+        shortest_s, fewest_cells: of a plateau.
+        slowest_rad_s: of a plateau, joint side; below it the Stribeck range begins.
+        cell_s: shortest cell. longest_cell_s: a joint whose ripple period takes longer is too slow to be averaged.
+        ripple_per_motor_rev: ripple periods per motor revolution.
+        velocity_band_rad_s, velocity_band: width of the band of a plateau's velocity, absolute and as a share of it;
+        the wider one counts.
+        load_band, load_band_most: width of the band of torque and motor torque as a share of rated torque. Where
+        the noise from cell to cell is larger the band follows it, up to `load_band_most`.
+    """
+
+    shortest_s: float = 0.5
+    fewest_cells: int = 3
+    slowest_rad_s: float = 0.05
+    cell_s: float = 0.1
+    longest_cell_s: float = 1.0
+    ripple_per_motor_rev: float = 2.0
+    velocity_band_rad_s: float = 0.005
+    velocity_band: float = 0.01
+    load_band: float = 0.01
+    load_band_most: float = 0.05
+
+
+class Mean(NamedTuple):
+    """A mean over a plateau and its standard error."""
+
+    value: float
+    se: float
+
+
+@dataclass(frozen=True)
+class Plateau:
+    """Averages over one settled stretch of one joint.
+
+    velocity [rad/s] joint side, current [A], torque [Nm] as measured; temperature [degC], NaN where not measured.
+    """
+
+    run: str
+    start_s: float
+    end_s: float
+    velocity: Mean
+    current: Mean
+    torque: Mean
+    cells: int
+    temperature_c: float = math.nan
+
+
+def find_plateaus(
+    time_s: FloatArray, run: JointColumns, joint: Joint, name: str = "", rules: PlateauRules | None = None
+) -> list[Plateau]:
+    """Return the plateaus of one joint in one run, in order of time.
+
+    time_s [n] rising; run: current, motor velocity and measured torque [n] are needed (`RunTable.joint` derives a
+    missing velocity); joint: gear ratio, torque constant and rated torque are used. `name` goes into the plateaus.
+
+    Raises:
+        PlateauError: a column is missing, or nothing ever settled.
+    """
+    rules = rules or PlateauRules()
+    current, omega_m, torque = needed_columns(run, name)
+    nm_per_a = joint.gear_ratio * joint.torque_constant_nm_per_a
+    speed = omega_m / joint.gear_ratio
+    cells = cut_cells(
+        time_s,
+        (speed, torque, nm_per_a * current),
+        omega_m,
+        shortest_s=rules.cell_s,
+        longest_s=rules.longest_cell_s,
+        periods_per_motor_rev=rules.ripple_per_motor_rev,
+    )
+    found, longest_s = _stretches(cells, joint.rated_torque_nm, rules)
+    if not found:
+        raise PlateauError(
+            f"{name}: found no settled plateau (longest settled stretch {longest_s:.2f} s), expected velocity and load "
+            f"constant for {rules.shortest_s:g} s while the joint moves at {rules.slowest_rad_s:g} rad/s or more"
+        )
+    angle = integral(time_s, omega_m)
+    plateaus = []
+    for first, last in found:
+        start_s, end_s = float(cells.start_s[first]), float(cells.end_s[last - 1])
+        inside = slice(*np.searchsorted(time_s, (start_s, end_s)).tolist())
+        whole = np.array([start_s]), np.array([end_s])
+        velocity_mean, torque_mean, current_mean = (
+            Mean(
+                float(means_between(time_s, signal, *whole)[0]),
+                standard_error(signal[inside], angle[inside]),
+            )
+            for signal in (speed, torque, current)
+        )
+        warm = math.nan if run.temperature_c is None else float(np.mean(run.temperature_c[inside]))
+        plateaus.append(
+            Plateau(
+                name,
+                start_s,
+                end_s,
+                velocity_mean,
+                current_mean,
+                torque_mean,
+                last - first,
+                temperature_c=warm,
+            )
+        )
+    return plateaus
+
+
+def needed_columns(run: JointColumns, name: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return current, motor velocity and measured torque [n]. Raises PlateauError naming what is missing."""
+    columns = {key: getattr(run, key) for key in ("current_a", "motor_velocity_rad_s", "torque_nm")}
+    missing = [key for key, column in columns.items() if column is None]
+    if missing:
+        raise PlateauError(
+            f"{name}: found no {', '.join(missing)}, expected current, motor velocity and measured torque"
+        )
+    return columns["current_a"], columns["motor_velocity_rad_s"], columns["torque_nm"]
+
+
+def standard_error(samples: FloatArray, motor_angle_rad: FloatArray) -> float:
+    """Return the standard error of the mean of samples [n] over whole ripple periods, under coloured noise.
+
+    motor_angle_rad [n]: for the ripple, which is taken out before the noise is judged.
+    """
+    residual = samples - samples.mean()
+    angles = [order * (motor_angle_rad - motor_angle_rad[0]) for order in RIPPLE_ORDERS]
+    ripple = np.column_stack([f(a) for a in angles for f in (np.cos, np.sin)])
+    residual = residual - ripple @ np.linalg.lstsq(ripple, residual, rcond=None)[0]
+    # the mean is taken from the same samples: of n_eff independent ones n_eff - 1 are left to judge by
+    independent = max(effective_samples(residual) - 1.0, 1.0)
+    return max(float(np.std(residual)) / math.sqrt(independent), _resolution_error(samples))
+
+
+def _resolution_error(samples: FloatArray) -> float:
+    """resolution/sqrt(12) where the signal is too quiet to be dithered over its own steps, else 0."""
+    values = np.unique(samples)
+    if len(values) == 1:
+        return 0.0  # a single value does not show its own resolution
+    step = float(np.min(np.diff(values)))
+    return step / math.sqrt(12.0) if float(np.std(samples)) < 0.5 * step else 0.0
+
+
+def _stretches(cells: Cells, rated_nm: float, rules: PlateauRules) -> tuple[list[tuple[int, int]], float]:
+    """Plateaus as (first, last + 1) of cells, in order of time; and the length [s] of the longest stretch of all."""
+    found: list[tuple[int, int]] = []
+    longest_s = 0.0
+    reach = _reach(cells, _load_bands(cells, rated_nm, rules), rules)
+    todo = [(0, len(cells.means))]
+    while todo:
+        low, high = todo.pop()
+        if low >= high:
+            continue
+        ends = np.minimum(reach[low:high], high)
+        lengths = cells.end_s[ends - 1] - cells.start_s[low:high]
+        lengths[ends <= np.arange(low, high)] = 0.0  # a cell that is no plateau even by itself
+        first = low + int(np.argmax(lengths))
+        last = int(ends[first - low])
+        longest_s = max(longest_s, float(lengths.max()))
+        if float(lengths.max()) < rules.shortest_s:
+            continue
+        todo += [(low, first), (last, high)]
+        first, last = _trimmed(cells.means, first, last, rated_nm)
+        long_enough = cells.end_s[last - 1] - cells.start_s[first] >= rules.shortest_s
+        fast_enough = abs(float(np.mean(cells.means[first:last, 0]))) >= rules.slowest_rad_s
+        if last - first >= rules.fewest_cells and long_enough and fast_enough:
+            found.append((first, last))
+    return sorted(found), longest_s
+
+
+def _load_bands(cells: Cells, rated_nm: float, rules: PlateauRules) -> FloatArray:
+    """Widths [2] of the band in Nm for torque and motor torque: of the rules, or of the noise from cell to cell."""
+    moving = cells.usable & (np.abs(cells.means[:, 0]) >= rules.slowest_rad_s)
+    # Third differences of the cells: a drift and a slow swing leave next to nothing in them, noise sqrt(20) of itself.
+    # The lowest fifth: cells of a transition are no noise, and in a run of short holds they are many.
+    wild = np.abs(np.diff(cells.means[:, 1:], n=3, axis=0))
+    wild = wild[moving[3:] & moving[2:-1] & moving[1:-2] & moving[:-3]]
+    if not len(wild):
+        return np.full(2, rules.load_band * rated_nm)
+    noise = np.quantile(wild, 0.2, axis=0) / (
+        0.2533 * math.sqrt(20.0)
+    )  # 20 % of a normal are within 0.2533 sigma
+    # 8 sigma hold a hundred cells of one plateau
+    result: FloatArray = np.clip(8.0 * noise, rules.load_band * rated_nm, rules.load_band_most * rated_nm)
+    return result
+
+
+def _reach(cells: Cells, load_bands: FloatArray, rules: PlateauRules) -> NDArray[np.intp]:
+    """For each cell k the end (exclusive) of the longest stretch from k on that stays within all bands."""
+    count = len(cells.means)
+    reach = np.arange(count)
+    moving = (cells.usable & (np.abs(cells.means[:, 0]) >= 0.5 * rules.slowest_rad_s)).tolist()
+    rows = cells.means.tolist()
+    torque_band, motor_band = load_bands.tolist()
+    for first in range(count):
+        v_low, t_low, m_low = v_high, t_high, m_high = rows[first]
+        velocity_band = max(rules.velocity_band_rad_s, rules.velocity_band * abs(v_low))
+        last = first
+        while last < count and moving[last]:
+            v, t, m = rows[last]
+            v_low, t_low, m_low = min(v, v_low), min(t, t_low), min(m, m_low)
+            v_high, t_high, m_high = max(v, v_high), max(t, t_high), max(m, m_high)
+            if v_high - v_low > velocity_band or t_high - t_low > torque_band or m_high - m_low > motor_band:
+                break
+            last += 1
+        reach[first] = last
+    return reach
+
+
+def _trimmed(means: FloatArray, first: int, last: int, rated_nm: float) -> tuple[int, int]:
+    """Cut the cells at both ends that differ from the rest by more than its noise: what is left of the settling."""
+    while last - first >= 3:
+        inside = means[first:last]
+        middle = np.median(inside, axis=0)
+        noise = 1.4826 * np.median(np.abs(inside - middle), axis=0)
+        floor = np.array((0.001 * abs(middle[0]), 0.001 * rated_nm, 0.001 * rated_nm))
+        far = np.any(np.abs(inside - middle) > 4.0 * np.maximum(noise, floor), axis=1)
+        if not far[0] and not far[-1]:
+            break
+        first, last = first + int(far[0]), last - int(far[-1])
+    return first, last

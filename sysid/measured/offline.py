@@ -1,0 +1,250 @@
+"""Judge the estimator on measured runs by the arm's own torque sensor, before and after fitting friction.
+
+    python -m jtqd.sysid.measured.offline --out DIR [--json] [--joint-files DIR]
+    python -m jtqd.sysid.measured.offline --bus vcan0|unix:PATH --out DIR [--json]      jtqd itself: see measured.bus
+
+For each joint and each run the estimate is made three times: with the joint file that ships (before), with
+its friction fitted on the OTHER run (after), and with no friction at all, for scale. Nothing but friction
+is fitted, and no run is judged by a fit that has seen it. The reference is the sensor passed through the
+observer's own low-pass, so that the known group delay is not counted as error.
+"""
+
+import argparse
+import datetime as dt
+import json
+import math
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.joint import Friction, Joint
+from jtqd.estimator.run import RunTable, RunTableError
+from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.status import STANDSTILL
+from jtqd.estimator.whole_run import EstimateRun, estimate_run
+from jtqd.models.files import load_joint, shipped
+from jtqd.sysid.figures import draw_each_joint
+from jtqd.sysid.fit.friction import FitError, FrictionFit, fit_friction, low_pass
+from jtqd.sysid.runs.files import ColumnMap, RunError, RunFile, read_run
+
+Array = NDArray[np.float64]
+
+RUNS = ("opti_traj_testing1", "RunTrajectory1")
+JOINTS = (2, 4)
+SETTINGS = EstimatorSettings(method="tob", bandwidth_rad_s=200.0)
+NO_FRICTION = Friction(coulomb_nm=0.0, viscous_nms_per_rad=0.0)
+
+
+@dataclass(frozen=True)
+class Score:
+    """Error of an estimate against the sensor, in Nm, over the rows that have an estimate."""
+
+    rmse_nm: float
+    p95_nm: float
+    max_nm: float
+    rows: int
+
+
+@dataclass(frozen=True)
+class Case:
+    """One joint in one run. Arrays [n]; `reference_nm` is the sensor through the observer's low-pass.
+
+    At standstill the estimate is the middle of an interval as wide as the friction, no more.
+    """
+
+    joint: int
+    run: str
+    fitted_on: str
+    rated_nm: float
+    time_s: Array
+    reference_nm: Array
+    before_nm: Array
+    after_nm: Array
+    standstill: NDArray[np.bool_]
+    no_friction: Score
+    before: Score
+    after: Score
+
+
+def score(estimate_nm: Array, sensor_nm: Array, dt_s: Array, bandwidth_rad_s: float) -> Score:
+    """Compare an estimate [n] with the sensor [n] filtered like it; rows whose estimate is NaN do not count.
+
+    dt_s[k] is the step that ends at row k; dt_s[0] is not used. Raises ValueError without a single estimate.
+    """
+    error = estimate_nm - low_pass(sensor_nm, dt_s, bandwidth_rad_s)
+    size = np.abs(error[np.isfinite(error)])
+    if not len(size):
+        raise ValueError("found no row with an estimate, expected at least one")
+    return Score(
+        math.sqrt(float(np.mean(size**2))), float(np.quantile(size, 0.95)), float(np.max(size)), len(size)
+    )
+
+
+def estimate(joint: Joint, table: RunTable, number: int) -> EstimateRun:
+    """Estimate joint `number` of a run; torque is NaN where none would be published. Raises RunTableError."""
+    dt_s, current, position, velocity, link = table.estimator_inputs(number, joint.gear_ratio)
+    return estimate_run(joint, SETTINGS, None, dt_s, current, position, velocity, link)
+
+
+def fitted_joint(joint: Joint, fit: FrictionFit, file: RunFile, *, number: int, run: str, date: str) -> Joint:
+    """The joint with the fitted friction (four decimals) and where it comes from."""
+    friction: dict[str, float] = {key: round(value, 4) for key, value in asdict(fit.friction).items()}
+    temperature = file.table.joints[number].temperature_c
+    origin: dict[str, object] = {
+        "friction": f"fitted on {run}.csv.gz by jtqd.sysid.measured.offline; nothing else was fitted",
+        "friction_fit": fit.lines(),
+        "log_sha256": file.sha256,
+        "date": date,
+    }
+    if temperature is not None:
+        origin["temperature_c"] = round(float(np.mean(temperature)), 1)
+    return replace(joint, friction=Friction(**friction), provenance={**joint.provenance, **origin})
+
+
+def judge(joint: Joint, after: Joint, table: RunTable, *, number: int, run: str, fitted_on: str) -> Case:
+    """Estimate one joint in one run before and after, and score both."""
+    sensor = table.joints[number].torque_nm
+    if sensor is None:
+        raise RunError(f"{run}: found no usable column j{number}.torque_nm, expected a reference to judge by")
+    dt_s = table.dt_s
+    estimates = [estimate(j, table, number) for j in (replace(joint, friction=NO_FRICTION), joint, after)]
+    none, old, new = (score(e.torque_nm, sensor, dt_s, SETTINGS.bandwidth_rad_s) for e in estimates)
+    return Case(
+        joint=number,
+        run=run,
+        fitted_on=fitted_on,
+        rated_nm=joint.rated_torque_nm,
+        time_s=table.time_s,
+        reference_nm=low_pass(sensor, dt_s, SETTINGS.bandwidth_rad_s),
+        before_nm=estimates[1].torque_nm,
+        after_nm=estimates[2].torque_nm,
+        standstill=estimates[2].status == STANDSTILL,
+        no_friction=none,
+        before=old,
+        after=new,
+    )
+
+
+def evaluate(joint_files: Path | None, date: str) -> tuple[list[Case], dict[tuple[int, str], FrictionFit]]:
+    """All joints and runs, and the fits by (joint, run). Writes the fitted joint files where told."""
+    columns = ColumnMap.load(shipped("kinova_gen3/columns.yaml"))
+    files = {run: read_run(shipped(f"kinova_gen3/{run}.csv.gz"), columns) for run in RUNS}
+    cases: list[Case] = []
+    fits: dict[tuple[int, str], FrictionFit] = {}
+    for number in JOINTS:
+        joint = load_joint(columns.joint_files[number])
+        for run, other in (RUNS, RUNS[::-1]):
+            table = files[other].table
+            fit = fits[number, other] = fit_friction(
+                table.time_s, table.joints[number], joint, bandwidth_rad_s=SETTINGS.bandwidth_rad_s
+            )
+            after = fitted_joint(joint, fit, files[other], number=number, run=other, date=date)
+            cases.append(judge(joint, after, files[run].table, number=number, run=run, fitted_on=other))
+            if joint_files is not None:
+                _save(after, joint_files / f"joint{number}.fitted_on_{other}.yaml")
+    return cases, fits
+
+
+def table_lines(cases: list[Case]) -> list[str]:
+    """RMSE per joint and run in Nm and in percent of rated torque, with what the fit did to it."""
+    lines = [
+        f"{'joint':>5}  {'judged on':<20}{'fitted on':<20}"
+        f"{'no friction':>16}{'before':>16}{'after':>16}  the fit made it"
+    ]
+    for case in cases:
+        cells = "".join(
+            f"{s.rmse_nm:8.3f} ({100.0 * s.rmse_nm / case.rated_nm:4.1f} %)"
+            for s in (case.no_friction, case.before, case.after)
+        )
+        change = case.after.rmse_nm / case.before.rmse_nm - 1.0
+        verdict = f"better by {-100.0 * change:.0f} %" if change < 0.0 else f"WORSE by {100.0 * change:.0f} %"
+        lines.append(f"{case.joint:>5}  {case.run:<20}{case.fitted_on:<20}{cells}  {verdict}")
+    return lines
+
+
+def as_mapping(cases: list[Case], fits: dict[tuple[int, str], FrictionFit]) -> dict[str, object]:
+    """The same for a program: scores per case, terms per fit."""
+    return {
+        "schema": "jtq.measured/1",
+        "cases": [
+            {
+                "joint": case.joint,
+                "run": case.run,
+                "fitted_on": case.fitted_on,
+                "rated_nm": case.rated_nm,
+                "no_friction": asdict(case.no_friction),
+                "before": asdict(case.before),
+                "after": asdict(case.after),
+            }
+            for case in cases
+        ],
+        "fits": [
+            {"joint": joint, "run": run, "friction": asdict(fit.friction), "report": fit.lines()}
+            for (joint, run), fit in fits.items()
+        ],
+    }
+
+
+def _save(joint: Joint, path: Path) -> None:
+    text = yaml.safe_dump(joint.to_mapping(), sort_keys=False, width=120)
+    path.write_text(
+        f"# Made by python -m jtqd.sysid.measured.offline: the shipped joint file with another friction.\n{text}"
+    )
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line; results on stdout, log on stderr. Exit status 0 done, 1 failure, 2 usage."""
+    parser = argparse.ArgumentParser(
+        prog="jtq measured",
+        description="Score the torque observer on the Kinova Gen3 runs, before and after fitting friction.",
+        epilog="examples:\n  jtq measured --out measured\n  jtq measured --bus unix:/tmp/bus --out measured",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--bus", help="play the runs on this bus (vcan0, unix:PATH) and score what jtqd publishes there"
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, help="folder for measured_joint2.png and measured_joint4.png"
+    )
+    parser.add_argument("--json", action="store_true", help="print the results as JSON")
+    parser.add_argument(
+        "--joint-files", type=Path, help="folder for the fitted joint files (default: the --out folder)"
+    )
+    options = parser.parse_args(arguments)
+    if options.bus is not None:
+        if options.joint_files is not None:
+            parser.error("--joint-files: nothing is fitted with --bus")
+        from jtqd.sysid.measured import bus as measured_bus
+
+        return measured_bus.run(options.bus, options.out, options.json)
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+        cases, fits = evaluate(options.joint_files or options.out, dt.date.today().isoformat())
+        draw_each_joint(JOINTS, cases, options.out / "measured_joint{}.png", _draw_joint)
+        if options.json:
+            print(json.dumps(as_mapping(cases, fits), indent=1))
+        else:
+            print("RMSE of the estimate against the arm's torque sensor, Nm (percent of rated torque)")
+            print("\n".join(table_lines(cases)))
+            for (joint, run), fit in fits.items():
+                print(f"\njoint {joint}, friction fitted on {run}:", *fit.lines(), sep="\n  ")
+    except (RunError, RunTableError, ConfigError, FitError, OSError) as error:
+        print(f"measured: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _draw_joint() -> Callable[[Sequence[Case], Path], None]:
+    from jtqd.sysid.measured.figures import draw_joint
+
+    return draw_joint
+
+
+if __name__ == "__main__":
+    sys.exit(main())

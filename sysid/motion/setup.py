@@ -1,0 +1,428 @@
+"""All devices of the bench made ready for the motion, and put back after it, over a frame socket of its own."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from jtqd.drivers.boot_procedure import BusSettings, NodeBoot
+from jtqd.drivers.devices import (
+    COMMANDER_NODE,
+    JTQD_NODE,
+    SYNC_COB_ID,
+    DriveProfile,
+    DriveScaling,
+    SensorProfile,
+    SensorScaling,
+    drive_rpdo1,
+    drive_rpdo2,
+)
+from jtqd.drivers.filters import exact
+from jtqd.drivers.frame import FRAME, FRAME_SIZE, pack
+from jtqd.drivers.frame_socket import BusError, open_frame_socket
+from jtqd.drivers.pdo import CAN_ID, INVALID, PdoMap, split_word
+from jtqd.drivers.sdo import (
+    NO_OBJECT,
+    NO_SUBINDEX,
+    BootError,
+    FrameSdo,
+    SdoAbort,
+    SdoAccess,
+    SdoSilence,
+    label,
+    mismatch,
+    no_answer,
+    refused,
+)
+from jtqd.sysid.motion.cia402 import (
+    CST,
+    CSV,
+    DISABLE_VOLTAGE,
+    FAULT_RESET,
+    FAULTED,
+    POWERED,
+    QUICK_STOP_WORD,
+    describe,
+    state_of,
+)
+from jtqd.sysid.motion.setpoints import Limits, MotionError, Setpoints, Timing
+
+# SDO of one node with the node's name on everything that goes wrong. No bus, no clock.
+
+
+Key = tuple[int, int]
+
+
+class NamedSdo:
+    """SDO with the node's name on what goes wrong."""
+
+    def __init__(self, access: SdoAccess, node: int) -> None:
+        self._access, self.node = access, node
+
+    def number(self, key: Key, signed: bool = False) -> int:
+        """Upload. Raises BootError."""
+        found = self.optional(key, signed)
+        if found is None:
+            raise BootError(self.node, label(*key), detail=f"{label(*key)}: no such object in this device")
+        return found
+
+    def optional(self, key: Key, signed: bool = False) -> int | None:
+        """None when the device does not have the object."""
+        try:
+            return int.from_bytes(self._access.read(*key), "little", signed=signed)
+        except SdoSilence as silence:
+            raise no_answer(self.node, key, silence.waited_s, "") from silence
+        except SdoAbort as abort:
+            if abort.code in (NO_OBJECT, NO_SUBINDEX):
+                return None
+            raise refused(self.node, key, "read", abort.code) from abort
+
+    def write(self, key: Key, value: int, size: int) -> None:
+        """Download. Raises BootError."""
+        value &= (1 << 8 * size) - 1
+        try:
+            self._access.write(*key, value.to_bytes(size, "little"))
+        except SdoSilence as silence:
+            raise no_answer(self.node, key, silence.waited_s, "") from silence
+        except SdoAbort as abort:
+            raise refused(self.node, key, f"write of 0x{value:0{2 * size}X}", abort.code) from abort
+
+    def put(self, key: Key, value: int, size: int, signed: bool = False) -> None:
+        """Download and compare."""
+        self.write(key, value, size)
+        self.require(key, value, signed)
+
+    def require(self, key: Key, value: int, signed: bool = False) -> None:
+        """BootError unless the object holds `value`."""
+        found = self.number(key, signed)
+        if found != value:
+            raise mismatch(self.node, key, "read back", expected=f"0x{value:X}", found=f"0x{found:X}")
+
+
+# A drive made ready for the motion, and put back after it, by SDO. Written against `SdoAccess`: no bus, no clock.
+#
+# jtqd has booted the node: TPDOs, heartbeat and the watch over jtqd (1016h:1) are there. Here come mode of operation,
+# interpolation time, temperature (TPDO3) and the watch over the commander (1016h:2). What is written is read back. Every
+# failure is a BootError: one line with node, object, expected and found.
+
+
+INTERPOLATION_MS: Final = 2
+"""60C2h: each drive gets every second set-point."""
+TEMPERATURE_TPDO: Final = 0x380
+"""COB-ID of TPDO3, plus the node number: joint temperature, I16, 0.1 °C."""
+_POLL_S, _POLLS = 0.005, 200
+_STATUSWORD: Final = (0x6041, 0)
+
+Sleep = Callable[[float], None]
+
+
+@dataclass(frozen=True, slots=True)
+class DriveUnits:
+    """What the commander must know of a drive: identifiers and factors to SI, as the drive itself told them.
+
+    Attributes:
+        node: node number; also the number of the joint.
+        mode: 9 (csv) or 10 (cst).
+        gear_ratio: 6091h.
+        scaling: factors of 6064h, 606Ch, 60E4h:1 and 6078h.
+        heartbeat_ms: 1017h.
+        temperature: True when TPDO3 (380h+n) brings the temperature in 0.1 °C.
+    """
+
+    node: int
+    mode: int
+    gear_ratio: float
+    scaling: DriveScaling
+    heartbeat_ms: int
+    temperature: bool
+
+    def velocity_units(self, velocity_rad_s: float) -> int:
+        """60FFh of a joint side velocity: it counts as 606Ch does, on the motor side."""
+        return round(velocity_rad_s * self.gear_ratio / self.scaling.motor_rad_s_per_unit)
+
+    def current_units(self, current_a: float) -> int:
+        """6071h of a motor current.
+
+        6071h is in 1/1000 of rated torque (6076h). The drive's own torque constant is 6076h / 6075h, so the torque of the
+        current i is i * 6076h / 6075h, and 6071h becomes 1000 i / 6075h: the rated torque cancels.
+        """
+        return round(current_a / self.scaling.ampere_per_unit)
+
+
+@dataclass(frozen=True, slots=True)
+class SensorUnits:
+    """Node of the torque sensor, Nm per unit of each channel in use, and its heartbeat (1017h)."""
+
+    node: int
+    nm_per_unit: tuple[float, ...]
+    heartbeat_ms: int
+
+
+def quick_stop(access: SdoAccess, node: int) -> None:
+    """Let the drive brake by itself if it is powered; does not wait. Raises BootError."""
+    drive = NamedSdo(access, node)
+    if not _off(drive.number(_STATUSWORD)):
+        drive.write((0x6040, 0), QUICK_STOP_WORD, 2)
+
+
+def switch_off(access: SdoAccess, node: int, sleep: Sleep) -> None:
+    """Bring the drive to a stop if it is powered, and take the power off; returns when it says so.
+
+    Raises BootError when the drive is still powered a second later.
+    """
+    drive = NamedSdo(access, node)
+    if not _off(drive.number(_STATUSWORD)):
+        quick_stop(access, node)
+        _wait(drive, _STATUSWORD, _off, sleep)  # with the option codes 5 to 8 (605Ah) it stays there
+    drive.write((0x6040, 0), DISABLE_VOLTAGE, 2)
+    word = _wait(drive, _STATUSWORD, _off, sleep)
+    if not _off(word):
+        raise BootError(node, "6041h:0", detail=f"6041h:0: expected disabled, found {describe(word)}")
+
+
+def reset_fault(access: SdoAccess, node: int, sleep: Sleep) -> str | None:
+    """Reset a fault by a rising edge of bit 7 (transition 15); says which (603Fh), None when there was none.
+
+    Raises BootError when the fault stays.
+    """
+    drive = NamedSdo(access, node)
+    word = drive.number(_STATUSWORD)
+    if state_of(word) not in FAULTED:
+        return None
+    code = drive.optional((0x603F, 0))
+    fault = "fault" if code is None else f"fault {code:04X}h"
+    for command in (DISABLE_VOLTAGE, FAULT_RESET, DISABLE_VOLTAGE):
+        drive.write((0x6040, 0), command, 2)
+    word = _wait(drive, _STATUSWORD, lambda word: state_of(word) not in FAULTED, sleep)
+    if state_of(word) in FAULTED:
+        raise BootError(node, "6041h:0", detail=f"{fault} cannot be reset: {describe(word)}")
+    return fault
+
+
+def set_up(
+    access: SdoAccess, profile: DriveProfile, mode: int, timeout_ms: int, sleep: Sleep, *, temperature: bool
+) -> DriveUnits:
+    """Mode, targets at zero, 60C2h, TPDO3 if `temperature` is wanted, and last the watch over the commander.
+
+    The drive must be off (`switch_off`, `reset_fault`). Raises BootError.
+    """
+    node = profile.node_id
+    drive = NamedSdo(access, node)
+    boot = NodeBoot(access, profile, BusSettings(master_node=JTQD_NODE))
+    boot.check_device_type()
+    boot.check_identity()
+    scaling, gear_ratio = boot.read_scaling()
+    assert isinstance(scaling, DriveScaling)
+    assert gear_ratio is not None
+    if drive.number((0x6076, 0)) < 1:
+        raise mismatch(node, (0x6076, 0), "motor rated torque in mNm", expected="1..", found="0")
+    heartbeat_ms = _heartbeat(drive)
+    for communication, pdo in ((0x1400, drive_rpdo1(node)), (0x1401, drive_rpdo2(node))):
+        _require_rpdo(drive, communication, pdo)
+    drive.put((0x60FF, 0), 0, 4)
+    drive.put((0x6071, 0), 0, 2)
+    drive.write((0x6060, 0), mode, 1)
+    found = _wait(drive, (0x6061, 0), lambda display: display == mode, sleep)
+    if found != mode:
+        raise mismatch(node, (0x6061, 0), "mode of operation display", expected=str(mode), found=str(found))
+    drive.put((0x60C2, 1), INTERPOLATION_MS, 1)
+    drive.put((0x60C2, 2), -3, 1, signed=True)
+    if temperature:
+        _switch_on_temperature(drive)
+    drive.put((0x1016, 2), COMMANDER_NODE << 16 | timeout_ms, 4)
+    return DriveUnits(node, mode, gear_ratio, scaling, heartbeat_ms, temperature)
+
+
+def sensor_units(access: SdoAccess, profile: SensorProfile) -> SensorUnits:
+    """Read what the sensor says about itself. Raises BootError."""
+    boot = NodeBoot(access, profile, BusSettings(master_node=JTQD_NODE))
+    boot.check_device_type()
+    boot.check_identity()
+    scaling, _ = boot.read_scaling()
+    assert isinstance(scaling, SensorScaling)
+    factors = tuple(scaling.nm_per_unit[channel] for channel in profile.channels)
+    return SensorUnits(profile.node_id, factors, _heartbeat(NamedSdo(access, profile.node_id)))
+
+
+def release(access: SdoAccess, node: int, sleep: Sleep) -> None:
+    """After the motion: the drive is off, its targets are zero, and it watches the commander no longer.
+
+    Raises BootError: it did not answer, or is still powered.
+    """
+    switch_off(access, node, sleep)
+    drive = NamedSdo(access, node)
+    drive.put((0x1016, 2), 0, 4)
+    drive.put((0x60FF, 0), 0, 4)
+    drive.put((0x6071, 0), 0, 2)
+
+
+def _wait(drive: NamedSdo, key: Key, wanted: Callable[[int], bool], sleep: Sleep) -> int:
+    """Read `key` until it is as wanted, for a second at most; what it is then."""
+    found = drive.number(key)
+    for _ in range(_POLLS):
+        if wanted(found):
+            break
+        sleep(_POLL_S)
+        found = drive.number(key)
+    return found
+
+
+def _off(statusword: int) -> bool:
+    return state_of(statusword) not in POWERED
+
+
+def _heartbeat(node: NamedSdo) -> int:
+    """1017h: the loss of a node must be noticed."""
+    period_ms = node.number((0x1017, 0))
+    if not period_ms:
+        key = (0x1017, 0)
+        raise mismatch(node.node, key, "producer heartbeat time in ms", expected="1..", found="0")
+    return period_ms
+
+
+def _require_rpdo(drive: NamedSdo, communication: int, pdo: PdoMap) -> None:
+    """An RPDO must be mapped as the commander sends it: its mapping cannot be changed while the node is operational."""
+    cob_id = drive.number((communication, 1))
+    if cob_id & (INVALID | CAN_ID) != pdo.cob_id:
+        key = (communication, 1)
+        raise mismatch(
+            drive.node, key, "COB-ID of RPDO", expected=f"{pdo.cob_id:X}h", found=f"0x{cob_id:08X}"
+        )
+    mapping = communication + 0x200
+    count = drive.number((mapping, 0))
+    words = tuple(drive.number((mapping, entry)) for entry in range(1, count + 1))
+    if words != pdo.words:
+        wanted, found = (" ".join(f"{word:08X}" for word in each) for each in (pdo.words, words))
+        raise mismatch(drive.node, (mapping, 1), "mapping of RPDO", expected=wanted, found=found or "nothing")
+
+
+def _switch_on_temperature(drive: NamedSdo) -> None:
+    """TPDO3 must carry one 16-bit number first; jtqd's boot may have switched it off."""
+    cob_id, count = drive.optional((0x1802, 1)), drive.optional((0x1A02, 0))
+    word = drive.optional((0x1A02, 1)) if count else None
+    if cob_id is None or word is None or split_word(word)[2] != 16:
+        detail = "no TPDO3 with a temperature of 16 bits (1A02h:1): the limit of temperature cannot be kept"
+        raise BootError(drive.node, "1A02h:1", detail=detail)
+    wanted = TEMPERATURE_TPDO + drive.node
+    if cob_id & CAN_ID != wanted:
+        raise mismatch(
+            drive.node, (0x1802, 1), "COB-ID of TPDO3", expected=f"{wanted:X}h", found=f"0x{cob_id:08X}"
+        )
+    if cob_id & INVALID:
+        drive.put((0x1802, 1), cob_id & ~INVALID, 4)
+
+
+_HEARTBEAT = pack(0x700 + COMMANDER_NODE, b"\x05")
+
+
+class BenchSetup:
+    """SDO to both drives and the sensor. Raises BusError when the bus cannot be opened."""
+
+    def __init__(
+        self,
+        bus: str,
+        drives: tuple[DriveProfile, DriveProfile],
+        sensor: SensorProfile | None,
+        timing: Timing,
+    ) -> None:
+        nodes = [profile.node_id for profile in (*drives, sensor) if profile is not None]
+        self._socket = open_frame_socket(bus, [exact(SYNC_COB_ID), exact(0x700 + COMMANDER_NODE)])
+        self._drives, self._sensor, self._timing = drives, sensor, timing
+        self._beating = False
+        self._access = {node: FrameSdo(self._socket, node) for node in nodes}
+
+    def prepare(
+        self, setpoints: Setpoints, limits: Limits
+    ) -> tuple[tuple[DriveUnits, DriveUnits], SensorUnits | None]:
+        """Both drives off and free of faults, modes set, targets zero, watching our heartbeat; their units and the sensor's.
+
+        Raises MotionError; what was set is put back then. A second commander is noticed before anything is touched.
+        """
+        try:
+            self._require_company()
+        except BusError as error:
+            raise MotionError(str(error)) from None
+        try:
+            return self._prepare(setpoints, limits)
+        except (BootError, BusError) as error:
+            self.release(beating=False)
+            raise MotionError(str(error)) from None
+
+    def _require_company(self) -> None:
+        """jtqd's SYNC is there, and no other commander: for two periods of our own heartbeat nobody else sends it."""
+        socket, frames = self._socket, self._socket.frames
+        heard = set()
+        end_s = time.monotonic() + 2.0 * self._timing.own_heartbeat_s
+        while (left_s := end_s - time.monotonic()) > 0.0:
+            time.sleep(left_s)
+            while count := socket.receive():
+                heard |= {FRAME.unpack_from(frames, FRAME_SIZE * position)[0] for position in range(count)}
+        if 0x700 + COMMANDER_NODE in heard:
+            raise MotionError(f"another commander is on the bus (node {COMMANDER_NODE:02X}h): end it first")
+        if SYNC_COB_ID not in heard:
+            raise MotionError(f"no SYNC on {socket.bus}: jtqd must run on this bus")
+        socket.set_filters([exact(0x580 + node) for node in self._access])
+
+    def _prepare(
+        self, setpoints: Setpoints, limits: Limits
+    ) -> tuple[tuple[DriveUnits, DriveUnits], SensorUnits | None]:
+        access = self._access
+        for profile in self._drives:
+            quick_stop(access[profile.node_id], profile.node_id)
+        for profile in self._drives:
+            switch_off(access[profile.node_id], profile.node_id, time.sleep)
+            fault = reset_fault(access[profile.node_id], profile.node_id, time.sleep)
+            if fault is not None:
+                logging.getLogger(__name__).warning("node %d: %s was reset", profile.node_id, fault)
+        units = [
+            set_up(
+                access[profile.node_id],
+                profile,
+                CSV if joint == setpoints.velocity_joint else CST,
+                round(self._timing.drive_timeout_s * 1e3),
+                time.sleep,
+                temperature=math.isfinite(limits.temperature_c),
+            )
+            for joint, profile in enumerate(self._drives, 1)
+        ]
+        sensor = self._sensor
+        found = None if sensor is None else sensor_units(access[sensor.node_id], sensor)
+        return (units[0], units[1]), found
+
+    def release(self, *, beating: bool) -> str:
+        """Both drives off for certain, targets zero, no longer watching us; "" or what could not be done, in one line.
+
+        `beating`: our heartbeat has been heard, so it goes on until nobody watches it any more.
+        """
+        self._beating = beating
+        problems = []
+        for step in (self._quick_stop, self._release):
+            for profile in self._drives:
+                try:
+                    self._beat()
+                    step(profile.node_id)
+                except (BootError, BusError) as error:
+                    problems.append(str(error))
+        return "; ".join(dict.fromkeys(problems))
+
+    def _quick_stop(self, node: int) -> None:
+        quick_stop(self._access[node], node)
+
+    def _release(self, node: int) -> None:
+        release(self._access[node], node, self._sleep)
+
+    def _sleep(self, duration_s: float) -> None:
+        self._beat()
+        time.sleep(duration_s)
+
+    def _beat(self) -> None:
+        if self._beating:
+            self._socket.send(_HEARTBEAT)
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._socket.close()

@@ -1,0 +1,97 @@
+"""`jtq plot`: a log as a picture: estimate with its standard deviation beside the sensor, and their difference."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from jtqd.daemon.logs.errors import LogError
+from jtqd.daemon.logs.reader import read_topic
+from jtqd.daemon.logs.rows import Records
+from jtqd.estimator.status import DEGRADED, NAMES, STANDSTILL, VALID
+from jtqd.sysid.figures import shade
+
+_SHADES = {STANDSTILL: "#dcecf2", DEGRADED: "#fbe8c8"}
+_OTHER = "#f3d6d6"
+
+
+def main(argv: list[str]) -> int:
+    """Draw one joint of a log; exit status 0 done, 1 failure, 2 usage."""
+    parser = argparse.ArgumentParser(
+        prog="jtq plot",
+        description="Draw the estimate of one joint beside the torque sensor from a log of jtqd.",
+        epilog="example: jtq plot logs/jtqd-sim-20261121T080000Z.mcap --joint 1 --out joint1.png",
+    )
+    parser.add_argument("log", type=Path, help="MCAP file of jtqd")
+    parser.add_argument("--joint", type=int, choices=(1, 2), default=1)
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="FILE", help="picture to write (png, svg, pdf)"
+    )
+    parser.add_argument("--json", action="store_true", help="print the path and the RMSE as JSON")
+    arguments = parser.parse_args(argv)
+    joint = arguments.joint
+    try:
+        rmse = draw(read_topic(arguments.log, f"/joint/{joint}/state"), joint, arguments.out)
+    except ImportError:
+        print("jtq plot: matplotlib is not installed: pip install matplotlib", file=sys.stderr)
+        return 1
+    except (LogError, OSError, ValueError) as error:
+        text = (
+            f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else error
+        )
+        print(f"jtq plot: {text}", file=sys.stderr)
+        return 1
+    if arguments.json:
+        shown = None if math.isnan(rmse) else rmse
+        print(json.dumps({"paths": [str(arguments.out)], "rmse_nm": {f"joint_{joint}": shown}}))
+    else:
+        print(arguments.out)
+    return 0
+
+
+def draw(log: Records, joint: int, path: Path) -> float:
+    """Two panels over time: torque and sensor, then their difference; shaded where the status is not valid.
+
+    Returns:
+        The RMSE in the title [Nm], over what was published while the joint moved and the sensor was valid; NaN without any.
+    """
+    import matplotlib as mpl
+
+    mpl.use("Agg")  # files only; a display is not needed
+    from matplotlib import pyplot as plt
+
+    time_s = (log["sync_monotonic_ns"] - log["sync_monotonic_ns"][0]) * 1e-9
+    status = log["status"]
+    published = np.isin(status, (VALID, DEGRADED, STANDSTILL))
+    torque = np.where(published, log["torque_nm"], np.nan)
+    sigma, sensor = log["sigma_nm"], log["sensor_torque_nm"]
+    figure, (above, below) = plt.subplots(2, 1, figsize=(10, 5.2), sharex=True, height_ratios=(3, 1.3))
+    above.fill_between(
+        time_s, torque - sigma, torque + sigma, color="#9ec5e8", linewidth=0, label="estimate ± sigma"
+    )
+    above.plot(time_s, sensor, color="#222222", linewidth=1.0, label="torque sensor")
+    above.plot(time_s, torque, color="#1f6fb4", linewidth=0.8, label="estimate")
+    moving = np.isin(status, (VALID, DEGRADED))
+    error = np.where(moving, torque - sensor, np.nan)
+    below.plot(time_s, error, color="#b4431f", linewidth=0.6)
+    below.axhline(0.0, color="#222222", linewidth=0.6)
+    rmse = float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else float("nan")
+    above.set_title(f"joint {joint}: estimate and sensor, RMSE {rmse:.2f} Nm where it moves", fontsize=10)
+    above.set_ylabel("joint torque [Nm]")
+    below.set_ylabel("difference [Nm]")
+    below.set_xlabel("time [s]")
+    for axis in (above, below):
+        axis.margins(x=0)
+        for code in np.unique(status[status != VALID]):
+            label = NAMES.get(int(code), str(code)) if axis is above else None
+            shade(axis, time_s, status == code, _SHADES.get(int(code), _OTHER), label)
+    above.legend(loc="upper right", fontsize=8, ncols=3)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    return rmse

@@ -1,0 +1,195 @@
+"""`jtq reproduce`: the paper's whole procedure and ours from nothing: campaigns, fits, training, evaluation, report.
+
+Every step is a `jtq` command of its own, printed before it runs, so that it can be repeated alone. Campaigns go on where
+they were interrupted; fits and training give the same files from the same runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import yaml
+
+from jtqd.estimator.checked import natural
+from jtqd.models.files import shipped
+from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Plan
+from jtqd.sysid.campaign.plans import outside_runs
+from jtqd.sysid.campaign.state import DONE, STATE_FILE
+
+_OUTSIDE_PLANT: Final = "campaign_plant_outside.yaml"
+_FINDINGS: Final = 3
+_OTHER_DAYS: Final = 7
+"""Added to the seed: days and trajectories that no campaign has."""
+TRAINED: Final = "trained"
+"""Folder in models/ with what this command has made; beside the configuration in a directory of its own."""
+_EXAMPLES: Final = """examples:
+  jtq reproduce --out reproduction            everything, about 85 minutes of which the bench moves 41
+  jtq reproduce --out /tmp/quick --quick      the same steps in a few minutes; too few runs for good figures"""
+
+
+class Step(NamedTuple):
+    """A command of the toolbox, and whether findings (exit status 3) are a result to go on with."""
+
+    arguments: tuple[str, ...]
+    findings_are_fine: bool = False
+    module: str = "jtqd.daemon.jtq"
+
+    @property
+    def text(self) -> str:
+        """The command as one would type it."""
+        name = "jtq" if self.module == "jtqd.daemon.jtq" else f"python -m {self.module}"
+        return " ".join((name, *self.arguments))
+
+
+def main(argv: list[str]) -> int:
+    """Run all steps; exit status 0 done, 1 a step failed, 2 usage, 3 done with findings."""
+    options = _parser().parse_args(argv)
+    out: Path = options.out
+    worst = 0
+    try:
+        (out / "models").mkdir(parents=True, exist_ok=True)
+        _write_outside_plan(out / "outside.plan.yaml", options.seed, 2 if options.quick else 6)
+        for step in steps(out, options.bus, options.quick, options.seed):
+            print(f"$ {step.text}", file=sys.stderr, flush=True)
+            status = _run(step)
+            if status and not (status == _FINDINGS and step.findings_are_fine):
+                name = " ".join(step.text.split()[: 2 if step.module == "jtqd.daemon.jtq" else 3])
+                print(f"jtq reproduce: {name} ended with status {status}", file=sys.stderr)
+                return 1
+            worst = max(worst, status)
+            if step.arguments[0] == "train" and "ours" in step.arguments:
+                for name in ("bench.yaml", "bench_paper.yaml"):
+                    write_config(out / "models" / name, name)
+    except OSError as error:
+        print(f"jtq reproduce: {error.filename or out}: {error.strerror or error}", file=sys.stderr)
+        return 1
+    print(
+        f"report: {out / 'report' / 'evaluation.html'}, of many days {out / 'report_days' / 'evaluation.html'}\n"
+        f"configuration for jtqd: {out / 'models' / 'bench.yaml'}"
+    )
+    return worst
+
+
+def _run(step: Step) -> int:
+    """Run a step; a campaign that ended early goes on for as long as each attempt gets at least one more run done."""
+    done = -1
+    while True:
+        status = subprocess.run([sys.executable, "-m", step.module, *step.arguments], check=False).returncode
+        if status != 1 or step.arguments[0] != "campaign":
+            return status
+        now = _runs_done(Path(step.arguments[step.arguments.index("--out") + 1]))
+        if now <= done:
+            return status
+        done = now
+        print(f"jtq reproduce: {now} runs are done, the campaign goes on", file=sys.stderr, flush=True)
+
+
+def _runs_done(campaign: Path) -> int:
+    """Return how many runs of a campaign are done; -1 where no campaign was begun."""
+    try:
+        runs = json.loads((campaign / STATE_FILE).read_text(encoding="utf-8"))["runs"]
+    except (OSError, ValueError, KeyError):
+        return -1
+    return sum(run["status"] == DONE for run in runs)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="jtq reproduce",
+        description="Campaigns, fits, training and evaluation on the emulated bench, over the bus, from nothing.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="everything goes there; made if missing"
+    )
+    parser.add_argument(
+        "--bus",
+        default="sim",
+        metavar="BUS",
+        help="sim, or sim:vcan0: the emulated bench on SocketCAN (default sim)",
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="small campaigns and short training: a test of the steps"
+    )
+    parser.add_argument(
+        "--seed", type=natural, default=0, help="of trajectories, days and weights (default 0)"
+    )
+    return parser
+
+
+def steps(out: Path, bus: str, quick: bool, seed: int) -> Iterator[Step]:
+    """Yield the commands in their order."""
+    runs, models, work = out / "campaigns", out / "models", out / "work"
+    work.mkdir(exist_ok=True)
+    common = ("--bus", bus, "--seed", str(seed))
+    sizes = {
+        "efficiency": ("--quick",) if quick else ("--hold", "1.2"),
+        "excitation": ("--runs", "8", "--seconds", "10", "--evaluations", "160")
+        if quick
+        else ("--runs", "96", "--seconds", "12", "--evaluations", "400"),
+        "validate": ("--runs", "4", "--seconds", "6", "--hold", "1.0")
+        if quick
+        else ("--runs", "96", "--seconds", "8", "--hold", "1.6"),
+    }
+    for kind in ("excitation", "efficiency"):
+        yield Step(("campaign", kind, *common, "--out", str(runs / kind), *sizes[kind]), True)
+    for n in ("1", "2"):
+        first, fitted, last = shipped(f"joint{n}.yaml"), work / f"joint{n}.yaml", models / f"joint{n}.yaml"
+        number = ("--number", n)
+        yield Step(("fit", "efficiency", str(runs / "efficiency"), "--joint", str(first), *number, "--out", str(fitted),
+                    "--plot", str(out / f"efficiency_joint{n}.png")))  # fmt: skip
+        yield Step(
+            ("fit", "losses", str(runs / "excitation"), "--joint", str(fitted), *number, "--out", str(last))
+        )
+    joints = ("--joint", str(models / "joint1.yaml"), "--joint", str(models / "joint2.yaml"))
+    short = ("--iterations", "60") if quick else ()
+    for network in ("paper", "ours"):
+        yield Step(
+            ("train", str(runs / "excitation"), *joints, "--network", network, "--seed", str(seed),
+             "--out", str(models), *short)
+        )  # fmt: skip
+    yield Step(("campaign", "validate", *common, "--out", str(runs / "validate"), *sizes["validate"]), True)
+    plan, plant = str(out / "outside.plan.yaml"), str(shipped(_OUTSIDE_PLANT))
+    yield Step(("campaign", plan, *common, "--plant", plant, "--out", str(runs / "outside")), True)
+    yield Step(
+        ("evaluate", str(runs / "validate"), "--outside", str(runs / "outside"), "--models", str(models),
+         "--out", str(out / "report")),
+        True,
+    )  # fmt: skip
+    # How often an interval covers takes more days than a bus has time for.
+    days = ("2", "6", "1.0") if quick else ("384", "8", "1.6")
+    size = tuple(x for pair in zip(("--runs", "--seconds", "--hold"), days, strict=True) for x in pair)
+    other = ("--seed", str(seed + _OTHER_DAYS))
+    yield Step(("--out", str(out / "days"), *size, *other), module="jtqd.sysid.campaign.emulated")
+    yield Step(
+        ("evaluate", str(out / "days"), "--models", str(models), "--out", str(out / "report_days")), True
+    )
+
+
+def _write_outside_plan(path: Path, seed: int, count: int) -> None:
+    """Write the plan of runs with half as much load again as any that is trained on."""
+    limits = replace(DEFAULT_LIMITS, current_a=16.0, torque_nm=90.0)
+    plan = Plan("outside", limits, outside_runs(limits, count, 9.0, seed=seed))
+    path.write_text(yaml.safe_dump(plan.to_mapping(), sort_keys=False, width=140), encoding="utf-8")
+
+
+def write_config(path: Path, name: str) -> None:
+    """Write a shipped configuration beside the models that are there, with their hashes."""
+    text = shipped(name).read_text(encoding="utf-8").replace(f" {TRAINED}/", " ")
+
+    def renewed(match: re.Match[str]) -> str:
+        digest = hashlib.sha256((path.parent / match[2]).read_bytes()).hexdigest()
+        return f"{match[1]}{match[2]}{match[3]}{digest}"
+
+    text = re.sub(r"(network:\s*\n\s+file: )(\S+)(\s*\n\s+sha256: )[0-9a-f]{64}", renewed, text)
+    path.write_text(text, encoding="utf-8")

@@ -1,0 +1,163 @@
+"""Time base of a run for a diagnosis: rate, unevenness, positions that roll over, skew between channels. Pure."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
+from jtqd.sysid.runs.checks import MOVING_RAD_S
+
+SLOWEST_HZ: Final = 50.0
+"""Below it accelerations and reversals are not in the data; ripple of slow motion folds."""
+UNEVEN: Final = 0.3
+"""A step this part off the median is an uneven one: jitter of a stamp is less, a lost row more."""
+SKEW_NOTED_S: Final = 0.02
+"""Less is the matter of the effect channel_delay."""
+SKEW_REFUSED_S: Final = 0.1
+_SKEW_LONGEST_S: Final = 0.6
+_SKEW_STEP_S: Final = 0.005
+_SKEW_GAIN: Final = 0.3
+"""Part of the residual energy that a shift must take away to be believed."""
+_POSITIONS: Final = ("motor_position_rad", "link_position_rad")
+
+
+def rate_problem(time_s: FloatArray, where: str) -> str | None:
+    """One line when the run is sampled too slowly for a diagnosis."""
+    step = float(np.median(np.diff(time_s)))
+    if 1.0 / step >= SLOWEST_HZ:
+        return None
+    guess = ", or time in milliseconds" if step >= 0.5 else ""
+    return (
+        f"{where}: time_s: found {1.0 / step:.4g} Hz (steps of {step:.4g} s), expected at least {SLOWEST_HZ:g} Hz: "
+        f"recorded too slowly for friction and ripple{guess}"
+    )
+
+
+def evened(table: RunTable, where: str) -> tuple[RunTable, list[str]]:
+    """Return the run on equal steps (the median's) where its own are uneven, and a note of it.
+
+    Values between two rows lie on a cubic through both with the slopes of a parabola through three rows: on straight lines
+    every missing cycle would leave two blows in the acceleration. A run whose steps are equal but for jitter is returned
+    as it is.
+    """
+    steps = np.diff(table.time_s)
+    median = float(np.median(steps))
+    uneven = int(np.count_nonzero(np.abs(steps - median) > UNEVEN * median))
+    if not uneven:
+        return table, []
+    grid = np.arange(table.time_s[0], table.time_s[-1] + 1e-9, median)
+
+    def on_grid(column: FloatArray | None) -> FloatArray | None:
+        return None if column is None else _cubic(grid, table.time_s, column)
+
+    joints = {
+        number: JointColumns(**{name: on_grid(getattr(columns, name)) for name in COLUMN_NAMES})
+        for number, columns in table.joints.items()
+    }
+    note = (
+        f"{where}: time_s: found {uneven} of {len(steps)} steps off the median of {median:.4g} s by more than "
+        f"{UNEVEN:.0%} (up to {float(np.max(steps)):.4g} s): brought to equal steps"
+    )
+    return RunTable(grid, joints), [note]
+
+
+def _cubic(at: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return y(at) [m] on a cubic Hermite spline through (x, y) [n], x rising; at within x."""
+    slope = np.gradient(y, x)
+    k = np.clip(np.searchsorted(x, at, side="right") - 1, 0, len(x) - 2)
+    h = x[k + 1] - x[k]
+    u = np.clip((at - x[k]) / h, 0.0, 1.0)
+    w = 1.0 - u
+    ends = w * w * (1.0 + 2.0 * u) * y[k] + u * u * (1.0 + 2.0 * w) * y[k + 1]
+    result: FloatArray = ends + h * u * w * (w * slope[k] - u * slope[k + 1])
+    return result
+
+
+def unwrapped(table: RunTable, where: str) -> tuple[RunTable, list[str]]:
+    """Return the run with positions that roll over made continuous, and a note for each."""
+    joints, notes = {}, []
+    for number, columns in table.joints.items():
+        changed: dict[str, Any] = {}
+        for name in _POSITIONS:
+            position = getattr(columns, name)
+            turn = None if position is None else _turn(position)
+            if turn is None:
+                continue
+            changed[name] = np.unwrap(position, period=turn)
+            rolls = int(np.count_nonzero(np.abs(np.diff(position)) > 0.5 * turn))
+            notes.append(
+                f"{where}: j{number}.{name}: found it rolling over by {turn:.4g} rad {rolls} times: made continuous"
+            )
+        joints[number] = replace(columns, **changed) if changed else columns
+    return (RunTable(table.time_s, joints) if notes else table), notes
+
+
+def _turn(position: FloatArray) -> float | None:
+    """The period of a position that rolls over by 2 pi (or by 360, for what is still to be found in degrees), else None."""
+    steps = np.diff(position)
+    usual = float(np.quantile(np.abs(steps), 0.99))
+    jumps = np.abs(steps[np.abs(steps) > max(3.0, 20.0 * usual)])
+    if not len(jumps):
+        return None
+    for period in (2.0 * math.pi, 360.0):
+        if np.all(np.abs(jumps - period) < 0.1 * period + usual):
+            return period
+    return None
+
+
+def skew_s(table: RunTable, number: int, joint: Joint) -> float | None:
+    """Seconds by which the sensor's torque comes late (early: negative) against current and motion; None: not to be told.
+
+    The torque is shifted over the regression on motor torque, acceleration, friction's sign, velocity and a constant;
+    where the residual is smallest, the channels are in step. Friction would bias a plain cross-correlation.
+    """
+    columns = table.joint(number, joint.gear_ratio)
+    torque, current, velocity = columns.torque_nm, columns.current_a, columns.motor_velocity_rad_s
+    if torque is None or current is None or velocity is None:
+        return None
+    dt = float(np.median(np.diff(table.time_s)))
+    width = max(1, round(_SKEW_STEP_S / dt))
+    tau, i, w = (_means(column, width) for column in (torque, current, velocity))
+    step = dt * width
+    reach = round(_SKEW_LONGEST_S / step)
+    v = w / joint.gear_ratio
+    inside = slice(reach, len(v) - reach)
+    if len(v) < 6 * reach or np.count_nonzero(np.abs(v[inside]) > MOVING_RAD_S) < 100:
+        return None
+    x = np.column_stack((i, np.gradient(w, step), np.tanh(v / MOVING_RAD_S), v, np.ones(len(v))))[inside]
+    size = np.linalg.norm(x, axis=0)
+    q, _ = np.linalg.qr(x / np.where(size > 0.0, size, 1.0))
+    left = _left_over(q, tau - np.mean(tau), 2 * reach + 1)
+    best = int(np.argmin(left))
+    if left[best] > (1.0 - _SKEW_GAIN) * left[reach] or left[best] > 0.5 or best in (0, 2 * reach):
+        return 0.0 if best == reach else None
+    return (best - reach) * step
+
+
+def _left_over(q: FloatArray, y: FloatArray, shifts: int) -> FloatArray:
+    """Part of the variance of y[k : k + n] that the orthonormal q [n, p] does not explain, for k = 0 .. shifts - 1.
+
+    q spans the constant. All shifts at once: the products with q are correlations, taken by FFT; sums are running ones.
+    """
+    n = len(q)
+    size = 1 << (len(y) + n).bit_length()
+    spectrum = np.fft.rfft(y, size)[:, None] * np.conj(np.fft.rfft(q, size, axis=0))
+    products = np.fft.irfft(spectrum, size, axis=0)[:shifts]
+    total, energy = (np.concatenate(([0.0], np.cumsum(x))) for x in (y, y * y))
+    constant = (total[n : n + shifts] - total[:shifts]) ** 2 / n
+    variance = np.maximum(energy[n : n + shifts] - energy[:shifts] - constant, 1e-30)
+    result: FloatArray = 1.0 - (np.sum(products**2, axis=1) - constant) / variance
+    return result
+
+
+def _means(x: FloatArray, width: int) -> FloatArray:
+    """Averages over equal pieces of `width` samples."""
+    whole = len(x) // width * width
+    result: FloatArray = x[:whole].reshape(-1, width).mean(axis=1)
+    return result

@@ -1,0 +1,252 @@
+"""Our network trained on runs: a correction to the fused physics, its envelope, and its calibrated sigma. Pure.
+
+The network gives gains of waves (sysid/train/ours.py): it corrects what turns with the motor and cannot
+learn anything else, as a run's zeros or a day's friction. What is slow in a run's residual is taken out of its target
+too (a running mean over half a second), because it is nothing but noise to these gains. sigma_scale comes from runs
+that neither the physics nor the network of their fold had seen.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.fusion import Fusion, turning_many
+from jtqd.estimator.joint import AdditiveLoss, FusedSigma, Joint, Torsion
+from jtqd.estimator.network import FUSED_FEATURES
+from jtqd.estimator.validity import Envelope
+from jtqd.estimator.whole_run import network_features, quadrant_many
+from jtqd.sysid.fit.fused import conformal_scale, folds, loss_and_width
+from jtqd.sysid.fit.losses import fit_loss
+from jtqd.sysid.fit.signals import RunSignals
+from jtqd.sysid.fit.torsion import fit_torsion, torsion_torque
+from jtqd.sysid.train.network import IR_VERSION, OPSET, Trained, folded_layers, hidden_output, train
+from jtqd.sysid.train.paper import TrainedNetwork, digest_of, thinned
+
+# A network whose outputs are gains of waves: sum over m of gain_m(x) wave_m, in numpy and as ONNX.
+#
+#     y = std_y sum_m g_m wave_m,   g = gains of a fully connected network over the first inputs, sigma(x) = tanh(x/2)
+#
+# What turns with the motor is corrected, and nothing else can be: over a turn of the angle the waves average to zero, so
+# no offset, friction or drift of a training run can hide in the network.
+
+
+def gated_output(trained: Trained, core: FloatArray, waves: FloatArray) -> FloatArray:
+    """Return the output [n] for core inputs [n, k] and waves [n, m]: what the exported graph must equal."""
+    gains = hidden_output(trained.weights, trained.input_mean, trained.input_std, core)
+    result: FloatArray = trained.output_std * (gains * waves).sum(axis=1)
+    return result
+
+
+def export_gated(trained: Trained, waves: int, metadata: Mapping[str, Any]) -> bytes:
+    """Return the ONNX file; its input x is core inputs and waves side by side, [N, k + waves]."""
+    from onnx import TensorProto, helper, numpy_helper
+
+    layers = folded_layers(
+        trained.weights, trained.input_mean, trained.input_std, 0.0, trained.output_std, last_is_one=False
+    )
+    core = len(trained.input_mean)
+    first, bias = layers[0]
+    layers[0] = (
+        np.vstack((first, np.zeros((waves, first.shape[1])))),
+        bias,
+    )  # the waves do not enter the gains
+    constants = {"pick": np.vstack((np.zeros((core, waves)), np.eye(waves))), "sum": np.ones((waves, 1))}
+    nodes, name = [], "x"
+    for n, (w, b) in enumerate(layers):
+        constants[f"W{n}"], constants[f"b{n}"] = w, b
+        nodes.append(helper.make_node("Gemm", [name, f"W{n}", f"b{n}"], [f"g{n}"]))
+        name = f"g{n}"
+        if n < len(layers) - 1:
+            nodes.append(helper.make_node("Tanh", [name], [f"h{n}"]))
+            name = f"h{n}"
+    nodes += [
+        helper.make_node("MatMul", ["x", "pick"], ["waves"]),
+        helper.make_node("Mul", [name, "waves"], ["parts"]),
+        helper.make_node("MatMul", ["parts", "sum"], ["torque_nm"]),
+    ]
+    graph = helper.make_graph(
+        nodes,
+        "ripple_correction",
+        [helper.make_tensor_value_info("x", TensorProto.DOUBLE, ["N", core + waves])],
+        [helper.make_tensor_value_info("torque_nm", TensorProto.DOUBLE, ["N", 1])],
+        [numpy_helper.from_array(np.asarray(value, np.float64), key) for key, value in constants.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="jtqd")
+    model.ir_version = IR_VERSION
+    helper.set_model_props(model, {key: json.dumps(value) for key, value in metadata.items()})
+    data: bytes = model.SerializeToString()
+    return data
+
+
+Table = np.ndarray[tuple[int, int], np.dtype[np.bool_]]
+
+HIDDEN: Final = (16, 16)
+_CORE: Final = 3
+"""Features that set the gains (speed, motor torque, torsion less current); the others are the waves."""
+_WEIGHT_DECAY: Final = 0.05
+_VELOCITY_STEP_RAD_S: Final = 0.25
+_TORQUE_STEP_NM: Final = 3.0
+_SLOW_SAMPLES: Final = 501
+"""Half a second at 1 kHz: at 0.1 rad/s the ripple at 2 per motor revolution has turned 1.6 times."""
+_LEAST_SHARE: Final = 0.05
+_VISITS: Final = 20
+"""Samples at 1 kHz in a cell that make it known."""
+
+
+class Seen:
+    """A run through physics with given parameters: features [n, 7], physics and sigma [n], all of moving samples."""
+
+    def __init__(self, run: RunSignals, loss: AdditiveLoss, torsion: Torsion, sigma: FusedSigma) -> None:
+        keep = run.moving
+        torque, open_nm = torsion_torque(torsion, run)
+        seen = replace(run.seen, torsion_nm=torque, open_nm=open_nm)
+        value, wide = loss_and_width(run, loss)
+        physics, spread = Fusion(sigma, True).fuse_many(
+            seen.raw_nm, value, wide, seen.velocity_rad_s, seen.torsion_nm, seen.open_nm
+        )
+        self.name = run.name
+        self.features: FloatArray = network_features(seen, seen.raw_nm - value)[keep]
+        turning = turning_many(seen.velocity_rad_s[keep])
+        self.waves: FloatArray = self.features[:, _CORE:] * turning[:, None]
+        self.residual_nm: FloatArray = (run.sensor_nm - physics)[keep]
+        self.sigma_nm: FloatArray = spread[keep]
+        self.quadrant = quadrant_many(seen.raw_nm[keep], seen.velocity_rad_s[keep])
+
+
+def train_fused(
+    runs: Sequence[RunSignals],
+    joint: Joint,
+    hashes: dict[str, str],
+    *,
+    iterations: int,
+    seed: int,
+    progress: Callable[[int, float], None],
+) -> TrainedNetwork:
+    """Train our network of a joint that has section `fused` with torsion; at least 8 runs (ValueError)."""
+    fused = joint.fused
+    if fused is None or fused.torsion is None:
+        raise ValueError(
+            f"joint {joint.name}: found no section 'fused' with torsion; 'jtq fit losses' makes one"
+        )
+    if len(runs) < 8:
+        raise ValueError(f"found {len(runs)} runs, expected at least 8: standard deviations need unseen runs")
+    unseen: list[tuple[Seen, FloatArray]] = []
+    for known, judged in folds(runs):
+        loss, torsion = fit_loss(known, joint.friction).loss, fit_torsion(known)
+        trained = _train([Seen(run, loss, torsion, fused.sigma) for run in known], iterations, seed, progress)
+        for n in judged:
+            one = Seen(runs[n], loss, torsion, fused.sigma)
+            unseen.append((one, gated_output(trained, one.features[:, :_CORE], one.waves)))
+    share = safe_share([(one.residual_nm, correction) for one, correction in unseen])
+    errors = [one.residual_nm - share * correction for one, correction in unseen]
+    scores = {
+        one.name: (float(np.mean(error**2)), float(np.mean(one.residual_nm**2)))
+        for (one, _), error in zip(unseen, errors, strict=True)
+    }
+    blocks = [Seen(run, fused.loss, fused.torsion, fused.sigma) for run in runs]
+    trained = _train(blocks, iterations, seed, progress)
+    trained = scaled(trained, share)
+    features = np.concatenate([block.features for block in blocks])
+    low, high = np.quantile(features, [1e-4, 1.0 - 1e-4], axis=0)
+    metadata = {
+        "features": list(FUSED_FEATURES),
+        "envelope": envelope_of(blocks, runs).to_mapping(),
+        "sigma_scale": list(
+            conformal_scale(errors, [one.sigma_nm for one, _ in unseen], [one.quadrant for one, _ in unseen])
+        ),
+        "share": share,
+        "input_low": low.tolist(),
+        "input_high": high.tolist(),
+        "joint": joint.name,
+        "data_sha256": digest_of(hashes),
+        "runs": hashes,
+    }
+    data = export_gated(trained, len(FUSED_FEATURES) - _CORE, metadata)
+    return TrainedNetwork(data, trained, metadata, scores)
+
+
+def scaled(trained: Trained, share: float) -> Trained:
+    """Return the network whose answer is `share` of this one's: its last layer is linear, and 0 is allowed."""
+    *hidden, (weight, bias) = trained.weights
+    return replace(trained, weights=[*hidden, (share * weight, share * bias)])
+
+
+def safe_share(unseen: Sequence[tuple[FloatArray, FloatArray]]) -> float:
+    """Return the part of the correction that helps on unseen runs: (residual [n], correction [n]) of each.
+
+    With share s the MSE of a run changes by s^2 E[c^2] - 2 s E[c r]: best at E[c r]/E[c^2], harmful beyond twice that.
+    Taken is the best over all runs, but no more than what would harm a single one. 0 when even a twentieth would: then
+    the network has learned nothing that lasts, and the physics alone is the better estimate.
+    """
+    products = np.array([float(np.mean(r * c)) for r, c in unseen])
+    squares = np.array([float(np.mean(c * c)) for _, c in unseen])
+    squares = np.maximum(squares, 1e-12)
+    share = min(1.0, float(products.sum() / squares.sum()), float(np.min(1.8 * products / squares)))
+    return share if share >= _LEAST_SHARE else 0.0
+
+
+def quick_part(residual_nm: FloatArray) -> FloatArray:
+    """Return residual [n] less its running mean over _SLOW_SAMPLES, shorter at both ends."""
+    width = min(_SLOW_SAMPLES, max(1, len(residual_nm) // 2))
+    total = np.concatenate(([0.0], np.cumsum(residual_nm)))
+    index = np.arange(len(residual_nm))
+    low, high = np.maximum(index - width // 2, 0), np.minimum(index + width // 2 + 1, len(residual_nm))
+    result: FloatArray = residual_nm - (total[high] - total[low]) / (high - low)
+    return result
+
+
+def _train(
+    blocks: Sequence[Seen], iterations: int, seed: int, progress: Callable[[int, float], None]
+) -> Trained:
+    return train(
+        thinned([block.features[:, :_CORE] for block in blocks]),
+        thinned([quick_part(block.residual_nm) for block in blocks]),
+        iterations=iterations,
+        seed=seed,
+        hidden=HIDDEN,
+        waves=thinned([block.waves for block in blocks]),
+        weight_decay=_WEIGHT_DECAY,
+        progress=progress,
+    )
+
+
+def envelope_of(blocks: Sequence[Seen], runs: Sequence[RunSignals]) -> Envelope:
+    """Return what the data covered: cells of (v, tau_raw) with enough samples, and cells between such cells."""
+    v = np.concatenate([block.features[:, 0] for block in blocks])
+    raw = np.concatenate([block.features[:, 1] for block in blocks])
+    rows = int(np.ceil(np.abs(v).max() / _VELOCITY_STEP_RAD_S)) + 1
+    columns = int(np.ceil(np.abs(raw).max() / _TORQUE_STEP_NM)) + 1
+    counts = np.zeros((2 * rows + 1, 2 * columns + 1), np.int64)
+    at = (
+        np.rint(v / _VELOCITY_STEP_RAD_S).astype(int) + rows,
+        np.rint(raw / _TORQUE_STEP_NM).astype(int) + columns,
+    )
+    np.add.at(counts, at, 1)
+    known = _filled(counts >= _VISITS)
+    temperatures = [run.temperature_c for run in runs if np.isfinite(run.temperature_c)]
+    distance = float(np.quantile(np.abs(np.concatenate([block.features[:, 2] for block in blocks])), 0.999))
+    return Envelope(
+        _VELOCITY_STEP_RAD_S,
+        _TORQUE_STEP_NM,
+        tuple(tuple(int(cell) for cell in row) for row in known),
+        1.25 * distance,
+        (min(temperatures) - 0.5, max(temperatures) + 0.5) if temperatures else None,
+    )
+
+
+def _filled(known: Table) -> Table:
+    """Also call a cell known that lies between known cells in both directions: a hole, not an edge."""
+
+    def between(axis: int) -> Table:
+        before = np.maximum.accumulate(known, axis=axis)
+        after = np.flip(np.maximum.accumulate(np.flip(known, axis), axis=axis), axis)
+        return np.logical_and(before, after)
+
+    result: Table = known | (between(0) & between(1))
+    return result

@@ -1,0 +1,134 @@
+"""Is a node still configured as at its boot? Signature, objects, rounds."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+import pytest
+
+from jtqd.daemon.bus.nodes import ConfigurationMismatch, ConfigurationWatch, checks_of
+from jtqd.drivers.boot_procedure import signature
+
+
+def frame(text: str) -> bytes:
+    return bytes.fromhex(text)
+
+
+REPORT = {
+    "signed": True,
+    "configuration_sha256": "0123456789abcdef" * 4,
+    "gear_ratio": 100.0,
+    "watched": [
+        *([0x1800, 1, 0x4000_0181], [0x1800, 2, 1], [0x1803, 1, 0xC000_0481]),
+        *([0x1A00, 0, 2], [0x1A00, 1, 0x6064_0020], [0x1A00, 2, 0x60E4_0120], [0x6075, 0, 9500]),
+    ],
+}
+SIGNED = frame("67 45 23 01")
+
+
+def answer(
+    watch: ConfigurationWatch, changes: Mapping[int, int] = MappingProxyType({})
+) -> ConfigurationMismatch | None:
+    """As a node whose objects are as in REPORT, but for `changes` of whole indices."""
+    check = watch.next()
+    value = check.expected if check.expected is not None else 3
+    return watch.result(changes.get(check.index, value).to_bytes(4, "little"))
+
+
+def until_found(watch: ConfigurationWatch, changes: Mapping[int, int]) -> tuple[ConfigurationMismatch, int]:
+    for readings in range(1, 100):
+        finding = answer(watch, changes)
+        if finding is not None:
+            return finding, readings
+    raise AssertionError("nothing was found")
+
+
+def test_the_signature_is_two_words_of_the_hash_and_never_zero() -> None:
+    assert signature("0123456789abcdef" * 4) == (0x0123_4567, 0x89AB_CDEF)
+    assert signature("0" * 64) == (1, 1)
+
+
+def test_signature_and_objects_are_read_by_turns_and_all_of_them() -> None:
+    watch, asked = ConfigurationWatch(REPORT), []
+    for _ in range(12):
+        asked.append((watch.next().index, watch.next().subindex))
+        assert answer(watch) is None
+    mark = (0x1020, 1)
+    objects = [(index, subindex) for index, subindex, _ in REPORT["watched"]]
+    assert asked == [mark, *objects[:3], mark, *objects[3:6], mark, objects[6], (0x6061, 0), objects[0]]
+
+
+def test_a_signature_that_is_gone_leads_to_the_objects() -> None:
+    watch = ConfigurationWatch(REPORT)
+    assert watch.result(SIGNED) is None
+    for _ in range(3):
+        assert answer(watch) is None
+    finding = watch.result(bytes(4))  # 0: somebody has written to the configuration
+    assert finding == (
+        False,
+        "its configuration was written to by somebody else (1020h:1: expected 0x1234567, found 0x0)",
+    )
+    asked = []
+    for expected in checks_of(REPORT):
+        asked.append((watch.next().index, watch.next().subindex))
+        # bit 30 of a COB-ID (no RTR) is the device's own
+        value = (expected.expected or 0) | (0x4000_0000 if asked[-1] == (0x1800, 1) else 0)
+        assert watch.result(value.to_bytes(4, "little")) is None
+    assert asked[0] == (0x1800, 1), "from the beginning"
+    assert asked[-2:] == [(0x6075, 0), (0x6061, 0)]
+    assert watch.next().index == 0x1800, "and again"
+
+
+@pytest.mark.parametrize(
+    ("index", "value", "text"),
+    [
+        (0x1800, 0x8000_0181, "1800h:1: expected 0x181, found 0x80000181"),  # switched off: bit 31
+        (0x1803, 0x0000_0481, "1803h:1: expected 0x80000000, found 0x481"),  # one that was off is on
+        (0x1A00, 3, "1A00h:0: expected 0x2, found 0x3"),
+        (0x6075, 4750, "6075h:0: expected 9500, found 4750"),
+    ],
+)
+@pytest.mark.parametrize("signed", [True, False])
+def test_whatever_the_meaning_of_the_pdos_depends_on_is_found(
+    index: int, value: int, text: str, signed: bool
+) -> None:
+    """With the signature intact, and in at most one round of all objects with the signature between them."""
+    finding, readings = until_found(ConfigurationWatch({**REPORT, "signed": signed}), {index: value})
+    assert finding == (True, f"its configuration was changed ({text})")
+    assert readings <= (1 + len(REPORT["watched"])) * (4 / 3 if signed else 1) + 1
+
+
+def test_a_mapping_that_was_changed_needs_a_boot() -> None:
+    watch = ConfigurationWatch({**REPORT, "signed": False})
+    for _ in range(4):
+        assert answer(watch) is None
+    assert (watch.next().index, watch.next().subindex) == (0x1A00, 1)
+    finding = watch.result(frame("20 01 e4 60"))  # the two positions swapped: same length, other meaning
+    assert finding == (True, "its configuration was changed (1A00h:1: expected 0x60640020, found 0x60E40120)")
+
+
+def test_a_mode_of_operation_that_changes_is_told_and_no_reason_for_a_boot() -> None:
+    watch = ConfigurationWatch({**REPORT, "signed": False})
+    for _ in range(30):
+        assert answer(watch) is None, "whatever it is at first"
+    finding, _ = until_found(watch, {0x6061: 0xFD})
+    assert finding == (False, "its mode of operation (6061h) is -3 now, 3 before")
+    for _ in range(20):
+        assert answer(watch, {0x6061: 0xFD}) is None, "told once"
+    assert checks_of({**REPORT, "gear_ratio": None})[-1].index == 0x6075, "a sensor has no mode"
+
+
+def test_silence_and_refusals_do_not_stop_the_round() -> None:
+    watch, asked = ConfigurationWatch({**REPORT, "signed": False}), []
+    for _ in range(8):
+        asked.append(watch.next())
+        assert watch.result(None) is None, "no answer"
+    assert len(set(asked)) == 8
+    for _ in range(7):
+        assert watch.result(None, 0x0800_0022) is None, "not now, because of the device's state"
+    assert watch.next().index == 0x6061
+    assert watch.result(None, 0x0602_0000) is None, "a drive without 6061h"
+    assert 0x6061 not in {answer(watch) or watch.next().index for _ in range(20)}
+    while watch.next().index != 0x6075:
+        answer(watch)
+    finding = watch.result(None, 0x0602_0000)
+    assert finding == (True, "its configuration was changed (6075h:0: expected 9500, found no such object)")

@@ -1,0 +1,135 @@
+"""The whole daemon on vcan: what a master has to notice in a run, by frames on its bus."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import canopen
+import pytest
+
+from jtqd.daemon.shared.notices import NoticesReader
+from tests.daemon.bus.master_daemon import STALE, Daemon, a_daemon, frame
+from tests.paths import JTQD_EDS
+
+pytestmark = pytest.mark.socketcan
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[Daemon]:
+    with a_daemon() as daemon:
+        yield daemon
+
+
+@pytest.fixture
+def daemon(running: Daemon) -> Daemon:
+    running.begin()
+    return running
+
+
+@pytest.fixture
+def node(daemon: Daemon) -> Iterator[Any]:
+    """jtqd as another master sees it: canopen's RemoteNode with the data sheet."""
+    network = canopen.Network()
+    network.connect(interface="socketcan", channel=daemon.bus)
+    remote = network.add_node(0x20, str(JTQD_EDS))
+    remote.sdo.RESPONSE_TIMEOUT = 2.0
+    yield remote
+    network.disconnect()
+
+
+def test_any_master_reads_every_object_of_the_data_sheet(node: Any) -> None:
+    read = {}
+    for index, described in node.object_dictionary.items():
+        if index < 0x1000:
+            continue  # dummies
+        for sub in described.subindices if hasattr(described, "subindices") else (None,):
+            entry = node.sdo[index] if sub is None else node.sdo[index][sub]
+            read[index, sub or 0] = entry.raw
+    assert len(read) > 120
+    assert read[0x1000, 0] == 0
+    assert read[0x1005, 0] == 0x4000_0080, "producer of SYNC 080h"
+    assert (read[0x1006, 0], read[0x1019, 0]) == (1000, 240)
+    assert read[0x1008, 0] == "jtqd"
+    assert read[0x1014, 0] == 0x0A0
+    assert read[0x1015, 0] == 100, "10 ms"
+    assert [read[0x1016, sub] for sub in (1, 2, 3)] == [node << 16 | 300 for node in (1, 2, 3)]
+    assert (read[0x1200, 1], read[0x1200, 2]) == (0x620, 0x5A0)
+    assert (read[0x1800, 1], read[0x1800, 2]) == (0x4000_01A0, 1)
+    assert read[0x1A00, 0] == 6
+    assert [read[0x2206, sub] for sub in (1, 2, 3)] == [0x01_01_02_05, 0x02_01_02_05, 0x03_01_02_05]
+    assert read[0x2200, 1] > 0, "cycles"
+    assert (read[0x2205, 1], read[0x2205, 6]) == (0, 0)
+    assert (read[0x1020, 1], read[0x1020, 2]) == tuple(
+        int(read[0x2204, 0][8 * n : 8 * n + 8], 16) for n in range(2)
+    )
+    for index, sub in ((0x2200, 1), (0x1016, 1), (0x1017, None)):
+        entry = node.sdo[index] if sub is None else node.sdo[index][sub]
+        with pytest.raises(canopen.SdoAbortedError):
+            entry.raw = 0
+
+
+def test_lengths_are_told_per_pdo_and_never_applied(daemon: Daemon, node: Any) -> None:
+    """5 bytes under 282h, and 8 under 183h, which has 5."""
+    node.sdo[0x1003][0].raw = 0
+    daemon.send(0x282, bytes(5))
+    assert daemon.until(lambda: bool(daemon.emcys))
+    #                                code reg ended COB-ID joint 2
+    assert daemon.emcys[0] == frame("1082 11 0000 8202 02")
+    daemon.send(0x183, bytes(8))
+    assert daemon.until(lambda: len(daemon.emcys) >= 4)
+    assert daemon.emcys[1] == frame("2082 11 0000 8301 00")
+    assert {each[3:] for each in daemon.emcys[2:4]} == {frame("1082 8202 02"), frame("2082 8301 00")}
+    assert [each[2] for each in daemon.emcys[2:4]] == [0x00, 0x00] or daemon.emcys[2][2] == 0x11
+    assert [node.sdo[0x1003][sub].raw for sub in (0, 1, 2)] == [2, 0x0183_8220, 0x0282_8210]
+    assert daemon.well() or daemon.until(daemon.well)
+    inputs = daemon.reader.read().inputs
+    assert (inputs[3].short, inputs[4].long) == (1, 1)
+    assert "281h" not in daemon.said()
+    node.sdo[0x1003][0].raw = 0
+    assert node.sdo[0x1003][0].raw == 0
+
+
+def test_a_second_sync_producer_makes_all_inputs_stale_and_is_8150h(daemon: Daemon) -> None:
+    assert (
+        daemon.until(
+            lambda: daemon.statuses[-50:].count((STALE, STALE)) >= 45,
+            do=lambda: daemon.send(0x080, b"\x07"),
+        )
+        or daemon.reader.read().counters["foreign_sync"] > 0
+    )
+    assert daemon.until(lambda: frame("5081 11 0000 8000 03") in daemon.emcys)
+    assert "another SYNC producer" in daemon.said()
+    assert daemon.until(
+        lambda: any(each[:2] == b"\0\0" and each[3:7] == frame("5081 8000") for each in daemon.emcys)
+    )
+    assert daemon.until(daemon.well), "it has gone, and estimates are back"
+
+
+def test_a_node_that_stops_is_8250h_for_each_of_its_pdos(daemon: Daemon) -> None:
+    """NMT stop by somebody else: told, its PDOs time out, and it is configured and started again."""
+    daemon.send(0x000, b"\x02\x02")
+    assert daemon.until(lambda: len(daemon.emcys) >= 4)
+    come = [each for each in daemon.emcys if each[:2] == frame("5082")]
+    assert {each[5:] for each in come} == {frame("8201 02"), frame("8202 02")}
+    gone = [each for each in daemon.emcys if each[:2] == b"\0\0"]
+    assert {each[3:] for each in gone} == {frame("5082 8201 02"), frame("5082 8202 02")}
+    assert "NMT command 'stop' to node 2 from somebody else" in daemon.said()
+    assert daemon.until(daemon.well)
+    assert (STALE, STALE) not in daemon.statuses[-50:]
+
+
+def test_a_node_reset_in_the_middle_of_a_run_is_configured_before_it_is_believed(daemon: Daemon) -> None:
+    """Reset communication: its mapping is the device's default again (TPDO1 the statusword, TPDO2 other positions)."""
+    before = daemon.reader.read().counters["published"]
+    daemon.send(0x000, b"\x82\x01")
+    assert daemon.until(lambda: any(each[0] == STALE for each in daemon.statuses))
+    assert daemon.until(daemon.well, 20.0), daemon.said()
+    first = next(n for n, each in enumerate(daemon.statuses) if each[0] == STALE)
+    assert daemon.statuses[first : first + 50].count((STALE, STALE)) < 25, "joint 2 goes on"
+    assert daemon.process.poll() is None
+    assert daemon.reader.read().counters["published"] > before
+    assert "node 1 was away and is configured again" in daemon.said()
+    (notices,) = (daemon.directory / "run").glob("*/notices")
+    texts = [each.text for each in NoticesReader(notices).read()[0]]
+    assert "node 1 was away and is configured again" in texts, "for the log"

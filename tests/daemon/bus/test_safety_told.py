@@ -1,0 +1,146 @@
+"""Faults are named: to the operator, in objects and EMCY of jtqd's own node, and released from there."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import pytest
+
+from jtqd.daemon.bus.errors import LoopErrors, OwnErrors
+from jtqd.daemon.bus.own_node import OwnNode
+from jtqd.daemon.config import load_config
+from jtqd.daemon.shared import cycle_record as faults
+from jtqd.daemon.shared.snapshot import COUNTERS, JointView, Snapshot, SnapshotReader, View
+from jtqd.daemon.supervisor.health import FaultWatch
+from jtqd.daemon.supervisor.summary import Summary
+from jtqd.drivers.eds.own_objects import COUNTERS as OWN_COUNTERS
+from jtqd.drivers.object_dictionary import ObjectStore, read_eds
+from jtqd.estimator.status import INVALID, VALID
+from tests.daemon.supervisor.watch_views import WELL, view
+from tests.paths import JTQD_EDS
+
+JUMP, TORSION = faults.BITS["motor_jump"], faults.BITS["torsion"]
+
+
+def faulty(bits: int, latched: int = 0) -> JointView:
+    return WELL._replace(status=INVALID, input_flags=WELL.input_flags | bits << 8, latched=latched)
+
+
+def reading(n: int, one: JointView = WELL, two: JointView = WELL) -> View:
+    return view(n, one, two)
+
+
+def test_a_fault_is_told_when_it_begins_and_when_all_are_over() -> None:
+    watch = FaultWatch()
+    assert watch.lines(reading(1), 0.0) == []
+    assert watch.lines(reading(2, faulty(TORSION)), 1.0) == [
+        "joint 1: no torque: motor and link position are further apart than the gear can be twisted (torsion)"
+    ]
+    assert watch.lines(reading(3, faulty(TORSION)), 20.0) == [], "told once"
+    assert watch.lines(reading(4), 22.5) == ["joint 1: no fault any more after 21.5 s"]
+
+
+def test_a_latched_fault_says_how_it_is_released() -> None:
+    watch = FaultWatch()
+    assert watch.lines(reading(1, WELL, faulty(JUMP, JUMP)), 0.0) == [
+        "joint 2: no torque: the motor position jumped (motor_jump); latched: `jtq control reset` releases it"
+    ]
+    assert watch.lines(reading(2, WELL, WELL._replace(latched=JUMP)), 1.0) == []
+    assert watch.lines(reading(3), 2.0) == ["joint 2: no fault any more after 2.0 s"]
+
+
+def test_a_fault_that_comes_and_goes_is_few_lines() -> None:
+    watch = FaultWatch()
+    lines = [
+        line
+        for n in range(2000)
+        for line in watch.lines(reading(n, faulty(TORSION) if n % 2 else WELL), 0.05 * n)
+    ]
+    assert 2 <= len(lines) <= 2 * 100 / 5 + 2
+
+
+@pytest.fixture
+def node(tmp_path: Path) -> tuple[ObjectStore, Snapshot, SnapshotReader]:
+    """jtqd's own node beside a snapshot."""
+    snapshot = Snapshot(tmp_path / "s", 1e-3, 0.8)
+    reader = SnapshotReader(tmp_path / "s", supervisor=True)
+    store = ObjectStore(read_eds(JTQD_EDS, 0x20), 0x20)
+    OwnNode(store, load_config(None), reader)
+    return store, snapshot, reader
+
+
+def test_the_latched_faults_are_an_object(node: tuple[ObjectStore, Snapshot, SnapshotReader]) -> None:
+    store, snapshot, _ = node
+    snapshot.write(8, 8, 1, (faulty(JUMP, JUMP | faults.DRIVE_FAULT), WELL))
+    assert store.read(0x2104, 1) == struct.pack("<H", JUMP | 0x100)
+    assert store.read(0x2104, 2) == bytes(2)
+
+
+def test_a_reset_by_sdo_is_asked_for_once_and_shown_until_done(
+    node: tuple[ObjectStore, Snapshot, SnapshotReader],
+) -> None:
+    store, snapshot, reader = node
+    assert store.read(0x2110, 0) == b"\x00"
+    store.write(0x2110, 0, b"\x00")
+    assert snapshot.orders[0] == 0, "0 asks for nothing"
+    store.write(0x2110, 0, b"\x01")
+    assert (snapshot.orders[0], reader.resets_done) == (1, 0)
+    assert store.read(0x2110, 0) == b"\x01"
+    snapshot.orders[1] = 1  # the loop has done it
+    assert store.read(0x2110, 0) == b"\x00"
+
+
+def test_faults_and_latches_are_emcy_with_the_drives_node(
+    node: tuple[ObjectStore, Snapshot, SnapshotReader],
+) -> None:
+    store, _, _ = node
+    errors = OwnErrors(store)
+    loop_errors = LoopErrors(load_config(None), errors, lambda *_: None)
+    store.set_number(0x1015, 0, 0)
+
+    def told(one: JointView, two: JointView) -> list[str]:
+        loop_errors.watch(reading(1, one, two), (), 0.0)
+        return [message.hex(" ") for message in iter(lambda: errors.tick(0.0), None)]
+
+    assert told(WELL, WELL) == []
+    assert told(WELL, faulty(TORSION)) == ["01 ff 81 00 00 02 00 02"]
+    assert told(faulty(JUMP, JUMP), faulty(TORSION)) == ["01 ff 81 00 00 01 00 01", "02 ff 81 00 00 01 00 01"]
+    assert told(faulty(JUMP, JUMP), faulty(TORSION)) == []
+    assert told(faulty(JUMP), WELL) == ["00 00 81 02 ff 01 00 01", "00 00 81 01 ff 02 00 02"]
+    assert told(WELL, WELL) == ["00 00 00 01 ff 01 00 01"]
+
+
+def test_every_fault_has_its_counter_and_its_object() -> None:
+    for bit in faults.COUNTED:
+        assert f"fault_{faults.NAMES[bit]}" in COUNTERS
+        assert f"fault_{faults.NAMES[bit]}" in OWN_COUNTERS
+    assert set(faults.MEANINGS) == set(faults.NAMES)
+    assert {*OWN_COUNTERS} <= {*COUNTERS, "recorder_lost"}
+    assert (WELL.status, WELL.latched) == (VALID, 0)
+
+
+def test_the_summary_says_why_there_was_no_torque() -> None:
+    def lines(**counters: int) -> list[str]:
+        counted = dict.fromkeys(COUNTERS, 0) | counters
+        us = (1.0, 2.0, 3.0)
+        text = Summary(9, 0, 0, us, us, (0.1, 0.1), counted, (), None, None, {}, (0, 0)).text()
+        return [line for line in text.splitlines() if line.startswith("no torque")]
+
+    assert lines() == []
+    assert lines(fault_motor_jump=2, latches=1, overruns=3) == [
+        "no torque     overruns 3, motor jump 2, latches 1"
+    ]
+
+
+def test_the_summary_tells_stolen_time_where_there_was_any() -> None:
+    us = (1.0, 2.0, 3.0)
+    for stolen_s, lines in (
+        (0.0, []),
+        (0.318, ["processors    taken away for 0.32 s by the hypervisor (stolen time)"]),
+    ):
+        told = Summary(
+            9, 0, 0, us, us, (0.1, 0.1), dict.fromkeys(COUNTERS, 0), (), None, None, {}, (0, 0), stolen_s
+        )
+        assert [line for line in told.text().splitlines() if line.startswith("processors")] == lines
+        assert told.content()["stolen_s"] == round(stolen_s, 2)

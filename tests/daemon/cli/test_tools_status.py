@@ -1,0 +1,192 @@
+"""`jtq status`: the picture at any width; no daemon, several, one that stands still."""
+
+import json
+import os
+import pty
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from jtqd.daemon.cli.reading import find_daemons
+from jtqd.daemon.cli.status import main
+from jtqd.daemon.recording.progress import Account, ProgressFile
+from jtqd.daemon.shared.notices import WARNING, Notices
+from jtqd.daemon.shared.runtime_dir import start_ticks, write_about
+from tests.daemon.cli.status_daemon import picture, running
+
+pytestmark = pytest.mark.native
+
+Status = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def status(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Status:
+    """`jtq status` in this process: exit status, standard output, standard error."""
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+    monkeypatch.setattr("jtqd.daemon.cli.reading._SHARED", ())
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    monkeypatch.setenv("COLUMNS", "80")
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        code = main(list(arguments))
+        return code, *capsys.readouterr()
+
+    return run
+
+
+@pytest.mark.parametrize("width", [80, 100, 140])
+def test_the_picture_shows_everything_and_fits(tmp_path: Path, width: int) -> None:
+    log = tmp_path / "logs"
+    log.mkdir()
+    daemon = running(tmp_path, log=log)
+    (log / "jtqd-vcan0-20260101T000000Z.mcap.active").write_bytes(bytes(1_500_000))
+    (log / "jtqd-other-20260101T000000Z.mcap.active").write_bytes(bytes(9_000_000))
+    ProgressFile(daemon.directory / "recorded").store(Account(8000, 7990, 10, 0))
+    notices = Notices(daemon.directory / "notices")
+    for n in range(6):
+        notices.add(WARNING, "heartbeat", 2, f"node 2: no heartbeat for 0.{n} s")
+    text = picture(daemon, width)
+    assert max(len(line.rstrip()) for line in text.splitlines()) <= width
+    assert "…" not in text
+    for wanted in (
+        *("-117.94 Nm", "0.48 Nm", "-118.48 Nm", "3.21 A", "31.5 °C", "valid"),
+        "joint 2 stale for 8 ms: node 2 is silent: no heartbeat for 2.0 s",
+        *("335 us", "330..360 us", "never", "2.3 s"),
+        *(
+            "p50 204  p99 204  max 301 us",
+            "3 of 8003 cycles, an input missing in 10",
+            "84.8 % by configuration",
+        ),
+        *("operational", "silent, was operational", "no heartbeat yet"),
+        *("7990 cycles written, 10 lost, 1.5 MB in this file", "free of"),
+        "stale inputs 12",
+        "node 2: no heartbeat for 0.5 s",
+    ):
+        assert wanted in " ".join(text.split()) or wanted in text, wanted
+    assert ("100.0 %" in text) == ("-155.2 rad/s" in text) == (width >= 100), "where there is room"
+
+
+@pytest.mark.parametrize("width", [54, 66, 78])
+def test_nothing_is_cut_in_a_narrow_terminal(tmp_path: Path, width: int) -> None:
+    text = picture(running(tmp_path), width)
+    assert max(len(line.rstrip()) for line in text.splitlines()) <= width
+    assert "…" not in text
+    assert "-117.94 Nm" in text
+    assert "stale" in text
+
+
+def test_a_loop_that_stands_still_shows_no_old_torque(tmp_path: Path, status: Status) -> None:
+    daemon = running(tmp_path, cycling=False)
+    text = picture(daemon, 80)
+    assert f"NOT RUNNING: the loop (process {os.getpid()}) is" in text
+    assert "no cycle for 10.0 s" in text
+    assert "-117.94" not in text
+    code, out, _ = status("--json")
+    content = json.loads(out)
+    assert (code, content["state"], content["joints"][0]["torque_nm"]) == (3, "still", None)
+
+
+def test_json_holds_what_the_picture_shows(tmp_path: Path, status: Status) -> None:
+    running(tmp_path)
+    code, out, _ = status("--json")
+    content = json.loads(out)
+    assert (code, content["schema"], content["state"]) == (0, "jtq.status/1", "running")
+    one, two = content["joints"]
+    assert (one["torque_nm"], one["status"], one["current_a"], one["temperature_c"]) == (
+        -117.94,
+        "valid",
+        3.21,
+        31.5,
+    )
+    assert (two["torque_nm"], two["status"], two["cycles"]) == (None, "stale", {"stale": 8000})
+    assert "node 2 is silent" in two["reason"]
+    assert [each["age_s"] for each in content["inputs"]] == [0.0, 0.0, None, pytest.approx(2.345), 0.0]
+    assert content["recorder"] is None
+    assert content["notices"] == []
+    assert content["counters"]["missed"] == 3
+
+
+def test_none_one_and_several(tmp_path: Path, status: Status) -> None:
+    assert status("--once") == (1, "", "jtq status: no jtqd runs here\n")
+    running(tmp_path, "vcan0")
+    assert status("--once")[0] == 0
+    assert "vcan1" in status("--once", "--bus", "vcan1")[2]
+    running(tmp_path, "vcan1")
+    code, _, said = status("--once")
+    assert code == 2
+    assert said.splitlines()[0] == "jtq status: several daemons run: which one?"
+    assert [line.split()[:2] for line in said.splitlines()[1:]] == [["--bus", "vcan0"], ["--bus", "vcan1"]]
+    assert status("--once", "--bus", "vcan1")[0] == 0
+
+
+def test_a_daemon_that_is_booting_and_one_that_was_killed(tmp_path: Path, status: Status) -> None:
+    daemon = running(tmp_path)
+    (daemon.directory / "snapshot").unlink()
+    code, out, _ = status("--once")
+    assert code == 3
+    assert "its nodes are being booted" in out
+    content = json.loads((daemon.directory / "about.json").read_text())
+    content["pid"] = subprocess.run(["true"], check=True).returncode + 2**22 - 3  # nobody's
+    (daemon.directory / "about.json").write_text(json.dumps(content))
+    found = find_daemons([tmp_path])
+    assert (found.daemons, found.left_over) == ((), (daemon.directory,))
+    content |= {"pid": os.getpid(), "started_ticks": 1}
+    (daemon.directory / "about.json").write_text(json.dumps(content))
+    assert find_daemons([tmp_path]).daemons == (), "another process got its number"
+    assert status("--once")[0] == 1
+
+
+def test_lines_where_there_is_no_terminal(tmp_path: Path) -> None:
+    running(tmp_path)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "jtqd.daemon.jtq", "status", "--bus", "vcan0"],
+        env={**os.environ, "RUNTIME_DIRECTORY": str(tmp_path)},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    lines = [process.stdout.readline() for _ in range(2)]
+    process.terminate()
+    process.communicate()
+    assert all(line.startswith("joint 1 -117.94 Nm +- 0.48 valid") for line in lines)
+    assert not any("\x1b" in line for line in lines)
+
+
+def test_the_live_view_on_a_terminal_outlives_its_daemon_and_ends_by_ctrl_c(tmp_path: Path) -> None:
+    daemon = running(tmp_path)
+    sleeper = subprocess.Popen(["sleep", "60"])
+    write_about(
+        daemon.directory, replace(daemon.about, pid=sleeper.pid, started_ticks=start_ticks(sleeper.pid) or 0)
+    )
+    child, terminal = pty.fork()
+    if not child:
+        os.environ |= {"RUNTIME_DIRECTORY": str(tmp_path), "TERM": "xterm", "COLUMNS": "90", "LINES": "40"}
+        os.execv(sys.executable, [sys.executable, "-m", "jtqd.daemon.jtq", "status", "--bus", "vcan0"])
+    shown = until(terminal, "-117.94 Nm")
+    assert "\x1b[?1049h" in shown, "the alternate screen: what was there before comes back"
+    assert "Ctrl-C ends this view" in shown or "Ctrl-C ends this view" in until(terminal, "Ctrl-C")
+    sleeper.kill()
+    sleeper.wait()
+    until(terminal, "jtqd on vcan0 has ended; waiting for its return")
+    write_about(daemon.directory, daemon.about)
+    until(terminal, "-117.94 Nm")
+    os.write(terminal, b"\x03")
+    until(terminal, "\x1b[?1049l")
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    os.close(terminal)
+
+
+def until(terminal: int, wanted: str) -> str:
+    """What the terminal shows up to there; a wait of 60 s is a failure."""
+    shown, deadline = "", time.monotonic() + 60
+    while wanted not in shown:
+        assert time.monotonic() < deadline, (wanted, shown[-2000:])
+        if select.select([terminal], [], [], 1.0)[0]:
+            shown += os.read(terminal, 65536).decode(errors="replace")
+    return shown

@@ -1,0 +1,160 @@
+"""The live view of a whole daemon: started, said, killed, refused; the loop goes on."""
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from jtqd.daemon import jtqd
+from jtqd.daemon.config import load_config
+from jtqd.daemon.live import keeper as keeper_module
+from jtqd.daemon.live.address import Address
+from jtqd.daemon.live.keeper import LiveKeeper
+from jtqd.daemon.shared.child_process import Child
+from tests.daemon.live.live_view_helpers import ROOT, Memory, Viewer
+
+pytestmark = pytest.mark.native
+
+_LISTENING = re.compile(r"jtqd: live view: (ws://127\.0\.0\.1:\d+)\n")
+
+
+class Kept:
+    """A LiveKeeper with real children on memory without a loop."""
+
+    def __init__(self, directory, capfd, port=0):
+        self.memory = Memory(directory)
+        self.children, self.capfd, self.said = [], capfd, ""
+        self.keeper = LiveKeeper(self._child, Address(port=port))
+        self.keeper.start(load_config(None), directory, "vcan7")
+
+    def _child(self, module, arguments, name):
+        self.children.append(Child(module, arguments, name=name))
+        return self.children[-1]
+
+    def until(self, pattern, timeout_s=15.0):
+        """Watch as the supervisor does, until something was said."""
+        end = time.monotonic() + timeout_s
+        while not (found := re.search(pattern, self.said)):
+            assert time.monotonic() < end, self.said
+            self.keeper.watch()
+            self.said += self.capfd.readouterr().err
+            time.sleep(0.02)
+        self.said = self.said[found.end() :]
+        return found
+
+    def end(self):
+        for child in self.children:
+            child.end()
+
+
+@pytest.fixture
+def kept(tmp_path, capfd):
+    made = Kept(tmp_path, capfd)
+    yield made
+    made.end()
+
+
+def test_where_it_listens_is_said_and_a_viewer_finds_it(kept):
+    Viewer(kept.until(_LISTENING)[1]).leave()
+
+
+def test_one_that_is_killed_is_started_again(kept):
+    kept.until(_LISTENING)
+    os.kill(kept.keeper.pid, signal.SIGKILL)
+    kept.until("jtqd: the live view ended with exit status -9; started again, the loop goes on\n")
+    Viewer(kept.until(_LISTENING)[1]).leave()
+
+
+def test_one_that_dies_again_and_again_is_left(kept, monkeypatch):
+    monkeypatch.setattr(keeper_module, "_PAUSE_S", 0.0)
+    for _ in range(5):
+        kept.until(_LISTENING)
+        os.kill(kept.keeper.pid, signal.SIGKILL)
+        kept.until("started again, the loop goes on\n")
+    os.kill(kept.keeper.pid, signal.SIGKILL)
+    kept.until("exit status -9, too often; the loop goes on without it\n")
+    assert kept.keeper.pid is None
+    started = len(kept.children)
+    kept.keeper.watch()
+    assert len(kept.children) == started
+
+
+def test_a_port_in_use_is_said_once_and_that_is_all(tmp_path, capfd):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        made = Kept(tmp_path, capfd, port)
+        made.until(rf"jtqd: no live view: 127\.0\.0\.1:{port}: Address already in use; the loop goes on\n")
+        for _ in range(5):
+            made.keeper.watch()
+        assert capfd.readouterr().err == ""
+        assert len(made.children) == 1
+        made.end()
+
+
+def test_an_address_that_others_reach_is_said(tmp_path, capfd, monkeypatch):
+    monkeypatch.setattr(LiveKeeper, "_run", lambda self: None)
+    LiveKeeper(lambda *_: None, Address("0.0.0.0")).start(load_config(None), tmp_path, "can0")
+    assert "open to everyone who can reach 0.0.0.0; it can only be read" in capfd.readouterr().err
+
+
+def test_without_the_package_the_daemon_refuses_in_one_line(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    assert jtqd.main(["--bus", "sim", "--record", "none", "--live"]) == 1
+    said = capsys.readouterr()
+    assert said.err == "jtqd: --live needs the package foxglove-sdk: pip install 'jtqd[live]'\n"
+    assert said.out == ""
+
+
+def test_live_view_of_the_emulated_bench(tmp_path):
+    """One daemon: a viewer sees torques, the view is killed and comes back, the loop misses nothing for it."""
+    arguments = ["--bus", "sim", "--record", "none", "--live", ":0", "--duration", "6", "--json"]
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(
+        [sys.executable, "-m", "jtqd.daemon.jtqd", *arguments],
+        cwd=tmp_path,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=(tmp_path / "said").open("w"),
+        text=True,
+    ) as process:
+        said = tmp_path / "said"
+
+        def wait_for(pattern, timeout_s=60.0):
+            end = time.monotonic() + timeout_s
+            while not (found := re.search(pattern, said.read_text())):
+                assert process.poll() is None, said.read_text()
+                assert time.monotonic() < end, said.read_text()
+                time.sleep(0.02)
+            return found
+
+        viewer = Viewer(wait_for(_LISTENING)[1], ["/joint/1/state", "/diagnostics"])
+        states = viewer.wait_for("/joint/1/state", 20)
+        assert all(message["sync_counter"] for _, message in states)
+        viewer.wait_for("/diagnostics")
+        status = viewer.messages["/diagnostics"][0][1]["status"]
+        assert [each["name"] for each in status][:2] == ["jtqd: loop", "jtqd: bus"]
+        name = b"jtqd.daemon.live.process"
+        (pid,) = [
+            int(entry.name)
+            for entry in Path("/proc").iterdir()
+            if entry.name.isdigit()
+            and name in (entry / "cmdline").read_bytes()
+            and str(tmp_path).encode() in (entry / "cmdline").read_bytes()
+        ]
+        os.kill(pid, signal.SIGKILL)
+        wait_for("the live view ended with exit status -9; started again, the loop goes on")
+        output, _ = process.communicate(timeout=60)
+        assert process.returncode == 0, said.read_text()
+        assert len(_LISTENING.findall(said.read_text())) == 2
+        summary = json.loads(output)
+        assert summary["cycles"] + summary["missed"] >= 5900
+        assert "Traceback" not in said.read_text()

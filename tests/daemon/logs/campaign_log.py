@@ -1,0 +1,91 @@
+"""Logs of jtqd with known content, for the tests of campaigns: written by the recorder's own code, cycle by cycle."""
+
+import math
+import struct
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from jtqd.daemon.recording.journal import Journal
+from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, SealedChunk
+from jtqd.daemon.recording.messages import BLOCK_PARTS, JointStateMessage
+from jtqd.daemon.recording.progress import Account
+from jtqd.daemon.recording.recording import Recording
+from jtqd.daemon.recording.schemas import definitions
+from jtqd.daemon.shared import cycle_record as cr
+
+START_NS = 1_700_000_000_000_000_000
+ENABLED, OFF = 0x1237, 0x1250
+
+
+class Joint(NamedTuple):
+    """What one joint's block of a cycle holds."""
+
+    current_a: float = 1.0
+    motor_position_rad: float = 2.0
+    motor_velocity_rad_s: float = 3.0
+    link_position_rad: float = 4.0
+    sensor_nm: float = 5.0
+    statusword: int = ENABLED
+    input_flags: int = 7
+
+
+class Cycle(NamedTuple):
+    """One cycle: its number, when its SYNC was sent, both joints, and what came as (COB-ID, data)."""
+
+    index: int
+    time_ns: int
+    joints: tuple[Joint, Joint]
+    frames: Sequence[tuple[int, bytes]] = ()
+
+
+class _OneFile:
+    """Where the chunks go."""
+
+    def __init__(self, file: McapFile) -> None:
+        self._file = file
+
+    def write(self, chunk: SealedChunk, at_ns: int) -> None:
+        """Append it."""
+        self._file.append(chunk)
+
+
+def write_log(path: Path, cycles: Iterable[Cycle]) -> Path:
+    """An MCAP file of these cycles."""
+    schemas, channels = definitions(None)
+    file = McapFile(path, Head(schemas, channels, []), {"run": "test", "part": "1"}, 1)
+    journal = Journal(ChunkBuilder(schemas, channels, BLOCK_PARTS, 60), print)
+    overview = JointStateMessage(("a", "b"), (1.0, 1.0))
+    recording = Recording(journal, _OneFile(file), overview, 500_000_000, Account())
+    for cycle in cycles:
+        recording.add(_record(cycle))
+    recording.flush()
+    file.finish(path.name)
+    return path
+
+
+def regular(count: int, joints: Callable[[int], tuple[Joint, Joint]], start: int = 100) -> list[Cycle]:
+    """`count` cycles, 1 ms apart, the first numbered `start`."""
+    return [Cycle(start + n, 7_000_000_000 + n * 1_000_000, joints(n)) for n in range(count)]
+
+
+def temperature(node: int, celsius: float) -> tuple[int, bytes]:
+    """TPDO3 of a drive."""
+    return 0x380 + node, struct.pack("<h", round(10 * celsius))
+
+
+def _record(cycle: Cycle) -> bytes:
+    record = bytearray(cr.RECORD_SIZE)
+    nan = math.nan
+    blocks: list[float] = []
+    for joint in cycle.joints:
+        numbers = [*joint[:5], nan, nan, nan, nan, nan, nan, 1e-3]  # no temperature, no stage of an estimate
+        blocks += [*numbers, joint.statusword, 0, 0, joint.input_flags]
+    counts = (cycle.index % 240 + 1, len(cycle.frames), 0, 0, 0, 0, 0, 0)
+    cr.HEAD.pack_into(
+        record, 0, cycle.index, cycle.time_ns, START_NS + cycle.time_ns, 15, 0, 0, 0, *counts, *blocks
+    )
+    for n, (can_id, data) in enumerate(cycle.frames):
+        struct.pack_into("<IB3x8s", record, cr.FRAMES_OFFSET + 16 * n, can_id, len(data), data)
+    cr.TAIL.pack_into(record, cr.TAIL_OFFSET, cycle.index)
+    return bytes(record)

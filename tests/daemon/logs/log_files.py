@@ -1,0 +1,110 @@
+"""Logs of several writers with known content, readers to judge them by, ways to damage them: for tests of daemon/logs."""
+
+import io
+import random
+import struct
+
+from mcap.reader import make_reader
+from mcap.records import Channel, Message
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
+
+from jtqd.daemon.recording.journal import Journal
+from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData
+from jtqd.daemon.recording.messages import BLOCK_PARTS, JointStateMessage
+from jtqd.daemon.recording.progress import Account
+from jtqd.daemon.recording.recording import Recording
+from jtqd.daemon.recording.schemas import definitions
+from tests.daemon.logs.campaign_log import Cycle, Joint, write_log
+
+ATTACHMENTS = [
+    NamedData("configuration.yaml", "application/yaml", b"a: 1\n" * 50),
+    NamedData("bus.dbc", "text/plain", b'VERSION ""\n\nBU_: jtqd\n\nBO_ 128 SYNC: 1 jtqd\n' + b"\n" * 160),
+]
+
+
+def cycles(count, seed=1):
+    """Noise in every quantity; two frames a cycle."""
+    source = random.Random(seed)
+    for n in range(count):
+        joints = tuple(Joint(*(source.gauss(0, 1) for _ in range(5))) for _ in range(2))
+        frames = [(0x181, struct.pack("<ii", n, -n)), (0x281, struct.pack("<ihH", n, 3, 0x1237))]
+        yield Cycle(100 + n, 7_000_000_000 + n * 1_000_000, joints, frames)
+
+
+def ours(path, count=120, chunk_ns=20_000_000, seed=1):
+    """A log by the recorder's own code, with attachments."""
+    from tests.daemon.logs import campaign_log
+
+    schemas, channels = definitions(None)
+    partial = path.with_name(path.name + ".active")
+    file = McapFile(partial, Head(schemas, channels, ATTACHMENTS), {"run": "test", "part": "1"}, 1)
+
+    class OneFile:
+        def write(self, chunk, at_ns):
+            file.append(chunk)
+
+    journal = Journal(ChunkBuilder(schemas, channels, BLOCK_PARTS, 60), print)
+    recording = Recording(journal, OneFile(), JointStateMessage(("a", "b"), (1.0, 1.0)), chunk_ns, Account())
+    for cycle in cycles(count, seed):
+        recording.add(campaign_log._record(cycle))
+    recording.flush()
+    file.finish(path.name)
+    return path.read_bytes()
+
+
+def foreign(compression="zstd", *, chunked=True, count=400, finish=True):
+    """A log by the mcap library: three topics of changing length, an attachment and metadata."""
+    buffer = io.BytesIO()
+    kind = {"": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}[compression]
+    writer = Writer(buffer, chunk_size=4096, compression=kind, use_chunking=chunked)
+    writer.start("x", "lib")
+    schema = writer.register_schema("a/B", "ros2msg", b"int64 a\nstring b\n")
+    channels = [writer.register_channel(f"/t{n}", "cdr", schema) for n in range(3)]
+    writer.add_attachment(1, 1, "att", "text/plain", b"hello" * 20)
+    writer.add_metadata("meta", {"k": "v"})
+    source = random.Random(3)
+    for n in range(count):
+        text = b"x" * source.randrange(40) + b"\0"
+        data = b"\0\1\0\0" + struct.pack("<qI", source.getrandbits(60), len(text)) + text
+        writer.add_message(channels[n % 3], 1_000_000 * n, data, 1_000_000 * n, n)
+    if finish:
+        writer.finish()
+    return buffer.getvalue()
+
+
+def by_index(data):
+    """(messages the library's seeking reader gets, its error)."""
+    count = 0
+    try:
+        for _ in make_reader(io.BytesIO(data), validate_crcs=True).iter_messages(log_time_order=False):
+            count += 1
+    except Exception as error:
+        return count, error
+    return count, None
+
+
+def in_order(data):
+    """(messages of known channels that the library gets going through the file, its error)."""
+    count, known = 0, set()
+    try:
+        for record in StreamReader(io.BytesIO(data), validate_crcs=True, record_size_limit=1 << 28).records:
+            if isinstance(record, Channel):
+                known.add(record.id)
+            elif isinstance(record, Message):
+                count += record.channel_id in known
+    except Exception as error:
+        return count, error
+    return count, None
+
+
+def record_starts(data):
+    """Offsets of the records of a whole file, and of the magic behind them."""
+    at, found = 8, []
+    while at < len(data) - 8:
+        found.append(at)
+        at += 9 + struct.unpack_from("<Q", data, at + 1)[0]
+    return [*found, at]
+
+
+__all__ = ["ATTACHMENTS", "by_index", "cycles", "foreign", "in_order", "ours", "record_starts", "write_log"]

@@ -1,0 +1,305 @@
+"""`jtq export`, and the log as a file of python-can: real commands on logs written by the recorder's code."""
+
+import csv
+import gzip
+import json
+import math
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+from jtqd.daemon.logs.can_io import McapCanReader, McapCanWriter
+from jtqd.daemon.logs.errors import LogError
+from jtqd.daemon.logs.export_command import main
+from jtqd.daemon.logs.reader import read_topic
+from jtqd.daemon.logs.recover import recover
+from tests.daemon.logs.campaign_log import Cycle, Joint, regular, write_log
+from tests.daemon.logs.log_files import ATTACHMENTS, ours
+from tests.paths import ROOT
+
+BIN = Path(sys.executable).parent
+CYCLES = 120
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    path = tmp_path_factory.mktemp("log") / "a.mcap"
+    ours(path, CYCLES)
+    return path
+
+
+def run(*arguments, stdin=None):
+    done = subprocess.run(
+        [str(each) for each in arguments], cwd=ROOT, input=stdin, capture_output=True, text=True, check=False
+    )
+    assert "Traceback" not in done.stderr, done.stderr
+    return done
+
+
+def frames_of(path):
+    with can.LogReader(path) as reader:
+        return [
+            (
+                round(m.timestamp * 1e6),
+                m.arbitration_id,
+                m.is_extended_id,
+                m.is_remote_frame,
+                m.dlc,
+                bytes(m.data),
+            )
+            for m in reader
+        ]
+
+
+def expected_frames():
+    """As `log_files.cycles` wrote them; the recorder's test records have no stamp of the kernel, the cycle's counts."""
+    found = []
+    for n in range(CYCLES):
+        micros = 1_700_000_007_000_000 + 1000 * n
+        found.append(
+            (
+                micros,
+                0x181,
+                False,
+                False,
+                8,
+                n.to_bytes(4, "little") + (-n).to_bytes(4, "little", signed=True),
+            )
+        )
+        found.append((micros, 0x281, False, False, 8, n.to_bytes(4, "little") + b"\3\0" + b"\x37\x12"))
+    return found
+
+
+# ---- run table ----
+
+
+def joints(n):
+    one = Joint(0.1 * n, 10.0 + n, 20.0 + 2 * n, 0.01 * n, 3.0 + 0.5 * n)
+    return one, Joint(-0.2 * n, -10.0 - n, -20.0 - 2 * n, -0.01 * n, 3.0 + 0.5 * n)
+
+
+@pytest.mark.parametrize("name", ["run.csv", "run.csv.gz", "run.parquet"])
+def test_run_table_is_what_the_diagnosis_reads(tmp_path, name):
+    if name.endswith("parquet"):
+        pytest.importorskip("pyarrow")
+    from jtqd.sysid.runs.sources import read_any
+
+    log = write_log(tmp_path / "a.mcap", regular(50, joints))
+    out = tmp_path / name
+    assert main([name.split(".")[1], str(log), "--out", str(out)]) == 0
+    table = read_any(out).table
+    assert table.time_s.tolist() == pytest.approx([n * 1e-3 for n in range(50)], abs=1e-12)
+    for number in (1, 2):
+        wanted = [joints(n)[number - 1] for n in range(50)]
+        columns = table.joints[number]
+        assert columns.current_a.tolist() == [each.current_a for each in wanted]
+        assert columns.torque_nm.tolist() == [each.sensor_nm for each in wanted]
+        assert columns.link_position_rad.tolist() == [each.link_position_rad for each in wanted]
+        assert columns.temperature_c is None
+
+
+def test_cycles_with_missing_values_are_left_out_and_said(tmp_path, capsys):
+    def holes(n):
+        one, two = joints(n)
+        return (one._replace(current_a=math.nan), two) if n in (3, 4) else (one, two)
+
+    log = write_log(tmp_path / "a.mcap", regular(20, holes))
+    out = tmp_path / "run.csv"
+    assert main(["csv", str(log), "--out", str(out), "--json"]) == 3
+    said = capsys.readouterr()
+    assert json.loads(said.out) == {"path": str(out), "rows": 18, "columns": 11, "left_out": 2}
+    assert "2 cycles with a missing value left out" in said.err
+    assert main(["csv", str(log), "--out", str(out), "--all-cycles"]) == 0
+    rows = list(csv.DictReader(out.open()))
+    assert len(rows) == 20
+    assert [row["j1.current_a"] for row in rows[2:6]] == ["0.2", "", "", "0.5"]
+
+
+def test_every_field_of_a_topic(log, tmp_path):
+    pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    records = read_topic(log, "/joint/1/state")
+    assert main(["csv", str(log), "--topic", "/joint/1/state", "--out", str(tmp_path / "j.csv.gz")]) == 0
+    rows = list(csv.DictReader(gzip.decompress((tmp_path / "j.csv.gz").read_bytes()).decode().splitlines()))
+    assert [float(row["current_a"]) for row in rows] == records["current_a"].tolist()
+    assert rows[0]["header.frame_id"] == "joint_1"
+    assert main(["parquet", str(log), "--topic", "/can/frames", "--out", str(tmp_path / "f.parquet")]) == 0
+    table = parquet.read_table(tmp_path / "f.parquet")
+    frames = read_topic(log, "/can/frames")
+    assert table["frames.id[1]"].to_pylist() == frames["frames"]["id"][:, 1].tolist()
+    assert table["stamps_ns[0]"].type == "int64"
+    assert main(["csv", str(log), "--topic", "/joint_states", "--out", str(tmp_path / "s.csv")]) == 0
+    first = next(csv.DictReader((tmp_path / "s.csv").open()))
+    assert first["name"] == "a b"
+    assert len(first["position"].split()) == 2
+
+
+def test_span_in_seconds(log, tmp_path, capsys):
+    assert (
+        main(
+            ["csv", str(log), "--start", "0.02", "--end", "0.05", "--out", str(tmp_path / "a.csv"), "--json"]
+        )
+        == 0
+    )
+    assert json.loads(capsys.readouterr().out)["rows"] == 30
+
+
+# ---- frames ----
+
+
+def test_candump_lines_and_the_dbc_are_what_cantools_takes(tmp_path):
+    """Lines out of the log, decoded by the DBC of the shipped configuration as plain integers."""
+    pytest.importorskip("cantools")
+    position = (1000).to_bytes(4, "little") + (-7).to_bytes(4, "little", signed=True)
+    cycle = Cycle(1, 1_000_000, (Joint(), Joint()), [(0x181, position), (0x080, b"\5")])
+    log = write_log(tmp_path / "a.mcap", [cycle])
+    lines = run(BIN / "jtq", "export", "candump", log)
+    assert lines.stdout.splitlines() == [
+        "(1700000000.001000) can0 181#E8030000F9FFFFFF",
+        "(1700000000.001000) can0 080#05",
+    ]
+    dbc = tmp_path / "bus.dbc"
+    made = run(
+        BIN / "jtq", "export", "dbc", "--config", ROOT / "models" / "bench.yaml", "--out", dbc, "--json"
+    )
+    assert json.loads(made.stdout)["messages"] > 10
+    decoded = run(sys.executable, "-m", "cantools", "decode", "--single-line", dbc, stdin=lines.stdout).stdout
+    assert re.search(r"drive_1_TPDO1\(motor_position: 1000, link_position: -7\)", decoded)
+    assert "SYNC(sync_counter: 5)" in decoded
+
+
+def test_dbc_of_the_log_is_its_attachment(log, tmp_path, capsys):
+    assert main(["dbc", str(log)]) == 0
+    assert capsys.readouterr().out.encode() == ATTACHMENTS[1].data
+    bare = write_log(tmp_path / "b.mcap", regular(3, joints))
+    assert main(["dbc", str(bare)]) == 1
+    assert "expected bus.dbc (--config makes one without a log)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text", [b"", b'VERSION ""\n'])
+def test_dbc_without_a_message_is_none(tmp_path, capsys, text):
+    with open(tmp_path / "a.mcap", "wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_attachment(1, 1, "bus.dbc", "text/plain", text)
+        writer.finish()
+    assert main(["dbc", str(tmp_path / "a.mcap"), "--out", str(tmp_path / "bus.dbc")]) == 1
+    assert f"found no message in its bus.dbc ({len(text)} characters)" in capsys.readouterr().err
+    assert not (tmp_path / "bus.dbc").exists()
+
+
+def test_reader_of_a_topic_without_frames_is_refused(log):
+    with pytest.raises(LogError, match="found frames on /can/frames, expected them on /joint/1/state"):
+        McapCanReader(log, topic="/joint/1/state")
+    assert len(list(McapCanReader(log, topic="/can/frames"))) == 2 * CYCLES
+
+
+@pytest.mark.parametrize("suffix", ["blf", "log", "asc"])
+def test_can_logconvert_there_and_back(log, tmp_path, suffix):
+    there, back = tmp_path / f"a.{suffix}", tmp_path / "b.mcap"
+    for source, target in ((log, there), (there, back)):
+        done = run(BIN / "can_logconvert", source, target)
+        assert done.returncode == 0, done.stderr
+    found, expected = frames_of(back), expected_frames()
+    assert [frame[1:] for frame in found] == [frame[1:] for frame in expected]
+    first = found[0][0] - expected[0][0] if suffix == "asc" else 0  # its time is relative
+    assert all(abs(f[0] - e[0] - first) <= 1000 for f, e in zip(found, expected, strict=True))
+
+
+def test_every_kind_of_frame_comes_back(tmp_path):
+    """29-bit, remote, error, empty, 40 in one millisecond, a clock that goes back; FD is left out and said."""
+    path = tmp_path / "a.mcap"
+    messages = [
+        can.Message(timestamp=1.5, arbitration_id=0x1ABCDEF0, is_extended_id=True, data=b"12345678"),
+        can.Message(timestamp=1.5, arbitration_id=0x123, is_extended_id=False, is_remote_frame=True, dlc=4),
+        can.Message(
+            timestamp=1.5, arbitration_id=0x20, is_extended_id=False, is_error_frame=True, data=bytes(8)
+        ),
+        *[
+            can.Message(timestamp=2 + n * 1e-5, arbitration_id=n, is_extended_id=False, data=bytes([n]))
+            for n in range(40)
+        ],
+        can.Message(timestamp=1.0, arbitration_id=0x7FF, is_extended_id=False, data=b""),
+    ]
+    with can.Logger(path) as writer:
+        assert isinstance(writer, McapCanWriter)
+        for message in messages:
+            writer(message)
+        writer(can.Message(arbitration_id=1, is_fd=True, data=bytes(12)))
+    assert writer.left_out == 1
+    found = list(McapCanReader(path))
+    assert [m.timestamp for m in found] == pytest.approx([m.timestamp for m in messages], abs=1e-6)
+    for one, other in zip(found, messages, strict=True):
+        assert one.equals(other, timestamp_delta=1e-6, check_direction=False), (one, other)
+    records = read_topic(path, "/can/frames")
+    assert records["frame_count"].tolist() == [3, 16, 16, 8, 1]
+    assert not recover(path).changed
+
+
+def test_can_player_and_can_logger_on_a_bus(log, tmp_path):
+    """Player -> the hub of `jtq sim`'s kind -> logger: python-can's own multicast interface carries the frames."""
+    out = tmp_path / "heard.mcap"
+    bus = ["-i", "udp_multicast", "-c", "239.74.163.2"]
+    try:
+        can.Bus(interface="udp_multicast", channel="239.74.163.2").shutdown()
+    except (can.CanError, ImportError, OSError) as error:
+        pytest.skip(f"no multicast: {error}")
+    logger = subprocess.Popen(
+        [BIN / "can_logger", *bus, "-f", out], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        logger.stdout.readline()
+        logger.stdout.readline()
+        player = run(BIN / "can_player", *bus, "--ignore-timestamps", log)
+        assert player.returncode == 0, player.stderr
+        import time
+
+        end = time.monotonic() + 20
+        while not out.exists() and time.monotonic() < end:
+            time.sleep(0.05)
+        time.sleep(0.5)
+    finally:
+        logger.send_signal(2)
+        _, errors = logger.communicate(timeout=20)
+    assert "Traceback" not in errors
+    assert [frame[1:] for frame in frames_of(out)] == [frame[1:] for frame in expected_frames()]
+
+
+# ---- use ----
+
+
+def test_failures_are_one_line(tmp_path, capsys):
+    (tmp_path / "a.mcap").write_bytes(b"x")
+    assert main(["candump", str(tmp_path / "a.mcap")]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+    assert main(["csv", str(tmp_path / "no.mcap"), "--out", str(tmp_path / "a.csv")]) == 1
+    assert capsys.readouterr().err == f"jtq export: {tmp_path / 'no.mcap'}: No such file or directory\n"
+    assert not (tmp_path / "a.csv").exists()
+    with pytest.raises(LogError):
+        can.LogReader(tmp_path / "a.mcap")
+    for wrong in (
+        ["csv", "a.mcap"],
+        ["dbc"],
+        ["dbc", "a.mcap", "--config", "b"],
+        ["candump", "a.mcap", "--json"],
+    ):
+        with pytest.raises(SystemExit) as stop:
+            main(wrong)
+        assert stop.value.code == 2
+
+
+def test_nothing_is_left_of_a_table_that_could_not_be_written(log, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        os, "replace", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device"))
+    )
+    assert main(["csv", str(log), "--out", str(tmp_path / "a.csv")]) == 1
+    assert list(tmp_path.iterdir()) == []
+    assert np.isfinite(1.0)

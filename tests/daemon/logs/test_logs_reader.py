@@ -1,0 +1,347 @@
+"""Reading logs: the fast way against the library's decoder, the generic decoder, time, parts, unfinished and lying files."""
+
+import os
+import resource
+import struct
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+from mcap_ros2.decoder import DecoderFactory
+
+from jtqd.daemon.logs import rows
+from jtqd.daemon.logs.errors import LogError
+from jtqd.daemon.logs.reader import (
+    log_parts,
+    read_attachments,
+    read_messages,
+    read_topic,
+    read_topics,
+    topics_of,
+)
+from jtqd.daemon.recording.schemas import SCHEMAS
+from tests.daemon.logs.log_files import ATTACHMENTS, cycles, foreign, ours, record_starts
+from tests.paths import ROOT
+
+JOINT, FRAMES = "/joint/1/state", "/can/frames"
+START_NS = 1_700_000_007_000_000_000
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    path = tmp_path_factory.mktemp("log") / "a.mcap"
+    ours(path, 130)
+    return path
+
+
+def by_library(path, topic):
+    with open(path, "rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        return [(m.log_time, d) for _, _, m, d in reader.iter_decoded_messages([topic], log_time_order=False)]
+
+
+def same(value, expected):
+    """A value of ours is the one the library's decoder gives."""
+    if hasattr(expected, "__slots__"):
+        return all(same(value[name], getattr(expected, name)) for name in expected.__slots__)
+    if isinstance(value, bytes):
+        value = value.decode()
+    if isinstance(value, np.ndarray | list):
+        return len(value) == len(expected) and all(map(same, value, expected))
+    return value == expected or (value != value and expected != expected)  # noqa: PLR0124
+
+
+@pytest.mark.parametrize("topic", [JOINT, "/joint/2/state", FRAMES, "/joint_states"])
+def test_every_field_is_what_the_library_decodes(log, topic):
+    found = read_messages(log, (topic,))[topic]
+    expected = by_library(log, topic)
+    assert found.log_times.tolist() == [time for time, _ in expected]
+    for record, (_, message) in zip(found.records, expected, strict=True):
+        for name in record.dtype.names:
+            assert same(record[name], getattr(message, name)), name
+
+
+def test_fixed_messages_are_never_decoded_one_by_one(log, monkeypatch):
+    def refuse(*_):
+        raise AssertionError("decoded one by one")
+
+    monkeypatch.setattr(rows.Decoder, "rows", refuse)
+    found = read_topics(log, (JOINT, FRAMES))
+    assert len(found[JOINT]) == len(found[FRAMES]) == 130
+    assert found[JOINT]["header"]["stamp"]["sec"].tolist() == [1_700_000_007] * 130
+
+
+@pytest.mark.parametrize("kind", ["", "lz4", "zstd", "unchunked"])
+def test_foreign_files_with_texts_of_any_length(tmp_path, kind):
+    path = tmp_path / "a.mcap"
+    path.write_bytes(foreign("" if kind == "unchunked" else kind, chunked=kind != "unchunked"))
+    for topic in ("/t0", "/t2"):
+        found = read_messages(path, (topic,))[topic]
+        expected = by_library(path, topic)
+        assert found.log_times.tolist() == [time for time, _ in expected]
+        assert found.records["a"].tolist() == [message.a for _, message in expected]
+        assert found.records["b"].tolist() == [message.b for _, message in expected]
+
+
+MIXED = """\
+# Everything that ros2msg has.
+int32 NUMBER=3
+string WORD="a b"
+bool flag true
+int8 small -1
+geometry_msgs/Point[] points
+string[2] pair
+float32[<=4] few
+int64[3] three
+std_msgs/Header header
+builtin_interfaces/Duration span
+uint8[] blob
+char letter
+================================================================================
+MSG: geometry_msgs/Point
+float64 x
+string name
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+"""
+
+
+def write_mixed(path, count):
+    from mcap_ros2.writer import Writer as Ros2Writer
+
+    with open(path, "wb") as file:
+        writer = Ros2Writer(file)
+        schema = writer.register_msgdef("x_msgs/msg/Mixed", MIXED)
+        for n in range(count):
+            message = {
+                "flag": n % 2 == 0,
+                "small": -n,
+                "points": [{"x": n + k / 8, "name": "p" * k} for k in range(n % 4)],
+                "pair": ["a" * n, "ü"],
+                "few": [0.5] * (n % 3),
+                "three": [n, -n, 1 << 40],
+                "header": {"stamp": {"sec": n, "nanosec": 5}, "frame_id": "f" * (n % 5)},
+                "span": {"sec": n, "nanosec": 7},
+                "blob": bytes(range(n)),
+                "letter": 65,
+            }
+            writer.write_message("/mixed", schema, message, n, n, n)
+        writer.finish()
+
+
+def test_every_kind_of_field(tmp_path):
+    path = tmp_path / "a.mcap"
+    write_mixed(path, 20)
+    found = read_topic(path, "/mixed")
+    for n, (record, (_, message)) in enumerate(zip(found, by_library(path, "/mixed"), strict=True)):
+        assert (record["flag"], record["small"], record["letter"]) == (n % 2 == 0, -n, 65)
+        assert [(p["x"], p["name"]) for p in record["points"]] == [(p.x, p.name) for p in message.points]
+        assert list(record["pair"]) == ["a" * n, "ü"]
+        assert record["few"].tolist() == [0.5] * (n % 3)
+        assert record["three"].tolist() == [n, -n, 1 << 40]
+        assert record["header"]["stamp"]["sec"] == n
+        assert record["header"]["frame_id"] == "f" * (n % 5)
+        assert record["span"]["sec"] == n
+        assert bytes(record["blob"]) == bytes(range(n))
+
+
+def test_text_of_another_length_in_the_middle_of_a_topic(tmp_path):
+    """Two texts whose lengths change while the message's does not: only their length fields tell."""
+    path = tmp_path / "a.mcap"
+    with open(path, "wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE)
+        writer.start("ros2", "x")
+        schema = writer.register_schema("x/Two", "ros2msg", b"string a\nstring b\n")
+        channel = writer.register_channel("/two", "cdr", schema)
+        for n in range(30):
+            first, second = (b"abc\0", b"defghij\0") if n < 20 else (b"abcdefg\0", b"hij\0")
+            data = (
+                b"\0\1\0\0" + struct.pack("<I", len(first)) + first + struct.pack("<I", len(second)) + second
+            )
+            writer.add_message(channel, n, data, n)
+        writer.finish()
+    found = read_topic(path, "/two")
+    assert [tuple(row) for row in found[[0, 19, 20, 29]]] == [("abc", "defghij")] * 2 + [
+        ("abcdefg", "hij")
+    ] * 2
+
+
+def test_time_selection(log):
+    times = read_messages(log, (JOINT,))[JOINT].log_times
+    start, end = START_NS + 17_000_000, START_NS + 45_000_000
+    part = read_messages(log, (JOINT, FRAMES), start_ns=start, end_ns=end)
+    assert part[JOINT].log_times.tolist() == [t for t in times.tolist() if start <= t < end]
+    assert (
+        part[JOINT].records["cycle"].tolist()
+        == part[FRAMES].records["cycle"].tolist()
+        == list(range(117, 145))
+    )
+    assert len(read_topic(log, JOINT, start_ns=end)) == 85
+    with pytest.raises(LogError, match="no message on /joint/1/state in that time"):
+        read_topic(log, JOINT, start_ns=START_NS + 10**12)
+
+
+def test_parts_of_one_run(tmp_path):
+    """Given in any order, as a directory, and with the last one still being written."""
+    paths = [tmp_path / f"jtqd-can0-20261121T173111Z-{n:04d}.mcap" for n in (1, 2, 10)]
+    for n, path in enumerate(paths):
+        ours(path, 30, seed=n)
+    last = paths[2].with_name(paths[2].name + ".active")
+    last.write_bytes(paths[2].read_bytes()[:-2000])
+    paths[2].unlink()
+    found = read_topic(tmp_path, JOINT)
+    assert len(found) == 90
+    alone = [read_topic(path, JOINT) for path in (*paths[:2], last)]
+    assert np.array_equal(found["current_a"], np.concatenate([each["current_a"] for each in alone]))
+    assert np.array_equal(read_topic([last, paths[1], paths[0]], JOINT)["current_a"], found["current_a"])
+    (tmp_path / "jtqd-can0-20261121T173112Z-0001.mcap").write_bytes(paths[0].read_bytes())
+    with pytest.raises(LogError, match="found 2 runs"):
+        log_parts(tmp_path)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(LogError, match=r"found no \*.mcap"):
+        log_parts(tmp_path / "empty")
+
+
+def test_file_that_is_being_written_is_read_as_far_as_it_is_there(log, tmp_path):
+    data = log.read_bytes()
+    chunks = [at for at in record_starts(data) if data[at] == 6]
+    whole = len(read_topic(log, JOINT))
+    for cut, lost in (
+        (chunks[-1] + 200, 1),
+        (chunks[-1], 1),
+        (chunks[1] + 9, None),
+        (record_starts(data)[-4] - 3, None),
+    ):
+        active = tmp_path / "a.mcap.active"
+        active.write_bytes(data[:cut])
+        count = len(read_topic(active, JOINT))
+        assert 0 < count < whole if lost or cut < chunks[2] else 0 < count <= whole
+        assert read_attachments(active)["configuration.yaml"] == ATTACHMENTS[0].data
+        finished = tmp_path / "a.mcap"
+        finished.write_bytes(data[:cut])
+        with pytest.raises(LogError, match=r"ends too early.*jtq recover"):
+            read_topic(finished, JOINT)
+
+
+def test_wrong_message_index_is_not_believed(log, tmp_path):
+    data = bytearray(log.read_bytes())
+    whole = read_topics(log, (JOINT, FRAMES))
+    for number in range(3):  # of /joint/1/state, /joint/2/state, /can/frames in the first chunk
+        index = [at for at in record_starts(data) if data[at] == 7][number]
+        data[index + 9 + 6 + 8] += 7  # offset of the first message
+        path = tmp_path / "a.mcap"
+        path.write_bytes(data)
+        found = read_topics(path, (JOINT, FRAMES))
+        assert {topic: rows.tobytes() for topic, rows in found.items()} == {
+            topic: rows.tobytes() for topic, rows in whole.items()
+        }
+        data[index + 9 + 6 + 8] -= 7
+
+
+def test_attachments_and_topics(log):
+    assert read_attachments(log) == {each.name: each.data for each in ATTACHMENTS}
+    found = topics_of(log)
+    assert found[FRAMES] == "jtqd_msgs/msg/CanFrames"
+    assert len(found) == 7
+
+
+def damage(log, tmp_path, at, byte):
+    data = bytearray(log.read_bytes())
+    data[at] ^= byte
+    path = tmp_path / "a.mcap"
+    path.write_bytes(data)
+    return path
+
+
+def test_damage_is_one_line(log, tmp_path):
+    data = log.read_bytes()
+    starts = record_starts(data)
+    chunk = next(at for at in starts if data[at] == 6)
+    attachment = next(at for at in starts if data[at] == 9)
+    for at, words in ((chunk + 400, "chunk at byte"), (chunk + 33, "CRC does not match"), (2, "first bytes")):
+        with pytest.raises(LogError, match=words) as error:
+            read_topic(damage(log, tmp_path, at, 4), JOINT)
+        assert "\n" not in str(error.value)
+    with pytest.raises(LogError, match=r"attachment 'configuration\.yaml' is damaged"):
+        read_attachments(damage(log, tmp_path, attachment + 80, 1))
+
+
+@pytest.mark.parametrize(
+    ("schema", "payload", "words"),
+    [
+        ("string a\n", struct.pack("<I", 1 << 31), "length of 2147483648"),
+        ("float64[] a\n", struct.pack("<I", 1 << 30), "length of 1073741824"),
+        ("float64[900000000000] a\n", b"\0" * 16, "array of 900000000000"),
+        ("a/B[] a\n====\nMSG: a/B\na/B[] a\n", struct.pack("<I", 1) * 50, "nested deeper"),
+        ("a/B a\n====\nMSG: a/B\na/B a\n", b"\0" * 8, "nested deeper"),
+        ("wstring a\n", b"\0" * 8, "type 'wstring'"),
+        ("int32\n", b"\0" * 8, "expected a field"),
+        ("int32 a\nint32 a\n", b"\0" * 8, "two fields"),
+        ("float64 a\n", b"\0" * 4, "4 bytes, expected 8"),
+    ],
+)
+def test_schemas_and_messages_that_lie(tmp_path, schema, payload, words):
+    path = tmp_path / "a.mcap"
+    with open(path, "wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "x")
+        channel = writer.register_channel(
+            "/a", "cdr", writer.register_schema("a/A", "ros2msg", schema.encode())
+        )
+        writer.add_message(channel, 1, b"\0\1\0\0" + payload, 1)
+        writer.add_message(channel, 2, b"\0\1\0\0" + payload + b"\0", 2)  # of another length: one by one
+        writer.finish()
+    with pytest.raises(LogError, match=words):
+        read_topic(path, "/a")
+
+
+def test_decompression_bomb_takes_no_memory(tmp_path):
+    """64 kB that unpack to 4 GB, within 700 MB of address space: one line."""
+    import zstandard
+
+    whole = foreign("zstd", count=3)
+    starts = record_starts(whole)
+    chunk = next(at for at in starts if whole[at] == 6)
+    bomb = zstandard.ZstdCompressor(write_content_size=False).compress(bytes(1 << 28)) * 16
+    body = struct.pack("<QQQII4sQ", 0, 9, 1 << 27, 0, 4, b"zstd", len(bomb)) + bomb
+    path = tmp_path / "a.mcap.active"
+    path.write_bytes(whole[:chunk] + struct.pack("<BQ", 6, len(body)) + body + whole[chunk : starts[-3]])
+    code = (
+        "from pathlib import Path; from jtqd.daemon.logs.reader import *\n"
+        f"try: read_topic(Path({str(path)!r}), '/t0')\nexcept LogError as e: print(e)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (700 << 20, 700 << 20)),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stderr == ""
+    assert done.stdout.count("\n") == 1
+    assert "cannot be unpacked" in done.stdout or "bytes unpacked" in done.stdout
+
+
+def test_other_encodings_are_named(tmp_path):
+    path = tmp_path / "a.mcap"
+    with open(path, "wb") as file:
+        writer = Writer(file)
+        writer.start("", "x")
+        channel = writer.register_channel("/a", "json", writer.register_schema("A", "jsonschema", b"{}"))
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.finish()
+    with pytest.raises(LogError, match="found jsonschema schema, expected ros2msg"):
+        read_topic(path, "/a")
+
+
+def test_all_of_our_definitions_have_a_layout_or_a_decoder(log):
+    assert set(SCHEMAS) >= {"jtqd_msgs/msg/JointEstimate"}
+    assert sum(1 for _ in cycles(3)) == 3
+    assert read_topic(log, "/joint_states")["position"][0].shape == (2,)

@@ -1,0 +1,317 @@
+"""Repair of damaged logs: named cases, each with what must still be there."""
+
+import json
+import os
+import resource
+import signal
+import struct
+import subprocess
+import sys
+import time
+
+import pytest
+from mcap.reader import make_reader
+
+from jtqd.daemon.logs.recover import RecoverError, recover
+from jtqd.daemon.logs.recover_command import main
+from tests.daemon.logs.log_files import ATTACHMENTS, by_index, foreign, in_order, ours, record_starts
+from tests.paths import ROOT
+
+CHUNK, INDEX, DATA_END, ATTACHMENT, SCHEMA = 0x06, 0x07, 0x0F, 0x09, 0x03
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    """A whole log of 120 cycles in 6 chunks, and the offset of every record in it."""
+    data = ours(tmp_path_factory.mktemp("log") / "whole.mcap")
+    return data, record_starts(data)
+
+
+def starts_of(log, opcode):
+    data, starts = log
+    return [(at, end) for at, end in zip(starts, starts[1:]) if data[at] == opcode and end <= len(data) - 8]  # noqa: B905, RUF007
+
+
+def repaired(path, data):
+    """Recover these bytes; both of the library's readers must then get every message without an error."""
+    path.write_bytes(data)
+    result = recover(path)
+    now = result.path.read_bytes()
+    assert by_index(now) == in_order(now) == (result.messages, None)
+    again = recover(result.path)
+    assert (again.changed, again.lossy, again.messages) == (False, False, result.messages)
+    assert result.path.read_bytes() == now
+    return result, now
+
+
+def test_whole_file_is_not_touched(log, tmp_path):
+    path = tmp_path / "a.mcap"
+    path.write_bytes(log[0])
+    os.utime(path, ns=(1, 1))
+    result = recover(path)
+    assert (result.changed, result.renamed, result.lossy) == (False, False, False)
+    assert (result.messages, result.chunks, result.attachments) == (by_index(log[0])[0], 6, 2)
+    assert path.read_bytes() == log[0]
+    assert path.stat().st_mtime_ns == 1
+
+
+def test_whole_file_with_the_name_of_an_active_one_is_renamed_only(log, tmp_path):
+    path = tmp_path / "a.mcap.active"
+    path.write_bytes(log[0])
+    result = recover(path)
+    assert (result.changed, result.renamed, result.lossy) == (False, True, False)
+    assert result.path == tmp_path / "a.mcap"
+    assert result.path.read_bytes() == log[0]
+    assert not path.exists()
+
+
+def test_killed_between_two_chunks_loses_nothing(log, tmp_path):
+    data_end = starts_of(log, DATA_END)[0][0]
+    result, now = repaired(tmp_path / "a.mcap.active", log[0][:data_end])
+    assert not result.lossy
+    assert result.messages == by_index(log[0])[0]
+    assert now[:data_end] == log[0][:data_end]
+    attached = make_reader(open(result.path, "rb")).iter_attachments()  # noqa: SIM115
+    assert [(a.name, a.data) for a in attached] == [(a.name, a.data) for a in ATTACHMENTS]
+
+
+def test_torn_last_chunk_costs_that_chunk_and_says_its_time(log, tmp_path):
+    """Chunks of 20 cycles: the last one, of 15 cycles, torn in the middle of its packed bytes."""
+    at, end = starts_of(log, CHUNK)[-1]
+    result, now = repaired(tmp_path / "a.mcap.active", log[0][: (at + end) // 2])
+    lost = by_index(log[0])[0] - result.messages
+    assert result.lossy
+    assert (result.chunks, result.lost_chunks, result.lost_bytes) == (5, 1, (at + end) // 2 - at)
+    assert 0 < lost <= 3 * 21 + 1
+    assert result.lost_s == pytest.approx(0.015, abs=0.001)
+    assert now[:at] == log[0][:at]
+
+
+def test_torn_message_index_is_made_anew(log, tmp_path):
+    data_end = starts_of(log, DATA_END)[0][0]
+    last_index = starts_of(log, INDEX)[-1][0]
+    result, now = repaired(tmp_path / "a.mcap.active", log[0][: last_index + 20])
+    assert not result.lossy
+    assert result.messages == by_index(log[0])[0]
+    assert now[:last_index] == log[0][:last_index]
+    assert len(now[:data_end]) == data_end
+
+
+def test_zeros_at_the_end_are_cut_off(log, tmp_path):
+    at = starts_of(log, CHUNK)[-1][0]
+    result, _ = repaired(tmp_path / "a.mcap.active", log[0][:at] + bytes(1 << 20))
+    assert result.chunks == 5
+    assert result.lost_bytes == 1 << 20
+    assert "zeros" in result.findings[0]
+
+
+def test_bad_chunk_in_the_middle_is_left_out_and_its_bytes_stay(log, tmp_path):
+    at, end = starts_of(log, CHUNK)[2]
+    data = bytearray(log[0])
+    data[end - 30] ^= 0x10
+    result, now = repaired(tmp_path / "a.mcap", bytes(data))
+    assert (result.chunks, result.lost_chunks, result.lost_bytes) == (5, 1, end - at)
+    assert result.lost_s == pytest.approx(0.022, abs=0.003)
+    assert now[at] == 0x80
+    assert now[at + 1 : end] == bytes(data[at + 1 : end])
+
+
+@pytest.mark.parametrize("byte", [0, 1, 2, 8, 9, 17, 25, 33 + 4, 37 + 4], ids=lambda b: f"head byte {b}")
+def test_head_of_a_chunk_is_restored(log, tmp_path, byte):
+    """Opcode, length, times, size and the packed length are known without it: the CRC proves them. Nothing is lost."""
+    at = starts_of(log, CHUNK)[3][0]
+    data = bytearray(log[0])
+    data[at + byte] ^= 0x40
+    result, now = repaired(tmp_path / "a.mcap", bytes(data))
+    assert not result.lossy
+    assert now == log[0] or (
+        now[: starts_of(log, DATA_END)[0][0]] == log[0][: starts_of(log, DATA_END)[0][0]]
+    )
+
+
+def test_first_chunk_and_all_definitions_before_it_gone(log, tmp_path):
+    """They stand in the summary too, and go where there is room for them again."""
+    first = starts_of(log, SCHEMA)[0][0]
+    end = starts_of(log, CHUNK)[0][1]
+    data = bytearray(log[0])
+    data[first:end] = bytes(end - first)
+    result, _ = repaired(tmp_path / "a.mcap", bytes(data))
+    assert (result.chunks, result.attachments) == (5, 2)
+    assert result.messages > 0.75 * by_index(log[0])[0]
+
+
+def test_torn_within_the_attachments(log, tmp_path):
+    second, end = starts_of(log, ATTACHMENT)[1]
+    result, _ = repaired(tmp_path / "a.mcap.active", log[0][: end - 10])
+    assert (result.attachments, result.messages, result.lost_bytes) == (1, 0, end - 10 - second)
+
+
+def test_magic_and_header_are_written_again(log, tmp_path):
+    data = bytearray(log[0])
+    data[:40] = bytes(40)
+    result, now = repaired(tmp_path / "a.mcap", bytes(data))
+    assert result.messages == by_index(log[0])[0]
+    assert make_reader(open(result.path, "rb")).get_header().profile == "ros2"  # noqa: SIM115
+    assert now[starts_of(log, SCHEMA)[0][0] :][:100] == log[0][starts_of(log, SCHEMA)[0][0] :][:100]
+
+
+def test_wrong_summary_is_made_anew(log, tmp_path):
+    data = bytearray(log[0])
+    data[-40] ^= 1
+    result, now = repaired(tmp_path / "a.mcap", bytes(data))
+    assert not result.lossy
+    assert result.messages == by_index(log[0])[0]
+    assert len(now) <= len(log[0]) + 100
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"precious text\n" * 100, bytes(5000)])
+def test_files_with_nothing_to_read_are_refused_and_stay(tmp_path, content, capsys):
+    path = tmp_path / "a.mcap.active"
+    path.write_bytes(content)
+    with pytest.raises(RecoverError, match="found nothing"):
+        recover(path)
+    assert path.read_bytes() == content
+    assert main([str(path)]) == 1
+    assert capsys.readouterr().err.startswith("jtq recover: ")
+
+
+def test_taken_name_is_refused(log, tmp_path):
+    path = tmp_path / "a.mcap.active"
+    path.write_bytes(log[0][:-100])
+    (tmp_path / "a.mcap").write_bytes(b"other")
+    with pytest.raises(RecoverError, match="to be free"):
+        recover(path)
+    assert path.read_bytes() == log[0][:-100]
+
+
+def test_dry_run_changes_nothing(log, tmp_path, capsys):
+    path = tmp_path / "a.mcap.active"
+    path.write_bytes(log[0][:-30000])
+    assert main(["--dry-run", "--json", str(path)]) == 3
+    result = json.loads(capsys.readouterr().out)["files"][0]
+    assert result["lossy"]
+    assert path.read_bytes() == log[0][:-30000]
+    assert os.listdir(tmp_path) == [path.name]
+
+
+WRITER = """
+import sys, time
+from mcap.writer import Writer, CompressionType
+import fcntl
+file = open(sys.argv[1], "wb")
+if sys.argv[2] == "lock":
+    fcntl.flock(file, fcntl.LOCK_EX)
+writer = Writer(file, chunk_size=2000, compression=CompressionType.ZSTD)
+writer.start("x", "y")
+channel = writer.register_channel("/a", "json", 0)
+n = 0
+while True:
+    writer.add_message(channel, n * 1_000_000, b'{"n": %d}' % n, n * 1_000_000, n)
+    n += 1
+    if n % 100 == 0:
+        file.flush()
+    if n == 1000:
+        print(n, flush=True)
+        time.sleep(60)
+"""
+
+
+def test_file_of_a_living_writer_is_refused_and_repaired_when_it_was_killed(tmp_path):
+    path = tmp_path / "a.mcap.active"
+    writer = subprocess.Popen([sys.executable, "-c", WRITER, str(path), "lock"], stdout=subprocess.PIPE)
+    try:
+        writer.stdout.readline()
+        before = path.read_bytes()
+        for dry_run in (False, True):
+            with pytest.raises(RecoverError, match="a recorder is writing it"):
+                recover(path, dry_run=dry_run)
+        assert path.read_bytes() == before
+    finally:
+        writer.send_signal(signal.SIGKILL)
+        writer.communicate()
+    result = recover(path)
+    assert 900 <= result.messages <= 1000
+    now = result.path.read_bytes()
+    assert by_index(now) == in_order(now) == (result.messages, None)
+
+
+def test_full_disk_leaves_the_file_as_it_was(log, tmp_path):
+    """No file may grow: the summary has no room, and not even the bad chunk is touched."""
+    path = tmp_path / "a.mcap.active"
+    data = bytearray(log[0][: starts_of(log, DATA_END)[0][0]])
+    data[starts_of(log, CHUNK)[1][1] - 20] ^= 1
+    path.write_bytes(data)
+
+    def limit():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (len(data) + 50, len(data) + 50))
+
+    done = subprocess.run(
+        [sys.executable, "-m", "jtqd.daemon.jtq", "recover", str(path)],
+        cwd=ROOT,
+        preexec_fn=limit,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr == f"jtq recover: {path}: File too large\n"
+    assert path.read_bytes() == bytes(data)
+
+
+def test_lies_about_sizes_take_no_memory(tmp_path):
+    """A chunk that says 1 TB, one of 64 kB that unpacks to 2 GB, a message of 8 EB: within 400 MB of address space."""
+    import zstandard
+
+    whole = foreign("zstd")
+    starts = record_starts(whole)
+    chunk = next(at for at in starts if whole[at] == CHUNK)
+    bomb = zstandard.ZstdCompressor(write_content_size=False).compress(bytes(1 << 28)) * 8
+    said = struct.pack("<QQQI", 1, 2, 1 << 40, 0) + struct.pack("<I4sQ", 4, b"zstd", len(bomb)) + bomb
+    small = struct.pack("<QQQI", 1, 2, 1 << 33, 5) + struct.pack("<I4sQ", 4, b"zstd", len(bomb)) + bomb
+    lies = whole[:chunk]
+    for body in (said, small):
+        lies += struct.pack("<BQ", CHUNK, len(body)) + body
+    lies += whole[chunk : starts[-2]] + struct.pack("<BQ", 5, 1 << 62)
+    path = tmp_path / "a.mcap"
+    path.write_bytes(lies)
+    start = time.monotonic()
+    done = subprocess.run(
+        [sys.executable, "-m", "jtqd.daemon.jtq", "recover", "--json", str(path)],
+        cwd=ROOT,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (700 << 20, 700 << 20)),
+        env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 3, done.stderr
+    result = json.loads(done.stdout)["files"][0]
+    assert result["messages"] == 400
+    assert result["lost_chunks"] >= 2
+    assert time.monotonic() - start < 20
+
+
+def test_command_on_a_directory(log, tmp_path, capsys):
+    """What a crash has left, and what has no end; a whole file is not even looked into."""
+    (tmp_path / "a.mcap.active").write_bytes(log[0][:-30000])
+    (tmp_path / "b.mcap").write_bytes(log[0])
+    (tmp_path / "c.mcap").write_bytes(log[0][:-3])
+    (tmp_path / "note.txt").write_text("x")
+    assert main([str(tmp_path)]) == 3
+    said = capsys.readouterr().out
+    assert "a.mcap: repaired" in said
+    assert "c.mcap: repaired" in said
+    assert "b.mcap" not in said
+    assert "lost: " in said
+    assert sorted(os.listdir(tmp_path)) == ["a.mcap", "b.mcap", "c.mcap", "note.txt"]
+    assert main([str(tmp_path)]) == 0
+    assert capsys.readouterr().out == "nothing to recover\n"
+
+
+def test_wrong_use(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([str(tmp_path / "a.txt")])
+    assert stop.value.code == 2
+    assert main([str(tmp_path / "none.mcap")]) == 1
+    assert capsys.readouterr().err.endswith("none.mcap: No such file or directory\n")

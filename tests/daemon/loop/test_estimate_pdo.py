@@ -1,0 +1,54 @@
+"""The estimate PDO byte by byte, and what must never be on the wire."""
+
+from math import inf, nan
+
+import numpy as np
+import pytest
+
+from jtqd.daemon.loop.estimate_pdo import decode, encode, field
+
+
+def test_transcript() -> None:
+    # 12.34 Nm -> 1234 = 04D2h; -0.5 Nm -> -50 = FFCEh; sigma 0.31 -> 7 steps (up), 1.0 -> 20;
+    # status 2 (joint 1), 6 (joint 2) -> 62h; sequence 240 = F0h
+    data = encode(field(12.34, 0.31, 2), field(-0.5, 1.0, 6), 240)
+    assert data == bytes.fromhex("D204 CEFF 07 14 62 F0")
+
+
+@pytest.mark.parametrize("status", [0, 1, 4, 5, 15])
+def test_no_torque_without_a_status_that_carries_one(status: int) -> None:
+    data = encode(field(1.0, 0.1, status), field(1.0, 0.1, 2), 1)
+    assert data[0:2] == b"\x00\x80"
+    assert data[4] == 255
+    assert data[6] == status | 2 << 4
+
+
+@pytest.mark.parametrize("torque", [nan, inf, -inf, 327.69, -327.69, 1e300])
+def test_a_number_that_is_none_becomes_invalid(torque: float) -> None:
+    assert field(torque, 0.1, 2) == (-0x8000, 255, 15)
+
+
+def test_sigma_is_never_narrower_than_it_was() -> None:
+    rng = np.random.default_rng(7)
+    for sigma in rng.uniform(0.0, 12.7, 2000):
+        steps = field(0.0, float(sigma), 2)[1]
+        assert steps * 0.05 >= sigma - 1e-9
+        assert steps * 0.05 - sigma < 0.05 + 1e-9
+    assert field(0.0, 12.70, 2)[1] == 254
+    assert field(0.0, 12.71, 2) == (0, 255, 2)
+
+
+@pytest.mark.parametrize("sigma", [nan, inf, -inf, -1e-9, -1.0])
+@pytest.mark.parametrize("status", [2, 3, 6])
+def test_a_torque_whose_sigma_is_none_is_none(sigma: float, status: int) -> None:
+    assert field(1.0, sigma, status) == (-0x8000, 255, 15)
+
+
+def test_round_trip() -> None:
+    rng = np.random.default_rng(11)
+    for _ in range(500):
+        torques = rng.uniform(-327, 327, 2)
+        pdo = decode(encode(field(torques[0], 0.2, 2), field(torques[1], 0.4, 3), 17))
+        assert pdo.torque_nm == pytest.approx(tuple(torques), abs=0.00501)
+        assert pdo.sigma_nm == pytest.approx((0.2, 0.4))
+        assert (pdo.status, pdo.sequence) == ((2, 3), 17)

@@ -1,0 +1,114 @@
+"""Section `recording` of the configuration, and what the recorder is told of the daemon."""
+
+import hashlib
+import json
+import shutil
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from jtqd.daemon.config import RecordingSettings, load_config
+from jtqd.daemon.recording.request import RecorderRequest, recording_request
+from jtqd.estimator.checked import ConfigError, Section
+from jtqd.models.files import shipped
+from tests.daemon.recording.test_dbc import SCALING
+
+
+def read(**keys):
+    return RecordingSettings.from_section(Section(keys, "a.yaml", "recording"))
+
+
+def test_defaults():
+    assert RecordingSettings.from_section(None) == read() == RecordingSettings()
+    assert asdict(read()) == {
+        "ring_cycles": 4096,
+        "chunk_s": 0.5,
+        "rotate_s": 600.0,
+        "rotate_mb": 1000.0,
+        "budget_mb": None,
+        "keep_run": True,
+        "reserve_mb": 256.0,
+        "flight_recorder_s": None,
+    }
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("ring_cycles", 100),
+        ("chunk_s", 0.0),
+        ("chunk_s", 60),
+        ("rotate_s", 0.5),
+        ("rotate_mb", 0),
+        ("budget_mb", 5),
+        ("keep_run", 1),
+        ("reserve_mb", -1),
+        ("flight_recorder_s", 601),
+        ("flight_recorder_s", "long"),
+        ("rotate", 5),
+    ],
+)
+def test_what_is_wrong_is_named(key, value):
+    with pytest.raises(ConfigError, match=rf"^a\.yaml: .*recording\.{key}") as caught:
+        read(**{key: value})
+    assert "\n" not in str(caught.value)
+
+
+def test_request_carries_all_that_a_log_must_hold(tmp_path):
+    """From the shipped configuration to the attachments, byte for byte; joint files and networks by their hashes."""
+    config = load_config(None)
+    nodes = {str(n): {"scaling": SCALING} for n in (1, 2)} | {"3": {"scaling": {"nm_per_unit": {"1": 0.001}}}}
+    content = recording_request(
+        config,
+        {"nodes": nodes},
+        directory=tmp_path / "logs",
+        ring=tmp_path / "ring",
+        progress=tmp_path / "recorded",
+        snapshot=tmp_path / "snapshot",
+        notices=tmp_path / "notices",
+        instance="can0",
+    )
+    (tmp_path / "request.json").write_text(json.dumps(content))
+    request = RecorderRequest.from_file(tmp_path / "request.json")
+    assert (request.prefix, request.rotate_s, request.reserve_mb) == ("jtqd-can0", 600.0, 256.0)
+    assert [tuple(node) for node in request.nodes] == [(1, "drive 1"), (2, "drive 2"), (3, "torque sensor")]
+    loaded, problems = request.load_attachments()
+    assert problems == []
+    files = {item.name: item.data for item in loaded}
+    assert len(files) == len(loaded), "two attachments of one name"
+    assert files["configuration.yaml"] == Path(shipped("bench.yaml")).read_bytes()
+    assert b"BO_ 385 drive_1_TPDO1" in files["bus.dbc"]
+    assert {"drive.eds", "jtqd.eds", "torque_sensor.eds"} <= files.keys()
+    provenance = json.loads(files["provenance.json"])
+    assert provenance["configuration"]["sha256"] == hashlib.sha256(files["configuration.yaml"]).hexdigest()
+    for number in "12":
+        joint = provenance["joints"][number]
+        for kind in ("file", "network"):
+            assert hashlib.sha256(files[joint[kind]]).hexdigest() == joint[f"{kind}_sha256"]
+    assert {"jtqd", "numpy", "onnxruntime", "python"} <= provenance["versions"].keys()
+    assert provenance["nodes"] == nodes
+
+
+def test_what_is_attached_is_what_was_read_whatever_becomes_of_the_files(tmp_path):
+    """Files edited, or gone, after the configuration was read: a recorder that starts later attaches what is in force."""
+    shutil.copytree(shipped("bench.yaml").parent / "trained", tmp_path / "trained")
+    shutil.copy(shipped("bench.yaml"), tmp_path / "bench.yaml")
+    read = {path.name: path.read_bytes() for path in (tmp_path / "trained").iterdir()}
+    config = load_config(tmp_path / "bench.yaml")
+    (tmp_path / "trained" / "joint1.yaml").write_text("name: edited without a reload\n")
+    for network in (tmp_path / "trained").glob("*.onnx"):
+        network.unlink()
+    (tmp_path / "bench.yaml").write_text("node_id: 1\n")
+    nodes = {str(n): {"scaling": SCALING} for n in (1, 2)} | {"3": {"scaling": {"nm_per_unit": {"1": 0.001}}}}
+    where = {name: tmp_path / name for name in ("directory", "ring", "progress", "snapshot", "notices")}
+    content = recording_request(config, {"nodes": nodes}, **where, instance="can0")
+    (tmp_path / "request.json").write_text(json.dumps(content))
+    loaded, problems = RecorderRequest.from_file(tmp_path / "request.json").load_attachments()
+    assert problems == []
+    files = {item.name: item.data for item in loaded}
+    assert files["joint1.yaml"] == read["joint1.yaml"]
+    joint = json.loads(files["provenance.json"])["joints"]["1"]
+    assert joint["file_sha256"] == hashlib.sha256(read["joint1.yaml"]).hexdigest()
+    assert files[joint["network"]] == read[joint["network"]]
+    assert files["configuration.yaml"] == Path(shipped("bench.yaml")).read_bytes()

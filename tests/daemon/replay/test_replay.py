@@ -1,0 +1,293 @@
+"""`jtq replay` on a log that was just recorded over the unix bus: bit for bit, and honest where that cannot be."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jtqd.daemon.logs.reader import read_attachments, read_topic
+from jtqd.daemon.replay.command import main
+from jtqd.daemon.replay.session import Wishes, replay
+from tests.daemon.replay.replay_helpers import cut, cycles, provenance
+from tests.paths import GOLDEN
+
+pytestmark = pytest.mark.native
+
+VALUES = 4 + 24 + 16
+"""Where the 12 numbers of a JointEstimate begin: after encapsulation, stamp and frame_id, cycle and monotonic time."""
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """2.2 s of jtqd on the emulated bench, method fused, in real time: with whatever the machine did meanwhile."""
+    directory = tmp_path_factory.mktemp("recorded")
+    result = subprocess.run(
+        [
+            *(sys.executable, "-m", "jtqd.daemon.jtqd", "--bus", "sim", "--duration", "2.2"),
+            *("--record", str(directory / "logs"), "--json"),
+        ],
+        env={**os.environ, "RUNTIME_DIRECTORY": str(directory)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert result.returncode in (0, 3), result.stderr
+    found = list((directory / "logs").glob("*.mcap"))
+    assert len(found) == 1, result.stdout + result.stderr
+    return found[0]
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, dict, str]:  # type: ignore[type-arg]
+    """(exit status, the one run of the JSON, stderr)."""
+    status = main([*map(str, arguments), "--json"])
+    out, err = capsys.readouterr()
+    return status, json.loads(out)["runs"][0] if out else {}, err
+
+
+def one_line(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """The line that a log or model that cannot be used gives."""
+    assert main([*map(str, arguments)]) == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("jtq replay: ")
+    assert err.count("\n") == 1, err
+    return err
+
+
+def test_what_was_recorded_comes_out_bit_for_bit(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, found, _ = run(capsys, log)
+    assert found["exact"]
+    assert found["cycles"] == found["identity"]["identical"] == len(cycles(log))
+    assert found["identity"]["pdos"] == found["identity"]["pdos_equal"] > 1500
+    assert found["identity"]["differences"] == found["identity"]["unknown"] == []
+    assert status == 0
+    assert main([str(log)]) == 0
+    said = capsys.readouterr().out
+    count = f"{found['cycles']:,}".replace(",", " ")
+    assert f"bit-identical: {count} of {count} cycles" in said
+
+
+def test_in_arrays_the_same_to_rounding(log: Path) -> None:
+    """Every method; the published statuses are the same, the numbers to 1e-9 Nm."""
+    for method in ("tob", "efficiency", "fused"):
+        (exact,) = replay([log], Wishes(method=method, exact=True))
+        (whole,) = replay([log], Wishes(method=method, exact=False))
+        for one, two in zip(exact.joints, whole.joints, strict=True):
+            np.testing.assert_array_equal(one["status"], two["status"])
+            for name in ("torque_nm", "sigma_nm", "physics_nm", "network_nm", "tob_nm"):
+                np.testing.assert_allclose(
+                    one[name], two[name], rtol=0, atol=1e-9, err_msg=f"{method} {name}"
+                )
+
+
+def test_a_log_that_begins_in_the_middle(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What the observer knew is not in it: the replay says so, and is identical again when that is forgotten."""
+    begin = cycles(log)[500]
+    late = cut(log, tmp_path / "late.mcap", lambda cycle: cycle >= begin)
+    status, found, _ = run(capsys, late)
+    same = found["identity"]
+    assert status == 0
+    assert not same["bit_identical"]
+    assert same["explained"]
+    assert {each["joint"] for each in same["unknown"]} == {1, 2}
+    assert begin <= min(each["first_cycle"] for each in same["unknown"]) < begin + 100
+    assert all("begins in the middle" in each["reason"] for each in same["unknown"])
+    assert begin < same["from_cycle"] < begin + 1200
+    assert same["identical"] >= sum(cycle >= same["from_cycle"] for cycle in cycles(late))
+    main([str(late)])
+    assert f"bit-identical from cycle {same['from_cycle']:,} on".replace(",", " ") in capsys.readouterr().out
+
+
+def test_parts_of_one_run_are_joined(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    middle = cycles(log)[900]
+    one = cut(log, tmp_path / "b.mcap", lambda cycle: cycle < middle)
+    two = cut(log, tmp_path / "a.mcap", lambda cycle: cycle >= middle)
+    status, found, _ = run(capsys, two, one)
+    assert status == 0
+    assert found["logs"] == [str(one), str(two)]
+    assert found["identity"]["bit_identical"]
+    assert found["cycles"] == len(cycles(log))
+    assert "given twice" in one_line(capsys, one, one)
+
+
+def test_lost_cycles_are_counted_and_forgotten(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """30 cycles are missing: the difference from there on has a reason, and ends."""
+    gone = set(cycles(log)[700:730])
+    status, found, _ = run(capsys, cut(log, tmp_path / "thin.mcap", lambda cycle: cycle not in gone))
+    same = found["identity"]
+    assert status == 0
+    assert found["lost_cycles"] == 30
+    assert all("missing" in each["reason"] for each in same["unknown"])
+    assert same["unknown"][0]["first_cycle"] > max(gone)
+    assert same["explained"]
+    assert same["from_cycle"] > max(gone)
+
+
+def test_a_changed_number_is_found(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One torque in the log is another by one bit."""
+    state = read_topic(log, "/joint/2/state")
+    target = int(state["cycle"][np.isfinite(state["physics_nm"])][1200])
+
+    def spoil(topic: str, cycle: int, data: bytes) -> bytes:
+        if topic != "/joint/2/state" or cycle != target:
+            return data
+        at = VALUES + 8 * 8  # tob_nm is not published; physics_nm, one further, is of method fused
+        (bits,) = struct.unpack_from("<q", data, at + 8)
+        return data[: at + 8] + struct.pack("<q", bits ^ 1) + data[at + 16 :]
+
+    status, found, _ = run(capsys, cut(log, tmp_path / "spoilt.mcap", payload=spoil))
+    (one,) = found["identity"]["differences"]
+    assert status == 3
+    assert (one["joint"], one["cycle"], one["cycles"], one["field"]) == (2, target, 1, "physics_nm")
+    assert found["identity"]["identical"] == found["cycles"] - 1
+
+
+def test_the_raw_frames_are_what_is_replayed(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A current that is changed in the frames of one cycle only: the estimate is another from there on."""
+    state = read_topic(log, "/joint/1/state")
+    target = int(state["cycle"][(state["input_flags"] & 3) == 3][800])
+    head = struct.pack("<IB3x", 0x281, 8)
+
+    def spoil(topic: str, cycle: int, data: bytes) -> bytes:
+        if topic != "/can/frames" or cycle != target:
+            return data
+        at = data.rindex(head) + len(head) + 4  # 606Ch I32, then 6078h I16
+        (current,) = struct.unpack_from("<h", data, at)
+        return data[:at] + struct.pack("<h", current + 50) + data[at + 2 :]
+
+    status, found, _ = run(capsys, cut(log, tmp_path / "spoilt.mcap", payload=spoil))
+    (one,) = found["identity"]["differences"]
+    assert status == 3
+    assert (one["joint"], one["cycle"]) == (1, target)
+
+
+def test_other_models_and_the_file_with_both(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Joint 1 with a torque constant 10 % larger: the difference, the sensor's opinion, and a file for the viewer."""
+    models = tmp_path / "models"
+    models.mkdir()
+    text = read_attachments(log)["joint1.yaml"].decode()
+    (line,) = [each for each in text.splitlines() if each.startswith("torque_constant_nm_per_a:")]
+    constant = float(line.split(":")[1])
+    (models / "joint1.yaml").write_text(text.replace(line, f"torque_constant_nm_per_a: {1.1 * constant!r}"))
+    target = tmp_path / "both.mcap"
+    status, found, _ = run(capsys, log, "--model", models, "--out", target)
+    one, two = found["joints"]
+    assert status == 0
+    assert found["identity"] is None
+    assert str(models / "joint1.yaml") in found["models"][0]
+    assert found["models"][1] == "as logged"
+    assert two["max_nm"] < 1e-9
+    assert 0.001 < one["rms_nm"] <= one["max_nm"]
+    assert one["sensor_replayed_nm"] != pytest.approx(one["sensor_logged_nm"], rel=1e-4)
+    assert one["sensor_cycles"] == one["both"] > 1000
+    for number in (1, 2):
+        logged = read_topic(target, f"/joint/{number}/state")
+        replayed = read_topic(target, f"/joint/{number}/replay")
+        original = read_topic(log, f"/joint/{number}/state")
+        assert logged.dtype.names == original.dtype.names
+        assert logged.tobytes() == original.tobytes()
+        np.testing.assert_array_equal(replayed["cycle"], original["cycle"])
+        apart = np.nanmax(np.abs(replayed["torque_nm"] - original["torque_nm"]))
+        assert apart == pytest.approx(found["joints"][number - 1]["max_nm"], abs=1e-12)
+    assert {"replay.json", "configuration.yaml", "joint1.yaml"} <= read_attachments(target).keys()
+    assert main([str(log), "--out", str(target)]) == 2
+    assert "exists" in capsys.readouterr().err
+
+
+def test_wrong_models(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "not a directory" in one_line(capsys, log, "--model", tmp_path / "nowhere")
+    assert "found no file for these joints" in one_line(capsys, log, "--model", tmp_path)
+    (tmp_path / "joint1.yaml").write_text("name: [")
+    assert "joint1.yaml" in one_line(capsys, log, "--model", tmp_path)
+    (tmp_path / "joint1.yaml").unlink()
+    (tmp_path / "joint2.fused.onnx").write_bytes(b"no network")
+    assert "joint2.fused.onnx" in one_line(capsys, log, "--model", tmp_path)
+    assert "needs" in one_line(capsys, log, "--method", "network")
+
+
+def test_logs_that_cannot_be_used(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def without(name: str):  # type: ignore[no-untyped-def]
+        return lambda found: {key: value for key, value in found.items() if key != name}
+
+    def bent(name: str):  # type: ignore[no-untyped-def]
+        return lambda found: {**found, name: found[name] + b" "}
+
+    few = cycles(log)[5]
+    bad = {
+        "configuration.yaml, expected one": without("configuration.yaml"),
+        "provenance.json, expected one": without("provenance.json"),
+        "attachment configuration.yaml: found SHA-256": bent("configuration.yaml"),
+        "attachment joint1.yaml: found SHA-256": bent("joint1.yaml"),
+        "sha256 of the network": bent("joint2.fused.onnx"),
+        "found no JSON": lambda found: {**found, "provenance.json": b"{"},
+        "no usable scaling": provenance(lambda content: content["nodes"]["1"].pop("scaling")),
+        "joints.2.file: missing": provenance(lambda content: content["joints"]["2"].pop("file")),
+    }
+    for n, (text, change) in enumerate(bad.items()):
+        path = cut(log, tmp_path / f"{n}.mcap", lambda cycle: cycle < few, attachments=change)
+        assert text in one_line(capsys, path)
+    assert "No such file" in one_line(capsys, tmp_path / "none.mcap")
+    (tmp_path / "empty").mkdir()
+    assert "found no *.mcap" in one_line(capsys, tmp_path / "empty")
+    (tmp_path / "text.mcap").write_text("time_s,torque\n" * 100)
+    assert "MCAP" in one_line(capsys, tmp_path / "text.mcap")
+    foreign = cut(log, tmp_path / "foreign.mcap", lambda cycle: False)
+    assert "/joint/1/state" in one_line(capsys, foreign)
+    capsys.readouterr()
+    assert main([]) == 2
+
+
+def test_in_arrays_rounding_is_no_finding(
+    log: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A long log, whose replay is in arrays without being asked: equal, exit status 0; a real difference is found."""
+    from jtqd.daemon.replay import compare as difference
+    from jtqd.daemon.replay import session
+
+    monkeypatch.setattr(session, "SHORT_CYCLES", 10)
+    status, found, _ = run(capsys, log)
+    assert (status, found["exact"]) == (0, False)
+    assert found["identity"]["tolerance_nm"] == 1e-9
+    assert found["identity"]["differences"] == []
+    assert main([str(log)]) == 0
+    assert "  equal to 1e-09 Nm" in capsys.readouterr().out
+    (whole,) = replay([log], Wishes(exact=False))
+    logged, made = whole.run.joints, tuple(each.copy() for each in whole.joints)
+    row = int(np.flatnonzero(np.isfinite(made[0]["torque_nm"]))[-50])
+    made[0]["torque_nm"][row] += 1e-6
+    same = difference.identity(logged, made, whole.run.steps(), None, 1e-9)
+    (one,) = same.differences
+    assert (one.joint, one.cycle, one.cycles) == (1, int(logged[0]["cycle"][row]), 1)
+    assert not same.explained
+
+
+def test_logs_of_another_version(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Fields with other names and types: one line, never numbers of something else."""
+    log = GOLDEN / "tob.mcap"
+    for old, new, said in (
+        (b"motor_position_rad", b"position_of_motor_x", "found no field motor_position_rad"),
+        (b"float64 dt_s", b"int64 dt_s", "found dt_s of type int64, expected float64"),
+        (b"builtin_interfaces/Time stamp", b"float64 stamp", "found header.stamp of type float64"),
+        (b"CanFrame[16] frames", b"CanFrame[16] fraims", "found no field frames.id"),
+        (b"uint8[8] data", b"int8[8] data", "found frames.data of type"),
+    ):
+        path = tmp_path / "a.mcap"
+        cut(log, path, schema=lambda text, a=old, b=new: text.replace(a, b))  # type: ignore[misc]
+        line = one_line(capsys, path, "--exact")
+        assert said in line

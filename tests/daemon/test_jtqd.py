@@ -1,0 +1,473 @@
+"""The daemon from the outside: run as users run it, on the emulated bench over the unix frame socket."""
+
+import json
+import os
+import signal
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import canopen
+import numpy as np
+import pytest
+import yaml
+from mcap.reader import make_reader
+
+from jtqd.daemon.logs.reader import read_topic
+from jtqd.daemon.loop.estimate_pdo import decode
+from jtqd.daemon.loop.joint import FLAG_MOTION, FLAG_POSITION
+from jtqd.daemon.loop.joint_status import FLAG_NETWORK_SKIPPED
+from jtqd.daemon.shared.snapshot import SnapshotReader
+from jtqd.drivers.can_unix import UnixBus
+from jtqd.drivers.filters import exact
+from jtqd.drivers.frame import pack
+from jtqd.drivers.frame_socket import open_frame_socket
+from jtqd.estimator.status import STALE
+from jtqd.models.files import shipped
+from tests.drivers.hub_helpers import until_it_listens
+from tests.estimator.fused_configuration import configured, networks
+from tests.paths import JTQD_EDS
+
+pytestmark = pytest.mark.native
+
+JTQD = [sys.executable, "-m", "jtqd.daemon.jtqd"]
+INPUTS = FLAG_POSITION | FLAG_MOTION
+
+
+@pytest.fixture
+def environment(tmp_path: Path) -> dict[str, str]:
+    """A runtime directory of its own, so that runs of other people do not meet ours."""
+    directory = tmp_path / "run"
+    directory.mkdir()
+    return {**os.environ, "RUNTIME_DIRECTORY": str(directory), "LOGS_DIRECTORY": ""}
+
+
+def run(
+    *arguments: str, environment: dict[str, str], timeout: float = 60
+) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*JTQD, *arguments], env=environment, capture_output=True, text=True, timeout=timeout, check=False
+    )
+
+
+def started(*arguments: str, environment: dict[str, str], own_group: bool = False) -> subprocess.Popen[str]:
+    """jtqd without a log, running; both outputs are pipes."""
+    return subprocess.Popen(
+        [*JTQD, "--record", "none", *arguments],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=own_group,
+    )
+
+
+def until_it_publishes(process: subprocess.Popen[str], environment: dict[str, str]) -> None:
+    """Wait until the loop has counted cycles in its shared memory."""
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        assert process.poll() is None, "it ended before"
+        for path in Path(environment["RUNTIME_DIRECTORY"]).glob("*/snapshot"):
+            if SnapshotReader(path).read().counters["published"] > 100:
+                return
+        time.sleep(0.05)
+    raise AssertionError("no cycle within 60 s")
+
+
+def no_traceback(result: subprocess.CompletedProcess[str]) -> str:
+    assert "Traceback" not in result.stderr, result.stderr
+    return result.stderr.strip()
+
+
+def temperatures(log: Path, number: int) -> tuple[list[float], list[float]]:
+    """Of one joint: what each cycle had, and what its drive told, frame by frame [degC]."""
+    state = read_topic(log, f"/joint/{number}/state")
+    assert ((state["input_flags"] & 8 != 0) == np.isfinite(state["temperature_c"])).all()
+    frames = read_topic(log, "/can/frames")["frames"]
+    data = frames["data"][frames["id"] == 0x380 + number]
+    told = [0.1 * struct.unpack_from("<h", bytes(each))[0] for each in data]
+    return state["temperature_c"].tolist(), told
+
+
+def test_a_run_on_the_emulated_bench(tmp_path: Path, environment: dict[str, str]) -> None:
+    result = run(
+        "--bus",
+        "sim",
+        "--duration",
+        "3",
+        "--record",
+        str(tmp_path / "logs"),
+        "--json",
+        environment=environment,
+    )
+    assert result.returncode == 0, result.stderr
+    no_traceback(result)
+    summary = json.loads(result.stdout)
+    slots = summary["cycles"] + summary["missed"] + summary["counters"]["sync_gaps"]
+    assert slots == pytest.approx(3000, abs=2)
+    recording = summary["recording"]
+    assert recording["lost"] == 0
+    assert recording["cycles"] == summary["cycles"]
+    with open(recording["path"], "rb") as file:
+        reader = make_reader(file)
+        content = reader.get_summary()
+        assert content is not None
+        assert content.statistics is not None
+        counts = {
+            channel.topic: content.statistics.channel_message_counts[channel.id]
+            for channel in content.channels.values()
+        }
+        attached = {attachment.name: attachment.data for attachment in reader.iter_attachments()}
+        attachments, dbc = attached.keys(), attached["bus.dbc"].decode()
+    assert counts["/joint/1/state"] == counts["/joint/2/state"] == counts["/can/frames"] == summary["cycles"]
+    assert {
+        "configuration.yaml",
+        "joint1.yaml",
+        "joint2.yaml",
+        "bus.dbc",
+        "provenance.json",
+        "drive.eds",
+    } <= attachments
+    for number in (1, 2):
+        values, told = temperatures(Path(recording["path"]), number)
+        assert set(values[-500:]) <= set(told), (
+            "known half a second after the start, by the frames of the log"
+        )
+        assert 4 <= len(told) <= 7
+        assert f"drive_{number}_TPDO3: 2 drive_{number}" in dbc
+
+
+def test_method_fused_on_the_emulated_bench(tmp_path: Path, environment: dict[str, str]) -> None:
+    """With random networks: it is the daemon that is tried here."""
+    config = str(configured(tmp_path, "fused", networks(), temperature=True))
+    options = ["--bus", "sim", "--config", config, "--duration", "2", "--record", str(tmp_path), "--json"]
+    result = run(*options, environment=environment)
+    assert result.returncode == 0, result.stderr
+    no_traceback(result)
+    recording = json.loads(result.stdout)["recording"]
+    for number in (1, 2):
+        state = read_topic(Path(recording["path"]), f"/joint/{number}/state")[-1000:]
+        used = np.isfinite(state["network_nm"])
+        had_time = (state["input_flags"] & (INPUTS | FLAG_NETWORK_SKIPPED) == INPUTS) & (
+            state["status"] != STALE
+        )
+        assert had_time.sum() > 100
+        assert used[had_time].mean() > 0.9
+        assert {2, 6} & set(state["status"])
+        values, told = temperatures(Path(recording["path"]), number)
+        assert set(values[-1000:]) <= set(told)
+        assert np.isfinite(state["physics_nm"][used]).all()
+        assert not np.isfinite(state["tob_nm"]).any(), "no stage of this method"
+
+
+def test_a_network_of_another_method_is_refused_in_one_line(
+    tmp_path: Path, environment: dict[str, str]
+) -> None:
+    config = str(configured(tmp_path, "network", networks()))
+    result = run("--bus", "sim", "--config", config, "--record", "none", environment=environment)
+    assert result.returncode == 1
+    (line,) = (text for text in no_traceback(result).splitlines() if not text.startswith("bench ready"))
+    assert line.startswith(
+        f"jtqd: {tmp_path}/n1.onnx: found input 'x' of shape ['N', 7], expected ['N', 6] ("
+    )
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[str]:
+    """The emulated bench as a process; the address of its bus."""
+    bus = f"unix:{tmp_path / 'bus'}"
+    process = subprocess.Popen([sys.executable, "-m", "sim_can", "--bus", bus])
+    until_it_listens(bus, process)
+    yield bus
+    process.terminate()
+    process.wait(5)
+
+
+@pytest.fixture
+def daemon(bench: str, environment: dict[str, str]) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """jtqd on that bench, publishing."""
+    process = started("--bus", bench, "--json", environment=environment)
+    socket = open_frame_socket(bench, [exact(0x1A0)])
+    deadline = time.monotonic() + 20
+    while not socket.wait(0.1):
+        assert process.poll() is None, process.stderr
+        assert time.monotonic() < deadline
+    socket.close()
+    yield bench, process
+    if process.poll() is None:
+        process.kill()
+        process.wait()
+
+
+def test_any_master_reads_its_object_dictionary(daemon: tuple[str, subprocess.Popen[str]]) -> None:
+    bus, _ = daemon
+    network = canopen.Network()
+    network.bus = UnixBus(channel=bus.removeprefix("unix:"))
+    network.connect()
+    try:
+        node = network.add_node(0x20, str(JTQD_EDS))
+        node.sdo.RESPONSE_TIMEOUT = 5.0  # the supervisor may be about to begin
+        assert "jtqd" in node.sdo[0x1008].raw
+        first = node.sdo[0x2200][1].raw
+        time.sleep(0.5)
+        assert node.sdo[0x2200][1].raw > first
+        assert node.sdo[0x2202][1].raw == pytest.approx(100.0)  # gear ratio of joint 1
+        assert len(node.sdo[0x2204].raw) == 64
+        with pytest.raises(canopen.SdoAbortedError):
+            node.sdo[0x2200][1].raw = 0
+    finally:
+        network.disconnect()
+
+
+def test_sigterm_ends_in_order(
+    daemon: tuple[str, subprocess.Popen[str]], environment: dict[str, str]
+) -> None:
+    bus, process = daemon
+    socket = open_frame_socket(bus, [exact(0x1A0), exact(0x000)])
+    process.send_signal(signal.SIGTERM)
+    out, err = process.communicate(timeout=15)
+    assert process.returncode == 0, err
+    assert json.loads(out)["cycles"] > 0
+    assert list(Path(environment["RUNTIME_DIRECTORY"]).iterdir()) == [], "nothing is left behind"
+    estimates, nmt = [], []
+    while count := socket.receive():
+        for n in range(count):
+            can_id, _, data = struct.unpack_from("<IB3x8s", socket.frames, 16 * n)
+            (estimates if can_id == 0x1A0 else nmt).append(data)
+    assert decode(estimates[-1]).status == (0, 0), "the last estimate says off"
+    assert [bytes(data[:2]) for data in nmt] == [b"\x80\x01", b"\x80\x02", b"\x80\x03"]
+    socket.close()
+
+
+@pytest.mark.parametrize("command", [0x02, 0x80, 0x81])  # stop, enter pre-operational, reset node
+def test_nmt_commands_to_the_own_node_are_ignored(
+    daemon: tuple[str, subprocess.Popen[str]], command: int
+) -> None:
+    bus, process = daemon
+    socket = open_frame_socket(bus, [exact(0x1A0), exact(0x720)])
+    socket.send(pack(0x000, bytes((command, 0x20))))
+    time.sleep(0.5)
+    estimates, states = 0, set()
+    while count := socket.receive():
+        for n in range(count):
+            can_id, _, data = struct.unpack_from("<IB3x8s", socket.frames, 16 * n)
+            if can_id == 0x1A0:
+                estimates += 1
+            else:
+                states.add(data[0])
+    socket.close()
+    assert estimates > 200
+    assert states == {5}
+    assert process.poll() is None
+
+
+def test_garbage_on_the_bus_is_counted_and_changes_nothing(daemon: tuple[str, subprocess.Popen[str]]) -> None:
+    bus, process = daemon
+    socket = open_frame_socket(bus, [exact(0x1A0)])
+    for n in range(200):
+        socket.send(pack(0x181, bytes(n % 8)))  # too short
+        socket.send(pack(0x181 | 0x8000_0000, bytes(8)))  # 29-bit
+        socket.send(pack(0x7FF, bytes(8)))
+        time.sleep(0.001)
+    socket.close()
+    time.sleep(0.5)
+    process.send_signal(signal.SIGTERM)
+    out, err = process.communicate(timeout=15)
+    assert "Traceback" not in err
+    summary = json.loads(out)
+    assert summary["counters"]["rejected_frames"] == 400
+    assert summary["error"] is None
+
+
+def test_a_node_that_restarts_is_configured_again_before_it_is_believed(
+    daemon: tuple[str, subprocess.Popen[str]],
+) -> None:
+    bus, process = daemon
+    socket = open_frame_socket(bus, [exact(0x1A0)])
+    time.sleep(0.5)
+    while socket.receive():
+        pass  # what was before does not count
+    socket.send(pack(0x000, b"\x81\x01"))  # NMT reset node 1: its mapping is the device's default again
+    seen: list[int] = []
+    deadline = time.monotonic() + 15
+    back = False
+    while not back and time.monotonic() < deadline:
+        socket.wait(0.1)
+        frames, count = socket.frames, socket.receive()
+        seen += [decode(bytes(frames[16 * n + 8 : 16 * n + 16])).status[0] for n in range(count)]
+        back = seen.count(4) > 50 and 4 not in seen[-100:]
+    socket.close()
+    process.send_signal(signal.SIGTERM)
+    _, err = process.communicate(timeout=15)
+    assert back, err
+    assert "node 1 was away and is configured again" in err
+    assert "jtqd: joint 1: inputs lost: " in err
+    assert process.returncode == 0
+
+
+def test_the_bus_that_ends_is_said(bench: str, environment: dict[str, str], tmp_path: Path) -> None:
+    process = started("--bus", bench, environment=environment)
+    socket = open_frame_socket(bench, [exact(0x1A0)])
+    assert socket.wait(20)
+    for pid in Path("/proc").iterdir():
+        if pid.name.isdigit() and bench in (pid / "cmdline").read_bytes().decode(errors="replace"):
+            command = (pid / "cmdline").read_bytes()
+            if b"sim_can" in command:
+                os.kill(int(pid.name), signal.SIGKILL)
+    out, err = process.communicate(timeout=20)
+    assert process.returncode == 1
+    assert "Traceback" not in err
+    assert "the bus" in out + err
+
+
+def test_unknown_bus(environment: dict[str, str]) -> None:
+    for bus in ("can77", "unix:/nonexistent/bus", "unix:"):
+        result = run("--bus", bus, "--duration", "1", "--record", "none", environment=environment)
+        assert result.returncode == 1
+        message = no_traceback(result)
+        assert len(message.splitlines()) == 1, message
+        assert bus.removeprefix("unix:") in message
+    assert list(Path(environment["RUNTIME_DIRECTORY"]).iterdir()) == [], "nothing is left behind"
+
+
+@pytest.mark.parametrize(
+    "arguments", [[], ["--bus"], ["--bus", "sim", "--duration", "-1"], ["--bus", "sim", "--frob"]]
+)
+def test_usage(arguments: list[str], environment: dict[str, str]) -> None:
+    result = run(*arguments, environment=environment)
+    assert result.returncode == 2
+    no_traceback(result)
+
+
+def configuration(directory: Path, **changes: object) -> str:
+    content = yaml.safe_load(shipped("bench.yaml").read_text())
+    for joint in ("joint_1", "joint_2"):
+        content[joint]["file"] = str(shipped(content[joint]["file"]))
+        if "network" in content[joint]:
+            content[joint]["network"]["file"] = str(shipped(content[joint]["network"]["file"]))
+    for key, value in changes.items():
+        section, _, name = key.partition("__")
+        if name:
+            content[section][name] = value
+        else:
+            content[section] = value
+    path = directory / "c.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"joint_2__node": 9}, ["node 9", "1000h"]),
+        ({"joint_1__identity": {"product": 0x1234}}, ["node 1", "1018h:2", "1234"]),
+        ({"sensor__node": 2, "joint_2__node": 3}, ["node", "1000h"]),
+        ({"estimator__method": "nonsense"}, ["estimator.method", "nonsense"]),
+        ({"bitrate": 500_000}, ["bus load", "95"]),
+    ],
+)
+def test_what_does_not_fit_is_named_and_nothing_is_published(
+    tmp_path: Path, environment: dict[str, str], bench: str, changes: dict[str, object], words: list[str]
+) -> None:
+    socket = open_frame_socket(bench, [exact(0x1A0)])
+    path = configuration(tmp_path, **changes)
+    result = run(
+        "--bus", bench, "--config", path, "--duration", "1", "--record", "none", environment=environment
+    )
+    assert result.returncode == 1
+    lines = no_traceback(result).splitlines()
+    assert len(lines) == 1, lines
+    for word in words:
+        assert word in lines[0]
+    assert socket.receive() == 0
+    socket.close()
+
+
+def with_joint_1(directory: Path, joint_1: dict[str, object], **estimator: object) -> str:
+    """A configuration whose first joint file and estimator say something else."""
+    joint = yaml.safe_load(shipped("joint1.yaml").read_text())
+    (directory / "other.yaml").write_text(yaml.safe_dump({**joint, **joint_1}))
+    changes = {f"estimator__{key}": value for key, value in estimator.items()}
+    return configuration(directory, joint_1__file=str(directory / "other.yaml"), **changes)
+
+
+def test_a_wrong_gear_ratio_is_refused(tmp_path: Path, environment: dict[str, str], bench: str) -> None:
+    path = with_joint_1(tmp_path, {"gear_ratio": 120}, method="efficiency")
+    result = run(
+        "--bus", bench, "--config", path, "--duration", "1", "--record", "none", environment=environment
+    )
+    assert result.returncode == 1
+    assert "6091h gear ratio: expected 120" in no_traceback(result)
+
+
+def test_an_estimate_far_from_the_sensor_is_said_once_and_counted(
+    tmp_path: Path, environment: dict[str, str], bench: str
+) -> None:
+    too_sure = {"load_uncertainty": 0.0, "friction_uncertainty": 0.0, "sigma_floor": 0.001}
+    path = with_joint_1(tmp_path, {"torque_constant_nm_per_a": 0.11}, method="tob", **too_sure)
+    process = started("--bus", bench, "--config", path, "--json", environment=environment)
+    assert process.stderr is not None
+    assert process.stdout is not None
+    warning = "jtqd: joint {}: the estimate has been more than 3 sigma away"
+    deadline, said = time.monotonic() + 60, ""
+    while warning.format(1) not in said and time.monotonic() < deadline:
+        said += process.stderr.readline()  # at least one comes every 5 s
+    process.send_signal(signal.SIGTERM)
+    said += process.stderr.read()
+    counted = json.loads(process.stdout.read())["deviations"]
+    assert process.wait(15) == 0
+    assert counted["joint_1"] >= 1
+    assert counted == {f"joint_{number}": said.count(warning.format(number)) for number in (1, 2)}
+
+
+def test_no_process_that_stays_loads_torch_or_scipy(daemon: tuple[str, subprocess.Popen[str]]) -> None:
+    """Training libraries are for training."""
+    _, process = daemon
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    for pid in [str(process.pid), *children]:
+        try:
+            maps = Path(f"/proc/{pid}/maps").read_text()
+        except FileNotFoundError:
+            continue
+        assert "libtorch" not in maps
+        assert "scipy/" not in maps
+
+
+def test_a_second_daemon_on_the_same_bus_is_refused(
+    daemon: tuple[str, subprocess.Popen[str]], environment: dict[str, str]
+) -> None:
+    bus, process = daemon
+    result = run("--bus", bus, "--duration", "1", "--record", "none", environment=environment)
+    assert result.returncode == 1
+    message = no_traceback(result)
+    assert len(message.splitlines()) == 1
+    assert str(process.pid) in message
+    assert process.poll() is None, "the first one goes on"
+    assert len(list(Path(environment["RUNTIME_DIRECTORY"]).glob("*/ring"))) == 1, "and keeps its memory"
+
+
+def test_ctrl_c_on_a_terminal_ends_in_order(environment: dict[str, str]) -> None:
+    """A terminal sends SIGINT to its whole foreground group; bench, loop and recorder must not die of it."""
+    process = started("--bus", "sim", "--json", environment=environment, own_group=True)
+    until_it_publishes(process, environment)
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=15)
+    assert process.returncode == 0, err
+    assert "Traceback" not in err
+    assert json.loads(out)["error"] is None
+
+
+def test_a_loop_that_hangs_does_not_keep_the_daemon(environment: dict[str, str]) -> None:
+    process = started("--bus", "sim", environment=environment)
+    until_it_publishes(process, environment)
+    for entry in Path("/proc").glob("[0-9]*"):
+        command = (entry / "cmdline").read_bytes() if (entry / "cmdline").exists() else b""
+        if b"jtqd.daemon.loop.process" in command and environment["RUNTIME_DIRECTORY"].encode() in command:
+            os.kill(int(entry.name), signal.SIGKILL)
+    out, err = process.communicate(timeout=15)
+    assert process.returncode == 1
+    assert "the loop ended with exit status -9" in out
+    assert "Traceback" not in err

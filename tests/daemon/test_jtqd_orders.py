@@ -1,0 +1,190 @@
+"""Orders to a daemon at awkward moments: while it starts, twice at once, where memory is short. Real processes."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from jtqd.daemon.shared.child_process import Child
+from jtqd.daemon.supervisor.process import wait_for
+from jtqd.drivers.filters import exact
+from jtqd.drivers.frame_socket import open_frame_socket, reachable
+from tests.daemon.slow_bench import slow_configuration
+
+pytestmark = pytest.mark.native
+
+PERIOD_US = 5000
+"""Slow: it is not the loop that is tried here."""
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[str]:
+    bus = f"unix:{tmp_path / 'bus'}"
+    process = subprocess.Popen([sys.executable, "-m", "sim_can", "--bus", bus], stderr=subprocess.DEVNULL)
+    until((tmp_path / "bus").exists)
+    yield bus
+    process.terminate()
+    process.wait(5)
+
+
+@pytest.fixture
+def run_directory(tmp_path: Path) -> Path:
+    directory = tmp_path / "run"
+    directory.mkdir()
+    return directory
+
+
+@pytest.fixture
+def configuration(tmp_path: Path) -> Path:
+    return slow_configuration(tmp_path, PERIOD_US)
+
+
+def until(true: Callable[[], object], timeout_s: float = 60.0) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not true():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def started(*options: str, directory: Path, limit: Callable[[], None] | None = None) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "jtqd.daemon.jtqd", "--record", "none", *options],
+        env={**os.environ, "RUNTIME_DIRECTORY": str(directory), "LOGS_DIRECTORY": ""},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=limit,  # noqa: PLW1509 - no threads here
+        start_new_session=True,
+    )
+
+
+def ended(process: subprocess.Popen[str], directory: Path) -> tuple[int, str]:
+    """(exit status, standard error); no traceback, nothing left."""
+    _, err = process.communicate(timeout=30)
+    assert "Traceback" not in err
+    assert list(directory.iterdir()) == []
+    return process.returncode, err
+
+
+def loaded(process: subprocess.Popen[str], library: str) -> bool:
+    assert process.poll() is None
+    return library in Path(f"/proc/{process.pid}/maps").read_text()
+
+
+def booting(process: subprocess.Popen[str]) -> bool:
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    try:
+        return any(b"jtqd.drivers.boot" in Path(f"/proc/{pid}/cmdline").read_bytes() for pid in children)
+    except OSError:
+        return False
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("moment", ["loading", "booting"])
+def test_told_to_end_while_it_starts(
+    bench: str, run_directory: Path, configuration: Path, number: signal.Signals, moment: str
+) -> None:
+    """While its modules are loaded, and while the nodes are booted: one line, status 0, no child left."""
+    process = started("--bus", bench, "--config", str(configuration), directory=run_directory)
+    until(lambda: loaded(process, "numpy") if moment == "loading" else booting(process))
+    os.killpg(process.pid, number)
+    assert ended(process, run_directory) == (0, "jtqd: stopped before it ran\n")
+
+
+def test_sighup_before_it_runs_is_no_reason_to_end(
+    bench: str, run_directory: Path, configuration: Path
+) -> None:
+    process = started("--bus", bench, "--config", str(configuration), directory=run_directory)
+    until(lambda: loaded(process, "numpy"))
+    process.send_signal(signal.SIGHUP)
+    until(lambda: list(run_directory.glob("*/control")))
+    process.terminate()
+    assert ended(process, run_directory)[0] == 0
+
+
+def test_nodes_are_put_back_where_the_start_fails_after_their_boot(
+    bench: str, run_directory: Path, configuration: Path
+) -> None:
+    """No file may be as large as the ring must be: the loop ends, when the boot has started all nodes."""
+    nmt = open_frame_socket(bench, [exact(0x000)])
+    small = 200_000
+
+    def limit() -> None:
+        import resource
+
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (small, small))
+
+    process = started("--bus", bench, "--config", str(configuration), directory=run_directory, limit=limit)
+    status, err = ended(process, run_directory)
+    assert (status, err) == (1, "jtqd: shared memory: File too large\n")
+    sent = []
+    while count := nmt.receive():
+        sent += [bytes(nmt.frames[16 * n + 8 : 16 * n + 10]) for n in range(count)]
+    nmt.close()
+    assert [each[0] for each in sent if each[1] == 1][-2:] == [0x01, 0x80], "started, and put back"
+    assert sent[-3:] == [b"\x80\x01", b"\x80\x02", b"\x80\x03"]
+
+
+def control(verb: str, bus: str, directory: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "jtqd.daemon.jtq", "control", verb, "--bus", bus, "--json"],
+        env={**os.environ, "RUNTIME_DIRECTORY": str(directory), "XDG_RUNTIME_DIR": ""},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def test_an_order_while_it_starts_is_refused_in_plain_words(
+    bench: str, run_directory: Path, configuration: Path
+) -> None:
+    process = started("--bus", bench, "--config", str(configuration), directory=run_directory)
+    until(lambda: list(run_directory.glob("*/about.json")))
+    process.send_signal(signal.SIGSTOP)  # it stays where it is
+    _, err = control("reload", bench, run_directory).communicate(timeout=30)
+    process.send_signal(signal.SIGCONT)
+    assert err == "jtq control: reload: jtqd takes no orders now: it is starting or ending\n"
+    process.terminate()
+    assert ended(process, run_directory)[0] == 0
+
+
+def test_reloads_at_once(bench: str, run_directory: Path, configuration: Path) -> None:
+    """Each asker gets the outcome of its own reload; SIGHUPs meanwhile make one more, not one each."""
+    deep = run_directory / ("d" * 100) / "e"  # longer than the address of a socket may be
+    deep.mkdir(parents=True)
+    process = started("--bus", bench, "--config", str(configuration), directory=deep)
+    until(lambda: list(deep.glob("*/control")))
+    time.sleep(1.0)
+    told = []
+    first = control("reload", bench, deep)
+    with reachable(next(deep.iterdir()) / "handover") as address:
+        until(lambda: first.poll() is not None or os.path.lexists(address))
+    for _ in range(30):
+        process.send_signal(signal.SIGHUP)
+    second = control("reload", bench, deep)
+    for asker in (first, second):
+        out, _ = asker.communicate(timeout=60)
+        told.append(json.loads(out))
+    assert told[0]["ok"], told
+    assert told[1] == {"ok": False, "error": "another reload is under way"} or told[1]["ok"], told
+    time.sleep(4.0)
+    process.terminate()
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == 0, err
+    assert "Traceback" not in err
+    reloads = len(re.findall("in force from cycle", err)) + len(re.findall("not reloaded", err))
+    assert 2 <= reloads <= 3, err
+
+
+def test_a_child_is_not_waited_for_when_we_are_told_to_end() -> None:
+    child = Child("http.server", ["--bind", "127.0.0.1", "0"])
+    assert wait_for(child, lambda: True) is None
+    child.end()

@@ -1,0 +1,448 @@
+"""Boot against emulated nodes: the way it goes, and each thing that goes wrong with the message it gets."""
+
+import json
+import subprocess
+import sys
+import time
+import uuid
+
+import can
+import pytest
+
+from jtqd.drivers.boot import boot
+from jtqd.drivers.boot_procedure import BusSettings, NodeBoot, RequestError, parse_request
+from jtqd.drivers.devices import (
+    DriveProfile,
+    Identity,
+    SensorProfile,
+    drive_tpdo1,
+    drive_tpdo2,
+    drive_tpdo3,
+    sensor_tpdo1,
+    sensor_tpdo2,
+)
+from jtqd.drivers.pdo import PdoParameters
+from jtqd.drivers.sdo import BootError
+from tests.drivers.canopen_nodes import HubResponder, Responder, TestNode, drive_store, sensor_store
+from tests.paths import ROOT
+
+REQUEST = {
+    "bus": "virtual",
+    "answer_timeout_s": 0.2,
+    "heartbeat_ms": 30,
+    "sync": {"counter_overflow": 240},
+    "nodes": [
+        {"node": 1, "kind": "drive", "identity": {"vendor": 0x7A1, "product": 0x402}},
+        {"node": 2, "kind": "drive", "identity": {"serial": 22}},
+        {"node": 3, "kind": "sensor", "channels": [1]},
+    ],
+}
+
+
+class Bench:
+    """Three nodes on a virtual bus."""
+
+    def __init__(self):
+        self.drive1, self.drive2 = TestNode(drive_store(1)), TestNode(drive_store(2))
+        self.sensor = TestNode(sensor_store(3))
+        self.nodes = [self.drive1, self.drive2, self.sensor]
+        self.drive2.store.set_number(0x1018, 4, 22)
+        self.extra = list
+
+    def boot(self, **changes):
+        channel = uuid.uuid4().hex
+        responder = Responder(can.Bus(interface="virtual", channel=channel), self.nodes)
+        responder.extra = self.extra
+        with responder:
+            request = parse_request({**REQUEST, **changes})
+            return boot(request, can.Bus(interface="virtual", channel=channel))
+
+    def fails(self, **changes):
+        with pytest.raises(BootError) as caught:
+            self.boot(**changes)
+        return caught.value
+
+
+@pytest.fixture
+def bench():
+    return Bench()
+
+
+def test_three_nodes_end_operational_and_mapped(bench):
+    report = bench.boot()
+    assert [node.state for node in bench.nodes] == [5, 5, 5]
+    assert bench.drive1.parameters.tpdos() == [drive_tpdo1(1), drive_tpdo2(1)]
+    assert bench.drive2.parameters.tpdos() == [drive_tpdo1(2), drive_tpdo2(2)]
+    assert bench.sensor.parameters.tpdos() == [sensor_tpdo1(3)]  # its second TPDO is switched off
+    drive = bench.drive1.store
+    assert drive.number(0x1016, 1) == 0x20 << 16 | 500  # watches jtqd's heartbeat
+    assert drive.number(0x1017) == 30
+    assert drive.number(0x1019) == 240
+    assert report.nodes[1].gear_ratio == 100.0
+    assert report.nodes[1].name == "emulated joint drive"
+    assert report.nodes[2].serial == 22
+    assert report.nodes[3].scaling.nm_per_unit == {1: pytest.approx(1e-3)}
+
+
+def test_second_channel_is_mapped_when_used(bench):
+    bench.boot(nodes=[{"node": 3, "kind": "sensor", "channels": [1, 2]}])
+    assert bench.sensor.parameters.tpdos() == [sensor_tpdo1(3), sensor_tpdo2(3)]
+    assert bench.drive1.requests == []  # one node alone can be booted again
+
+
+def test_hash_says_whether_the_configuration_is_the_same(bench):
+    first = bench.boot().nodes[1].configuration_sha256
+    assert bench.boot().nodes[1].configuration_sha256 == first
+    bench.drive1.store.set_number(0x6075, 0, 4000)
+    assert bench.boot().nodes[1].configuration_sha256 != first
+
+
+def test_mapping_is_written_in_the_order_of_cia_301():
+    """Transcript of TPDO1: destroy, clear, entries, count, type, create."""
+    node = TestNode(drive_store(1))
+    written = []
+
+    class Access:
+        def read(self, index, subindex):
+            return node.store.read(index, subindex)
+
+        def write(self, index, subindex, data):
+            written.append((index, subindex, int.from_bytes(data, "little")))
+            node.store.write(index, subindex, data)
+
+    NodeBoot(Access(), DriveProfile(1, temperature=True), BusSettings(0x20)).configure_pdos()
+    assert written[:7] == [
+        (0x1800, 1, 0xC0000181),
+        (0x1A00, 0, 0),
+        (0x1A00, 1, 0x60640020),
+        (0x1A00, 2, 0x60E40120),
+        (0x1A00, 0, 2),
+        (0x1800, 2, 1),
+        (0x1800, 1, 0x40000181),
+    ]
+    assert PdoParameters(node.store).tpdos() == [drive_tpdo1(1), drive_tpdo2(1), drive_tpdo3(1)]
+    assert written[15:] == [
+        (0x1802, 1, 0xC0000381),
+        (0x1A02, 0, 0),
+        (0x1A02, 1, 0x30010010),
+        (0x1A02, 0, 1),
+        (0x1802, 2, 255),
+        (0x1802, 3, 5000),  # 100 us: a value that flickers sends no more than the timer does
+        (0x1802, 5, 500),
+        (0x1802, 1, 0x40000381),
+    ]
+
+
+def test_temperature_is_mapped_where_it_is_asked_for(bench):
+    bench.drive1.store.set_number(0x1802, 5, 0)  # left without its timer, and off, by somebody else
+    bench.drive1.store.set_number(0x1802, 1, 0xC0000381)
+    nodes = [{"node": 1, "kind": "drive", "temperature": True}, {"node": 2, "kind": "drive"}]
+    report = bench.boot(nodes=nodes)
+    one, two = bench.drive1.parameters, bench.drive2.parameters
+    assert one.tpdos() == [drive_tpdo1(1), drive_tpdo2(1), drive_tpdo3(1)]
+    assert two.tpdos() == [drive_tpdo1(2), drive_tpdo2(2)]
+    assert bench.drive1.store.number(0x1802, 5) == 500
+    assert report.nodes[1].tpdos == (drive_tpdo1(1), drive_tpdo2(1), drive_tpdo3(1))
+    cold = report.nodes[1].configuration_sha256
+    bench.drive1.store.set_number(0x3001, 0, 300)
+    assert bench.boot(nodes=nodes).nodes[1].configuration_sha256 == cold, "a value is no configuration"
+
+
+def test_a_node_without_an_inhibit_time_is_mapped_all_the_same(bench):
+    del bench.drive1.store.entries[0x1802, 3]
+    bench.boot(nodes=[{"node": 1, "kind": "drive", "temperature": True}])
+    assert bench.drive1.parameters.tpdos()[2] == drive_tpdo3(1)
+
+
+# What goes wrong --------------------------------------------------------------------------------------------
+
+
+def test_absent_node(bench):
+    bench.nodes.remove(bench.drive2)
+    error = bench.fails()
+    assert str(error) == "node 2: no answer to SDO 1000h:0 within 0.2 s (status B)"
+    assert (error.node, error.object, error.letter) == (2, "1000h:0", "B")
+    assert bench.drive1.state == bench.sensor.state == 0x7F  # nothing is started
+
+
+def test_a_lost_answer_is_asked_for_again(bench):
+    lost = []
+
+    def lose_first(request, reply):
+        if not lost:
+            lost.append(request)
+            return None
+        return reply
+
+    bench.drive1.answer = lose_first
+    bench.boot()
+    assert bench.drive1.requests.count(lost[0]) == 2
+
+
+def test_a_late_answer_to_another_request_is_not_taken(bench):
+    """Before the real answer to the write of 1A00h:1, one for another object arrives."""
+
+    def wrong_index(request, reply):
+        if request[:4] == bytes.fromhex("23 00 1A 01") and bench.drive1.requests.count(request) == 1:
+            return bytes.fromhex("60 17 10 00 00 00 00 00")
+        return reply
+
+    bench.drive1.answer = wrong_index
+    bench.boot()
+    assert bench.drive1.requests.count(bytes.fromhex("23 00 1A 01 20 00 64 60")) == 2  # asked again
+    assert bench.drive1.parameters.tpdos()[0] == drive_tpdo1(1)
+
+
+def test_wrong_device_type(bench):
+    bench.drive1.store.set_number(0x1000, 0, 0x00020194)
+    error = bench.fails()
+    assert "node 1: 1000h:0 device type: expected profile 402 (0x....0192), found 0x00020194" in str(error)
+    assert error.letter == "C"
+
+
+@pytest.mark.parametrize(
+    ("subindex", "key", "name", "letter"),
+    [
+        (1, "vendor", "vendor-ID", "D"),
+        (2, "product", "product code", "M"),
+        (3, "revision", "revision number", "N"),
+        (4, "serial", "serial number", "O"),
+    ],
+)
+def test_wrong_identity(bench, subindex, key, name, letter):
+    bench.drive2.store.set_number(0x1018, subindex, 0x403)
+    error = bench.fails(nodes=[{"node": 2, "kind": "drive", "identity": {key: 0x402}}])
+    expected = f"1018h:{subindex} {name}: expected 0x00000402, found 0x00000403 (status {letter})"
+    assert str(error) == f"node 2: {expected}"
+
+
+def test_refused_mapping(bench):
+    def refuse(request, reply):
+        if request[:4] == bytes.fromhex("23 00 1A 01"):
+            return bytes.fromhex("80 00 1A 01 41 00 04 06")
+        return reply
+
+    bench.drive1.answer = refuse
+    error = bench.fails()
+    assert str(error) == (
+        "node 1: 1A00h:1: write of 0x60640020 refused: object cannot be mapped (06040041h) (status J)"
+    )
+    assert error.letter == "J"
+
+
+def test_mapping_that_reads_back_different(bench):
+    bench.drive1.store.on_read(0x1A01, 2, lambda: 0x60770010)
+    error = bench.fails()
+    expected = "mapping entry read back: expected 0x60780010, found 0x60770010"
+    assert str(error) == f"node 1: 1A01h:2 {expected} (status J)"
+
+
+def test_transmission_type_that_does_not_stick(bench):
+    bench.drive1.store.on_read(0x1800, 2, lambda: 255)
+    assert "1800h:2 transmission type read back: expected 0x01, found 0xFF" in str(bench.fails())
+
+
+def test_a_drive_without_the_temperature_that_is_asked_for(bench):
+    del bench.drive2.store.entries[0x3001, 0]
+    bench.drive2.store._indices.discard(0x3001)
+    error = bench.fails(nodes=[{"node": 2, "kind": "drive", "temperature": True}])
+    assert str(error) == (
+        "node 2: 3001h:0 joint temperature: expected a value (the configuration asks for it), "
+        "found no such object (status J)"
+    )
+    assert bench.drive2.store.number(0x1A00, 1) != drive_tpdo1(2).words[0], "found before anything is written"
+    bench.boot(nodes=[{"node": 2, "kind": "drive"}])
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "text"),
+    [
+        ((0x1A02, 1), 0x30010020, "1A02h:1 mapping entry read back: expected 0x30010010, found 0x30010020"),
+        ((0x1802, 2), 1, "1802h:2 transmission type read back: expected 0xFF, found 0x01"),
+        ((0x1802, 3), 0, "1802h:3 inhibit time in 100 us read back: expected 0x1388, found 0x0000"),
+        ((0x1802, 5), 0, "1802h:5 event timer in ms read back: expected 0x01F4, found 0x0000"),
+    ],
+)
+def test_a_temperature_that_is_not_taken_as_written(bench, key, value, text):
+    bench.drive1.store.on_read(*key, lambda: value)
+    error = bench.fails(nodes=[{"node": 1, "kind": "drive", "temperature": True}])
+    assert str(error) == f"node 1: {text} (status J)"
+
+
+def test_zero_gear_ratio_and_rated_current(bench):
+    bench.drive2.store.set_number(0x6091, 2, 0)
+    assert str(bench.fails()).startswith("node 2: 6091h:2 gear ratio driving shaft revolutions: expected 1..")
+    bench.drive2.store.restore()
+    bench.drive2.store.set_number(0x1018, 4, 22)
+    bench.drive2.store.set_number(0x6075, 0, 0)
+    error = bench.fails()
+    assert str(error) == "node 2: 6075h:0 motor rated current in mA: expected 1..1000000, found 0"
+
+
+def test_missing_scaling_object_is_named_and_can_be_given(bench):
+    for subindex in (0, 1):
+        del bench.drive1.store.entries[0x60E6, subindex]
+    bench.drive1.store._indices.discard(0x60E6)
+    error = bench.fails()
+    assert str(error) == "node 1: 60E6h:1: read refused: object does not exist (06020000h)"
+    nodes = [{"node": 1, "kind": "drive", "given": {"60E6h:1": 1024}}]
+    scaling = bench.boot(nodes=nodes).nodes[1].scaling
+    assert scaling.link_rad_per_count == pytest.approx(2 * 3.141592653589793 / 1024)
+
+
+def test_sensor_channel_that_is_off(bench):
+    bench.sensor.store.set_number(0x6112, 1, 0)
+    error = bench.fails()
+    assert str(error) == "node 3: 6112h:1 channel operating mode: expected 1 (normal operation), found 0"
+
+
+def test_another_sync_identifier(bench):
+    bench.drive1.store.set_number(0x1005, 0, 0x90)
+    assert "node 1: 1005h:0 COB-ID SYNC: expected 080h, found 0x00000090" in str(bench.fails())
+
+
+def test_no_heartbeat(bench):
+    bench.sensor.beats = False
+    error = bench.fails()
+    assert str(error) == "node 3: no heartbeat 703h within 0.1 s (status K)"
+    assert bench.drive1.state == 0x7F
+
+
+def test_never_operational(bench):
+    bench.drive2.obeys_start = False
+    error = bench.fails()
+    assert str(error) == "node 2: NMT start: expected operational within 0.1 s, found pre-operational"
+
+
+def test_restart_during_boot(bench):
+    """A boot-up message after the configuration: the mapping is the default one again."""
+    sent = []
+
+    def boot_up():
+        if sent or not bench.drive2.store.number(0x1017):
+            return []
+        sent.append(1)
+        return [(0x702, b"\x00")]
+
+    bench.extra = boot_up
+    assert str(bench.fails()).startswith("node 2: it restarted during boot")
+
+
+def test_foreign_sync(bench):
+    bench.extra = lambda: [(0x080, b"\x01")]
+    error = bench.fails()
+    assert "another SYNC producer is on the bus (COB-ID 080h" in str(error)
+    assert [node.state for node in bench.nodes] == [0x7F] * 3
+    bench.boot(sync={"check_foreign": False})  # jtqd's own SYNC runs when one node is booted again
+
+
+def test_garbage_on_the_answer_identifiers_is_passed_over(bench):
+    """Short and 29-bit frames on 581h and 701h, all the time."""
+    bench.extra = lambda: [(0x581, b""), (0x581, b"\x80"), (0x701, b""), (0x701, b"\x00\x00")]
+    bench.boot()
+
+
+# The request and the process --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"bus": 3}, "bus: found 3"),
+        ({"nodes": []}, "nodes: found []"),
+        (
+            {"nodes": [{"node": 1, "kind": "motor"}]},
+            "nodes[0].kind: found 'motor', expected 'drive' or 'sensor'",
+        ),
+        (
+            {"nodes": [{"node": 200, "kind": "drive"}]},
+            "nodes[0].node: found 200, expected a whole number 1..127",
+        ),
+        ({"nodes": [{"node": 1, "kind": "drive"}] * 2}, "expected different node numbers"),
+        ({"nodes": [{"node": 1, "kind": "drive", "speed": 1}]}, "nodes[0]: unknown key 'speed'"),
+        ({"nodes": [{"node": 1, "kind": "drive", "given": {"x": 1}}]}, "nodes[0].given"),
+        ({"nodes": [{"node": 3, "kind": "sensor", "channels": [2]}]}, "nodes[0].channels: found [2]"),
+        ({"nodes": [{"node": 1, "kind": "drive", "temperature": 1}]}, "nodes[0].temperature: found 1"),
+        ({"answer_timeout_s": 0}, "answer_timeout_s: found 0"),
+        ({"heartbeat_ms": True}, "heartbeat_ms: found True"),
+    ],
+)
+def test_wrong_requests_are_named(change, message):
+    with pytest.raises(RequestError) as caught:
+        parse_request({**REQUEST, **change})
+    assert message in str(caught.value)
+
+
+def test_request_becomes_profiles():
+    request = parse_request(REQUEST)
+    assert request.profiles == (
+        DriveProfile(1, Identity(vendor=0x7A1, product=0x402)),
+        DriveProfile(2, Identity(serial=22)),
+        SensorProfile(3),
+    )
+    assert request.settings == BusSettings(0x20, heartbeat_ms=30, counter_overflow=240)
+
+
+def run_boot(request):
+    text = request if isinstance(request, str) else json.dumps(request)
+    command = [sys.executable, "-m", "jtqd.drivers.boot"]
+    done = subprocess.run(
+        command, input=text, capture_output=True, text=True, timeout=20, check=False, cwd=ROOT
+    )
+    assert done.stderr == ""
+    return done.returncode, json.loads(done.stdout)
+
+
+def test_process_over_the_unix_bus(tmp_path, bench):
+    path = str(tmp_path / "bus")
+    started = time.monotonic()
+    with HubResponder(path, bench.nodes):
+        status, report = run_boot({**REQUEST, "bus": f"unix:{path}"})
+    assert (status, report["ok"]) == (0, True)
+    print(f"boot {report['duration_s']} s, process {time.monotonic() - started:.2f} s")
+    assert report["duration_s"] < 0.5
+    assert sorted(report["nodes"]) == ["1", "2", "3"]
+    assert report["nodes"]["1"]["scaling"]["ampere_per_unit"] == pytest.approx(0.005)
+    assert report["nodes"]["3"]["scaling"] == {"nm_per_unit": {"1": pytest.approx(0.001)}}
+    assert bench.drive2.parameters.tpdos() == [drive_tpdo1(2), drive_tpdo2(2)]
+
+
+def test_process_names_the_fault_without_a_traceback(tmp_path, bench):
+    path = str(tmp_path / "bus")
+    bench.drive2.store.set_number(0x1018, 4, 23)
+    with HubResponder(path, bench.nodes):
+        status, report = run_boot({**REQUEST, "bus": f"unix:{path}"})
+    assert status == 1
+    assert report == {
+        "ok": False,
+        "error": {
+            "node": 2,
+            "object": "1018h:4",
+            "expected": "0x00000016",
+            "found": "0x00000017",
+            "letter": "O",
+            "message": "node 2: 1018h:4 serial number: expected 0x00000016, found 0x00000017 (status O)",
+        },
+    }
+
+
+def test_process_without_a_bus(tmp_path):
+    for bus in (f"unix:{tmp_path}/none", "nocan7"):
+        status, report = run_boot({**REQUEST, "bus": bus})
+        assert (status, report["ok"]) == (1, False)
+        assert report["error"]["message"].startswith(f"bus {bus}: ")
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"bus": "can0"}'])
+def test_process_with_a_broken_request(text):
+    status, report = run_boot(text)
+    assert status == 1
+    assert report["error"]["message"].startswith("boot request: ")
+
+
+@pytest.mark.socketcan
+def test_boot_over_socketcan(bench):
+    with Responder(can.Bus(interface="socketcan", channel="vcan0"), bench.nodes):
+        report = boot(parse_request({**REQUEST, "bus": "vcan0"}))
+    assert sorted(report.nodes) == [1, 2, 3]
+    assert [node.state for node in bench.nodes] == [5, 5, 5]

@@ -1,0 +1,126 @@
+import math
+
+import pytest
+
+from jtqd.drivers.devices import (
+    DriveProfile,
+    SensorProfile,
+    drive_scaling,
+    drive_tpdo1,
+    drive_tpdo2,
+    drive_tpdo3,
+    estimate_tpdo,
+    parse_key,
+    sensor_scaling,
+    sensor_tpdo1,
+    sensor_tpdo2,
+)
+from jtqd.drivers.sdo import BootError
+
+DRIVE = {
+    (0x608F, 1): 65536,
+    (0x608F, 2): 1,
+    (0x6090, 1): 65536,
+    (0x6090, 2): 1,
+    (0x60E6, 1): 524288,
+    (0x60EB, 1): 1,
+    (0x6091, 1): 201,
+    (0x6091, 2): 2,
+    (0x6075, 0): 5000,
+}
+SENSOR = {(0x6131, 1): 0x00230000, (0x6132, 1): 3}
+
+
+def test_maps_are_those_of_the_bus_layout():
+    assert (drive_tpdo1(2).cob_id, drive_tpdo1(2).words) == (0x182, (0x60640020, 0x60E40120))
+    assert (drive_tpdo2(1).cob_id, drive_tpdo2(1).words) == (0x281, (0x606C0020, 0x60780010, 0x60410010))
+    assert (sensor_tpdo1(3).cob_id, sensor_tpdo1(3).words) == (0x183, (0x91300120, 0x61500108))
+    assert (sensor_tpdo2(3).cob_id, sensor_tpdo2(3).words) == (0x283, (0x71300210, 0x61500208))
+    temperature = drive_tpdo3(2)
+    assert (temperature.cob_id, temperature.words, temperature.transmission_type) == (
+        0x382,
+        (0x30010010,),
+        255,
+    )
+    lengths = [drive_tpdo1(1).length, drive_tpdo2(1).length, sensor_tpdo1(3).length, sensor_tpdo2(3).length]
+    assert lengths == [8, 8, 5, 3]
+
+
+def test_estimate_frame_byte_by_byte():
+    pdo = estimate_tpdo()
+    assert pdo.cob_id == 0x1A0
+    # -12.34 Nm, none (8000h), sigma 0.05 * 7, unknown, joint 1 valid (2), joint 2 stale (4), SYNC 240
+    frame = bytes.fromhex("2E FB  00 80  07 FF  42  F0")
+    assert pdo.layout.unpack(frame) == (-1234, -32768, 7, 255, 0x42, 240)
+
+
+def test_drive_scaling_in_si():
+    scaling, gear_ratio = drive_scaling(DriveProfile(1), DRIVE)
+    assert scaling.motor_rad_per_count * 65536 == pytest.approx(2 * math.pi)
+    assert scaling.motor_rad_s_per_unit * 65536 == pytest.approx(2 * math.pi)
+    assert scaling.link_rad_per_count * 524288 == pytest.approx(2 * math.pi)
+    assert scaling.ampere_per_unit * 1000 == pytest.approx(5.0)  # 1000 permille of 5000 mA
+    assert gear_ratio == 100.5
+
+
+def test_encoders_of_several_revolutions():
+    values = {**DRIVE, (0x608F, 2): 4, (0x6090, 2): 3, (0x60EB, 1): 2}
+    scaling, _ = drive_scaling(DriveProfile(1), values)
+    assert scaling.motor_rad_per_count * 65536 == pytest.approx(8 * math.pi)
+    assert scaling.motor_rad_s_per_unit * 65536 == pytest.approx(6 * math.pi)
+    assert scaling.link_rad_per_count * 524288 == pytest.approx(4 * math.pi)
+
+
+@pytest.mark.parametrize("key", list(DRIVE))
+def test_zero_is_refused_by_name(key):
+    with pytest.raises(BootError) as caught:
+        drive_scaling(DriveProfile(2), {**DRIVE, key: 0})
+    error = caught.value
+    assert (error.node, error.object, error.found) == (2, f"{key[0]:04X}h:{key[1]}", "0")
+    assert error.expected.startswith("1..")
+
+
+def test_given_values_replace_objects():
+    profile = DriveProfile(1, given={(0x6091, 1): 50, (0x6091, 2): 1})
+    assert (0x6091, 1) not in profile.scaling_objects
+    assert drive_scaling(profile, {**DRIVE, (0x6091, 1): 0})[1] == 50
+
+
+@pytest.mark.parametrize(
+    ("word", "decimals", "nm"),
+    [(0x00230000, 0, 1.0), (0x00230000, 3, 1e-3), (0xFD230000, 0, 1e-3), (0x03230000, 2, 10.0)],
+)
+def test_sensor_units(word, decimals, nm):
+    values = {(0x6131, 1): word, (0x6132, 1): decimals}
+    assert sensor_scaling(SensorProfile(3), values).nm_per_unit == {1: pytest.approx(nm)}
+
+
+def test_each_channel_has_its_own_decimals():
+    values = {**SENSOR, (0x6131, 2): 0x00230000, (0x6132, 2): 2}
+    scaling = sensor_scaling(SensorProfile(3, channels=(1, 2)), values)
+    assert scaling.nm_per_unit == {1: pytest.approx(1e-3), 2: pytest.approx(1e-2)}
+
+
+@pytest.mark.parametrize("word", [0x004E0000, 0x00210000, 0x00230100, 0x00230001, 0])
+def test_other_units_are_refused(word):
+    with pytest.raises(BootError, match=f"node 3: 6131h:1 physical unit: expected .*, found 0x{word:08X}"):
+        sensor_scaling(SensorProfile(3), {**SENSOR, (0x6131, 1): word})
+
+
+def test_a_vendor_word_is_accepted_when_given():
+    profile = SensorProfile(3, unit_words={0x00560000: 0.5})
+    values = {(0x6131, 1): 0x00560000, (0x6132, 1): 1}
+    assert sensor_scaling(profile, values).nm_per_unit[1] == pytest.approx(0.05)
+
+
+def test_decimals_are_bounded():
+    with pytest.raises(BootError, match=r"6132h:1 decimal digits: expected 0\.\.9, found 10"):
+        sensor_scaling(SensorProfile(3), {**SENSOR, (0x6132, 1): 10})
+
+
+def test_keys():
+    assert parse_key("608Fh:1") == (0x608F, 1)
+    assert parse_key("6075h") == (0x6075, 0)
+    for bad in ("608f:1", "608Fh:x", "", "608Fh:1:2"):
+        with pytest.raises(ValueError, match=r".*"):
+            parse_key(bad)

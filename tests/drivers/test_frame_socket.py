@@ -1,0 +1,308 @@
+"""Frame sockets: one suite over both transports.
+
+On AF_CAN the suite runs where JTQD_CAN_INTERFACE (default vcan0) exists; named in the environment it must.
+"""
+
+import errno
+import os
+import random
+import socket
+import time
+
+import pytest
+
+from jtqd.drivers.filters import CanFilter, exact, look_alikes
+from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, pack
+from jtqd.drivers.frame_socket import BusDown, BusError, BusGone, open_frame_socket
+from jtqd.drivers.hub import Hub
+
+pytestmark = pytest.mark.native
+
+SEED = 7
+SYNC = pack(0x080, b"\x01")
+TPDO = pack(0x181, bytes(range(8)))
+
+
+class Bench:
+    """A bus of one of the two kinds, driven from the test's own thread."""
+
+    def __init__(self, name, hub=None):
+        self.name = name
+        self.hub = hub
+        self.sockets = []
+
+    def open(self, filters=None, **options):
+        sock = open_frame_socket(self.name, filters, **options)
+        self.sockets.append(sock)
+        self.settle()
+        return sock
+
+    def settle(self):
+        if self.hub is not None:
+            for _ in range(4):
+                self.hub.run_once(0)
+        else:
+            time.sleep(0.002)  # a vcan delivers in a soft interrupt, perhaps after send has returned
+
+
+def received(sock):
+    """All frames that have arrived, as (frame, own)."""
+    result = []
+    while n := sock.receive():
+        result += [(bytes(sock.frames[16 * i : 16 * i + 16]), bool(sock.own[i])) for i in range(n)]
+        assert list(sock.lengths) == [16] * n
+    return result
+
+
+@pytest.fixture(params=["unix", pytest.param("can", marks=pytest.mark.socketcan)])
+def bench(request, tmp_path):
+    if request.param == "unix":
+        hub = Hub(str(tmp_path / "bus"))
+        bench = Bench(f"unix:{tmp_path}/bus", hub)
+    else:
+        name = os.environ.get("JTQD_CAN_INTERFACE", "vcan0")
+        bench = Bench(name)
+        try:
+            open_frame_socket(name, None).close()
+        except BusError as error:
+            if "JTQD_CAN_INTERFACE" in os.environ:
+                raise
+            pytest.skip(str(error))
+    yield bench
+    for sock in bench.sockets:
+        sock.close()
+    if bench.hub is not None:
+        bench.hub.close()
+
+
+def test_frames_arrive_in_order_whole_and_not_at_the_sender(bench):
+    a, b = bench.open(), bench.open()
+    sent = [pack(0x100 + i, bytes([i]) * (i % 9)) for i in range(20)]
+    for frame in sent:
+        assert a.send(frame)
+    bench.settle()
+    assert b.wait(0.0)
+    assert received(b) == [(frame, False) for frame in sent]
+    assert received(a) == []
+    assert not b.wait(0.0)
+
+
+def test_more_frames_than_one_call_takes(bench):
+    a, b = bench.open(), bench.open(capacity=8)
+    for i in range(30):
+        a.send(pack(i))
+    bench.settle()
+    counts = []
+    while n := b.receive():
+        counts.append(n)
+    assert counts == [8, 8, 8, 6]
+
+
+def test_exact_filters_refuse_remote_and_29_bit_frames_of_the_same_number(bench):
+    a, b = bench.open(), bench.open([exact(0x181), exact(0x123456 | CAN_EFF_FLAG)])
+    wanted = [TPDO, pack(0x123456 | CAN_EFF_FLAG, b"\x01")]
+    other = [
+        pack(0x181 | CAN_EFF_FLAG, bytes(8)),
+        pack(0x181 | CAN_RTR_FLAG, bytes(8)),
+        pack(0x182, bytes(8)),
+        pack(0x081),
+        pack(0x123456 | CAN_EFF_FLAG | CAN_RTR_FLAG),
+        pack(0x123457 | CAN_EFF_FLAG),
+        pack(0x456),
+    ]
+    for frame in [*other, *wanted, *other]:
+        a.send(frame)
+    bench.settle()
+    assert [frame for frame, _ in received(b)] == wanted
+
+
+def test_look_alikes_filter_lets_the_wrong_formats_through(bench):
+    a, b = bench.open(), bench.open([look_alikes(0x181)])
+    alike = [TPDO, pack(0x181 | CAN_EFF_FLAG), pack(0x181 | CAN_RTR_FLAG)]
+    for frame in [*alike, pack(0x981 | CAN_EFF_FLAG), pack(0x180)]:
+        a.send(frame)
+    bench.settle()
+    assert [frame for frame, _ in received(b)] == alike
+
+
+def test_no_filter_at_all_receives_nothing_and_filters_can_be_replaced(bench):
+    a, b = bench.open(), bench.open([])
+    a.send(SYNC)
+    bench.settle()
+    assert received(b) == []
+    b.set_filters([exact(0x80)])
+    a.send(TPDO)
+    a.send(SYNC)
+    bench.settle()
+    assert received(b) == [(SYNC, False)]
+    b.set_filters(None)
+    a.send(TPDO)
+    bench.settle()
+    assert received(b) == [(TPDO, False)]
+
+
+def test_random_filters_follow_the_rule_of_can_raw(bench):
+    rng = random.Random(SEED)
+    print("seed", SEED)
+    a, b = bench.open(), bench.open([])
+    ids = [rng.getrandbits(11) | rng.choice([0, CAN_RTR_FLAG]) for _ in range(40)]
+    ids += [rng.getrandbits(29) | CAN_EFF_FLAG | rng.choice([0, CAN_RTR_FLAG]) for _ in range(40)]
+    for _ in range(20):
+        flags = [0, CAN_EFF_FLAG, CAN_RTR_FLAG, CAN_EFF_FLAG | CAN_RTR_FLAG]
+        filters = [
+            CanFilter(rng.choice(ids), 1 << rng.randrange(29) | 1 << rng.randrange(11) | rng.choice(flags))
+            for _ in range(rng.randrange(4))
+        ]
+        b.set_filters(filters)
+        expected = [i for i in ids if any(i & mask == can_id & mask for can_id, mask in filters)]
+        for can_id in ids:
+            a.send(pack(can_id))
+        bench.settle()
+        assert [FRAME.unpack(frame)[0] for frame, _ in received(b)] == expected, filters
+
+
+def test_512_filters_work(bench):
+    a, b = bench.open(), bench.open([exact(i) for i in range(512)])
+    a.send(pack(511))
+    a.send(pack(512))
+    bench.settle()
+    assert [frame for frame, _ in received(b)] == [pack(511)]
+
+
+def test_own_echo_is_flagged_and_filtered_like_any_frame(bench):
+    a, b = bench.open([exact(0x80)], receive_own=True), bench.open()
+    a.send(SYNC)
+    a.send(TPDO)  # no filter of a's own matches: no echo
+    b.send(SYNC)
+    bench.settle()
+    assert received(a) == [(SYNC, True), (SYNC, False)]
+    assert received(b) == [(SYNC, False), (TPDO, False)]
+
+
+def test_kernel_stamps_are_wall_clock_and_monotonic(bench):
+    a, b = bench.open(receive_own=True), bench.open()
+    before = time.time_ns()
+    for i in range(5):
+        a.send(pack(i))
+    bench.settle()
+    after = time.time_ns()
+    for sock in (a, b):
+        assert sock.receive() == 5
+        stamps = list(sock.stamps_ns)
+        assert before <= stamps[0]
+        assert stamps[-1] <= after
+        assert stamps == sorted(stamps)
+
+
+def test_stamp_is_taken_at_arrival_not_at_reading(bench):
+    a, b = bench.open(), bench.open()
+    a.send(SYNC)
+    bench.settle()
+    arrived = time.time_ns()
+    time.sleep(0.02)
+    assert b.receive() == 1
+    assert arrived - 10_000_000 < b.stamps_ns[0] <= arrived
+
+
+def test_error_frames_only_where_asked_for(bench):
+    bus_off = pack(CAN_ERR_FLAG | 0x40, bytes(8))
+    a, plain, alert = bench.open(), bench.open(), bench.open([], error_frames=True)
+    a.send(bus_off)
+    bench.settle()
+    assert received(plain) == []
+    assert [frame for frame, _ in received(alert)] == [bus_off]
+
+
+def test_nothing_to_receive_is_no_error_and_wait_returns_in_time(bench):
+    a = bench.open()
+    assert a.receive() == 0
+    start = time.monotonic()
+    assert not a.wait(0.003)
+    assert 0.0029 < time.monotonic() - start < 0.5
+    assert not a.wait(-1.0)
+
+
+def test_receive_overflow_is_counted(bench):
+    """A socket that is not read loses frames; what follows afterwards says how many."""
+    a, b = bench.open(), bench.open()
+    bench.open()  # a third one keeps the hub's other paths busy
+    if bench.hub is None:
+        b._sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)  # the kernel's minimum, a few frames
+    sent = 0
+    for _ in range(200):
+        for _ in range(32):
+            sent += a.send(TPDO)
+        bench.settle()
+    got = len(received(b))
+    assert got < sent
+    a.send(SYNC)
+    bench.settle()
+    assert received(b) == [(SYNC, False)]
+    assert b.rx_dropped == sent - got
+    a.send(SYNC)
+    bench.settle()
+    assert received(b) == [(SYNC, False)]
+    assert b.rx_dropped == sent - got
+
+
+def test_filters_that_no_transport_knows_are_refused(bench):
+    for wrong in [CanFilter(0x20000080, 0x7FF), CanFilter(-1, 0), CanFilter(0, 1 << 32)]:
+        with pytest.raises(ValueError, match="filter"):
+            bench.open([wrong])
+    with pytest.raises(ValueError, match="512"):
+        bench.open([exact(i) for i in range(513)])
+
+
+# --- failures a test cannot bring about on every kernel ---
+
+
+@pytest.mark.parametrize("number", [errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT])
+def test_kernel_without_can_says_so(monkeypatch, number):
+    def refuse(*_arguments):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(socket, "socket", refuse)
+    with pytest.raises(BusError) as caught:
+        open_frame_socket("can0", None)
+    assert (
+        str(caught.value) == f"can0: this kernel has no CAN (AF_CAN, errno {number}); use unix:PATH instead"
+    )
+
+
+@pytest.mark.parametrize(
+    ("number", "kind"),
+    [
+        (errno.ENETDOWN, BusDown),
+        (errno.ENODEV, BusGone),
+        (errno.ENXIO, BusGone),
+        (errno.EPIPE, BusGone),
+        (errno.EINVAL, BusError),
+    ],
+)
+def test_errors_of_send_by_number(bench, number, kind):
+    sock = bench.open()
+
+    def fail(_frame):
+        raise OSError(number, os.strerror(number))
+
+    sock._send = fail
+    with pytest.raises(BusError) as caught:
+        sock.send(SYNC)
+    assert type(caught.value) is kind
+    assert str(caught.value).startswith(bench.name)
+    if kind is BusGone:
+        with pytest.raises(BusGone):
+            sock.receive()
+    else:
+        assert sock.receive() == 0
+
+
+def test_enobufs_is_a_dropped_frame_not_an_error(bench):
+    sock = bench.open()
+
+    def fail(_frame):
+        raise OSError(errno.ENOBUFS, os.strerror(errno.ENOBUFS))
+
+    sock._send = fail
+    assert [sock.send(SYNC) for _ in range(3)] == [False] * 3
+    assert sock.tx_dropped == 3

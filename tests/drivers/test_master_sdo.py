@@ -1,0 +1,263 @@
+"""SDO client: transfers, waiting times and the queue of a node, as frames; the server's side is the real one."""
+
+import itertools
+import threading
+import time
+import uuid
+
+import can
+import canopen
+import pytest
+
+from jtqd.drivers.sdo import (
+    LENGTH_MISMATCH,
+    MAX_BYTES,
+    OUT_OF_MEMORY,
+    TOGGLE_NOT_ALTERNATED,
+    Broken,
+    Exchange,
+    NodeSdo,
+    SdoAbort,
+    SdoQueue,
+    SdoResult,
+    SdoSilence,
+    Transfer,
+)
+from jtqd.drivers.sdo_server import SdoServer
+from tests.drivers.canopen_nodes import Responder, TestNode, drive_store
+
+
+def frame(text: str) -> bytes:
+    return bytes.fromhex(text)
+
+
+def talk(transfer: Transfer, server: SdoServer) -> list[str]:
+    """Both sides until the end; the frames as text."""
+    said = []
+    for _ in range(2000):
+        reply = server.handle(transfer.request)
+        assert reply is not None
+        said += [transfer.request.hex(" "), reply.hex(" ")]
+        assert transfer.answer(reply)
+        if transfer.done:
+            return said
+    raise AssertionError("endless")
+
+
+def test_expedited_both_ways():
+    server = SdoServer(drive_store(1))
+    read = Transfer(0x1000, 0)
+    assert talk(read, server) == [
+        "40 00 10 00 00 00 00 00",  # initiate upload, 1000h:0
+        "43 00 10 00 92 01 02 00",  # expedited, 4 bytes: servo drive 00020192h
+    ]
+    assert read.value == frame("92 01 02 00")
+    write = Transfer(0x1017, 0, frame("64 00"))
+    assert talk(write, server) == [
+        "2b 17 10 00 64 00 00 00",  # initiate download, expedited, 2 bytes of 4 used: 100 ms
+        "60 17 10 00 00 00 00 00",  # taken
+    ]
+    assert server.store.number(0x1017) == 100
+
+
+def test_segmented_upload_of_a_name():
+    store = drive_store(1)
+    store.set_text(0x1008, 0, "joint drive")  # 11 bytes: two segments
+    read = Transfer(0x1008, 0)
+    assert talk(read, SdoServer(store)) == [
+        "40 08 10 00 00 00 00 00",
+        "41 08 10 00 0b 00 00 00",  # segmented, size 11
+        "60 00 00 00 00 00 00 00",  # segment, toggle 0
+        "00 6a 6f 69 6e 74 20 64",  # 7 bytes, more follow
+        "70 00 00 00 00 00 00 00",  # toggle 1
+        "17 72 69 76 65 00 00 00",  # last: toggle 1, 3 bytes unused, c = 1
+    ]
+    assert read.value == b"joint drive"
+
+
+def test_segmented_download():
+    """Frames only: none of our objects is a writable text."""
+    write = Transfer(0x2000, 1, b"ABCDEFGHI")
+    assert write.request == frame("21 00 20 01 09 00 00 00")  # initiate, size 9
+    assert write.answer(frame("60 00 20 01 00 00 00 00"))
+    assert write.request == frame("00 41 42 43 44 45 46 47")  # toggle 0, 7 bytes
+    assert write.answer(frame("20 00 00 00 00 00 00 00"))
+    assert write.request == frame("1b 48 49 00 00 00 00 00")  # toggle 1, 5 bytes unused, last
+    assert not write.done
+    assert write.answer(frame("30 00 00 00 00 00 00 00"))
+    assert write.done
+
+
+def test_a_refusal_is_the_servers():
+    with pytest.raises(SdoAbort, match="object does not exist"):
+        Transfer(0x5000, 0).answer(frame("80 00 50 00 00 00 02 06"))
+
+
+@pytest.mark.parametrize(
+    "reply",
+    [
+        "43 18 10 01 a1 07 00 00",  # the late answer to 1018h:1
+        "43 00 10 01 00 00 00 00",  # another sub-index
+        "60 00 10 00 00 00 00 00",  # the answer to a download of the same object
+        "80 18 10 01 00 00 04 05",  # an abort of the earlier request
+        "00 01 02 03 04 05 06 07",  # a segment of nobody's
+        "43 00 10 00",  # too short to be one
+    ],
+)
+def test_answers_to_something_else_are_passed_over(reply):
+    exchange = Exchange(0x1000, 0, None, now=0.0, timeout_s=0.5)
+    exchange.begin()
+    assert exchange.on_reply(frame(reply), 0.01) == []
+    assert not exchange.over
+    exchange.on_reply(frame("43 00 10 00 92 01 02 00"), 0.02)
+    assert exchange.value == frame("92 01 02 00")
+    assert exchange.ignored == 1
+
+
+def test_a_toggle_error_ends_the_transfer_and_it_is_begun_again():
+    exchange = Exchange(0x1008, 0, None, now=0.0, timeout_s=0.5)
+    exchange.begin()
+    assert exchange.on_reply(frame("41 08 10 00 0b 00 00 00"), 0.01) == [frame("60 00 00 00 00 00 00 00")]
+    out = exchange.on_reply(frame("10 6a 6f 69 6e 74 20 64"), 0.02)  # toggle 1 where 0 is due
+    assert out == [
+        frame("80 08 10 00 00 00 03 05"),  # abort 05030000h
+        frame("40 08 10 00 00 00 00 00"),  # and the request anew
+    ]
+    assert int.from_bytes(out[0][4:], "little") == TOGGLE_NOT_ALTERNATED
+    assert exchange.repeats == 1
+
+
+def test_a_size_that_is_not_kept_and_one_that_is_too_large():
+    transfer = Transfer(0x1008, 0)
+    transfer.answer(frame("41 08 10 00 09 00 00 00"))  # 9 bytes announced
+    with pytest.raises(Broken) as caught:
+        transfer.answer(frame("01 41 42 43 44 45 46 47"))  # the last segment holds 7
+    assert caught.value.code == LENGTH_MISMATCH
+    with pytest.raises(Broken) as caught:
+        Transfer(0x1008, 0).answer(frame("41 08 10 00") + (MAX_BYTES + 1).to_bytes(4, "little"))
+    assert caught.value.code == OUT_OF_MEMORY
+    endless = Transfer(0x1008, 0)
+    endless.answer(frame("40 08 10 00 00 00 00 00"))  # segmented, size not said
+
+    def send_for_ever() -> None:
+        for n in itertools.count():
+            endless.answer(bytes([0x10 * (n % 2)]) + bytes(7))
+
+    with pytest.raises(Broken):
+        send_for_ever()
+
+
+def test_silence_is_asked_again_and_then_given_up():
+    exchange = Exchange(0x1000, 0, None, now=0.0, timeout_s=0.3)
+    request = exchange.begin()
+    assert exchange.tick(0.05) == []
+    assert exchange.tick(0.11) == request
+    assert exchange.tick(0.22) == request
+    assert exchange.tick(0.32) == [frame("80 00 10 00 00 00 04 05")]  # abort 05040000h: timed out
+    assert exchange.silent
+    assert exchange.on_reply(frame("43 00 10 00 92 01 02 00"), 0.4) == []  # too late
+    assert exchange.value is None
+
+
+# The queue --------------------------------------------------------------------------------------------------
+
+
+def test_requests_to_one_node_go_one_after_the_other_and_each_gets_its_own_answer():
+    queue, results = SdoQueue(), []
+    for subindex in (1, 2):
+        assert queue.read(0x1018, subindex, results.append)
+    assert queue.tick(0.0) == [frame("40 18 10 01 00 00 00 00")]
+    assert queue.tick(0.01) == [], "the second waits"
+    assert queue.on_reply(frame("43 18 10 02 02 04 00 00"), 0.02) == [], "an answer to what was not asked yet"
+    assert queue.on_reply(frame("43 18 10 01 a1 07 00 00"), 0.03) == [frame("40 18 10 02 00 00 00 00")]
+    queue.on_reply(frame("43 18 10 02 02 04 00 00"), 0.04)
+    assert results == [
+        SdoResult(0x1018, 1, frame("a1 07 00 00"), None),
+        SdoResult(0x1018, 2, frame("02 04 00 00"), None),
+    ]
+    assert (queue.ignored, queue.busy) == (1, False)
+
+
+def test_a_request_that_is_never_answered_keeps_the_next_one_waiting_and_no_longer():
+    queue, results = SdoQueue(), []
+    queue.read(0x1000, 0, results.append, timeout_s=0.2)
+    queue.write(0x1017, 0, frame("64 00"), results.append)
+    sent = [each for step in range(60) for each in queue.tick(0.01 * step)]
+    assert sent[0] == sent[1] == frame("40 00 10 00 00 00 00 00")
+    assert results[0] == SdoResult(0x1000, 0, None, None)
+    late = queue.on_reply(frame("43 00 10 00 92 01 02 00"), 0.31)  # of the one that was given up
+    assert late == []
+    queue.on_reply(frame("60 17 10 00 00 00 00 00"), 0.32)
+    assert results[1] == SdoResult(0x1017, 0, b"", None)
+    assert (queue.silences, queue.ignored, queue.repeats >= 1) == (1, 1, True)
+
+
+def test_a_flood_of_answers_fills_nothing_and_the_right_one_is_found():
+    queue, results = SdoQueue(), []
+    queue.read(0x1000, 0, results.append)
+    queue.tick(0.0)
+    for _ in range(10_000):
+        assert queue.on_reply(frame("43 18 10 01 a1 07 00 00"), 0.01) == []
+    queue.on_reply(frame("43 00 10 00 92 01 02 00"), 0.02)
+    assert results == [SdoResult(0x1000, 0, frame("92 01 02 00"), None)]
+    assert queue.ignored == 10_000
+
+
+def test_the_queue_is_bounded_and_can_be_cleared():
+    queue = SdoQueue(limit=4)
+    taken = [queue.read(0x1000, 0, lambda _result: None) for _ in range(6)]
+    assert taken == [True] * 4 + [False] * 2
+    queue.clear()
+    assert not queue.busy
+    assert queue.tick(0.0) == []
+
+
+def test_a_refused_write_is_told():
+    queue, results = SdoQueue(), []
+    queue.write(0x1000, 0, bytes(4), results.append)
+    (request,) = queue.tick(0.0)
+    reply = SdoServer(drive_store(1)).handle(request)
+    assert reply == frame("80 00 10 00 02 00 01 06")  # 06010002h: read only
+    queue.on_reply(reply, 0.01)
+    assert results[0].refusal == 0x0601_0002
+    assert queue.refusals == 1
+
+
+# The boot's client, over a python-can bus with threads -------------------------------------------------------
+
+
+def test_the_boots_client_in_a_flood_of_foreign_answers():
+    """A node whose SDO server floods: 1018h:1 is answered without a question, 2000 times a second."""
+    channel = uuid.uuid4().hex
+    node = TestNode(drive_store(1))
+    network = canopen.Network()
+    network.bus = can.Bus(interface="virtual", channel=channel)
+    network.NOTIFIER_CYCLE = 0.01
+    network.connect()
+    flooder = can.Bus(interface="virtual", channel=channel)
+    stop = threading.Event()
+
+    def flood():
+        while not stop.is_set():
+            flooder.send(
+                can.Message(arbitration_id=0x581, data=frame("43 18 10 01 a1 07 00 00"), is_extended_id=False)
+            )
+            time.sleep(0.0005)
+
+    thread = threading.Thread(target=flood)
+    try:
+        with Responder(can.Bus(interface="virtual", channel=channel), [node]):
+            thread.start()
+            sdo = NodeSdo(network, 1, 0.5)
+            for _ in range(20):
+                assert sdo.read(0x1000, 0) == frame("92 01 02 00")
+                sdo.write(0x1017, 0, frame("64 00"))
+        began = time.monotonic()
+        with pytest.raises(SdoSilence):  # nobody is there any more: the flood does not keep it waiting
+            sdo.read(0x1000, 0)
+        assert time.monotonic() - began < 2.0
+    finally:
+        stop.set()
+        thread.join()
+        flooder.shutdown()
+        network.disconnect()

@@ -1,0 +1,120 @@
+"""Parameters, networks and seeded motions for the tests of the fused estimator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.joint import AdditiveLoss, Fused, FusedSigma, Joint, LossSide, Torsion
+from jtqd.estimator.network import FUSED_FEATURES
+from jtqd.estimator.validity import Envelope
+from tests.estimator.estimator_helpers import Motion, SmallNetwork, joint1, motion
+
+NODES = (-30.0, -12.0, -4.0, 0.0, 3.0, 9.0, 21.0, 40.0)
+SIZES = (7, 16, 16, 1)
+LOW = (-3.5, -50.0, -4.0, *([-1.0] * 4))
+HIGH = (3.5, 50.0, 4.0, *([1.0] * 4))
+TRAINED_C = (20.0, 32.0)
+
+
+def side(seed: int, nodes: tuple[float, ...] = NODES) -> LossSide:
+    """One direction: larger when driving, some of it near zero when back-driven, never negative."""
+    rng = np.random.default_rng(seed)
+    driving = np.maximum(np.array(nodes), 0.0)
+    c = 1.5 + 0.25 * driving + rng.uniform(0.0, 1.0, len(nodes))
+    f = rng.uniform(0.5, 2.5, len(nodes))
+    q = rng.uniform(0.0, 0.3, len(nodes))
+    return LossSide(tuple(c.tolist()), tuple(f.tolist()), tuple(q.tolist()), float(rng.uniform(0.2, 1.0)))
+
+
+def loss_of(seed: int, **changes: Any) -> AdditiveLoss:
+    loss = AdditiveLoss(NODES, side(seed), side(seed + 1000), 0.05, 3.0, 25.0, 2.0, 0.025)
+    return replace(loss, **changes)
+
+
+TORSION = Torsion(12000.0, 4.0e7, 2.0e-5, (2.0, 4.0), (3.0e-5, -4.0e-6), (-2.0e-5, 5.0e-6))
+SIGMA = FusedSigma(0.2, 0.1, 0.02, 0.35, 0.015, 0.15, (1.0, 1.2, 0.9, 1.4))
+
+
+def fused(seed: int = 1, torsion: Torsion | None = TORSION) -> Fused:
+    return Fused(loss_of(seed), torsion, SIGMA)
+
+
+def fused_joint(seed: int = 1, torsion: Torsion | None = TORSION) -> Joint:
+    return replace(joint1(), fused=fused(seed, torsion))
+
+
+def everywhere(
+    velocity: float = 4.0, torque: float = 60.0, temperature_c: tuple[float, float] | None = TRAINED_C
+) -> Envelope:
+    """Known from -velocity to velocity and -torque to torque; any distance up to 1000 Nm."""
+    rows, columns = 2 * round(velocity / 0.25) + 1, 2 * round(torque / 3.0) + 1
+    return Envelope(0.25, 3.0, ((1,) * columns,) * rows, 1000.0, temperature_c)
+
+
+def patches(seed: int, temperature_c: tuple[float, float] | None = TRAINED_C) -> Envelope:
+    """A map with holes, so that a motion runs in and out of what is known."""
+    known = np.random.default_rng(seed).random((13, 13)) < 0.7
+    table = tuple(tuple(int(cell) for cell in row) for row in known)
+    return Envelope(0.5, 6.0, table, 12.0, temperature_c)
+
+
+def fused_network(seed: int = 1, noise: float = 0.4, size_nm: float = 1.0, **metadata: Any) -> SmallNetwork:
+    """7-16-16-1 of random weights; `size_nm` scales its answer. Metadata `...` leaves a key out."""
+    rng = np.random.default_rng(seed)
+    layers = tuple((noise * rng.normal(size=(m, n)), noise * rng.normal(size=n)) for m, n in pairwise(SIZES))
+    values = {
+        "features": list(FUSED_FEATURES),
+        "envelope": everywhere().to_mapping(),
+        "sigma_scale": [0.5, 0.6, 0.7, 0.8],
+        "input_low": list(LOW),
+        "input_high": list(HIGH),
+        "joint": "joint1",
+        "data_sha256": "cd" * 32,
+    }
+    kept = {key: value for key, value in (values | metadata).items() if value is not ...}
+    return SmallNetwork(layers, np.zeros(7), np.array(HIGH), 0.0, size_nm, kept)
+
+
+class FakeNetwork:
+    """A network that says what the test wants."""
+
+    joint = "joint1"
+    sigma_scale = (0.5, 0.6, 0.7, 0.8)
+
+    def __init__(self, answer: Callable[..., float], envelope: Envelope | None = None) -> None:
+        self.answer = answer
+        self.envelope = envelope or everywhere()
+
+    def run_one(self, *x: float) -> float:
+        return float(self.answer(*x))
+
+    def run_many(self, features: FloatArray) -> FloatArray:
+        return np.array([self.run_one(*row) for row in features.tolist()])
+
+
+def twisted(seed: int, count: int = 3000) -> Motion:
+    """`motion` with a torsion of up to 25 Nm between its encoders."""
+    m = motion(seed, count)
+    rng = np.random.default_rng(seed + 500)
+    t = np.cumsum(m.dt_s)
+    torque = rng.uniform(5.0, 25.0) * np.sin(rng.uniform(1.0, 4.0) * t + rng.uniform(0.0, 6.0))
+    return replace(m, motor_position_rad=m.motor_position_rad + 100.0 * torque / 12000.0)
+
+
+def temperatures(kind: str, seed: int, count: int) -> FloatArray | None:
+    """A joint's temperature over a run: unknown, constant, or rising in steps, warm and with gaps."""
+    if kind == "none":
+        return None
+    rng = np.random.default_rng(seed + 900)
+    rising = np.round(np.linspace(rng.uniform(15.0, 26.0), rng.uniform(26.0, 45.0), count), 1)
+    if kind == "gaps":
+        rising[rng.random(count) < 0.1] = np.nan
+        rising[count // 2 : count // 2 + 100] = np.nan
+        rising[rng.integers(0, count, 3)] = (np.inf, -np.inf, 1e300)
+    return np.full(count, 27.0) if kind == "constant" else rising

@@ -1,0 +1,209 @@
+"""Friction and losses: closed forms, Table I in both conventions, dissipation, continuity, twins."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.joint import Efficiency, Friction, Joint
+from jtqd.estimator.losses import FrictionModel, LossModel, static_friction
+from jtqd.models.files import load_joint, shipped
+from tests.estimator.estimator_helpers import joint1, reciprocal_efficiency
+
+GRID_I = [s * a for s in (-1, 1) for a in np.linspace(1.0, 7.0, 25).tolist()]
+GRID_V = [s * a for s in (-1, 1) for a in np.linspace(0.2, 3.0, 29).tolist()]
+
+
+def printed_eta(e: Efficiency, i: float, v: float) -> float:
+    """The polynomial of the quadrant as the file gives it: no bounds, no blending."""
+    if i > 0:
+        return (e.i_pos_w_pos if v > 0 else e.i_pos_w_neg).value(i, v)
+    return (e.i_neg_w_pos if v > 0 else e.i_neg_w_neg).value(i, v)
+
+
+def both_conventions(joint: Joint) -> list[Joint]:
+    return [joint, replace(joint, efficiency=reciprocal_efficiency(joint))]
+
+
+def random_points(seed: int, count: int) -> tuple[FloatArray, FloatArray]:
+    rng = np.random.default_rng(seed)
+    i = rng.normal(size=count) * rng.choice([0.01, 0.3, 3.0, 10.0], count)
+    v = rng.normal(size=count) * rng.choice([0.001, 0.03, 1.0, 4.0], count)
+    i[:50] = 0.0
+    v[25:75] = 0.0
+    v[75:80] = -0.0
+    return i, v
+
+
+def test_friction_closed_forms() -> None:
+    model = FrictionModel(Friction(3.0, 2.0, 0.8, 0.05))
+    # at 1 rad/s the direction is 1, Stribeck gone (exp(-400)): 3 + 2; at 0.02 rad/s tanh(1), exp(-0.16)
+    assert model.torque(1.0) == pytest.approx(5.0, abs=1e-12)
+    assert model.torque(0.02) == pytest.approx(
+        math.tanh(1.0) * (3.0 + 0.8 * math.exp(-0.16)) + 0.04, abs=1e-12
+    )
+    assert model.torque(0.0) == 0.0
+    assert static_friction(Friction(3.0, 2.0, 0.8)) == model.static == pytest.approx(3.8)
+    _, v = random_points(3, 5000)
+    many = model.torque_many(v)
+    assert np.max(np.abs(many - [model.torque(x) for x in v.tolist()])) < 1e-12
+    assert np.array_equal(model.torque_many(-v), -many)
+    assert np.all(many * v >= 0.0)
+
+
+@pytest.mark.parametrize("name", ["joint1.yaml", "joint2.yaml"])
+def test_steady_state_is_the_table_in_both_conventions(name: str) -> None:
+    for joint in both_conventions(load_joint(shipped(name))):
+        e = joint.efficiency
+        assert e is not None
+        model = LossModel(joint)
+        gain = joint.gear_ratio * joint.torque_constant_nm_per_a
+        checked = 0
+        for i in GRID_I:
+            for v in GRID_V:
+                driving = i * v > 0
+                if not driving and abs(i) > 5.0:
+                    continue
+                eta = printed_eta(e, i, v)
+                eta = eta if e.convention == "joint_over_motor" else 1.0 / eta
+                if eta > 1.0 if driving else eta < 1.0:
+                    continue  # here the fit itself would feed energy in
+                torque = gain * i - model.loss(i, v)
+                assert torque / (gain * i) == pytest.approx(eta, abs=1e-3), (e.convention, i, v)
+                checked += 1
+        assert checked > 2200  # of 2 * 25 * 29 driving and 2 * 17 * 29 back-driving points
+
+
+def test_the_table_misses_dissipation_by_little_and_rarely() -> None:
+    """Table I as printed feeds energy in at a corner of one quadrant; the bound moves it by < 2e-3."""
+    joint = joint1()
+    assert joint.efficiency is not None
+    worst = 0.0
+    for i in GRID_I:
+        for v in GRID_V:
+            if i * v < 0 and abs(i) <= 5.0:
+                worst = max(worst, 1.0 - printed_eta(joint.efficiency, i, v))
+    assert 0.0 < worst < 2e-3
+
+
+def test_a_driving_joint_gives_less_than_its_motor_and_a_driven_one_holds_more() -> None:
+    for joint in both_conventions(joint1()):
+        model = LossModel(joint)
+        gain = model.torque_per_ampere
+        for i in GRID_I:
+            for v in GRID_V:
+                torque = gain * i - model.loss(i, v)
+                if i * v > 0:
+                    assert 0.0 < torque / (gain * i) < 1.0
+                else:
+                    assert torque / (gain * i) >= 1.0 - 1e-12
+
+
+def test_losses_always_dissipate_and_are_bounded() -> None:
+    i, v = random_points(11, 20000)
+    for joint in both_conventions(joint1()):
+        model = LossModel(joint)
+        loss = model.loss_many(i, v)
+        assert np.all(loss * v >= 0.0)
+        assert np.all(loss[v == 0.0] == 0.0)
+        bound = np.maximum(3.0 * model.torque_per_ampere * np.abs(i), 0) + FrictionModel(
+            joint.friction
+        ).torque_many(np.abs(v))
+        assert np.all(np.abs(loss) <= bound + 1e-12)
+
+
+def test_continuous_across_reversal_zero_current_and_clamps() -> None:
+    for joint in both_conventions(joint1()):
+        model = LossModel(joint)
+        for i in (-6.9, -3.0, -0.5, 0.0, 0.2, 0.5, 4.0, 8.0):
+            v = np.linspace(-3.5, 3.5, 280001)  # 2.5e-5 rad/s
+            loss = model.loss_many(np.full_like(v, i), v)
+            # d/dv tanh(50 v) is at most 50; Stribeck and eta add less than 40 Nm/(rad/s)
+            assert np.max(np.abs(np.diff(loss))) < 2.5e-5 * (50 * np.max(np.abs(loss)) + 40)
+        for v0 in (-3.5, -1.0, -0.05, -0.001, 0.001, 0.05, 1.0, 3.5):
+            i = np.linspace(-9, 9, 180001)  # 1e-4 A, slopes below 75 Nm/A
+            loss = model.loss_many(i, np.full_like(i, v0))
+            assert np.max(np.abs(np.diff(loss))) < 1.05e-4 * 75
+
+
+def test_zero_current_is_the_additive_friction() -> None:
+    joint = joint1()
+    model, friction = LossModel(joint), FrictionModel(joint.friction)
+    for v in (-2.0, -0.03, -0.0, 0.0, 0.004, 0.7, 5.0):
+        assert model.loss(0.0, v) == pytest.approx(friction.torque(v), abs=1e-12)
+
+
+def test_beyond_the_measured_range_eta_is_held() -> None:
+    model = LossModel(joint1())
+    for i, i_end, v, v_end in ((9.0, 7.0, 1.0, 1.0), (-20.0, -5.0, 1.0, 1.0), (3.0, 3.0, -8.0, -3.0)):
+        held = 1.0 - model.loss(i, v) / (model.torque_per_ampere * i)
+        end = 1.0 - model.loss(i_end, v_end) / (model.torque_per_ampere * i_end)
+        assert held == pytest.approx(end, abs=1e-9)
+        assert model.eta(i, v) == pytest.approx(end, abs=1e-9)
+
+
+def test_a_wild_table_is_bounded() -> None:
+    joint = joint1()
+    e = joint.efficiency
+    assert e is not None
+    for p00, driving, driven in ((-9.0, 0.05, 1.0), (99.0, 1.0, 4.0)):
+        wild = {name: replace(getattr(e, name), p00=p00) for name in ("i_pos_w_pos", "i_pos_w_neg")}
+        model = LossModel(replace(joint, efficiency=replace(e, **wild)))
+        assert model.eta(3.0, 1.0) == driving
+        assert model.eta(3.0, -1.0) == driven
+        assert model.loss(3.0, 1.0) == pytest.approx(18.6 * (1.0 - driving))
+        assert model.loss(3.0, -1.0) == pytest.approx(18.6 * (1.0 - driven))
+        inverse = replace(e, convention="motor_over_joint", **wild)
+        model = LossModel(replace(joint, efficiency=inverse))
+        assert model.eta(3.0, 1.0) == pytest.approx(1.05 - driving)  # the reciprocal meets the other end
+        assert model.eta(3.0, -1.0) == pytest.approx(5.0 - driven)
+
+
+def test_twins() -> None:
+    i, v = random_points(5, 20000)
+    points = list(zip(i.tolist(), v.tolist(), strict=True))
+    for joint in [*both_conventions(joint1()), replace(joint1(), efficiency=None)]:
+        model = LossModel(joint)
+        assert np.max(np.abs(model.loss_many(i, v) - [model.loss(a, b) for a, b in points])) < 1e-12
+        assert (
+            np.max(np.abs(model.rmse_torque_many(i, v) - [model.rmse_torque(a, b) for a, b in points]))
+            < 1e-12
+        )
+        forward, backward = model.standstill_bounds_many(i)
+        single = np.array([model.standstill_bounds(a) for a in i.tolist()])
+        assert np.max(np.abs(np.column_stack((forward, backward)) - single)) < 1e-12
+
+
+def test_without_efficiency_the_loss_is_friction() -> None:
+    joint = replace(joint1(), efficiency=None)
+    model = LossModel(joint)
+    assert not model.has_efficiency
+    assert model.loss(4.0, 0.7) == FrictionModel(joint.friction).torque(0.7)
+    assert model.standstill_bounds(4.0) == (3.8, -3.8)
+    with pytest.raises(ValueError, match="no efficiency"):
+        model.eta(1.0, 1.0)
+
+
+def test_standstill_bounds_are_the_losses_of_the_first_motion() -> None:
+    """At |i| >> i_b they are G Kt |i| |1-eta| at the lowest speed; at i = 0 the static friction."""
+    model = LossModel(joint1())
+    assert model.standstill_bounds(0.0) == pytest.approx((3.8, -3.8))
+    for i in (-4.0, 2.0, 5.0):
+        forward, backward = model.standstill_bounds(i)
+        raw = 6.2 * abs(i)
+        assert forward == pytest.approx(raw * abs(1 - model.eta(i, 0.2)))
+        assert backward == pytest.approx(-raw * abs(1 - model.eta(i, -0.2)))
+        assert forward >= 0.0 >= backward
+
+
+def test_rmse_as_torque() -> None:
+    joint = joint1()
+    assert LossModel(joint).rmse_torque(3.0, 1.0) == pytest.approx(0.01963 * 6.2 * 3.0)
+    assert LossModel(joint).rmse_torque(-3.0, 1.0) == pytest.approx(0.05599 * 6.2 * 3.0)
+    # eta' = 1/eta known to rmse: tau = G Kt i/eta' is known to rmse G Kt |i|/eta'^2
+    other = LossModel(replace(joint, efficiency=reciprocal_efficiency(joint)))
+    assert other.rmse_torque(3.0, 1.0) == pytest.approx(0.01963 * 6.2 * 3.0 * other.eta(3.0, 1.0) ** 2)

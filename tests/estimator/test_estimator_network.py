@@ -1,0 +1,203 @@
+"""The network: exported graph against numpy, one sample against many, and every way a file can be wrong."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+
+from jtqd.estimator.network import FEATURES, TorqueNetwork
+from jtqd.estimator.onnx_graph import NetworkError
+from jtqd.sysid.train.network import export_network
+from tests.estimator.estimator_helpers import HIGH, LOW, SmallNetwork, small_network
+
+
+def inputs(count: int, seed: int = 2) -> np.ndarray[Any, np.dtype[np.float64]]:
+    return np.random.default_rng(seed).normal(size=(count, 6)) * 2.0 * np.array(HIGH)
+
+
+def edited(change: Callable[[onnx.ModelProto], None]) -> bytes:
+    model = onnx.load_from_string(small_network().data)
+    change(model)
+    data: bytes = model.SerializeToString()
+    return data
+
+
+def refused(source: bytes | Path, **options: Any) -> str:
+    with pytest.raises(NetworkError) as caught:
+        TorqueNetwork(source, **options)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+def test_the_graph_is_the_paper_s_network() -> None:
+    """Weights well into saturation, so that tanh(x) instead of tanh(x/2) would be far off."""
+    wild = small_network(3, noise=0.9)
+    network = TorqueNetwork(wild.data)
+    x = inputs(500)
+    expected = wild.numpy(x)
+    assert np.ptp(expected) > 1.0
+    assert np.max(np.abs(network.run_many(x) - expected)) < 1e-9 * np.max(np.abs(expected))
+
+
+def test_a_network_by_hand() -> None:
+    """One hidden neuron: x = 2 -> (2-1)/0.5 = 2 -> 3*2+1 = 7 -> tanh(3.5) -> 4*()-1 -> *10+5."""
+    w0 = np.zeros((6, 1))
+    w0[0, 0] = 3.0
+    mean, std = np.zeros(6), np.ones(6)
+    mean[0], std[0] = 1.0, 0.5
+    layers = [(w0, np.array([1.0])), (np.array([[4.0]]), np.array([-1.0]))]
+    data = export_network(layers, mean, std, 5.0, 10.0, small_network().metadata)
+    expected = 5.0 + 10.0 * (4.0 * math.tanh(3.5) - 1.0)
+    assert TorqueNetwork(data).run_one(2.0, 0.0, 0.0, 0.0, 0.0, 0.0) == pytest.approx(expected, abs=1e-12)
+
+
+def test_one_sample_and_many_agree() -> None:
+    network = TorqueNetwork(small_network(4, noise=0.3).data)
+    x = inputs(2000)
+    assert network.bound
+    many = network.run_many(x)
+    assert np.max(np.abs(many - [network.run_one(*row) for row in x.tolist()])) < 1e-11
+    assert network.run_many(np.zeros((0, 6))).shape == (0,)
+    with pytest.raises(ValueError, match=r"\(4, 5\)"):
+        network.run_many(np.zeros((4, 5)))
+    assert math.isnan(network.run_one(math.nan, 0.0, 0.0, 0.0, 0.0, 0.0))
+    assert network.run_one(*x[0].tolist()) == many[0]  # NaN leaves nothing behind
+
+
+def test_without_aliasing_it_falls_back_to_plain_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    original = onnxruntime.OrtValue.ortvalue_from_numpy
+    monkeypatch.setattr(onnxruntime.OrtValue, "ortvalue_from_numpy", lambda x: original(x.copy()))
+    network = TorqueNetwork(small_network(4, noise=0.3).data)
+    assert not network.bound
+    x = inputs(20)
+    assert [network.run_one(*row) for row in x.tolist()] == pytest.approx(
+        network.run_many(x).tolist(), abs=1e-11
+    )
+
+
+def test_metadata_and_hash(tmp_path: Path) -> None:
+    small = small_network()
+    path = tmp_path / "a.onnx"
+    path.write_bytes(small.data)
+    network = TorqueNetwork(path)
+    assert (network.envelope_low, network.envelope_high) == (LOW, HIGH)
+    assert (network.sigma_nm, network.joint, network.data_sha256) == (0.31, "joint1", "ab" * 32)
+    assert TorqueNetwork(path, sha256=network.sha256.upper()).sha256 == network.sha256
+    message = refused(path, sha256="0" * 64)
+    assert message.startswith(f"{path}: found SHA-256 {network.sha256}, expected 000")
+
+
+def test_unreadable_and_corrupt_files(tmp_path: Path) -> None:
+    absent = tmp_path / "no.onnx"
+    assert refused(absent).startswith(f"{absent}: cannot be read: No such file")
+    assert "cannot be read" in refused(tmp_path)
+    data = small_network().data
+    rng = np.random.default_rng(8)
+    for bad in (b"", b"\x00", b"not a model", data[: len(data) // 2], data[:-1], rng.bytes(5000)):
+        assert refused(bad).startswith("network (bytes): ")
+
+
+def test_flipped_bytes_never_give_another_exception() -> None:
+    seed = 99
+    rng = np.random.default_rng(seed)
+    good = small_network().data
+    for round_ in range(150):
+        data = bytearray(good)
+        for _ in range(rng.integers(1, 6)):
+            data[rng.integers(0, len(data))] = rng.integers(0, 256)
+        try:
+            network = TorqueNetwork(bytes(data))
+        except NetworkError as error:
+            single_line = "\n" not in str(error)
+        else:
+            single_line = True
+            network.run_one(1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+        assert single_line, (seed, round_)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("features", ..., "metadata 'features': missing"),
+        ("features", list(FEATURES)[::-1], "metadata 'features': found ['efficiency_torque_nm'"),
+        ("envelope_low", [0.0] * 5, "expected 6 finite numbers"),
+        ("envelope_high", [*HIGH[:5], math.nan], "expected 6 finite numbers"),
+        ("envelope_high", [-7.0, *HIGH[1:]], "envelope of current_a: found low -6 above high -7"),
+        ("sigma_nm", 0.0, "metadata 'sigma_nm': found 0.0, expected a number in Nm > 0"),
+        ("sigma_nm", "0.3", "metadata 'sigma_nm': found '0.3'"),
+        ("joint", "", "metadata 'joint': found ''"),
+        ("joint", ..., "metadata 'joint': missing"),
+        ("data_sha256", 5, "metadata 'data_sha256': found 5"),
+    ],
+)
+def test_wrong_metadata(key: str, value: object, words: str) -> None:
+    assert words in refused(small_network().with_metadata(**{key: value}).data)
+
+
+def test_metadata_that_is_not_json() -> None:
+    def spoil(model: onnx.ModelProto) -> None:
+        next(p for p in model.metadata_props if p.key == "sigma_nm").value = "0.3 Nm"
+
+    assert "metadata 'sigma_nm': found '0.3 Nm', expected JSON" in refused(edited(spoil))
+
+
+def test_wrong_shapes_types_and_names() -> None:
+    def fixed_batch(model: onnx.ModelProto) -> None:
+        model.graph.input[0].type.tensor_type.shape.dim[0].dim_value = 1
+
+    def renamed(model: onnx.ModelProto) -> None:
+        model.graph.input[0].name = model.graph.node[0].input[0] = "features"
+
+    assert "of shape [1, 6], expected ['N', 6]" in refused(edited(fixed_batch))
+    assert "found inputs ['features'], expected one, 'x'" in refused(edited(renamed))
+    meta = small_network().metadata
+    seven = export_network([(np.ones((7, 1)), np.zeros(1))], np.zeros(7), np.ones(7), 0.0, 1.0, meta)
+    assert "found input 'x' of shape ['N', 7], expected ['N', 6]" in refused(seven)
+
+
+def test_float32_is_refused() -> None:
+    helper = onnx.helper
+    kind = onnx.TensorProto.FLOAT
+    graph = helper.make_graph(
+        [helper.make_node("ReduceSum", ["x", "axes"], ["y"])],
+        "g",
+        [helper.make_tensor_value_info("x", kind, ["N", 6])],
+        [helper.make_tensor_value_info("y", kind, ["N", 1])],
+        [onnx.numpy_helper.from_array(np.array([1], np.int64), "axes")],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+    helper.set_model_props(model, {k: json.dumps(v) for k, v in small_network().metadata.items()})
+    message = refused(model.SerializeToString())
+    assert "found input 'x' of type tensor(float), expected tensor(double)" in message
+
+
+def test_a_network_that_gives_nan_is_refused() -> None:
+    small = small_network()
+    w, b = small.layers[-1]
+    nan = SmallNetwork((*small.layers[:-1], (w * np.nan, b)), small.mean, small.std, 0.0, 1.0, small.metadata)
+    assert "found nan in the middle of its envelope" in refused(nan.data)
+
+
+def test_the_writer_refuses_what_does_not_fit() -> None:
+    ok = [(np.ones((6, 1)), np.zeros(1))]
+    zero, one = np.zeros(6), np.ones(6)
+    for weights, std, output_std in (
+        ([(np.ones((6, 2)), np.zeros(2))], one, 1.0),
+        ([(np.ones((5, 1)), np.zeros(1))], one, 1.0),
+        ([(np.ones((6, 1)), np.zeros(2))], one, 1.0),
+        ([], one, 1.0),
+        (ok, zero, 1.0),
+        (ok, np.ones(5), 1.0),
+        (ok, one, 0.0),
+    ):
+        with pytest.raises(ValueError, match="found"):
+            export_network(weights, zero, std, 0.0, output_std, {})

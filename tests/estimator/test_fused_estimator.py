@@ -1,0 +1,273 @@
+"""The fused estimate of one joint: values in steady state, statuses, trust, temperature, faults."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jtqd.estimator import status as st
+from jtqd.estimator.estimator import STANDSTILL_SIGMAS, FusedEstimator
+from jtqd.estimator.fusion import Fusion
+from jtqd.estimator.joint import QUADRANTS, Joint
+from jtqd.estimator.losses import AdditiveLossModel
+from jtqd.estimator.network import FusedNetwork
+from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.status import Estimate
+from tests.estimator.fused_helpers import TRAINED_C, FakeNetwork, everywhere, fused_joint, fused_network
+
+FUSED = EstimatorSettings(method="fused")
+JOINT = fused_joint()
+K, GAIN = 12000.0, 6.2
+PLAIN = replace(
+    JOINT,
+    fused=replace(
+        JOINT.fused,  # type: ignore[arg-type, type-var]
+        torsion=replace(
+            JOINT.fused.torsion,  # type: ignore[type-var, union-attr]
+            cubic_nm_per_rad3=0.0,
+            zero_rad=0.0,
+            cos_rad=(0.0, 0.0),
+            sin_rad=(0.0, 0.0),
+        ),
+    ),
+)
+"""Torsion torque is K (theta_m/G - theta_l) without more."""
+
+
+def estimator(network: Any = None, joint: Joint = PLAIN, **settings: Any) -> FusedEstimator:
+    return FusedEstimator(joint, replace(FUSED, **settings), network)
+
+
+def says(answer: float | Callable[..., float], **envelope: Any) -> FakeNetwork:
+    return FakeNetwork(answer if callable(answer) else lambda *_: answer, everywhere(**envelope))
+
+
+def steady(  # noqa: PLR0917 - a state and how it is held
+    e: FusedEstimator,
+    i: float,
+    v: float,
+    torsion_nm: float = 5.0,
+    temperature_c: float = 25.0,
+    count: int = 4,
+) -> Estimate:
+    for k in range(count):
+        link = v * 0.001 * k
+        last = e.step(0.001, i, 100.0 * (link + torsion_nm / K), 100.0 * v, link, temperature_c)
+    return last
+
+
+def physics(i: float, v: float, torsion_nm: float, temperature_c: float = 25.0) -> tuple[float, float, float]:
+    """(value, sigma before its scale, half) of both paths at a constant state."""
+    assert PLAIN.fused is not None
+    model = AdditiveLossModel(PLAIN.fused.loss)
+    loss, half = model.loss(GAIN * i, v, model.thermal(temperature_c))
+    return (*Fusion(PLAIN.fused.sigma, True).fuse(GAIN * i, loss, half, v, torsion_nm), half)
+
+
+# ---- values
+
+
+@pytest.mark.parametrize(("i", "v"), [(3.0, 1.0), (-3.0, -1.0), (-3.0, 1.0), (3.0, -1.0), (0.0, 2.0)])
+def test_steady_state_is_the_fusion_of_both_paths(i: float, v: float) -> None:
+    """Sigma times the factor of the quadrant, by the name of the quadrant."""
+    got = steady(estimator(), i, v, torsion_nm=7.0)
+    value, sigma, _ = physics(i, v, 7.0)
+    quadrant = f"i_{'pos' if i >= 0 else 'neg'}_w_{'pos' if v >= 0 else 'neg'}"
+    assert got.status == st.VALID
+    assert got.torque_nm == got.physics_nm == pytest.approx(value, abs=1e-9)
+    assert got.sigma_nm == pytest.approx(sigma * (1.0, 1.2, 0.9, 1.4)[QUADRANTS.index(quadrant)], abs=1e-9)
+    assert math.isnan(got.network_nm)
+    assert math.isnan(got.tob_nm)
+
+
+def test_a_network_inside_its_envelope_is_added() -> None:
+    got = steady(estimator(says(1.5)), 3.0, 1.0)
+    value, sigma, _ = physics(3.0, 1.0, 5.0)
+    assert got.status == st.VALID
+    assert got.torque_nm == got.network_nm == pytest.approx(value + 1.5, abs=1e-9)
+    assert got.physics_nm == pytest.approx(value, abs=1e-9)
+    assert got.sigma_nm == pytest.approx(0.5 * sigma, abs=1e-9)
+
+
+def test_half_trusted_is_half_added() -> None:
+    """Half a kelvin beyond the training range: half of the value, half of the way to the network's sigma."""
+    got = steady(estimator(says(1.5)), 3.0, 1.0, temperature_c=TRAINED_C[1] + 0.5)
+    value, sigma, _ = physics(3.0, 1.0, 5.0, TRAINED_C[1] + 0.5)
+    assert got.status == st.DEGRADED
+    assert got.torque_nm == pytest.approx(value + 0.75, abs=1e-9)
+    assert got.sigma_nm == pytest.approx(0.75 * sigma, abs=1e-9)
+
+
+def test_a_joint_15_k_warmer_than_trained_is_physics_alone() -> None:
+    """The network says nothing any more; the loss still knows the temperature."""
+    network = FusedNetwork(fused_network(size_nm=3.0).data)
+    trained = steady(estimator(network), 3.0, 1.0, temperature_c=TRAINED_C[1])
+    assert trained.status == st.VALID
+    assert abs(trained.torque_nm - trained.physics_nm) > 1e-3
+    warm = steady(estimator(network), 3.0, 1.0, temperature_c=TRAINED_C[1] + 15.0)
+    assert warm.status == st.DEGRADED
+    assert warm.torque_nm == warm.physics_nm  # exactly
+    assert warm.physics_nm == pytest.approx(physics(3.0, 1.0, 5.0, TRAINED_C[1] + 15.0)[0], abs=1e-9)
+    assert warm.physics_nm > trained.physics_nm
+    assert warm.sigma_nm == pytest.approx(physics(3.0, 1.0, 5.0, TRAINED_C[1] + 15.0)[1], abs=1e-9)
+
+
+def test_an_unknown_temperature_is_that_of_the_fit_and_takes_the_trust() -> None:
+    got = steady(estimator(says(1.5)), 3.0, 1.0, temperature_c=math.nan)
+    assert got.status == st.DEGRADED
+    assert got.torque_nm == got.physics_nm == pytest.approx(physics(3.0, 1.0, 5.0)[0], abs=1e-9)
+    assert (
+        steady(estimator(says(1.5, temperature_c=None)), 3.0, 1.0, temperature_c=math.nan).status == st.VALID
+    )
+    e = estimator(says(1.5))
+    e.step(0.001, 3.0, 0.0, 100.0, 0.0)  # no temperature at all
+    assert e.step(0.001, 3.0, 0.0, 100.0, 0.0).status == st.DEGRADED
+
+
+def test_the_temperature_may_change_at_any_sample() -> None:
+    e = estimator()
+    for temperature in (25.0, 25.0, 31.5, math.nan, math.nan, 31.5, 20.0):
+        got = steady(e, 3.0, 1.0, temperature_c=temperature, count=1)
+    for temperature in (31.5, math.nan, 20.0, 20.0):
+        got = steady(e, 3.0, 1.0, temperature_c=temperature, count=40)
+        assert got.physics_nm == pytest.approx(physics(3.0, 1.0, 5.0, temperature)[0], abs=1e-9)
+
+
+@pytest.mark.parametrize("answer", [math.nan, math.inf, -math.inf, 10.1, -10.1, 1e300])
+def test_a_network_that_is_not_near_physics_is_refused(answer: float) -> None:
+    """Limit 25 % of 40 Nm; the record still shows what it said."""
+    got = steady(estimator(says(answer)), 3.0, 1.0)
+    assert got.status == st.DEGRADED
+    assert got.torque_nm == got.physics_nm
+    assert got.sigma_nm == steady(estimator(), 3.0, 1.0).sigma_nm
+    assert got.network_nm == pytest.approx(got.physics_nm + answer, nan_ok=True)
+
+
+def test_no_jump_where_the_network_leaves_its_limit() -> None:
+    """Its answer swept from 7 to 11 Nm: all of it up to 7.5, nothing from 10 on, a straight fall between."""
+    answers = iter(np.linspace(7.0, 11.0, 4001).tolist())
+    e = estimator(says(lambda *_: next(answers)))
+    steady(e, 3.0, 1.0, count=1)
+    got = [steady(e, 3.0, 1.0, count=1) for _ in range(4001)]
+    added = np.array([x.torque_nm - x.physics_nm for x in got])
+    assert added[[0, 500, 1750, 3000, 4000]] == pytest.approx([7.0, 7.5, 8.75 / 2, 0.0, 0.0], abs=1e-9)
+    assert np.max(np.abs(np.diff(added))) < 0.005
+    assert [got[k].status for k in (0, 500, 502, 4000)] == [st.VALID, st.VALID, st.DEGRADED, st.DEGRADED]
+
+
+def test_the_network_fades_at_standstill() -> None:
+    for v, share in ((1.0, 1.0), (0.2, 1.0), (0.125, 0.5), (-0.08, 0.2), (0.05, 0.0), (0.0, 0.0)):
+        got = steady(estimator(says(1.5)), 3.0, v)
+        assert got.torque_nm - got.physics_nm == pytest.approx(share * 1.5, abs=1e-9)
+
+
+# ---- statuses
+
+
+def test_standstill_value_and_sigma() -> None:
+    """The middle of the friction interval, drawn to the torsion; the smaller of both half widths."""
+    for torsion_nm in (5.0, 40.0):
+        got = steady(estimator(says(3.0)), 2.0, 0.0, torsion_nm=torsion_nm)
+        value, sigma, half = physics(2.0, 0.0, torsion_nm)
+        assert half > 2.0
+        assert got.status == st.STANDSTILL
+        assert got.torque_nm == pytest.approx(value, abs=1e-9)
+        assert abs(got.torque_nm - torsion_nm) < 0.1 * abs(2.0 * GAIN - torsion_nm)
+        assert got.sigma_nm == pytest.approx(STANDSTILL_SIGMAS * 0.5 * sigma, abs=1e-9)
+    assert PLAIN.fused is not None
+    rigid = replace(PLAIN, fused=replace(PLAIN.fused, torsion=None))
+    got = steady(estimator(joint=rigid), 2.0, 0.0)
+    assert got.status == st.STANDSTILL
+    assert got.sigma_nm == pytest.approx(1.15 * half + 0.2, abs=1e-9)
+    assert got.torque_nm == pytest.approx(
+        2.0 * GAIN - AdditiveLossModel(PLAIN.fused.loss).loss(12.4, 0.0, 0.0)[0]
+    )
+
+
+def test_first_sample_starts_and_publishes_nothing() -> None:
+    e = estimator(says(1.0))
+    for got in (steady(e, 2.0, 1.0, count=1), e.step(0.0, 2.0, 0.0, 100.0, 0.0)):
+        assert got.status == st.STARTING
+        assert all(math.isnan(x) for n, x in enumerate(got) if n != 2)
+    assert e.step(0.001, 2.0, 0.1, 100.0, 0.001, 25.0).status == st.VALID
+    e.reset()
+    assert e.step(0.001, 2.0, 0.2, 100.0, 0.002, 25.0).status == st.STARTING
+
+
+def test_more_than_three_times_rated_is_invalid() -> None:
+    seen = set()
+    for torsion_nm in range(100, 180, 5):
+        got = steady(estimator(), 22.0, 1.0, torsion_nm=float(torsion_nm))
+        value = physics(22.0, 1.0, float(torsion_nm))[0]
+        assert got.physics_nm == pytest.approx(value, abs=1e-9)  # kept for the record in any case
+        assert got.status == (st.INVALID if value > 120.0 else st.VALID)
+        assert math.isnan(got.torque_nm) == math.isnan(got.sigma_nm) == (value > 120.0)
+        seen.add(got.status)
+    assert seen == {st.VALID, st.INVALID}
+
+
+ABSURD = [
+    *product(range(4), (math.nan, math.inf, -math.inf)),
+    *product((0, 1, 2, 3), (1e300, -1e300, 1.7e308)),
+    (0, -1e4),
+    (1, 1e6),
+    (1, -5e3),
+    (2, -1e6),
+    (3, 40.0),
+]
+
+
+@pytest.mark.parametrize(("place", "absurd"), ABSURD)
+def test_absurd_numbers_are_invalid_for_one_sample_and_leave_nothing(place: int, absurd: float) -> None:
+    e = estimator(says(1.0))
+    steady(e, 2.0, 1.0, count=20)
+    inputs = [2.0, 2.0 + 100 * 5 / K, 100.0, 0.02]
+    inputs[place] = absurd
+    got = e.step(0.001, *inputs, 25.0)
+    assert got.status == st.INVALID
+    assert math.isnan(got.torque_nm)
+    fresh = estimator(says(1.0))
+    again = [(2.0, 100 * (0.021 + 0.001 * k + 5 / K), 100.0, 0.021 + 0.001 * k, 25.0) for k in range(3)]
+    assert e.step(0.001, *again[0]).status == fresh.step(0.001, *again[0]).status == st.STARTING
+    for sample in again[1:]:
+        got = e.step(0.001, *sample)
+        assert got == fresh.step(0.001, *sample)
+        assert got.status == st.VALID
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.001, 0.0501, math.inf, math.nan])
+def test_a_bad_step_starts_again_from_that_sample(dt: float) -> None:
+    e, fresh = estimator(), estimator()
+    steady(e, 4.0, -2.0, count=30)
+    for one in (e, fresh):
+        assert one.step(dt, 2.0, 0.0, 100.0, 0.0, 25.0).status == st.STARTING
+    assert e.step(0.001, 2.5, 0.1, 90.0, 0.001, 25.0) == fresh.step(0.001, 2.5, 0.1, 90.0, 0.001, 25.0)
+
+
+def test_no_float_raises_and_no_number_is_published_without_a_status() -> None:
+    """Seeded storms of ordinary, huge, tiny and absent numbers, also with a network that gives such."""
+    seed = 8100
+    rng = np.random.default_rng(seed)
+    nasty = (0.0, -0.0, 1e-320, 1e-30, 0.001, 1.0, 50.0, 1e3, 1e9, 1e150, 1e300, 1.79e308, math.inf, math.nan)
+
+    def draw() -> float:
+        return float(rng.choice(nasty) * rng.choice((-1.0, 1.0)))
+
+    seen = set()
+    for round_ in range(6):
+        e = estimator(says(lambda *_: draw()), joint=(PLAIN, fused_joint(round_))[round_ % 2])
+        for _ in range(2000):
+            calm = rng.random() < 0.7
+            dt = 0.001 if calm else draw()
+            got = e.step(dt, *((2.0, 100 * 5 / K, 90.0, 0.0, 25.0) if calm else [draw() for _ in range(5)]))
+            seen.add(got.status)
+            published = got.status in st.PUBLISHED
+            assert math.isfinite(got.torque_nm) == math.isfinite(got.sigma_nm) == published, (seed, round_)
+            assert not published or (abs(got.torque_nm) <= 120.0 and got.sigma_nm > 0.0), (seed, round_)
+    assert {st.STARTING, st.VALID, st.DEGRADED, st.INVALID} <= seen

@@ -1,0 +1,76 @@
+"""One door to the estimators of all methods: which it gives, and what it refuses to put together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.estimator import FusedEstimator, JointEstimator
+from jtqd.estimator.joint import Effect
+from jtqd.estimator.methods import estimate_columns, load_network, make_estimator
+from jtqd.estimator.network import FusedNetwork, TorqueNetwork
+from jtqd.estimator.run import JointColumns
+from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.whole_run import estimate_run
+from tests.estimator.estimator_helpers import joint1, small_network
+from tests.estimator.fused_helpers import fused_joint, fused_network
+
+FUSED = EstimatorSettings(method="fused")
+JOINT = fused_joint()
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    with pytest.raises(
+        ConfigError, match="joint joint1: found no section 'fused', which method 'fused' needs"
+    ):
+        make_estimator(joint1(), FUSED)
+    with pytest.raises(ConfigError, match=r"joint1: found effects \(torque_ripple\)"):
+        FusedEstimator(replace(JOINT, effects=(Effect("torque_ripple", {"amplitude_nm": 0.3}),)), FUSED)
+    with pytest.raises(ConfigError, match="joint1: found method 'tob', expected 'fused'"):
+        FusedEstimator(JOINT, EstimatorSettings(method="tob"))
+
+
+def test_networks_of_another_joint_or_kind_are_refused() -> None:
+    ours, paper = FusedNetwork(fused_network().data), TorqueNetwork(small_network().data)
+    table = np.arange(3) * 0.001, JointColumns(*[np.zeros(3)] * 4)
+    other = "joint joint9: found a network of joint 'joint1', expected one of 'joint9'"
+    for method, network, joint, words in (
+        ("fused", ours, replace(JOINT, name="joint9"), other),
+        ("fused", paper, JOINT, "joint joint1: found a network of method 'network', expected one of 'fused'"),
+        (
+            "network",
+            ours,
+            JOINT,
+            "joint joint1: found a network of method 'fused', expected one of 'network'",
+        ),
+        ("tob", ours, JOINT, "found a network of method 'fused'"),
+        ("network", paper, replace(JOINT, name="joint9"), other),
+    ):
+        settings = EstimatorSettings(method=method)
+        with pytest.raises(ConfigError, match=words):
+            make_estimator(joint, settings, network)
+        with pytest.raises(ConfigError, match=words):
+            estimate_columns(joint, settings, network, *table)
+
+
+def test_the_door_gives_the_estimator_of_the_method() -> None:
+    ours = load_network("fused", fused_network().data)
+    paper = load_network("network", small_network().data)
+    assert isinstance(ours, FusedNetwork)
+    assert isinstance(paper, TorqueNetwork)
+    assert isinstance(make_estimator(JOINT, FUSED), FusedEstimator)
+    assert isinstance(make_estimator(JOINT, FUSED, ours), FusedEstimator)
+    for method, network in (("tob", None), ("efficiency", None), ("network", paper)):
+        assert isinstance(make_estimator(JOINT, EstimatorSettings(method=method), network), JointEstimator)
+
+
+def test_the_papers_estimator_does_not_apply_ours() -> None:
+    """Given method `fused` it would quietly be something else."""
+    words = "joint joint1: found method 'fused', which FusedEstimator applies"
+    with pytest.raises(ConfigError, match=words):
+        JointEstimator(JOINT, FUSED)
+    with pytest.raises(ConfigError, match=words):
+        estimate_run(JOINT, FUSED, None, *[np.full(3, 0.001)] * 5)

@@ -1,0 +1,153 @@
+"""Section `fused` of a joint file: written and read back, and every wrong value named by file, key, found, expected."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.joint import MAX_NODES, Joint
+from jtqd.models.files import load_joint
+from jtqd.sysid.fit.joint_writer import write_joint
+from tests.estimator.fused_helpers import NODES, SIGMA, TORSION, fused_joint, loss_of, side
+
+Mapping = dict[str, Any]
+
+
+def read(mapping: Mapping) -> Joint:
+    return Joint.from_mapping(mapping, "some.yaml")
+
+
+def refused(change: Callable[[Mapping], object]) -> str:
+    """The message for a joint file whose section `fused` was changed."""
+    mapping = copy.deepcopy(fused_joint().to_mapping())
+    change(mapping["fused"])
+    with pytest.raises(ConfigError) as caught:
+        read(mapping)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.startswith("some.yaml: key 'fused")
+    return message
+
+
+def put(path: str, value: object) -> Callable[[Mapping], None]:
+    def change(fused: Mapping) -> None:
+        *parents, last = path.split(".")
+        for parent in parents:
+            fused = fused[parent]
+        if value is ...:
+            del fused[last]
+        else:
+            fused[last] = value
+
+    return change
+
+
+@pytest.mark.parametrize("torsion", [TORSION, None, replace(TORSION, orders_per_motor_rev=(2.0, 4.25))])
+def test_round_trip(torsion: Any) -> None:
+    joint = fused_joint(3, torsion)
+    mapping = joint.to_mapping()
+    assert ("torsion" in mapping["fused"]) == (torsion is not None)
+    assert read(mapping) == joint
+    assert read(yaml.safe_load(yaml.safe_dump(mapping))) == joint
+    assert Joint.from_mapping(mapping, "x").to_mapping() == mapping
+
+
+def test_round_trip_through_a_file(tmp_path: Path) -> None:
+    joint = fused_joint(4)
+    write_joint(tmp_path / "joint.yaml", joint, "A test wrote this.")
+    assert load_joint(tmp_path / "joint.yaml").fused == joint.fused
+
+
+def test_one_order_of_the_kinematic_error_is_enough() -> None:
+    one = replace(TORSION, orders_per_motor_rev=(2.0,), cos_rad=(1e-5,), sin_rad=(0.0,))
+    joint = fused_joint(1, one)
+    assert read(joint.to_mapping()) == joint
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        ("los", {}, "fused.los': unknown key, did you mean 'loss'?"),
+        ("loss.positive.coulomb", 1.0, "fused.loss.positive.coulomb': unknown key"),
+        ("loss.color", 1.0, "fused.loss.color': unknown key"),
+        ("torsion.zero", 1.0, "fused.torsion.zero': unknown key, did you mean 'zero_rad'?"),
+        ("sigma.nm", 1.0, "fused.sigma.nm': unknown key"),
+        ("loss", ..., "fused.loss': missing"),
+        ("sigma", ..., "fused.sigma': missing"),
+        ("loss.negative", ..., "fused.loss.negative': missing"),
+        ("loss.temperature_c", ..., "fused.loss.temperature_c': missing"),
+        ("sigma.scale", ..., "fused.sigma.scale': missing"),
+        ("loss.load_nodes_nm", [1.0], "found '1 numbers', expected a list of 2 to 64 finite numbers in Nm"),
+        ("loss.load_nodes_nm", list(range(MAX_NODES + 1)), "found '65 numbers', expected a list of 2 to 64"),
+        (
+            "loss.load_nodes_nm",
+            [*NODES[:3], -4.0, *NODES[4:]],
+            "load_nodes_nm': found [-30.0, -12.0, -4.0, -4",
+        ),
+        ("loss.load_nodes_nm", list(reversed(NODES)), "expected rising numbers"),
+        ("loss.load_nodes_nm", "1 2 3", "found '1 2 3', expected a list"),
+        (
+            "loss.positive.constant_nm",
+            [1.0] * 7,
+            "positive.constant_nm': found '7 numbers', expected a list of 8",
+        ),
+        (
+            "loss.negative.viscous_nms_per_rad",
+            [1.0] * 9,
+            "found '9 numbers', expected a list of 8 finite numbers",
+        ),
+        (
+            "loss.positive.quadratic_nms2_per_rad2",
+            [1.0] * 7 + [float("nan")],
+            "quadratic_nms2_per_rad2': found",
+        ),
+        ("loss.positive.constant_nm", [1.0] * 7 + [True], "expected a list of 8 finite numbers in Nm"),
+        ("loss.positive.stribeck_nm", "0.8", "positive.stribeck_nm': found '0.8', expected a number in Nm"),
+        ("loss.stribeck_velocity_rad_s", 0.0, "stribeck_velocity_rad_s': found 0.0"),
+        ("loss.velocity_max_rad_s", -1.0, "velocity_max_rad_s': found -1.0"),
+        ("loss.temperature_c", 400.0, "temperature_c': found 400.0"),
+        ("loss.viscous_per_k", 0.2, "viscous_per_k': found 0.2"),
+        ("loss.thermal_viscous_nms_per_rad", -0.1, "thermal_viscous_nms_per_rad': found -0.1"),
+        ("torsion.stiffness_nm_per_rad", 0.0, "torsion.stiffness_nm_per_rad': found 0.0"),
+        ("torsion.orders_per_motor_rev", [], "found '0 numbers', expected a list of 1 to 64"),
+        (
+            "torsion.cos_rad",
+            [0.0],
+            "torsion.cos_rad': found '1 numbers', expected a list of 2 finite numbers in rad",
+        ),
+        ("torsion.sin_rad", [0.0] * 3, "torsion.sin_rad': found '3 numbers', expected a list of 2"),
+        ("sigma.current_nm", 0.0, "sigma.current_nm': found 0.0"),
+        ("sigma.torsion_nm", 0.0, "sigma.torsion_nm': found 0.0"),
+        ("sigma.reference_nm", -0.1, "sigma.reference_nm': found -0.1"),
+        (
+            "sigma.scale",
+            [1.0, 1.0, 1.0],
+            "sigma.scale': found '3 numbers', expected a list of 4 finite numbers",
+        ),
+        (
+            "sigma.scale",
+            [1.0, 1.0, 0.0, 1.0],
+            "sigma.scale': found [1.0, 1.0, 0.0, 1.0], expected 4 numbers > 0",
+        ),
+        ("loss", 5, "fused.loss': found 5, expected a mapping"),
+    ],
+)
+def test_wrong_values_are_named(path: str, value: object, words: str) -> None:
+    assert words in refused(put(path, value))
+
+
+def test_values_made_in_code_are_checked_too() -> None:
+    with pytest.raises(ConfigError, match="expected at least 2 rising numbers"):
+        loss_of(1, load_nodes_nm=(*NODES[:-1], NODES[-2]))
+    with pytest.raises(ConfigError, match="found lists of 3, 3, 3 numbers, expected 8"):
+        loss_of(1, negative=side(1, (0.0, 1.0, 2.0)))
+    for change in ({"current_nm": 0.0}, {"torsion_nm": -1.0}, {"scale": (1.0, 1.0, 1.0, 0.0)}):
+        with pytest.raises(ConfigError, match=f"fused.sigma.{next(iter(change))}: found"):
+            replace(SIGMA, **change)

@@ -1,0 +1,265 @@
+"""Joint files: what ships is what the paper says; whatever is wrong is refused in one line that names it."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import pickle
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jtqd.daemon.config import load_config
+from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.joint import EFFECT_NAMES, Effect, Friction, Joint
+from jtqd.models.files import load_joint, load_yaml, shipped
+from jtqd.sim_can.plant_file import load_plant
+from jtqd.sysid.fit.efficiency import TABLE_I
+
+# Table I as printed: one row per coefficient, columns i>0 w>0 | i<0 w<0 | i<0 w>0 | i>0 w<0
+PRINTED = """
+P00   0.2530  0.2850  1.8830  1.8660
+P10   0.1493 -0.1430  0.4870 -0.4769
+P01  -0.0820  0.0839  0.2602 -0.2342
+P20  -0.0117 -0.0114  0.0658  0.0645
+P11   0.0060  0.0059  0.0435  0.04295
+P02   0.0066  0.0060 -0.0168 -0.0101
+RMSE 0.01963 0.01719 0.05599 0.05504
+"""
+
+
+def mapping() -> dict[str, Any]:
+    return load_yaml(shipped("joint1.yaml"))[0]
+
+
+def refused(change: dict[str, Any]) -> str:
+    with pytest.raises(ConfigError) as caught:
+        Joint.from_mapping(change, "my.yaml")
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+def test_table_one_is_the_printed_one_and_ships_with_both_joints() -> None:
+    quadrants = (TABLE_I.i_pos_w_pos, TABLE_I.i_neg_w_neg, TABLE_I.i_neg_w_pos, TABLE_I.i_pos_w_neg)
+    for line in PRINTED.strip().splitlines():
+        name, *printed = line.split()
+        assert [getattr(q, name.lower()) for q in quadrants] == [float(x) for x in printed]
+    assert TABLE_I.convention == "joint_over_motor"
+    for name in ("joint1.yaml", "joint2.yaml"):
+        assert load_joint(shipped(name)).efficiency == TABLE_I
+
+
+def test_shipped_numbers() -> None:
+    one, two = load_joint(shipped("joint1.yaml")), load_joint(shipped("joint2.yaml"))
+    assert (one.name, one.gear_ratio, one.torque_constant_nm_per_a) == ("joint1", 100.0, 0.062)
+    assert (one.rotor_inertia_kgm2, one.stiffness_nm_per_rad, one.damping_nms_per_rad) == (7e-5, 12000.0, 8.0)
+    assert (one.link_inertia_kgm2, one.rated_torque_nm, one.effects) == (0.008, 40.0, ())
+    assert one.friction == Friction(3.0, 2.0, 0.8, 0.05)
+    assert (two.name, two.torque_constant_nm_per_a, two.friction.coulomb_nm) == ("joint2", 0.0615, 3.2)
+
+
+def test_round_trip_copy_and_pickle() -> None:
+    joint = replace(
+        load_joint(shipped("joint1.yaml")),
+        effects=(Effect("cogging", {"amplitude_nm": 0.1, "order_per_motor_rev": 12}),),
+    )
+    assert Joint.from_mapping(joint.to_mapping(), "x") == joint
+    assert pickle.loads(pickle.dumps(joint)) == joint
+    assert copy.deepcopy(joint) == joint
+    with pytest.raises(TypeError):
+        joint.effects[0].parameters["amplitude_nm"] = 1.0  # type: ignore[index]
+
+
+def test_a_typo_is_refused_with_the_nearest_key() -> None:
+    change = mapping()
+    change["friction"]["coloumb_nm"] = 1.0
+    message = refused(change)
+    assert message.startswith("my.yaml: key 'friction.coloumb_nm': unknown key")
+    assert "did you mean 'coulomb_nm'?" in message
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        ("friction.coulomb_nm", "abc", "found 'abc', expected a number in Nm >= 0"),
+        ("friction.coulomb_nm", -1, "found -1, expected a number in Nm >= 0"),
+        ("friction.stribeck_velocity_rad_s", 0.0, "expected a number in rad/s > 0"),
+        ("gear_ratio", 0, "found 0, expected a number > 0"),
+        ("gear_ratio", True, "found True"),
+        ("gear_ratio", float("nan"), "found nan"),
+        ("rated_torque_nm", float("inf"), "found inf"),
+        ("rated_torque_nm", 10**400, "expected a number in Nm > 0"),
+        ("rotor_inertia_kgm2", "7e-5", "write 7.0e-5, not 7e-5"),
+        ("name", "", "expected a text"),
+        ("name", 3, "expected a text"),
+        ("efficiency", [1], "expected a mapping"),
+        ("efficiency.i_pos_w_pos.p00", None, "expected a number"),
+        ("efficiency.convention", "up", "one of 'joint_over_motor'"),
+        ("effects", {"name": "cogging"}, "expected a list of mappings"),
+        ("provenance", "yesterday", "expected a mapping"),
+    ],
+)
+def test_wrong_values_name_key_found_and_expected(path: str, value: object, words: str) -> None:
+    change = mapping()
+    *parents, last = path.split(".")
+    inner = change
+    for parent in parents:
+        inner = inner[parent]
+    inner[last] = value
+    message = refused(change)
+    assert message.startswith(f"my.yaml: key '{path}': found")
+    assert words in message
+
+
+def test_every_key_but_the_optional_ones_must_be_there() -> None:
+    optional = {"efficiency", "effects", "provenance"}
+    for key in mapping():
+        change = mapping()
+        del change[key]
+        if key in optional:
+            Joint.from_mapping(change, "my.yaml")
+        else:
+            assert refused(change).startswith(f"my.yaml: key '{key}': missing")
+
+
+def test_efficiency_without_convention_names_both_choices() -> None:
+    change = mapping()
+    del change["efficiency"]["convention"]
+    message = refused(change)
+    assert "'joint_over_motor'" in message
+    assert "'motor_over_joint'" in message
+    assert "efficiency.convention': missing" in message
+
+
+def test_effects_are_carried_and_only_known_names_pass() -> None:
+    change = mapping()
+    change["effects"] = [
+        {"name": "torque_ripple", "parameters": {"amplitude_nm": 0.4, "order_per_motor_rev": 2}}
+    ]
+    joint = Joint.from_mapping(change, "my.yaml")
+    assert joint.effects == (Effect("torque_ripple", {"amplitude_nm": 0.4, "order_per_motor_rev": 2.0}),)
+    assert len(EFFECT_NAMES) == 25
+    change["effects"][0]["name"] = "magic"
+    assert "effects[0].name': found 'magic'" in refused(change)
+    change["effects"][0] = {"name": "cogging", "parameters": {"amplitude_nm": "big"}}
+    assert "effects[0].parameters.amplitude_nm': found 'big'" in refused(change)
+
+
+def test_values_built_in_code_are_checked_too() -> None:
+    joint = load_joint(shipped("joint1.yaml"))
+    for change in ({"gear_ratio": 0.0}, {"rated_torque_nm": float("nan")}, {"link_inertia_kgm2": -1.0}):
+        with pytest.raises(ConfigError):
+            replace(joint, **change)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError):
+        Friction(-0.1, 1.0)
+
+
+def test_random_garbage_never_gets_past_as_another_exception() -> None:
+    seed = 20260
+    rng = np.random.default_rng(seed)
+    garbage: list[Any] = [None, "x", -1, [], {}, float("nan"), True, [[1]], {"a": 1}, b"x", 1e400]
+    for round_ in range(400):
+        change: Any = mapping()
+        inner = change
+        for _ in range(rng.integers(0, 3)):
+            keys = [k for k in inner if isinstance(inner[k], dict)]
+            if keys:
+                inner = inner[keys[rng.integers(len(keys))]]
+        key = list(inner)[rng.integers(len(inner))]
+        inner[key] = garbage[rng.integers(len(garbage))]
+        message = ""
+        try:
+            Joint.from_mapping(change, "my.yaml")
+        except ConfigError as error:
+            message = str(error)
+        assert message == "" or message.startswith("my.yaml: key"), (seed, round_)
+
+
+def test_section_reads_the_other_kinds() -> None:
+    section = Section({"n": 3, "b": True, "t": "x", 's': {}}, "f.yaml", "top")  # fmt: skip
+    assert section.integer("n", low=1, high=5) == 3
+    assert section.boolean("b") is True
+    assert section.text("t", choices=("x", "y")) == "x"
+    assert section.number("missing", default=None) is None
+    assert section.section("s") is not None
+    assert section.section("absent", optional=True) is None
+    section.finish()
+    for read in (
+        lambda: section.integer("b"),
+        lambda: section.integer("n", high=2),
+        lambda: section.boolean("n"),
+        lambda: section.text("t", choices=("y",)),
+        lambda: section.section("n"),
+        lambda: section.required("absent"),
+        lambda: Section([1], "f.yaml"),
+        lambda: Section({1: 2}, "f.yaml"),
+    ):
+        with pytest.raises(ConfigError, match=r"^f\.yaml: "):
+            read()
+
+
+def test_files(tmp_path: Path) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_bytes(b"a: 1\nb: {c: 2.5}\n")
+    content, digest = load_yaml(path)
+    assert content == {"a": 1, "b": {"c": 2.5}}
+    assert digest == hashlib.sha256(b"a: 1\nb: {c: 2.5}\n").hexdigest()
+    for text, words in (
+        (b"a: 1\na: 2\n", "line 2, column 1 not YAML: the key 'a' is given twice"),
+        (b"a: [1\n", "not YAML"),
+        (b"- 1\n", "found list"),
+        (b"", "an empty file"),
+        (b"\xff\xfe\x00", "not YAML"),
+        (b"a: \x00", "not YAML"),
+        (b"a: !!python/object:os.system {}", "not YAML"),
+        (b"? [1]\n: 2\n? {a: 1}\n: 3\n", "not YAML"),
+    ):
+        path.write_bytes(text)
+        with pytest.raises(ConfigError) as caught:
+            load_yaml(path)
+        assert str(caught.value).startswith(str(path)), text
+        assert words in str(caught.value)
+        assert "\n" not in str(caught.value)
+    for bad in (tmp_path / "absent.yaml", tmp_path):
+        with pytest.raises(ConfigError, match="cannot be read"):
+            load_yaml(bad)
+
+
+def test_a_file_too_large_for_anything_written_by_hand_is_refused_without_reading_it_all(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "large.yaml"
+    path.write_bytes(b"a: 1\n#".ljust(1_000_000, b" "))
+    assert load_yaml(path)[0] == {"a": 1}
+    path.write_bytes(b"a: 1\n#".ljust(1_000_001, b" "))
+    for load in (load_yaml, load_joint, load_config, load_plant):
+        for large in (path, Path("/dev/zero")):
+            with pytest.raises(ConfigError) as caught:
+                load(large)
+            assert str(caught.value) == (
+                f"{large}: found more than 1000000 bytes, expected a YAML file written by hand"
+            )
+
+
+def test_whole_limits_are_told_as_whole_numbers() -> None:
+    def words(**limits: int) -> str:
+        with pytest.raises(ConfigError) as caught:
+            Section({"bits": "x"}, "c.yaml").integer("bits", "bit/s", **limits)
+        return str(caught.value).partition("expected ")[2]
+
+    assert words(low=10_000, high=1_000_000) == "a whole number in bit/s from 10000 to 1000000"
+    assert words(low=1_000_000) == "a whole number in bit/s >= 1000000"
+    assert words(high=0xFFFF_FFFF) == "a whole number in bit/s <= 4294967295"
+    with pytest.raises(ConfigError, match=r"a number in s from 0\.5 to 1e\+09$"):
+        Section({"x": -1}, "c.yaml").number("x", "s", 0.5, 1e9)
+
+
+def test_shipped_lists_what_ships() -> None:
+    with pytest.raises(ConfigError, match=r"which has: .*joint1\.yaml.*joint2\.yaml"):
+        shipped("joint3.yaml")
+    with pytest.raises(ConfigError):
+        shipped("../pyproject.toml")

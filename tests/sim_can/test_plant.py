@@ -1,0 +1,356 @@
+"""The plant against closed forms: Table I in steady state, resonances, energy, statics, stiction, step size."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jtqd.models.files import load_joint, shipped
+from jtqd.sim_can.plant import Plant, joint_friction
+from jtqd.sim_can.plant_file import (
+    Deviations,
+    DriveParameters,
+    JointPlant,
+    PlantParameters,
+    load_plant,
+    plant_of_joint,
+    substep_limit,
+)
+from jtqd.sim_can.source import CURRENT, OFF, VELOCITY
+
+JOINT = load_joint(shipped("joint1.yaml"))
+G, KT, K = JOINT.gear_ratio, JOINT.torque_constant_nm_per_a, JOINT.stiffness_nm_per_rad
+JM, JL = JOINT.rotor_inertia_kgm2, JOINT.link_inertia_kgm2
+
+# Table I, literally: p00 p10 p01 p20 p11 p02 by (sign of i, sign of w)
+TABLE_I = {
+    (1, 1): (0.2530, 0.1493, -0.0820, -0.0117, 0.0060, 0.0066),
+    (-1, -1): (0.2850, -0.1430, 0.0839, -0.0114, 0.0059, 0.0060),
+    (-1, 1): (1.8830, 0.4870, 0.2602, 0.0658, 0.0435, -0.0168),
+    (1, -1): (1.8660, -0.4769, -0.2342, 0.0645, 0.04295, -0.0101),
+}
+
+
+def table_i(i, w):
+    p00, p10, p01, p20, p11, p02 = TABLE_I[int(math.copysign(1, i)), int(math.copysign(1, w))]
+    return p00 + p10 * i + p01 * w + p20 * i * i + p11 * i * w + p02 * w * w
+
+
+def ideal(joint=JOINT, **deviations):
+    side = JointPlant(joint, Deviations(**deviations))
+    return PlantParameters((side, side))
+
+
+def frictionless(**changes):
+    joint = replace(JOINT, damping_nms_per_rad=0.0, **changes)
+    return Plant(ideal(joint, friction_scale=0.0))
+
+
+@pytest.mark.parametrize("velocity", [0.2, 1.4, 2.95])
+@pytest.mark.parametrize("direction", [1, -1])
+def test_steady_state_has_the_efficiencies_of_table_i_in_all_four_quadrants(velocity, direction):
+    """τ/(G Kt i) of both joints within 1 % of Eq. (8): joint 2 driving and back-driven, joint 1 driving."""
+    checked = set()
+    for current in (-5.0, -3.0, -1.0, 1.0, 3.0, 5.0):
+        plant = Plant(ideal())
+        w = direction * velocity
+        plant.motor_velocity = [G * w, -G * w]
+        plant.link_velocity = w
+        plant.command(0, VELOCITY, G * w)
+        plant.command(1, CURRENT, current)
+        plant.step(1.0)
+        samples = []
+        for _ in range(300):
+            plant.step(0.001)
+            currents = [drive.current_a for drive in plant.drives]
+            samples.append([*currents, *plant.joint_torques(), *plant.motor_velocity])
+        i1, i2, tau1, tau2, w1, w2 = np.mean(samples, axis=0)
+        for i, tau, speed in ((i1, tau1, w1 / G), (i2, tau2, w2 / G)):
+            if 0.99 <= abs(i) <= 5.0:
+                assert tau / (G * KT * i) == pytest.approx(table_i(i, speed), rel=0.01), (current, i, speed)
+                checked.add((i > 0, speed > 0))
+    assert {pair[0] for pair in checked} == {True, False}
+    assert len(checked) == 4
+
+
+def test_stribeck_is_there_at_standstill_and_gone_at_the_first_speed_of_table_i():
+    plain = joint_friction(JointPlant(JOINT))
+    peaked = joint_friction(JointPlant(JOINT, Deviations(stribeck_nm=0.8, stribeck_velocity_rad_s=0.05)))
+    for tau in (-20.0, 0.0, 15.0):
+        assert peaked(tau, 0.0) - plain(tau, 0.0) == pytest.approx(0.8)
+        assert peaked(tau, 0.05) - plain(tau, 0.05) == pytest.approx(0.8 / math.e)
+        assert peaked(tau, -0.1) - plain(tau, -0.1) == pytest.approx(0.8 * math.exp(-4))
+        for w in (0.2, -0.2, 1.0):
+            assert abs(peaked(tau, w) - plain(tau, w)) < 1e-6
+
+
+def test_friction_never_helps_the_motion():
+    rng = np.random.default_rng(5)
+    friction = joint_friction(JointPlant(JOINT, Deviations(viscous_scale=0.0)))
+    for tau, w in zip(rng.uniform(-90, 90, 4000), rng.uniform(-5, 5, 4000), strict=True):
+        assert friction(tau, w) >= 0.0
+
+
+def crossings_hz(values, dt):
+    """Frequency from the first and last upward zero crossing, interpolated."""
+    v = np.asarray(values)
+    k = np.flatnonzero((v[:-1] < 0) & (v[1:] >= 0))
+    times = k + v[k] / (v[k] - v[k + 1])
+    return (len(times) - 1) / ((times[-1] - times[0]) * dt)
+
+
+def test_rotors_against_each_other_ring_at_the_closed_form():
+    """Both rotors opposed, link at rest by symmetry: ω² = K / (Jm G²)."""
+    plant = frictionless()
+    plant.motor_position = [1e-3 * G, 1e-3 * G]  # own frames: the coupling is squeezed from both sides
+    samples = []
+    for _ in range(2000):
+        plant.step(0.001)
+        samples.append(plant.motor_velocity[0])
+    assert plant.link_position == pytest.approx(0.0, abs=1e-12)
+    expected = math.sqrt(K / (JM * G * G)) / (2 * math.pi)
+    assert crossings_hz(samples, 0.001) == pytest.approx(expected, rel=1e-3)
+
+
+def test_link_against_both_rotors_rings_at_the_closed_form():
+    """Link between two rotors moving together: ω² = 2 K (1/(2 Jl) + 1/(2 Jm G²)); Jl of each link."""
+    plant = frictionless()
+    mass = 2 * JM * G * G
+    plant.link_position = 1e-4
+    plant.motor_position = [-1e-4 * 2 * JL / mass * G, +1e-4 * 2 * JL / mass * G]
+    samples = []
+    for _ in range(4000):
+        plant._integrate(1, plant.substep_s)
+        samples.append(plant.link_velocity)
+    expected = math.sqrt(2 * K * (1 / (2 * JL) + 1 / mass)) / (2 * math.pi)
+    assert crossings_hz(samples, plant.substep_s) == pytest.approx(expected, rel=3e-3)
+
+
+def test_energy_balance_of_every_term():
+    """ΔE = motor work - damping - friction, term by term summed outside the plant."""
+    h = 5e-6
+    plant = Plant(ideal(ripple_nm=0.5))
+    plant.motor_velocity = [120.0, -90.0]
+    plant.motor_position = [0.2, 0.1]
+    plant.link_velocity = 1.0
+    plant.command(0, CURRENT, 4.0)
+    plant.command(1, CURRENT, -2.5)
+    for drive in plant.drives:
+        drive.plan(1.0)
+    before = plant.energy()
+    balance = work = 0.0
+    for _ in range(60_000):
+        tau = plant.joint_torques()
+        link = plant.link_velocity
+        old = list(plant.motor_velocity)
+        plant._integrate(1, h)
+        for k, sign in ((0, 1.0), (1, -1.0)):
+            w = 0.5 * (old[k] + plant.motor_velocity[k])
+            slip = old[k] / G - sign * link
+            power = KT * plant.drives[k].current_a * w
+            friction = plant.friction[k](tau[k], old[k] / G) * abs(w) / G
+            balance += h * (power - friction - JOINT.damping_nms_per_rad * slip * slip)
+            work += h * abs(power)
+    assert work > 1.0
+    assert plant.energy() - before == pytest.approx(balance, abs=0.005 * work)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_without_current_the_energy_only_falls(seed):
+    rng = np.random.default_rng(seed)
+    plant = Plant(ideal(ripple_nm=0.4, stribeck_nm=0.8))
+    plant.motor_velocity = list(rng.uniform(-250, 250, 2))
+    plant.link_velocity = float(rng.uniform(-2, 2))
+    plant.motor_position = list(rng.uniform(-0.3, 0.3, 2))
+    first = energy = plant.energy()
+    for _ in range(600):
+        plant.step(0.001)
+        # 1e-3 of the start: semi-implicit Euler exchanges that much with its shadow energy in a period
+        assert plant.energy() <= energy + 1e-3 * first
+        energy = plant.energy()
+    assert energy < 0.5 * first
+
+
+def test_torsion_at_rest_is_torque_over_stiffness():
+    plant = Plant(ideal())
+    plant.command(0, VELOCITY, 0.0)
+    plant.command(1, CURRENT, 4.0)
+    plant.step(3.0)
+    tau1, tau2 = plant.joint_torques()
+    assert plant.motor_velocity == [0.0, 0.0]
+    assert tau1 > 5.0
+    assert tau1 == pytest.approx(tau2, rel=1e-6)
+    assert plant.motor_position[0] / G - plant.link_position == pytest.approx(tau1 / K, rel=1e-6)
+    assert plant.sensor_torque() == pytest.approx(tau1, rel=1e-6)
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+def test_positive_current_gives_positive_torque_in_the_sensor(joint):
+    plant = Plant(ideal())
+    plant.command(1 - joint, VELOCITY, 0.0)
+    plant.command(joint, CURRENT, 3.0)
+    plant.step(1.0)
+    assert plant.sensor_torque() > 3.0
+    assert plant.motor_position[joint] > 0.0
+    assert plant.link_position * (1 if joint == 0 else -1) > 0.0
+
+
+def test_sensor_sees_each_joint_less_its_own_link_inertia():
+    """τ1 - Jl1 a1 = τ2 - Jl2 a2 while the link accelerates, with unequal links."""
+    light = replace(JOINT, link_inertia_kgm2=0.004)
+    plant = Plant(PlantParameters((JointPlant(JOINT), JointPlant(light))))
+    plant.motor_position = [0.3, -0.1]
+    tau1, tau2 = plant.joint_torques()
+    acceleration = (tau1 - tau2) / (0.004 + JL)
+    assert abs(acceleration) > 100.0
+    assert plant.sensor_torque() == pytest.approx(tau1 - JL * acceleration)
+    assert plant.sensor_torque() == pytest.approx(tau2 + 0.004 * acceleration)
+
+
+def test_friction_of_each_joint_is_asked_at_its_own_torque_and_velocity():
+    plant = Plant(ideal())
+    asked = {}
+    plant.friction = tuple(lambda tau, w, k=k: asked.update({k: (tau, w)}) or 0.0 for k in (0, 1))
+    plant.motor_position = [0.3, -0.1]
+    plant.motor_velocity = [40.0, -25.0]
+    torques = plant.joint_torques()
+    plant._integrate(1, 1e-9)
+    for k in (0, 1):
+        assert asked[k] == pytest.approx((torques[k], plant.motor_velocity[k] / G), rel=1e-6)
+
+
+def test_load_held_by_friction_does_not_creep():
+    """5 s with a load below breakaway: velocities are exactly zero and no angle changes by one bit."""
+    plant = Plant(ideal(ripple_nm=0.4, stribeck_nm=0.8))
+    plant.command(1, CURRENT, 0.35)
+    plant.motor_position = [0.0, 0.02]
+    plant.step(1.0)
+    angles = list(plant.motor_position)
+    for _ in range(100):
+        plant.step(0.05)
+        assert plant.motor_velocity == [0.0, 0.0]
+    assert plant.motor_position == angles
+
+
+def test_joint_breaks_away_where_the_current_exceeds_friction():
+    """Joint 2 is off and holds by its friction: joint 1 stands, then winds the spring up, then turns both."""
+    static = joint_friction(JointPlant(JOINT))(0.0, 0.0)
+
+    def after(factor):
+        plant = Plant(ideal())
+        plant.command(0, CURRENT, factor * static / (G * KT))
+        plant.step(1.0)
+        return plant
+
+    assert after(0.95).motor_position == [0.0, 0.0]
+    wound = after(1.5)
+    assert wound.motor_velocity == [0.0, 0.0]
+    assert 0.1 * static < wound.sensor_torque() < static
+    turning = after(5.0)
+    assert turning.motor_velocity[0] > 0.1 * G
+    assert turning.motor_velocity[1] < -0.1 * G
+
+
+def test_late_step_is_the_same_physics_as_steps_in_time():
+    def run(dt, count):
+        plant = Plant(load_plant(shipped("plant.yaml")))
+        plant.command(0, VELOCITY, 80.0)
+        plant.command(1, CURRENT, -2.0)
+        for _ in range(count):
+            plant.step(dt)
+        return [*plant.motor_position, *plant.motor_velocity, plant.link_position, plant.sensor_torque()]
+
+    assert run(0.05, 10) == pytest.approx(run(0.001, 500), rel=1e-9)
+    assert run(0.00107, 467)[2] == pytest.approx(run(0.001, 500)[2], rel=2e-3)  # jitter: other substeps
+
+
+def test_results_converge_with_the_step_size():
+    """Halving the step halves the error (first order); at 125 us the torque is within 0.05 Nm rms."""
+
+    def torque(substep):
+        plant = Plant(replace(load_plant(shipped("plant.yaml")), substep_s=substep))
+        out = []
+        for k in range(800):
+            plant.command(0, VELOCITY, 100.0 * math.sin(6.0 * k * 0.001))
+            plant.command(1, CURRENT, 2.0 * math.sin(9.0 * k * 0.001))
+            plant.step(0.001)
+            out.append(plant.sensor_torque())
+        return np.array(out)
+
+    exact = torque(125e-6 / 16)
+    coarse, fine = (float(np.sqrt(np.mean((torque(h) - exact) ** 2))) for h in (125e-6, 62.5e-6))
+    assert coarse < 0.05
+    assert 1.5 < coarse / fine < 3.0
+
+
+def test_ripple_has_its_amplitude_and_order():
+    """G Kt i - G Jm dw/dt - τ is the ripple alone when there is no friction: A cos(2 θm + φ)."""
+    plant = Plant(ideal(friction_scale=0.0, ripple_nm=0.4, ripple_phase_rad=0.7))
+    plant.motor_velocity = [100.0, -100.0]
+    plant.link_velocity = 1.0
+    plant.command(0, VELOCITY, 100.0)
+    plant.command(1, VELOCITY, -100.0)
+    rows = []
+    for k in range(4000):
+        if k % 8 == 0:
+            plant.drives[0].plan(0.001)
+            plant.drives[1].plan(0.001)
+        before = plant.motor_velocity[0]
+        tau = plant.joint_torques()[0]
+        angle = plant.motor_position[0]
+        plant._integrate(1, 125e-6)
+        acceleration = (plant.motor_velocity[0] - before) / 125e-6
+        rows.append((angle, G * KT * plant.drives[0].current_a - G * JM * acceleration - tau))
+    angle, ripple = np.array(rows).T
+    assert ripple == pytest.approx(0.4 * np.cos(2.0 * angle + 0.7), abs=1e-6)
+    assert np.ptp(angle) > 2 * math.pi
+
+
+def test_step_is_shortened_for_a_stiff_light_joint():
+    stiff = replace(JOINT, stiffness_nm_per_rad=200_000.0, link_inertia_kgm2=0.002)
+    parameters = ideal(stiff)
+    step = substep_limit(parameters)
+    assert step < 30e-6
+    plant = Plant(parameters)
+    plant.motor_position = [0.05, 0.0]
+    first = plant.energy()
+    plant.step(0.05)
+    assert plant.energy() < first  # an unstable step would have grown without bound
+
+
+def test_joint_file_serves_as_a_plant():
+    parameters = load_plant(shipped("joint1.yaml"))
+    assert parameters.joints[0].joint.name == parameters.joints[1].joint.name == "joint1"
+    assert parameters.joints[0].deviations.stribeck_nm == JOINT.friction.stribeck_nm
+    assert parameters == plant_of_joint(JOINT)
+
+
+def test_current_loop_is_first_order_at_its_bandwidth_and_limited():
+    plant = Plant(PlantParameters((JointPlant(JOINT, drive=DriveParameters(current_limit_a=6.0)),) * 2))
+    drive = plant.drives[0]
+    drive.command(CURRENT, 5.0, 0.0)
+    drive.plan(0.001)
+    tau = 1 / (2 * math.pi * 500.0)
+    for k in range(1, 20):
+        assert drive.step(1e-4, 0.0) == pytest.approx(5.0 * (1 - math.exp(-k * 1e-4 / tau)))
+    drive.command(CURRENT, 50.0, 0.0)
+    drive.plan(0.001)
+    for _ in range(1000):
+        current = drive.step(1e-4, 0.0)
+    assert current == pytest.approx(6.0)
+    drive.command(OFF, 0.0, 0.0)
+    drive.plan(0.001)
+    for _ in range(1000):
+        current = drive.step(1e-4, 0.0)
+    assert current == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_joint_file_without_efficiency_has_the_friction_it_says():
+    """Fc + Fv |v| + Fs exp(-(v/vs)²) at any torque, with a wide peak too."""
+    friction = replace(JOINT.friction, stribeck_nm=1.5, stribeck_velocity_rad_s=0.15)
+    joint = replace(JOINT, efficiency=None, friction=friction)
+    law = Plant(plant_of_joint(joint)).friction[0]
+    for v in (0.0, 0.01, -0.07, 0.15, -0.3, 0.61, 2.0):
+        expected = 3.0 + 2.0 * abs(v) + 1.5 * math.exp(-((v / 0.15) ** 2))
+        assert law(12.0, v) == pytest.approx(expected, abs=1e-6), v

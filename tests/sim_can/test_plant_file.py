@@ -1,0 +1,88 @@
+"""Plant files: the campaign's bench, what its sections may hold, and what is refused."""
+
+import json
+
+import pytest
+import yaml
+
+from jtqd.estimator.checked import ConfigError
+from jtqd.models.files import load_joint, shipped
+from jtqd.sim_can.days import RunToRun, Thermal
+from jtqd.sim_can.plant_file import load_plant, plant_from_mapping
+
+CAMPAIGN = "campaign_plant.yaml"
+
+
+def mapping(name=CAMPAIGN):
+    # through JSON: what the file shares by an anchor must not be shared here
+    return json.loads(json.dumps(yaml.safe_load(shipped(name).read_text())))
+
+
+def from_mapping(changed):
+    return plant_from_mapping(changed, CAMPAIGN, lambda name: load_joint(shipped(name)))
+
+
+def test_campaign_plant_is_the_hard_bench():
+    plant = load_plant(shipped(CAMPAIGN))
+    assert plant.run_to_run == RunToRun(0.15, 0.3, 2.0, 1e-5)
+    assert plant.profile == "demo"
+    for side, phase in zip(plant.joints, (0.9, 2.3), strict=True):
+        d = side.deviations
+        assert (d.ripple_nm, d.ripple_order_per_motor_rev) == (0.25, 2.0)
+        assert (d.kinematic_error_rad, d.kinematic_error_order_per_motor_rev) == (4e-5, 2.0)
+        assert d.kinematic_error_phase_rad == phase
+        assert (d.hysteresis_nm, d.hysteresis_travel_rad) == (0.4, 1e-4)
+        assert side.thermal == Thermal(25.0, 0.025, 0.004, 0.6, 600.0)
+    mild = load_plant(shipped("plant.yaml")).joints[0]
+    assert d.stribeck_nm == mild.deviations.stribeck_nm
+    assert d.stribeck_velocity_rad_s == mild.deviations.stribeck_velocity_rad_s
+
+
+def test_new_sections_may_be_left_out():
+    changed = mapping()
+    del changed["run_to_run"]
+    for joint in ("joint_1", "joint_2"):
+        del changed[joint]["thermal"]
+        del changed[joint]["deviations"]["hysteresis"]
+        del changed[joint]["deviations"]["kinematic_error"]
+    plant = from_mapping(changed)
+    assert plant.run_to_run == RunToRun() == RunToRun(0.0, 0.0, 0.0, 0.0)
+    assert plant.joints[0].thermal == Thermal()
+    assert plant.joints[0].deviations.hysteresis_nm == plant.joints[1].deviations.kinematic_error_rad == 0.0
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        (
+            ("run_to_run", "viscous"),
+            1.5,
+            "'run_to_run.viscous': found 1.5, expected a number in 1 from 0 to 0.9",
+        ),
+        (("run_to_run", "sensor_zero"), 0.3, "'run_to_run.sensor_zero': unknown key, did you mean"),
+        (("run_to_run", "temperature_k"), -4.0, "'run_to_run.temperature_k': found -4.0"),
+        (("run_to_run",), 3, "'run_to_run': found 3, expected a mapping"),
+        (("joint_1", "thermal", "time_constant_s"), 0.0, "'joint_1.thermal.time_constant_s': found 0.0"),
+        (("joint_2", "thermal", "viscous_per_k"), "warm", "'joint_2.thermal.viscous_per_k': found 'warm'"),
+        (("joint_1", "thermal", "kelvin_per_watt"), 1.0, "did you mean 'kelvin_per_w'?"),
+        (("joint_1", "deviations", "hysteresis", "travel_rad"), 0.0, "hysteresis.travel_rad': found 0.0"),
+        (("joint_1", "deviations", "hysteresis"), {"travel_rad": 1e-4}, "hysteresis.torque_nm': missing"),
+        (("joint_1", "deviations", "kinematic_error", "amplitude_rad"), float("nan"), "found nan"),
+        (
+            ("joint_2", "deviations", "kinematic_error", "amplitude_rad"),
+            5e-3,  # 5e-3 * 2 = 0.01 = 1/G: the link would stand still while the motor turns
+            "'joint_2.deviations.kinematic_error': found 0.01, expected amplitude_rad times",
+        ),
+    ],
+)
+def test_wrong_section_is_refused_by_name(path, value, message):
+    changed = mapping()
+    inner = changed
+    for key in path[:-1]:
+        inner = inner[key]
+    inner[path[-1]] = value
+    with pytest.raises(ConfigError) as error:
+        from_mapping(changed)
+    assert message in str(error.value)
+    assert str(error.value).startswith(CAMPAIGN)
+    assert "\n" not in str(error.value)

@@ -1,0 +1,197 @@
+"""Cases, or parts of them, that other tests show; and what no test shows, with the reason."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Shown(NamedTuple):
+    """What is shown of a case, what comes out, and by which tests (path::function)."""
+
+    number: int
+    what: str
+    outcome: str
+    tests: tuple[str, ...]
+
+
+ELSEWHERE = (
+    Shown(
+        5,
+        "interface removed and made again",
+        "exit status 1 with one line; systemd starts it again when the interface is back",
+        (
+            "tests/daemon/bus/test_master_vcan.py::test_an_interface_that_is_removed_ends_the_daemon_with_one_line",
+            "tests/systemd/test_systemd_boot.py::test_whatever_happens_to_a_service",
+        ),
+    ),
+    Shown(
+        6,
+        "bus absent at the start",
+        "one line, exit status 1; a link that is down says so at the first receive",
+        (
+            "tests/daemon/test_jtqd.py::test_unknown_bus",
+            "tests/drivers/test_socketcan.py::test_opening_a_link_that_is_down_says_so_at_the_first_receive",
+        ),
+    ),
+    Shown(
+        7,
+        "transmit queue full (ENOBUFS)",
+        "the frame is dropped and counted in `tx_dropped`; vcan has no queue that could fill",
+        ("tests/drivers/test_frame_socket.py::test_enobufs_is_a_dropped_frame_not_an_error",),
+    ),
+    Shown(
+        14,
+        "the loop is late for its own SYNC",
+        "the slot is skipped and counted in `missed`, no burst",
+        ("tests/daemon/loop/test_cycle.py::test_a_stall_of_minutes_is_recorded_and_not_fatal",),
+    ),
+    Shown(
+        15,
+        "echo of the own SYNC missing",
+        "no input of the cycle is used, `sync_errors`; vcan always echoes",
+        ("tests/daemon/loop/test_intake.py::test_without_the_echo_of_sync_nothing_is_used",),
+    ),
+    Shown(
+        27,
+        "wrong device at the start",
+        "refused with node, object, expected and found",
+        ("tests/drivers/test_boot.py::test_wrong_identity",),
+    ),
+    Shown(
+        28,
+        "mapping or transmission type that does not stick",
+        "refused at the boot",
+        (
+            "tests/drivers/test_boot.py::test_mapping_that_reads_back_different",
+            "tests/drivers/test_boot.py::test_transmission_type_that_does_not_stick",
+        ),
+    ),
+    Shown(
+        31,
+        "mode of operation displayed (6061h) is another than before",
+        "a line for the operator; the estimate uses current and positions, whatever the mode",
+        ("tests/daemon/bus/test_master_changes.py::test_another_mode_is_told_and_the_node_is_used",),
+    ),
+    Shown(
+        32,
+        "SDO: aborts, toggle error, late and wrong answers, sizes, flood",
+        "each ends in a result, never in a wrong value",
+        (
+            "tests/drivers/test_master_sdo.py::test_a_refusal_is_the_servers",
+            "tests/drivers/test_master_sdo.py::test_answers_to_something_else_are_passed_over",
+            "tests/drivers/test_master_sdo.py::test_a_toggle_error_ends_the_transfer_and_it_is_begun_again",
+            "tests/drivers/test_master_sdo.py::test_a_size_that_is_not_kept_and_one_that_is_too_large",
+            "tests/drivers/test_master_sdo.py::test_silence_is_asked_again_and_then_given_up",
+            "tests/slow/test_fuzz_frames.py::test_the_supervisors_path",
+        ),
+    ),
+    Shown(
+        34,
+        "position counter rolls over at 2^31",
+        "the estimate goes on",
+        ("tests/daemon/loop/test_cycle.py::test_a_position_that_rolls_over_goes_on",),
+    ),
+    Shown(
+        36,
+        "rated current 0",
+        "refused at the boot",
+        ("tests/drivers/test_boot.py::test_zero_gear_ratio_and_rated_current",),
+    ),
+    Shown(
+        38,
+        "loop stopped for good",
+        "the watchdog of systemd restarts the service",
+        ("tests/systemd/test_systemd_boot.py::test_installed_started_reloaded_hung_and_stopped",),
+    ),
+    Shown(
+        39,
+        "a processor hog, 0.2 s at a priority above the loop's",
+        "slots are skipped and counted in `missed`; what is published then is from inputs of its own cycle",
+        (
+            "tests/daemon/test_jtqd_hog.py::"
+            "test_a_processor_hog_costs_counted_cycles_and_nothing_that_is_published_is_stale",
+        ),
+    ),
+    Shown(
+        39,
+        "collection of garbage",
+        "it is off in the loop, and no cycle leaves anything that would need it",
+        (
+            "tests/daemon/loop/test_loop_garbage.py::test_the_collector_is_off_once_the_loop_is_ready",
+            "tests/daemon/loop/test_loop_garbage.py::test_no_cycle_leaves_anything_to_a_collector",
+        ),
+    ),
+    Shown(
+        40,
+        "disk full, slow recorder",
+        "cycles go on; what is not in the log is counted",
+        (
+            "tests/daemon/test_vcan.py::test_a_recorder_that_dies_or_stalls_costs_the_loop_nothing",
+            "tests/slow/test_fuzz_soak.py::test_a_minute_of_faults",
+            "tests/daemon/logs/test_recover.py::test_full_disk_leaves_the_file_as_it_was",
+            "tests/systemd/test_systemd_boot.py::test_whatever_happens_to_a_service",
+        ),
+    ),
+    Shown(
+        41,
+        "kill -9 while the log is written",
+        "repaired at the next start; nothing complete is lost",
+        (
+            "tests/daemon/test_vcan.py::test_a_recorder_that_dies_or_stalls_costs_the_loop_nothing",
+            "tests/daemon/logs/test_recover.py::test_killed_between_two_chunks_loses_nothing",
+            "tests/daemon/logs/test_recover_fuzz.py::test_random_damage",
+            "tests/slow/test_fuzz_files.py::test_every_kind_of_file",
+        ),
+    ),
+    Shown(
+        42,
+        "network: NaN, slow, far, corrupt, missing",
+        "refused at the start, or left out in the cycle and counted by reason",
+        (
+            "tests/estimator/test_estimator_network.py::test_a_network_that_gives_nan_is_refused",
+            "tests/estimator/test_estimator_network.py::test_unreadable_and_corrupt_files",
+            "tests/estimator/test_estimator_network.py::test_flipped_bytes_never_give_another_exception",
+            "tests/slow/test_fuzz_files.py::test_every_kind_of_file",
+            "tests/daemon/loop/test_safety_published.py::test_the_network_that_is_dropped_is_counted_by_its_reason",
+            "tests/daemon/loop/test_safety_overrun.py::test_a_network_that_has_become_slow_costs_two_cycles_and_then_only_itself",
+        ),
+    ),
+    Shown(
+        43,
+        "configuration and joint files that are none",
+        "one line that names file, key, found and expected",
+        (
+            "tests/daemon/test_config.py::test_mistakes_are_named",
+            "tests/daemon/test_config.py::test_files_that_are_no_configuration",
+            "tests/models/test_joint_file.py::test_random_garbage_never_gets_past_as_another_exception",
+            "tests/slow/test_fuzz_files.py::test_every_kind_of_file",
+            "tests/slow/test_fuzz_files.py::test_small_texts_that_explode",
+        ),
+    ),
+    Shown(
+        44,
+        "EDS files",
+        "CiA 306 is kept; each breach is seen by the lint",
+        (
+            "tests/drivers/eds/test_eds.py::test_the_lint_sees_each_breach",
+            "tests/slow/test_fuzz_files.py::test_every_kind_of_file",
+        ),
+    ),
+    Shown(
+        45,
+        "random frames",
+        "what is used carries its own cycle's number; garbage is counted and changes nothing",
+        (
+            "tests/daemon/loop/test_intake.py::test_whatever_is_lost_or_late_what_is_used_is_of_its_own_cycle",
+            "tests/daemon/test_jtqd.py::test_garbage_on_the_bus_is_counted_and_changes_nothing",
+            "tests/slow/test_fuzz_frames.py::test_50_000_frames",
+            "tests/slow/test_fuzz_frames.py::test_a_million_frames",
+            "tests/slow/test_fuzz_frames.py::test_minimal_examples",
+            "tests/slow/test_fuzz_frames.py::test_the_supervisors_path",
+            "tests/slow/test_fuzz_soak.py::test_a_storm",
+        ),
+    ),
+)
+
+NOT_COVERED: dict[int, str] = {}
+"""Number of the case: why."""

@@ -1,0 +1,235 @@
+"""The emulated bench on a SocketCAN interface with a hook between its nodes and the bus, and jtqd beside it.
+
+One thread does all of it: so a fault knows the cycle it works in, and the watcher sees the bus in its order. Times are
+CLOCK_MONOTONIC in ns; in the bench kernel with time travel they are exact.
+"""
+
+from __future__ import annotations
+
+import heapq
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from jtqd.daemon.shared.snapshot import SnapshotReader
+from jtqd.drivers.filters import exact
+from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, pack
+from jtqd.drivers.frame_socket import BusDown, open_frame_socket
+from jtqd.models.files import shipped
+from jtqd.sim_can.bench import Bench, bench_filters
+from jtqd.sim_can.plant_file import load_plant
+from jtqd.sim_can.plant_source import PlantSource
+from tests.slow.faults.ears import Ears
+from tests.slow.faults.injections import Fault
+from tests.slow.faults.watcher import Watcher
+
+MS = 1_000_000
+DEADLINE_NS = 800_000
+"""Inputs that are sent later than this after SYNC count as withheld (`inputs.deadline_us` is 850)."""
+SYNC, OWN_EMCY, ESTIMATE = 0x080, 0x0A0, 0x1A0
+_NEEDED = ({0x181, 0x281}, {0x182, 0x282})
+_LOOK_AGAIN_NS = 10 * MS
+
+
+class DaemonEndedError(Exception):
+    """jtqd has ended; the text is what it said."""
+
+
+class Rig:
+    """Bench, jtqd and watcher. Context manager.
+
+    Attributes:
+        bench: the nodes (`jtqd.sim_can.bench.Bench`); a fault may reach into them.
+        fault: what is between them and the bus now.
+        cycle: SYNCs of jtqd heard so far.
+        watcher: what jtqd publishes and says.
+        ears: an independent listener.
+    """
+
+    def __init__(self, bus: str, directory: Path, seed: int = 1) -> None:
+        self.bus, self._directory = bus, directory
+        self.bench = Bench(PlantSource(load_plant(shipped("campaign_plant.yaml")), seed), "demo")
+        self.fault = self.healthy = Fault()
+        self.watcher = Watcher()
+        self.cycle = 0
+        self._delayed: list[tuple[int, int, bytes]] = []
+        self._number = 0
+        self._down = False
+        self._sync_at_ns = 0
+        self._open()
+        self.ears = Ears(bus)
+
+    def __enter__(self) -> Rig:
+        (self._directory / "run").mkdir()
+        self.emit(self.bench.tick(time.monotonic_ns()))
+        with open(self._directory / "stderr", "w") as log:
+            self.process = subprocess.Popen(
+                [
+                    *(sys.executable, "-m", "jtqd.daemon.jtqd", "--bus", self.bus, "--record", "none"),
+                    *("--config", self._configuration()),
+                ],
+                env={**os.environ, "RUNTIME_DIRECTORY": str(self._directory / "run")},
+                stdout=subprocess.DEVNULL,
+                stderr=log,
+            )
+        try:
+            if not self.until(lambda: self.watcher.well(100), 60.0):
+                raise DaemonEndedError(f"no estimate within 60 s: {self.said()}")
+            (snapshot,) = (self._directory / "run").glob("*/snapshot")
+            self.reader = SnapshotReader(snapshot)
+            self.loop_pid = self._child(b"jtqd.daemon.loop.process")
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
+            end_ns = time.monotonic_ns() + 20_000 * MS
+            while self.process.poll() is None and time.monotonic_ns() < end_ns:
+                self._turn(5 * MS)
+            if self.process.poll() is None:
+                self.process.kill()
+            self.process.wait()
+        self.ears.end()
+        self.socket.close()
+
+    def _configuration(self) -> str:
+        content: dict[str, Any] = yaml.safe_load(shipped("bench.yaml").read_text())
+        content["estimator"] = {"method": "efficiency"}  # the start is short, and no network decides a status
+        for number in (1, 2):
+            joint = content[f"joint_{number}"]
+            joint.pop("network")
+            joint["file"] = str(shipped(f"joint{number}.yaml"))
+            joint["identity"] = {"vendor": 0x7A1, "product": self.bench.drives[0].store.number(0x1018, 2)}
+        path = self._directory / "configuration.yaml"
+        path.write_text(yaml.safe_dump(content))
+        return str(path)
+
+    def _open(self) -> None:
+        own = (exact(ESTIMATE), exact(OWN_EMCY), exact(0x5A0))
+        self.socket = open_frame_socket(self.bus, [*bench_filters(), *own])
+
+    def _child(self, module: bytes) -> int:
+        for process in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):  # it has just ended
+                parent = process.joinpath("stat").read_text().rpartition(")")[2].split()[1]
+                command = process.joinpath("cmdline").read_bytes().split(b"\0")
+                if int(parent) == self.process.pid and module in command:
+                    return int(process.name)
+        raise DaemonEndedError(f"no process {module.decode()}: {self.said()}")
+
+    # For faults ---------------------------------------------------------------------------------------------
+
+    def send(self, can_id: int, data: bytes = b"") -> None:
+        """A frame of somebody who is not on the bench; its nodes do not hear it. Lost while the interface is down."""
+        self._transmit(pack(can_id, data))
+
+    def inject(self, can_id: int, data: bytes = b"") -> None:
+        """A frame of somebody else that the nodes hear too, and answer."""
+        self.send(can_id, data)
+        now_ns = time.monotonic_ns()
+        self.emit(self.bench.on_frame(can_id, data, time.time_ns(), now_ns))
+
+    def counters(self) -> dict[str, int]:
+        """Of the snapshot."""
+        return self.reader.read().counters
+
+    def configured(self) -> bool:
+        """No node waits for its configuration."""
+        return not self.reader.read().unconfigured
+
+    def report(self) -> Any:
+        """`bus.json`."""
+        return json.loads(next((self._directory / "run").glob("*/bus.json")).read_text())
+
+    def said(self) -> str:
+        """Everything on jtqd's standard error."""
+        return (self._directory / "stderr").read_text()
+
+    def until(self, condition: Callable[[], bool], longest_s: float) -> bool:
+        """Go on until the condition holds; False: not within the time."""
+        end_ns = time.monotonic_ns() + round(longest_s * 1e9)
+        while not condition():
+            left_ns = end_ns - time.monotonic_ns()
+            if left_ns <= 0:
+                return False
+            if self.process.poll() is not None:
+                raise DaemonEndedError(f"jtqd ended with {self.process.returncode}: {self.said()[-2000:]}")
+            self._turn(min(left_ns, 10 * MS))
+        return True
+
+    # The loop -----------------------------------------------------------------------------------------------
+
+    def _turn(self, longest_ns: int) -> None:
+        now_ns = time.monotonic_ns()
+        if now_ns >= self.bench.due_ns:
+            self.emit(self.bench.tick(now_ns))
+        while self._delayed and self._delayed[0][0] <= time.monotonic_ns():
+            self._transmit(heapq.heappop(self._delayed)[2])
+        wake_ns = min(self.bench.due_ns, now_ns + longest_ns)
+        if self._delayed:
+            wake_ns = min(wake_ns, self._delayed[0][0])
+        try:
+            if self.socket.wait(max(wake_ns - time.monotonic_ns(), 0) * 1e-9):
+                self._receive()
+        except BusDown:
+            time.sleep(0.001)
+
+    def _receive(self) -> None:
+        count = self.socket.receive()
+        frames, stamps = bytes(self.socket.frames[: 16 * count]), list(self.socket.stamps_ns[:count])
+        now_ns = time.monotonic_ns()
+        for n in range(count):
+            can_id, length, data = FRAME.unpack_from(frames, 16 * n)
+            if can_id & (CAN_EFF_FLAG | CAN_RTR_FLAG | CAN_ERR_FLAG):
+                continue
+            data = data[:length]
+            if can_id == ESTIMATE:
+                self.watcher.estimate(data, now_ns)
+            elif can_id == OWN_EMCY:
+                self.watcher.emcy(data, now_ns)
+            elif can_id == SYNC:
+                self._on_sync(data, stamps[n], now_ns)
+            elif self.fault.hears(can_id):
+                self.emit(self.bench.on_frame(can_id, data, stamps[n], now_ns))
+
+    def _on_sync(self, data: bytes, stamp_ns: int, now_ns: int) -> None:
+        self.cycle += 1
+        self._sync_at_ns = now_ns
+        self.watcher.sync(data[0])
+        if self.fault.hears(SYNC):
+            sent = self.emit(self.bench.on_frame(SYNC, data, stamp_ns, now_ns))
+            one, two = (needed <= sent for needed in _NEEDED)
+            self.watcher.delivered((one, two))
+        self.fault.each_cycle(self)
+
+    def emit(self, frames: list[bytes]) -> set[int]:
+        """Send what nodes say, through the fault. Returns the identifiers that went out in time, whole."""
+        sent = set()
+        for frame in frames:
+            can_id, length, data = FRAME.unpack(frame)
+            for delay_ns, other_id, other in self.fault.passes(can_id, data[:length]):
+                if delay_ns <= 0:
+                    self._transmit(pack(other_id, other))
+                else:
+                    self._number += 1
+                    due_ns = time.monotonic_ns() + delay_ns
+                    heapq.heappush(self._delayed, (due_ns, self._number, pack(other_id, other)))
+                if delay_ns < DEADLINE_NS and len(other) == length:
+                    sent.add(other_id)
+        return sent
+
+    def _transmit(self, frame: bytes) -> None:
+        with suppress(BusDown):
+            self.socket.send(frame)

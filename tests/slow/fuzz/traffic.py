@@ -1,0 +1,222 @@
+"""What is on the bus after each SYNC: answers that carry its number, and everything that should not be there.
+
+Traffic comes in episodes of one kind. In the strict ones the frames of a PDO keep their order, nobody else sends under
+its identifier, and no frame is late by whole periods to within its usual arrival: there a valid estimate from a stale
+input is an error. In the others (`LOOSE`) a frame cannot be told from the right one by anything that is on the bus; they
+are followed by calm cycles, and what was used in them is counted apart.
+"""
+
+from __future__ import annotations
+
+import random
+import struct
+from collections.abc import Callable
+
+from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG
+from tests.slow.fuzz.bus_in_time import Arrival
+
+US = 1000
+I32 = struct.Struct("<ii")
+MOTION = struct.Struct("<ihH")
+SENSOR = struct.Struct("<iB")
+_FRAME = struct.Struct("<IB3x8s")
+ENABLED = 0x27
+NUMBERS = 1024
+"""Range of the SYNC's number within TPDO2, where its velocity must stay plausible."""
+LINK, SPEED, CURRENT = 20_000, 5_000, 200
+INPUT_IDS = (0x181, 0x281, 0x182, 0x282, 0x183)
+_USUAL_US = (150, 260, 205, 315, 370)
+_LATE_US = ((850, 950), (1000, 1090), (1600, 1900), (2600, 2900))
+"""After the deadline, or in a later cycle outside of the arrival band."""
+CALM_CYCLES = 40
+
+STRICT = ("calm", "lossy", "stall", "copies", "junk", "storm", "shapes", "syncs", "nodes", "load", "down")
+LOOSE = ("impostor", "replay", "shuffle")
+
+
+def frame(can_id: int, data: bytes, length: int | None = None) -> bytes:
+    return _FRAME.pack(can_id, len(data) if length is None else length, data)
+
+
+def genuine(number: int) -> tuple[bytes, ...]:
+    """The five PDOs that answer SYNC `number`."""
+    speed = SPEED + number % NUMBERS
+    return (
+        frame(0x181, I32.pack(number, LINK + number)),
+        frame(0x281, MOTION.pack(speed, CURRENT, ENABLED)),
+        frame(0x182, I32.pack(number, LINK + number)),
+        frame(0x282, MOTION.pack(speed, CURRENT, ENABLED)),
+        frame(0x183, SENSOR.pack(number, 0)),
+    )
+
+
+def is_of(number: int, index: int, values: tuple[int, ...]) -> bool:
+    """The values of input `index` are those of SYNC `number`."""
+    if index in (0, 2):
+        return values == (number, LINK + number)
+    return values == (SPEED + number % NUMBERS, CURRENT, ENABLED)
+
+
+class Traffic:
+    """Script of a `BusInTime`, drawn from `seed`.
+
+    Args:
+        seed: of all that is random.
+        kinds: episodes to draw from.
+
+    Attributes:
+        kind: of the episode.
+        strict: a stale input that is used is an error in this cycle.
+        counts: cycles of each kind.
+        slow_ns, oversleep_ns, down: what the bus and the machine do in this cycle.
+    """
+
+    def __init__(self, seed: int, kinds: tuple[str, ...] = STRICT + LOOSE) -> None:
+        self.random = random.Random(seed)
+        self._kinds = kinds
+        self.kind = "calm"
+        self.strict = True
+        self.counts = dict.fromkeys(("calm", *kinds), 0)
+        self.slow_ns = self.oversleep_ns = 0
+        self.down = False
+        self._left = CALM_CYCLES
+        self._last_ns = [0] * len(INPUT_IDS)
+        self._old: list[bytes] = []
+        self._noise: dict[str, Callable[[int], list[Arrival]]] = {
+            "junk": lambda t: self._junk(t, self.random.randrange(12)),
+            "storm": lambda t: self._junk(t, self.random.randrange(50, 400)),
+            "shapes": self._shapes,
+            "nodes": self._nodes,
+            "impostor": self._impostor,
+            "replay": self._replay,
+        }
+
+    def __call__(self, number: int, now_ns: int, counter: int) -> list[Arrival]:
+        """All that arrives because of, or after, SYNC `number` sent at `now_ns` with `counter`."""
+        self._turn()
+        kind, draw = self.kind, self.random.random
+        self.counts[kind] += 1
+        out = self._echo(counter, now_ns)
+        if kind == "stall" and draw() < 0.05:
+            end = now_ns + self.random.randrange(500, 20_000) * US
+            self._last_ns = [max(last, end) for last in self._last_ns]
+        for n, data in enumerate(genuine(number)):
+            delay_us = _USUAL_US[n] + self.random.randrange(25)
+            chance = draw()
+            if kind == "lossy":
+                if chance < 0.03:
+                    continue
+                if chance < 0.06:
+                    delay_us = self.random.randrange(*self.random.choice(_LATE_US))
+            elif kind == "shuffle" and chance < 0.3:
+                delay_us = self.random.randrange(5, 3000)
+            at = now_ns + delay_us * US
+            if kind != "shuffle":
+                at = max(at, self._last_ns[n] + 50 * US)
+            self._last_ns[n] = at
+            out.append((at, data, False))
+            if kind == "copies" and chance < 0.1:
+                self._last_ns[n] = at + self.random.randrange(120) * US
+                out.append((self._last_ns[n], data, False))
+            if n < 4 and chance > 0.95:
+                self._old = [*self._old[-20:], data]
+        noise = self._noise.get(kind)
+        if noise is not None:
+            out += noise(now_ns)
+        return out
+
+    def _turn(self) -> None:
+        """The next cycle; perhaps the next episode."""
+        draw = self.random
+        self._left -= 1
+        if self._left < 0:
+            after_loose = self.kind in LOOSE
+            self.kind = "calm" if after_loose else draw.choice(self._kinds)
+            self._left = CALM_CYCLES if after_loose else draw.randrange(5, 120)
+        if self.kind in LOOSE:
+            self.strict = False
+        elif self.kind == "calm" and self._left < CALM_CYCLES // 2:
+            self.strict = True
+        self.down = self.kind == "down" and draw.random() < 0.1
+        load = self.kind == "load"
+        self.slow_ns = draw.choice((0, 20, 200, 400)) * US if load else 0
+        self.oversleep_ns = draw.choice((0, 50, 300, 2500)) * US if load and draw.random() < 0.1 else 0
+
+    def _echo(self, sent: int, now_ns: int) -> list[Arrival]:
+        data = frame(0x080, bytes((sent,)))
+        out = [(now_ns + 4 * US, data, True)]
+        if self.kind == "syncs":
+            chance = self.random.random()
+            if chance < 0.05:
+                return []
+            if chance < 0.1:
+                out = [(now_ns + self.random.randrange(900, 2500) * US, data, True)]
+            if chance > 0.9:
+                counter = bytes((self.random.randrange(256),) * self.random.choice((0, 1, 8)))
+                out.append((now_ns + self.random.randrange(-20, 990) * US, frame(0x080, counter), False))
+        return out
+
+    def _time(self, now_ns: int) -> int:
+        return now_ns + self.random.randrange(-10, 2000) * US
+
+    def _junk(self, now_ns: int, count: int) -> list[Arrival]:
+        """Frames of any identifier, length and flag, but none that is one of the inputs."""
+        draw, out = self.random, []
+        for _ in range(count):
+            flags = draw.choice(
+                (0, 0, 0, CAN_EFF_FLAG, CAN_RTR_FLAG, CAN_ERR_FLAG, CAN_EFF_FLAG | CAN_RTR_FLAG)
+            )
+            can_id = draw.getrandbits(29 if flags & CAN_EFF_FLAG else 11) | flags
+            if can_id in INPUT_IDS or can_id == 0x080:
+                continue
+            data = draw.randbytes(8)
+            out.append(
+                (self._time(now_ns), frame(can_id, data, draw.choice((0, 1, 2, 5, 7, 8, 8, 8, 15))), False)
+            )
+        return out
+
+    def _shapes(self, now_ns: int) -> list[Arrival]:
+        """The inputs' own identifiers with a wrong length or in another format; heartbeats and temperatures likewise."""
+        draw, out = self.random, []
+        for _ in range(draw.randrange(4)):
+            can_id = draw.choice((*INPUT_IDS, 0x080, 0x701, 0x702, 0x703, 0x381, 0x382))
+            flags = draw.choice((0, CAN_EFF_FLAG, CAN_RTR_FLAG, CAN_ERR_FLAG, CAN_EFF_FLAG | CAN_RTR_FLAG))
+            right = {0x183: 5, 0x080: 1, 0x381: 2, 0x382: 2}.get(can_id, 8)
+            length = draw.choice([n for n in (0, 1, 2, 3, 4, 6, 7, 9, 64, 255) if n != right])
+            if can_id > 0x700 and not flags and length == 1:
+                length = 0
+            if not flags and can_id == 0x080:
+                flags = CAN_RTR_FLAG
+            out.append((self._time(now_ns), frame(can_id | flags, draw.randbytes(8), length), False))
+        return out
+
+    def _nodes(self, now_ns: int) -> list[Arrival]:
+        """Heartbeats of all nodes, now and then a boot-up message, temperatures of any value."""
+        draw = self.random
+        if draw.random() < 0.5:
+            return []
+        if draw.random() < 0.3:
+            data = draw.randbytes(2)
+            return [(self._time(now_ns), frame(0x380 + draw.randrange(1, 3), data), False)]
+        state = draw.choice((5,) * 20 + (4, 127, 127, 0, 1, 255))
+        return [
+            (
+                self._time(now_ns),
+                frame(0x700 + draw.choice((1, 2, 3, draw.randrange(128))), bytes((state,))),
+                False,
+            )
+        ]
+
+    def _impostor(self, now_ns: int) -> list[Arrival]:
+        """Somebody else sends under an input's identifier, with its length."""
+        draw = self.random
+        if draw.random() < 0.5:
+            return []
+        can_id = draw.choice(INPUT_IDS)
+        return [(self._time(now_ns), frame(can_id, draw.randbytes(5 if can_id == 0x183 else 8)), False)]
+
+    def _replay(self, now_ns: int) -> list[Arrival]:
+        """Somebody sends old inputs again."""
+        if not self._old or self.random.random() < 0.5:
+            return []
+        return [(self._time(now_ns), self.random.choice(self._old), False)]

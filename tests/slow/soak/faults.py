@@ -1,0 +1,226 @@
+"""Faults of a soak: each does something to bus, nodes or processes, and names what must tell of it."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tests.slow.faults import proofs
+from tests.slow.faults.ears import Heard
+from tests.slow.faults.proofs import Proof, Seen
+from tests.slow.soak.bench import BUS_OFF, RESTARTED
+from tests.slow.soak.scene import NotInjectedError, Scene
+
+_STOP, _RESET = 2, 129
+INPUTS = (0x181, 0x281, 0x182, 0x282)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One kind.
+
+    Attributes:
+        name: in the table.
+        act: does it, leaves the bench as it was within some two seconds, and returns how the bus proves it. Raises
+            NotInjectedError.
+        words: one of them must be in the daemon's standard error afterwards; empty: nothing is to be said.
+        counters: one of them must have grown; empty: nothing is to be counted.
+        statuses: one of them a joint must have had; empty: nothing.
+        recorder: all is well only when the recorder has written cycles of after the fault.
+    """
+
+    name: str
+    act: Callable[[Scene], Proof]
+    words: tuple[str, ...] = ()
+    counters: tuple[str, ...] = ()
+    statuses: tuple[int, ...] = ()
+    recorder: bool = False
+
+
+def _burst(can_id: int, length: int, count: int = 5) -> Callable[[Scene], Proof]:
+    def act(scene: Scene) -> Proof:
+        sent = [scene.source.randbytes(length) for _ in range(count)]
+        for data in sent:
+            scene.send(can_id, data)
+            time.sleep(0.003)
+        return proofs.frames(count, can_id, *sent)
+
+    return act
+
+
+def _nmt(command: int) -> Callable[[Scene], Proof]:
+    def act(scene: Scene) -> Proof:
+        node = scene.source.choice((1, 2, 3))
+        data = bytes((command, node))
+        scene.send(0x000, data)
+        stopped, restarted = proofs.withheld(20, 0x180 + node), proofs.frames(1, 0x700 + node, b"\0")
+        return proofs.all_of(proofs.frames(1, 0x000, data), stopped if command == _STOP else restarted)
+
+    return act
+
+
+def _emcy(scene: Scene) -> Proof:
+    data = bytes((scene.source.randrange(256), 0x23, 1)) + scene.source.randbytes(5)
+    can_id = 0x080 + scene.source.choice((1, 2, 3))
+    scene.send(can_id, data)
+    return proofs.frames(1, can_id, data)
+
+
+def _sdo_load(scene: Scene) -> Proof:
+    for _ in range(200):
+        index = scene.source.choice((0x1000, 0x1018, 0x1001, 0x2200, 0x5000))
+        data = bytes((0x40, index & 0xFF, index >> 8, scene.source.randrange(4), 0, 0, 0, 0))
+        scene.send(0x620, data)
+        time.sleep(0.001)
+    return proofs.all_of(proofs.frames(200, 0x620), proofs.frames(150, 0x5A0))
+
+
+def _babble(scene: Scene) -> Proof:
+    for _ in range(100):
+        for _ in range(6):
+            scene.send(scene.source.randrange(0x500, 0x57F), scene.source.randbytes(8))
+        time.sleep(0.002)
+
+    def proof(heard: Heard) -> Seen:
+        found = len(heard.at(*range(0x500, 0x57F)))
+        return Seen(found >= 600, f"{found} frames of the babbler")
+
+    return proof
+
+
+def _foreign_sync(scene: Scene) -> Proof:
+    scene.send(0x080)
+    return proofs.of_length(1, 0x080, 0)
+
+
+def _lost(scene: Scene) -> Proof:
+    can_id = scene.source.choice(INPUTS)
+    scene.order("lost", ids=[can_id], frames=1)
+    return proofs.withheld(1, can_id)
+
+
+def _late(scene: Scene) -> Proof:
+    # Later than any SYNC: the next one may itself be late by up to half a period, and would then come after the frame.
+    can_id, delay_us = scene.source.choice(INPUTS), scene.source.choice((1600, 2500))
+    scene.order("late", ids=[can_id], frames=1, delay_us=delay_us)
+    return proofs.withheld(1, can_id)
+
+
+def _sensor_invalid(scene: Scene) -> Proof:
+    scene.order("sensor invalid", ms=400)
+    return proofs.sensor_status(300, 1)
+
+
+def _sensor_gone(scene: Scene) -> Proof:
+    scene.order("lost", ids=[0x183], ms=400)
+    return proofs.withheld(300, 0x183)
+
+
+def _drive_fault(scene: Scene) -> Proof:
+    node = scene.source.choice((1, 2))
+    scene.order("drive fault", node=node, ms=300)
+
+    def beats(heard: Heard) -> Seen:
+        at = heard.at(0x700 + node)
+        longest_s = float(np.diff(heard.stamps_ns[at]).max(initial=0)) * 1e-9
+        going = len(at) > 2 and longest_s < 0.3 and set(heard.data[at, 0].tolist()) == {5}
+        return Seen(going, f"heartbeat operational, longest pause {longest_s:.2f} s")
+
+    emcys = proofs.frames(1, 0x080 + node, b"\x10\x23"), proofs.frames(1, 0x080 + node, b"\0\0")
+    return proofs.all_of(proofs.statuswords(200, node, 0x4F, 0x08), *emcys, beats)
+
+
+def _restart(scene: Scene) -> Proof:
+    node = scene.source.choice((1, 2, 3))
+    scene.order("restart", node=node, ms=1)
+    return proofs.frames(1, 0x700 + node, b"\0")
+
+
+def _forget(scene: Scene) -> Proof:
+    node = scene.source.choice((1, 2))
+    scene.order("forget", node=node, ms=1)
+
+    def silent(heard: Heard) -> Seen:
+        boots = heard.count(0x700 + node, b"\0")
+        return Seen(not boots, f"{boots} boot-ups")
+
+    return proofs.all_of(proofs.withheld(20, 0x180 + node), silent)
+
+
+def _stopped(name: str, seconds: float) -> Callable[[Scene], Proof]:
+    def act(scene: Scene) -> Proof:
+        scene.stop(name, seconds)
+        # A unix bus stands still altogether, as its hub is in the bench.
+        return proofs.silent(0.8 * seconds, *INPUTS) if name == "bench" else _by_the_kernel
+
+    return act
+
+
+def _by_the_kernel(_heard: Heard) -> Seen:
+    """`Scene.stop` and `Scene.kill` have asked the kernel."""
+    return Seen(True, "the kernel says so")
+
+
+def _kill_recorder(scene: Scene) -> Proof:
+    scene.kill("recorder")
+    return _by_the_kernel
+
+
+def _link_down(seconds: float) -> Callable[[Scene], Proof]:
+    def act(scene: Scene) -> Proof:
+        _link(scene.rig.bus, "down")
+        time.sleep(seconds)
+        up = _is_up(scene.rig.bus)
+        _link(scene.rig.bus, "up")
+        if up:
+            raise NotInjectedError(f"{scene.rig.bus} was not down")
+
+        return proofs.silent(0.9 * seconds, *INPUTS)
+
+    return act
+
+
+def _is_up(name: str) -> bool:
+    return bool(int(Path(f"/sys/class/net/{name}/flags").read_text(), 16) & 1)
+
+
+def _link(name: str, state: str) -> None:
+    subprocess.run(["ip", "link", "set", name, state], check=True)
+
+
+def _bus_off(scene: Scene) -> Proof:
+    scene.order("bus-off", ms=100)
+    return proofs.all_of(proofs.frames(1, BUS_OFF), proofs.withheld(80, 0x181), proofs.frames(1, RESTARTED))
+
+
+COMMON = (
+    Fault("wrong length", _burst(0x181, 4), counters=("rejected_frames",)),
+    Fault("second sender", _burst(0x281, 8), counters=("duplicate_frames", "late_frames", "stale_inputs")),
+    Fault("foreign SYNC", _foreign_sync, counters=("foreign_sync",)),
+    Fault("node reset", _nmt(_RESET), ("restarted", "was away"), ("boot_ups",)),
+    Fault("node stopped", _nmt(_STOP), ("NMT command", "was away", "more before")),
+    Fault("node restarts", _restart, ("restarted", "was away"), ("boot_ups",)),
+    Fault("configuration lost", _forget, ("is configured again",), ("stale_inputs",)),
+    Fault("drive in fault", _drive_fault, ("EMCY 2310h", "more before"), statuses=(5,)),
+    Fault("sensor invalid", _sensor_invalid, ("torque sensor",)),
+    Fault("sensor gone", _sensor_gone, ("torque sensor",)),
+    Fault("input lost once", _lost, counters=("stale_inputs",)),
+    Fault("input late once", _late, counters=("stale_inputs", "late_frames")),
+    Fault("EMCY", _emcy, ("EMCY",)),
+    Fault("SDO load", _sdo_load),
+    Fault("babbling", _babble),
+    Fault("recorder stopped", _stopped("recorder", 1.5), recorder=True),
+    Fault("recorder killed", _kill_recorder, ("recorder",), recorder=True),
+    Fault("supervisor stopped", _stopped("supervisor", 0.5)),
+    Fault("bench stopped", _stopped("bench", 0.05), counters=("stale_inputs",)),
+)
+ON_INTERFACE = (
+    Fault("link down", _link_down(0.3), counters=("bus_errors",)),
+    Fault("link down for long", _link_down(1.5), counters=("bus_errors",)),
+    Fault("bus-off", _bus_off, ("bus-off",), ("stale_inputs",)),
+)

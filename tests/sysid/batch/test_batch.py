@@ -1,0 +1,320 @@
+"""`jtq batch` on this machine: groups, resuming, failures; real commands in processes of their own."""
+
+import json
+import os
+import re
+import signal
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from jtqd.daemon.jtq import main as jtq
+from jtqd.sysid.batch import run, tool
+from jtqd.sysid.batch.groups import GroupError, find_groups
+from jtqd.sysid.batch.store import Store, StoreError, key_of, write_whole
+from jtqd.sysid.batch.task import Outcome, Task, run_task
+from tests.paths import ROOT
+from tests.sysid.batch.batch_helpers import (
+    arguments,
+    fleet,
+    results,
+    started,
+    states,
+    summary,
+    tasks_of,
+    wait_for,
+)
+from tests.sysid.diagnosis.diagnose_helpers import JOINT_FILE, write_runs
+
+_KINDS = ((".csv", ".csv.gz", ".parquet"), (".mcap",))
+
+
+def touch(directory, *names):
+    for name in names:
+        (directory / name).parent.mkdir(parents=True, exist_ok=True)
+        (directory / name).write_text(name)
+    return directory
+
+
+def names_of(found):
+    return {group.name: [path.name for path in group.files] for group in found.groups}
+
+
+# ---- groups ----
+
+
+def test_groups_by_directory_run_and_file(tmp_path):
+    run = "jtqd-can0-20261121T173515Z"
+    touch(
+        tmp_path,
+        f"a/{run}-0001.mcap",
+        f"a/{run}-0002.mcap",
+        "a/other-0001.mcap",
+        f"b/{run}-0001.mcap",
+        "b/x.txt",
+    )
+    assert names_of(find_groups([tmp_path], "directory", _KINDS)) == {
+        "a": [f"{run}-0001.mcap", f"{run}-0002.mcap", "other-0001.mcap"],
+        "b": [f"{run}-0001.mcap"],
+    }
+    assert names_of(find_groups([tmp_path], "run", _KINDS)) == {
+        f"a/{run}.mcap": [f"{run}-0001.mcap", f"{run}-0002.mcap"],
+        "a/other.mcap": ["other-0001.mcap"],
+        f"b/{run}.mcap": [f"{run}-0001.mcap"],
+    }
+    assert len(names_of(find_groups([tmp_path], "file", _KINDS))) == 4
+
+
+def test_a_directory_with_tables_and_logs_gives_its_tables(tmp_path):
+    touch(tmp_path, "a/run.csv", "a/run.mcap", "b/run.mcap", "b/.hidden.csv")
+    assert names_of(find_groups([tmp_path], "directory", _KINDS)) == {"a": ["run.csv"], "b": ["run.mcap"]}
+
+
+def test_what_is_named_twice_counts_once_and_what_is_not_ended_is_left_out(tmp_path):
+    touch(tmp_path, "run.mcap", "now.mcap.active")
+    found = find_groups([tmp_path, tmp_path / "run.mcap"], "directory", _KINDS)
+    assert names_of(found) == {tmp_path.name: ["run.mcap"]}
+    assert [path.name for path in found.active] == ["now.mcap.active"]
+
+
+@pytest.mark.parametrize(
+    ("named", "part"),
+    [
+        ("nothing", "found nothing there"),
+        ("empty", "found no log in it"),
+        ("x.txt", "found a file ending in '.txt'"),
+        ("active", "is not ended"),
+    ],
+)
+def test_nothing_to_work_on(tmp_path, named, part):
+    (tmp_path / "empty").mkdir()
+    touch(tmp_path, "x.txt", "active/a.mcap.active")
+    with pytest.raises(GroupError, match=part):
+        print(find_groups([tmp_path / named], "file", _KINDS))
+
+
+# ---- results on the disk ----
+
+
+def test_a_result_is_named_by_everything_it_was_made_from():
+    base = ("diagnose", "1.0", {"joint": "a"}, ["h1", "h2"])
+    changed = [
+        ("replay", *base[1:]),
+        (base[0], "1.1", *base[2:]),
+        (*base[:2], {"joint": "b"}, base[3]),
+        (*base[:3], ["h1"]),
+        (*base[:3], ["h2", "h1"]),
+    ]
+    assert key_of(*base) == key_of(*base)
+    assert len({key_of(*each) for each in (base, *changed)}) == 6
+
+
+def test_an_edit_of_the_code_makes_another_tool(tmp_path, monkeypatch):
+    package = tmp_path / "extra"
+    package.mkdir()
+    (package / "a.py").write_text("x = 1\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(tool, "_PACKAGES", ("extra",))
+    first = tool.tool_version()
+    assert re.fullmatch(r"0\.[\w.]+\+code\.[0-9a-f]{12}", first)
+    (package / "notes.txt").write_text("no code")
+    assert tool.tool_version() == first
+    (package / "a.py").write_text("x = 2\n")
+    second = tool.tool_version()
+    (package / "a.py").rename(package / "b.py")
+    assert len({first, second, tool.tool_version()}) == 3
+    assert key_of("replay", first, {}, ["h"]) != key_of("replay", second, {}, ["h"])
+
+
+def test_a_worker_with_other_code_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "run_task", lambda task: Outcome(0, {"runs": []}, "", 1.0, "0.1.0+code.other"))
+    touch(tmp_path, "a.mcap")
+    groups = find_groups([tmp_path], "file", _KINDS).groups
+    job = run.Job("replay", (), {}, False, "0.1.0+code.here")
+    store = Store(tmp_path / "out")
+    with ThreadPoolExecutor(1) as executor:
+        (row,) = run.Batch(job, groups, store, executor).run()
+    assert (row.state, row.content) == ("failed", None)
+    assert row.error == "the worker has jtqd 0.1.0+code.other, expected 0.1.0+code.here as here"
+    assert not list((tmp_path / "out" / "results").iterdir())
+    store.close()
+
+
+def test_all_packages_take_part_in_the_hash():
+    """Those that are installed."""
+    folders = [
+        path for path in (ROOT / "src" / "jtqd").iterdir() if path.is_dir() and path.name != "__pycache__"
+    ]
+    assert sorted(tool._PACKAGES) == sorted(f"jtqd.{path.name}" for path in folders)
+
+
+def test_a_result_is_there_whole_or_not_at_all(tmp_path):
+    store = Store(tmp_path)
+    assert store.get("k") is None
+    kept = store.put("k", {"result": {"x": 1}, "seconds": 2.0}, {"report.html": b"<p>"})
+    assert store.get("k") == kept
+    assert (tmp_path / store.link("k", "report.html")).read_bytes() == b"<p>"
+    path = tmp_path / "results" / "k.json"
+    path.write_bytes(path.read_bytes()[:-20])
+    assert store.get("k") is None, "half a file is none"
+    path.write_text(json.dumps({"schema": "another", "key": "k"}))
+    assert store.get("k") is None
+    path.write_text(json.dumps(kept | {"key": "another"}))
+    assert store.get("k") is None
+    with pytest.raises(TypeError):
+        write_whole(tmp_path / "x", 3)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".lock", "results"]
+
+
+def test_a_directory_holds_one_batch_at_a_time(tmp_path):
+    store = Store(tmp_path)
+    with pytest.raises(StoreError, match="another batch works there"):
+        Store(tmp_path)
+    store.close()
+    Store(tmp_path).close()
+
+
+def test_hashes_are_known_until_a_file_changes(tmp_path):
+    store, path = Store(tmp_path / "o"), touch(tmp_path, "a.mcap") / "a.mcap"
+    assert store.hashes([path]) is None
+    store.learn([path], ["h"])
+    assert store.hashes([path]) == ["h"]
+    store.save()
+    store.close()
+    again = Store(tmp_path / "o")
+    assert again.hashes([path]) == ["h"]
+    os.utime(path, ns=(1, 1))
+    assert again.hashes([path]) is None
+
+
+# ---- the command ----
+
+
+def test_a_fleet_with_one_broken_log(tmp_path, capsys):
+    """Failed is a row, not the end; the same command again does only what is missing or has changed."""
+    logs, out = fleet(tmp_path / "logs", ["r1/left", "r1/right"]), tmp_path / "out"
+    touch(logs, "r2/bad.csv")
+    assert jtq(["batch", *arguments(logs, out)]) == 3
+    said = capsys.readouterr()
+    assert states(out) == {"r1/left": "done", "r1/right": "done", "r2": "failed"}
+    assert "3 groups: 2 done, 0 finished before, 1 failed" in said.out
+    assert f"jtq batch: r2: {logs}/r2/bad.csv: " in said.err
+    broken = next(group for group in summary(out)["groups"] if group["name"] == "r2")
+    assert broken["key"] not in results(out), "what failed is tried again"
+    assert broken["figures"] is None
+    page = (out / "index.html").read_text()
+    for key, content in results(out).items():
+        assert content["result"]["verdict"] == "insufficient_data"
+        assert content["exit_status"] == 3
+        assert (out / "results" / key / "report.html").stat().st_size > 10_000
+        assert f'href="results/{key}/report.html"' in page
+    assert "bad.csv" in page
+    assert "http" not in page.replace("http-equiv", "")
+
+    before = results(out)
+    write_runs(logs / "r1" / "left", count=1, seconds=0.4)
+    (logs / "r1" / "right").rename(logs / "r1" / "moved")
+    (logs / "r2" / "bad.csv").unlink()
+    assert jtq(["batch", *arguments(logs, out, "--json")]) == 0
+    assert states(out) == {"left": "done", "moved": "kept"}, "content counts, not place"
+    assert json.loads(capsys.readouterr().out) == summary(out)
+    assert before.items() <= results(out).items()
+
+    assert jtq(["batch", *arguments(logs / "r1" / "moved", out, "--again")]) == 0
+    assert states(out) == {"moved": "done"}
+    assert not tasks_of(os.getpid())
+
+
+def test_the_same_logs_in_two_places_are_worked_on_once(tmp_path):
+    logs, out = fleet(tmp_path / "logs", ["a"]), tmp_path / "out"
+    (logs / "b").mkdir()
+    for path in (logs / "a").iterdir():
+        (logs / "b" / path.name).write_bytes(path.read_bytes())
+    assert jtq(["batch", *arguments(logs, out, "--again")]) == 0
+    first, second = summary(out)["groups"]
+    assert (first["key"], first["seconds"]) == (second["key"], second["seconds"])
+    assert len(results(out)) == 1
+
+
+def test_a_batch_that_is_killed_goes_on_where_it_was(tmp_path):
+    """kill -9 after the first result: what was finished is kept, and no task is left running."""
+    logs, out = fleet(tmp_path / "logs", ["a", "b", "c"]), tmp_path / "out"
+    with started(*arguments(logs, out, "--jobs", "1"), cwd=tmp_path) as process:
+        wait_for(lambda: results(out) if out.exists() else None)
+        wait_for(lambda: tasks_of(process.pid))
+        running = tasks_of(process.pid)
+        process.kill()
+    wait_for(lambda: not [pid for pid in running if Path(f"/proc/{pid}").exists()])
+    kept = results(out)
+    assert 1 <= len(kept) < 3
+    assert jtq(["batch", *arguments(logs, out)]) == 0
+    assert sorted(states(out).values()) == ["done"] * (3 - len(kept)) + ["kept"] * len(kept)
+    assert kept.items() <= results(out).items()
+
+
+def test_an_interrupted_batch_says_so_and_leaves_nothing_running(tmp_path):
+    logs, out = fleet(tmp_path / "logs", ["a", "b"]), tmp_path / "out"
+    with started(*arguments(logs, out, "--jobs", "1"), cwd=tmp_path) as process:
+        wait_for(lambda: tasks_of(process.pid))
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert errors.splitlines()[-1] == "jtq batch: interrupted; the same command goes on from here"
+    assert "Traceback" not in errors
+
+
+# ---- one task ----
+
+
+def test_a_task_that_is_killed_is_a_failed_one(tmp_path):
+    fleet(tmp_path, ["a"])
+    (log,) = (tmp_path / "a").iterdir()
+    task = Task("diagnose", (str(log),), ("--joint", str(JOINT_FILE)), writes=True)
+
+    def kill():
+        os.kill(wait_for(lambda: tasks_of(os.getpid()))[0], signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    outcome = run_task(task)
+    killer.join()
+    assert (outcome.exit_status, outcome.error) == (-9, "was ended by SIGKILL (out of memory?)")
+
+
+def test_a_task_that_takes_too_long_is_a_failed_one(tmp_path):
+    outcome = run_task(Task("diagnose", (str(tmp_path),), (), writes=True, timeout_s=0.02))
+    assert (outcome.exit_status, outcome.error) == (None, "took longer than 0.02 s")
+    assert not tasks_of(os.getpid())
+
+
+# ---- usage ----
+
+
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [
+        (["diagnose", "nowhere", "--joint", str(JOINT_FILE)], (2, "nowhere: found nothing there")),
+        (["diagnose", "logs"], (2, "--joint")),
+        (["diagnose", "logs", "--joint", "none.yaml"], (1, "none.yaml: cannot be read: No such file")),
+        (["replay", "logs", "--model", "none"], (1, "--model none: found no such directory")),
+    ],
+)
+def test_wrong_usage_is_one_line(tmp_path, monkeypatch, capsys, command, expected):
+    monkeypatch.chdir(tmp_path)
+    touch(tmp_path, "logs/a.mcap")
+    status, part = expected
+    assert jtq(["batch", *command, "--out", "out"]) == status
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("jtq batch: ")
+    assert part in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_help_has_examples(capsys):
+    for argv in (["--help"], ["diagnose", "--help"], ["replay", "--help"]):
+        with pytest.raises(SystemExit) as left:
+            jtq(["batch", *argv])
+        assert left.value.code == 0
+        assert "--scheduler tcp://10.0.0.5:8786" in capsys.readouterr().out

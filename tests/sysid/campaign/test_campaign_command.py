@@ -1,0 +1,248 @@
+"""`jtq campaign` from the outside, without a bus: usage, dry run, refusals; each one line, none a traceback."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from jtqd.models.files import shipped
+from jtqd.sysid.campaign.command import main, parser, recipe, wanted_plan
+from jtqd.sysid.campaign.runner import BenchConfig
+from jtqd.sysid.campaign.state import DONE, CampaignDirectory, RunState
+from tests.drivers.hub_helpers import until_it_listens
+
+SMALL = {
+    "schema": "jtq.plan/1",
+    "name": "small",
+    "runs": [
+        {
+            "name": name,
+            "velocity_joint": 1,
+            "segments": [
+                {"kind": "plateau", "velocity_rad_s": 0.5, "current_a": 1.0, "hold_s": 1.0},
+                {"kind": "rest", "hold_s": 0.5},
+            ],
+        }
+        for name in ("a", "b")
+    ],
+}
+
+
+@pytest.fixture
+def plan(tmp_path: Path) -> str:
+    path = tmp_path / "small.yaml"
+    path.write_text(yaml.safe_dump(SMALL))
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["efficiency"], ["--bus is missing"]),
+        (["efficiency", "--bus", "sim"], ["--out is missing"]),
+        (["eficiency", "--dry-run"], ["'eficiency'", "efficiency, excitation, validate"]),
+        (["p.yaml", "--dry-run", "--runs", "3"], ["--runs belongs to"]),
+        (["p.yaml", "--dry-run", "--hold", "3"], ["--hold belongs to"]),
+        (["p.yaml", "--dry-run", "--quick"], ["--quick belongs to"]),
+        (["efficiency", "--bus", "can0", "--out", "x", "--plant", "p"], ["--plant belongs to --bus sim"]),
+    ],
+)
+def test_misuse_is_status_2_and_one_line(
+    arguments: list[str], words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert len(captured.err.splitlines()) == 1
+    for word in words:
+        assert word in captured.err
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        (["--runs", "0"], ["found '0'"]),
+        (["--limit", "curent_a=3"], ["'curent_a'", "current_a"]),
+        (["--limit", "current_a=-3"], ["current_a=-3", "> 0"]),
+        (["--limit", "current_a=none"], ["current_a=none"]),
+    ],
+)
+def test_options_say_what_they_expect(
+    option: list[str], words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["efficiency", "--dry-run", *option])
+    assert caught.value.code == 2
+    said = capsys.readouterr().err
+    for word in words:
+        assert word in said
+
+
+def test_a_dry_run_prints_every_run_and_moves_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["efficiency", "--dry-run"]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    lines = captured.out.splitlines()
+    assert len(lines) == 1 + 32 + 3
+    row = next(line for line in lines if line.startswith("back_1_n2.2")).split()
+    assert row[1:3] == ["2", "7"]
+    assert row[4:6] == ["2.20", "4.00"]
+    assert "32 runs, 8:" in lines[-3]
+    assert "94.4% in the worst case, 944 of 1000 bits" in lines[-1]
+
+
+def test_a_dry_run_as_json_adds_up(plan: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([plan, "--dry-run", "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert [run["run"] for run in content["runs"]] == ["a", "b"]
+    assert content["motion_s"] == pytest.approx(sum(run["seconds"] for run in content["runs"]))
+    assert content["motion_s"] == pytest.approx(5.0)
+    assert content["expected_s"] > content["motion_s"]
+    assert content["runs"][0]["travel_rad"] == pytest.approx(0.75, abs=1e-3)
+    assert content["bus_load_worst"] == pytest.approx(0.944, abs=0.002)
+
+
+def bench_config(folder: Path, **changes: object) -> Path:
+    """The shipped configuration beside copies of its models, with changes of top-level keys."""
+    content = yaml.safe_load(shipped("bench.yaml").read_text()) | changes
+    shutil.copytree(shipped("trained/joint1.yaml").parent, folder / "trained")
+    path = folder / "bench.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"bitrate": 800_000}, ["bench.yaml", "commander", "bus load", "95%"]),
+        ({"sensor": {"node": 3, "channels": 2}}, ["bus load"]),
+        ({"sync": {"period_us": 2000}}, ["sync.period_us", "2000"]),
+        ({"sensor": {"node": 2, "channels": 1}}, ["bench.yaml", "different node numbers"]),
+        ({"joint_1": {"node": 1, "file": "none.yaml"}}, ["none.yaml"]),
+    ],
+)
+def test_a_bench_that_cannot_carry_it_is_refused(
+    tmp_path: Path, changes: dict[str, object], words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = bench_config(tmp_path, **changes)
+    assert main(["efficiency", "--dry-run", "--config", str(path)]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert len(captured.err.splitlines()) == 1
+    for word in words:
+        assert word in captured.err
+
+
+def test_a_plan_beyond_its_limits_is_refused(plan: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([plan, "--dry-run", "--limit", "velocity_rad_s=0.4"]) == 1
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1
+    for word in ("small.yaml", "run 'a'", "velocity", "limit 0.4 rad/s"):
+        assert word in said
+    assert main([plan, "--dry-run", "--limit", "temperature_c=none"]) == 0
+    assert "temperature not supervised" in capsys.readouterr().out
+
+
+def done_directory(path: Path, arguments: list[str]) -> None:
+    """A campaign that is done, as it would be left."""
+    options = parser().parse_args([*arguments, "--bus", "x", "--out", str(path)])
+    joints = BenchConfig.load(None).joints
+    wanted = wanted_plan(options, joints)
+    directory = CampaignDirectory(path)
+    directory.begin(wanted, recipe(options, joints))
+    for run in wanted.runs:
+        for ending in (".csv.gz", ".json", ".mcap"):
+            (path / (run.name + ending)).write_text("x")
+        directory.put(run.name, RunState(DONE, attempts=1, rows=10))
+    directory.close()
+
+
+def test_a_campaign_that_is_done_needs_no_bus(
+    plan: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    done_directory(tmp_path / "out", [plan])
+    assert main([plan, "--bus", "unix:/nonexistent/bus", "--out", str(tmp_path / "out"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["runs"]["done"] == 2
+
+
+def test_the_same_directory_takes_no_other_plan(
+    plan: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    done_directory(out, ["validate", "--quick", "--seed", "3"])
+    for other in (
+        [plan],
+        ["validate", "--quick", "--seed", "4"],
+        ["validate", "--quick", "--seed", "3", "--runs", "5"],
+        ["validate", "--quick", "--seed", "3", "--limit", "torque_nm=9"],
+    ):
+        assert main([*other, "--bus", "unix:/nonexistent/bus", "--out", str(out)]) == 1
+        said = capsys.readouterr().err
+        assert "of another plan" in said
+        assert len(said.splitlines()) == 1
+    same = ["validate", "--quick", "--seed", "3", "--bus", "unix:/nonexistent/bus", "--out", str(out)]
+    assert main(same) == 0
+
+
+def test_a_plan_that_was_designed_once_is_not_designed_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["excitation", "--quick", "--evaluations", "1"]
+    done_directory(tmp_path / "out", arguments)
+
+    def never(*_: object, **__: object) -> None:
+        raise AssertionError("designed again")
+
+    monkeypatch.setattr("jtqd.sysid.campaign.plans.design", never)
+    assert main([*arguments, "--bus", "x", "--out", str(tmp_path / "out")]) == 0
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize("bus", ["can77", "unix:/nonexistent/bus"])
+def test_a_bus_that_is_not_there_ends_the_campaign_in_one_line(
+    plan: str, tmp_path: Path, bus: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([plan, "--bus", bus, "--out", str(tmp_path / "out")]) == 1
+    captured = capsys.readouterr()
+    assert bus.removeprefix("unix:") in captured.out
+    assert "Traceback" not in captured.err
+    left = sorted(file.name for file in (tmp_path / "out").iterdir())
+    assert left == [".lock", "campaign.json", "plan.yaml"]
+
+
+def test_what_jtqd_says_when_it_does_not_start_is_told(
+    plan: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A bench with nothing on it: jtqd's boot names the node that is missing, and the campaign passes it on."""
+    (tmp_path / "run").mkdir()
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
+    hub = subprocess.Popen([sys.executable, "-m", "jtqd.drivers.hub", f"unix:{tmp_path}/bus"])
+    try:
+        bus = f"unix:{tmp_path}/bus"
+        until_it_listens(bus, hub)
+        assert main([plan, "--bus", bus, "--out", str(tmp_path / "out"), "--json"]) == 1
+        content = json.loads(capsys.readouterr().out)
+        assert "node 1" in content["not_done"]["a"]
+        assert content["runs"] == {"done": 0, "stopped": 0, "failed": 1, "pending": 1}
+        assert (tmp_path / "out" / "a.jtqd.log").exists()
+    finally:
+        hub.terminate()
+        hub.wait(10)
+
+
+def test_help_has_an_example_and_jtq_knows_the_command() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "jtqd.daemon.jtq", "campaign", "--help"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "COLUMNS": "100"},
+    )
+    assert done.returncode == 0
+    assert "jtq campaign efficiency --dry-run" in done.stdout
+    assert not done.stderr

@@ -1,0 +1,259 @@
+"""Plans and their set-points: what is written is what is read, what is told is smooth, and what goes too far is refused."""
+
+import copy
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from jtqd.estimator.checked import ConfigError
+from jtqd.sysid.campaign.plan import (
+    DEFAULT_LIMITS,
+    Fourier,
+    Plan,
+    Plateau,
+    Rest,
+    Run,
+    check_plan,
+    check_run,
+    expand,
+    load_plan,
+    smooth_step,
+    travel_rad,
+)
+from jtqd.sysid.excitation.fourier import FourierSeries, FourierTrajectory
+from jtqd.sysid.motion.setpoints import Limits
+
+PLAN: dict[str, Any] = {
+    "schema": "jtq.plan/1",
+    "name": "mixed",
+    "limits": {
+        "current_a": 8.0,
+        "velocity_rad_s": 3.0,
+        "torque_nm": 50.0,
+        "travel_rad": 20.0,
+        "temperature_c": 60.0,
+    },
+    "runs": [
+        {
+            "name": "one",
+            "velocity_joint": 2,
+            "segments": [
+                {"kind": "plateau", "velocity_rad_s": -1.5, "current_a": 2.0, "hold_s": 1.0, "ramp_s": 0.5},
+                {"kind": "rest", "hold_s": 0.5, "ramp_s": 0.4},
+                {
+                    "kind": "fourier",
+                    "duration_s": 4.0,
+                    "velocity": {"omega_rad_s": 1.5, "a": [0.4, -0.1], "b": [0.2, 0.3]},
+                    "current": {"omega_rad_s": 1.1, "a": [1.0], "b": [0.5], "offset_a": 0.5},
+                },
+                {"kind": "rest", "hold_s": 0.5, "ramp_s": 0.0},
+            ],
+        },
+        {
+            "name": "two",
+            "velocity_joint": 1,
+            "segments": [
+                {"kind": "rest", "hold_s": 1.0, "ramp_s": 0.5},
+                {"kind": "power_off", "hold_s": 2.0},
+            ],
+        },
+    ],
+}
+
+
+def changed(change: Callable[[dict[str, Any]], Any]) -> dict[str, Any]:
+    plan = copy.deepcopy(PLAN)
+    change(plan)
+    return plan
+
+
+def run_of(*segments: Any) -> Run:
+    return Run("r", 1, tuple(segments))
+
+
+def test_a_plan_is_the_same_after_yaml(tmp_path: Path) -> None:
+    plan = Plan.from_mapping(PLAN, "p.yaml")
+    assert plan.to_mapping() == PLAN
+    path = tmp_path / "plan.yaml"
+    path.write_text(plan.to_yaml())
+    again = load_plan(path)
+    assert again == plan
+    assert again.sha256 == plan.sha256
+    assert plan.duration_s == pytest.approx(1.5 + 0.9 + 4.0 + 0.5 + 1.5 + 2.0)
+
+
+def test_every_number_of_a_plan_counts_for_its_hash() -> None:
+    rng = random.Random(1)
+    plan = Plan.from_mapping(PLAN, "p.yaml")
+    seen = {plan.sha256}
+    for _ in range(50):
+        mapping = copy.deepcopy(PLAN)
+        segment = rng.choice(mapping["runs"][0]["segments"][:2])
+        key = rng.choice([key for key in segment if key != "kind"])
+        segment[key] = segment[key] + rng.uniform(1e-6, 0.3)
+        seen.add(Plan.from_mapping(mapping, "p.yaml").sha256)
+    assert len(seen) == 51
+    mapping = copy.deepcopy(PLAN)
+    mapping["runs"].reverse()
+    assert Plan.from_mapping(mapping, "p.yaml").sha256 not in seen
+    dumped = yaml.safe_load(yaml.safe_dump(PLAN, sort_keys=True))  # another order of keys is the same plan
+    assert Plan.from_mapping(dumped, "q.yaml").sha256 == plan.sha256
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda p: p.update(schema="jtq.plan/2"), ["'schema'", "jtq.plan/2"]),
+        (lambda p: p.update(runs=[]), ["'runs'", "at least one run"]),
+        (lambda p: p["limits"].update(curent_a=1.0), ["limits.curent_a", "did you mean 'current_a'"]),
+        (lambda p: p["limits"].update(torque_nm=0.0), ["limits.torque_nm", "> 0"]),
+        (lambda p: p["runs"][1].update(name="one"), ["runs[1].name", "no other run"]),
+        (lambda p: p["runs"][1].update(name="../up"), ["runs[1].name", "letters"]),
+        (lambda p: p["runs"][1].update(name="plan"), ["runs[1].name", "'plan'"]),
+        (lambda p: p["runs"][1].update(velocity_joint=3), ["velocity_joint", "3"]),
+        (lambda p: p["runs"][1].update(segments=[]), ["segments", "at least one"]),
+        (lambda p: p["runs"][0]["segments"][0].update(kind="platform"), ["segments[0].kind", "platform"]),
+        (lambda p: p["runs"][0]["segments"][0].update(hold_s=-1), ["segments[0].hold_s", "-1"]),
+        (lambda p: p["runs"][0]["segments"][0].update(hold_s="1e0x"), ["hold_s", "1e0x"]),
+        (lambda p: p["runs"][0]["segments"][1].update(current_a=1.0), ["segments[1].current_a", "unknown"]),
+        (lambda p: p["runs"][0]["segments"].pop(1), ["segments[1].kind", "a rest before it"]),
+        (
+            lambda p: p["runs"][0]["segments"].insert(1, {"kind": "power_off", "hold_s": 2.0}),
+            ["segments[1].kind", "power_off", "a rest before it"],
+        ),
+        (lambda p: p["runs"][1]["segments"][1].update(hold_s=0.5), ["segments[1].hold_s", "1.5"]),
+        (lambda p: p["runs"][0]["segments"][2]["velocity"].update(b=[1.0]), ["velocity.b", "as many"]),
+        (lambda p: p["runs"][0]["segments"][2]["current"].pop("omega_rad_s"), ["current.omega_rad_s"]),
+        (lambda p: p["runs"][0]["segments"][2].pop("duration_s"), ["duration_s", "missing"]),
+    ],
+)
+def test_what_is_wrong_in_a_plan_is_named_in_one_line(
+    change: Callable[[dict[str, Any]], Any], words: list[str]
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        Plan.from_mapping(changed(change), "my.plan.yaml")
+    message = str(caught.value)
+    assert len(message.splitlines()) == 1
+    for word in ["my.plan.yaml", *words]:
+        assert word in message
+
+
+def test_limits_that_are_left_out_have_their_defaults_and_null_is_no_limit_of_temperature() -> None:
+    assert Plan.from_mapping(changed(lambda p: p.pop("limits")), "p").limits == DEFAULT_LIMITS
+    some = Plan.from_mapping(changed(lambda p: p.update(limits={"torque_nm": 20.0})), "p").limits
+    assert (some.torque_nm, some.current_a, some.temperature_c) == (20.0, DEFAULT_LIMITS.current_a, 70.0)
+    plan = Plan.from_mapping(changed(lambda p: p["limits"].update(temperature_c=None)), "p")
+    assert plan.limits.temperature_c == float("inf")
+    assert Plan.from_mapping(yaml.safe_load(plan.to_yaml()), "p") == plan
+
+
+def test_smooth_step_has_no_slope_and_no_curvature_at_its_ends() -> None:
+    h = 1e-4
+    x = np.array([0.0, h, 2 * h, 0.5, 1.0 - 2 * h, 1.0 - h, 1.0])
+    y = smooth_step(x)
+    assert y[[0, 3, 6]] == pytest.approx([0.0, 0.5, 1.0])
+    assert np.abs(np.diff(y[:3]) / h).max() < 1e-6
+    assert abs(y[0] - 2 * y[1] + y[2]) / h**2 < 0.02  # its second derivative is 60 x there
+    assert abs(y[4] - 2 * y[5] + y[6]) / h**2 < 0.02
+    fine = smooth_step(np.linspace(0.0, 1.0, 10001))
+    assert np.all(np.diff(fine) >= 0.0)
+    assert np.diff(fine).max() * 10000 == pytest.approx(1.875, rel=1e-6)
+
+
+def test_set_points_hold_what_the_segments_say_at_the_times_of_the_marks() -> None:
+    points = expand(Plan.from_mapping(PLAN, "p").runs[0])
+    assert len(points) == 6900
+    assert (points.velocity_joint, points.current_joint) == (2, 1)
+    assert [mark.kind for mark in points.marks] == ["ramp", "plateau", "ramp", "rest", "fourier", "rest"]
+    assert points.marks[0].start_s == 0.0
+    for before, after in zip(points.marks[:-1], points.marks[1:], strict=True):
+        assert before.end_s == after.start_s
+    assert points.marks[-1].end_s == pytest.approx(6.9)
+    for mark in points.marks:
+        held = slice(round(mark.start_s * 1e3), round(mark.end_s * 1e3))
+        if mark.velocity_rad_s is not None:
+            assert np.all(points.velocity_rad_s[held] == mark.velocity_rad_s)
+            assert np.all(points.current_a[held] == mark.current_a)
+    plateau = points.marks[1]
+    assert (plateau.velocity_rad_s, plateau.current_a) == (-1.5, 2.0)
+    assert plateau.end_s - plateau.start_s == pytest.approx(1.0)
+    fourier = points.marks[4]
+    held = slice(round(fourier.start_s * 1e3), round(fourier.end_s * 1e3))
+    t = np.arange(4000) * 1e-3
+    assert np.array_equal(
+        points.velocity_rad_s[held], FourierTrajectory(1.5, (0.4, -0.1), (0.2, 0.3), 4.0).velocity(t)
+    )
+    assert np.array_equal(points.current_a[held], FourierSeries(1.1, (1.0,), (0.5,), 4.0, 0.5).value(t))
+
+
+def test_random_runs_never_jump_and_end_at_rest() -> None:
+    """Velocity and acceleration are continuous over every segment: differences stay below what the ramps explain."""
+    for seed in range(30):
+        rng = random.Random(seed)
+        segments: list[Any] = []
+        for _ in range(6):
+            ramp = rng.uniform(0.3, 1.0)
+            segments.append(
+                Plateau(rng.uniform(-2.5, 2.5), rng.uniform(-5, 5), rng.uniform(0.0, 0.5), ramp)
+                if rng.random() < 0.6
+                else Rest(rng.uniform(0.0, 0.5), ramp)
+            )
+        segments.append(Rest(0.2, 0.5))
+        points = expand(run_of(*segments))
+        for series, largest in ((points.velocity_rad_s, 5.0), (points.current_a, 10.0)):
+            first = np.diff(series, prepend=0.0) / 1e-3
+            second = np.diff(first, prepend=0.0) / 1e-3
+            assert np.abs(first).max() < 1.9 * largest / 0.3, f"seed {seed}"
+            assert np.abs(second).max() < 5.9 * largest / 0.3**2, f"seed {seed}"
+            assert np.all(series[-200:] == 0.0), f"seed {seed}"
+
+
+def test_travel_is_the_largest_distance_and_directions_cancel() -> None:
+    out = Plateau(1.0, 0.0, 2.0, 0.5)
+    back = Plateau(-1.0, 0.0, 2.0, 0.5)
+    # ramp 0 -> 1 within 0.5 s covers 0.25 rad, then 2 rad
+    assert travel_rad(expand(run_of(out, Rest(0.5, 0.5)))) == pytest.approx(2.5, abs=1e-9)
+    both = expand(run_of(out, back, Rest(0.5, 0.5)))
+    # half of the reversal: 0.5 s times the integral of 1 - 2 s(x) over 0..1/2, s = 10 x^3 - 15 x^4 + 6 x^5
+    reversal = 0.5 * (0.5 - 2.0 * (2.5 / 16 - 3 / 32 + 1 / 64))
+    assert travel_rad(both) == pytest.approx(2.25 + reversal, abs=1e-4)
+    assert np.cumsum(both.velocity_rad_s)[-1] * 1e-3 == pytest.approx(0.0, abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("segments", "words"),
+    [
+        ([Plateau(3.1, 0.0, 1.0), Rest(0.5)], ["velocity", "3.0", "limit 3 rad/s"]),
+        ([Plateau(0.1, -5.5, 1.0), Rest(0.5)], ["current", "5", "limit 5 A"]),
+        ([Plateau(2.0, 0.0, 6.0), Rest(0.5)], ["travel", "limit 10 rad"]),
+        ([Plateau(1.0, 0.0, 1.0, 0.0), Rest(0.5)], ["jump"]),
+        ([Plateau(1.0, 0.0, 1.0)], ["ends at rest"]),
+        ([Rest(0.0, 0.0)], ["no time"]),
+    ],
+)
+def test_a_run_beyond_its_limits_is_refused_before_anything_moves(
+    segments: list[Any], words: list[str]
+) -> None:
+    limits = Limits(current_a=5.0, velocity_rad_s=3.0, torque_nm=50.0, travel_rad=10.0)
+    with pytest.raises(ConfigError) as caught:
+        check_run(run_of(*segments), limits)
+    for word in ["run 'r'", *words]:
+        assert word in str(caught.value)
+
+
+def test_a_run_at_its_limits_is_allowed() -> None:
+    limits = Limits(current_a=5.0, velocity_rad_s=3.0, torque_nm=50.0, travel_rad=10.0)
+    plan = Plan("p", limits, (run_of(Plateau(3.0, -5.0, 1.0, 1.0), Rest(0.5)),))
+    assert list(check_plan(plan)) == ["r"]
+
+
+def test_fourier_segments_carry_their_series_unchanged() -> None:
+    segment = Plan.from_mapping(PLAN, "p").runs[0].segments[2]
+    assert isinstance(segment, Fourier)
+    assert segment.duration_s == 4.0
+    assert segment.current.offset_a == 0.5

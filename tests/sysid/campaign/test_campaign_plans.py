@@ -1,0 +1,198 @@
+"""The campaigns that ship: the paper's points are in them, and on the plant they are the quadrants they are named for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jtqd.estimator.checked import ConfigError
+from jtqd.models.files import load_joint, shipped
+from jtqd.sim_can.emulated_run import JointCommand, emulate_run
+from jtqd.sim_can.plant_file import load_plant
+from jtqd.sysid.campaign.plan import (
+    DEFAULT_LIMITS,
+    Fourier,
+    Plan,
+    Plateau,
+    Run,
+    check_plan,
+    expand,
+    travel_rad,
+)
+from jtqd.sysid.campaign.plans import (
+    KINDS,
+    Scale,
+    currents_of,
+    efficiency_runs,
+    excitation_runs,
+    make_plan,
+    seed_of,
+    slow_and_fast,
+    validation_runs,
+    variable_runs,
+)
+
+SECTION_II = [(v, i) for v in (0.2, 0.6, 1.0, 1.4, 1.8) for i in range(6)] + [
+    (v, i) for v in (2.2, 2.6, 3.0) for i in range(5)
+]
+
+
+def points_of(run: Run) -> list[tuple[float, float]]:
+    return [(s.velocity_rad_s, s.current_a) for s in run.segments if isinstance(s, Plateau)]
+
+
+def test_efficiency_has_every_point_of_section_ii_forward_and_back_in_both_directions() -> None:
+    runs = efficiency_runs()
+    assert len(runs) == 32
+    assert len({run.name for run in runs}) == 32
+    for joint in (1, 2):
+        for sign in (1.0, -1.0):
+            found = [
+                (abs(v), abs(i))
+                for run in runs
+                for v, i in points_of(run)
+                if run.velocity_joint == joint and np.sign(v) == sign
+            ]
+            assert sorted(found) == sorted((v, float(i)) for v, i in SECTION_II)
+    for run in runs:
+        velocities = {v for v, _ in points_of(run)}
+        assert len(velocities) == 1, "one velocity and direction per run"
+        currents = [i for _, i in points_of(run)]
+        assert currents == sorted(currents, key=abs)
+        assert all(i * velocities.copy().pop() >= 0.0 for i in currents)
+        assert run.name.startswith("forward_1" if run.velocity_joint == 1 else "back_1")
+
+
+def test_section_iv_a_has_its_points_in_both_directions() -> None:
+    wanted = {0.5: (0.5, 1.5, 2.5), 1.5: (1.5, 2.5, 3.5), 2.5: (2.5, 3.5, 4.5)}
+    found: dict[tuple[int, float], list[tuple[float, float]]] = {}
+    for run in validation_runs():
+        for v, i in points_of(run):
+            found.setdefault((run.velocity_joint, abs(v)), []).append((v, i))
+    assert set(found) == {(joint, v) for joint in (1, 2) for v in wanted}
+    for (_, speed), points in found.items():
+        assert sorted(points) == sorted((s * speed, s * i) for i in wanted[speed] for s in (1.0, -1.0))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("quick", [False, True])
+def test_shipped_campaigns_keep_their_own_limits(kind: str, quick: bool) -> None:
+    plan = make_plan(kind, Scale(quick=quick, evaluations=80))
+    assert set(check_plan(plan)) == {run.name for run in plan.runs}
+    assert make_plan(kind, Scale(quick=quick, evaluations=80)).sha256 == plan.sha256
+
+
+def test_the_named_quadrants_are_those_of_the_plant() -> None:
+    """forward_1: joint 1's current and velocity have the same sign, joint 2's opposite ones; back_1 the other way round.
+
+    Asked of the plant with measured currents, so that neither the plan nor its comments decide.
+    """
+    plant = load_plant(shipped("plant.yaml"))
+    gear = load_joint(shipped("joint1.yaml")).gear_ratio
+    for run in efficiency_runs((1.0,), hold_s=0.6, currents_a=(3.0,)):
+        points = expand(run)
+        velocity = JointCommand.velocity(lambda t, v=points.velocity_rad_s: float(v[round(t * 1e3)]))
+        current = JointCommand.current(lambda t, i=points.current_a: float(i[round(t * 1e3)]))
+        commands = (velocity, current) if run.velocity_joint == 1 else (current, velocity)
+        table = emulate_run(plant, commands, points.duration_s, seed=1)
+        plateau = next(mark for mark in points.marks if mark.kind == "plateau")
+        rows = slice(round((plateau.start_s + 0.2) * 1e3), round(plateau.end_s * 1e3))
+        power = {}
+        for number in (1, 2):
+            joint = table.joints[number]
+            assert joint.current_a is not None
+            assert joint.motor_velocity_rad_s is not None
+            assert joint.torque_nm is not None
+            power[number] = float(np.mean(joint.current_a[rows] * joint.motor_velocity_rad_s[rows] / gear))
+            assert abs(float(np.mean(joint.torque_nm[rows]))) > 5.0
+        one, two = (1, -1) if run.name.startswith("forward_1") else (-1, 1)
+        assert power[1] * one > 1.0, run.name
+        assert power[2] * two > 1.0, run.name
+        turned = table.joints[run.velocity_joint].link_position_rad
+        assert turned is not None
+        assert np.sign(turned[-1] - turned[0]) == (1.0 if "_p" in run.name else -1.0)
+
+
+def test_slow_and_fast_take_turns_and_none_is_lost() -> None:
+    order = slow_and_fast([0.2, 0.6, 1.0, 1.4, 1.8, 2.2, 2.6, 3.0])
+    assert order == [0.2, 3.0, 0.6, 2.6, 1.0, 2.2, 1.4, 1.8]
+    assert slow_and_fast([3.0, 1.0, 2.0]) == [1.0, 3.0, 2.0]
+
+
+def test_excitation_alternates_and_covers_low_velocity_for_either_joint() -> None:
+    runs = excitation_runs(DEFAULT_LIMITS, 12, 24.0, seed=3, evaluations=1)
+    assert [run.velocity_joint for run in runs] == [1, 2] * 6
+    for run in runs:
+        kinds = [type(segment).__name__ for segment in run.segments]
+        assert kinds == ["Rest", "Fourier", "Rest", "Fourier", "Rest"]
+        assert run.segments[2].duration_s == 2.0, "2 s at rest between: section III"
+        assert run.duration_s == pytest.approx(24.0)
+    for run in runs[:2]:  # already in the smallest campaign
+        slow = run.segments[3]
+        assert isinstance(slow, Fourier)
+        assert np.abs(slow.velocity.velocity(np.linspace(0.0, slow.duration_s, 999))).max() < 0.31
+    for joint in (1, 2):
+        velocity = np.concatenate([expand(run).velocity_rad_s for run in runs if run.velocity_joint == joint])
+        moving = np.abs(velocity[np.abs(velocity) > 1e-3])
+        assert np.mean(moving < 0.2) > 0.2
+        assert np.mean(moving > 1.0) > 0.2
+        assert moving.max() == pytest.approx(3.0, abs=0.1)
+        current = np.concatenate([expand(run).current_a for run in runs if run.velocity_joint == joint])
+        for v_sign in (1.0, -1.0):
+            for i_sign in (1.0, -1.0):  # all four quadrants
+                assert np.mean((velocity * v_sign > 0.1) & (current * i_sign > 0.3)) > 0.08
+
+
+def test_no_trajectory_of_validation_is_one_of_training_whatever_the_seeds() -> None:
+    def series(runs: tuple[Run, ...]) -> set[tuple[float, ...]]:
+        return {s.velocity.a for run in runs for s in run.segments if isinstance(s, Fourier)}
+
+    trained = set().union(
+        *(series(excitation_runs(DEFAULT_LIMITS, 4, 12.0, seed=seed, evaluations=1)) for seed in range(4))
+    )
+    judged = set().union(*(series(variable_runs(DEFAULT_LIMITS, 4, 12.0, seed=seed)) for seed in range(4)))
+    assert len(trained) == 32
+    assert len(judged) == 16
+    assert not trained & judged
+    purposes = [("excitation", v) for v in (3.0, 1.2, 0.3)] + [("variable", 3.0)]
+    seeds = {seed_of(purpose, level, n) for purpose, level in purposes for n in range(500)}
+    assert len(seeds) == 2000
+
+
+def test_scale_changes_what_it_names_and_nothing_else() -> None:
+    plan = make_plan("validate", Scale(runs=3, seconds=5.0, hold_s=0.5))
+    fourier = [run for run in plan.runs if run.name.startswith("variable")]
+    assert [run.duration_s for run in fourier] == pytest.approx([5.0] * 3)
+    holds = {s.hold_s for run in plan.runs for s in run.segments if isinstance(s, Plateau)}
+    assert holds == {0.5}
+    assert len(plan.runs) == 6 + 3
+    assert make_plan("excitation", Scale(runs=2, seed=1, evaluations=1)) != make_plan(
+        "excitation", Scale(runs=2, seed=2, evaluations=1)
+    )
+
+
+def test_runs_too_short_for_their_trajectories_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"--seconds: found 7, expected at least 8"):
+        make_plan("excitation", Scale(seconds=7.0))
+    with pytest.raises(ConfigError, match=r"--seconds: found 3, expected at least 4"):
+        make_plan("validate", Scale(seconds=3.0))
+
+
+def test_a_run_of_one_direction_turns_back_before_it_goes_too_far() -> None:
+    """Long holds in a short space: every point is still there, in its direction, and the limit is kept."""
+    for travel in (7.0, 12.0, 25.0):
+        for run in efficiency_runs((0.6, 2.2), hold_s=2.1, travel_rad=travel):
+            points = expand(run)
+            assert travel_rad(points) <= travel
+            sign = 1.0 if "_p" in run.name else -1.0
+            there = [(v, i) for v, i in points_of(run) if v * sign > 0.0]
+            back = [(v, i) for v, i in points_of(run) if v * sign < 0.0]
+            assert [abs(i) for _, i in there] == list(currents_of(there[0][0]))
+            assert all(i == 0.0 for _, i in back)
+    free = efficiency_runs((2.2,), hold_s=2.1)
+    assert all(len(points_of(run)) == 5 for run in free)
+    assert efficiency_runs((2.2,), hold_s=2.1, travel_rad=60.0) == free
+    with pytest.raises(ConfigError, match="travel"):  # one point alone is too long
+        check_plan(
+            Plan("p", replace(DEFAULT_LIMITS, travel_rad=4.0), efficiency_runs((2.2,), travel_rad=4.0))
+        )

@@ -1,0 +1,226 @@
+"""Which runs are tried, tried again, and what ends a campaign; and the exit status that says so."""
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Plan, Plateau, Rest, Run, check_plan
+from jtqd.sysid.campaign.processes import Interrupted
+from jtqd.sysid.campaign.runner import ATTEMPTS, Attempt, Outcome, _stopped, go_through, marks_of
+from jtqd.sysid.campaign.state import (
+    BETWEEN_RUNS_S,
+    DONE,
+    FAILED,
+    STOPPED,
+    CampaignDirectory,
+    Remaining,
+    Reporter,
+    RunState,
+    clock_text,
+)
+from jtqd.sysid.motion.commander import Pace
+from jtqd.sysid.motion.setpoints import JointSample, Limits, Monitor, MotionResult, Sample, Setpoints, Timing
+
+PLAN = Plan("p", DEFAULT_LIMITS, tuple(Run(name, 1, (Rest(1.0),)) for name in ("a", "b", "c")))
+GOOD = Attempt(RunState(DONE, played_s=1.0, rows=1000))
+LIMIT = Attempt(RunState(STOPPED, "joint 1: current 9.1 A, limit 9 A"))
+LATE = Attempt(RunState(STOPPED, "SYNC missing for 25 ms, limit 20 ms"), again=True)
+GAP = Attempt(RunState(FAILED, "found a gap of 30 ms"), again=True)
+NO_BENCH = Attempt(RunState(FAILED, "jtqd ended with exit status 1"), begun=False)
+REFUSED = Attempt(RunState(FAILED, "no SYNC: is jtqd running on this bus?"), again=True, begun=False)
+SIGNAL = Attempt(RunState(STOPPED, "SIGINT"), signalled=True)
+
+
+class Script:
+    """Attempts that a test prescribes, run by run; what was asked for is written down."""
+
+    def __init__(self, **attempts: list[Attempt | BaseException]) -> None:
+        self._attempts: dict[str, Iterator[Attempt | BaseException]] = {
+            name: iter(each) for name, each in attempts.items()
+        }
+        self.asked: list[str] = []
+
+    def __call__(self, run: Run, setpoints: Setpoints) -> Attempt:
+        assert setpoints.duration_s == run.duration_s
+        self.asked.append(run.name)
+        found = next(self._attempts[run.name], GOOD) if run.name in self._attempts else GOOD
+        if isinstance(found, BaseException):
+            raise found
+        return found
+
+
+@pytest.fixture
+def directory(tmp_path: Path) -> Iterator[CampaignDirectory]:
+    made = CampaignDirectory(tmp_path)
+    made.begin(PLAN, {})
+    yield made
+    made.close()
+
+
+def gone(directory: CampaignDirectory, script: Script, **options: bool) -> Outcome:
+    points = check_plan(PLAN)
+    with Reporter([3.0], 3, 0, Console(file=io.StringIO())) as reporter:
+        return go_through(PLAN, points, directory, reporter, script, **options)
+
+
+@pytest.mark.parametrize(
+    ("attempts", "options", "asked", "expected"),
+    [
+        ({}, {}, "abc", ([DONE, DONE, DONE], 0)),
+        ({"b": [LATE]}, {}, "abbc", ([DONE, DONE, DONE], 0)),
+        ({"b": [GAP, LATE]}, {}, "abbbc", ([DONE, DONE, DONE], 0)),
+        ({"b": [GAP] * 9}, {}, "abbbc", ([DONE, FAILED, DONE], 3)),
+        ({"b": [LIMIT]}, {}, "ab", ([DONE, STOPPED, "pending"], 1)),
+        ({"b": [LIMIT]}, {"keep_going": True}, "abc", ([DONE, STOPPED, DONE], 3)),
+        ({"b": [LATE] * 9}, {}, "abbb", ([DONE, STOPPED, "pending"], 1)),
+        ({"b": [NO_BENCH]}, {"keep_going": True}, "ab", ([DONE, FAILED, "pending"], 1)),
+        ({"b": [REFUSED]}, {}, "abbc", ([DONE, DONE, DONE], 0)),
+        ({"b": [REFUSED] * 9}, {}, "abbb", ([DONE, FAILED, "pending"], 1)),
+        ({"b": [SIGNAL]}, {"keep_going": True}, "ab", ([DONE, STOPPED, "pending"], 1)),
+        ({"b": [Interrupted()]}, {"keep_going": True}, "ab", ([DONE, "pending", "pending"], 1)),
+    ],
+)
+def test_what_is_tried_and_what_becomes_of_it(
+    directory: CampaignDirectory,
+    attempts: dict[str, list[Attempt | BaseException]],
+    options: dict[str, bool],
+    asked: str,
+    expected: tuple[list[str], int],
+) -> None:
+    statuses, status = expected
+    script = Script(**attempts)
+    outcome = gone(directory, script, **options)
+    assert "".join(script.asked) == asked
+    assert [state.status for state in outcome.runs.values()] == statuses
+    assert outcome.exit_status == status
+    assert bool(outcome.ended) == (status == 1)
+    assert all(state.attempts <= ATTEMPTS for state in outcome.runs.values())
+
+
+def test_only_what_is_not_done_is_played_when_the_command_is_repeated(directory: CampaignDirectory) -> None:
+    for ending in (".csv.gz", ".json", ".mcap"):
+        (directory.path / f"a{ending}").write_text("x")
+    assert gone(directory, Script(b=[LIMIT])).exit_status == 1
+    directory.begin(PLAN, {})
+    script = Script()
+    assert gone(directory, script).exit_status == 0
+    assert script.asked == ["b", "c"]
+
+
+def test_findings_are_told_and_make_the_exit_status_3(directory: CampaignDirectory) -> None:
+    dead = Attempt(RunState(DONE, rows=9, missed=4, incomplete=2, findings=("j1.torque_nm: dead channel",)))
+    outcome = gone(directory, Script(b=[dead]))
+    assert outcome.exit_status == 3
+    text = outcome.text()
+    for words in ("3 done", "b: j1.torque_nm: dead channel", "missed 4 (b 4)", "incomplete 2 (b 2)"):
+        assert words in text
+    content = outcome.content()
+    assert content["findings"] == {"b": ["j1.torque_nm: dead channel"]}
+    assert content["missed_cycles"] == {"b": 4}
+    assert content["runs"] == {"done": 3, "stopped": 0, "failed": 0, "pending": 0}
+
+
+def late_reasons() -> list[str]:
+    """What the commander itself says when nothing but time was against it."""
+    pace = Pace(Timing(), 0)
+    pace.on_sync(1_000_000, 1_000_000)
+    lost = pace.watch(40_000_000)
+    other = Pace(Timing(), 0)
+    other.on_sync(1_000_000, 1_000_000)
+    late = other.on_sync(2_000_000, 60_000_000)
+    assert lost is not None
+    assert late is not None
+    return [lost.reason, late.reason]
+
+
+def limit_reasons() -> list[str]:
+    """What the monitor says of every limit."""
+    fine = JointSample(0.0, 0.0, 0.0, 20.0)
+    monitor = Monitor(Limits(1.0, 1.0, 1.0, 1.0, 30.0))
+    samples = [
+        Sample(fine._replace(current_a=2.0), fine, (0.0,)),
+        Sample(fine, fine._replace(velocity_rad_s=-2.0), (0.0,)),
+        Sample(fine, fine._replace(travel_rad=2.0), (0.0,)),
+        Sample(fine, fine._replace(temperature_c=31.0), (0.0,)),
+        Sample(fine, fine, (-2.0,)),
+    ]
+    reasons = [monitor.check(sample) for sample in samples]
+    assert all(reasons)
+    return [reason for reason in reasons if reason]
+
+
+def test_a_late_bus_is_tried_again_and_a_limit_never() -> None:
+    for reason in late_reasons():
+        assert _stopped(MotionResult("stopped", reason, 1.0)).again, reason
+    for reason in [*limit_reasons(), "joint 1: fault (statusword 0218h)", "SIGINT", "SIGTERM"]:
+        assert not _stopped(MotionResult("stopped", reason, 1.0)).again, reason
+    assert _stopped(MotionResult("stopped", "SIGTERM", 1.0)).signalled
+    assert not _stopped(MotionResult("stopped", limit_reasons()[0], 1.0)).signalled
+
+
+def test_remaining_time_is_motion_plus_what_was_measured_between() -> None:
+    now = [100.0]
+    remaining = Remaining([10.0, 20.0, 30.0], lambda: now[0])
+    assert remaining.seconds() == pytest.approx(60.0 + 3 * BETWEEN_RUNS_S)
+    remaining.begin(10.0)
+    assert remaining.seconds(4.0) == pytest.approx(56.0 + 3 * BETWEEN_RUNS_S)
+    now[0] += 16.0  # 10 s of motion and 6 s beside it
+    remaining.end()
+    assert remaining.seconds() == pytest.approx(50.0 + 2 * 6.0)
+    remaining.begin(20.0)
+    now[0] += 26.0
+    remaining.end()
+    assert remaining.seconds() == pytest.approx(30.0 + 6.0)
+    remaining.begin(30.0)
+    now[0] += 36.0
+    remaining.end()
+    assert remaining.seconds() == 0.0
+
+
+def test_clock_text() -> None:
+    assert [clock_text(s) for s in (0, 61.6, 3723, -5)] == ["0:00", "1:02", "1:02:03", "0:00"]
+
+
+def reported(terminal: bool, state: RunState) -> str:
+    console = Console(file=io.StringIO(), force_terminal=terminal, width=120)
+    with Reporter([2.0], 1, 0, console) as reporter:
+        reporter.begin("one", 2.0)
+        reporter.on_progress(1.0, 2.0)
+        reporter.end("one", 2.0, state)
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+def test_a_bar_on_a_terminal_and_lines_elsewhere(capsys: pytest.CaptureFixture[str]) -> None:
+    bar = reported(True, RunState(DONE, rows=7))
+    assert "1/1 one" in bar
+    assert "left" in bar
+    assert capsys.readouterr().err == ""
+    nothing = reported(False, RunState(DONE, rows=7, findings=("[dead] channel",)))
+    assert nothing == ""
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == [
+        "jtq campaign: run 1 of 1: one: done, 7 rows, 0 cycles missing",
+        "jtq campaign: one: [dead] channel",
+    ]
+
+
+def test_marks_say_which_segment_was_when() -> None:
+    run = Run("r", 2, (Plateau(1.0, 2.0, 0.5, 0.25), Rest(0.5)))
+    plan = Plan("p", DEFAULT_LIMITS, (run,))
+    marks = marks_of(run, check_plan(plan)["r"])
+    assert (marks["run"], marks["velocity_joint"]) == ("r", 2)
+    assert [segment["kind"] for segment in marks["segments"]] == ["ramp", "plateau", "ramp", "rest"]
+    assert marks["segments"][1] == {
+        "kind": "plateau",
+        "start_s": 0.25,
+        "end_s": 0.75,
+        "velocity_joint": 2,
+        "velocity_rad_s": 1.0,
+        "current_a": 2.0,
+    }
+    assert np.isclose(marks["segments"][-1]["end_s"], run.duration_s)

@@ -1,0 +1,173 @@
+"""Small known problems for the tests of the diagnosis' statistics: normal equations, columns and runs made by numpy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.run import JointColumns, RunTable
+from jtqd.sysid.diagnosis.findings import JointName
+from jtqd.sysid.diagnosis.mixed_model import Mixed
+from jtqd.sysid.diagnosis.noise import Sums
+from jtqd.sysid.diagnosis.regressors import ChannelData, EffectCandidate, RunData
+from jtqd.sysid.diagnosis.search import Search
+from jtqd.sysid.diagnosis.signals import Channel
+
+MOTOR1, TORSION1 = Channel(1, "motor"), Channel(1, "torsion")
+
+
+@dataclass(frozen=True)
+class Dense:
+    """y = X beta + Z u + e of some runs, sample by sample: x [run][n, p], z [run][n, q], y [run][n]; e of unit variance."""
+
+    x: list[FloatArray]
+    z: list[FloatArray]
+    y: list[FloatArray]
+
+    def mixed(self, prior_sigma: Sequence[float]) -> Mixed:
+        return Mixed(self.sums(), self.x[0].shape[1], np.array(prior_sigma))
+
+    def sums(self) -> list[Sums]:
+        parts = [np.column_stack(part) for part in zip(self.x, self.z, self.y, strict=True)]
+        return [Sums(m.T @ m, len(m)) for m in parts]
+
+    def covariances(self, variances: FloatArray) -> list[FloatArray]:
+        """Of y of each run [n, n]."""
+        return [np.eye(len(z)) + (z * variances) @ z.T for z in self.z]
+
+    def deviance(self, beta: FloatArray, variances: FloatArray, columns: Sequence[int]) -> float:
+        """-2 log of the normal density of all y, less its constant."""
+        out = 0.0
+        for x, y, c in zip(self.x, self.y, self.covariances(variances), strict=True):
+            rest = y - x[:, columns] @ beta
+            out += float(rest @ np.linalg.solve(c, rest)) + float(np.linalg.slogdet(c)[1])
+        return out
+
+    def least_squares(
+        self, variances: FloatArray, columns: Sequence[int], leave: int | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Generalised least squares of the runs but `leave`: coefficients and covariance."""
+        gram, right = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
+        for k, c in enumerate(self.covariances(variances)):
+            if k != leave:
+                x = self.x[k][:, columns]
+                gram += x.T @ np.linalg.solve(c, x)
+                right += x.T @ np.linalg.solve(c, self.y[k])
+        inverse = np.asarray(np.linalg.inv(gram), np.float64)
+        return inverse @ right, inverse
+
+
+def dense(
+    seed: int,
+    beta: Sequence[float],
+    sigma: Sequence[float],
+    *,
+    runs: int = 5,
+    count: int = 60,
+    columns: FloatArray | None = None,
+) -> Dense:
+    """Runs with coefficients beta [p] of random columns (or `columns` [runs, n, p]) and nuisances of spread sigma [q]: a
+    constant first, then random columns.
+    """
+    rng = np.random.default_rng(seed)
+    p, q = len(beta), len(sigma)
+    x = rng.normal(size=(runs, count, p)) if columns is None else columns
+    z = rng.normal(size=(runs, count, q))
+    z[:, :, 0] = 1.0
+    u = rng.normal(size=(runs, q)) * np.array(sigma)
+    y = x @ np.array(beta, np.float64) + np.einsum("rnq,rq->rn", z, u) + rng.normal(size=(runs, count))
+    return Dense(list(x), list(z), list(y))
+
+
+def candidates(joint: Joint, *wanted: tuple[str, JointName, int]) -> list[EffectCandidate]:
+    """The term of this number of each effect (name, joint, number), columns one after another."""
+    out: list[EffectCandidate] = []
+    first = 0
+    for name, where, number in wanted:
+        term = EFFECTS[name].terms(joint)[number]
+        out.append(EffectCandidate(EFFECTS[name], where, term, first))
+        first += len(term.basis)
+    return out
+
+
+def search_of(
+    problem: Dense, found: Sequence[EffectCandidate], least_nm: float = 0.005, sigma: float = 0.1
+) -> Search:
+    """A search over these candidates; every nuisance has the prior spread sigma."""
+    q = problem.z[0].shape[1]
+    rows = float(sum(len(y) for y in problem.y))
+    return Search(problem.mixed([sigma] * q), found, rows, np.eye(problem.x[0].shape[1])[None], least_nm)
+
+
+def run_data(
+    name: str, channels: Mapping[Channel, FloatArray], axes: Mapping[str, FloatArray], step_s: float = 0.005
+) -> RunData:
+    """A binned run with these residuals (NaN: not valid), a constant for its zero and no regressors; the axes of all its
+    joints are the same, those that are not given are still.
+    """
+    count = len(next(iter(channels.values())))
+    time_s = step_s * np.arange(count, dtype=np.float64)
+    still = dict.fromkeys(
+        ("velocity", "load", "temperature", "motor_angle", "link_angle", "current"), np.zeros(count)
+    )
+    none = np.empty(0, np.intp)
+    return RunData(
+        name,
+        time_s,
+        {
+            c: ChannelData(
+                np.isfinite(x),
+                np.nan_to_num(x),
+                np.empty((count, 0)),
+                none,
+                np.ones((count, 1)),
+                np.array([0]),
+            )
+            for c, x in channels.items()
+        },
+        {c.joint: still | {"time": time_s} | dict(axes) for c in channels},
+    )
+
+
+def rigid_run(
+    joint: Joint,
+    phase: float = 0.0,
+    *,
+    seconds: float = 6.0,
+    step_s: float = 1e-3,
+    noise: float = 0.0,
+    stribeck_nm: float = 0.0,
+    stribeck_velocity_rad_s: float = 0.1,
+    stiffness: float = 1.0,
+) -> RunTable:
+    """Joint 1 by the equations, both encoders, every quadrant. stiffness: the truth as part of the file's value.
+
+    The motor's friction is that of the file and a Stribeck peak; noise: of the current, as torque at the joint [Nm].
+    """
+    t = np.arange(0.0, seconds, step_s)
+    w = (1.3, 2.9)
+    link = 0.7 * np.sin(w[0] * t + phase)
+    torque = 0.3 * joint.rated_torque_nm * np.sin(w[1] * t + 2.0 * phase)
+    bend = -(w[1] ** 2) * torque
+    link_acceleration = -(w[0] ** 2) * link
+    gear = torque + joint.link_inertia_kgm2 * link_acceleration
+    gear_bend = bend + joint.link_inertia_kgm2 * w[0] ** 4 * link
+    K = stiffness * joint.stiffness_nm_per_rad
+    motor = link + gear / K
+    velocity = 0.7 * w[0] * np.cos(w[0] * t + phase) + np.gradient(gear, t) / K
+    friction = joint.friction
+    peak = stribeck_nm * np.exp(-((velocity / stribeck_velocity_rad_s) ** 2))
+    loss = np.sign(velocity) * (friction.coulomb_nm + peak) + friction.viscous_nms_per_rad * velocity
+    G = joint.gear_ratio
+    inertial = joint.rotor_inertia_kgm2 * G**2 * (link_acceleration + gear_bend / K)
+    random = np.random.default_rng(int(1000 * phase)).normal(0.0, 1.0, len(t))
+    current = (gear + loss + inertial + noise * random) / (G * joint.torque_constant_nm_per_a)
+    columns = JointColumns(
+        current_a=current, motor_position_rad=G * motor, link_position_rad=link, torque_nm=torque
+    )
+    return RunTable(t, {1: columns})

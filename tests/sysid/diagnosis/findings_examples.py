@@ -1,0 +1,276 @@
+"""Findings made up for looking at the report: every verdict.
+
+`python -m tests.sysid.diagnosis.findings_examples DIR` writes the pages.
+
+Their signals follow from their causes (a ripple of the stated size is in the residual), their evidence is invented.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from jtqd.sysid.diagnosis.findings import Cause, Findings, Gain
+from tests.sysid.diagnosis.findings_parts import (
+    GAIN,
+    INFINITY,
+    NAN,
+    NOTHING,
+    RIPPLE,
+    SLIP,
+    VISCOUS,
+    candidates,
+    gap,
+    given,
+    trace,
+    value,
+)
+
+
+def _runs(count: int) -> tuple[str, ...]:
+    return tuple(f"excitation_{k:02d}.csv.gz" for k in range(1, count + 1))
+
+
+def one_cause() -> Findings:
+    """Torque ripple in joint 1, one joint recorded."""
+    ripple = {
+        "amplitude_nm": value(0.418, 0.021, "Nm"),
+        "order_per_motor_rev": given(2.0, "1/rev"),
+        "phase_rad": value(0.71, 0.05, "rad"),
+    }
+    return Findings(
+        verdict="cause",
+        reasons=("the gap is 2.3 times the noise floor of 3 repeated runs",),
+        runs=_runs(6),
+        joints=(1,),
+        gaps=(
+            gap(
+                1,
+                "motor",
+                0.343,
+                0.149,
+                {"motor_angle": {1: 0.21, 9: 0.22, 5: 0.2, 13: 0.19}, "frequency": {6: 0.5}},
+            ),
+            gap(1, "torsion", 0.152, 0.149, {}),
+        ),
+        causes=(Cause("torque_ripple", 1, ("torque_ripple",), ripple, 4312.0, 0.81, 0.296, "motor"),),
+        candidates=candidates(
+            (1,),
+            {
+                ("torque_ripple", 1): (4312.0, 0.81, "chosen"),
+                ("cogging", 1): (212.0, 0.05, "explained by torque_ripple"),
+                ("kinematic_error", 1): (94.0, 0.03, "explained by torque_ripple"),
+            },
+        ),
+        gain=Gain(0.343, 0.151, "6 runs, each left out once", (0.185, 0.198), 0.0412, 0.0187),
+        traces=tuple(
+            trace(run, 1, balance, RIPPLE if balance == "motor" else NOTHING, seed=k)
+            for k, run in enumerate(_runs(6))
+            for balance in ("motor", "torsion")
+        ),
+    )
+
+
+def two_causes() -> Findings:
+    """Viscous friction for certain, and one of two that cannot be told apart, with the experiment that would."""
+    plan = {
+        "schema": "jtq.plan/1",
+        "name": "separate-link-inertia-from-delay",
+        "limits": {
+            "current_a": 4.0,
+            "velocity_rad_s": 2.0,
+            "torque_nm": 40.0,
+            "travel_rad": 30.0,
+            "temperature_c": 70.0,
+        },
+        "runs": [
+            {
+                "name": f"reversals_{k}",
+                "velocity_joint": 1,
+                "segments": [
+                    {
+                        "kind": "plateau",
+                        "velocity_rad_s": s * 0.4 * k,
+                        "current_a": 2.0,
+                        "hold_s": 2.0,
+                        "ramp_s": 0.3,
+                    }
+                    for s in (1, -1)
+                ]
+                * 8,
+            }
+            for k in (1, 2, 3, 4)
+        ],
+    }
+    viscous = {"viscous_nms_per_rad": value(5.72, 0.14, "Nms/rad")}
+    inertia = {"link_inertia_kgm2": value(0.213, 0.048, "kgm2")}
+    base = one_cause()
+    return replace(
+        base,
+        verdict="ambiguous",
+        reasons=(
+            "the gap is 4.5 times the noise floor",
+            "link_inertia and channel_delay leave the same trace where acceleration and velocity keep one ratio",
+        ),
+        joints=(1, 2),
+        gaps=(
+            gap(1, "motor", 0.912, 0.204, {"velocity": {0: 0.33, 11: 0.31}}),
+            gap(1, "torsion", 0.31, 0.21, {"frequency": {7: 0.4}}),
+            gap(2, "motor", 0.207, 0.204, {}),
+            gap(2, "torsion", 0.211, 0.21, {}),
+        ),
+        causes=(
+            Cause("viscous_friction", 1, ("viscous_friction",), viscous, 8210.0, 0.77, 0.81, "motor"),
+            Cause(
+                "link_inertia", 1, ("link_inertia", "channel_delay"), inertia, 133.0, 0.09, 0.22, "torsion"
+            ),
+        ),
+        candidates=candidates(
+            (1, 2),
+            {
+                ("viscous_friction", 1): (8210.0, 0.77, "chosen"),
+                ("link_inertia", 1): (133.0, 0.09, "chosen"),
+                ("channel_delay", 1): (129.4, 0.088, "class of link_inertia"),
+                ("torque_constant", 1): (1204.0, 0.11, "explained by viscous_friction"),
+            },
+        ),
+        gain=Gain(0.912, 0.238, "6 runs, each left out once", (0.629, 0.711)),
+        next_experiment={
+            "why": "Link inertia grows with acceleration at any speed, a delay with the rate of the torque. Reversals at "
+            "four speeds with equal ramps change one and not the other.",
+            "plan": plan,
+        },
+        traces=tuple(
+            trace(run, j, balance, VISCOUS if (j, balance) == (1, "motor") else NOTHING, seed=10 * j + k)
+            for k, run in enumerate(_runs(6))
+            for j in (1, 2)
+            for balance in ("motor", "torsion")
+        ),
+    )
+
+
+def no_gap() -> Findings:
+    """Nothing hidden."""
+    return Findings(
+        verdict="no_gap",
+        reasons=("no effect of the library and no map stands out of the noise",),
+        runs=_runs(6),
+        joints=(1, 2),
+        gaps=tuple(gap(j, b, 0.154 + 0.001 * j, 0.153, {}) for j in (1, 2) for b in ("motor", "torsion")),
+        candidates=candidates((1, 2), {}),
+        traces=tuple(trace(run, 1, "motor", NOTHING, seed=k) for k, run in enumerate(_runs(2))),
+    )
+
+
+def unexplained() -> Findings:
+    """A coupling that slips at one place of the link's turn."""
+    return Findings(
+        verdict="unexplained",
+        reasons=(
+            "the best effect (stribeck_friction) takes 4 % of the gap on runs left out",
+            "the residual is above noise in 2 of 16 bins of the link angle, block permutation p < 0.001",
+        ),
+        runs=_runs(4),
+        joints=(1,),
+        gaps=(gap(1, "motor", 0.61, 0.2, {"link_angle": {3: 0.52, 4: 0.21}, "velocity": {6: 0.2}}),),
+        candidates=candidates(
+            (1,), {("stribeck_friction", 1): (38.0, 0.04, "does not hold on runs left out")}
+        ),
+        channel_notes=("excitation_03.csv.gz: j1.temperature_c is constant (25.0): not used",),
+        traces=tuple(trace(run, 1, "motor", SLIP, seed=k) for k, run in enumerate(_runs(4))),
+    )
+
+
+def insufficient() -> Findings:
+    """One short run, no torque sensor to speak of."""
+    plan = two_causes().next_experiment
+    assert plan is not None
+    return Findings(
+        verdict="insufficient_data",
+        reasons=(
+            "1 run of 4.2 s: at least 2 runs are needed to tell a cause from a change between runs",
+            "velocity never exceeds 0.03 rad/s: friction has no direction there",
+        ),
+        runs=("test.csv",),
+        joints=(1,),
+        candidates=tuple(
+            replace(
+                c,
+                delta_bic=NAN,
+                held_out_gain=NAN,
+                reason="invisible in these runs",
+                minimum={k: replace(v, value=INFINITY) for k, v in c.minimum.items()},
+            )
+            for c in candidates((1,), {})
+        ),
+        channel_notes=(
+            "test.csv: j1.torque_nm looks like mNm (median 12400): divide by 1000 (--columns)",
+            "test.csv: 12 gaps in time, longest 0.31 s",
+        ),
+        next_experiment={
+            "why": "Speeds from 0.05 to 1.5 rad/s in both directions, with and without load, make friction, gains "
+            "and offsets visible.",
+            "plan": plan["plan"],
+        },
+    )
+
+
+def sensor() -> Findings:
+    """The sensor's gain, which both joints see alike."""
+    return replace(
+        two_causes(),
+        verdict="cause",
+        reasons=("the residuals of both joints agree: common to both is the sensor's part",),
+        gaps=tuple(
+            gap(j, b, 0.82, 0.21, {"load": {0: 0.3, 11: 0.31}}) for j in (1, 2) for b in ("motor", "torsion")
+        ),
+        causes=(
+            Cause(
+                "sensor_gain",
+                "sensor",
+                ("sensor_gain",),
+                {"gain": value(1.0481, 0.0017, "1")},
+                5120.0,
+                0.92,
+                0.79,
+                "motor",
+            ),
+        ),
+        candidates=candidates(
+            (1, 2),
+            {
+                ("sensor_gain", "sensor"): (5120.0, 0.92, "chosen"),
+                ("torque_constant", 1): (2230.0, 0.44, "explained by sensor_gain"),
+                ("torque_constant", 2): (2190.0, 0.43, "explained by sensor_gain"),
+            },
+        ),
+        gain=Gain(0.82, 0.214, "6 runs, each left out once", (0.582, 0.623)),
+        next_experiment=None,
+        traces=tuple(trace(run, j, "motor", GAIN, seed=k) for k, run in enumerate(_runs(6)) for j in (1, 2)),
+    )
+
+
+EXAMPLES: Mapping[str, Callable[[], Findings]] = {
+    "one_cause": one_cause,
+    "two_causes": two_causes,
+    "no_gap": no_gap,
+    "unexplained": unexplained,
+    "insufficient": insufficient,
+    "sensor": sensor,
+}
+
+
+def main(directory: Path) -> None:
+    """Write the pages."""
+    from jtqd.sysid.diagnosis.report.page import render
+
+    for name, make in EXAMPLES.items():
+        text = render(make(), "Made up for looking at the report.")
+        (directory / f"{name}.html").write_text(text, encoding="utf-8")
+        print(f"{name}.html {len(text.encode()) / 1024:.0f} KiB")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,261 @@
+"""`jtq diagnose` from the command line: exit status and files; the statistics are stood in for."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from jtqd.daemon import jtq as jtq_module
+from jtqd.models.files import load_joint
+from jtqd.sysid.campaign.plan import load_plan
+from jtqd.sysid.diagnosis.findings import VERDICTS
+from jtqd.sysid.fit.joint_writer import write_joint
+from tests.daemon.logs.campaign_log import Joint as LogJoint
+from tests.daemon.logs.campaign_log import regular, write_log
+from tests.sysid.diagnosis.diagnose_helpers import (
+    COULOMB,
+    JOINT,
+    JOINT_FILE,
+    OFFSET,
+    Core,
+    bench_run,
+    cause,
+    findings,
+    run,
+    said,
+    stand_in,
+    value,
+    write_runs,
+)
+
+PLAN = {
+    "schema": "jtq.plan/1",
+    "name": "more",
+    "limits": {"current_a": 5.0, "velocity_rad_s": 2.0},
+    "runs": [{"name": "r1", "velocity_joint": 1, "segments": [{"kind": "rest", "hold_s": 1.0}]}],
+}
+
+
+@pytest.fixture
+def core(monkeypatch: pytest.MonkeyPatch) -> Core:
+    return stand_in(monkeypatch)
+
+
+def test_the_toolbox_knows_the_command() -> None:
+    assert jtq_module.COMMANDS["diagnose"][0] == "jtqd.sysid.diagnosis.command"
+
+
+def test_help_has_an_example(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        run("--help")
+    assert caught.value.code == 0
+    assert "jtq diagnose campaigns/validate --joint" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_status_and_files_by_verdict(
+    tmp_path: Path, core: Core, capsys: pytest.CaptureFixture[str], verdict: str
+) -> None:
+    core.answer = findings(verdict, causes=(COULOMB, OFFSET) if verdict == "cause" else ())
+    write_runs(tmp_path)
+    out = tmp_path / "new" / "out"
+    assert run(tmp_path, "--joint", JOINT_FILE, "--out", out) == (0 if verdict == "no_gap" else 3)
+    text, _ = capsys.readouterr()
+    assert text.startswith(f"{verdict}: ")
+    assert ("coulomb_friction of joint 2: coulomb_nm 4.4 [4.3, 4.5] Nm" in text) == (verdict == "cause")
+    made = json.loads((out / "findings.json").read_text())
+    assert made["verdict"] == verdict
+    assert [each["name"] for each in made["runs"]] == ["a.csv", "b.csv.gz", "c.csv"]
+    assert all(len(each["sha256"]) == 64 for each in made["runs"])
+    names = ["extended.joint.yaml", "extended.joint1.yaml", "extended.joint2.yaml", "report.html"]
+    assert sorted(made["files"]) == names
+    assert sorted(path.name for path in out.iterdir()) == sorted([*names, "findings.json"])
+    assert (out / "report.html").read_text() == f"<html>{verdict}</html>"
+    effects = [effect.name for effect in load_joint(out / "extended.joint.yaml").effects]
+    assert effects == (["coulomb_friction", "sensor_offset"] if verdict == "cause" else [])
+
+
+def test_json_on_standard_output_is_the_file(
+    tmp_path: Path, core: Core, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_runs(tmp_path)
+    assert run(tmp_path, "--joint", JOINT_FILE, "--out", tmp_path / "o", "--json") == 3
+    out = capsys.readouterr().out
+    assert out == (tmp_path / "o" / "findings.json").read_text()
+    assert json.loads(out)["causes"][0]["name"] == "coulomb_friction"
+
+
+def test_one_file_serves_both_joints_and_one_each_its_own(tmp_path: Path, core: Core) -> None:
+    write_runs(tmp_path)
+    other = tmp_path / "other.yaml"
+    write_joint(other, replace(JOINT, name="other"), "t")
+    run(tmp_path, "--joint", JOINT_FILE, "--out", tmp_path / "o")
+    run(tmp_path, "--joint", f"2={other}", "--joint", f"1={JOINT_FILE}", "--out", tmp_path / "p")
+    run(tmp_path, "--joint", f"2={other}", "--out", tmp_path / "q")
+    names = [{number: joint.name for number, joint in joints.items()} for _, joints in core.asked]
+    assert names == [{1: "joint1", 2: "joint1"}, {1: "joint1", 2: "other"}, {2: "other"}]
+    assert all(list(table.joints) == [2] for _, table in core.asked[2][0])
+    assert not (tmp_path / "q" / "extended.joint2.yaml").exists()  # the only joint
+
+
+def test_runs_of_one_joint(tmp_path: Path, core: Core) -> None:
+    write_runs(tmp_path, numbers=(2,))
+    assert run(tmp_path, "--joint", JOINT_FILE, "--out", tmp_path / "o") == 3
+    assert list(core.asked[0][1]) == [2]
+    assert not list((tmp_path / "o").glob("extended.joint?.yaml"))
+
+
+def test_a_map_of_columns_brings_names_units_and_joint_files(tmp_path: Path, core: Core) -> None:
+    table = bench_run(numbers=(1,))
+    columns = table.joints[1]
+    rows = np.column_stack(
+        (table.time_s, columns.current_a, np.degrees(columns.link_position_rad), columns.torque_nm)
+    )
+    np.savetxt(tmp_path / "rig.csv", rows, delimiter=",", header="t,amps,deg,torque", comments="")
+    mapping = {
+        "time_s": "t",
+        "j1.current_a": "amps",
+        "j1.link_position_rad": {"column": "deg", "scale": float(np.pi / 180)},
+        "j1.torque_nm": "torque",
+        "j1.joint_file": "arm.yaml",
+    }
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump(mapping))
+    write_joint(tmp_path / "arm.yaml", replace(JOINT, name="arm"), "t")
+    assert run(tmp_path / "rig.csv", "--columns", tmp_path / "map.yaml", "--out", tmp_path / "o") == 3
+    runs, joints = core.asked[0]
+    assert joints[1].name == "arm"
+    link = runs[0][1].joints[1].link_position_rad
+    assert link is not None
+    assert columns.link_position_rad is not None
+    assert np.allclose(link, columns.link_position_rad, atol=1e-9)
+
+
+def test_a_log_of_jtqd_is_a_run(tmp_path: Path, core: Core) -> None:
+    table = bench_run(seconds=2.0)
+
+    def joints(n: int) -> tuple[LogJoint, LogJoint]:
+        made = []
+        for number in (1, 2):
+            c = table.joints[number]
+            assert c.current_a is not None
+            assert c.motor_position_rad is not None
+            assert c.link_position_rad is not None
+            assert c.torque_nm is not None
+            velocity = np.gradient(c.motor_position_rad, table.time_s / 2.0)
+            row = (c.current_a, c.motor_position_rad, velocity, c.link_position_rad, c.torque_nm)
+            made.append(LogJoint(*(float(column[n]) for column in row)))
+        return made[0], made[1]
+
+    write_log(tmp_path / "a.mcap", regular(1000, joints))
+    assert run(tmp_path, "--joint", JOINT_FILE, "--out", tmp_path / "o") == 3
+    name, read = core.asked[0][0][0]
+    assert name == "a.mcap"
+    assert np.allclose(read.time_s, np.arange(1000) * 0.001)
+    torque, wanted = read.joints[2].torque_nm, table.joints[2].torque_nm
+    assert torque is not None
+    assert wanted is not None
+    assert np.array_equal(torque, wanted[:1000])
+
+
+def test_a_directory_with_tables_and_logs_is_read_once(tmp_path: Path, core: Core) -> None:
+    write_runs(tmp_path, 2)
+    (tmp_path / "a.mcap").write_bytes(b"not looked at")
+    (tmp_path / "a.json").write_text("{}")
+    run(tmp_path, "--joint", JOINT_FILE, "--out", tmp_path / "o")
+    assert [name for name, _ in core.asked[0][0]] == ["a.csv", "b.csv.gz"]
+
+
+def test_parquet_without_pyarrow_is_one_line(
+    tmp_path: Path, core: Core, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *rest: None if name == "pyarrow" else real(name, *rest)
+    )
+    (tmp_path / "a.parquet").write_bytes(b"PAR1")
+    assert run(tmp_path / "a.parquet", "--joint", JOINT_FILE, "--out", tmp_path / "o") == 1
+    assert "pip install pyarrow" in said(capsys)
+
+
+def test_parquet_is_the_same_run(tmp_path: Path, core: Core, capsys: pytest.CaptureFixture[str]) -> None:
+    arrow = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    table = bench_run(numbers=(1,))
+    columns = table.joints[1]
+    cells = {
+        "t": table.time_s,
+        "time_s": table.time_s,
+        "j1.current_a": columns.current_a,
+        "j1.link_position_rad": columns.link_position_rad,
+        "j1.torque_nm": columns.torque_nm,
+        "note": ["x"] * len(table.time_s),
+    }
+    path = tmp_path / "a.parquet"
+    parquet.write_table(arrow.table(cells), path)
+    assert run(path, "--joint", JOINT_FILE, "--out", tmp_path / "o") == 3
+    read = core.asked[0][0][0][1]
+    assert np.array_equal(read.time_s, table.time_s)
+    assert read.joints[1].torque_nm is not None
+    assert np.array_equal(read.joints[1].torque_nm, cells["j1.torque_nm"])
+    capsys.readouterr()
+    spoilt = columns.current_a.copy() if columns.current_a is not None else None
+    assert spoilt is not None
+    spoilt[4] = np.nan
+    for content, wanted in ((spoilt, "row 5, column 'j1.current_a'"), (["x"] * len(spoilt), "found 'x'")):
+        parquet.write_table(arrow.table({**cells, "j1.current_a": content}), path)
+        assert run(path, "--joint", JOINT_FILE, "--out", tmp_path / "p") == 1
+        assert wanted in said(capsys)
+
+
+def test_the_next_experiment_is_a_plan_that_the_campaign_reads(tmp_path: Path, core: Core) -> None:
+    core.answer = findings("ambiguous", next_experiment={"why": "load both ways", "plan": PLAN})
+    write_runs(tmp_path)
+    out = tmp_path / "o"
+    assert run(tmp_path, "--joint", JOINT_FILE, "--out", out) == 3
+    assert load_plan(out / "next_experiment.plan.yaml").name == "more"
+    made = json.loads((out / "findings.json").read_text())
+    assert made["next_experiment"] == {"why": "load both ways", "plan": PLAN}
+    assert "next_experiment.plan.yaml" in made["files"]
+
+
+def test_nothing_is_overwritten_without_force(
+    tmp_path: Path, core: Core, capsys: pytest.CaptureFixture[str]
+) -> None:
+    core.answer = findings("ambiguous", next_experiment={"why": "x", "plan": PLAN})
+    write_runs(tmp_path)
+    out = tmp_path / "o"
+    call = (tmp_path / "a.csv", tmp_path / "b.csv.gz", "--joint", JOINT_FILE, "--out", out)
+    run(*call)
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    (out / "mine.txt").write_text("kept")
+    capsys.readouterr()
+    core.answer = findings("no_gap")
+    assert run(*call) == 1
+    assert "--force" in said(capsys)
+    assert len(core.asked) == 1  # refused before the work, not after it
+    assert {path.name: path.read_bytes() for path in out.iterdir() if path.name != "mine.txt"} == before
+    assert run(*call, "--force") == 0
+    assert json.loads((out / "findings.json").read_text())["verdict"] == "no_gap"
+    assert not (out / "next_experiment.plan.yaml").exists()  # of the earlier diagnosis
+    assert (out / "mine.txt").read_text() == "kept"
+
+
+def test_a_failure_on_the_way_leaves_the_earlier_results(
+    tmp_path: Path, core: Core, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_runs(tmp_path)
+    out = tmp_path / "o"
+    call = (tmp_path / "a.csv", "--joint", JOINT_FILE, "--out", out, "--force")
+    run(*call)
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    core.answer = findings(causes=(cause("warp_core", 1, {"amplitude_nm": value(1.0)}),))
+    capsys.readouterr()
+    assert run(*call) == 1
+    assert "warp_core" in said(capsys)
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before

@@ -1,0 +1,290 @@
+"""The report of a diagnosis: what it says is what the findings hold; one file, readable by all, nothing from outside."""
+
+from __future__ import annotations
+
+import hashlib
+import html.parser
+import itertools
+import math
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from jtqd.sysid.diagnosis.findings import Trace
+from jtqd.sysid.diagnosis.report import theme
+from jtqd.sysid.diagnosis.report.views import evidence_views
+from jtqd.sysid.diagnosis.report.words import effect_title
+from tests.sysid.diagnosis import findings_examples as examples
+
+pytest.importorskip("jinja2")
+pytest.importorskip("matplotlib")
+
+from jtqd.sysid.diagnosis.report.page import render
+from jtqd.sysid.diagnosis.report.pictures import MOST, chosen_traces
+
+VOID = {"meta", "br", "link", "img", "input", "hr"}
+PLAIN_SPACE = str.maketrans("\u00a0\u202f", "  ")
+
+
+class Page(html.parser.HTMLParser):
+    """Elements, ids, addresses and texts of a page; fails on tags that do not match."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.ids: list[str] = []
+        self.refers: list[str] = []
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self.feed(text)
+        assert not self.open, f"left open: {self.open}"
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self._seen(tag, attrs)
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self._seen(tag, attrs)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag, f"</{tag}> closes nothing, line {self.getpos()}"
+
+    def handle_data(self, data: str) -> None:
+        if "style" not in self.open:
+            self.text += data
+
+    def _seen(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        named = dict(attrs)
+        self.elements.append((tag, named))
+        if named.get("id"):
+            self.ids.append(str(named["id"]))
+        self.refers += [str(v) for k, v in attrs if k in {"href", "src", "xlink:href"}]
+
+
+@pytest.fixture(scope="module")
+def pages() -> dict[str, str]:
+    """Every example, rendered once."""
+    return {name: render(make()) for name, make in examples.EXAMPLES.items()}
+
+
+def text_of(page: str) -> str:
+    """What a reader sees, spaces as plain ones."""
+    return re.sub(r"\s+", " ", Page(page).text.translate(PLAIN_SPACE))
+
+
+@pytest.mark.parametrize("name", examples.EXAMPLES)
+def test_a_page_is_whole_and_needs_nothing_else(pages: dict[str, str], name: str) -> None:
+    page = Page(pages[name])
+    assert len(pages[name].encode()) < 1_500_000
+    assert len(page.ids) == len(set(page.ids)), "an id occurs twice"
+    assert all(each.startswith("#") and each[1:] in page.ids for each in page.refers)
+    for each in re.findall(r"url\(([^)]*)\)", pages[name]):
+        assert each.startswith("#")
+        assert each[1:] in page.ids
+    assert not {"script", "link", "img", "iframe"} & {tag for tag, _ in page.elements}
+    assert "@import" not in pages[name]
+    assert not re.search(r"\b(nan|NaN|inf|None|Undefined)\b", text_of(pages[name]))
+
+
+@pytest.mark.parametrize("name", examples.EXAMPLES)
+def test_whoever_cannot_see_the_pictures_is_told_what_they_show(pages: dict[str, str], name: str) -> None:
+    page = Page(pages[name])
+    pictures = [named for _, named in page.elements if named.get("role") == "img"]
+    assert all(re.search(r"\d", str(named.get("aria-label"))) for named in pictures)
+    assert pages[name].count("<svg") == sum(
+        1 for _, n in page.elements if {"wide", "narrow"} & {n.get("class")} and n.get("role")
+    )
+    tables = [tag for tag, _ in page.elements if tag in {"table", "caption"}]
+    assert tables == ["table", "caption"] * (len(tables) // 2)
+    levels = [int(tag[1]) for tag, _ in page.elements if re.fullmatch("h[1-6]", tag)]
+    assert levels[0] == 1
+    assert levels.count(1) == 1
+    assert all(after <= before + 1 for before, after in itertools.pairwise(levels))
+
+
+def test_text_is_readable_on_its_ground_in_light_and_dark() -> None:
+    for colours in (theme.LIGHT, theme.DARK):
+        for role in theme.TEXT:
+            for ground in ("paper", "panel"):
+                assert theme.contrast(colours[role], colours[ground]) >= 4.5, (role, ground)
+    assert theme.contrast("#000000", "#ffffff") == pytest.approx(21.0)
+    assert theme.LIGHT.keys() == theme.DARK.keys()
+
+
+def test_pictures_follow_the_page_into_the_dark(pages: dict[str, str]) -> None:
+    svg = "".join(re.findall(r"<svg.*?</svg>", pages["one_cause"], re.DOTALL))
+    fixed = {c.lower() for c in re.findall(r"#[0-9a-fA-F]{6}\b", svg)}
+    assert not fixed - {"#ffffff"}, "a colour that stays the same in the dark"
+    assert "var(--before)" in svg
+    assert "var(--after)" in svg
+
+
+def test_the_evidence_names_every_effect_chosen_first_then_class_then_by_evidence(
+    pages: dict[str, str],
+) -> None:
+    findings = examples.two_causes()
+    rows = evidence_views(findings.candidates)
+    assert [(r.title, r.state) for r in rows[:4]] == [
+        ("viscous friction", "chosen"),
+        ("link inertia", "chosen"),
+        ("channel delay", "class"),
+        ("torque constant", ""),
+    ]
+    assert len(rows) == len(findings.candidates) == 47
+    numbers = {(c.name, c.joint): c.delta_bic for c in findings.candidates}
+    table = re.findall(
+        r'<tr(?: class="\w+")?><th scope="row">([^<]+)</th><td>([^<]+)</td><td class="bic"',
+        pages["two_causes"],
+    )
+    assert [(r.title, r.place) for r in rows] == table
+    rest = [
+        numbers[name, joint]
+        for r in rows[3:]
+        for name, joint in numbers
+        if effect_title(name) == r.title
+        and r.place == ("torque sensor" if joint == "sensor" else f"joint {joint}")
+    ]
+    known = [bic for bic in rest if math.isfinite(bic)]
+    assert known == sorted(known, reverse=True)
+    assert rest[: len(known)] == known, "unknown evidence comes last"
+    assert all(r.reason for r in rows)
+
+
+def test_the_plan_of_the_page_is_the_plan_of_the_findings(pages: dict[str, str]) -> None:
+    experiment = examples.two_causes().next_experiment
+    assert experiment is not None
+    (plan,) = re.findall(r"<pre[^>]*>(.*?)</pre>", pages["two_causes"], re.DOTALL)
+    assert yaml.safe_load(html.unescape(plan)) == experiment["plan"]
+    seconds = 4 * 16 * 2.3
+    assert f"4 runs, {seconds / 60:.2g} minutes of motion" in text_of(pages["two_causes"])
+    assert str(experiment["why"]) in text_of(pages["two_causes"])
+    assert "Next experiment" not in text_of(pages["one_cause"])
+
+
+def test_a_plan_that_no_campaign_would_take_does_not_stop_the_report() -> None:
+    bad = {"why": "By hand: hang a weight.", "plan": {"schema": "jtq.plan/1"}}
+    for experiment in (bad, {"why": "By hand: hang a weight.", "plan": None}):
+        text = text_of(render(replace(examples.insufficient(), next_experiment=experiment)))
+        assert "By hand: hang a weight." in text
+
+
+def test_names_from_outside_are_text_and_not_markup() -> None:
+    evil = "<b>run&amp;\"'</b>"
+    base = examples.unexplained()
+    page = render(
+        replace(
+            base,
+            runs=(evil,),
+            reasons=(evil,),
+            channel_notes=(evil,),
+            traces=(replace(base.traces[0], run=evil),),
+            next_experiment={"why": evil, "plan": {"name": evil}},
+        ),
+        made=evil,
+    )
+    assert evil not in page
+    assert text_of(page).count(evil) >= 6
+
+
+def peaks(svg: str, role: str) -> np.ndarray[Any, Any]:
+    """Points [n, 2] of a curve of a picture."""
+    (path,) = re.findall(rf'<g id="[^"]*{role}">\s*<path d="([^"]*)"', svg)
+    return np.array(re.findall(r"[ML] (\S+) (\S+)", path), float)
+
+
+def test_one_sample_that_stands_out_of_a_million_is_in_the_picture() -> None:
+    n = 200_000
+    time = np.arange(n) * 0.005
+    before = 0.1 * np.sin(time)
+    before[150_000] = 5.0
+    trace = Trace("long", 1, "motor", time, before, 0.1 * np.sin(time), np.sin(time), 9 * np.cos(time))
+    page = render(replace(examples.one_cause(), traces=(trace,)))
+    svg = re.findall(r"<svg.*?</svg>", page, re.DOTALL)
+    assert len(svg) == 2, "one for a laptop, one for a phone"
+    for one in svg:
+        points = peaks(one, "before")
+        top = points[np.argmin(points[:, 1])]
+        share = (top[0] - points[0, 0]) / (points[-1, 0] - points[0, 0])
+        assert share == pytest.approx(0.75, abs=2e-3)
+        calm = peaks(one, "after")
+        assert np.ptp(calm[:, 1]) == pytest.approx(np.ptp(points[:, 1]) * 0.2 / 5.1, rel=0.25), (
+            "not on one scale"
+        )
+
+
+def test_gaps_in_the_record_and_empty_records_are_drawn_without_a_word() -> None:
+    base = examples.one_cause().traces[0]
+    before = base.before_nm.copy()
+    before[2000:4000] = np.nan
+    nothing = np.full(len(before), np.nan)
+    findings = examples.one_cause()
+    page = render(
+        replace(findings, traces=(replace(base, before_nm=before), replace(base, before_nm=nothing)))
+    )
+    assert page.count("<svg") == 4
+
+
+def test_of_every_balance_the_run_in_the_middle_is_drawn_first() -> None:
+    findings = examples.two_causes()
+    drawn = chosen_traces(findings)
+    assert len(drawn) == MOST
+    assert [(t.joint, t.balance) for t in drawn[:4]] == [(g.joint, g.balance) for g in findings.gaps]
+    parts = {
+        t.run: 1.0 - float(np.sum(t.after_nm**2) / np.sum(t.before_nm**2))
+        for t in findings.traces
+        if (t.joint, t.balance) == (1, "motor")
+    }
+    assert sorted(parts, key=lambda run: -parts[run]).index(drawn[0].run) == 2, "of six"
+    loudest = chosen_traces(examples.unexplained())[0]
+    assert float(np.sum(loudest.before_nm**2)) == max(
+        float(np.sum(t.before_nm**2)) for t in examples.unexplained().traces
+    )
+
+
+def test_ten_long_runs_of_two_joints_stay_a_small_page() -> None:
+    random = np.random.default_rng(0)
+    time = np.arange(0.0, 60.0, 0.005)
+    traces = tuple(
+        Trace(f"run_{k}.csv.gz", j, balance, time, *random.normal(0.0, 1.0, (4, len(time))))
+        for k in range(10)
+        for j in (1, 2)
+        for balance in ("motor", "torsion")
+    )
+    page = render(replace(examples.two_causes(), traces=traces))
+    assert len(page.encode()) < 1_500_000
+    assert all(f"run_{k}.csv.gz" in text_of(page) for k in range(10)), (
+        "runs that are not drawn are in the table"
+    )
+
+
+def test_the_same_findings_give_the_same_page(pages: dict[str, str]) -> None:
+    code = (
+        "import hashlib; from tests.sysid.diagnosis.findings_examples import unexplained; "
+        "from jtqd.sysid.diagnosis.report import render;"
+        "print(hashlib.sha256(render(unexplained()).encode()).hexdigest())"
+    )
+    other = subprocess.run(
+        [sys.executable, "-c", code],
+        check=True,
+        capture_output=True,
+        text=True,
+        env={"PYTHONHASHSEED": "1", "PATH": ""},
+    ).stdout.strip()
+    assert other == hashlib.sha256(pages["unexplained"].encode()).hexdigest()
+
+
+def test_drawing_leaves_the_settings_of_others_alone() -> None:
+    import matplotlib as mpl
+
+    mpl.rcdefaults()
+    before = dict(mpl.rcParams)
+    render(examples.no_gap())
+    changed = {key for key in before if mpl.rcParams[key] != before[key]}
+    assert changed <= {"backend", "backend_fallback"}, "where pictures go, not how they look"

@@ -1,0 +1,88 @@
+"""With fewer than four runs a name needs each run left out: strong effects are still named, the rest is left open."""
+
+import pytest
+
+from examples.kinova_diagnosis import diagnose_all
+from jtqd.sysid.diagnosis import verdict
+from jtqd.sysid.diagnosis.diagnose import diagnose
+from jtqd.sysid.diagnosis.findings import AMBIGUOUS, CAUSE, INSUFFICIENT, NO_GAP, Findings
+from tests.hidden.case import draw
+from tests.hidden.trials import joint_files, tables
+
+
+def found(seed: int, *effects: tuple[str, int | str, float | None], runs: int = 2) -> Findings:
+    case = draw(seed, effects, runs=runs)
+    return diagnose(tables(case.runs), joint_files(case))
+
+
+@pytest.fixture(scope="module")
+def measured() -> dict[int, Findings]:
+    return {one.number: one.findings for one in diagnose_all(range(2, 8))}
+
+
+@pytest.mark.parametrize("runs", [2, 3])
+def test_nothing_hidden_in_few_runs_names_nothing(runs: int) -> None:
+    findings = found(206, runs=runs)
+    assert findings.verdict == NO_GAP
+    assert not findings.causes
+
+
+@pytest.mark.parametrize(
+    ("seed", "name", "joint"),
+    [(207, "torque_ripple", 1), (208, "load_dependent_friction", 2), (212, "sensor_gain", "sensor")],
+)
+def test_two_runs_of_a_strong_effect_name_it(seed: int, name: str, joint: int | str) -> None:
+    findings = found(seed, (name, joint, None))
+    assert findings.verdict == CAUSE
+    assert [(c.names, c.joint) for c in findings.causes] == [((name,), joint)]
+
+
+def test_a_parameter_whose_interval_holds_the_files_value_is_no_settled_cause() -> None:
+    findings = found(211, ("viscous_friction", 1, None))
+    assert [c.name for c in findings.causes] == ["viscous_friction"]
+    assert findings.verdict == AMBIGUOUS
+    assert findings.next_experiment is not None
+    assert "not settled by so few: viscous_friction of joint 1" in findings.reasons[-1]
+
+
+def test_with_four_runs_nothing_of_this_applies(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise AssertionError("asked for with four runs")
+
+    monkeypatch.setattr(verdict, "FewRuns", refuse)
+    assert found(206, runs=4).verdict == NO_GAP
+
+
+def test_measured_joints_are_never_settled_by_two_short_runs(measured: dict[int, Findings]) -> None:
+    for findings in measured.values():
+        assert findings.verdict in (AMBIGUOUS, INSUFFICIENT)
+        assert findings.next_experiment is not None
+        if findings.causes:
+            assert findings.gain is not None
+            assert findings.gain.ci95[0] > 0.0
+        for gap in findings.gaps:
+            assert gap.noise_floor_nm <= gap.rmse_nm
+
+
+def test_the_load_dependent_loss_of_joint_2_is_shown_and_not_named(measured: dict[int, Findings]) -> None:
+    two = measured[2]
+    assert two.verdict == INSUFFICIENT
+    assert not two.causes
+    assert "load_dependent_friction of joint 2" in two.reasons[0]
+    assert two.next_experiment is not None
+    assert "load_dependent_friction visible" in two.next_experiment["why"]
+
+
+def test_what_one_encoder_and_one_joint_cannot_tell_apart_is_one_class(measured: dict[int, Findings]) -> None:
+    inertia = next(c for c in measured[3].causes if "rotor_inertia" in c.names)
+    assert "link_inertia" in inertia.names
+    scale = next(c for c in measured[4].causes if c.joint == "sensor")
+    assert "sensor_gain" in scale.names
+    assert "torque_constant of joint 4" in scale.names
+
+
+def test_small_joints_agree_on_a_smaller_rotor(measured: dict[int, Findings]) -> None:
+    for number in (5, 6, 7):
+        rotor = next(c for c in measured[number].causes if c.name == "rotor_inertia")
+        assert 7e-6 < rotor.parameters["rotor_inertia_kgm2"].value < 1.1e-5  # the file has 2.2e-5
+        assert rotor.parameters["rotor_inertia_kgm2"].ci95[1] < 1.2e-5

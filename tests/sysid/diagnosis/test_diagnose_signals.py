@@ -1,0 +1,185 @@
+"""Residuals of both balances, the joint file's losses and the derivatives, against closed forms and the emulated plant."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.losses import DRIVING_CURRENT_MAX_A, FrictionModel, LossModel
+from jtqd.estimator.run import JointColumns, RunTable
+from jtqd.models.files import load_joint, shipped
+from jtqd.sim_can.losses import JointFriction, LossTable
+from jtqd.sysid.diagnosis.regressors import contribution
+from jtqd.sysid.diagnosis.signals import (
+    BaseLoss,
+    JointSignals,
+    SignalsError,
+    joint_signals,
+    second_difference,
+    smooth,
+)
+from tests.estimator.effects.effect_signals import PEAKED, PLAIN
+from tests.sysid.diagnosis.diagnose_core_helpers import rigid_run
+
+WITH_EFFICIENCY = load_joint(shipped("joint1.yaml"))
+
+
+def signals(table: RunTable, joint: Joint = PLAIN) -> JointSignals:
+    return joint_signals("run", table, 1, joint, BaseLoss(joint))
+
+
+def rms(x: FloatArray) -> float:
+    return float(np.sqrt(np.mean(x**2)))
+
+
+def test_the_second_difference_is_of_fourth_order() -> None:
+    def worst(step: float) -> float:
+        t = np.arange(0.0, 1.0, step)
+        return float(np.max(np.abs(second_difference(np.sin(9.0 * t), t) + 81.0 * np.sin(9.0 * t))[2:-2]))
+
+    assert worst(0.01) / worst(0.005) == pytest.approx(16.0, rel=0.1)
+    t = np.arange(0.0, 1.0, 0.05)
+    assert second_difference(t**5, t)[2:-2] == pytest.approx(20.0 * t[2:-2] ** 3, abs=1e-9)
+
+
+def test_a_ripple_of_80_hz_keeps_its_size() -> None:
+    t = np.arange(0.0, 1.0, 1e-3)
+    w = 2.0 * np.pi * 80.0
+    found = second_difference(np.sin(w * t), t)[2:-2]
+    assert rms(found) / (w**2 / np.sqrt(2.0)) == pytest.approx(1.0, abs=0.002)
+    assert rms(np.gradient(np.gradient(np.sin(w * t), t), t)) / (w**2 / np.sqrt(2.0)) < 0.93
+
+
+def test_uneven_steps_take_plain_differences() -> None:
+    rng = np.random.default_rng(1)
+    t = np.cumsum(rng.uniform(0.5e-3, 1.5e-3, 500))
+    assert second_difference(3.0 * t**2, t)[3:-3] == pytest.approx(np.full(494, 6.0), abs=1e-4)
+    assert second_difference(t[:4] ** 2, t[:4]).shape == (4,)
+
+
+@pytest.mark.parametrize("samples", [1, 2, 5, 8])
+def test_smoothing_is_centred_and_keeps_lines(samples: int) -> None:
+    line = 0.3 * np.arange(60.0) - 4.0
+    inner = slice(2 * samples, -2 * samples)
+    assert smooth(line, samples)[inner] == pytest.approx(line[inner])
+    pulse = np.zeros(61)
+    pulse[30] = 1.0
+    out = smooth(pulse, samples)
+    assert out == pytest.approx(out[::-1], abs=1e-12), "no delay"
+    assert out.sum() == pytest.approx(1.0)
+    assert out[30] == pytest.approx(1.0 / samples)
+    assert np.flatnonzero(out > 1e-12).tolist() == list(range(31 - samples, 30 + samples))
+
+
+def test_a_run_by_the_equations_leaves_nothing() -> None:
+    s = signals(rigid_run(PLAIN))
+    assert rms(s.motor_nm[s.moving]) < 2e-3
+    assert s.torsion_nm is not None
+    assert rms(s.torsion_nm[5:-5] - np.median(s.torsion_nm)) < 2e-2
+    assert 0.7 < s.moving.mean() < 1.0
+
+
+@pytest.mark.parametrize(
+    ("change", "effect", "parameters"),
+    [
+        (
+            {"torque_constant_nm_per_a": 0.084},
+            "torque_constant",
+            {"torque_constant_nm_per_a": 0.084},
+        ),
+        ({"rotor_inertia_kgm2": 9e-5}, "rotor_inertia", {"rotor_inertia_kgm2": 9e-5}),
+        ({"link_inertia_kgm2": 0.4}, "link_inertia", {"link_inertia_kgm2": 0.4}),
+        (
+            {"stiffness_nm_per_rad": 10000.0},
+            "nonlinear_stiffness",
+            {"stiffness_nm_per_rad": 10000.0, "cubic_nm_per_rad3": 0.0},
+        ),
+        ({"friction": {"coulomb_nm": 5.0}}, "coulomb_friction", {"coulomb_nm": 5.0}),
+        ({"friction": {"viscous_nms_per_rad": 4.0}}, "viscous_friction", {"viscous_nms_per_rad": 4.0}),
+    ],
+)
+def test_what_is_wrong_in_the_file_is_what_its_effect_leaves(
+    change: dict[str, float | dict[str, float]], effect: str, parameters: dict[str, float]
+) -> None:
+    """The truth differs in one value; residuals with the nominal file are the columns of the effect of that name."""
+    values = {k: replace(PLAIN.friction, **v) if isinstance(v, dict) else v for k, v in change.items()}
+    truth = replace(PLAIN, **values)  # type: ignore[arg-type]
+    s = signals(rigid_run(truth))
+    s.state.torsion_rad = (
+        s.state.torque_nm / truth.stiffness_nm_per_rad
+    )  # what the spring really does (`refine`)
+    made = contribution(EFFECTS[effect], parameters, s)
+    assert s.torsion_nm is not None
+    motor, torsion = s.motor_nm[s.moving], s.torsion_nm - np.median(s.torsion_nm)
+    explained = made["motor"][s.moving] if "motor" in made else np.zeros_like(motor)
+    assert rms(motor - explained) < 0.02 * rms(motor) + 3e-3
+    bent = made["torsion"] - np.median(made["torsion"]) if "torsion" in made else np.zeros_like(torsion)
+    assert rms((torsion - bent)[20:-20]) < 0.03 * rms(torsion) + 3e-2
+    assert max(rms(motor), rms(torsion)) > 0.1, "the change is large enough to judge by"
+
+
+def test_friction_has_no_direction_near_rest() -> None:
+    t = np.arange(0.0, 2.0, 1e-3)
+    velocity = np.where(t < 1.0, 0.5, 0.01)
+    link = np.cumsum(velocity) * 1e-3
+    columns = JointColumns(
+        current_a=0.0 * t, motor_velocity_rad_s=100.0 * velocity, link_position_rad=link, torque_nm=0.0 * t
+    )
+    moving = signals(RunTable(t, {1: columns})).moving
+    assert moving[:970].all()
+    assert not moving[971:].any(), "from 30 ms before"
+
+
+def test_one_encoder_gives_no_torsion_balance() -> None:
+    table = rigid_run(PLAIN)
+    columns = table.joints[1]
+    alone = RunTable(table.time_s, {1: replace(columns, motor_position_rad=None)})
+    assert signals(alone).torsion_nm is None
+    assert columns.link_position_rad is not None
+    same = replace(columns, motor_position_rad=PLAIN.gear_ratio * columns.link_position_rad)
+    assert signals(RunTable(table.time_s, {1: same})).torsion_nm is None
+
+
+def test_a_column_that_is_missing_is_one_line() -> None:
+    table = rigid_run(PLAIN)
+    for name in ("current_a", "torque_nm"):
+        less = RunTable(table.time_s, {1: replace(table.joints[1], **{name: None})})
+        with pytest.raises(SignalsError, match=rf"run: j1\.{name}: missing"):
+            signals(less)
+
+
+def test_losses_without_an_efficiency_are_the_friction_law_of_the_file() -> None:
+    rng = np.random.default_rng(2)
+    v = rng.uniform(0.11, 2.0, 500) * rng.choice([-1.0, 1.0], 500)
+    torque = rng.uniform(-40.0, 40.0, 500)
+    for joint in (PLAIN, PEAKED):
+        law = FrictionModel(joint.friction).torque_many(v)
+        assert BaseLoss(joint).loss(torque, v) == pytest.approx(law, rel=1e-3)
+
+
+@pytest.mark.parametrize("stribeck_nm", [0.0, 0.8])
+def test_losses_with_an_efficiency_are_those_of_the_emulated_plant(stribeck_nm: float) -> None:
+    friction = replace(WITH_EFFICIENCY.friction, stribeck_nm=stribeck_nm, stribeck_velocity_rad_s=0.05)
+    joint = replace(WITH_EFFICIENCY, friction=friction)
+    table = LossTable(
+        LossModel(joint).loss_many,
+        joint.gear_ratio,
+        joint.torque_constant_nm_per_a,
+        max(DRIVING_CURRENT_MAX_A, 9.0),
+    )
+    plant = JointFriction(table, stribeck_nm=stribeck_nm, stribeck_velocity_rad_s=0.05)
+    rng = np.random.default_rng(3)
+    v = rng.uniform(-4.0, 4.0, 2000)  # beyond the table at both ends
+    torque = rng.uniform(-1.3, 1.3, 2000) * table.torque_limit
+    found = BaseLoss(joint).loss(torque, v)
+    emulated = [plant(float(a), float(b)) for a, b in zip(torque, v, strict=True)]
+    assert np.abs(found) == pytest.approx(emulated, abs=1e-6)
+    assert (found * v >= 0.0).all(), "a loss opposes the motion"
+    if not stribeck_nm:
+        bare = [table.magnitude(float(a), float(b)) for a, b in zip(torque, v, strict=True)]
+        assert np.abs(found) == pytest.approx(bare, abs=1e-9)

@@ -1,0 +1,272 @@
+"""Scores of errors and intervals, jumps, ranges: against closed forms and samples whose errors are known."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from jtqd.estimator.joint import QUADRANTS
+from jtqd.estimator.run import JointColumns, RunTable
+from jtqd.estimator.status import DEGRADED, VALID
+from jtqd.estimator.validity import Envelope
+from jtqd.sysid.evaluate.constant import (
+    PlateauScore,
+    hardest,
+    is_constant,
+    outside_scores,
+    plateau_scores,
+    training_range,
+    worst,
+)
+from jtqd.sysid.evaluate.evaluation import worse_runs
+from jtqd.sysid.evaluate.inputs import by_data, by_marks
+from jtqd.sysid.evaluate.methods import Samples
+from jtqd.sysid.evaluate.scores import (
+    LEVELS,
+    Block,
+    coverage,
+    covered,
+    error_tables,
+    interval_tables,
+    median_run,
+    row,
+    score,
+    standstill,
+    velocity_bins,
+)
+from jtqd.sysid.figures import thinned
+from jtqd.sysid.fit.plateaus import Mean, Plateau
+from tests.sysid.evaluate.evaluate_helpers import samples
+
+
+def test_a_score_is_what_its_names_say() -> None:
+    one = score([Block(np.array([3.0, -4.0]), 40.0), Block(np.array([0.0, 5.0]), 20.0)])
+    assert one is not None
+    assert one.samples == 4
+    assert one.mse_nm2 == pytest.approx(50.0 / 4)
+    assert one.rmse_nm == pytest.approx(math.sqrt(12.5))
+    # each joint's errors against its own rated torque
+    assert one.rmse_rated_percent == pytest.approx(100 * math.sqrt((9 + 16) / 1600 / 4 + 25 / 400 / 4))
+    assert one.max_nm == 5.0
+    assert one.p95_nm == pytest.approx(np.quantile([3, 4, 0, 5], 0.95))
+    assert score([Block(np.zeros(0), 40.0)]) is None
+
+
+def test_velocity_bins_have_their_lower_edge_inside() -> None:
+    v = np.array([0.0, 0.049, -0.05, 0.2, -0.5, 0.99, 1.0, -2.0, 9.0])
+    assert velocity_bins(v).tolist() == [0, 0, 1, 2, 3, 3, 4, 5, 5]
+
+
+def test_the_standard_error_of_a_coverage_is_the_one_between_runs() -> None:
+    """2000 campaigns of 20 runs of 50 to 500 samples that are right, or wrong, as a whole."""
+    seed = 11
+    rng = np.random.default_rng(seed)
+    found = [
+        coverage([np.full(rng.integers(50, 500), rng.random() < 0.9) for _ in range(20)]) for _ in range(2000)
+    ]
+    shares = np.array([one.share for one in found if one is not None])
+    claimed = np.sqrt(np.mean([one.se**2 for one in found if one is not None]))
+    assert claimed == pytest.approx(shares.std(), rel=0.1), seed
+    assert math.isnan(coverage([np.ones(5, bool)]).se)  # type: ignore[union-attr]
+    assert coverage([]) is None
+
+
+def test_intervals_of_a_normal_error_cover_what_they_say() -> None:
+    seed = 5
+    rng = np.random.default_rng(seed)
+    runs = [samples({"fused": rng.normal(0.0, 2.0, 4000)}, run=str(k), sigma_nm=2.0) for k in range(10)]
+    for level in LEVELS:
+        one = covered(runs, "fused", level)
+        assert one is not None
+        assert one.share == pytest.approx(level, abs=0.01), (seed, level)
+    table = interval_tables(runs)
+    assert table is not None
+    assert table.curve[None][0.8].share == pytest.approx(0.8, abs=0.01)
+    assert list(table.quadrants[1]) == ["i_pos_w_pos"]  # the only quadrant with samples
+    assert interval_tables([samples({"tob": np.zeros(5)})]) is None
+
+
+def test_standstill_is_judged_by_sigma_itself_and_in_no_other_score() -> None:
+    error = np.concatenate((np.full(60, 0.9), np.full(40, 1.1)))  # of the interval +-1: 60 % inside
+    moving = np.zeros(100, bool)
+    moving[-10:] = True
+    one = samples({"fused": error}, scored=moving)
+    still = standstill([one])[1]
+    assert still.share == pytest.approx(0.9)
+    assert still.coverage["fused"].share == pytest.approx(60 / 90)
+    assert still.half_width_nm["fused"] == 1.0
+    assert row([one])["fused"].samples == 10
+    assert row([one])["fused"].mse_nm2 == pytest.approx(1.21)
+
+
+def test_tables_pool_what_belongs_together() -> None:
+    n = 100
+    quadrant_1 = samples({"tob": np.full(n, 1.0), "fused": np.full(n, 0.1)}, run="a", number=1)
+    quadrant_2 = samples(
+        {"tob": np.full(n, 3.0), "fused": np.full(n, 0.3)},
+        run="a",
+        number=2,
+        velocity_rad_s=np.full(n, -0.1),
+        raw_nm=np.full(n, -1.0),
+    )
+    other = samples({"tob": np.full(n, 5.0), "fused": np.full(n, 0.5)}, run="b", number=2)
+    tables = error_tables([quadrant_1, quadrant_2, other], {"a": 1, "b": 2})
+    assert tables.tested["tob"].mse_nm2 == pytest.approx((1 + 25) / 2)  # j1 of a, j2 of b
+    assert tables.both["tob"].mse_nm2 == pytest.approx((1 + 9 + 25) / 3)
+    assert tables.joints[2]["tob"].mse_nm2 == pytest.approx((9 + 25) / 2)
+    assert tables.quadrants[2]["i_neg_w_neg"]["tob"].mse_nm2 == pytest.approx(9)
+    assert tables.quadrants[2]["i_pos_w_neg"] == {}
+    assert tables.velocities[2]["0.05 to 0.2"]["fused"].mse_nm2 == pytest.approx(0.09)
+    assert tables.runs["b", 2]["tob"].rmse_nm == pytest.approx(5.0)
+    assert tables.bare_both_nm2 is None
+    assert tuple(QUADRANTS) == tuple(tables.quadrants[1])
+
+
+def test_a_method_that_one_joint_lacks_is_not_pooled() -> None:
+    n = 10
+    both = error_tables(
+        [samples({"tob": np.ones(n), "fused": np.ones(n)}), samples({"tob": np.ones(n)}, number=2)],
+        {"run": None},
+    )
+    assert set(both.both) == {"tob"}
+    assert set(both.joints[1]) == {"tob", "fused"}
+    assert both.tested == {}
+
+
+def test_the_median_run_is_the_one_in_the_middle_by_ours() -> None:
+    runs = [
+        samples({"tob": np.full(9, 9.0 - k), "fused": np.full(9, float(k))}, run=f"r{k}")
+        for k in (3, 0, 2, 1, 4)
+    ]
+    chosen = median_run(runs)
+    assert chosen is not None
+    assert chosen.run == "r2"
+    assert median_run(runs[:2]).run == "r0"  # type: ignore[union-attr]  # the lower one of two
+    assert median_run([]) is None
+
+
+def test_runs_in_which_ours_is_worse_than_its_physics_are_found_and_no_others() -> None:
+    def one(run: str, ours: float, physics: float) -> Samples:
+        return samples({"physics": np.full(9, physics), "fused": np.full(9, ours)}, run=run)
+
+    tables = error_tables([one("better", 0.1, 0.2), one("same", 0.3, 0.3), one("worse", 0.3, 0.2999)], {})
+    assert [found[:2] for found in worse_runs(tables.runs)] == [("worse", 1)]
+
+
+# --- constant velocity ---
+
+
+def _plateau(start_s: float, end_s: float, velocity: float = 2.5, current: float = -4.0) -> Plateau:
+    return Plateau("run", start_s, end_s, Mean(velocity, 0.0), Mean(current, 0.0), Mean(-29.0, 0.1), 9)
+
+
+def test_the_error_of_a_plateau_is_that_of_its_means() -> None:
+    n = 4000
+    ripple = 2.0 * np.sin(2 * np.pi * np.arange(n) / 50.0)  # averages out over whole periods
+    one = samples({"tob": -3.0 + ripple, "fused": np.full(n, 0.2)}, sensor_nm=np.full(n, -30.0))
+    (found,), lost = plateau_scores([_plateau(1.0, 3.0)], one)
+    assert lost == []
+    assert found.drive == "back"
+    assert found.errors_nm["tob"] == pytest.approx(-3.0)
+    assert found.percent("tob") == pytest.approx(10.0)
+    assert found.rated_percent("tob") == pytest.approx(7.5)
+    assert found.percent("fused") == pytest.approx(2 / 3)
+    assert plateau_scores([_plateau(1.0, 3.0, -2.5, -4.0)], one)[0][0].drive == "forward"
+
+
+def test_a_plateau_without_load_has_no_relative_error_and_one_without_values_is_named() -> None:
+    scored = np.ones(4000, bool)
+    scored[1000:1500] = False
+    one = samples({"tob": np.ones(4000)}, sensor_nm=np.full(4000, 1.9), scored=scored)
+    found, lost = plateau_scores([_plateau(2.0, 3.0), _plateau(1.0, 2.0)], one)
+    assert [each.percent("tob") for each in found] == [None]
+    assert found[0].rated_percent("tob") == pytest.approx(2.5)
+    assert len(lost) == 1
+    assert "50 %" in lost[0]
+    assert "1.00 to 2.00 s" in lost[0]
+
+
+def test_the_hardest_plateaus_are_back_driven_fast_and_heavy() -> None:
+    def one(drive: str, velocity: float, torque: float, error: float) -> PlateauScore:
+        return PlateauScore("run", 1, 0.0, 1.0, drive, velocity, 1.0, torque, 40.0, {"fused": error})
+
+    right = [one("back", 2.5, -30.0, 0.3), one("back", -2.45, 34.0, -0.6)]
+    wrong = [one("forward", 2.5, 30.0, 9.0), one("back", 1.5, 30.0, 9.0), one("back", 2.5, 20.0, 9.0)]
+    assert hardest(right + wrong) == right
+    found = worst(right, "fused", PlateauScore.rated_percent)
+    assert found is not None
+    assert found[0] == pytest.approx(1.5)
+    assert found[1] is right[1]
+    assert worst(right, "tob", PlateauScore.percent) is None
+
+
+def test_a_run_is_at_constant_velocity_when_plateaus_fill_it() -> None:
+    one = samples({"tob": np.zeros(4000)})  # moves for 4 s
+    assert is_constant([_plateau(0.0, 1.0)], one)
+    assert not is_constant([_plateau(0.0, 0.9)], one)
+    assert not is_constant([], samples({"tob": np.zeros(10)}, velocity_rad_s=np.zeros(10)))
+
+
+# --- outside of the envelope, velocity joint, curves ---
+
+
+def test_outside_is_what_the_envelope_says_and_not_the_status() -> None:
+    known = (
+        (0, 0, 1, 1, 0),
+        (0, 1, 1, 0, 0),
+        (0, 0, 1, 0, 0),
+    )  # columns -2..2 of 10 Nm: -1 to 1 are known somewhere
+    envelope = Envelope(0.5, 10.0, known, 5.0, (20.0, 30.0))
+    limits = training_range(envelope)
+    assert limits.torque_nm == (-15.0, 15.0)
+    assert limits.temperature_c == (20.0, 30.0)
+    raw = np.array([-16.0, -14.0, 14.0, 15.5])
+    errors = {"physics": np.array([1.0, 9.0, 9.0, 1.0]), "fused": np.array([1.0, 0.0, 0.0, 2.0])}
+    one = samples(errors, raw_nm=raw, temperature_c=25.0, status=DEGRADED)
+    one.status["fused"][0] = VALID
+    (found,) = outside_scores([one], {1: envelope})
+    assert (found.samples, found.of, found.by_load, found.by_temperature) == (2, 4, 2, 0)
+    assert found.physics.mse_nm2 == pytest.approx(1.0)
+    assert found.ours.mse_nm2 == pytest.approx(2.5)
+    assert found.flagged == 0.5
+    warm = samples(errors, raw_nm=raw, temperature_c=31.0, status=DEGRADED)
+    (found,) = outside_scores([warm], {1: envelope})
+    assert (found.samples, found.by_load, found.by_temperature, found.flagged) == (4, 2, 4, 1.0)
+    assert outside_scores([samples(errors, temperature_c=25.0)], {1: envelope}) == []
+
+
+def test_the_velocity_joint_is_the_one_whose_current_turns_over() -> None:
+    seed = 7
+    rng = np.random.default_rng(seed)
+    t = np.arange(8000) * 1e-3
+    smooth = 3.0 * np.sin(1.5 * t) + rng.normal(0.0, 0.01, len(t))
+    rough = smooth + 0.5 * np.tanh(np.sin(2.0 * t) / 0.02)
+
+    def table(one: np.ndarray, two: np.ndarray) -> RunTable:
+        return RunTable(t, {1: JointColumns(current_a=one), 2: JointColumns(current_a=two)})
+
+    assert by_data(table(rough, smooth)) == 1, seed
+    assert by_data(table(smooth, rough)) == 2, seed
+    assert by_data(table(smooth, smooth[::-1])) is None, seed
+    assert by_data(RunTable(t, {1: JointColumns(current_a=rough)})) is None
+    assert by_marks({"velocity_joint": 2}) == 2
+    assert by_marks({"velocity_joint": True}) is None
+    assert by_marks(None) is None
+
+
+def test_a_thinned_curve_keeps_its_spikes_and_its_gaps() -> None:
+    seed = 1
+    values = np.random.default_rng(seed).normal(size=20_000)
+    values[1234], values[4321] = 50.0, -60.0
+    values[9000:9500] = np.nan
+    time = np.arange(20_000) * 1e-3
+    short, kept = thinned(time, values, 500)
+    assert len(kept) <= 1500, seed
+    assert np.nanmax(kept) == 50.0
+    assert np.nanmin(kept) == -60.0
+    assert np.all(np.diff(short) > 0)
+    inside = (short > 9.05) & (short < 9.45)
+    assert np.isnan(kept[inside]).all()
+    assert thinned(time[:50], values[:50], 500)[1] is not None

@@ -1,0 +1,158 @@
+"""Comparison of searches, trial on the emulated bench, and the command `jtq excitation`."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import yaml
+
+from jtqd.estimator.checked import ConfigError
+from jtqd.models.files import load_joint, shipped
+from jtqd.sysid.campaign.plan import Plan, expand, load_plan
+from jtqd.sysid.excitation import command as excitation_command
+from jtqd.sysid.excitation.compare import compare, deviation_ratio, table_lines
+from jtqd.sysid.excitation.design import draw
+from jtqd.sysid.excitation.fourier import FourierSeries, FourierTrajectory
+from jtqd.sysid.excitation.model import ExcitationLimits
+
+JOINTS = (load_joint(shipped("joint1.yaml")), load_joint(shipped("joint2.yaml")))
+LIMITS = ExcitationLimits()
+
+
+def setpoints(one):
+    time_s = np.arange(round(one.velocity.duration_s * 1000) + 1) * 1e-3
+    return (time_s, *one.velocity.motion(time_s), one.current.value(time_s))
+
+
+def test_comparison_gives_every_method_the_same_evaluations():
+    seen = []
+    rows = compare(
+        LIMITS, count=1, duration_s=10.0, harmonics=3, seeds=2, evaluations=640, on_progress=seen.append
+    )
+    assert [row.evaluations for row in rows] == [640, 640, 640, 1]
+    spent = sum(seen) / 2
+    generation = 4 * 13
+    assert 3 * 640 + 1 - generation < spent <= 3 * 640 + 1
+    genetic, _, best, drawn = rows
+    assert genetic.median < best.median < drawn.median
+    assert deviation_ratio(genetic, genetic) == 1.0
+    assert deviation_ratio(best, genetic) == pytest.approx(math.exp((best.median - genetic.median) / 40.0))
+    lines = table_lines(rows)
+    assert len(lines) == 5
+    assert len({len(line) for line in lines}) == 1
+
+
+def test_comparison_refuses_a_budget_without_generations():
+    with pytest.raises(ConfigError, match="--evaluations: found 100, expected >= 252"):
+        compare(LIMITS, count=1, duration_s=10.0, evaluations=100)
+
+
+def test_segment_mapping_is_what_a_plan_reads(tmp_path):
+    (one,) = draw(LIMITS, count=1, duration_s=10.0, seed=2)
+    mapping = one.to_mapping()
+    assert mapping["kind"] == "fourier"
+    assert mapping["duration_s"] == 10.0
+    run = {"name": "one", "velocity_joint": 2, "segments": [yaml.safe_load(yaml.safe_dump(mapping))]}
+    plan = Plan.from_mapping({"schema": "jtq.plan/1", "name": "test", "runs": [run]}, "test")
+    made = expand(plan.runs[0])
+    _, _, velocity, _, current = setpoints(one)
+    assert made.velocity_rad_s == pytest.approx(velocity[:-1], abs=1e-9)
+    assert made.current_a == pytest.approx(current[:-1], abs=1e-9)
+
+
+def test_command_writes_a_plan_of_what_it_prints(tmp_path, capsys):
+    out = tmp_path / "new" / "excitation.plan.yaml"
+    arguments = ["--count", "2", "--duration", "8", "--evaluations", "60", "--velocity-joint", "2"]
+    assert excitation_command.main([*arguments, "--json", "--out", str(out)]) == 0
+    captured = capsys.readouterr()
+    result = json.loads(captured.out)
+    assert captured.err == f"jtq excitation: wrote {out}\n"
+    plan = load_plan(out)
+    assert [run.velocity_joint for run in plan.runs] == [2, 2]
+    for run, printed in zip(plan.runs, result["runs"], strict=True):
+        rest, motion, again = run.segments
+        assert rest == again
+        assert rest.hold_s == 1.0
+        segment = printed["segment"]
+        velocity, current = segment["velocity"], segment["current"]
+        assert motion.velocity == FourierTrajectory(
+            velocity["omega_rad_s"], tuple(velocity["a"]), tuple(velocity["b"]), 8.0
+        )
+        assert motion.current == FourierSeries(
+            current["omega_rad_s"], tuple(current["a"]), tuple(current["b"]), 8.0, current["offset_a"]
+        )
+        assert printed["peaks"]["velocity_rad_s"] == pytest.approx(3.0)
+    assert excitation_command.main(arguments) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 4
+
+
+def test_command_compares(capsys):
+    arguments = ["--compare", "--duration", "8", "--harmonics", "2", "--evaluations", "150", "--seeds", "2"]
+    assert excitation_command.main([*arguments, "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert [len(row["negative_log_det"]) for row in rows] == [2, 2, 2, 2]
+    assert excitation_command.main(arguments) == 0
+    assert "genetic algorithm" in capsys.readouterr().out
+
+
+def test_trial_judges_both_kinds_on_other_runs(capsys):
+    arguments = [
+        "--trial",
+        "--count",
+        "2",
+        "--duration",
+        "3",
+        "--evaluations",
+        "40",
+        "--seeds",
+        "1",
+        "--json",
+    ]
+    assert excitation_command.main(arguments) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert [one["runs"] for one in result["trials"]] == [1, 2]
+    one, two = result["trials"]
+    assert one["drawn_nm"] != two["drawn_nm"]
+    assert one["designed_nm"] != one["drawn_nm"]
+    for one in result["trials"]:  # nothing fits the judging runs better than a fit to them
+        assert min(one["designed_nm"] + one["drawn_nm"]) > result["floor_nm"] > 0.1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "message"),
+    [
+        (["--duration", "0.5"], 1, "duration_s: found 0.5, expected 1 to 600"),
+        (["--velocity", "99", "--out", "plan.yaml"], 1, "--velocity: found 99, expected at most"),
+        (["--joint-current", "99", "--out", "plan.yaml"], 1, "--joint-current: found 99, expected at most"),
+        (["--joints", "none1.yaml", "none2.yaml"], 1, "none1.yaml: cannot be read"),
+        (["--compare", "--out", "plan.yaml"], 2, "--out does not go with --compare"),
+        (["--compare", "--starts", "2"], 2, "--starts does not go with --compare"),
+        (["--compare", "--trial"], 2, "--trial does not go with --compare"),
+        (["--trial", "--out", "plan.yaml"], 2, "--out does not go with --trial"),
+        (["--seeds", "2"], 2, "--seeds belongs to --compare and --trial"),
+        (["--compare", "--evaluations", "20"], 1, "--evaluations: found 20, expected >= 252"),
+    ],
+)
+def test_command_refuses_in_one_line(arguments, status, message, capsys, tmp_path):
+    arguments = [str(tmp_path / word) if word == "plan.yaml" else word for word in arguments]
+    assert excitation_command.main(arguments) == status
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith(f"jtq excitation: {message}")
+    assert captured.err.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_command_without_scipy_says_so(capsys, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "scipy.optimize", None)
+    assert excitation_command.main(["--compare"]) == 1
+    assert capsys.readouterr().err == ("jtq excitation: scipy is not installed: pip install 'jtqd[train]'\n")
+
+
+@pytest.mark.parametrize("value", ["nan", "0", "-1", "many"])
+def test_numbers_without_sense_are_usage_errors(value, capsys):
+    with pytest.raises(SystemExit) as refused:
+        excitation_command.main([f"--torque={value}"])
+    assert refused.value.code == 2
+    assert f"argument --torque: found {value!r}, expected a number > 0" in capsys.readouterr().err

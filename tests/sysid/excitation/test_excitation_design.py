@@ -1,0 +1,375 @@
+"""Designed excitation: limits at every set-point, information by closed forms, and searches with equal budgets."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.losses import LossModel
+from jtqd.models.files import load_joint, shipped
+from jtqd.sim_can.emulated_run import JointCommand, emulate_run
+from jtqd.sim_can.plant_file import load_plant
+from jtqd.sysid.excitation import design as genetic
+from jtqd.sysid.excitation.design import (
+    COLUMNS,
+    POPULATION,
+    STARTS,
+    Information,
+    Problem,
+    condition,
+    design,
+    draw,
+    log_det,
+    loss_regressor,
+    minimise,
+)
+from jtqd.sysid.excitation.model import GOLDEN, Bench, Candidates, ExcitationLimits
+
+JOINTS = (load_joint(shipped("joint1.yaml")), load_joint(shipped("joint2.yaml")))
+LIMITS = ExcitationLimits()
+
+
+def setpoints(one):
+    time_s = np.arange(round(one.velocity.duration_s * 1000) + 1) * 1e-3
+    return (time_s, *one.velocity.motion(time_s), one.current.value(time_s))
+
+
+# --- limits ---------------------------------------------------------------------------------------------------
+
+
+def own_current(joint, torque, velocity, acceleration):
+    """Current the velocity joint needs: the loss model's scalar form, inverted by bisection."""
+    losses = LossModel(joint)
+    joint_torque = torque + joint.link_inertia_kgm2 * acceleration
+    low, high = -50.0, 50.0
+    for _ in range(45):
+        i = 0.5 * (low + high)
+        if losses.torque_per_ampere * i - losses.loss(i, velocity) < joint_torque:
+            low = i
+        else:
+            high = i
+    return low + joint.gear_ratio * joint.rotor_inertia_kgm2 * acceleration / joint.torque_constant_nm_per_a
+
+
+def between_joints(joint, current, velocity, acceleration):
+    """Torque by the driving joint's scalar loss; velocity and acceleration are those of the velocity joint."""
+    losses = LossModel(joint)
+    rotor = joint.gear_ratio**2 * joint.rotor_inertia_kgm2
+    effective = current + rotor * acceleration / losses.torque_per_ampere
+    raw = losses.torque_per_ampere * effective
+    return raw - losses.loss(effective, -velocity) + joint.link_inertia_kgm2 * acceleration
+
+
+@pytest.mark.parametrize(
+    ("change", "active"),
+    [
+        ({}, "velocity_rad_s"),
+        ({"acceleration_rad_s2": 1.0}, "acceleration_rad_s2"),
+        ({"travel_rad": 1.5}, "travel_rad"),
+        ({"velocity_rad_s": 0.3}, "velocity_rad_s"),
+        ({"joint_current_a": 5.0}, "velocity_rad_s"),
+        ({"torque_nm": 15.0}, "velocity_rad_s"),
+    ],
+)
+def test_every_setpoint_keeps_every_limit_and_one_is_reached(change, active):
+    limits = replace(LIMITS, **change)
+    for one in draw(limits, count=4, duration_s=12.0, seed=4):
+        _, position, velocity, acceleration, current = setpoints(one)
+        peaks = {
+            "velocity_rad_s": np.abs(velocity).max(),
+            "acceleration_rad_s2": np.abs(acceleration).max(),
+            "travel_rad": np.abs(position).max(),
+            "current_a": np.abs(current).max(),
+        }
+        for name, peak in peaks.items():
+            assert peak <= getattr(limits, name) * (1 + 1e-9), name
+        assert peaks[active] == pytest.approx(getattr(limits, active), rel=1e-9)
+        for k in range(0, len(velocity), 60):
+            torque = between_joints(JOINTS[1], current[k], velocity[k], acceleration[k])
+            assert abs(torque) <= limits.torque_nm * (1 + 1e-9)
+            own = own_current(JOINTS[0], torque, velocity[k], acceleration[k])
+            assert abs(own) <= limits.joint_current_a * (1 + 1e-9)
+
+
+def test_current_stops_where_velocity_joint_or_torque_is_at_its_limit():
+    """Bisection ends at the limit, not far below it: just a little more current would break it."""
+    for change in ({"joint_current_a": 5.0}, {"torque_nm": 20.0}):
+        limits = replace(LIMITS, current_a=8.0, **change)
+        for one in draw(limits, count=4, duration_s=12.0, seed=1):
+            _, _, velocity, acceleration, current = setpoints(one)
+            assert 0.3 < np.abs(current).max() < 0.99 * limits.current_a
+            # at a reversal the overshoot keeps a fifth free, elsewhere nothing
+            near = []
+            for k in range(0, len(velocity), 20):
+                torque = between_joints(JOINTS[1], 1.001 * current[k], velocity[k], acceleration[k])
+                near.append(
+                    abs(torque) / limits.torque_nm
+                    if "torque_nm" in change
+                    else abs(own_current(JOINTS[0], torque, velocity[k], acceleration[k]))
+                    / limits.joint_current_a
+                )
+            assert 0.8 < max(near) <= 1.01
+
+
+def test_only_the_direction_of_a_genome_counts():
+    bench = Bench(*JOINTS)
+    candidates = Candidates(bench, LIMITS, duration_s=10.0, harmonics=3, rate_hz=20.0)
+    rng = np.random.default_rng(0)
+    genomes = rng.normal(size=(5, candidates.dimension))
+    scaled = genomes.copy()
+    scaled[:, :6] *= rng.uniform(0.01, 100.0, (5, 1))
+    scaled[:, 6:] *= rng.uniform(0.01, 100.0, (5, 1))
+    one, two = candidates.motion(genomes), candidates.motion(scaled)
+    assert one.velocity == pytest.approx(two.velocity, abs=1e-9)
+    assert one.torque == pytest.approx(two.torque, abs=0.02)  # bisection ends at another place
+
+
+def test_matrices_are_the_series():
+    candidates = Candidates(Bench(*JOINTS), LIMITS, duration_s=10.0, harmonics=3, rate_hz=20.0)
+    genome = np.random.default_rng(0).normal(size=candidates.dimension)
+    velocity, current, motion = candidates.series(genome)
+    time_s = np.linspace(0.0, 10.0, 201)
+    assert motion.velocity[0] == pytest.approx(velocity.velocity(time_s), abs=1e-9)
+    assert motion.acceleration[0] == pytest.approx(velocity.acceleration(time_s), abs=1e-9)
+    assert motion.current[0] == pytest.approx(current.value(time_s), abs=1e-9)
+
+
+def test_genome_of_zeros_stays_at_rest():
+    candidates = Candidates(Bench(*JOINTS), LIMITS, duration_s=10.0, harmonics=2, rate_hz=20.0)
+    motion = candidates.motion(np.zeros((1, candidates.dimension)))
+    assert np.all(np.isfinite(motion.torque))
+    assert np.all(motion.velocity == 0.0)
+
+
+@pytest.mark.parametrize("change", [{"joint_current_a": 0.5}, {"torque_nm": 2.0}])
+def test_limits_that_leave_no_motion_are_refused(change):
+    with pytest.raises(
+        ConfigError, match=r"^limits: found joint_current_a .* turning the idle driving joint takes"
+    ):
+        draw(replace(LIMITS, **change), count=1, duration_s=10.0)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
+def test_limits_are_positive_numbers(value):
+    with pytest.raises(ConfigError, match=r"^limits: travel_rad: found .* expected a finite number > 0$"):
+        ExcitationLimits(travel_rad=value)
+
+
+def test_emulated_bench_stays_within_the_limits_of_a_loaded_design():
+    """The static model and its allowance at reversals hold on the bench with its springs and control loops."""
+    (one,) = design(LIMITS, count=1, duration_s=10.0, seed=1, evaluations=600, starts=1)
+    time_s, _, velocity, acceleration, current = setpoints(one)
+    v, i = (dict(zip(np.round(time_s, 3).tolist(), a.tolist(), strict=True)) for a in (velocity, current))
+    table = emulate_run(
+        load_plant(shipped("plant.yaml")),
+        (
+            JointCommand.velocity(lambda t: v[round(t, 3)]),
+            JointCommand.current(lambda t: i[round(t, 3)]),
+        ),
+        10.0,
+    )
+    predicted = Bench(*JOINTS).torque(current[:-1], velocity[:-1], acceleration[:-1])
+    steady = np.abs(velocity[:-1]) > 0.5
+    error = (table.joints[1].torque_nm - predicted)[steady]
+    assert np.sqrt(np.mean(error**2)) < 1.5
+    assert 0.7 < np.abs(table.joints[1].current_a).max() / LIMITS.joint_current_a < 1.1
+    assert np.abs(table.joints[1].torque_nm).max() < LIMITS.torque_nm
+
+
+# --- information ----------------------------------------------------------------------------------------------
+
+
+def test_regressor_by_hand():
+    v, tau = 0.5, -8.0  # turning forwards, driven backwards; tanh(25) = 1, exp(-100) = 0
+    row = loss_regressor(np.array([v]), np.array([tau]))[0]
+    expected = [1, 0.5, 0.25, 0, 0, 0, 0, 8, 64, 4] + [0] * 10
+    assert row == pytest.approx(expected, abs=1e-12)
+    row = loss_regressor(np.array([-0.02]), np.array([-8.0]))[0]  # backwards, driving
+    s, peak = -math.tanh(1.0), math.exp(-0.16)
+    expected = [0] * 10 + [s, 0.02 * s, -0.0004, s * peak, 8 * s, 64 * s, 0.16 * s, 0, 0, 0]
+    assert row == pytest.approx(expected, abs=2e-4)
+    assert row[10] == pytest.approx(s)
+
+
+def test_one_design_serves_both_joints():
+    """The other joint sees (-v, tau): the columns change places and signs, the determinant does not."""
+    rng = np.random.default_rng(2)
+    v, tau = rng.normal(size=(2, 1, 400)) * [[[2.0]], [[15.0]]]
+    information = Information(3.0, 50.0)
+    value = log_det(information.of(v, tau))
+    assert log_det(information.of(-v, tau)) == pytest.approx(value, abs=1e-6)
+    assert log_det(information.of(v, -tau)) == pytest.approx(value, abs=1e-6)
+
+
+def test_scale_shifts_every_log_det_alike():
+    rng = np.random.default_rng(2)
+    v, tau = rng.normal(size=(2, 2, 400)) * [[[2.0]], [[15.0]]]
+    one, two = (log_det(Information(*box).of(v, tau)) for box in ((3.0, 50.0), (2.0, 40.0)))
+    assert one[0] - one[1] == pytest.approx(two[0] - two[1], abs=1e-5)
+
+
+def test_information_is_that_of_least_squares():
+    """Its inverse, unscaled, is the covariance of the coefficients for unit noise: compared with repeated fits."""
+    rng = np.random.default_rng(5)
+    v, tau = rng.uniform(-3.0, 3.0, 500), rng.uniform(-30.0, 30.0, 500)
+    X = loss_regressor(v, tau)
+    fits = np.linalg.lstsq(X, rng.normal(size=(500, 2000)), rcond=None)[0]
+    scale = np.sqrt(np.mean(np.square(X), axis=0))
+    spread = np.cov(fits * scale[:, None])
+    information = Information(3.0, 30.0)
+    own_scale = information._scale  # the box is the range of the data: the two agree to sampling
+    M = information.of(v[None], tau[None])[0] * 500
+    expected = np.linalg.inv(M)
+    kept = np.diag(expected) < 0.5  # the narrow columns have a few samples only
+    ratio = (np.diag(spread) / scale**2) / (np.diag(expected) / own_scale**2)
+    assert kept.sum() > 15
+    assert ratio[kept] == pytest.approx(np.ones(kept.sum()), rel=0.15)
+
+
+def test_missing_quadrant_is_bad_but_finite():
+    rng = np.random.default_rng(1)
+    v, tau = rng.uniform(0.1, 3.0, (1, 500)), rng.uniform(-30.0, 30.0, (1, 500))
+    information = Information(3.0, 30.0)
+    signs = np.sign(rng.normal(size=(1, 500)))
+    assert np.isfinite(log_det(information.of(v, tau))[0])
+    assert log_det(information.of(v, tau))[0] < log_det(information.of(v * signs, tau))[0] - 100.0
+
+
+def test_condition_is_that_of_the_regressor():
+    rng = np.random.default_rng(1)
+    X = rng.normal(size=(100, COLUMNS)) * np.linspace(1.0, 5.0, COLUMNS)
+    assert condition(X.T @ X / 100) == pytest.approx(np.linalg.cond(X))
+
+
+# --- searches -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("evaluations", [1, 2, POPULATION - 1, POPULATION, POPULATION + 1, 1000])
+def test_search_uses_its_evaluations_and_returns_the_best_of_them(evaluations):
+    seen = []
+
+    def criterion(genomes):
+        assert np.abs(genomes).max() <= 1.0
+        values = np.sum((genomes - 0.3) ** 2, axis=1)
+        seen.extend(values)
+        return values
+
+    found = minimise(criterion, 6, evaluations=evaluations, rng=np.random.default_rng(0))
+    assert len(seen) == evaluations
+    assert found.value == min(seen)
+    assert np.sum((found.genome - 0.3) ** 2) == found.value
+
+
+def test_search_closes_in_on_a_minimum():
+    """Without mutation it freezes at 1e-2, without its fading at 2e-2; of random points 2000 come to 1."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        found = minimise(lambda g: np.sum((g - 0.3) ** 2, axis=1), 12, evaluations=2000, rng=rng)
+        assert found.value < 5e-4, f"seed {seed}"
+
+
+def test_better_parents_win_tournaments():
+    """The best of k out of values 0..999 has the mean 1000/(k + 1)."""
+    winners = genetic._winners(np.arange(1000.0), 20000, np.random.default_rng(0))
+    assert np.mean(winners) == pytest.approx(1000.0 / (genetic.TOURNAMENT + 1), rel=0.03)
+
+
+def test_search_without_evaluations_is_refused():
+    with pytest.raises(ValueError, match="0 evaluations"):
+        minimise(lambda g: g[:, 0], 2, evaluations=0, rng=np.random.default_rng(0))
+
+
+def small(**changes):
+    return {
+        "count": 2,
+        "duration_s": 10.0,
+        "harmonics": 3,
+        "seed": 3,
+        "evaluations": 120,
+        "starts": 1,
+        **changes,
+    }
+
+
+def test_same_seed_same_runs_and_more_runs_begin_alike():
+    once = design(LIMITS, **small())
+    assert design(LIMITS, **small()) == once
+    assert design(LIMITS, **small(count=3))[:2] == once
+    assert design(LIMITS, **small(seed=4))[0] != once[0]
+    assert once[0].velocity != once[1].velocity
+
+
+def test_information_grows_with_every_run():
+    runs = draw(LIMITS, count=4, duration_s=10.0, seed=1)
+    values = [one.information_log_det for one in runs]
+    assert values == sorted(values)
+    assert values[0] < values[-1] - 10.0
+
+
+def test_information_of_a_design_is_that_of_its_setpoints():
+    runs = draw(LIMITS, count=2, duration_s=10.0, seed=1)
+    total = 0.0
+    for one in runs:
+        _, _, velocity, acceleration, current = setpoints(one)
+        torque = Bench(*JOINTS).torque(current, velocity, acceleration)
+        total = (
+            total + Information(LIMITS.velocity_rad_s, LIMITS.torque_nm).of(velocity[None], torque[None])[0]
+        )
+        assert one.information_log_det == pytest.approx(float(log_det(total)), abs=1e-6)
+
+
+def test_later_runs_are_judged_with_those_before_them():
+    problem = Problem(LIMITS, duration_s=10.0, harmonics=2)
+    rng = np.random.default_rng(0)
+    first, second = rng.uniform(-1.0, 1.0, (2, problem.dimension))
+    before = problem.finish(first, np.zeros((1, 1)))[2]
+    together = problem.finish(second, before)[2]
+    value = problem.criterion(before)(second[None, :])[0]
+    assert value == pytest.approx(-float(log_det(together)), abs=0.5)  # 20 Hz against 1 kHz
+    assert value < problem.criterion(np.zeros((1, 1)))(second[None, :])[0] - 10.0
+
+
+def test_search_beats_drawing_and_more_starts_do_not_lose():
+    drawn = [-draw(LIMITS, count=1, duration_s=10.0, seed=s)[0].information_log_det for s in range(5)]
+    one, three = (
+        [
+            -design(LIMITS, count=1, duration_s=10.0, seed=s, evaluations=400, starts=starts)[
+                0
+            ].information_log_det
+            for s in range(2)
+        ]
+        for starts in (1, STARTS)
+    )
+    assert max(one) < np.median(drawn) - 10.0
+    assert np.mean(three) < np.mean(one)
+
+
+def test_velocity_and_current_never_repeat_together():
+    (one,) = draw(LIMITS, count=1, duration_s=20.0)
+    assert one.velocity.omega_rad_s / one.current.omega_rad_s == pytest.approx(GOLDEN)
+    assert one.velocity.omega_rad_s * 20.0 / (2.0 * math.pi) == pytest.approx(2.0)  # whole periods
+
+
+def test_progress_counts_every_evaluation():
+    seen = []
+    design(LIMITS, **small(starts=2), on_progress=seen.append)
+    assert sum(seen) == 2 * 2 * 120
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"count": 0}, "count: found 0, expected 1 to 1000"),
+        ({"duration_s": 0.5}, "duration_s: found 0.5, expected 1 to 600"),
+        ({"duration_s": math.nan}, "duration_s: found nan"),
+        ({"harmonics": 51}, "harmonics: found 51, expected 1 to 50"),
+        ({"evaluations": 0}, "evaluations: found 0"),
+        ({"starts": 0}, "starts: found 0"),
+    ],
+)
+def test_arguments_out_of_range_are_refused(change, message):
+    with pytest.raises(ConfigError) as refused:
+        design(LIMITS, **small(**change))
+    assert str(refused.value).startswith(message)

@@ -1,0 +1,225 @@
+"""Efficiency fit: gives Table I back, in the convention it names, and refuses what physics or the data do not support."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jtqd.estimator.joint import CONVENTIONS, QUADRANTS, Joint
+from jtqd.estimator.losses import LossModel
+from jtqd.models.files import shipped
+from jtqd.sim_can.plant_file import PlantParameters, load_plant, plant_of_joint
+from jtqd.sysid.fit.efficiency import (
+    COEFFICIENTS,
+    TABLE_I,
+    EfficiencyFit,
+    EtaPoint,
+    default_current_min,
+    distinct_points,
+    efficiency_findings,
+    eta_points,
+    fit_efficiency,
+    quadrant_of,
+    written_findings,
+)
+from jtqd.sysid.fit.plateaus import Mean, Plateau, find_plateaus
+from tests.estimator.estimator_helpers import reciprocal_efficiency
+from tests.sysid.campaign_helpers import VELOCITIES_RAD_S, section_two_currents, section_two_runs
+from tests.sysid.fit.eta_grid import JOINT, NM_PER_A, grid, plateau, points_of
+
+PAPER_RMSE = {name: getattr(TABLE_I, name).rmse for name in QUADRANTS}
+
+
+def emulated_points(plant: PlantParameters, joint: Joint, **runs: float) -> list[EtaPoint]:
+    plateaus: list[Plateau] = []
+    for k, table in enumerate(section_two_runs(plant, **runs)):  # type: ignore[arg-type]
+        plateaus += find_plateaus(table.time_s, table.joint(1, joint.gear_ratio), joint, f"run{k}")
+    count = 4 * sum(len(section_two_currents(v)) for v in VELOCITIES_RAD_S)
+    assert len(plateaus) == count
+    return points_of(plateaus, joint)
+
+
+def table_rms(fit: EfficiencyFit, points: Sequence[EtaPoint]) -> dict[str, float]:
+    """RMS difference of the fitted surface from Table I at the measured points."""
+    out = {}
+    for name, quadrant in fit.quadrants.items():
+        table = getattr(TABLE_I, name)
+        own = [(p.plateau.current.value, p.plateau.velocity.value) for p in points if p.quadrant == name]
+        off = [quadrant.polynomial.value(i, v) - table.value(i, v) for i, v in own]
+        out[name] = math.sqrt(float(np.mean(np.square(off))))
+    return out
+
+
+def check_table_is_given_back(points: Sequence[EtaPoint]) -> None:
+    fit = fit_efficiency(points, "joint_over_motor", JOINT)
+    assert not fit.refused
+    from_table = table_rms(fit, points)
+    for name in QUADRANTS:
+        assert fit.quadrants[name].rmse <= PAPER_RMSE[name]
+        assert from_table[name] <= PAPER_RMSE[name]
+    assert efficiency_findings(points, JOINT) == []
+    written = replace(JOINT, efficiency=fit.efficiency())
+    assert written_findings(written, points, fit) == []
+
+
+def test_the_emulated_joint_of_table_i_gives_table_i_back() -> None:
+    """Issue: RMSE of each quadrant at most the paper's; here of the fit and of its distance from the truth."""
+    assert JOINT.efficiency == TABLE_I
+    points = emulated_points(plant_of_joint(JOINT), JOINT)
+    check_table_is_given_back(points)
+    fit = fit_efficiency(points, "joint_over_motor", JOINT)
+    for name in ("i_neg_w_pos", "i_pos_w_neg"):  # inside the table's range: the coefficients themselves
+        for key in COEFFICIENTS:
+            truth = getattr(getattr(TABLE_I, name), key)
+            assert getattr(fit.quadrants[name].polynomial, key) == pytest.approx(truth, abs=2e-3)
+
+
+@pytest.mark.campaign
+def test_the_full_campaign_gives_table_i_back() -> None:
+    """Holds as long as the campaign's, of the ideal bench and of the shipped one with all its deviations."""
+    check_table_is_given_back(emulated_points(plant_of_joint(JOINT), JOINT, hold_s=2.1, ramp_s=0.4))
+    points = emulated_points(load_plant(shipped("plant.yaml")), JOINT, hold_s=2.1, ramp_s=0.4)
+    fit = fit_efficiency(points, "joint_over_motor", JOINT)
+    assert all(fit.quadrants[name].rmse <= PAPER_RMSE[name] for name in QUADRANTS)
+    assert efficiency_findings(points, JOINT) == []
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_exact_points_give_the_coefficients_exactly_in_the_convention_of_the_joint(convention: str) -> None:
+    joint = JOINT
+    if convention == "motor_over_joint":
+        joint = replace(JOINT, efficiency=reciprocal_efficiency(JOINT))
+    points = points_of(grid(joint))
+    fit = fit_efficiency(points, convention, joint)
+    for name in QUADRANTS:
+        truth = getattr(joint.efficiency, name)
+        for key in COEFFICIENTS:
+            assert getattr(fit.quadrants[name].polynomial, key) == pytest.approx(
+                getattr(truth, key), abs=2e-6
+            )
+        assert fit.quadrants[name].rmse < 1e-6
+        assert fit.quadrants[name].rmse_nm < 1e-5
+        assert fit.quadrants[name].distinct == fit.quadrants[name].plateaus == 40
+    assert written_findings(replace(joint, efficiency=fit.efficiency()), points, fit) == []
+
+
+@pytest.mark.parametrize("fitted", CONVENTIONS)
+def test_a_fit_written_under_the_other_convention_is_caught(fitted: str) -> None:
+    points = points_of(grid())
+    fit = fit_efficiency(points, fitted, JOINT)
+    right = fit.efficiency()
+    assert right.convention == fitted
+    assert written_findings(replace(JOINT, efficiency=right), points, fit) == []
+    other = next(name for name in CONVENTIONS if name != fitted)
+    wrong = replace(right, convention=other)
+    found = written_findings(replace(JOINT, efficiency=wrong), points, fit)
+    assert [item.kind for item in found] == ["convention"]
+    assert f"'{other}'" in found[0].text
+    # and it would have mattered: the estimator's law then turns losses round or doubles them
+    law = LossModel(replace(JOINT, efficiency=wrong))
+    good = LossModel(JOINT)
+    assert abs(law.loss(5.0, 1.0) - good.loss(5.0, 1.0)) > 2.0
+
+
+def test_both_conventions_describe_the_same_measurement() -> None:
+    point = points_of([plateau(4.0, 1.0, 15.0, se_i=0.01, se_tau=0.1)])[0]
+    ratio = 15.0 / (4.0 * NM_PER_A)
+    assert point.eta("joint_over_motor") == pytest.approx(ratio)
+    assert point.eta("motor_over_joint") == pytest.approx(1.0 / ratio)
+    # standard errors by a seeded draw of torque and current
+    rng = np.random.default_rng(8)
+    draws = (15.0 + 0.1 * rng.normal(size=20000)) / (NM_PER_A * (4.0 + 0.01 * rng.normal(size=20000)))
+    assert point.eta_se("joint_over_motor") == pytest.approx(float(np.std(draws)), rel=0.05)
+    assert point.eta_se("motor_over_joint") == pytest.approx(float(np.std(1.0 / draws)), rel=0.05)
+    assert point.loss_nm == pytest.approx(4.0 * NM_PER_A - 15.0)
+    assert point.driving
+
+
+def test_standard_errors_of_the_coefficients_are_their_scatter() -> None:
+    rng = np.random.default_rng(21)
+    exact = grid()
+    estimates, claimed = [], []
+    for _ in range(150):
+        noisy = [
+            replace(p, torque=Mean(p.torque.value * (1.0 + 0.02 * rng.normal()), p.torque.se)) for p in exact
+        ]
+        fit = fit_efficiency(points_of(noisy), "joint_over_motor", JOINT).quadrants["i_pos_w_pos"]
+        estimates.append([getattr(fit.polynomial, key) for key in COEFFICIENTS])
+        claimed.append([fit.errors[key] for key in COEFFICIENTS])
+    assert np.mean(claimed, axis=0) == pytest.approx(np.std(estimates, axis=0), rel=0.25)
+
+
+def test_weights_follow_the_sensors_zero() -> None:
+    """A zero off by 0.3 Nm spoils eta at small currents; weighted, the fit stays nearer the torque where it is large."""
+    shifted = [replace(p, torque=Mean(p.torque.value + 0.3, p.torque.se)) for p in grid()]
+    points = points_of(shifted)
+    assert efficiency_findings(points, JOINT) == []  # a zero within the allowance is no finding
+    plain = fit_efficiency(points, "joint_over_motor", JOINT)
+    weighted = fit_efficiency(points, "joint_over_motor", JOINT, weighted=True)
+    assert weighted.weighted
+    for name in QUADRANTS:
+        assert weighted.quadrants[name].rmse_nm < plain.quadrants[name].rmse_nm
+        assert weighted.quadrants[name].rmse >= plain.quadrants[name].rmse
+
+
+def test_points_that_are_exact_need_no_standard_error() -> None:
+    exact = [replace(p, torque=Mean(p.torque.value, 0.0), current=Mean(p.current.value, 0.0)) for p in grid()]
+    fit = fit_efficiency(points_of(exact), "motor_over_joint", JOINT, weighted=True)
+    assert not fit.refused
+
+
+# ---- what is left out, refused, found --------------------------------------------------------------------
+
+
+def test_plateaus_without_an_eta_are_left_out_and_returned() -> None:
+    assert default_current_min(JOINT) == pytest.approx(3.8 / 6.2)
+    idle = [plateau(0.0, -1.0, 4.0), plateau(0.5, -1.0, 6.0), plateau(-0.6, 1.0, -5.0)]
+    used, left_out = eta_points([*grid(), *idle], JOINT, default_current_min(JOINT))
+    assert left_out == idle
+    assert len(used) == len(grid())
+    assert eta_points(idle, JOINT, 0.55)[1] == idle[:2]
+
+
+def test_quadrants_by_sign() -> None:
+    assert [quadrant_of(i, v) for i, v in ((1, 1), (-1, -1), (-1, 1), (1, -1))] == list(QUADRANTS)
+
+
+def test_a_quadrant_without_data_is_refused_by_name() -> None:
+    fit = fit_efficiency([p for p in points_of(grid()) if p.driving], "joint_over_motor", JOINT)
+    assert list(fit.quadrants) == ["i_pos_w_pos", "i_neg_w_neg"]
+    assert list(fit.refused) == ["i_neg_w_pos", "i_pos_w_neg"]
+    assert fit.refused["i_neg_w_pos"].startswith("i_neg_w_pos: found 0 distinct operating points")
+    with pytest.raises(
+        ValueError, match="found no fit of i_neg_w_pos, i_pos_w_neg, and the joint file has no eff"
+    ):
+        fit.efficiency()
+    kept = fit.efficiency(TABLE_I)
+    assert kept.i_neg_w_pos == TABLE_I.i_neg_w_pos
+    assert kept.i_pos_w_pos == fit.quadrants["i_pos_w_pos"].polynomial
+    with pytest.raises(ValueError, match="one in the convention motor_over_joint"):
+        fit.efficiency(replace(TABLE_I, convention="motor_over_joint"))
+
+
+def test_repeated_plateaus_do_not_make_a_quadrant() -> None:
+    points = [p for p in points_of(grid()) if p.quadrant == "i_pos_w_pos"]
+    few = points[:6] * 5
+    assert distinct_points(few) == 6
+    refused = fit_efficiency(few, "joint_over_motor", JOINT).refused["i_pos_w_pos"]
+    assert "found 6 distinct operating points (30 plateaus), expected at least 7" in refused
+
+
+def test_points_that_do_not_span_the_surface_are_refused() -> None:
+    two = [p for p in points_of(grid()) if abs(p.plateau.velocity.value) in (0.2, 3.0)]
+    refused = fit_efficiency(two, "joint_over_motor", JOINT).refused
+    assert list(refused) == list(QUADRANTS)
+    assert "condition number" in refused["i_pos_w_pos"]
+    assert "three currents at three velocities" in refused["i_pos_w_pos"]
+
+
+def test_an_unknown_convention_is_refused() -> None:
+    with pytest.raises(ValueError, match="found 'eta', expected one of joint_over_motor, motor_over_joint"):
+        fit_efficiency(points_of(grid()), "eta", JOINT)

@@ -1,0 +1,246 @@
+"""Standard deviations and their calibration on unseen runs, the folds, and the whole fit of section `fused`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.fusion import Fusion
+from jtqd.estimator.joint import Friction, FusedSigma, Joint
+from jtqd.sysid.fit.fused import (
+    FOLDS,
+    GAUSS,
+    FusedFit,
+    PathResiduals,
+    conformal_scale,
+    fit_fused,
+    fit_sigma,
+    folds,
+    fused_error,
+    path_residuals,
+    quadrants_of,
+    unbiased_level,
+)
+from jtqd.sysid.fit.losses import fit_loss
+from jtqd.sysid.fit.signals import RunSignals
+from jtqd.sysid.fit.torsion import fit_torsion
+from tests.estimator.fused_helpers import fused_joint
+from tests.sysid.fit.fused_signals import STIFF, Nuisance, made_run, one_way, smooth_loss
+
+FRICTION = Friction(3.0, 2.0, 0.8, 0.05)
+TRUE = FusedSigma(0.25, 0.12, 0.02, 0.3, 0.03, 0.4)
+
+
+def residuals(rng: np.random.Generator, count: int = 2000) -> PathResiduals:
+    """One run of errors drawn as TRUE says, its reference shared by both paths."""
+    raw, v = rng.uniform(-30.0, 30.0, count), rng.uniform(-3.0, 3.0, count)
+    torque = 0.7 * raw
+    current = np.sqrt(0.25**2 + (0.12 * v) ** 2 + (0.02 * raw) ** 2)
+    torsion = np.sqrt(0.3**2 + (0.03 * torque) ** 2)
+    zero = rng.normal(0.0, 0.4)
+    errors = (rng.normal(0.0, sd) + zero for sd in (current, torsion))
+    return PathResiduals(raw, v, np.zeros(count), torque, np.zeros(count), *errors)
+
+
+def test_known_standard_deviations_come_back() -> None:
+    rng = np.random.default_rng(31)
+    found = fit_sigma([residuals(rng) for _ in range(120)])
+    for name in ("current_nm", "viscous_nms_per_rad", "load", "torsion_nm", "torsion_load", "reference_nm"):
+        assert getattr(found, name) == pytest.approx(getattr(TRUE, name), rel=0.15), name
+    assert found.scale == (1.0, 1.0, 1.0, 1.0)
+
+
+def test_sigma_needs_three_unseen_runs_with_motion() -> None:
+    rng = np.random.default_rng(32)
+    none = PathResiduals(*[np.zeros(0)] * 7)
+    with pytest.raises(ValueError, match="found 2 unseen runs with motion, expected at least 3"):
+        fit_sigma([residuals(rng), none, residuals(rng)])
+    slow = [
+        run._replace(velocity_rad_s=0.01 * run.velocity_rad_s) for run in (residuals(rng) for _ in range(3))
+    ]
+    with pytest.raises(ValueError, match=r"found no unseen sample above 0\.1 rad/s"):
+        fit_sigma(slow)
+
+
+def heteroscedastic(rng: np.random.Generator, count: int = 1500) -> tuple[FloatArray, FloatArray, np.ndarray]:
+    """(error, sigma as believed, quadrant): true scatter is a multiple of sigma that differs per quadrant, heavy tails."""
+    sigma = rng.uniform(0.1, 2.0, count)
+    quadrant = rng.integers(0, 4, count)
+    factor = np.array((0.4, 1.0, 2.0, 5.0))[quadrant] * rng.lognormal(0.0, 0.2)  # and a bit per run
+    return rng.standard_t(4, count) * sigma * factor, sigma, quadrant
+
+
+def test_the_scaled_interval_covers_90_percent_of_runs_it_has_not_seen() -> None:
+    rng = np.random.default_rng(33)
+    scale = conformal_scale(*zip(*(heteroscedastic(rng) for _ in range(60)), strict=True))
+    assert scale[3] > 8 * scale[0]
+    for quadrant in range(4):
+        covered = []
+        for _ in range(60):
+            error, sigma, where = heteroscedastic(rng)
+            inside = np.abs(error) <= GAUSS * scale[quadrant] * sigma
+            covered.append(np.mean(inside[where == quadrant]))
+        assert np.mean(covered) == pytest.approx(0.9, abs=0.015), quadrant
+
+
+def test_errors_that_whole_runs_share_are_covered_alike() -> None:
+    """Each run has its own zero and little else, calibrated on 20 runs: 90 % on average over 200 campaigns.
+
+    Level 0.9 of the pooled samples would cover 87 %, that of split conformal prediction, rounded up, 91 %.
+    """
+    rng = np.random.default_rng(36)
+    one, where = np.ones(100), np.zeros(100, int)
+
+    def error() -> FloatArray:
+        return rng.normal() + 0.1 * rng.normal(size=100)
+
+    covered = []
+    for _ in range(200):
+        scale = conformal_scale([error() for _ in range(20)], [one] * 20, [where] * 20)[0]
+        covered.append(np.mean(np.abs([error() for _ in range(40)]) <= GAUSS * scale))
+    assert np.mean(covered) == pytest.approx(0.9, abs=0.015)
+
+
+def test_the_level_lies_between_that_of_samples_and_that_of_runs() -> None:
+    rng = np.random.default_rng(37)
+    alike = [np.abs(rng.normal(size=4000)) for _ in range(48)]
+    assert unbiased_level(alike) == pytest.approx(0.9, abs=0.003)
+    apart = [np.full(100, k / 48) for k in rng.permutation(48)]
+    assert unbiased_level(apart) == pytest.approx(0.9 * 49 / 48, abs=0.01)  # of 48 places one must be taken
+    between = [np.abs(rng.normal() + rng.normal(size=4000)) for _ in range(48)]
+    assert 0.9 < unbiased_level(between) < 0.9 * 49 / 48
+    assert (
+        unbiased_level(apart[:8]) == unbiased_level(apart[:1]) == 0.97
+    )  # 8 runs have not shown their largest
+
+
+def test_gaussian_errors_of_the_believed_size_need_no_factor() -> None:
+    rng = np.random.default_rng(34)
+    one = np.ones(4000)
+    runs = [(rng.normal(size=4000), one, rng.integers(0, 4, 4000)) for _ in range(100)]
+    assert conformal_scale(*zip(*runs, strict=True)) == pytest.approx((1.0,) * 4, abs=0.01)
+
+
+def test_runs_count_alike_whatever_their_length() -> None:
+    """20 runs, one of them long and ten times as wrong as the others: 5 % of runs, though 98 % of samples; then three."""
+    short = (np.full(100, 1.0), np.ones(100), np.zeros(100, int))
+    long = (np.full(100_000, 10.0), np.ones(100_000), np.zeros(100_000, int))
+    for count, expected in ((1, 1.0), (3, 10.0)):
+        runs = [short] * (20 - count) + [long] * count
+        assert conformal_scale(*zip(*runs, strict=True))[0] == pytest.approx(expected / GAUSS)
+
+
+def test_a_quadrant_without_samples_takes_the_factor_of_all() -> None:
+    rng = np.random.default_rng(35)
+    runs = [(3.0 * rng.normal(size=500), np.ones(500), np.repeat((0, 1), (480, 20))) for _ in range(20)]
+    scale = conformal_scale(*zip(*runs, strict=True))
+    assert scale[1] == scale[2] == scale[3] == pytest.approx(3.0, abs=0.1)
+    with pytest.raises(ValueError, match="found no samples to calibrate sigma with"):
+        conformal_scale([np.zeros(0)] * 2, [np.zeros(0)] * 2, [np.zeros(0, int)] * 2)
+
+
+def test_an_error_that_is_always_zero_leaves_some_sigma() -> None:
+    assert min(conformal_scale([np.zeros(100)], [np.ones(100)], [np.zeros(100, int)])) > 0.0
+
+
+# ---- folds
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 5, 6, 7, 8, 17])
+def test_folds_never_split_a_run_and_judge_each_once(count: int) -> None:
+    one = made_run(1, smooth_loss(), count=300)
+    runs = [replace(one, name=f"run {k}") for k in range(count)]
+    judged_of_all: list[int] = []
+    parts = list(folds(runs))
+    assert len(parts) == min(FOLDS, count)
+    for known, judged in parts:
+        assert known
+        names = [run.name for run in known]
+        assert not set(names) & {runs[n].name for n in judged}
+        assert sorted(names + [runs[n].name for n in judged]) == sorted(run.name for run in runs)
+        assert all(any(run is whole for whole in runs) for run in known)
+        judged_of_all += judged
+    assert sorted(judged_of_all) == list(range(count))
+
+
+# ---- the whole fit
+
+
+@pytest.fixture(scope="module")
+def runs() -> list[RunSignals]:
+    rng = np.random.default_rng(41)
+    drawn = rng.uniform(-1.0, 1.0, (14, 3)).tolist()
+    return [
+        made_run(4100 + k, smooth_loss(), STIFF, Nuisance(0.3 * a, 0.2 * b, 25.0 + 5.0 * c), noise_nm=0.1)
+        for k, (a, b, c) in enumerate(drawn)
+    ]
+
+
+@pytest.fixture(scope="module")
+def fit(runs: list[RunSignals]) -> FusedFit:
+    return fit_fused(runs, FRICTION)
+
+
+def test_the_section_is_whole_and_can_be_written(fit: FusedFit) -> None:
+    joint = replace(fused_joint(), fused=fit.fused)
+    assert Joint.from_mapping(joint.to_mapping(), "x").fused == fit.fused
+    assert fit.fused.torsion is not None
+    assert fit.fused.torsion.stiffness_nm_per_rad == pytest.approx(11000.0, rel=0.01)
+    assert fit.fused.loss == fit.loss.loss
+
+
+def test_unseen_runs_are_as_wrong_as_sigma_says(runs: list[RunSignals], fit: FusedFit) -> None:
+    """Zeros of +-0.3 Nm are 0.17 Nm RMS, noise 0.1; judged by fits without the run, the share inside is that aimed at."""
+    assert len(fit.unseen_rmse_nm) == len(runs)
+    assert fit.fused.sigma.reference_nm == pytest.approx(0.17, abs=0.06)
+    assert 0.15 < np.sqrt(np.mean(np.square(fit.unseen_rmse_nm))) < 0.25
+    judged = []
+    for known, indices in folds(runs):
+        loss, torsion = fit_loss(known, FRICTION).loss, fit_torsion(known)
+        for n in indices:
+            parts = path_residuals(runs[n], loss, torsion)
+            error, sigma = fused_error(parts, fit.fused.sigma)
+            assert np.sqrt(np.mean(error**2)) == pytest.approx(fit.unseen_rmse_nm[n], rel=1e-6)
+            scale = np.array(fit.fused.sigma.scale)[quadrants_of(parts)]
+            judged.append(np.mean(np.abs(error) <= GAUSS * scale * sigma))
+    assert np.mean(judged) == pytest.approx(0.9, abs=0.02)
+
+
+def test_the_error_of_the_fused_value(runs: list[RunSignals], fit: FusedFit) -> None:
+    """By way of the paths' errors it is what fusing the paths themselves and taking the sensor off gives."""
+    run = runs[3]
+    assert fit.fused.torsion is not None
+    parts = path_residuals(run, fit.fused.loss, fit.fused.torsion)
+    error, sigma = fused_error(parts, fit.fused.sigma)
+    sensor = run.sensor_nm
+    value, spread = Fusion(fit.fused.sigma, True).fuse_many(
+        parts.raw_nm,
+        parts.raw_nm - sensor - parts.current_error_nm,
+        parts.half_nm,
+        parts.velocity_rad_s,
+        parts.torsion_nm,
+        parts.open_nm,
+    )
+    assert error == pytest.approx(value - sensor, abs=1e-9)
+    assert np.array_equal(sigma, spread)
+    assert parts.torsion_nm - parts.torsion_error_nm == pytest.approx(sensor, abs=1e-9)
+
+
+def test_runs_without_motion_are_left_out(runs: list[RunSignals]) -> None:
+    still = replace(runs[0], moving=runs[0].standing)
+    assert len(fit_fused([*runs[:6], still], FRICTION).unseen_rmse_nm) == 6
+
+
+def test_what_cannot_be_fitted_is_refused(runs: list[RunSignals]) -> None:
+    with pytest.raises(
+        ValueError, match="found 5 runs, expected at least 6: standard deviations need unseen"
+    ):
+        fit_fused(runs[:5], FRICTION)
+    with pytest.raises(ValueError, match="found no motion in negative direction"):
+        fit_fused([one_way(run, 1.0) for run in runs], FRICTION)
+    rigid = [replace(run, seen=replace(run.seen, torsion_nm=0.0 * run.sensor_nm)) for run in runs]
+    with pytest.raises(ValueError, match="found no torsion between motor and link encoder"):
+        fit_fused(rigid, FRICTION)

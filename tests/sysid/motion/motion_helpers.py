@@ -1,0 +1,196 @@
+"""The commander against the emulated bench in lock-step: no socket, no clock, every millisecond by hand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from jtqd.drivers.boot_procedure import BusSettings, NodeBoot
+from jtqd.drivers.devices import DriveProfile, SensorProfile
+from jtqd.drivers.frame import FRAME
+from jtqd.drivers.sdo import SdoAbort
+from jtqd.models.files import shipped
+from jtqd.sim_can.bench import Bench
+from jtqd.sim_can.plant_file import load_plant
+from jtqd.sim_can.plant_source import PlantSource
+from jtqd.sysid.motion.cia402 import CST, CSV
+from jtqd.sysid.motion.commander import Commander
+from jtqd.sysid.motion.setpoints import Limits, Setpoints, Timing
+from jtqd.sysid.motion.setup import sensor_units, set_up, switch_off
+from jtqd.sysid.motion.stopping import Phase
+
+MS = 1_000_000
+PLANT = load_plant(shipped("plant.yaml"))
+WIDE = Limits(current_a=9.0, velocity_rad_s=3.3, torque_nm=100.0, travel_rad=60.0)
+WARM = replace(WIDE, temperature_c=70.0)
+
+
+def raised_cosine(n: int) -> np.ndarray:
+    """From 0 to 1 in n steps, smooth at both ends."""
+    return 0.5 - 0.5 * np.cos(math.pi * np.arange(1, n + 1) / n)
+
+
+def plateau(
+    velocity: float, current: float, hold_ms: int = 400, ramp_ms: int = 300, joint: int = 1
+) -> Setpoints:
+    """Up, hold, down."""
+    ramp = raised_cosine(ramp_ms)
+    shape = np.concatenate([ramp, np.ones(hold_ms), 1.0 - ramp])
+    return Setpoints(joint, velocity * shape, current * shape)
+
+
+class BenchAccess:
+    """SDO to one node of a bench in memory; the bench's clock goes on by what `sleep` is told."""
+
+    def __init__(self, lock: LockStep, node: int) -> None:
+        self.lock, self.node = lock, node
+
+    def read(self, index: int, subindex: int) -> bytes:
+        reply = self._ask(bytes([0x40]) + index.to_bytes(2, "little") + bytes([subindex]) + bytes(4))
+        if reply[0] == 0x41:  # segmented: the device name, which nobody needs here
+            return b"?"
+        return reply[4 : 8 - (reply[0] >> 2 & 3)]
+
+    def write(self, index: int, subindex: int, data: bytes) -> None:
+        head = bytes([0x23 | (4 - len(data)) << 2]) + index.to_bytes(2, "little") + bytes([subindex])
+        self._ask(head + data.ljust(4, b"\0"))
+
+    def _ask(self, request: bytes) -> bytes:
+        for can_id, data, _ in self.lock.to_bench(0x600 + self.node, request):
+            if can_id == 0x580 + self.node:
+                if data[0] == 0x80:
+                    raise SdoAbort(int.from_bytes(data[4:], "little"))
+                return data
+        raise AssertionError("no answer")
+
+
+class LockStep:
+    """A bench, booted as jtqd boots it, and a commander; `sent` is all that the commander has sent: (ms, COB-ID, data).
+
+    `filter` sees each batch of frames on its way to the commander and may change it: that is how faults are injected.
+    """
+
+    def __init__(self, plant: Any = PLANT, profile: str = "rest") -> None:
+        self.source = PlantSource(plant, 1)
+        self.bench = Bench(self.source, profile)
+        self.now = 1_000 * MS
+        self.counter = 0
+        self.sent: list[tuple[int, int, bytes]] = []
+        self.filter: Callable[[list[tuple[int, bytes, int]]], list[tuple[int, bytes, int]]] = lambda frames: (
+            frames
+        )
+        self.sync_runs = True
+        self.deaf = False
+        self.waiting: list[tuple[int, bytes, int]] = []
+        self.bench.tick(self.now)
+        settings = BusSettings(0x20, counter_overflow=240)
+        for node in (1, 2, 3):
+            profile_of = DriveProfile(node) if node < 3 else SensorProfile(3)
+            boot = NodeBoot(BenchAccess(self, node), profile_of, settings)
+            boot.run(boot.check_device_type())
+        self.to_bench(0, b"\x01\x00")
+
+    def sleep(self, duration_s: float) -> None:
+        self.now += round(duration_s * 1e9)
+        self.waiting += self.texts(self.bench.tick(self.now))
+
+    def texts(self, frames: list[bytes]) -> list[tuple[int, bytes, int]]:
+        out = []
+        for frame in frames:
+            can_id, length, data = FRAME.unpack(frame)
+            out.append((can_id, data[:length], self.now))
+        return out
+
+    def to_bench(self, can_id: int, data: bytes) -> list[tuple[int, bytes, int]]:
+        return self.texts(self.bench.on_frame(can_id, data, self.now, self.now))
+
+    def access(self, node: int) -> BenchAccess:
+        return BenchAccess(self, node)
+
+    def commander(
+        self, setpoints: Setpoints, limits: Limits = WIDE, timing: Timing | None = None
+    ) -> Commander:
+        """Set up both drives and make the commander; kept as `self.motion`."""
+        timing = timing or Timing()
+        temperature = math.isfinite(limits.temperature_c)
+        for node in (1, 2):
+            switch_off(self.access(node), node, self.sleep)
+        units = [
+            set_up(
+                self.access(node),
+                DriveProfile(node),
+                CSV if node == setpoints.velocity_joint else CST,
+                round(timing.drive_timeout_s * 1e3),
+                self.sleep,
+                temperature=temperature,
+            )
+            for node in (1, 2)
+        ]
+        sensor = sensor_units(self.access(3), SensorProfile(3))
+        self.motion = Commander(
+            setpoints, limits, (units[0], units[1]), sensor, now_ns=self.now, timing=timing
+        )
+        return self.motion
+
+    def cycle(self) -> None:
+        """One millisecond: timers, SYNC, the bench's answers, and 0.7 ms later the commander's turn."""
+        self.now += MS
+        frames, self.waiting = self.waiting, []
+        frames += self.texts(self.bench.tick(self.now))
+        if self.sync_runs:
+            self.counter = self.counter % 240 + 1
+            sync = bytes([self.counter])
+            frames.append((0x080, sync, self.now))
+            frames += self.to_bench(0x080, sync)
+        frames = self.filter(frames)
+        if self.deaf:
+            self.waiting = frames
+            return
+        for can_id, data, _ in self.texts(self.motion.on_frames(frames, self.now + 7 * MS // 10)):
+            self.sent.append((self.now // MS, can_id, data))
+            self.waiting += self.to_bench(can_id, data)
+
+    def run(self, until: Callable[[], bool] | None = None, limit_ms: int = 20_000) -> int:
+        """Cycles until the commander is over, or `until` is true; how many they were."""
+        for n in range(limit_ms):
+            if self.motion.over or (until is not None and until()):
+                return n
+            self.cycle()
+        raise AssertionError(f"still {self.motion.phase} after {limit_ms} ms")
+
+    def run_for(self, ms: int) -> None:
+        for _ in range(ms):
+            self.cycle()
+
+    def play_until(self, ms: int) -> None:
+        """Until set-point number `ms` has been in force."""
+        self.run(lambda: self.motion.phase is Phase.PLAYING and self.motion.played_s * 1e3 >= ms)
+
+    @property
+    def velocities(self) -> tuple[float, float]:
+        """True velocities, joint side."""
+        plant = self.source.plant
+        one, two = (side.joint.gear_ratio for side in plant.parameters.joints)
+        return plant.motor_velocity[0] / one, plant.motor_velocity[1] / two
+
+    @property
+    def states(self) -> tuple[int, int]:
+        """jtqd.sim_can.drive_node states of both drives."""
+        one, two = self.bench.drives
+        return one.machine.state, two.machine.state
+
+    def setpoints_sent(self, after_ms: int = 0) -> list[tuple[int, int, int]]:
+        """(ms, COB-ID, target) of each RPDO that carries a target of an enabled drive."""
+        found = []
+        for ms, can_id, data in self.sent:
+            if ms < after_ms:
+                continue
+            if can_id & 0x780 == 0x300:
+                found.append((ms, can_id, int.from_bytes(data, "little", signed=True)))
+            elif can_id & 0x780 == 0x200 and data[:2] == b"\x0f\x00":
+                found.append((ms, can_id, int.from_bytes(data[2:], "little", signed=True)))
+        return found

@@ -1,0 +1,257 @@
+"""The commander leads the emulated bench through a motion, in lock-step: what it sends, and that the joints follow."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jtqd.sim_can import drive_node as cia402
+from jtqd.sysid.motion.setpoints import MotionError, MotionResult, Setpoints
+from jtqd.sysid.motion.stopping import Phase
+from tests.sysid.motion.motion_helpers import MS, WARM, WIDE, LockStep, plateau
+
+OFF = (cia402.SWITCH_ON_DISABLED, cia402.SWITCH_ON_DISABLED)
+RPDOS = {0x201, 0x202, 0x301, 0x302}
+
+
+@pytest.fixture
+def lock() -> LockStep:
+    return LockStep()
+
+
+def test_a_whole_motion_is_played_and_both_joints_are_disabled(lock: LockStep) -> None:
+    motion = lock.commander(plateau(1.0, 2.0))
+    lock.run()
+    assert motion.result == MotionResult("done", "", 1.0)
+    assert motion.refusal is None
+    assert lock.states == OFF
+    assert lock.velocities == (0.0, 0.0)
+    before = len(lock.sent)
+    lock.run_for(50)
+    assert len(lock.sent) == before, "nothing is sent once it is over"
+
+
+@pytest.mark.parametrize("joint", [1, 2])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_joints_do_what_was_planned(lock: LockStep, joint: int, sign: int) -> None:
+    """On the plateau the true velocity is the planned one, and the other joint's true current is the planned one."""
+    motion = lock.commander(plateau(sign * 1.2, 2.5, joint=joint))
+    velocities, currents = [], []
+    lock.play_until(400)
+    while motion.played_s < 0.7:
+        lock.cycle()
+        velocities.append(lock.velocities[joint - 1])
+        currents.append(lock.source.plant.drives[2 - joint].current_a)
+    assert np.mean(velocities) == pytest.approx(sign * 1.2, abs=0.005)
+    assert np.ptp(velocities) < 0.1
+    assert currents == pytest.approx([2.5] * len(currents), abs=0.005), "1/1000 of 8 A is 8 mA"
+
+
+def test_each_drive_gets_every_second_setpoint_and_no_cycle_carries_two(lock: LockStep) -> None:
+    plan = plateau(1.0, 2.0, hold_ms=100)
+    motion = lock.commander(plan)
+    lock.run(lambda: motion.phase is Phase.PLAYING)
+    begin_ms = lock.now // MS + 1  # of set-point 0
+    lock.run(lambda: motion.phase is Phase.RAMPING)
+    sent = {ms: (can_id, target) for ms, can_id, target in lock.setpoints_sent(begin_ms)}
+    velocity_units = motion.inputs.drives[0].units.velocity_units
+    assert velocity_units(1.0) == round(100 / (2 * math.pi) * 65536)
+    for k in range(len(plan)):
+        can_id, target = sent[begin_ms + k]
+        assert can_id == (0x301, 0x202)[(k + (sent[begin_ms][0] == 0x202)) % 2], "one drive after the other"
+        planned = (
+            velocity_units(plan.velocity_rad_s[k]) if can_id == 0x301 else round(plan.current_a[k] / 0.008)
+        )
+        assert target == planned
+    by_ms = [ms for ms, can_id, _ in lock.sent if can_id in RPDOS]
+    assert len(by_ms) == len(set(by_ms)), "never two RPDOs in one cycle"
+    for drive in lock.bench.drives:
+        assert (drive.store.number(0x60C2, 1), drive.store.number(0x60C2, 2)) == (2, -3)
+        assert drive.store.number(0x1016, 2) == 0x21 << 16 | 300
+
+
+def test_the_start_word_by_word(lock: LockStep) -> None:
+    """After boot-up and standstill: 6, 7, 15 to each drive, each when its statusword has confirmed the one before."""
+    motion = lock.commander(plateau(1.0, 2.0))
+    lock.run(lambda: motion.phase is Phase.PLAYING)
+    assert lock.sent[0][1:] == (0x721, b"\x00"), "boot-up message"
+    beats = [ms for ms, can_id, data in lock.sent if (can_id, data) == (0x721, b"\x05")]
+    assert np.diff(beats).tolist() == [100] * (len(beats) - 1)
+    for can_id in (0x201, 0x202):
+        words = [data for _, found, data in lock.sent if found == can_id]
+        assert words[:3] == [b"\x06\x00\x00\x00", b"\x07\x00\x00\x00", b"\x0f\x00\x00\x00"]
+        assert set(words[3:]) <= {b"\x0f\x00\x00\x00"}
+    first = min(ms for ms, can_id, _ in lock.sent if can_id in RPDOS)
+    assert first - lock.sent[0][0] >= 150, "standstill was watched before"
+
+
+def test_the_end_word_by_word(lock: LockStep) -> None:
+    """Set-points to zero, quick stop, power off: nothing else, and the current joint never without its velocity joint."""
+    motion = lock.commander(plateau(1.0, 2.0))
+    lock.run()
+    for can_id in (0x201, 0x202):
+        words = [data[:2] for _, found, data in lock.sent if found == can_id]
+        tail = [word for n, word in enumerate(words) if n == 0 or words[n - 1] != word]
+        assert tail[-3:] == [b"\x0f\x00", b"\x02\x00", b"\x00\x00"]
+    assert motion.over
+
+
+def test_joints_that_turn_are_not_enabled(lock: LockStep) -> None:
+    """Joint 2 turns by hand: refused after 3 s, nothing was enabled."""
+    motion = lock.commander(plateau(1.0, 2.0))
+
+    def turning(frames: list[tuple[int, bytes, int]]) -> list[tuple[int, bytes, int]]:
+        units = round(0.05 * 100 / (2 * math.pi) * 65536)
+        return [
+            (can_id, units.to_bytes(4, "little") + data[4:], t) if can_id == 0x282 else (can_id, data, t)
+            for can_id, data, t in frames
+        ]
+
+    lock.filter = turning
+    lock.run()
+    assert motion.refusal == "joint 2: velocity 0.050 rad/s before the start, limit 0.02 rad/s"
+    assert not [each for each in lock.sent if each[1] in RPDOS]
+    assert lock.states == OFF
+
+
+@pytest.mark.parametrize(
+    ("gone", "line"),
+    [
+        (0x080, "no SYNC: is jtqd running on this bus?"),
+        (0x702, "joint 2: no heartbeat 702h"),
+        (0x703, "sensor: no heartbeat 703h"),
+        (0x181, "joint 1: no TPDO1 or TPDO2; jtqd's boot configures them"),
+        (0x282, "joint 2: no TPDO1 or TPDO2; jtqd's boot configures them"),
+        (0x183, "sensor: no torque of channel 1"),
+    ],
+)
+def test_nothing_is_begun_without_every_input(lock: LockStep, gone: int, line: str) -> None:
+    motion = lock.commander(plateau(1.0, 2.0))
+    lock.filter = lambda frames: [frame for frame in frames if frame[0] != gone]
+    assert lock.run() == pytest.approx(3000, abs=5)
+    assert motion.refusal == line
+    assert not [each for each in lock.sent if each[1] in RPDOS]
+
+
+def test_an_emcy_or_a_fault_that_is_there_already_refuses_the_start(lock: LockStep) -> None:
+    motion = lock.commander(plateau(1.0, 2.0))
+    lock.filter = lambda frames: [*frames, (0x081, bytes.fromhex("1023020000000000"), lock.now)]
+    lock.run()
+    assert motion.refusal == "joint 1: EMCY 2310h (error register 02h)"
+    lock = LockStep()
+    motion = lock.commander(plateau(1.0, 2.0))
+    lock.bench.drives[1].machine.fault()
+    lock.run()
+    assert motion.refusal == "joint 2: fault (statusword 0218h)"
+
+
+@pytest.mark.parametrize("content", [None, (-0x8000).to_bytes(2, "little", signed=True)])
+def test_temperature_must_be_heard_when_it_is_limited(lock: LockStep, content: bytes | None) -> None:
+    """TPDO3 of drive 2 does not come, or says "not measured" (8000h)."""
+    motion = lock.commander(plateau(1.0, 2.0), WARM)
+
+    def filter_(frames: list[tuple[int, bytes, int]]) -> list[tuple[int, bytes, int]]:
+        replaced = [(0x382, content, t) for can_id, _, t in frames if can_id == 0x382 and content]
+        return [frame for frame in frames if frame[0] != 0x382] + replaced
+
+    lock.filter = filter_
+    lock.run()
+    assert motion.refusal == "joint 2: no temperature (382h), which its limit needs"
+
+
+def test_a_drive_that_does_not_come_on_stops_the_other(lock: LockStep) -> None:
+    """Drive 2 stays in "ready to switch on": nothing is played, both are off again."""
+    motion = lock.commander(plateau(1.0, 2.0))
+    machine = lock.bench.drives[1].machine
+    obey = type(machine).controlword
+    words: list[int] = []
+
+    class Stuck(type(machine)):  # type: ignore[misc]
+        __slots__ = ()
+
+        def controlword(self, word: int) -> bool:
+            words.append(word)
+            return obey(self, 0x06 if word in (0x07, 0x0F) else word)
+
+    machine.__class__ = Stuck
+    lock.run()
+    expected = "joint 2: ready to switch on (statusword 0231h) after 1 s, expected operation enabled"
+    assert motion.result == MotionResult("stopped", expected, 0.0)
+    assert 0x07 in words
+    assert lock.states == OFF
+
+
+def test_lost_cycles_make_the_motion_longer_and_never_jump(lock: LockStep) -> None:
+    """jtqd leaves out up to 12 SYNCs now and then: it goes on, at most four set-points further."""
+    ramp = plateau(1.5, 3.0, hold_ms=300)
+    motion = lock.commander(ramp)
+    lock.play_until(100)
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        lock.sync_runs = False
+        lock.run_for(int(rng.integers(1, 13)))
+        lock.sync_runs = True
+        lock.run_for(int(rng.integers(5, 25)))
+    lock.run()
+    assert motion.result == MotionResult("done", "", 0.9)
+    targets = [target for _, can_id, target in lock.setpoints_sent() if can_id == 0x301]
+    units = lock.motion.inputs.drives[0].units.velocity_units(1.0)
+    steepest = np.abs(np.diff(ramp.velocity_rad_s)).max()
+    assert np.abs(np.diff(targets)).max() <= 8.01 * steepest * units
+
+
+def test_a_commander_that_is_held_up_briefly_sends_no_burst(lock: LockStep) -> None:
+    motion = lock.commander(plateau(1.0, 2.0))
+    lock.play_until(300)
+    lock.deaf = True
+    held: list[tuple[int, bytes, int]] = []
+    for _ in range(15):
+        lock.cycle()
+        held += lock.waiting
+        lock.waiting = []
+    lock.deaf = False
+    lock.waiting = held
+    before = len(lock.sent)
+    lock.cycle()
+    assert len([each for each in lock.sent[before:] if each[1] in RPDOS]) == 1
+    lock.run()
+    assert motion.result.status == "done"
+
+
+def test_the_travel_begins_where_the_motion_begins_and_counters_roll_over(lock: LockStep) -> None:
+    """The motor's counter starts 0.2 rad of the motor below its upper end: 0.4 rad of the joint are 0.4 rad."""
+    plant = lock.source.plant
+    turns = (2**31 / 65536) * 2 * math.pi - 0.2
+    plant.motor_position[0] = turns
+    plant.motor_position[1] = -turns
+    plant.link_position = turns / 100
+    motion = lock.commander(plateau(1.0, 0.5, hold_ms=100), replace(WIDE, travel_rad=1.0))
+    lock.run_for(20)
+    plant.motor_position[0] += 300.0  # turned by 3 rad before the start: no travel of the motion
+    plant.motor_position[1] -= 300.0
+    plant.link_position += 3.0
+    lock.run(lambda: motion.phase is Phase.BRAKING)
+    one, two = motion.inputs.drives
+    true = (plant.motor_position[0] - turns - 300.0) / 100
+    assert true == pytest.approx(0.4, abs=0.01)
+    assert one.travel_rad == pytest.approx(true, abs=1e-3)
+    assert two.travel_rad == pytest.approx(-true, abs=1e-3)
+    assert motion.result.status == "done"
+
+
+def test_setpoints_beyond_what_an_rpdo_holds_are_refused(lock: LockStep) -> None:
+    """300 A of an 8 A drive are 37500 in 1/1000 of rated torque; 16 bits end at 32767."""
+    with pytest.raises(
+        MotionError, match="plan: current of joint 2 is -37500 in units of the drive, limit 32767"
+    ):
+        lock.commander(plateau(1.0, -300.0))
+
+
+def test_setpoints_that_end_in_motion_are_led_to_rest(lock: LockStep) -> None:
+    whole = plateau(1.0, 2.0)
+    cut = Setpoints(1, whole.velocity_rad_s[:500], whole.current_a[:500])
+    motion = lock.commander(cut)
+    lock.run()
+    assert motion.result == MotionResult("done", "", 0.5)
+    assert lock.velocities == (0.0, 0.0)

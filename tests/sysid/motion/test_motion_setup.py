@@ -1,0 +1,233 @@
+"""Drives made ready by SDO: against the emulated drives, and with devices that are not as they should be."""
+
+import struct
+from collections.abc import Callable
+
+import pytest
+
+from jtqd.drivers.devices import DriveProfile, SensorProfile
+from jtqd.drivers.frame import FRAME, pack
+from jtqd.drivers.sdo import NO_OBJECT, NO_SUBINDEX, BootError, FrameSdo, SdoAbort, SdoSilence
+from jtqd.drivers.sdo_server import SdoServer
+from jtqd.sim_can import drive_node as cia402
+from jtqd.sysid.motion.cia402 import CST, CSV
+from jtqd.sysid.motion.setup import quick_stop, release, reset_fault, sensor_units, set_up, switch_off
+from tests.drivers.canopen_nodes import drive_store
+from tests.sysid.motion.motion_helpers import BenchAccess, LockStep
+
+
+@pytest.fixture
+def lock() -> LockStep:
+    return LockStep()
+
+
+class Bent:
+    """An access whose answers to some objects are replaced: a number (4 bytes) or an abort code as SdoAbort."""
+
+    def __init__(self, access: BenchAccess, answers: dict[tuple[int, int], int | SdoAbort]) -> None:
+        self.access, self.answers = access, answers
+
+    def read(self, index: int, subindex: int) -> bytes:
+        answer = self.answers.get((index, subindex))
+        if isinstance(answer, SdoAbort):
+            raise answer
+        return self.access.read(index, subindex) if answer is None else answer.to_bytes(4, "little")
+
+    def write(self, index: int, subindex: int, data: bytes) -> None:
+        answer = self.answers.get((index, subindex))
+        if isinstance(answer, SdoAbort):
+            raise answer
+        self.access.write(index, subindex, data)
+
+
+def configure(
+    lock: LockStep, answers: dict[tuple[int, int], int | SdoAbort], *, temperature: bool = True
+) -> None:
+    set_up(Bent(lock.access(1), answers), DriveProfile(1), CSV, 300, lock.sleep, temperature=temperature)
+
+
+def test_a_drive_is_configured_and_says_how_it_counts(lock: LockStep) -> None:
+    units = set_up(lock.access(2), DriveProfile(2), CST, 300, lock.sleep, temperature=True)
+    store = lock.bench.drives[1].store
+    assert store.number(0x1016, 2) == 0x0021_012C, "node 21h, 300 ms"
+    assert (store.number(0x60C2, 1), store.number(0x60C2, 2)) == (2, -3)
+    assert store.number(0x1802, 1) == 0x4000_0382, "TPDO3 is on, although jtqd's boot had switched it off"
+    assert lock.bench.drives[1]._mode == CST
+    assert (units.node, units.mode, units.gear_ratio, units.heartbeat_ms) == (2, CST, 100.0, 100)
+    assert units.current_units(1.0) == 125, "1/1000 of 8 A"
+    assert units.current_units(-9.0) == -1125
+    assert units.velocity_units(1.0) == 1043038, "100 turns of 65536 counts in 2 pi seconds"
+
+
+def test_the_sensor_says_how_it_counts(lock: LockStep) -> None:
+    units = sensor_units(lock.access(3), SensorProfile(3))
+    assert (units.node, units.heartbeat_ms) == (3, 100)
+    assert units.nm_per_unit == pytest.approx((0.001,))
+
+
+@pytest.mark.parametrize(
+    ("answers", "line"),
+    [
+        ({(0x1000, 0): 0x194}, "node 1: 1000h:0 device type: expected profile 402"),
+        ({(0x6076, 0): 0}, "node 1: 6076h:0 motor rated torque in mNm: expected 1.., found 0"),
+        ({(0x6075, 0): 0}, "node 1: 6075h:0 motor rated current in mA: expected 1..1000000, found 0"),
+        ({(0x1017, 0): 0}, "node 1: 1017h:0 producer heartbeat time in ms: expected 1.., found 0"),
+        ({(0x1400, 1): 0x8000_0201}, "node 1: 1400h:1 COB-ID of RPDO: expected 201h, found 0x80000201"),
+        ({(0x1600, 2): 0x60FF_0020}, "node 1: 1600h:1 mapping of RPDO: expected 60400010 60710010, found 60400010 60FF0020"),
+        ({(0x1601, 0): 0}, "node 1: 1601h:1 mapping of RPDO: expected 60FF0020, found nothing"),
+        ({(0x6061, 0): 8}, "node 1: 6061h:0 mode of operation display: expected 9, found 8"),
+        ({(0x6060, 0): SdoAbort(0x0609_0030)}, "node 1: 6060h:0: write of 0x09 refused: value out of range (06090030h)"),
+        ({(0x60C2, 1): 1}, "node 1: 60C2h:1 read back: expected 0x2, found 0x1"),
+        ({(0x1802, 1): SdoAbort(NO_OBJECT)}, "node 1: no TPDO3 with a temperature of 16 bits (1A02h:1): "),
+        ({(0x1A02, 0): 0}, "node 1: no TPDO3 with a temperature of 16 bits (1A02h:1): "),
+        ({(0x1A02, 1): 0x3001_0020}, "node 1: no TPDO3 with a temperature of 16 bits (1A02h:1): "),
+        ({(0x1802, 1): 0x4000_0384}, "node 1: 1802h:1 COB-ID of TPDO3: expected 381h, found 0x40000384"),
+        ({(0x1016, 2): SdoAbort(NO_SUBINDEX)}, "node 1: 1016h:2: write of 0x0021012C refused: sub-index does not exist"),
+    ],
+)  # fmt: skip
+def test_a_drive_that_cannot_be_used_is_refused_in_one_line(
+    lock: LockStep, answers: dict[tuple[int, int], int | SdoAbort], line: str
+) -> None:
+    with pytest.raises(BootError) as refused:
+        configure(lock, answers)
+    assert str(refused.value).startswith(line)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_drive_without_temperature_may_be_used_when_none_is_limited(lock: LockStep) -> None:
+    configure(lock, {(0x1802, 1): SdoAbort(NO_OBJECT)}, temperature=False)
+
+
+def test_a_fault_is_reset_and_said(lock: LockStep) -> None:
+    machine = lock.bench.drives[0].machine
+    assert reset_fault(lock.access(1), 1, lock.sleep) is None
+    machine.fault()
+    lock.bench.drives[0]._error_code = 0x2310
+    assert reset_fault(lock.access(1), 1, lock.sleep) == "fault 2310h"
+    assert machine.state == cia402.SWITCH_ON_DISABLED
+
+
+def test_a_fault_that_stays_is_refused(lock: LockStep) -> None:
+    lock.bench.drives[0].machine.fault()
+    with pytest.raises(BootError, match=r"node 1: fault 2310h cannot be reset: fault \(statusword 0218h\)"):
+        reset_fault(Bent(lock.access(1), {(0x6041, 0): 0x0218, (0x603F, 0): 0x2310}), 1, lock.sleep)
+
+
+def test_a_drive_that_runs_is_braked_before_its_power_goes(lock: LockStep) -> None:
+    """Enabled at 1 rad/s by somebody: quick stop first, and it stands when the power is off."""
+    set_up(lock.access(1), DriveProfile(1), CSV, 300, lock.sleep, temperature=False)
+    access = lock.access(1)
+    access.write(0x60FF, 0, (1043038).to_bytes(4, "little"))
+    for word in (6, 7, 15):
+        access.write(0x6040, 0, word.to_bytes(2, "little"))
+    for _ in range(300):
+        lock.now += 1_000_000
+        lock.to_bench(0x080, b"\x01")
+    assert lock.velocities[0] == pytest.approx(1.0, abs=0.1)
+    words = []
+    write = access.write
+    access.write = lambda i, s, d: (words.append(d) if i == 0x6040 else None, write(i, s, d))[1]  # type: ignore[method-assign,func-returns-value]
+    switch_off(access, 1, lock.sleep)
+    assert words == [b"\x02\x00", b"\x00\x00"]
+    assert lock.states[0] == cia402.SWITCH_ON_DISABLED
+    assert abs(lock.velocities[0]) < 0.02
+    quick_stop(access, 1)
+    assert len(words) == 2, "a drive that is off is not commanded"
+
+
+def test_a_drive_that_stays_powered_is_said(lock: LockStep) -> None:
+    with pytest.raises(
+        BootError, match=r"node 1: 6041h:0: expected disabled, found operation enabled \(statusword 1237h\)"
+    ):
+        switch_off(Bent(lock.access(1), {(0x6041, 0): 0x1237}), 1, lock.sleep)
+
+
+def test_after_the_motion_nobody_watches_and_the_targets_are_zero(lock: LockStep) -> None:
+    access = lock.access(2)
+    set_up(access, DriveProfile(2), CST, 300, lock.sleep, temperature=False)
+    lock.to_bench(0x721, b"\x05")
+    access.write(0x6071, 0, b"\x10\x00")
+    release(access, 2, lock.sleep)
+    store = lock.bench.drives[1].store
+    assert (store.number(0x1016, 2), store.number(0x6071), store.number(0x60FF)) == (0, 0, 0)
+    lock.sleep(1.0)
+    assert lock.bench.drives[1].machine.state == cia402.SWITCH_ON_DISABLED, "no fault by a missing heartbeat"
+
+
+# SDO over a frame socket ------------------------------------------------------------------------------------
+
+
+class FakeSocket:
+    """A frame socket with one node behind it; `answers` may change or drop the reply to request number n."""
+
+    def __init__(self, answer: Callable[[int, bytes], list[tuple[int, bytes]]] | None = None) -> None:
+        self.store = drive_store(5)
+        self.server = SdoServer(self.store)
+        self.frames = bytearray(16 * 32)
+        self.requests: list[bytes] = []
+        self.waiting: list[bytes] = []
+        self.answer = answer or (lambda n, reply: [(0x585, reply)])
+
+    def send(self, frame16: bytes) -> bool:
+        can_id, length, data = FRAME.unpack(frame16)
+        assert (can_id, length) == (0x605, 8)
+        self.requests.append(data)
+        reply = self.server.handle(data)
+        if reply is not None:
+            self.waiting += [pack(*each) for each in self.answer(len(self.requests), reply)]
+        return True
+
+    def wait(self, timeout_s: float | None) -> bool:
+        return bool(self.waiting)
+
+    def receive(self) -> int:
+        count = len(self.waiting)
+        self.frames[: 16 * count] = b"".join(self.waiting)
+        self.waiting = []
+        return count
+
+
+def test_sdo_transcripts() -> None:
+    socket = FakeSocket()
+    sdo = FrameSdo(socket, 5)
+    assert sdo.read(0x1000, 0) == (0x0002_0192).to_bytes(4, "little")
+    assert sdo.read(0x60C2, 1) == b"\x01"
+    sdo.write(0x6040, 0, b"\x06\x00")
+    sdo.write(0x60FF, 0, struct.pack("<i", -5))
+    assert [request.hex() for request in socket.requests] == [
+        "4000100000000000",
+        "40c2600100000000",
+        "2b40600006000000",
+        "23ff6000fbffffff",
+    ]
+    assert socket.store.number(0x60FF) == -5
+    with pytest.raises(ValueError, match=r"1\.\.4 bytes"):
+        sdo.write(0x6040, 0, b"")
+
+
+def test_sdo_refusals_and_long_objects_are_aborts() -> None:
+    socket = FakeSocket()
+    sdo = FrameSdo(socket, 5)
+    with pytest.raises(SdoAbort) as refused:
+        sdo.write(0x6041, 0, b"\0\0")
+    assert refused.value.code == 0x0601_0002
+    with pytest.raises(SdoAbort) as refused:
+        sdo.read(0x1008, 0)
+    assert refused.value.code == 0x0607_0012
+    assert socket.requests[-1].hex() == "8008100012000706", "the server is told"
+    assert sdo.read(0x1000, 0), "and is ready again"
+
+
+def test_sdo_asks_again_and_takes_no_answer_that_is_not_its_own() -> None:
+    """The first reply is lost; the second comes behind one of another node, a short one and one to another object."""
+    others = [(0x586, bytes(8)), (0x585, b"\x43\x00\x10"), (0x585, b"\x43\x18\x10\x01\x99\x00\x00\x00")]
+    socket = FakeSocket(lambda n, reply: [] if n == 1 else [*others, (0x585, reply)])
+    assert FrameSdo(socket, 5).read(0x1000, 0) == (0x0002_0192).to_bytes(4, "little")
+    assert len(socket.requests) == 2
+
+
+def test_sdo_silence_ends_in_time() -> None:
+    socket = FakeSocket(lambda n, reply: [])
+    with pytest.raises(SdoSilence, match=r"no answer within 0\.15 s"):
+        FrameSdo(socket, 5, 0.15).read(0x1000, 0)
+    assert len(socket.requests) == 2

@@ -1,0 +1,257 @@
+"""Each way a motion is stopped, once: who is named, how fast both joints stand, that no set-point follows.
+
+Lock-step with the emulated bench, so the truth is known: the plant's velocities, and what the bench has said on the bus.
+"""
+
+import re
+import struct
+from dataclasses import replace
+
+import pytest
+
+from jtqd.sim_can import drive_node as cia402
+from jtqd.sysid.motion.stopping import Phase
+from tests.sysid.motion.motion_helpers import MS, WARM, WIDE, LockStep, plateau
+from tests.sysid.motion.motion_stop_helpers import (
+    BRAKE_MS,
+    CURRENT,
+    RAMP_MS,
+    SPEED,
+    Frames,
+    changed,
+    started,
+    stopped_with,
+    until_stop,
+)
+
+
+@pytest.fixture
+def lock() -> LockStep:
+    return LockStep()
+
+
+# Limits, reached by the true plant --------------------------------------------------------------------------
+
+
+def test_current_of_the_driving_joint(lock: LockStep) -> None:
+    """Planned 3 A, limit 2.5 A: joint 2 is named when its true current has come there, not before.
+
+    At negative speed it drives joint 1, which needs less.
+    """
+    lock.commander(plateau(-0.5, CURRENT, ramp_ms=1000), replace(WIDE, current_a=2.5))
+    until_stop(lock, 2000)
+    assert lock.source.plant.drives[1].current_a == pytest.approx(2.5, abs=0.06)
+    stopped_with(lock, r"joint 2: current 2\.5\d\d A, limit 2\.5 A")
+
+
+def test_current_of_the_velocity_joint(lock: LockStep) -> None:
+    """At positive speed joint 1 drives joint 2 as well, and needs more than its 3 A."""
+    lock.commander(plateau(0.5, CURRENT, ramp_ms=1000), replace(WIDE, current_a=3.4))
+    until_stop(lock, 2000)
+    assert lock.source.plant.drives[0].current_a == pytest.approx(3.4, abs=0.1)
+    assert lock.source.plant.drives[1].current_a < 3.1
+    stopped_with(lock, r"joint 1: current 3\.4\d\d A, limit 3\.4 A")
+
+
+def test_velocity(lock: LockStep) -> None:
+    lock.commander(plateau(SPEED, CURRENT), replace(WIDE, velocity_rad_s=1.0))
+    until_stop(lock, 1000)
+    assert abs(lock.velocities[0]) == pytest.approx(1.0, abs=0.05)
+    stopped_with(lock, r"joint [12]: velocity -?1\.0\d+ rad/s, limit 1 rad/s")
+
+
+def test_torque(lock: LockStep) -> None:
+    lock.commander(plateau(SPEED, CURRENT), replace(WIDE, torque_nm=10.0))
+    until_stop(lock, 1000)
+    assert abs(lock.source.channels[0].torque_nm) == pytest.approx(10.0, abs=1.0)
+    stopped_with(lock, r"joints 1 and 2: torque at the sensor -?1\d\.\d\d Nm, limit 10 Nm")
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_travel(lock: LockStep, direction: int) -> None:
+    lock.commander(plateau(direction * SPEED, CURRENT, hold_ms=3000), replace(WIDE, travel_rad=1.2))
+    until_stop(lock, 3000)
+    plant = lock.source.plant
+    assert plant.motor_position[0] / 100 == pytest.approx(direction * 1.2, abs=0.01)
+    minus_1, minus_2 = ("-", "") if direction < 0 else ("", "-")
+    reason = rf"joint (1: travel {minus_1}|2: travel {minus_2})1\.20\d rad, limit 1\.2 rad"
+    stopped_with(lock, reason)
+    assert abs(plant.motor_position[0] / 100) < 1.2 + SPEED**2 / 20 + 0.05, "stopping distance v^2 / 2a"
+
+
+# Limits and signals of each joint, told on the bus ----------------------------------------------------------
+
+
+# COB-ID, layout, place
+VELOCITY_FIELD = (0x280, "<ihH", 0)
+CURRENT_FIELD = (0x280, "<ihH", 1)
+TEMPERATURE_FIELD = (0x380, "<h", 0)
+
+
+@pytest.mark.parametrize("joint", [1, 2])
+@pytest.mark.parametrize(
+    ("field", "value", "line"),
+    [
+        (CURRENT_FIELD, 1200, "current 9.600 A, limit 9 A"),
+        (CURRENT_FIELD, -1200, "current -9.600 A, limit 9 A"),
+        (VELOCITY_FIELD, 3650633, "velocity 3.500 rad/s, limit 3.3 rad/s"),
+        (VELOCITY_FIELD, -3650633, "velocity -3.500 rad/s, limit 3.3 rad/s"),
+        (TEMPERATURE_FIELD, 703, "temperature 70.3 °C, limit 70 °C"),
+    ],
+)
+def test_one_sample_beyond_a_limit_names_its_joint(
+    lock: LockStep, joint: int, field: tuple[int, str, int], value: int, line: str
+) -> None:
+    base, layout, place = field
+    started(lock, WARM)
+    pending = [True]
+
+    def once(data: bytes) -> bytes:
+        if not pending:
+            return data
+        pending.clear()
+        fields = list(struct.unpack(layout, data))
+        fields[place] = value
+        return struct.pack(layout, *fields)
+
+    lock.filter = changed(base + joint, once)
+    assert until_stop(lock, 600) <= (500 if base == 0x380 else 1) + 1
+    stopped_with(lock, re.escape(f"joint {joint}: {line}"))
+
+
+@pytest.mark.parametrize("encoder", ["motor", "link"])
+def test_a_dead_encoder_does_not_hide_the_travel(lock: LockStep, encoder: str) -> None:
+    """One encoder of each joint stays where it is; the others still know."""
+    started(lock, replace(WIDE, travel_rad=2.0))
+    frozen: dict[int, bytes] = {}
+
+    def freeze(frames: Frames) -> Frames:
+        out = []
+        for can_id, data, t_ns in frames:
+            content = data
+            if can_id in (0x181, 0x182):
+                old = frozen.setdefault(can_id, data)
+                content = old[:4] + data[4:] if encoder == "motor" else data[:4] + old[4:]
+            out.append((can_id, content, t_ns))
+        return out
+
+    lock.filter = freeze
+    until_stop(lock, 3000)
+    stopped_with(lock, r"joint [12]: travel -?2\.00\d rad, limit 2 rad")
+
+
+# Inputs, drives, nodes --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("gone", "line"),
+    [
+        (0x181, "joint 1: TPDO1 (181h) missing for 6 cycles, limit 5"),
+        (0x281, "joint 1: TPDO2 (281h) missing for 6 cycles, limit 5"),
+        (0x182, "joint 2: TPDO1 (182h) missing for 6 cycles, limit 5"),
+        (0x282, "joint 2: TPDO2 (282h) missing for 6 cycles, limit 5"),
+        (0x183, "sensor: torque of channel 1 missing for 6 cycles, limit 5"),
+    ],
+)
+def test_a_pdo_that_stays_away(lock: LockStep, gone: int, line: str) -> None:
+    started(lock)
+    lock.filter = lambda frames: [frame for frame in frames if frame[0] != gone]
+    assert until_stop(lock, 100) == 6
+    stopped_with(lock, re.escape(line))
+    assert lock.states == (cia402.SWITCH_ON_DISABLED, cia402.SWITCH_ON_DISABLED)
+
+
+def test_a_pdo_of_another_length_is_none(lock: LockStep) -> None:
+    started(lock)
+    lock.filter = changed(0x281, lambda data: data[:7])
+    assert until_stop(lock, 100) == 6
+    stopped_with(lock, re.escape("joint 1: TPDO2 (281h) missing for 6 cycles, limit 5"))
+
+
+def test_five_missing_pdos_are_no_reason(lock: LockStep) -> None:
+    started(lock)
+    lock.filter = lambda frames: [frame for frame in frames if frame[0] != 0x282]
+    lock.run_for(5)
+    lock.filter = lambda frames: frames
+    lock.run_for(50)
+    assert lock.motion.phase is Phase.PLAYING
+
+
+@pytest.mark.parametrize("joint", [1, 2])
+def test_a_fault_of_one_drive_brakes_both(lock: LockStep, joint: int) -> None:
+    """Also that of the velocity joint: the other's current must not run away with the pair."""
+    started(lock)
+    lock.bench.drives[joint - 1].machine.fault()
+    assert until_stop(lock, 10) <= 2
+    assert lock.motion.phase is Phase.BRAKING
+    reason = (
+        rf"joint {joint}: fault( reaction active)? \(statusword [0-9A-F]{{4}}h\), expected operation enabled"
+    )
+    stopped_with(lock, reason, BRAKE_MS)
+    assert not lock.setpoints_sent(lock.now // MS - 20)
+
+
+def test_a_drive_that_trips_on_current_names_its_fault(lock: LockStep) -> None:
+    """The true drive 2 measures 13 A for a moment: EMCY 2310h or its state, whichever comes first."""
+    started(lock)
+    drive = lock.bench.drives[1]
+    drive._ratings = replace(drive._ratings, trip_current_a=2.0)
+    until_stop(lock, 10)
+    stopped_with(lock, r"joint 2: EMCY 2310h \(error register 03h\)|joint 2: fault.*", BRAKE_MS)
+
+
+@pytest.mark.parametrize("joint", [1, 2])
+def test_an_emcy(lock: LockStep, joint: int) -> None:
+    started(lock)
+    told = iter([[(0x080 + joint, bytes.fromhex("1042 08 0000000000"), lock.now)]])
+    lock.filter = lambda frames: [*frames, *next(told, [])]
+    assert until_stop(lock, 10) == 1
+    assert lock.motion.phase is Phase.BRAKING
+    stopped_with(lock, rf"joint {joint}: EMCY 4210h \(error register 08h\)", BRAKE_MS)
+
+
+@pytest.mark.parametrize(("node", "who"), [(1, "joint 1"), (2, "joint 2"), (3, "sensor")])
+def test_a_node_whose_heartbeat_stops(lock: LockStep, node: int, who: str) -> None:
+    started(lock)
+    lock.filter = lambda frames: [frame for frame in frames if frame[0] != 0x700 + node]
+    assert 200 <= until_stop(lock, 1000) <= 302
+    stopped_with(lock, rf"{who}: no heartbeat for 30\d ms, limit 300 ms")
+
+
+def test_the_sensor_says_that_it_is_not_valid(lock: LockStep) -> None:
+    started(lock)
+    lock.source.channels[0].valid = False
+    until_stop(lock, 10)
+    stopped_with(lock, "sensor: status of channel 1 is 01h, expected 00h")
+
+
+@pytest.mark.parametrize("node", [1, 2])
+def test_a_node_that_hears_no_rpdo_any_more_is_stopped_by_sdo(lock: LockStep, node: int) -> None:
+    """Pre-operational: its heartbeat says so, its power stage does not know. 10 ms later an SDO brakes it."""
+    started(lock)
+    lock.to_bench(0, bytes([0x80, node]))
+    assert until_stop(lock, 10) <= 7
+    assert lock.motion.phase is Phase.BRAKING
+    reason = rf"joint {node}: (NMT pre-operational, expected operational|TPDO2 \(28{node}h\) missing for 6 cycles, limit 5)"
+    stopped_with(lock, reason, BRAKE_MS + 20)
+    by_sdo = [each for each in lock.sent if each[1] == 0x600 + node]
+    assert [data.hex() for _, _, data in by_sdo] == ["2b40600002000000"]
+
+
+def test_a_drive_that_obeys_nothing_hears_no_heartbeat_and_stops_by_itself(lock: LockStep) -> None:
+    """Neither RPDO nor SDO reach drive 1: after 0.2 s our heartbeat ends, 0.3 s later it brakes with 8130h."""
+    started(lock)
+    reach = lock.bench.drives[0].on_frame
+    lock.bench.drives[0].on_frame = lambda i, d, t: [] if i in (0x201, 0x301, 0x601) else reach(i, d, t)  # type: ignore[method-assign]
+    lock.motion.stop("SIGTERM")
+    lock.cycle()
+    lock.run_for(RAMP_MS + 300 + 10)
+    assert lock.motion.phase is Phase.BRAKING
+    assert abs(lock.velocities[0]) > 1.0, "it still turns"
+    lock.run_for(230)
+    assert lock.motion.silent
+    lock.run_for(300 + BRAKE_MS)
+    assert max(abs(v) for v in lock.velocities) < 0.02
+    assert lock.bench.drives[0].store.number(0x1003, 1) & 0xFFFF == 0x8130
+    lock.run()
+    assert lock.motion.result.reason == "SIGTERM"

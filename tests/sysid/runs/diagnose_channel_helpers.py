@@ -1,0 +1,62 @@
+"""Emulated bench runs and ways to spoil them, for the tests of a diagnosis' channel checks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
+from jtqd.models.files import load_joint, shipped
+from jtqd.sim_can.emulated_run import JointCommand, emulate_run
+from jtqd.sim_can.plant_file import load_plant
+from jtqd.sysid.runs.channels import Checked, check_runs
+
+JOINTS = {number: load_joint(shipped(f"joint{number}.yaml")) for number in (1, 2)}
+DEGREES = 180.0 / math.pi
+Change = Callable[[JointColumns], JointColumns]
+
+
+def motion(scale: float = 1.0, offset: float = 0.0) -> tuple[JointCommand, JointCommand]:
+    """A velocity and a current that fill all four quadrants within 20 s."""
+    return (
+        JointCommand.velocity(lambda t: scale * 0.9 * math.sin(1.1 * t) * math.sin(0.4 * t + 0.3) + offset),
+        JointCommand.current(lambda t: 2.5 * math.sin(1.7 * t + 0.1)),
+    )
+
+
+def bench() -> RunTable:
+    """20 s of the campaign's bench on another day."""
+    return emulate_run(load_plant(shipped("campaign_plant.yaml")), motion(), 20.0, 5, day=3)
+
+
+def changed(table: RunTable, change: Change, number: int = 1) -> RunTable:
+    return RunTable(table.time_s, {**table.joints, number: change(table.joints[number])})
+
+
+def times(names: str, factor: float) -> Change:
+    def change(columns: JointColumns) -> JointColumns:
+        return replace(columns, **{name: getattr(columns, name) * factor for name in names.split()})
+
+    return change
+
+
+def each_column(table: RunTable, change: Callable[[FloatArray], FloatArray]) -> RunTable:
+    def of(columns: JointColumns) -> JointColumns:
+        parts = {name: getattr(columns, name) for name in COLUMN_NAMES}
+        return JointColumns(**{name: None if c is None else change(c) for name, c in parts.items()})
+
+    return RunTable(change(table.time_s), {number: of(columns) for number, columns in table.joints.items()})
+
+
+def checked(table: RunTable, joints: dict[int, Joint] | None = None) -> Checked:
+    result = check_runs([("r.csv", table)], joints or JOINTS)
+    for line in (*result.refused, *result.notes):
+        assert line.startswith("r.csv: ")
+        assert "\n" not in line
+    return result
+
+
+ANGLES = "motor_position_rad motor_velocity_rad_s link_position_rad"

@@ -1,0 +1,231 @@
+"""From jtqd's log to the run table: what is in it, what is left out, and that every slot is accounted for."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jtqd.daemon.logs.errors import LogError
+from jtqd.estimator.run import COLUMN_NAMES
+from jtqd.sysid.runs.logs import log_to_run
+from tests.daemon.logs.campaign_log import OFF, Cycle, Joint, regular, temperature, write_log
+
+NAN = math.nan
+
+
+def joints(n: int, **changes: float) -> tuple[Joint, Joint]:
+    """Every column of either joint another function of the cycle."""
+    one = Joint(0.1 * n, 10.0 + n, 20.0 + 2 * n, 0.01 * n, 3.0 + 0.5 * n)
+    two = Joint(-0.2 * n, -10.0 - n, -20.0 - 2 * n, -0.01 * n, 3.0 + 0.5 * n)
+    return one._replace(**changes), two  # type: ignore[arg-type]
+
+
+def test_every_column_is_the_log_s_and_time_is_that_of_sync(tmp_path: Path) -> None:
+    cycles = regular(50, joints)
+    cycles = [cycle._replace(time_ns=cycle.time_ns + 1000 * (cycle.index % 7)) for cycle in cycles]
+    logged = log_to_run(write_log(tmp_path / "a.mcap", cycles))
+    expected = (np.array([c.time_ns for c in cycles]) - cycles[0].time_ns) * 1e-9
+    assert logged.table.time_s == pytest.approx(expected, abs=1e-12)
+    for number in (1, 2):
+        for name, field in zip(
+            ("current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad", "torque_nm"),
+            ("current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad", "sensor_nm"),
+            strict=True,
+        ):
+            wanted = [getattr(cycle.joints[number - 1], field) for cycle in cycles]
+            assert getattr(logged.table.joints[number], name).tolist() == wanted
+        assert logged.table.joints[number].temperature_c is None
+        assert logged.table.joints[number].link_velocity_rad_s is None
+    assert (logged.missed, logged.incomplete, logged.lost_share) == (0, 0, 0.0)
+
+
+def test_a_run_of_several_parts_is_one_table(tmp_path: Path) -> None:
+    """A run longer than recording.rotate_s; the recorder was killed as well: cycles 30 to 34 are in both parts."""
+    cycles = regular(90, joints)
+    whole = log_to_run(write_log(tmp_path / "a.mcap", cycles))
+    parts = [tmp_path / "b-20260101T000000Z-0001.mcap", tmp_path / "b-20260101T000000Z-0002.mcap"]
+    write_log(parts[0], cycles[:35])
+    write_log(parts[1], cycles[30:])
+    logged = log_to_run(parts)
+    assert logged.table.time_s.tolist() == whole.table.time_s.tolist()
+    assert (logged.missed, logged.incomplete) == (0, 0)
+    for number in (1, 2):
+        columns = [each.table.joints[number] for each in (logged, whole)]
+        assert columns[0].motor_position_rad.tolist() == columns[1].motor_position_rad.tolist()
+
+
+def test_only_cycles_in_which_both_drives_are_enabled_are_the_run(tmp_path: Path) -> None:
+    def wanted(n: int) -> tuple[Joint, Joint]:
+        one, two = joints(n)
+        # joint 1 is enabled from 10 to 79, joint 2 from 20 to 89: the run is 20 to 79
+        return (
+            one if 10 <= n < 80 else one._replace(statusword=OFF),
+            two if 20 <= n < 90 else two._replace(statusword=OFF),
+        )
+
+    logged = log_to_run(write_log(tmp_path / "a.mcap", regular(100, wanted)))
+    assert len(logged.table.time_s) == 60
+    assert logged.table.joints[1].current_a is not None
+    assert logged.table.joints[1].current_a[0] == pytest.approx(2.0)
+
+
+def test_the_column_enabled_is_there_where_the_power_was_off_within_the_run(tmp_path: Path) -> None:
+    """Switch on disabled, ready and switched on carry no current; quick stop active (1217h) does."""
+    words = {10: 0x1250, 11: 0x1231, 12: 0x1233, 13: 0x1217}
+
+    def wanted(n: int) -> tuple[Joint, Joint]:
+        one, two = joints(n)
+        return one._replace(statusword=words.get(n, one.statusword)), two
+
+    logged = log_to_run(write_log(tmp_path / "a.mcap", regular(30, wanted)))
+    enabled = logged.table.joints[1].enabled
+    assert enabled is not None
+    assert np.flatnonzero(enabled == 0.0).tolist() == [10, 11, 12]
+    assert set(enabled) == {0.0, 1.0}
+    assert logged.table.joints[2].enabled is None, "its power was on all the time"
+    assert (logged.missed, logged.incomplete) == (0, 0)
+
+
+def test_missing_inputs_and_cycles_are_left_out_and_counted_by_input(tmp_path: Path) -> None:
+    def wanted(n: int) -> tuple[Joint, Joint]:
+        one, two = joints(n)
+        if n in (5, 6):
+            one = Joint(NAN, NAN, NAN, NAN, one.sensor_nm, 0, 4)
+        if n == 6:
+            two = Joint(NAN, NAN, NAN, NAN, two.sensor_nm, 0, 4)
+        if n in (6, 9, 10):
+            one, two = one._replace(sensor_nm=NAN), two._replace(sensor_nm=NAN)
+        return one, two
+
+    cycles = [cycle for n, cycle in enumerate(regular(40, wanted)) if n not in (20, 21, 22)]
+    logged = log_to_run(write_log(tmp_path / "a.mcap", cycles))
+    assert logged.missed == 3
+    assert logged.incomplete == 4
+    assert logged.incomplete_by == {"joint 1": 2, "joint 2": 1, "sensor": 3}
+    assert len(logged.table.time_s) + logged.missed + logged.incomplete == 40
+    assert logged.lost_share == pytest.approx(7 / 40)
+    assert logged.longest_gap_s == pytest.approx(0.004)
+    for columns in logged.table.joints.values():
+        for name in COLUMN_NAMES:
+            column = getattr(columns, name)
+            assert column is None or np.isfinite(column).all()
+
+
+def test_a_sensor_that_never_says_anything_leaves_the_rest(tmp_path: Path) -> None:
+    def wanted(n: int) -> tuple[Joint, Joint]:
+        one, two = joints(n)
+        return one._replace(sensor_nm=NAN, input_flags=3), two._replace(sensor_nm=NAN, input_flags=3)
+
+    for sensor in (True, False):
+        log = write_log(tmp_path / f"{sensor}.mcap", regular(30, wanted))
+        logged = log_to_run(log, sensor=sensor)
+        assert len(logged.table.time_s) == 30
+        assert logged.table.joints[1].torque_nm is None
+        assert logged.table.joints[1].current_a is not None
+
+
+def test_a_joint_without_a_channel_of_the_sensor_has_no_torque(tmp_path: Path) -> None:
+    def wanted(n: int) -> tuple[Joint, Joint]:
+        one, two = joints(n)
+        return one, two._replace(sensor_nm=NAN, input_flags=3)
+
+    table = log_to_run(write_log(tmp_path / "a.mcap", regular(30, wanted))).table
+    assert table.joints[1].torque_nm is not None
+    assert table.joints[2].torque_nm is None
+    assert len(table.time_s) == 30
+
+
+def test_temperature_holds_between_its_frames_and_before_the_first_one(tmp_path: Path) -> None:
+    cycles = regular(40, joints)
+
+    def with_frames(at: int, *frames: tuple[int, bytes]) -> None:
+        cycles[at] = cycles[at]._replace(frames=[(0x181, bytes(8)), *frames])
+
+    with_frames(10, temperature(4, 31.5), temperature(5, -3.2))
+    with_frames(20, temperature(4, 33.0), (0x385, b"\x00\x80"))  # 8000h: not measured
+    with_frames(30, (0x384, b"\x01"))  # too short: not a temperature
+    logged = log_to_run(write_log(tmp_path / "a.mcap", cycles), nodes=(4, 5))
+    one, two = (logged.table.joints[number].temperature_c for number in (1, 2))
+    assert one is not None
+    assert two is not None
+    assert one.tolist() == pytest.approx([31.5] * 20 + [33.0] * 20)
+    assert two.tolist() == pytest.approx([-3.2] * 40)
+    assert log_to_run(tmp_path / "a.mcap", nodes=(1, 2)).table.joints[1].temperature_c is None
+
+
+def test_a_temperature_from_before_the_motion_counts(tmp_path: Path) -> None:
+    def wanted(n: int) -> tuple[Joint, Joint]:
+        one, two = joints(n)
+        return (one, two) if n >= 20 else (one._replace(statusword=OFF), two)
+
+    cycles = regular(40, wanted)
+    cycles[3] = cycles[3]._replace(frames=[temperature(1, 25.0)])
+    table = log_to_run(write_log(tmp_path / "a.mcap", cycles)).table
+    assert table.joints[1].temperature_c is not None
+    assert table.joints[1].temperature_c.tolist() == [25.0] * 20
+
+
+def test_a_temperature_told_with_the_drive_off_does_not_hold_in_the_motion(tmp_path: Path) -> None:
+    """An emulated day begins when the drives are enabled: what was told before is of the day before."""
+
+    def wanted(n: int) -> tuple[Joint, Joint]:
+        one, two = joints(n)
+        return (one, two) if n >= 20 else (one._replace(statusword=OFF), two)
+
+    cycles = regular(40, wanted)
+    for at, value in ((3, 25.0), (27, 29.0), (35, 29.5)):
+        cycles[at] = cycles[at]._replace(frames=[temperature(1, value)])
+    table = log_to_run(write_log(tmp_path / "a.mcap", cycles)).table
+    assert table.joints[1].temperature_c is not None
+    assert table.joints[1].temperature_c.tolist() == pytest.approx([29.0] * 15 + [29.5] * 5)
+
+
+def test_logs_without_a_motion_are_refused_in_one_line(tmp_path: Path) -> None:
+    def off(n: int) -> tuple[Joint, Joint]:
+        one, two = joints(n)
+        return one, two._replace(statusword=OFF)
+
+    def deaf(n: int) -> tuple[Joint, Joint]:
+        one, two = joints(n)
+        return one._replace(link_position_rad=NAN), two
+
+    for name, wanted, words in (
+        ("off", off, ["operation enabled", "found 0"]),
+        ("deaf", deaf, ["j1.link_position_rad", "found no value"]),
+    ):
+        path = write_log(tmp_path / f"{name}.mcap", regular(30, wanted))
+        with pytest.raises(LogError) as caught:
+            log_to_run(path)
+        assert len(str(caught.value).splitlines()) == 1
+        for word in [str(path), *words]:
+            assert word in str(caught.value)
+
+
+def test_the_account_holds_for_any_losses(tmp_path: Path) -> None:
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        lost = rng.random((200, 4)) < 0.05
+        lost[[0, -1]] = False  # the run's own ends
+
+        def wanted(n: int, lost: np.ndarray = lost) -> tuple[Joint, Joint]:
+            one, two = joints(n)
+            if lost[n, 0]:
+                one = Joint(NAN, NAN, NAN, NAN, one.sensor_nm, 0, 4)
+            if lost[n, 1]:
+                two = Joint(NAN, NAN, NAN, NAN, two.sensor_nm, 0, 4)
+            if lost[n, 2]:
+                one, two = one._replace(sensor_nm=NAN), two._replace(sensor_nm=NAN)
+            return one, two
+
+        cycles: list[Cycle] = [c for n, c in enumerate(regular(200, wanted)) if not lost[n, 3]]
+        logged = log_to_run(write_log(tmp_path / f"{seed}.mcap", cycles))
+        good = ~lost.any(axis=1)
+        assert logged.missed == int(lost[:, 3].sum()), f"seed {seed}"
+        assert len(logged.table.time_s) == int(good.sum()), f"seed {seed}"
+        assert len(logged.table.time_s) + logged.missed + logged.incomplete == 200, f"seed {seed}"
+        found = logged.table.joints[1].current_a
+        assert found is not None
+        assert found.tolist() == pytest.approx((0.1 * np.flatnonzero(good)).tolist()), f"seed {seed}"
+        assert replace(logged, incomplete=0).lost_share <= logged.lost_share

@@ -1,0 +1,71 @@
+"""`jtq plot`: a picture is written, and --json says where and what RMSE stands in its title."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jtqd.daemon.logs.errors import LogError
+from jtqd.estimator.status import DEGRADED, STALE, STANDSTILL, VALID
+from jtqd.sysid import plot as plot_command
+
+pytest.importorskip("matplotlib")
+ROWS = [  # status, estimate, sensor
+    (VALID, 3.0, 1.0),
+    (DEGRADED, 1.0, 2.0),
+    (STANDSTILL, 9.0, 0.0),  # an interval: no error
+    (STALE, np.nan, 5.0),
+    (VALID, 4.0, np.nan),  # no reference
+]
+
+
+@pytest.fixture
+def log(monkeypatch):
+    names = ("sync_monotonic_ns", "status", "torque_nm", "sigma_nm", "sensor_torque_nm")
+    table = np.array(
+        [(n * 1_000_000, status, torque, 0.5, sensor) for n, (status, torque, sensor) in enumerate(ROWS)],
+        dtype=[(name, "i8" if name == "sync_monotonic_ns" else "f8") for name in names],
+    )
+    asked = []
+
+    def read_topic(path, topic):
+        asked.append(topic)
+        return table
+
+    monkeypatch.setattr(plot_command, "read_topic", read_topic)
+    return asked
+
+
+def test_json_names_the_picture_and_its_rmse(log, tmp_path, capsys):
+    out = tmp_path / "joint2.png"
+    assert plot_command.main(["run.mcap", "--joint", "2", "--out", str(out), "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content["paths"] == [str(out)]
+    assert content["rmse_nm"] == {"joint_2": pytest.approx((2.5) ** 0.5)}
+    assert log == ["/joint/2/state"]
+    assert out.read_bytes().startswith(b"\x89PNG")
+
+
+def test_without_json_the_path_alone_is_printed(log, tmp_path, capsys):
+    out = tmp_path / "joint1.svg"
+    assert plot_command.main(["run.mcap", "--out", str(out)]) == 0
+    assert capsys.readouterr().out == f"{out}\n"
+    assert out.read_text().startswith("<?xml")
+
+
+def test_no_reference_at_all_is_null(log, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(plot_command, "draw", lambda records, joint, path: float("nan"))
+    assert plot_command.main(["run.mcap", "--out", str(tmp_path / "a.png"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["rmse_nm"] == {"joint_1": None}
+
+
+def test_a_log_that_cannot_be_read_is_one_line(tmp_path, capsys, monkeypatch):
+    def refuse(path: Path, topic: str) -> None:
+        raise LogError(f"{path}: not a log")
+
+    monkeypatch.setattr(plot_command, "read_topic", refuse)
+    assert plot_command.main(["run.mcap", "--out", str(tmp_path / "a.png"), "--json"]) == 1
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err == "jtq plot: run.mcap: not a log\n"

@@ -1,0 +1,134 @@
+"""`jtq reproduce`: the commands, their order, what ends it, the configuration it leaves; the shipped models fit theirs."""
+
+import hashlib
+import json
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import yaml
+
+from jtqd.daemon.config import load_config
+from jtqd.models.files import load_joint, shipped
+from jtqd.sysid import reproduce as reproduce_command
+from jtqd.sysid.campaign.plan import check_plan, load_plan
+from jtqd.sysid.reproduce import steps, write_config
+
+
+def test_every_step_comes_after_what_it_reads(tmp_path):
+    made = {str(shipped(f"joint{n}.yaml")) for n in (1, 2)} | {str(shipped("campaign_plant_outside.yaml"))}
+    made |= {str(tmp_path / "outside.plan.yaml")}
+    names = []
+    for step in steps(tmp_path, "sim", True, 0):
+        names.append(step.text.split()[2 if step.module != "jtqd.daemon.jtq" else 1])
+        paths = [word for word in step.arguments if "/" in word and not word.startswith("-")]
+        out = step.arguments[step.arguments.index("--out") + 1]
+        for path in paths:
+            assert path in made or path == out or path.endswith(".png"), (step.arguments, path)
+        made.add(out)
+    assert names == [
+        "campaign",
+        "campaign",
+        *["fit"] * 4,
+        "train",
+        "train",
+        "campaign",
+        "campaign",
+        "evaluate",
+        "jtqd.sysid.campaign.emulated",
+        "evaluate",
+    ]
+
+
+def test_nothing_is_trained_on_what_judges(tmp_path):
+    for step in steps(tmp_path, "sim", False, 0):
+        if step.arguments[0] in ("fit", "train"):
+            assert not any(
+                part in word for word in step.arguments for part in ("validate", "outside", "days")
+            )
+
+
+def test_failed_step_ends_it_and_findings_of_a_campaign_do_not(tmp_path, monkeypatch, capsys):
+    called = []
+
+    def run(command, check):
+        called.append(command[3])
+        return SimpleNamespace(returncode=3 if command[3] == "campaign" else 1)
+
+    monkeypatch.setattr(subprocess, "run", run)
+    assert reproduce_command.main(["--out", str(tmp_path), "--quick"]) == 1
+    assert called == ["campaign", "campaign", "fit"]
+    assert "jtq fit ended with status 1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("done", "calls"), [([1, 2, 2], 3), ([0, 0], 2), ([], 1)])
+def test_campaign_that_ended_early_goes_on_while_runs_get_done(tmp_path, monkeypatch, capsys, done, calls):
+    """Each number is how many runs are done after an attempt that ended early; without a state nothing was begun."""
+    called = []
+
+    def run(command, check):
+        called.append(command[3])
+        state = tmp_path / "campaigns" / "excitation" / "campaign.json"
+        if done:
+            state.parent.mkdir(parents=True, exist_ok=True)
+            count = done[len(called) - 1]
+            runs = [{"name": f"run{n}", "status": "done" if n < count else "pending"} for n in range(3)]
+            state.write_text(json.dumps({"runs": runs}))
+        return SimpleNamespace(returncode=1)
+
+    monkeypatch.setattr(subprocess, "run", run)
+    assert reproduce_command.main(["--out", str(tmp_path), "--quick"]) == 1
+    assert called == ["campaign"] * calls
+    assert "jtq campaign ended with status 1" in capsys.readouterr().err
+
+
+def test_out_that_cannot_be_made_is_one_line(tmp_path, capsys):
+    file = tmp_path / "file"
+    file.touch()
+    assert reproduce_command.main(["--out", str(file / "below")]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_outside_plan_has_half_as_much_load_again_and_is_within_its_limits(tmp_path):
+    path = tmp_path / "outside.plan.yaml"
+    reproduce_command._write_outside_plan(path, 0, 2)
+    plan = load_plan(path)
+    peaks = [np.abs(points.current_a).max() for points in check_plan(plan).values()]
+    assert max(peaks) > 1.3 * 5.0  # the peak of every other campaign is 5 A
+
+
+@pytest.mark.parametrize("name", ["bench.yaml", "bench_paper.yaml"])
+def test_configuration_written_beside_the_models_is_one_that_jtqd_takes(tmp_path, name):
+    for file in shipped("trained/joint1.yaml").parent.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    write_config(tmp_path / name, name)
+    config = load_config(tmp_path / name)
+    for joint in config.joints:
+        assert joint.network is not None
+        assert joint.network.path.parent == tmp_path
+        assert hashlib.sha256(joint.network.path.read_bytes()).hexdigest() == joint.network.sha256
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_shipped_models_come_from_the_same_runs(number):
+    import onnx
+
+    joint = load_joint(shipped(f"trained/joint{number}.yaml"))
+    trained_on = joint.provenance["fused"]["sha256"]
+    for kind in ("", ".fused"):
+        model = onnx.load(str(shipped(f"trained/joint{number}{kind}.onnx")))
+        metadata = {item.key: yaml.safe_load(item.value) for item in model.metadata_props}
+        assert metadata["runs"] == trained_on
+        assert metadata["joint"] == joint.name
+
+
+@pytest.mark.campaign
+def test_quick_reproduction_from_nothing(tmp_path):
+    command = [sys.executable, "-m", "jtqd.daemon.jtq", "reproduce", "--quick", "--out", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1500, check=False)
+    assert done.returncode in (0, 3), done.stderr[-2000:]
+    assert (tmp_path / "report" / "evaluation.html").stat().st_size > 10_000
+    assert (tmp_path / "report_days" / "evaluation.html").stat().st_size > 10_000
+    assert load_config(tmp_path / "models" / "bench.yaml").estimator.method == "fused"

@@ -1,0 +1,91 @@
+"""Wheels of this project and of what it needs, made from what is installed here: a guest has no network."""
+
+import importlib.metadata
+import re
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+from packaging.requirements import Requirement
+
+from tests.paths import ROOT
+
+_LEFT_OUT = (".pyc", "/INSTALLER", "/REQUESTED", "/direct_url.json")
+
+
+def make_wheels(directory: Path) -> Path:
+    """Fill `directory`; returns the project's own wheel."""
+    directory.mkdir(parents=True, exist_ok=True)
+    for name, distribution in runtime_distributions().items():
+        if name != "jtqd":
+            _repack(distribution, directory)
+    return _own_wheel(directory)
+
+
+def make_environment(wheels: Path, own: Path, directory: Path) -> Path:
+    """A virtual environment that will lie at /opt/jtqd, made at `directory`."""
+    subprocess.run(["/usr/bin/python3", "-m", "venv", "--without-pip", str(directory)], check=True)
+    site = next((directory / "lib").glob("python3*")) / "site-packages"
+    subprocess.run(
+        [
+            *(sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-index"),
+            *("--find-links", str(wheels), "--target", str(site), str(own)),
+        ],
+        check=True,
+    )
+    shutil.rmtree(site / "bin", ignore_errors=True)
+    for command, module in (("jtqd", "jtqd.daemon.jtqd"), ("jtq", "jtqd.daemon.jtq")):
+        script = directory / "bin" / command
+        script.write_text(
+            f"#!/opt/jtqd/bin/python\nimport sys\nfrom {module} import main\nsys.exit(main())\n"
+        )
+        script.chmod(0o755)
+    return directory
+
+
+def runtime_distributions() -> dict[str, importlib.metadata.Distribution]:
+    """jtqd and all that it needs to run, by name, without extras."""
+    found: dict[str, importlib.metadata.Distribution] = {}
+    waiting = ["jtqd"]
+    while waiting:
+        requirement = Requirement(waiting.pop())
+        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
+            continue
+        distribution = importlib.metadata.distribution(requirement.name)
+        name = distribution.metadata["Name"].lower()
+        if name not in found:
+            found[name] = distribution
+            waiting += distribution.requires or []
+    return found
+
+
+def _repack(distribution: importlib.metadata.Distribution, directory: Path) -> None:
+    tags = re.findall(r"^Tag: (\S+)-(\S+)-(\S+)$", distribution.read_text("WHEEL") or "", re.MULTILINE)
+    pythons, abis, platforms = (".".join(dict.fromkeys(column)) for column in zip(*tags, strict=True))
+    name = distribution.metadata["Name"].replace("-", "_")
+    path = directory / f"{name}-{distribution.version}-{pythons}-{abis}-{platforms}.whl"
+    with zipfile.ZipFile(path, "w") as wheel:
+        for file in distribution.files or ():
+            if not str(file).startswith("..") and not str(file).endswith(_LEFT_OUT):
+                wheel.write(file.locate(), str(file))
+
+
+def _own_wheel(directory: Path) -> Path:
+    """Built from a copy: setuptools leaves its traces beside the sources."""
+    copy = directory / "source"
+    for item in ("pyproject.toml", "README.md", "LICENSE"):
+        copy.mkdir(exist_ok=True)
+        shutil.copy2(ROOT / item, copy / item)
+    for package in ("daemon", "drivers", "estimator", "models", "sim_can", "sysid"):
+        shutil.copytree(ROOT / package, copy / package, ignore=shutil.ignore_patterns("__pycache__"))
+    subprocess.run(
+        [
+            *(sys.executable, "-m", "pip", "wheel", "--quiet", "--disable-pip-version-check"),
+            *("--no-deps", "--no-build-isolation", "--wheel-dir", str(directory), str(copy)),
+        ],
+        check=True,
+    )
+    shutil.rmtree(copy)
+    return next(directory.glob("jtqd-*.whl"))

@@ -1,0 +1,81 @@
+"""jtqd as a service of a real systemd, in the bench kernel: installed, started, hung, killed, cut off, reloaded, stopped.
+
+Guest time moves only when everything sleeps: the times in the table are those of timers (watchdog, restart delay, polling)
+and count no CPU time. `make test` runs the short list with an environment made beside the guest; the campaign runs every
+step and installs in the guest as a user would. `JTQD_SYSTEMD_LOG=FILE` keeps the table.
+"""
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from jtqd.sim_can.bench_kernel import build, guest
+from jtqd.sim_can.bench_kernel import build as packages
+from tests.systemd.systemd_wheels import ROOT, make_environment, make_wheels
+
+DRIVER = Path(__file__).with_name("systemd_driver.py")
+PYTHON = Path("/usr/bin/python3")
+pytestmark = pytest.mark.boots
+SHORT = ("start", "bad reload", "good reload", "stopped loop", "stop")
+LONG = (
+    *("start", "bad reload", "good reload", "stopped loop", "killed supervisor", "killed loop"),
+    *("link down and up", "link removed and made again", "full disk", "stop", "uninstall"),
+)
+
+
+def needs() -> str | None:
+    """What is missing here to boot systemd."""
+    try:
+        packages.require(packages.SYSTEMD)
+        build.ensure()
+    except (packages.MissingPackagesError, build.BuildError, RuntimeError) as error:
+        return str(error)
+    return None
+
+
+def booted(directory: Path, steps: tuple[str, ...], *, whole: bool) -> dict[str, dict[str, Any]]:
+    """What each step found; the table is printed."""
+    reason = needs()
+    if reason is not None:
+        print(f"\nSYSTEMD NOT TESTED: {reason}")
+        pytest.skip(f"systemd not tested: {reason}")
+    wheels = directory / "wheels"
+    own = make_wheels(wheels)
+    prepared = () if whole else ("prepared", str(make_environment(wheels, own, directory / "opt")))
+    arguments = prepared or (str(own), str(wheels))
+    command = [str(PYTHON), str(DRIVER), str(ROOT), *arguments, *steps]
+    with guest.Guest(command, systemd=True, time_travel=True, vcans=["vcan0"]) as one:
+        result = one.wait(1500.0)
+    assert result.returncode == 0, result.stdout + result.stderr
+    found = {line["step"]: line for line in map(json.loads, result.stdout.splitlines())}
+    lines = [
+        f"{name:<28} " + (", ".join(f"{what} {s:.2f} s" for what, s in line["seconds"].items()) or "-")
+        for name, line in found.items()
+    ]
+    print("\n" + "\n".join(lines))
+    if "JTQD_SYSTEMD_LOG" in os.environ:
+        Path(os.environ["JTQD_SYSTEMD_LOG"]).write_text(result.stdout)
+    return found
+
+
+def check(found: dict[str, dict[str, Any]], steps: tuple[str, ...]) -> None:
+    """What the driver does not check itself."""
+    assert list(found) == ["install", *steps]
+    assert found["install"]["seen"]["exposure"] <= 2.0
+    assert 1.5 < found["stopped loop"]["seconds"]["noticed"] < 4.0  # WatchdogSec=2s
+    assert len(found["bad reload"]["seen"]) == 4
+    assert "needs a restart" in found["bad reload"]["seen"]["another period"]
+    assert "sha256" in found["bad reload"]["seen"]["a network with another hash"]
+    assert "0 cycles missed" in found["good reload"]["seen"]["said"]
+
+
+def test_installed_started_reloaded_hung_and_stopped(tmp_path: Path) -> None:
+    check(booted(tmp_path, SHORT, whole=False), SHORT)
+
+
+@pytest.mark.campaign
+def test_whatever_happens_to_a_service(tmp_path: Path) -> None:
+    check(booted(tmp_path, LONG, whole=True), LONG)
