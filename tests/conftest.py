@@ -14,8 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.sim_can.bench_kernel import build, guest, vcan
-from jtqd.sim_can.bench_kernel import build as packages
+from jtqd.sim_can.bench_kernel import build, guest, packages, vcan
 from tests.native_pace import NativePace
 
 FORWARDED = "JTQD_FORWARDED_TESTS"  # set for the guest's pytest: write reports for the host's pytest
@@ -153,7 +152,7 @@ class SocketCanTests:
             if self._ended(item.nodeid):
                 break
             if not running:
-                return self._without_end(item, "the guest's pytest ended early")
+                return self._without_end(item, f"the guest went down early, {self.guest.why()}")
             if time.monotonic() - self.started > self.config.option.bench_timeout:
                 self.guest.kill()
                 return self._without_end(item, "killed at the limit of --bench-timeout")

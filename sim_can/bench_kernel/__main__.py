@@ -5,8 +5,7 @@ import signal
 import sys
 from typing import NoReturn
 
-from jtqd.sim_can.bench_kernel import build, guest, vcan
-from jtqd.sim_can.bench_kernel import build as packages
+from jtqd.sim_can.bench_kernel import build, guest, packages, vcan
 
 EXIT_TIMEOUT, EXIT_NO_GUEST = 124, 125  # as timeout(1) and env(1) have them
 

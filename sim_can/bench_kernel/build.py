@@ -11,13 +11,24 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO
 
-# What the bench kernel changes in the sources of Linux before it is compiled, and why.
+from jtqd.sim_can.bench_kernel.packages import (
+    BUILD,
+    GUEST,
+    SOURCE_ARCHIVE,
+    SOURCE_PACKAGE,
+    find_program,
+    require,
+)
+
+CONFIG_FILE = Path(__file__).with_name("bench_kernel.config")
+OVERRIDE = "JTQD_BENCH_KERNEL"
+"""Environment variable: path of a ready-made kernel binary, used as it is."""
 
 
 @dataclass(frozen=True)
@@ -57,113 +68,10 @@ def apply_edits(tree: Path, edits: tuple[Edit, ...] = EDITS) -> None:
         path.write_text(text.replace(edit.found, edit.put))
 
 
-# Debian packages that the bench kernel needs: which are missing, and their installation.
-
-
-SOURCE_PACKAGE = "linux-source-6.1"
-SOURCE_ARCHIVE = f"/usr/src/{SOURCE_PACKAGE}.tar.xz"
-
-
-class Requirement(NamedTuple):
-    """One Debian package and the program (bare name) or file (absolute path) that shows it is there."""
-
-    package: str
-    proof: str
-
-
-BUILD = (
-    Requirement(SOURCE_PACKAGE, SOURCE_ARCHIVE),
-    Requirement("gcc", "gcc"),
-    Requirement("libc6-dev", "/usr/include/stdio.h"),
-    Requirement("make", "make"),
-    Requirement("flex", "flex"),
-    Requirement("bison", "bison"),
-    Requirement("bc", "bc"),
-    Requirement("libelf-dev", "/usr/include/libelf.h"),
-    Requirement("xz-utils", "xz"),
-)
-GUEST = (Requirement("iproute2", "ip"),)
-TESTS = (Requirement("can-utils", "candump"),)
-SYSTEMD = (
-    Requirement("systemd", "/lib/systemd/systemd"),
-    Requirement("udev", "/lib/systemd/systemd-udevd"),
-    Requirement("dbus", "/usr/bin/dbus-daemon"),
-    Requirement("python3-venv", "/usr/bin/python3"),
-)
-
-
-class MissingPackagesError(RuntimeError):
-    """Packages are needed that are not installed and may not be installed by this user."""
-
-    def __init__(self, packages: Iterable[str]) -> None:
-        self.packages = tuple(packages)
-        super().__init__(
-            "the bench kernel needs Debian packages that are not installed: "
-            f"{' '.join(self.packages)}; install them with: sudo apt-get install {' '.join(self.packages)}"
-        )
-
-
-def find_program(name: str) -> str | None:
-    """Path of a program; looks into the sbin directories too, which are not in every user's PATH."""
-    return shutil.which(name, path=os.environ.get("PATH", "") + ":/usr/sbin:/sbin:/usr/bin:/bin")
-
-
-def missing(
-    requirements: Iterable[Requirement],
-    which: Callable[[str], str | None] = find_program,
-    exists: Callable[[str], bool] = os.path.exists,
-) -> list[str]:
-    """Names of the packages whose program or file is not there, in the order of `requirements`."""
-    return [
-        need.package
-        for need in requirements
-        if not (exists(need.proof) if need.proof.startswith("/") else which(need.proof))
-    ]
-
-
-def require(requirements: Iterable[Requirement], *, install: bool = True) -> None:
-    """Make sure that all packages are there; as root, install what is not.
-
-    Raises MissingPackagesError when packages are missing and this user may not install them (or `install` is
-    false), RuntimeError when apt-get fails.
-    """
-    wanted = tuple(requirements)
-    lacking = missing(wanted)
-    if not lacking:
-        return
-    if not install or os.geteuid() != 0 or find_program("apt-get") is None:
-        raise MissingPackagesError(lacking)
-    print(f"bench kernel: apt-get install {' '.join(lacking)}", file=sys.stderr, flush=True)
-    _apt_get("update")
-    # Recommended packages are left out: those of linux-source alone are several hundred megabytes.
-    _apt_get("install", "-y", "--no-install-recommends", *lacking)
-    still = missing(wanted)
-    if still:
-        raise MissingPackagesError(still)
-
-
-def _apt_get(*arguments: str) -> None:
-    done = subprocess.run(
-        ["apt-get", "-q", *arguments],
-        env={**os.environ, "DEBIAN_FRONTEND": "noninteractive"},
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        errors="replace",
-        check=False,
-    )
-    if done.returncode != 0:
-        last = "\n".join(done.stdout.splitlines()[-15:])
-        raise RuntimeError(f"apt-get {' '.join(arguments)} failed with status {done.returncode}:\n{last}")
-
-
-CONFIG_FILE = Path(__file__).with_name("bench_kernel.config")
-OVERRIDE = "JTQD_BENCH_KERNEL"
-"""Environment variable: path of a ready-made kernel binary, used as it is."""
-
 _MAKE_ARCH = ("ARCH=um", "SUBARCH=x86_64")
-_PROGRESS_INTERVAL_S = 30.0
+_PROGRESS_INTERVAL_S = 10.0
+_FILES = 660
+"""Files that this configuration compiles, about: what progress is measured by."""
 
 
 class BuildError(RuntimeError):
@@ -353,7 +261,8 @@ def _compile(tree: Path, log: Path, out: IO[str]) -> None:
                 process.wait(_PROGRESS_INTERVAL_S)
             except subprocess.TimeoutExpired:
                 compiled = log.read_text(errors="replace").count("  CC ")
-                _say(f"{time.monotonic() - started:.0f} s, {compiled} files compiled")
+                share = min(compiled / _FILES, 0.99)
+                _say(f"{share:4.0%}  {compiled} of about {_FILES} files, {time.monotonic() - started:.0f} s")
     finally:
         if process.poll() is None:
             process.terminate()

@@ -33,7 +33,7 @@ _NOT_FORWARDED = ("HOME", "TMPDIR", "TMP", "TEMP", "OLDPWD", "PWD", "SHLVL", "_"
 
 
 class GuestError(RuntimeError):
-    """The guest did not boot or went down too early; the message has the console's last lines."""
+    """The guest did not boot or went down too early: the first line says why, then come the console's last lines."""
 
 
 class GuestTimeoutError(GuestError):
@@ -157,6 +157,10 @@ class Guest:
                 )
             time.sleep(_POLL_INTERVAL_S)
 
+    def why(self) -> str:
+        """Why a guest that is not up any more went down, in one line."""
+        return end_of_guest(_text(self.job / "console.log"), self._process.poll())
+
     def kill(self) -> None:
         """End the guest and all its host processes at once."""
         try:
@@ -183,12 +187,47 @@ class Guest:
         try:
             status = int((self.job / "status").read_text())
         except (OSError, ValueError):
-            raise GuestError(f"the bench kernel went down without a result{self._last_words()}") from None
+            raise GuestError(
+                f"the guest went down without a result: {self.why()}{self._last_words()}"
+            ) from None
         return Result(status, _text(self.job / "stdout"), _text(self.job / "stderr"))
 
     def _last_words(self) -> str:
         lines = [f"  {name}: {line}" for name in ("console.log", "stderr") for line in _tail(self.job / name)]
         return "\n".join(["; last lines:", *lines]) if lines else ""
+
+
+_CAUSES = (
+    (r"jtqd: guest set-up failed: (.+)", "its set-up failed: {}"),
+    (
+        r"ptrace set fp regs failed, errno = (\d+)",
+        "the kernel does not fit this processor's FPU registers (errno {})",
+    ),
+    (r"Kernel panic - not syncing: (.+)", "kernel panic: {}"),
+    (r"Out of memory: (.+)", "out of memory: {}"),
+    (
+        r"(?:can't|cannot|couldn't|Failed to) (?:map|expand|create|write)[^\n]*(?:mem|physmem)[^\n]*",
+        "no room for the guest's memory",
+    ),
+    (
+        r"No space left on device",
+        "no room for the guest's memory: /dev/shm or the temporary directory is full",
+    ),
+)
+"""What the console shows, and what it means; the first that is found is the cause."""
+
+
+def end_of_guest(console: str, status: int | None) -> str:
+    """Why a guest went down, in one line, from its console and the exit status of its kernel."""
+    for pattern, meaning in _CAUSES:
+        seen = re.search(pattern, console)
+        if seen is not None:
+            return meaning.format(*seen.groups()).strip()
+    if status is not None and status < 0:
+        return f"its kernel was ended by {signal.Signals(-status).name}"
+    if not console.strip():
+        return f"its kernel ended with status {status} before its first line"
+    return f"its kernel ended with status {status} before the command did"
 
 
 def guest_environment(

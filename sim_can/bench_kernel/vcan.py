@@ -4,7 +4,7 @@ import os
 import socket
 import subprocess
 
-from jtqd.sim_can.bench_kernel.build import find_program
+from jtqd.sim_can.bench_kernel.packages import find_program
 
 
 def ready(name: str = "vcan0") -> bool:

@@ -12,8 +12,7 @@ from typing import Any
 
 import pytest
 
-from jtqd.sim_can.bench_kernel import build, guest
-from jtqd.sim_can.bench_kernel import build as packages
+from jtqd.sim_can.bench_kernel import build, guest, packages
 from tests.systemd.systemd_wheels import ROOT, make_environment, make_wheels
 
 DRIVER = Path(__file__).with_name("systemd_driver.py")

@@ -4,6 +4,7 @@ import ctypes
 import os
 import random
 import shlex
+import shutil
 import socket
 import struct
 import subprocess
@@ -11,9 +12,7 @@ import time
 
 import pytest
 
-from jtqd.sim_can.bench_kernel import build, guest
-from jtqd.sim_can.bench_kernel import build as packages
-from jtqd.sim_can.bench_kernel import build as source_edits
+from jtqd.sim_can.bench_kernel import build, guest, packages
 
 FRAME = struct.Struct("<IB3x8s")
 SOL_CAN_RAW, CAN_RAW_FILTER, CAN_RAW_ERR_FILTER = 101, 1, 2
@@ -143,6 +142,33 @@ def test_time_out_kills_the_guest_and_says_so():
 # ---- pure parts
 
 
+@pytest.mark.parametrize(
+    ("console", "status", "words"),
+    [
+        ("x\njtqd: guest set-up failed: mount overlay\n", 0, "its set-up failed: mount overlay"),
+        (
+            "userspace - ptrace set fp regs failed, errno = 14\nKernel panic - not syncing: died",
+            1,
+            "FPU registers",
+        ),
+        ("Kernel panic - not syncing: No working init found.", 1, "kernel panic: No working init found."),
+        ("", -9, "ended by SIGKILL"),
+        ("", 1, "status 1 before its first line"),
+        ("Linux version 6.1\n", 0, "status 0 before the command did"),
+    ],
+)
+def test_a_guest_that_went_down_says_why_in_one_line(console, status, words):
+    why = guest.end_of_guest(console, status)
+    assert words in why
+    assert "\n" not in why
+
+
+def test_a_kernel_that_does_not_come_up_is_an_error_with_its_reason(monkeypatch):
+    monkeypatch.setenv(build.OVERRIDE, shutil.which("false"))
+    with pytest.raises(guest.GuestError, match="its kernel ended with status 1 before its first line"):
+        guest.run(["true"])
+
+
 def test_cache_key_changes_with_every_byte_of_the_recipe_and_with_the_version():
     config, version = build.recipe(), "6.1.1-1"
     keys = {build.cache_key(config, version), build.cache_key(config, "6.1.1-2")}
@@ -158,20 +184,20 @@ def test_cache_key_changes_with_every_byte_of_the_recipe_and_with_the_version():
 def test_the_recipe_holds_configuration_and_edits(monkeypatch):
     before = build.recipe()
     assert build.CONFIG_FILE.read_bytes() in before
-    monkeypatch.setattr(build, "EDITS", (*source_edits.EDITS, source_edits.Edit("a", "b", "c")))
+    monkeypatch.setattr(build, "EDITS", (*build.EDITS, build.Edit("a", "b", "c")))
     assert build.recipe() != before
 
 
 def test_an_edit_fits_exactly_or_is_refused(tmp_path):
-    edit = source_edits.Edit("dir/file.c", "size 1;", "size 2;")
+    edit = build.Edit("dir/file.c", "size 1;", "size 2;")
     (tmp_path / "dir").mkdir()
     for text, count in (("", 0), ("size 1; size 1;", 2)):
         (tmp_path / edit.file).write_text(text)
-        with pytest.raises(source_edits.EditError, match=f"file.c: `size 1;` found {count} times"):
-            source_edits.apply_edits(tmp_path, (edit,))
+        with pytest.raises(build.EditError, match=f"file.c: `size 1;` found {count} times"):
+            build.apply_edits(tmp_path, (edit,))
         assert (tmp_path / edit.file).read_text() == text
     (tmp_path / edit.file).write_text("int size 1; // more")
-    source_edits.apply_edits(tmp_path, (edit,))
+    build.apply_edits(tmp_path, (edit,))
     assert (tmp_path / edit.file).read_text() == "int size 2; // more"
 
 
