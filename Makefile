@@ -74,7 +74,7 @@ bench-kernel: $(VENV)/.installed ## build the kernel with SocketCAN into the cac
 	$(BIN)/python -m jtqd.sim_can.bench_kernel build
 
 clean: ## remove what make made here; the cached bench kernel stays
-	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) build dist src/*.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Three stages of one environment; each stamp is renewed when pyproject.toml changes.

@@ -1,0 +1,60 @@
+"""What README and docs/ name is there: files, modules, imports, links; and the examples of docs/api.md run as they stand."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from tests.paths import ROOT
+
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+IDS = [page.name for page in PAGES]
+FILE = re.compile(
+    r"`((?:daemon|drivers|estimator|examples|models|sim_can|sysid|systemd|tests)/[\w./-]*\.(?:py|yaml|sh|c|md|csv|csv\.gz|service))[:`]"
+)
+MODULE = re.compile(r"python -m ((?:jtqd|examples|tests)[\w.]*)")
+LINK = re.compile(r"\]\((?!https?:|mailto:)([^)#]*)(#[^)]*)?\)")
+IMPORT = re.compile(r"^ *(from (?:jtqd|examples)[\w.]* import (?:\([^)]*\)|[^\n]+)|import jtqd[\w.]*)", re.MULTILINE)
+BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=IDS)
+def test_files_and_links_are_there(page: Path) -> None:
+    text = page.read_text()
+    missing = [name for name in FILE.findall(text) if not (ROOT / name).exists()]
+    missing += [link for link, _ in LINK.findall(text) if link and not (page.parent / link).exists()]
+    assert not missing
+
+
+@pytest.mark.parametrize("page", PAGES, ids=IDS)
+def test_modules_that_are_run_are_there(page: Path) -> None:
+    for name in MODULE.findall(page.read_text()):
+        path = ROOT / name.rstrip(".").removeprefix("jtqd.").replace(".", "/")
+        assert path.with_suffix(".py").exists() or (path / "__main__.py").exists(), name
+
+
+@pytest.mark.parametrize("page", PAGES, ids=IDS)
+def test_imports_are_there(page: Path) -> None:
+    for line in IMPORT.findall(page.read_text()):
+        (node,) = ast.parse(textwrap.dedent(line)).body
+        if isinstance(node, ast.ImportFrom):
+            module = importlib.import_module(str(node.module))
+            for alias in node.names:
+                assert hasattr(module, alias.name) or importlib.import_module(f"{node.module}.{alias.name}"), line
+
+
+@pytest.mark.parametrize("number", range(len(BLOCK.findall((ROOT / "docs" / "api.md").read_text()))))
+def test_the_examples_of_the_api_run(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each block alone, in an empty directory; what stands behind `#>` is what the line before it prints."""
+    monkeypatch.chdir(tmp_path)
+    code = BLOCK.findall((ROOT / "docs" / "api.md").read_text())[number]
+    exec(compile(code, f"docs/api.md, example {number + 1}", "exec"), {"__name__": "example", "GOLDEN": ROOT / "tests" / "golden"})
+    expected = re.findall(r"#> (.*)", code)
+    assert capsys.readouterr().out.splitlines() == expected

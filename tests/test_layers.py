@@ -1,0 +1,125 @@
+"""Which room may import which: the rules are the table of docs/architecture.md, the imports are read from the sources.
+
+Imports inside of functions and under TYPE_CHECKING count like all others.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from tests.paths import ROOT
+
+PACKAGES = ("daemon", "drivers", "estimator", "models", "sim_can", "sysid")
+PAGE = ROOT / "docs" / "architecture.md"
+ROW = re.compile(r"^\| `([a-z_./]+)` \|[^|]*\|([^|]*)\|([^|]*)\|$", re.MULTILINE)
+
+
+@cache
+def rules() -> dict[str, tuple[frozenset[str], frozenset[str]]]:
+    """Room -> (rooms that it may import, libraries that it may import), from the table of the page."""
+    return {
+        room.rstrip("/").replace("/", "."): (
+            frozenset(each.rstrip("/").replace("/", ".") for each in re.findall(r"`([^`]+)`", rooms)),
+            frozenset(re.findall(r"`([^`]+)`", libraries)),
+        )
+        for room, rooms, libraries in ROW.findall(PAGE.read_text())
+    }
+
+
+def name_of(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+@cache
+def modules() -> dict[str, Path]:
+    """Every module of the product, by its name without `jtqd.`."""
+    return {name_of(path): path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))}
+
+
+@cache
+def imports(name: str) -> frozenset[str]:
+    """Full names of all that a module imports, wherever in it."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(modules()[name].read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, f"{name}: a relative import"
+            for alias in node.names:
+                full = f"{node.module}.{alias.name}"
+                found.add(full if full.removeprefix("jtqd.") in modules() else str(node.module))
+    return frozenset(found)
+
+
+def of_project(name: str) -> Iterator[str]:
+    """Modules of the project that a module imports, without `jtqd.`; each package's own name is not one of them."""
+    for each in imports(name):
+        inside = each.removeprefix("jtqd.")
+        if inside != each and inside in modules() and inside != name:
+            yield inside
+
+
+def room_of(name: str) -> str:
+    """The longest name of the table that the module lies in."""
+    fitting = [room for room in rules() if name == room or name.startswith(room + ".")]
+    assert fitting, f"{name} lies in no room of {PAGE.name}"
+    return max(fitting, key=len)
+
+
+def test_every_room_of_the_table_is_there() -> None:
+    assert len(rules()) > 15
+    for room, (allowed, _) in rules().items():
+        assert any(name == room or name.startswith(room + ".") for name in modules()), room
+        assert allowed <= set(rules()), f"{room}: {sorted(allowed - set(rules()))} are no rooms"
+
+
+@pytest.mark.parametrize("room", sorted(rules()))
+def test_a_room_imports_only_what_the_table_allows(room: str) -> None:
+    allowed, libraries = rules()[room]
+    wrong = []
+    for name in modules():
+        if room_of(name) != room:
+            continue
+        wrong += [f"{name} -> {each}" for each in of_project(name) if room_of(each) not in {room, *allowed}]
+        tops = {each.partition(".")[0] for each in imports(name)} - {"jtqd"} - set(sys.stdlib_module_names)
+        wrong += [f"{name} -> {top}" for top in sorted(tops - libraries)]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_no_circles() -> None:
+    """Depth-first search; the first circle is named from its first module to its first module."""
+    done: set[str] = set()
+
+    def follow(name: str, path: list[str]) -> None:
+        assert name not in path, " -> ".join([*path[path.index(name) :], name])
+        if name not in done:
+            for each in of_project(name):
+                follow(each, [*path, name])
+            done.add(name)
+
+    for name in modules():
+        follow(name, [])
+
+
+def test_one_import_name() -> None:
+    """Nothing is imported by a folder's bare name: `daemon` may be somebody else's package."""
+    for name in modules():
+        tops = {each.partition(".")[0] for each in imports(name)}
+        assert not tops & set(PACKAGES), f"{name} imports {sorted(tops & set(PACKAGES))} without `jtqd.`"
+    links = {path.name for path in (ROOT / "src" / "jtqd").iterdir() if path.is_symlink()}
+    assert links == set(PACKAGES)
+
+
+def test_every_room_says_what_it_is_for() -> None:
+    for name, path in modules().items():
+        if path.name == "__init__.py":
+            lines = (ast.get_docstring(ast.parse(path.read_text())) or "").splitlines()
+            assert len(lines) >= 3, f"{name}: its __init__ has {len(lines)} lines of docstring, expected at least 3"
