@@ -1,65 +1,71 @@
 """Configuration of jtqd: read once into frozen, validated objects.
 
-Unknown keys and wrong values are errors of one line that name the file, the key, what was found and what was expected.
+The keys of the file with their types, units, ranges and defaults are `SafetySettings`, `RecordingSettings`, `Realtime`,
+`EstimatorSettings` and the sections from `_Sync` to `_File`. Unknown keys and wrong values are errors of one line that
+name the file, the key, what was found and what was expected.
 """
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 from jtqd.daemon.shared import cycle_record as faults
-from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.checked import ConfigError, Section, range_text
+from jtqd.estimator.decoder import FieldError, Text, check, choice, decode, limits
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.plausibility import PlausibilityLimits
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import read_yaml, shipped
 
-# Section `safety` of the configuration: which faults are latched, and the thresholds of the checks.
-
-
+DEFAULT_CONFIG: Final = "bench.yaml"
+MAX_NODE_ID: Final = 127
 LATCHED_BY_DEFAULT: Final = faults.NOT_FINITE | faults.BITS["motor_jump"] | faults.BITS["link_jump"]
 """What leaves numbers behind that look right and are not: a broken estimator, an encoder that has lost its zero."""
-_LIMITS: Final = PlausibilityLimits()
+_ERROR_BEHAVIOURS: Final = ("pre_operational", "none", "stopped")
+"""1029h:1 in the order of its values."""
+_NEEDED: Final = {"tob": (), "efficiency": ("efficiency",), "network": ("efficiency",), "fused": ("fused",)}
+"""Sections of a joint file that a method cannot do without."""
+_WITH_NETWORK: Final = ("network", "fused")
+"""Methods that use one; `fused` is its physics alone without."""
+
+NodeId = Annotated[int, limits(ge=1, le=MAX_NODE_ID)]
+_Unsigned32 = Annotated[int, limits(ge=0, le=0xFFFF_FFFF)]
+_Given = Mapping[str, Annotated[float, limits(ge=0.0)]]
+"""Free names to numbers; what the names may be is checked by the boot."""
 
 
 @dataclass(frozen=True, slots=True)
 class SafetySettings:
-    """How faults are found and which of them wait for a reset.
+    """Section `safety`: how faults are found and which of them wait for a reset.
 
-    latch: bits of `shared/cycle_record.py`; stale_latch_cycles: so many cycles in a row without inputs, or without time,
-    are the fault `stale` (None: never); deviation_sigmas, deviation_s: the fault `deviation`; plausibility: None for no
-    checks.
+    latch: bits of `shared/cycle_record.py`, in the file a list of their names; stale_latch_cycles: so many cycles in a
+    row without inputs, or without time, are the fault `stale` (None: never); deviation_sigmas, deviation_s: the fault
+    `deviation`; plausibility: None (in the file: false) for no checks.
     """
 
     latch: int = LATCHED_BY_DEFAULT
-    stale_latch_cycles: int | None = None
-    deviation_sigmas: float = 3.0
-    deviation_s: float = 1.0
-    plausibility: PlausibilityLimits | None = _LIMITS
+    stale_latch_cycles: Annotated[int, limits(ge=1, le=1_000_000)] | None = None
+    deviation_sigmas: Annotated[float, limits(ge=1.0, le=100.0)] = 3.0
+    deviation_s: Annotated[float, limits("s", ge=0.01, le=60.0)] = 1.0
+    plausibility: PlausibilityLimits | None = field(default_factory=PlausibilityLimits)
+
+    def __post_init__(self) -> None:
+        check(self, "safety")
 
     @classmethod
-    def from_section(cls, section: Section | None) -> SafetySettings:
-        """Read the mapping of a configuration file; every key is optional. Raises ConfigError."""
-        if section is None:
-            return cls()
-        latch = _latch(section)
-        stale = section.raw("stale_latch_cycles", None)
-        if stale is not None:
-            stale = section.integer("stale_latch_cycles", low=1, high=1_000_000)
-            latch |= faults.STALE
-        sigmas = section.number("deviation_sigmas", low=1.0, high=100.0, default=3.0)
-        seconds = section.number("deviation_s", unit="s", low=0.01, high=60.0, default=1.0)
-        limits: PlausibilityLimits | None = _LIMITS
+    def from_section(cls, section: Section) -> SafetySettings:
+        """Read the section of a configuration file; every key is optional. Raises ConfigError."""
+        given: dict[str, Any] = {"latch": _latch(section)}
         if section.raw("plausibility", None) is False:
-            limits = None
-        else:
-            inner = section.section("plausibility", optional=True)
-            limits = limits if inner is None else PlausibilityLimits.from_section(inner)
-        section.finish()
-        return cls(latch, stale, sigmas, seconds, limits)
+            given["plausibility"] = None
+        settings = decode(cls, section, **given)
+        if settings.stale_latch_cycles is None:
+            return settings
+        return replace(settings, latch=settings.latch | faults.STALE)
 
 
 def _latch(section: Section) -> int:
@@ -72,12 +78,9 @@ def _latch(section: Section) -> int:
     return sum({faults.BITS[name] for name in value})
 
 
-# Section `recording` of the configuration: how long files are, how much disk they may take, or the flight recorder.
-
-
 @dataclass(frozen=True)
 class RecordingSettings:
-    """Megabytes are of 1 000 000 bytes.
+    """Section `recording`; megabytes are of 1 000 000 bytes.
 
     Attributes:
         ring_cycles: cycles that shared memory holds for the recorder: for so long it may be stopped.
@@ -89,57 +92,37 @@ class RecordingSettings:
         flight_recorder_s: keep this time in memory and write it on a fault or on request. None: record all.
     """
 
-    ring_cycles: int = 4096
-    chunk_s: float = 0.5
-    rotate_s: float = 600.0
-    rotate_mb: float = 1000.0
-    budget_mb: float | None = None
+    ring_cycles: Annotated[int, limits(ge=256, le=1 << 20)] = 4096
+    chunk_s: Annotated[float, limits("s", ge=0.05, le=10.0)] = 0.5
+    rotate_s: Annotated[float, limits("s", ge=1.0, le=86_400.0)] = 600.0
+    rotate_mb: Annotated[float, limits("MB", ge=1.0, le=1e6)] = 1000.0
+    budget_mb: Annotated[float, limits("MB", ge=10.0, le=1e9)] | None = None
     keep_run: bool = True
-    reserve_mb: float = 256.0
-    flight_recorder_s: float | None = None
+    reserve_mb: Annotated[float, limits("MB", ge=0.0, le=1e9)] = 256.0
+    flight_recorder_s: Annotated[float, limits("s", ge=1.0, le=600.0)] | None = None
 
-    @classmethod
-    def from_section(cls, section: Section | None) -> RecordingSettings:
-        """Read and finish the section; without one everything takes its default. Raises ConfigError."""
-        if section is None:
-            return cls()
-        result = cls(
-            ring_cycles=section.integer("ring_cycles", low=256, high=1 << 20, default=cls.ring_cycles),
-            chunk_s=section.number("chunk_s", unit="s", low=0.05, high=10.0, default=cls.chunk_s),
-            rotate_s=section.number("rotate_s", unit="s", low=1.0, high=86_400.0, default=cls.rotate_s),
-            rotate_mb=section.number("rotate_mb", unit="MB", low=1.0, high=1e6, default=cls.rotate_mb),
-            budget_mb=section.number("budget_mb", unit="MB", low=10.0, high=1e9, default=None),
-            keep_run=section.boolean("keep_run", default=cls.keep_run),
-            reserve_mb=section.number("reserve_mb", unit="MB", low=0.0, high=1e9, default=cls.reserve_mb),
-            flight_recorder_s=section.number(
-                "flight_recorder_s", unit="s", low=1.0, high=600.0, default=None
-            ),
-        )
-        section.finish()
-        return result
+    def __post_init__(self) -> None:
+        check(self, "recording")
 
 
-# The nodes of a configuration: joints with their files and networks, and the sensor. Read once into frozen objects.
-#
-# Wrong values are errors of one line that name the file, the key, what was found and what was expected.
+@dataclass(frozen=True)
+class Realtime:
+    """Section `realtime`: what the loop asks of the kernel; what it does not get is logged."""
 
-
-MAX_NODE_ID = 127
-_NEEDED = {"tob": (), "efficiency": ("efficiency",), "network": ("efficiency",), "fused": ("fused",)}
-"""Sections of a joint file that a method cannot do without."""
-_WITH_NETWORK = ("network", "fused")
-"""Methods that use one; `fused` is its physics alone without."""
+    priority: Annotated[int, limits(ge=0, le=98)] = 80
+    cpu: Annotated[int, limits(ge=0, le=4095)] | None = None
+    lock_memory: bool = True
 
 
 @dataclass(frozen=True)
 class Identity:
     """Expected 1018h entries and software; None where the bench accepts any value."""
 
-    vendor: int | None
-    product: int | None
-    revision: int | None
-    serial: int | None
-    software: str | None
+    vendor: _Unsigned32 | None = None
+    product: _Unsigned32 | None = None
+    revision: _Unsigned32 | None = None
+    serial: _Unsigned32 | None = None
+    software: Text | None = None
     """100Ah, the software version."""
 
 
@@ -188,138 +171,150 @@ class SensorConfig:
     """jtqd does not start without it. By default it does, and configures the sensor when it appears."""
 
 
-def section_of(parent: Section, key: str) -> Section:
-    """A section that may be left out: then every key takes its default (and a key without one says that it is missing)."""
-    return parent.section(key, optional=True) or Section({}, parent.where, key)
+@dataclass(frozen=True)
+class _Sync:
+    """Section `sync`."""
 
-
-def _numbers(parent: Section, key: str) -> dict[str, float]:
-    """A mapping of free names to numbers; what the names may be is checked by the boot."""
-    section = section_of(parent, key)
-    values = {name: section.number(name, low=0.0) for name in section.names()}
-    section.finish()
-    return values
-
-
-def _whole(values: dict[str, float]) -> dict[str, int]:
-    return {name: int(value) for name, value in values.items()}
-
-
-def _identity(parent: Section) -> Identity:
-    section = section_of(parent, "identity")
-    keys = ("vendor", "product", "revision", "serial")
-    values = {key: section.integer(key, low=0, high=0xFFFF_FFFF, default=None) for key in keys}
-    software = section.text("software", default=None)
-    section.finish()
-    return Identity(**values, software=software)
-
-
-def read_sensor(top: Section) -> SensorConfig | None:
-    """Section `sensor`; None without it. Raises ConfigError."""
-    section = top.section("sensor", optional=True)
-    if section is None:
-        return None
-    node = section.integer("node", low=1, high=MAX_NODE_ID)
-    channels = section.integer("channels", low=1, high=2, default=1)
-    identity = _identity(section)
-    given = _numbers(section, "given")
-    unit_words = _numbers(section, "unit_words")
-    mandatory = section.boolean("mandatory", default=False)
-    section.finish()
-    channel_numbers = tuple(range(1, channels + 1))
-    return SensorConfig(node, identity, channel_numbers, _whole(given), unit_words, mandatory)
-
-
-def read_joint(
-    top: Section, path: Path, number: int, method: str, sensor: SensorConfig | None
-) -> JointConfig:
-    """Section `joint_NUMBER` with its joint file and network, which lie beside the configuration. Raises ConfigError."""
-    key = f"joint_{number}"
-    section = top.section(key)
-    assert section is not None
-    node = section.integer("node", low=1, high=MAX_NODE_ID)
-    identity = _identity(section)
-    given = _whole(_numbers(section, "given"))
-    joint_path = _beside(path, section.text("file"))
-    channel = section.integer("sensor_channel", low=1, high=2, default=None)
-    if channel is not None and (sensor is None or channel not in sensor.channels):
-        expected = (
-            f"one of the sensor's channels {list(sensor.channels)}"
-            if sensor
-            else "no channel without a sensor"
-        )
-        raise section.error("sensor_channel", channel, expected)
-    temperature = section.boolean("temperature", default=False)
-    mandatory = section.boolean("mandatory", default=True)
-    network = _network(section.section("network", optional=True), path)
-    section.finish()
-    mapping, data = read_yaml(joint_path)
-    joint = Joint.from_mapping(mapping, str(joint_path))
-    if method == "network" and network is None:
-        raise ConfigError(
-            f"{path}: key '{key}.network': missing, expected file and sha256 because estimator.method is network"
-        )
-    for needed in _NEEDED[method]:
-        if getattr(joint, needed) is None:
-            raise ConfigError(
-                f"{joint_path}: key '{needed}': missing, expected because estimator.method is {method}"
-            )
-    if method not in _WITH_NETWORK:
-        network = None
-    return JointConfig(
-        number, node, identity, given, joint_path, joint, network, channel, temperature, mandatory, data
-    )
-
-
-def _network(section: Section | None, path: Path) -> NetworkFile | None:
-    if section is None:
-        return None
-    file = _beside(path, section.text("file"))
-    expected = section.text("sha256").lower()
-    section.finish()
-    try:
-        data = file.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{file}: cannot be read: {error.strerror}") from None
-    found = hashlib.sha256(data).hexdigest()
-    if found != expected:
-        raise ConfigError(f"{file}: sha256 of the network: found {found}, expected {expected} (from {path})")
-    return NetworkFile(file, expected, data)
-
-
-def _beside(path: Path, name: str) -> Path:
-    """File names in a configuration are relative to the configuration itself."""
-    return path.parent / name
-
-
-def check_node_ids(
-    path: Path, own: int, joints: tuple[JointConfig, ...], sensor: SensorConfig | None
-) -> None:
-    """Raises ConfigError when two nodes share a node-ID, or one has jtqd's own."""
-    users: dict[int, str] = {own: "node_id"}
-    named = [(f"joint_{joint.number}.node", joint.node_id) for joint in joints]
-    if sensor is not None:
-        named.append(("sensor.node", sensor.node_id))
-    for key, node in named:
-        if node in users:
-            raise ConfigError(
-                f"{path}: key '{key}': found {node}, expected a node-ID not used by {users[node]}"
-            )
-        users[node] = key
-
-
-DEFAULT_CONFIG = "bench.yaml"
-_ERROR_BEHAVIOURS = ("pre_operational", "none", "stopped")
-"""1029h:1 in the order of its values."""
+    period_us: Annotated[int, limits(ge=500, le=100_000)] = 1000
+    counter_overflow: Annotated[int, limits(ge=2, le=240)] = 240
+    """1019h: 1 is reserved."""
 
 
 @dataclass(frozen=True)
-class Realtime:
-    """What the loop asks of the kernel; what it does not get it says."""
+class _Inputs:
+    """Section `inputs`; ranges and defaults depend on the period of SYNC (see `_File`)."""
 
-    priority: int
-    cpu: int | None
-    lock_memory: bool
+    wait_us: Annotated[float, limits("us")] | None = None
+    deadline_us: Annotated[float, limits("us")] | None = None
+
+
+@dataclass(frozen=True)
+class _Nodes:
+    """Section `nodes`."""
+
+    heartbeat_ms: Annotated[int, limits(ge=10, le=10_000)] = 100
+    heartbeat_timeout_ms: Annotated[int, limits(le=0xFFFF)] | None = None
+    error_behaviour: Annotated[str, choice(_ERROR_BEHAVIOURS)] = "pre_operational"
+    emcy_inhibit_ms: Annotated[int, limits(ge=0, le=6000)] = 10
+    boot_timeout_s: Annotated[float, limits("s", ge=0.1, le=60.0)] = 2.0
+
+    def __post_init__(self) -> None:
+        least, timeout = 2 * self.heartbeat_ms, self.timeout_ms
+        if timeout < least:
+            expected = range_text("a whole number", least, 0xFFFF, None)
+            raise FieldError("nodes", "heartbeat_timeout_ms", timeout, expected)
+
+    @property
+    def timeout_ms(self) -> int:
+        """Time without a heartbeat after which a node counts as lost."""
+        given = self.heartbeat_timeout_ms
+        return max(3 * self.heartbeat_ms, 300) if given is None else given
+
+
+@dataclass(frozen=True)
+class _Network:
+    """Section `joint_N.network`."""
+
+    file: Text
+    sha256: Text
+
+
+@dataclass(frozen=True)
+class _JointSection:
+    """Section `joint_N`; files lie beside the configuration."""
+
+    node: NodeId
+    file: Text
+    identity: Identity = Identity()
+    given: _Given = field(default_factory=dict)
+    sensor_channel: Annotated[int, limits(ge=1, le=2)] | None = None
+    temperature: bool = False
+    mandatory: bool = True
+    network: _Network | None = None
+
+
+@dataclass(frozen=True)
+class _SensorSection:
+    """Section `sensor`."""
+
+    node: NodeId
+    channels: Annotated[int, limits(ge=1, le=2)] = 1
+    identity: Identity = Identity()
+    given: _Given = field(default_factory=dict)
+    unit_words: _Given = field(default_factory=dict)
+    mandatory: bool = False
+
+
+@dataclass(frozen=True)
+class _Metrics:
+    """Section `metrics`."""
+
+    file: Text
+
+
+@dataclass(frozen=True)
+class _File:
+    """A configuration as it is written."""
+
+    node_id: NodeId
+    joint_1: _JointSection
+    joint_2: _JointSection
+    bitrate: Annotated[int, limits(ge=10_000, le=1_000_000)] = 1_000_000
+    sync: _Sync = _Sync()
+    inputs: _Inputs = _Inputs()
+    nodes: _Nodes = _Nodes()
+    estimator: EstimatorSettings = field(default_factory=EstimatorSettings)
+    safety: SafetySettings = field(default_factory=SafetySettings)
+    sensor: _SensorSection | None = None
+    realtime: Realtime = Realtime()
+    recording: RecordingSettings = field(default_factory=RecordingSettings)
+    metrics: _Metrics | None = None
+
+    def __post_init__(self) -> None:
+        self._check_inputs()
+        self._check_channels()
+        self._check_node_ids()
+
+    @property
+    def wait_us(self) -> float:
+        """Time after SYNC at which the loop first looks for its inputs."""
+        return 0.5 * self.sync.period_us if self.inputs.wait_us is None else self.inputs.wait_us
+
+    @property
+    def deadline_us(self) -> float:
+        """Time after SYNC at which missing inputs count as missing."""
+        return 0.85 * self.sync.period_us if self.inputs.deadline_us is None else self.inputs.deadline_us
+
+    def _check_inputs(self) -> None:
+        period_us = self.sync.period_us
+        for key, value, low, high in (
+            ("wait_us", self.wait_us, 50, period_us),
+            ("deadline_us", self.deadline_us, self.wait_us, 0.95 * period_us),
+        ):
+            if not low <= value <= high:
+                raise FieldError(
+                    "configuration", f"inputs.{key}", value, range_text("a number in us", low, high, None)
+                )
+
+    def _check_channels(self) -> None:
+        channels = [] if self.sensor is None else list(range(1, self.sensor.channels + 1))
+        for number, joint in enumerate((self.joint_1, self.joint_2), start=1):
+            channel = joint.sensor_channel
+            if channel is not None and channel not in channels:
+                expected = (
+                    f"one of the sensor's channels {channels}" if channels else "no channel without a sensor"
+                )
+                raise FieldError("configuration", f"joint_{number}.sensor_channel", channel, expected)
+
+    def _check_node_ids(self) -> None:
+        users = {self.node_id: "node_id"}
+        nodes = {"joint_1.node": self.joint_1.node, "joint_2.node": self.joint_2.node}
+        if self.sensor is not None:
+            nodes["sensor.node"] = self.sensor.node
+        for key, node in nodes.items():
+            if node in users:
+                raise FieldError("configuration", key, node, f"a node-ID not used by {users[node]}")
+            users[node] = key
 
 
 @dataclass(frozen=True)
@@ -373,74 +368,92 @@ def load_config(path: Path | None) -> Config:
     if path is None:
         path = shipped(DEFAULT_CONFIG)
     mapping, data = read_yaml(path)
-    top = Section(mapping, str(path))
-    node_id = top.integer("node_id", low=1, high=MAX_NODE_ID)
-    bitrate = top.integer("bitrate", low=10_000, high=1_000_000, default=1_000_000)
-    sync = section_of(top, "sync")
-    period_us = sync.integer("period_us", low=500, high=100_000, default=1000)
-    overflow = sync.integer("counter_overflow", low=2, high=240, default=240)  # 1019h: 1 is reserved
-    sync.finish()
-    inputs = section_of(top, "inputs")
-    wait_us = inputs.number("wait_us", unit="us", low=50, high=period_us, default=0.5 * period_us)
-    deadline_us = inputs.number(
-        "deadline_us", unit="us", low=wait_us, high=0.95 * period_us, default=0.85 * period_us
+    file = decode(_File, Section(mapping, str(path)))
+    one, two = (
+        _joint(path, number, section, file.estimator.method)
+        for number, section in enumerate((file.joint_1, file.joint_2), start=1)
     )
-    inputs.finish()
-    nodes = section_of(top, "nodes")
-    heartbeat_ms = nodes.integer("heartbeat_ms", low=10, high=10_000, default=100)
-    heartbeat_timeout_ms = nodes.integer(
-        "heartbeat_timeout_ms", low=2 * heartbeat_ms, high=0xFFFF, default=max(3 * heartbeat_ms, 300)
-    )
-    behaviour = nodes.text("error_behaviour", default="pre_operational")
-    if behaviour not in _ERROR_BEHAVIOURS:
-        raise nodes.error("error_behaviour", behaviour, f"one of {', '.join(_ERROR_BEHAVIOURS)}")
-    emcy_inhibit_ms = nodes.integer("emcy_inhibit_ms", low=0, high=6000, default=10)
-    boot_timeout_s = nodes.number("boot_timeout_s", unit="s", low=0.1, high=60, default=2.0)
-    nodes.finish()
-    settings = EstimatorSettings.from_section(section_of(top, "estimator"))
-    safety = SafetySettings.from_section(top.section("safety", optional=True))
-    sensor = read_sensor(top)
-    joints = tuple(read_joint(top, path, number, settings.method, sensor) for number in (1, 2))
-    realtime = _realtime(top)
-    recording = RecordingSettings.from_section(top.section("recording", optional=True))
-    metrics = top.section("metrics", optional=True)
-    metrics_file = None if metrics is None else Path(metrics.text("file"))
-    if metrics is not None:
-        metrics.finish()
-    top.finish()
-    check_node_ids(path, node_id, joints, sensor)
     return Config(
         path=path,
         text=_text(path, data),
         sha256=hashlib.sha256(data).hexdigest(),
-        node_id=node_id,
-        bitrate=bitrate,
-        period_ns=period_us * 1000,
-        counter_overflow=overflow,
-        input_wait_ns=round(wait_us * 1000),
-        input_deadline_ns=round(deadline_us * 1000),
-        heartbeat_ms=heartbeat_ms,
-        heartbeat_timeout_ms=heartbeat_timeout_ms,
-        error_behaviour=_ERROR_BEHAVIOURS.index(behaviour),
-        emcy_inhibit_ms=emcy_inhibit_ms,
-        boot_timeout_s=boot_timeout_s,
-        estimator=settings,
-        safety=safety,
-        joints=joints,
-        sensor=sensor,
-        realtime=realtime,
-        recording=recording,
-        metrics_file=metrics_file,
+        node_id=file.node_id,
+        bitrate=file.bitrate,
+        period_ns=file.sync.period_us * 1000,
+        counter_overflow=file.sync.counter_overflow,
+        input_wait_ns=round(file.wait_us * 1000),
+        input_deadline_ns=round(file.deadline_us * 1000),
+        heartbeat_ms=file.nodes.heartbeat_ms,
+        heartbeat_timeout_ms=file.nodes.timeout_ms,
+        error_behaviour=_ERROR_BEHAVIOURS.index(file.nodes.error_behaviour),
+        emcy_inhibit_ms=file.nodes.emcy_inhibit_ms,
+        boot_timeout_s=file.nodes.boot_timeout_s,
+        estimator=file.estimator,
+        safety=file.safety,
+        joints=(one, two),
+        sensor=None if file.sensor is None else _sensor(file.sensor),
+        realtime=file.realtime,
+        recording=file.recording,
+        metrics_file=None if file.metrics is None else Path(file.metrics.file),
     )
 
 
-def _realtime(top: Section) -> Realtime:
-    section = section_of(top, "realtime")
-    priority = section.integer("priority", low=0, high=98, default=80)
-    cpu = section.integer("cpu", low=0, high=4095, default=None)
-    lock = section.boolean("lock_memory", default=True)
-    section.finish()
-    return Realtime(priority, cpu, lock)
+def _sensor(section: _SensorSection) -> SensorConfig:
+    return SensorConfig(
+        node_id=section.node,
+        identity=section.identity,
+        channels=tuple(range(1, section.channels + 1)),
+        given=_whole(section.given),
+        unit_words=dict(section.unit_words),
+        mandatory=section.mandatory,
+    )
+
+
+def _joint(path: Path, number: int, section: _JointSection, method: str) -> JointConfig:
+    """Read what a section `joint_N` names: the joint file and, where the method uses one, the network."""
+    network = None if section.network is None else _network(section.network, path)
+    joint_path = path.parent / section.file
+    mapping, data = read_yaml(joint_path)
+    joint = Joint.from_mapping(mapping, str(joint_path))
+    if method == "network" and network is None:
+        key = f"joint_{number}.network"
+        raise ConfigError(
+            f"{path}: key '{key}': missing, expected file and sha256 because estimator.method is network"
+        )
+    for needed in _NEEDED[method]:
+        if getattr(joint, needed) is None:
+            raise ConfigError(
+                f"{joint_path}: key '{needed}': missing, expected because estimator.method is {method}"
+            )
+    return JointConfig(
+        number=number,
+        node_id=section.node,
+        identity=section.identity,
+        given=_whole(section.given),
+        joint_path=joint_path,
+        joint=joint,
+        network=network if method in _WITH_NETWORK else None,
+        sensor_channel=section.sensor_channel,
+        temperature=section.temperature,
+        mandatory=section.mandatory,
+        joint_data=data,
+    )
+
+
+def _whole(values: Mapping[str, float]) -> dict[str, int]:
+    return {name: int(value) for name, value in values.items()}
+
+
+def _network(section: _Network, path: Path) -> NetworkFile:
+    file, expected = path.parent / section.file, section.sha256.lower()
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be read: {error.strerror}") from None
+    found = hashlib.sha256(data).hexdigest()
+    if found != expected:
+        raise ConfigError(f"{file}: sha256 of the network: found {found}, expected {expected} (from {path})")
+    return NetworkFile(file, expected, data)
 
 
 def _text(path: Path, data: bytes) -> str:

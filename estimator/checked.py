@@ -16,6 +16,7 @@ class Required:
 
 REQUIRED: Final = Required()
 """Default of every reading method: the key must be there."""
+SECTION: Final = "a mapping of keys to values"
 
 
 class ConfigError(ValueError):
@@ -28,12 +29,20 @@ _SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxdict, _SHORT.maxset = 3, 20, 20, 20
 _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 200
 
 
+class Verbatim(str):
+    """What was found, in words: a message shows it without quotes."""
+
+    __slots__ = ()
+
+
 def _shown(value: object) -> str:
+    if isinstance(value, Verbatim):
+        return value
     text = _SHORT.repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _number_text(value: object) -> str:
+def number_as_text(value: object) -> str:
     """Explain a number that arrived as text: YAML 1.1 needs a point and a signed exponent."""
     if isinstance(value, str):
         try:
@@ -56,7 +65,7 @@ class Section:
         self.path: Final = path
         if not isinstance(mapping, Mapping):
             at = f"key '{path}': " if path else ""
-            raise ConfigError(f"{where}: {at}found {_shown(mapping)}, expected a mapping of keys to values")
+            raise ConfigError(f"{where}: {at}found {_shown(mapping)}, expected {SECTION}")
         for key in mapping:
             if not isinstance(key, str):
                 raise ConfigError(
@@ -90,9 +99,9 @@ class Section:
 
     names = keys  # for loops: linters take `.keys()` for a dict's
 
-    def raw(self, key: str, default: Any = REQUIRED) -> Any:
-        """Return the value as parsed, marking the key as known."""
-        return self._take(key, default, "a value")
+    def raw(self, key: str, default: Any = REQUIRED, expected: str = "a value") -> Any:
+        """Return the value as parsed, marking the key as known; `expected` is for the message when it is missing."""
+        return self._take(key, default, expected)
 
     def number(
         self,
@@ -105,12 +114,12 @@ class Section:
         above: float | None = None,
     ) -> float:
         """Return a finite float in [low, high], and > `above`; bool, text, NaN and infinity are refused."""
-        expected = _range_text("a number" + (f" in {unit}" if unit else ""), low, high, above)
+        expected = range_text("a number" + (f" in {unit}" if unit else ""), low, high, above)
         value = self._take(key, default, expected)
         if key not in self._mapping:
             return value  # type: ignore[no-any-return]  # the caller's own default, None included
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise self.error(key, value, expected + _number_text(value))
+            raise self.error(key, value, expected + number_as_text(value))
         try:
             number = float(value)
         except OverflowError:
@@ -128,7 +137,7 @@ class Section:
         default: Any = REQUIRED,
     ) -> int:
         """Return a whole number in [low, high]; 3.0, bool and text are refused."""
-        expected = _range_text("a whole number" + (f" in {unit}" if unit else ""), low, high, None)
+        expected = range_text("a whole number" + (f" in {unit}" if unit else ""), low, high, None)
         value = self._take(key, default, expected)
         if key not in self._mapping:
             return value  # type: ignore[no-any-return]
@@ -163,14 +172,14 @@ class Section:
 
     def section(self, key: str, optional: bool = False) -> Section | None:
         """Return the mapping under `key`; None when it is optional and missing (or empty in the file)."""
-        value = self._take(key, None if optional else REQUIRED, "a mapping of keys to values")
+        value = self._take(key, None if optional else REQUIRED, SECTION)
         if value is None and optional:
             return None
         return Section(value, self.where, self._child(key))
 
     def required(self, key: str) -> Section:
         """Return the mapping under `key`, which must be there."""
-        return Section(self._take(key, REQUIRED, "a mapping of keys to values"), self.where, self._child(key))
+        return Section(self._take(key, REQUIRED, SECTION), self.where, self._child(key))
 
     def sections(self, key: str) -> list[Section]:
         """Return the list of mappings under `key`; a missing key or null is an empty list."""
@@ -184,8 +193,9 @@ class Section:
     def _child(self, key: str) -> str:
         return f"{self.path}.{key}" if self.path else key
 
-    def finish(self) -> None:
-        """Refuse keys that were never read, naming the nearest known one."""
+    def finish(self, known: Iterable[str] = ()) -> None:
+        """Refuse keys that are not `known` and were not read yet, naming the nearest known one."""
+        self._known.update(dict.fromkeys(known))
         for key in self._mapping:
             if key not in self._known:
                 near = difflib.get_close_matches(key, self._known, n=1)
@@ -199,7 +209,8 @@ def _in_range(value: float, low: float | None, high: float | None, above: float 
     )
 
 
-def _range_text(kind: str, low: float | None, high: float | None, above: float | None) -> str:
+def range_text(kind: str, low: float | None, high: float | None, above: float | None) -> str:
+    """Return a kind of number with its range in words."""
     if low is not None and high is not None:
         return f"{kind} from {_bound(low)} to {_bound(high)}"
     if low is not None:

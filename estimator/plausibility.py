@@ -19,12 +19,11 @@ reference is the first sample, whose own torque is not known. It stays, over gap
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from math import nan
-from typing import Final
+from typing import Annotated, Final
 
-from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.decoder import check, limits
 from jtqd.estimator.joint import Joint
 
 MOTOR_JUMP: Final = 0x04
@@ -45,14 +44,6 @@ LONGEST_STEP_S: Final = 0.05
 _GAP_PERIODS: Final = 5.0
 """A longer step is a gap: its slip is acceleration that nobody has seen, and not added up."""
 
-# name -> unit, lowest, highest
-_RANGES: Final = {
-    "motor_jump_rad": ("rad", 0.01, 1e6),
-    "mismatch_rad": ("rad", 0.01, 1e6),
-    "twist_rad": ("rad", 1e-4, 1e3),
-    "frozen_s": ("s", 0.01, 1e6),
-}
-
 
 @dataclass(frozen=True, slots=True)
 class PlausibilityLimits:
@@ -62,30 +53,13 @@ class PlausibilityLimits:
     current. docs/safety.md says how far the runs of the bench stay below them.
     """
 
-    motor_jump_rad: float = 1.0
-    mismatch_rad: float = 4.0
-    twist_rad: float = 0.01
-    frozen_s: float = 0.5
+    motor_jump_rad: Annotated[float, limits("rad", ge=0.01, le=1e6)] = 1.0
+    mismatch_rad: Annotated[float, limits("rad", ge=0.01, le=1e6)] = 4.0
+    twist_rad: Annotated[float, limits("rad", ge=1e-4, le=1e3)] = 0.01
+    frozen_s: Annotated[float, limits("s", ge=0.01, le=1e6)] = 0.5
 
     def __post_init__(self) -> None:
-        for name, (unit, low, high) in _RANGES.items():
-            value = getattr(self, name)
-            if not (isinstance(value, int | float) and math.isfinite(value) and low <= value <= high):
-                raise ConfigError(
-                    f"plausibility.{name}: found {value!r}, expected a number in {unit} from {low:g} to {high:g}"
-                )
-
-    @classmethod
-    def from_section(cls, section: Section) -> PlausibilityLimits:
-        """Read the mapping of a configuration file; keys are the field names, all optional."""
-        values = {
-            name: section.number(
-                name, unit, low, high, default=next(each.default for each in fields(cls) if each.name == name)
-            )
-            for name, (unit, low, high) in _RANGES.items()
-        }
-        section.finish()
-        return cls(**values)
+        check(self, "plausibility")
 
 
 class Plausibility:

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
 from jtqd.estimator.effects.regression import full, linear
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
 
 SENSOR, CURRENT, LINK = 0.0, 1.0, 2.0
 """Codes of `channel`."""
@@ -31,19 +28,19 @@ class ChannelDelay(Effect):
     )
     hooks = ("sensor_nm", "current_a", "link_rad")
 
-    def sensor_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def sensor_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return what the sensor reads above the truth, Nm."""
         if p["channel"] != SENSOR:
             return full(0.0, s.torque_rate_nm_s)
         return -p["delay_s"] * s.torque_rate_nm_s
 
-    def current_a(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def current_a(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return what the current reads above the truth, A."""
         if p["channel"] != CURRENT:
             return full(0.0, s.current_a)
         return -p["delay_s"] * s.current_rate_a_s
 
-    def link_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def link_rad(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return what the link encoder reads above the truth, rad."""
         if p["channel"] != LINK:
             return full(0.0, s.link_velocity_rad_s)
@@ -53,7 +50,7 @@ class ChannelDelay(Effect):
         """Whether it is the sensor that is late."""
         return p["channel"] == SENSOR
 
-    def terms(self, joint: Joint) -> Sequence[Term]:
+    def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one column per channel."""
         return tuple(linear("delay_s", 1e-3, channel=channel) for channel in (SENSOR, CURRENT, LINK))
 

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
 from jtqd.estimator.effects.regression import Wave
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
 
 ORDERS = (6.0, 12.0, 18.0, 24.0, 36.0, 42.0, 48.0, 60.0, 72.0, 84.0)
 """Usual lcm(poles, slots) and harmonics of the pole pairs; any other order: `term_of_order`."""
@@ -37,11 +34,11 @@ class Cogging(Effect):
     hooks = ("loss_nm",)
     needs = ("motor_position_rad",)
 
-    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return the torque lost beyond the file's losses, Nm joint side."""
         return p["amplitude_nm"] * x.cos(p["order_per_motor_rev"] * s.motor_position_rad + p["phase_rad"])
 
-    def terms(self, joint: Joint) -> Sequence[Term]:
+    def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return a wave (two columns) of each usual order."""
         return tuple(self.term_of_order(order) for order in ORDERS)
 

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
-from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
 from jtqd.estimator.effects.regression import linear
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
 
 
 class CoulombFriction(Effect):
@@ -26,11 +23,11 @@ class CoulombFriction(Effect):
     hooks = ("loss_nm",)
     dissipative: ClassVar[bool] = True
 
-    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return the torque lost beyond the file's losses, Nm joint side."""
         return (p["coulomb_nm"] - joint.friction.coulomb_nm) * s.direction
 
-    def terms(self, joint: Joint) -> Sequence[Term]:
+    def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one column."""
         return (linear("coulomb_nm", 1.0, joint.friction.coulomb_nm),)
 

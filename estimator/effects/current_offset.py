@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
 from jtqd.estimator.effects.regression import full, linear
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
 
 
 class CurrentOffset(Effect):
@@ -27,11 +24,11 @@ class CurrentOffset(Effect):
     parameters = (Parameter("offset_a", "A", -5.0, 5.0),)
     hooks = ("current_a",)
 
-    def current_a(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def current_a(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return what the current reads above the truth, A."""
         return full(p["offset_a"], s.current_a)
 
-    def terms(self, joint: Joint) -> Sequence[Term]:
+    def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one column."""
         return (linear("offset_a", 0.01),)
 

@@ -21,11 +21,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
+from dataclasses import Field, dataclass
+from typing import Any, ClassVar, Final, Protocol, TypeVar
 
 Values = Mapping[str, float]
 """Parameters of an effect by name, SI units."""
@@ -33,6 +30,67 @@ Values = Mapping[str, float]
 MOTOR: Final = "motor"
 TORSION: Final = "torsion"
 BALANCES: Final = (MOTOR, TORSION)
+
+
+class FrictionValues(Protocol):
+    """Friction of a joint file as effects read it, joint side (`estimator.joint.Friction`)."""
+
+    @property
+    def coulomb_nm(self) -> float:
+        """Coulomb friction, Nm."""
+
+    @property
+    def viscous_nms_per_rad(self) -> float:
+        """Viscous friction, Nms/rad."""
+
+    @property
+    def stribeck_nm(self) -> float:
+        """Height of the Stribeck peak, Nm."""
+
+    @property
+    def stribeck_velocity_rad_s(self) -> float:
+        """Velocity at which the Stribeck peak has fallen to 1/e, rad/s."""
+
+
+class JointValues(Protocol):
+    """Values of a joint file that effects read (`estimator.joint.Joint` has them all)."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    @property
+    def gear_ratio(self) -> float:
+        """Motor revolutions per joint revolution."""
+
+    @property
+    def torque_constant_nm_per_a(self) -> float:
+        """Torque constant on the motor side, Nm/A."""
+
+    @property
+    def rotor_inertia_kgm2(self) -> float:
+        """Rotor inertia on the motor side, kg m2."""
+
+    @property
+    def stiffness_nm_per_rad(self) -> float:
+        """Stiffness of the gear on the joint side, Nm/rad."""
+
+    @property
+    def link_inertia_kgm2(self) -> float:
+        """Inertia between gear and sensor, kg m2."""
+
+    @property
+    def rated_torque_nm(self) -> float:
+        """Rated torque on the joint side, Nm."""
+
+    @property
+    def friction(self) -> FrictionValues:
+        """Additive friction."""
+
+    @property
+    def provenance(self) -> Mapping[str, Any]:
+        """Origin of the values, among them `temperature_c`."""
+
+
+AnyJoint = TypeVar("AnyJoint", bound=JointValues)
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,31 +226,31 @@ class Effect:
     geometric: ClassVar[bool] = False
     follows_torsion: ClassVar[bool] = False
 
-    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Motor torque lost in addition to the joint file's losses, Nm joint side."""
         raise NotImplementedError
 
-    def twist_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def twist_rad(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """What the spring sees in addition to theta_m/G - theta_l, rad."""
         raise NotImplementedError
 
-    def load_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def load_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Torque taken between gear and sensor in addition to the file's link inertia, Nm."""
         raise NotImplementedError
 
-    def current_a(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def current_a(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """What the current reads above the truth, A."""
         raise NotImplementedError
 
-    def link_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def link_rad(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """What the link encoder reads above the truth, rad."""
         raise NotImplementedError
 
-    def sensor_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def sensor_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """What the torque sensor reads above the truth, Nm."""
         raise NotImplementedError
 
-    def joint(self, p: Values, joint: Joint) -> Joint:
+    def joint(self, p: Values, joint: AnyJoint) -> AnyJoint:
         """The joint with the values that the effect replaces (`changes_joint`)."""
         return joint
 
@@ -204,13 +262,13 @@ class Effect:
         """Whether with these parameters it is the motor's encoder that reads wrong: by -G link_rad, motor side."""
         return False
 
-    def largest(self, joint: Joint, p: Values) -> float:
+    def largest(self, joint: JointValues, p: Values) -> float:
         """Largest size of its leading parameter, beside the others of p, with which the joint would still move as without
         it: one that would have to be larger to show is invisible, whatever its columns say of motions without it.
         """
         return math.inf
 
-    def terms(self, joint: Joint) -> Sequence[Term]:
+    def terms(self, joint: JointValues) -> Sequence[Term]:
         """Ways to look for it; the best is taken and its parameters refined."""
         raise NotImplementedError
 

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
 from jtqd.estimator.effects.regression import Wave
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
 
 
 class EncoderEccentricity(Effect):
@@ -34,7 +31,7 @@ class EncoderEccentricity(Effect):
     hooks = ("link_rad",)
     needs = ("torsion_rad",)
 
-    def link_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def link_rad(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return what the link encoder reads above the truth, rad."""
         if p["motor_side"]:
             return (-p["amplitude_rad"] / joint.gear_ratio) * x.sin(s.motor_position_rad + p["phase_rad"])
@@ -44,7 +41,7 @@ class EncoderEccentricity(Effect):
         """Whether it is the motor's encoder."""
         return bool(p["motor_side"])
 
-    def terms(self, joint: Joint) -> Sequence[Term]:
+    def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return a wave of the link's encoder and one of the motor's."""
         link = Wave("amplitude_rad", 1e-5, {"motor_side": 0.0}).term()
         return link, Wave("amplitude_rad", 1e-3, {"motor_side": 1.0}).term()

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
 from jtqd.estimator.effects.regression import linear
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
 
 TRAVELS_RAD = (3e-5, 5e-5, 1e-4, 2e-4, 3e-4)
 """Grid of the search; the fit refines it."""
@@ -36,11 +33,11 @@ class Hysteresis(Effect):
     needs = ("torsion_rad",)
     follows_torsion = True
 
-    def twist_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def twist_rad(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return what the spring sees beyond theta_m/G - theta_l, rad."""
         return (p["torque_nm"] / joint.stiffness_nm_per_rad) * x.slip(s.torsion_rad, p["travel_rad"])
 
-    def terms(self, joint: Joint) -> Sequence[Term]:
+    def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one column per travel."""
         return tuple(linear("torque_nm", 1.0, travel_rad=travel) for travel in TRAVELS_RAD)
 

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
 from jtqd.estimator.effects.regression import Wave
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
 
 ORDERS = (1.0, 2.0, 4.0)
 """Shaft, the wave generator's two lobes, and their second harmonic."""
@@ -40,17 +37,17 @@ class KinematicError(Effect):
     needs = ("motor_position_rad", "torque_nm")
     geometric = True
 
-    def twist_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def twist_rad(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return what the spring sees beyond theta_m/G - theta_l, rad."""
         return p["amplitude_rad"] * x.sin(p["order_per_motor_rev"] * s.motor_position_rad + p["phase_rad"])
 
-    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return the torque lost beyond the file's losses, Nm joint side."""
         k = p["order_per_motor_rev"]
         slope = joint.gear_ratio * k * p["amplitude_rad"] * x.cos(k * s.motor_position_rad + p["phase_rad"])
         return s.torque_nm * slope
 
-    def terms(self, joint: Joint) -> Sequence[Term]:
+    def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return a wave (two columns) of each usual order."""
         return tuple(self.term_of_order(order) for order in ORDERS)
 

@@ -9,12 +9,12 @@ import importlib
 import math
 import pkgutil
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, Final
 
 from jtqd.estimator.checked import REQUIRED, ConfigError, Section
-from jtqd.estimator.effects.effect import Effect, Parameter
+from jtqd.estimator.effects.effect import Effect
 
 HOOKS: Final = ("loss_nm", "twist_rad", "load_nm", "current_a", "link_rad", "sensor_nm")
 GROUPS: Final = ("friction", "transmission", "actuator", "measurement", "load")
@@ -49,7 +49,7 @@ NAMES: Final = (
 """What joint files and findings may rely on; the library may hold more, never fewer."""
 
 
-def found() -> dict[str, Effect]:
+def discover() -> dict[str, Effect]:
     """Return the effects of this package by name, in alphabetical order.
 
     Raises TypeError for a file whose EFFECT is not what its name says or has a hook, group or parameter that does
@@ -86,7 +86,7 @@ def _complete(effect: object, file: str) -> Effect:
     return effect
 
 
-EFFECTS: Final[Mapping[str, Effect]] = MappingProxyType(found())
+EFFECTS: Final[Mapping[str, Effect]] = MappingProxyType(discover())
 
 
 def effect_of(name: str) -> Effect:
@@ -117,12 +117,3 @@ def read_parameters(name: str, section: Section) -> dict[str, float]:
             values[p.name] = value
     section.finish()
     return values
-
-
-def outside(parameters: Iterable[Parameter], values: Mapping[str, float]) -> list[str]:
-    """Return the names of the values that are not finite or out of their plausible range."""
-    return [
-        p.name
-        for p in parameters
-        if p.name in values and not p.low <= values[p.name] <= p.high  # NaN is outside too
-    ]

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
-from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import (
+    AnyJoint,
+    Effect,
+    Functions,
+    JointValues,
+    Parameter,
+    State,
+    Term,
+    Values,
+)
 from jtqd.estimator.effects.regression import linear
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
 
 
 class LinkInertia(Effect):
@@ -28,15 +34,15 @@ class LinkInertia(Effect):
     needs = ("link_acceleration_rad_s2",)
     changes_joint: ClassVar[bool] = True
 
-    def load_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def load_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return the torque taken before the sensor, Nm."""
         return (p["link_inertia_kgm2"] - joint.link_inertia_kgm2) * s.link_acceleration_rad_s2
 
-    def joint(self, p: Values, joint: Joint) -> Joint:
+    def joint(self, p: Values, joint: AnyJoint) -> AnyJoint:
         """Return the joint with this inertia."""
         return replace(joint, link_inertia_kgm2=p["link_inertia_kgm2"])
 
-    def terms(self, joint: Joint) -> Sequence[Term]:
+    def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one column."""
         return (linear("link_inertia_kgm2", 0.01, joint.link_inertia_kgm2),)
 

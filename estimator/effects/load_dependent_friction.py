@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
-from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
 from jtqd.estimator.effects.regression import linear
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
 
 
 class LoadDependentFriction(Effect):
@@ -29,11 +26,11 @@ class LoadDependentFriction(Effect):
     needs = ("torque_nm",)
     dissipative: ClassVar[bool] = True
 
-    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return the torque lost beyond the file's losses, Nm joint side."""
         return p["load_coefficient"] * abs(s.torque_nm) * s.direction
 
-    def terms(self, joint: Joint) -> Sequence[Term]:
+    def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one column."""
         return (linear("load_coefficient", 0.1),)
 

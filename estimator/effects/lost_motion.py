@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
 from jtqd.estimator.effects.regression import linear
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
 
 WIDTHS_RAD = (3e-5, 1e-4, 3e-4, 1e-3)
 """Grid of the search; the fit refines it."""
@@ -30,12 +27,12 @@ class LostMotion(Effect):
     needs = ("torsion_rad",)
     follows_torsion = True
 
-    def twist_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def twist_rad(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return what the spring sees beyond theta_m/G - theta_l, rad."""
         half = 0.5 * p["width_rad"]
         return -x.clip(s.torsion_rad, -half, half)
 
-    def terms(self, joint: Joint) -> Sequence[Term]:
+    def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one column per width; the coefficient scales the width, exact beyond the play."""
         return tuple(linear("width_rad", width) for width in WIDTHS_RAD)
 

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
 from jtqd.estimator.effects.regression import Linear
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
 
 
 class NonlinearStiffness(Effect):
@@ -34,7 +31,7 @@ class NonlinearStiffness(Effect):
     hooks = ("twist_rad",)
     needs = ("torsion_rad",)
 
-    def twist_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def twist_rad(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return what the spring sees beyond theta_m/G - theta_l, rad."""
         own = joint.stiffness_nm_per_rad
         d = s.torsion_rad
@@ -42,7 +39,7 @@ class NonlinearStiffness(Effect):
             d * d * d
         )
 
-    def terms(self, joint: Joint) -> Sequence[Term]:
+    def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return another slope, hardening alone, and both."""
         own = joint.stiffness_nm_per_rad
         # at the rated torque, K3 d^3 is a tenth of the torque

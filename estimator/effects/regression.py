@@ -8,14 +8,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
-from jtqd.estimator.effects.effect import Term, Values
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
+from jtqd.estimator.effects.effect import JointValues, Term, Values
 
 FALLBACK_C: Final = 25.0
 """Reference temperature of a joint file that names none."""
@@ -40,7 +37,7 @@ def above(temperature_c: Any, reference_c: float) -> Any:
     return difference if math.isfinite(difference) else 0.0
 
 
-def reference_of(joint: Joint) -> float:
+def reference_of(joint: JointValues) -> float:
     """Return the temperature [°C] of the joint file's values, from its provenance."""
     value = joint.provenance.get("temperature_c")
     good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

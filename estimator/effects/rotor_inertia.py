@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
-from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import (
+    AnyJoint,
+    Effect,
+    Functions,
+    JointValues,
+    Parameter,
+    State,
+    Term,
+    Values,
+)
 from jtqd.estimator.effects.regression import linear
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
 
 
 class RotorInertia(Effect):
@@ -28,16 +34,16 @@ class RotorInertia(Effect):
     needs = ("motor_acceleration_rad_s2",)
     changes_joint: ClassVar[bool] = True
 
-    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return the torque lost beyond the file's losses, Nm joint side."""
         more = p["rotor_inertia_kgm2"] - joint.rotor_inertia_kgm2
         return joint.gear_ratio * more * s.motor_acceleration_rad_s2
 
-    def joint(self, p: Values, joint: Joint) -> Joint:
+    def joint(self, p: Values, joint: AnyJoint) -> AnyJoint:
         """Return the joint with this inertia."""
         return replace(joint, rotor_inertia_kgm2=p["rotor_inertia_kgm2"])
 
-    def terms(self, joint: Joint) -> Sequence[Term]:
+    def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one column."""
         own = joint.rotor_inertia_kgm2
         return (linear("rotor_inertia_kgm2", 0.1 * own, own),)

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
-from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
 from jtqd.estimator.effects.regression import Wave
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
 
 
 class SensorCrosstalk(Effect):
@@ -35,12 +32,12 @@ class SensorCrosstalk(Effect):
     needs = ("coupling_position_rad", "torque_nm")
     at_sensor: ClassVar[bool] = True
 
-    def sensor_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def sensor_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return what the sensor reads above the truth, Nm."""
         size = p["amplitude_nm"] + p["share"] * s.torque_nm
         return size * x.cos(s.coupling_position_rad + p["phase_rad"])
 
-    def terms(self, joint: Joint) -> Sequence[Term]:
+    def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return a wave of constant size and one in proportion to the load."""
         constant = Wave("amplitude_nm", 0.1, {"share": 0.0}).term()
         return constant, Wave("share", 0.01, {"amplitude_nm": 0.0}).term()

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
-from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
 from jtqd.estimator.effects.regression import FALLBACK_C, Slope, above, linear, reference_of
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
 
 
 class SensorDrift(Effect):
@@ -31,12 +28,12 @@ class SensorDrift(Effect):
     needs = ("time_s",)
     at_sensor: ClassVar[bool] = True
 
-    def sensor_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def sensor_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return what the sensor reads above the truth, Nm."""
         drift = p["rate_nm_per_s"] * s.time_s
         return drift + p["per_k_nm"] * above(s.temperature_c, p["reference_c"]) if p["per_k_nm"] else drift
 
-    def terms(self, joint: Joint) -> Sequence[Term]:
+    def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return a drift with time, and one with temperature (two columns: slope and constant)."""
         time = linear("rate_nm_per_s", 1e-3, per_k_nm=0.0, reference_c=FALLBACK_C)
         return time, Slope("per_k_nm", 0.01, reference_of(joint), {"rate_nm_per_s": 0.0}).term()

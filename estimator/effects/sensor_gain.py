@@ -9,12 +9,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
-from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
 
 STEP = 0.01
 """1 - 1/g of the column."""
@@ -48,11 +45,11 @@ class SensorGain(Effect):
     needs = ("torque_nm",)
     at_sensor: ClassVar[bool] = True
 
-    def sensor_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def sensor_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return what the sensor reads above the truth, Nm."""
         return (1.0 - 1.0 / p["gain"]) * s.torque_nm
 
-    def terms(self, joint: Joint) -> Sequence[Term]:
+    def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one column."""
         return (Term(({"gain": 1.0 / (1.0 - STEP)},), _Gain()),)
 

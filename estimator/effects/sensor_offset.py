@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
-from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
 from jtqd.estimator.effects.regression import full, linear
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
 
 
 class SensorOffset(Effect):
@@ -26,11 +23,11 @@ class SensorOffset(Effect):
     hooks = ("sensor_nm",)
     at_sensor: ClassVar[bool] = True
 
-    def sensor_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def sensor_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return what the sensor reads above the truth, Nm."""
         return full(p["offset_nm"], s.torque_nm)
 
-    def terms(self, joint: Joint) -> Sequence[Term]:
+    def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one column."""
         return (linear("offset_nm", 0.1),)
 

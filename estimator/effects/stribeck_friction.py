@@ -5,13 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
 from jtqd.estimator.effects.regression import linear
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
 
 VELOCITIES_RAD_S = (0.02, 0.035, 0.05, 0.08, 0.12, 0.2)
 """Grid of the search, the joint file's own beside it; the fit refines it."""
@@ -66,7 +63,7 @@ class StribeckFriction(Effect):
     hooks = ("loss_nm",)
     dissipative = True
 
-    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return the torque lost beyond the file's losses, Nm joint side."""
         own = joint.friction
         v = s.velocity_rad_s
@@ -77,7 +74,7 @@ class StribeckFriction(Effect):
             peak = peak - own.stribeck_nm * x.exp(-old * old)
         return peak * s.direction
 
-    def largest(self, joint: Joint, p: Values) -> float:
+    def largest(self, joint: JointValues, p: Values) -> float:
         """Return the height at which friction falls with velocity as steeply as a drive can hold, peak slope over inertia
         sqrt(2/e) Fs/(vs J) = _HELD_PER_S, and at most half the Coulomb friction. Beyond, the joint sticks and jumps where it
         has crept before: the slow samples in which the peak's foot would show are not there any more.
@@ -87,7 +84,7 @@ class StribeckFriction(Effect):
         held = _HELD_PER_S * inertia * velocity / math.sqrt(2.0 / math.e)
         return min(held, 0.5 * max(friction.coulomb_nm, _LEAST_COULOMB * joint.rated_torque_nm))
 
-    def terms(self, joint: Joint) -> Sequence[Term]:
+    def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one column per velocity; where the file has a peak itself, its height and a second peak."""
         own_nm, own = joint.friction.stribeck_nm, joint.friction.stribeck_velocity_rad_s
         height = linear("stribeck_nm", 1.0, own_nm, stribeck_velocity_rad_s=own)

@@ -5,13 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
 from jtqd.estimator.effects.regression import SPAN_K, above, reference_of
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
 
 RATES_PER_K = (0.003, 0.015, 0.03)
 """Grid of the search: how curved the fall over temperature is; the fit refines it."""
@@ -77,7 +74,7 @@ class TemperatureDependentFriction(Effect):
     needs = ("temperature_c",)
     dissipative = True
 
-    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return the torque lost beyond the file's losses, Nm joint side; NaN temperature: 0."""
         own = joint.friction
         warmer = above(s.temperature_c, p["reference_c"])
@@ -88,7 +85,7 @@ class TemperatureDependentFriction(Effect):
             loss = loss + own.coulomb_nm * s.direction * coulomb
         return loss
 
-    def terms(self, joint: Joint) -> Sequence[Term]:
+    def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return two columns (slope over temperature, constant) per rate, of viscous and of Coulomb friction."""
         reference = reference_of(joint)
         viscous, coulomb = "viscous_per_k", "coulomb_per_k"

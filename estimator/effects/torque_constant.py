@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
 from jtqd.estimator.effects.regression import linear
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
 
 
 class TorqueConstant(Effect):
@@ -35,13 +32,13 @@ class TorqueConstant(Effect):
     )
     hooks = ("loss_nm",)
 
-    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return the torque lost beyond the file's losses, Nm joint side."""
         return (
             -joint.gear_ratio * (p["torque_constant_nm_per_a"] - joint.torque_constant_nm_per_a) * s.current_a
         )
 
-    def terms(self, joint: Joint) -> Sequence[Term]:
+    def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one column."""
         own = joint.torque_constant_nm_per_a
         return (linear("torque_constant_nm_per_a", 0.01 * own, own),)

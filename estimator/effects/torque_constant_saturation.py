@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
 from jtqd.estimator.effects.regression import linear
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
 
 
 class TorqueConstantSaturation(Effect):
@@ -28,12 +25,12 @@ class TorqueConstantSaturation(Effect):
     parameters = (Parameter("saturation_per_a", "1/A", 0.0, 0.5),)
     hooks = ("loss_nm",)
 
-    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return the torque lost beyond the file's losses, Nm joint side."""
         scale = joint.gear_ratio * joint.torque_constant_nm_per_a * p["saturation_per_a"]
         return scale * s.current_a * abs(s.current_a)
 
-    def terms(self, joint: Joint) -> Sequence[Term]:
+    def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one column."""
         return (linear("saturation_per_a", 0.01),)
 

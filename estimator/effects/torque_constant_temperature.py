@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
 from jtqd.estimator.effects.regression import Slope, above, reference_of
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
 
 
 class TorqueConstantTemperature(Effect):
@@ -32,12 +29,12 @@ class TorqueConstantTemperature(Effect):
     hooks = ("loss_nm",)
     needs = ("temperature_c",)
 
-    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return the torque lost beyond the file's losses, Nm joint side."""
         scale = -joint.gear_ratio * joint.torque_constant_nm_per_a * p["per_k"]
         return scale * above(s.temperature_c, p["reference_c"]) * s.current_a
 
-    def terms(self, joint: Joint) -> Sequence[Term]:
+    def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return two columns: slope over temperature, and constant."""
         return (Slope("per_k", 1e-3, reference_of(joint)).term(),)
 

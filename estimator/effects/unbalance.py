@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
 from jtqd.estimator.effects.regression import Wave
-
-if TYPE_CHECKING:
-    from jtqd.estimator.joint import Joint
 
 
 class Unbalance(Effect):
@@ -33,11 +30,11 @@ class Unbalance(Effect):
     hooks = ("load_nm",)
     needs = ("link_position_rad",)
 
-    def load_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
+    def load_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return the torque taken before the sensor, Nm."""
         return p["moment_nm"] * x.sin(s.link_position_rad + p["phase_rad"])
 
-    def terms(self, joint: Joint) -> Sequence[Term]:
+    def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one wave (two columns)."""
         return (Wave("moment_nm", 0.1).term(),)
 

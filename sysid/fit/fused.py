@@ -94,6 +94,7 @@ def fit_sigma(runs: Sequence[PathResiduals]) -> FusedSigma:
         torsion_nm=max(float(np.sqrt(b[0])), _FLOOR_NM),
         torsion_load=float(np.sqrt(b[1])),
         reference_nm=float(np.sqrt(shared)),
+        scale=(1.0, 1.0, 1.0, 1.0),
     )
 
 

@@ -29,6 +29,7 @@ from jtqd.daemon.logs.errors import LogError
 from jtqd.daemon.logs.reader import read_topic
 from jtqd.daemon.logs.rows import Records
 from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.decoder import decode
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable, RunTableError
 from jtqd.estimator.settings import EstimatorSettings
@@ -106,7 +107,7 @@ def configured(config: Path) -> tuple[tuple[Joint, Joint], EstimatorSettings]:
     )
     estimator = top.section("estimator")
     assert estimator is not None  # a missing section is a ConfigError
-    return (one, two), EstimatorSettings.from_section(estimator)
+    return (one, two), decode(EstimatorSettings, estimator)
 
 
 def published_torque(frames: Records, joint: int) -> Array:

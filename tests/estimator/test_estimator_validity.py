@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.decoder import decode
 from jtqd.estimator.losses import FrictionModel, LossModel
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.validity import Trust, Uncertainty
@@ -115,14 +116,12 @@ def test_weight_twin() -> None:
 
 
 def test_settings_are_checked() -> None:
-    assert EstimatorSettings.from_section(Section({}, "c.yaml", "estimator")) == EstimatorSettings()
-    settings = EstimatorSettings.from_section(
-        Section({"method": "tob", "bandwidth_rad_s": 80}, "c.yaml", "e")
-    )
+    assert decode(EstimatorSettings, Section({}, "c.yaml", "estimator")) == EstimatorSettings()
+    settings = decode(EstimatorSettings, Section({"method": "tob", "bandwidth_rad_s": 80}, "c.yaml", "e"))
     assert (settings.method, settings.bandwidth_rad_s) == ("tob", 80.0)
     for bad in ({"method": "magic"}, {"bandwidth_rad_s": 0}, {"bandwith_rad_s": 80}, {"max_gap_s": math.nan}):
         with pytest.raises(ConfigError, match=r"^c\.yaml: key 'e\."):
-            EstimatorSettings.from_section(Section(bad, "c.yaml", "e"))
+            decode(EstimatorSettings, Section(bad, "c.yaml", "e"))
     for wrong in ({"method": "x"}, {"sigma_floor": -1.0}, {"torque_limit": math.inf}):
         with pytest.raises(ConfigError):
             EstimatorSettings(**wrong)  # type: ignore[arg-type]

@@ -39,7 +39,7 @@ def test_at_rest_the_torsion_takes_over() -> None:
 
 
 def test_both_alike_is_the_mean() -> None:
-    sigma = FusedSigma(0.3, 0.0, 0.0, 0.3, 0.0, 0.0)
+    sigma = FusedSigma(0.3, 0.0, 0.0, 0.3, 0.0, 0.0, (1.0, 1.0, 1.0, 1.0))
     assert Fusion(sigma, True).fuse(RAW, LOSS, 0.0, V, 8.0) == pytest.approx((8.5, 0.3 / 2**0.5), abs=1e-12)
 
 

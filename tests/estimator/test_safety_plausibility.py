@@ -12,6 +12,7 @@ import pytest
 from jtqd.daemon.config import load_config
 from jtqd.daemon.loop.joint_status import safety_of
 from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.decoder import decode
 from jtqd.estimator.plausibility import (
     CURRENT_FROZEN,
     FROZEN_RAD,
@@ -197,7 +198,7 @@ def test_the_first_sample_and_a_wrong_time_step_conclude_nothing() -> None:
 )
 def test_limits_out_of_range_are_refused(mapping: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        PlausibilityLimits.from_section(Section(mapping, "c.yaml", "safety.plausibility"))
+        decode(PlausibilityLimits, Section(mapping, "c.yaml", "safety.plausibility"))
     assert message in str(caught.value)
 
 

@@ -11,16 +11,17 @@ import pytest
 from jtqd.daemon.config import RecordingSettings, load_config
 from jtqd.daemon.recording.request import RecorderRequest, recording_request
 from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.decoder import decode
 from jtqd.models.files import shipped
 from tests.daemon.recording.test_dbc import SCALING
 
 
 def read(**keys):
-    return RecordingSettings.from_section(Section(keys, "a.yaml", "recording"))
+    return decode(RecordingSettings, Section(keys, "a.yaml", "recording"))
 
 
 def test_defaults():
-    assert RecordingSettings.from_section(None) == read() == RecordingSettings()
+    assert read() == RecordingSettings()
     assert asdict(read()) == {
         "ring_cycles": 4096,
         "chunk_s": 0.5,

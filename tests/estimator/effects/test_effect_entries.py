@@ -11,7 +11,7 @@ import pytest
 
 from jtqd.estimator import effects
 from jtqd.estimator.checked import ConfigError
-from jtqd.estimator.effects.library import EFFECTS, found, outside
+from jtqd.estimator.effects.library import EFFECTS, discover
 from jtqd.estimator.joint import Effect as Entry
 from tests.estimator.effects.effect_signals import PLAIN, balances, state
 
@@ -64,14 +64,6 @@ def test_defaults_are_filled_in_and_the_files_own_values_are_not() -> None:
             np.testing.assert_array_equal(left, right)
 
 
-def test_values_out_of_range_are_named() -> None:
-    p = EFFECTS["cogging"].parameters
-    assert outside(p, {"amplitude_nm": -1.0, "order_per_motor_rev": 6.0, "phase_rad": math.nan}) == [
-        "amplitude_nm",
-        "phase_rad",
-    ]
-
-
 def test_one_key_has_one_right_value() -> None:
     twice = (Entry("torque_constant", {"torque_constant_nm_per_a": 0.07}),) * 2
     with pytest.raises(ConfigError, match="found 'torque_constant' twice"):
@@ -113,7 +105,7 @@ def test_a_new_effect_is_one_new_file(
     (tmp_path / f"{name}.py").write_text(NEW.format(**values))
     monkeypatch.setattr(effects, "__path__", [*effects.__path__, str(tmp_path)])
     if message is None:
-        assert set(found()) == set(EFFECTS) | {name}
+        assert set(discover()) == set(EFFECTS) | {name}
         return
     with pytest.raises(TypeError, match=message):
-        found()
+        discover()

@@ -72,7 +72,7 @@ def simple_fused() -> Fused:
     side = LossSide((3.0, 3.0, 5.0, 9.0), (2.0,) * 4, (0.0,) * 4, 0.5)
     loss = AdditiveLoss((-40.0, 0.0, 20.0, 50.0), side, side, 0.05, 3.0, 25.0, 2.0, 0.0)
     torsion = Torsion(12000.0, 0.0, 0.0, (2.0, 4.0), (0.0, 0.0), (0.0, 0.0))
-    return Fused(loss, torsion, FusedSigma(1.0, 0.0, 0.0, 0.5, 0.0, 0.1))
+    return Fused(loss, torsion, FusedSigma(1.0, 0.0, 0.0, 0.5, 0.0, 0.1, (1.0, 1.0, 1.0, 1.0)))
 
 
 def fused_network(joint: str, correction_nm: float = 0.0, **metadata: Any) -> bytes:

@@ -31,7 +31,7 @@ from tests.estimator.fused_helpers import fused_joint
 from tests.sysid.fit.fused_signals import STIFF, Nuisance, made_run, one_way, smooth_loss
 
 FRICTION = Friction(3.0, 2.0, 0.8, 0.05)
-TRUE = FusedSigma(0.25, 0.12, 0.02, 0.3, 0.03, 0.4)
+TRUE = FusedSigma(0.25, 0.12, 0.02, 0.3, 0.03, 0.4, (1.0, 1.0, 1.0, 1.0))
 
 
 def residuals(rng: np.random.Generator, count: int = 2000) -> PathResiduals:
