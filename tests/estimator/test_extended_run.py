@@ -13,7 +13,7 @@ from jtqd.daemon.config import load_config
 from jtqd.daemon.loop.process import build_estimator, warm_up
 from jtqd.estimator import status as st
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.corrections import acting, needs_torque
+from jtqd.estimator.corrections import acting_effects, needs_torque
 from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.estimator import ExtendedEstimator, FusedEstimator, JointEstimator
 from jtqd.estimator.methods import AnyNetwork, estimate_columns, load_network, make_estimator
@@ -114,7 +114,7 @@ def test_without_acting_effects_the_estimator_is_the_plain_one() -> None:
     none = ("sensor_offset", "sensor_gain", "sensor_drift", "sensor_crosstalk", "unbalance", "link_inertia")
     late_sensor = ("channel_delay", {"delay_s": 1e-3, "channel": 0.0})
     joint = extended(PLAIN, *((name, ALL[name]) for name in none), late_sensor)
-    assert acting(joint) == ()
+    assert acting_effects(joint) == ()
     assert type(make_estimator(joint, TOB)) is JointEstimator
     assert type(make_estimator(PLAIN, TOB)) is JointEstimator
     assert make_estimator(PLAIN, TOB).joint is PLAIN
