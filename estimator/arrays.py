@@ -1,4 +1,4 @@
-"""Types of the arrays that pass between the parts: what one element is; shapes stand where a function takes them."""
+"""Array types by element; shapes stand in the docstring of the function that takes them."""
 
 import numpy as np
 import numpy.typing as npt

@@ -1,4 +1,4 @@
-"""Effects of a joint file as corrections of what an estimator is given, so that estimators know nothing of effects.
+"""Effects of a joint file as corrections of the estimator's inputs, so that estimators know nothing of effects.
 
     I       = i - current_a                       what flows
     i'      = I - loss_nm / (G Kt)                the current that would do without the additional losses
@@ -9,8 +9,8 @@ for the spring, and makes the rotor seem to accelerate by G link_rad omega_m^2 (
 out): i' makes up for that inertia, + Jm G link_rad omega_m^2 / Kt.
 
 Current and link readings are corrected first; loss and twist see the corrected ones. A loss that depends on the torque
-takes the estimate of the sample before. Inertias replace the joint file's (`Effect.joint`). Loads and the sensor's
-effects change nothing of the torque at the drive side.
+takes the estimate of the sample before. Inertias replace the joint file's (`plain_joint`). Loads and the sensor's effects
+change nothing of the torque at the drive side.
 
 Derivatives of a noisy channel and the deflection that moves a slip pass a first-order filter; it starts at the first
 sample, and again after garbage or a gap.
@@ -32,14 +32,14 @@ from jtqd.estimator.settings import EstimatorSettings
 
 Pairs = tuple[tuple[Effect, Values], ...]
 
-_READ: Final = ("current_a", "link_rad", "twist_rad", "loss_nm")
+_INPUT_HOOKS: Final = ("current_a", "link_rad", "twist_rad", "loss_nm")
 INVERSE_W0: Final = 1.0 / DIRECTION_VELOCITY_RAD_S
 
 
 class Smoothed(Scalar):
-    """Functions of the loop whose slip follows the filtered deflection: noise would wear the state away.
+    """`Scalar` functions whose slip follows the filtered deflection: noise would wear the state away.
 
-    share: part of the way to a new deflection, 1 to start.
+    share: gain of the filter, the part of the way to a new deflection; 1 to start.
     """
 
     __slots__ = ("_d", "share")
@@ -50,19 +50,19 @@ class Smoothed(Scalar):
         self.share = 1.0
 
     def slip(self, d: float, travel: float) -> float:
-        """Return the state after the filtered deflection went on towards d."""
+        """Return the state after the filtered deflection moved towards d [rad]."""
         self._d += self.share * (d - self._d)
         return Scalar.slip(self, self._d, travel)
 
 
-def acting(joint: Joint) -> Pairs:
+def acting_effects(joint: Joint) -> Pairs:
     """Return the effects that change what an estimator of the drive-side torque must be given, with parameters."""
     pairs = [(EFFECTS[e.name], dict(e.parameters)) for e in joint.effects]
     return tuple(
         (effect, p)
         for effect, p in pairs
         if not effect.changes_joint
-        and any(hook in _READ for hook in effect.hooks)
+        and any(hook in _INPUT_HOOKS for hook in effect.hooks)
         and not (effect.name == "channel_delay" and p["channel"] == SENSOR)
     )
 
@@ -78,18 +78,18 @@ def plain_joint(joint: Joint) -> Joint:
 
 
 def needs_torque(joint: Joint) -> bool:
-    """Whether a loss depends on the torque, so that corrections need the estimate of the sample before."""
-    return any("loss_nm" in e.hooks and "torque_nm" in e.needs for e, _ in acting(joint))
+    """Return whether a loss depends on the torque, so that corrections need the estimate of the sample before."""
+    return any("loss_nm" in e.hooks and "torque_nm" in e.needs for e, _ in acting_effects(joint))
 
 
 def torsion_zero(joint: Joint) -> float:
-    """Return theta_m/G - theta_l [rad] without torque, where the joint file says it."""
+    """Return theta_m/G - theta_l [rad] without torque, 0 where the joint file gives none."""
     torsion = None if joint.fused is None else joint.fused.torsion
     return 0.0 if torsion is None else torsion.zero_rad
 
 
 def seeming_inertia_a(joint: Joint) -> float:
-    """Return Jm G / Kt: times link_rad omega_m^2 the current [A] that an error of the motor's encoder makes up."""
+    """Return Jm G / Kt: times link_rad omega_m^2 the current [A] that an error of the motor's encoder feigns."""
     return plain_joint(joint).rotor_inertia_kgm2 * joint.gear_ratio / joint.torque_constant_nm_per_a
 
 
@@ -102,7 +102,7 @@ class Hook(NamedTuple):
 
 
 def at_motor(pairs: Pairs) -> Pairs:
-    """Return those that are errors of the motor's encoder."""
+    """Return the effects that are errors of the motor's encoder."""
     return tuple((effect, p) for effect, p in pairs if effect.at_motor_of(p))
 
 
@@ -112,7 +112,7 @@ def hooks_of(pairs: Pairs, name: str, functions: Any) -> tuple[Hook, ...]:
 
 
 class ExtendedInputs:
-    """Corrections of one joint sample by sample; one State is used again and again."""
+    """Corrections of one joint's inputs, sample by sample, in one preallocated `State`."""
 
     __slots__ = (
         "_current",
@@ -136,7 +136,7 @@ class ExtendedInputs:
     )
 
     def __init__(self, joint: Joint, settings: EstimatorSettings) -> None:
-        pairs = acting(joint)
+        pairs = acting_effects(joint)
         self._joint: Final = replace(joint, effects=())
         self._current: Final = hooks_of(pairs, "current_a", Scalar)
         self._motor: Final = hooks_of(at_motor(pairs), "link_rad", Scalar)
@@ -171,7 +171,7 @@ class ExtendedInputs:
     ) -> tuple[float, float]:
         """Return (i', theta_l'); torque_nm: the estimate of the sample before, NaN without.
 
-        A sample that is not finite comes back as it is, for the estimator to refuse.
+        A sample that is not finite is returned as it is, for the estimator to refuse.
         """
         if not isfinite(current_a + motor_position_rad + motor_velocity_rad_s + link_position_rad):
             self._running = False

@@ -1,4 +1,14 @@
-"""Any estimator of a joint whose file has effects: inputs corrected (`extended_inputs`), then the estimator as it is."""
+"""The estimate of one joint, sample by sample: observer, loss, network, uncertainty, in this order.
+
+| class | methods |
+|---|---|
+| `JointEstimator` | the paper's: `tob`, `efficiency`, `network` |
+| `FusedEstimator` | ours: `fused` |
+| `ExtendedEstimator` | either of them for a joint with effects: inputs corrected first (`corrections`) |
+
+`methods.make_estimator` chooses. Each has `step`, `reset`, `with_network`, `joint` and `settings`. Everything that enters
+the loss went through the same filter, so the physics estimate as a whole is 1/g old.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +21,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.corrections import ExtendedInputs
 from jtqd.estimator.fusion import HOLD_S, Fusion, turning
-from jtqd.estimator.guard import Tracker
+from jtqd.estimator.guard import Guard
 from jtqd.estimator.joint import Fused, Joint
 from jtqd.estimator.losses import AdditiveLossModel, LossModel
 from jtqd.estimator.network import FusedNetworkModel, NetworkModel, checked_network, trust_of
@@ -28,27 +38,28 @@ from jtqd.estimator.status import (
 )
 from jtqd.estimator.validity import FADE_START, FusedTrust, Uncertainty
 
-# The estimate of one joint, sample by sample: observer, loss, network, validity, in this order.
-#
-#     tau_raw, tau_tob, v, r  <-  observer (Eqs. 4, 7)
-#     i_eff      = tau_raw/(G Kt)                current without the part that accelerates the rotor
-#     efficiency = tau_raw - loss(i_eff, v)      inside a quadrant tau_raw eta(i_eff, v): Eq. (7) with Table I
-#     network    = N(i, theta_m, omega_m, theta_l, omega_l, efficiency)
-#
-# Everything that enters the loss went through the same filter, so the physics estimate as a whole is 1/g old.
+STANDSTILL_SIGMAS: Final = 3.0
+"""Half width of the standstill interval in standard deviations, where torsion narrows what friction leaves open."""
 
-
-_new: Final = tuple.__new__
+_new: Final = tuple.__new__  # a NamedTuple's own constructor costs twice as much
 
 
 class JointEstimator:
-    """Estimator of one plain joint. Raises ConfigError for effects (`make_estimator` applies them), another's network.
+    """The paper's estimator of one joint: methods `tob`, `efficiency` and `network`.
 
-    joint: parameters; settings: method and thresholds; network: needed by method "network" only. A joint
-    without efficiency may use methods "tob" and "network" (the loss is then its additive friction).
+        tau_raw, tau_tob, v, r  <-  observer (Eqs. 4, 7)
+        i_eff      = tau_raw/(G Kt)                current without the part that accelerates the rotor
+        efficiency = tau_raw - loss(i_eff, v)      inside a quadrant tau_raw eta(i_eff, v): Eq. (7) with Table I
+        network    = N(i, theta_m, omega_m, theta_l, omega_l, efficiency)
+
+    joint: parameters; settings: method and thresholds; network: needed by method "network" only. A joint without
+    efficiency may use methods "tob" and "network" (the loss is then its additive friction).
+
+    Raises ConfigError for effects (`make_estimator` applies them), a missing network or that of another joint.
     """
 
     __slots__ = (
+        "_guard",
         "_inverse_gain",
         "_limit",
         "_loss",
@@ -56,7 +67,6 @@ class JointEstimator:
         "_network_sigma",
         "_run_network",
         "_standing",
-        "_tracker",
         "_weight",
         "_with_efficiency",
         "joint",
@@ -71,7 +81,7 @@ class JointEstimator:
         uncertainty = Uncertainty(joint, settings, losses)
         self.joint: Final = joint
         self.settings: Final = settings
-        self._tracker: Final = Tracker(
+        self._guard: Final = Guard(
             Observer(joint, settings.bandwidth_rad_s, settings.link_bandwidth_rad_s), joint, settings
         )
         self._with_efficiency: Final = settings.method != "tob"
@@ -91,7 +101,7 @@ class JointEstimator:
 
     def reset(self) -> None:
         """Forget the past: the next step starts."""
-        self._tracker.reset()
+        self._guard.reset()
 
     def step(  # noqa: PLR0917 - a sample, positional for speed
         self,
@@ -107,9 +117,9 @@ class JointEstimator:
 
         Without network_wanted there is no time for it: this sample is physics only.
         """
-        tracker = self._tracker
-        seen = tracker.step(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
-        status = tracker.status
+        guard = self._guard
+        seen = guard.step(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
+        status = guard.status
         if seen is None:
             return STARTING_ESTIMATE if status == STARTING else INVALID_ESTIMATE
         raw, tob, v, link_velocity = seen
@@ -158,27 +168,8 @@ class JointEstimator:
         return _new(Estimate, (torque, sigma, status, tob, efficiency, network))
 
 
-# Our estimator of one joint, sample by sample: observer, additive loss, fusion with torsion, network, validity.
-#
-#     tau_raw, v, tau_t, waves, s, open  <-  FusedObserver    s: direction, -1 to 1; open: of the torsion's slip
-#     physics = fusion of tau_raw - loss(tau_raw, v, s, T) and tau_t
-#     torque  = physics + w turning(v) N(features)            w: trust of the network; turning: 0 at rest, 1 from 0.2 rad/s
-#
-# w is 1 inside the network's envelope, falls continuously to 0 outside of it, and falls from 1 to 0 while |N| goes from
-# 75 % to 100 % of the limit. Status 2 where w = 1, 3 where it is less (at w = 0 the value is the physics alone), 6 at
-# standstill. Everything has passed the same filter: the estimate as a whole is 1/g old.
-
-
-STANDSTILL_SIGMAS: Final = 3.0
-"""Half width of the standstill interval in standard deviations, where torsion narrows what friction leaves open."""
-
-_fused_estimator_new: Final = tuple.__new__
-
-
-def fused_parts(
-    joint: Joint, settings: EstimatorSettings, network: FusedNetworkModel | None
-) -> tuple[Fused, FusedNetworkModel | None]:
-    """Return section `fused` and the network, checked; ConfigError when joint, method and network do not fit."""
+def checked_fused(joint: Joint, settings: EstimatorSettings, network: FusedNetworkModel | None) -> Fused:
+    """Return section `fused` of the joint; ConfigError when joint, method and network do not fit."""
     if settings.method != "fused":
         raise ConfigError(f"joint {joint.name}: found method '{settings.method}', expected 'fused'")
     if joint.effects:
@@ -195,7 +186,7 @@ def fused_parts(
         raise ConfigError(
             f"joint {joint.name}: found a network of joint '{network.joint}', expected one of '{joint.name}'"
         )
-    return joint.fused, network
+    return joint.fused
 
 
 def _no_trust(*_: float) -> float:
@@ -203,7 +194,15 @@ def _no_trust(*_: float) -> float:
 
 
 class FusedEstimator:
-    """Estimator of one joint by method `fused`; without a network its physics alone, status valid.
+    """Our estimator of one joint, method `fused`; without a network its physics alone, status valid.
+
+        tau_raw, v, tau_t, waves, s, open  <-  FusedObserver    s: direction, -1 to 1; open: of the torsion's slip
+        physics = fusion of tau_raw - loss(tau_raw, v, s, T) and tau_t
+        torque  = physics + w turning(v) N(features)            w: trust of the network; turning: 0 at rest, 1 from 0.2 rad/s
+
+    w is 1 inside the network's envelope, falls continuously to 0 outside of it, and falls from 1 to 0 while |N| goes
+    from 75 % to 100 % of the limit. Status 2 where w = 1, 3 where it is less (at w = 0 the value is the physics alone),
+    6 at standstill.
 
     Raises ConfigError for a joint without section `fused`, effects (`make_estimator` applies them), another joint's
     network, or settings of another method.
@@ -212,6 +211,7 @@ class FusedEstimator:
     __slots__ = (
         "_fade",
         "_fuse",
+        "_guard",
         "_half",
         "_inverse_fade",
         "_limit",
@@ -225,7 +225,6 @@ class FusedEstimator:
         "_temperature",
         "_thermal",
         "_thermal_of",
-        "_tracker",
         "_weight",
         "joint",
         "settings",
@@ -234,14 +233,14 @@ class FusedEstimator:
     def __init__(
         self, joint: Joint, settings: EstimatorSettings, network: FusedNetworkModel | None = None
     ) -> None:
-        fused, used = fused_parts(joint, settings, network)
+        fused = checked_fused(joint, settings, network)
         loss = AdditiveLossModel(fused.loss)
         self.joint: Final = joint
         self.settings: Final = settings
         observer = FusedObserver(
             joint, fused.torsion, settings.bandwidth_rad_s, settings.link_bandwidth_rad_s
         )
-        self._tracker: Final = Tracker(observer, joint, settings)
+        self._guard: Final = Guard(observer, joint, settings)
         self._loss: Final = loss.loss
         self._thermal_of: Final = loss.thermal
         self._fuse: Final = Fusion(fused.sigma, fused.torsion is not None).fuse
@@ -252,9 +251,9 @@ class FusedEstimator:
         self._network_limit: Final = settings.network_limit * joint.rated_torque_nm
         self._fade: Final = FADE_START * self._network_limit
         self._inverse_fade: Final = 1.0 / max(self._network_limit - self._fade, 1e-12)
-        self._run_network: Final = None if used is None else used.run_one
-        self._network_scale: Final = fused.sigma.scale if used is None else used.sigma_scale
-        self._weight: Final = _no_trust if used is None else FusedTrust(used.envelope).weight
+        self._run_network: Final = None if network is None else network.run_one
+        self._network_scale: Final = fused.sigma.scale if network is None else network.sigma_scale
+        self._weight: Final = _no_trust if network is None else FusedTrust(network.envelope).weight
         self._temperature = nan
         self._thermal = 0.0
         self._half = 0.0
@@ -266,9 +265,9 @@ class FusedEstimator:
 
     def reset(self) -> None:
         """Forget the past: the next step starts."""
-        self._tracker.reset()
+        self._guard.reset()
 
-    def step(  # noqa: PLR0917
+    def step(  # noqa: PLR0917 - a sample, positional for speed
         self,
         dt_s: float,
         current_a: float,
@@ -283,9 +282,9 @@ class FusedEstimator:
         temperature_c: of the joint, NaN where it is not known (the loss is then that of the fit's temperature). Without
         network_wanted there is no time for it: this sample is physics only.
         """
-        tracker = self._tracker
-        seen = tracker.step(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
-        status = tracker.status
+        guard = self._guard
+        seen = guard.step(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
+        status = guard.status
         if seen is None:
             self._half = 0.0
             return STARTING_ESTIMATE if status == STARTING else INVALID_ESTIMATE
@@ -325,11 +324,15 @@ class FusedEstimator:
         if not -self._limit <= torque <= self._limit:
             torque = sigma = nan
             status = INVALID
-        return _fused_estimator_new(Estimate, (torque, sigma, status, nan, physics, network))
+        return _new(Estimate, (torque, sigma, status, nan, physics, network))
 
 
 class ExtendedEstimator:
-    """An estimator of the plain joint behind the corrections of the extended one; used as the estimator itself."""
+    """Estimator of a joint with effects: corrected inputs (`ExtendedInputs`) into the estimator of the plain joint.
+
+    joint: with its effects; inner: estimator of `plain_joint(joint)`. `corrected`: current [A] and link position [rad]
+    that the inner one was given last.
+    """
 
     __slots__ = ("_inner", "_inner_step", "_inputs", "_torque", "corrected", "joint", "settings")
 
@@ -365,10 +368,7 @@ class ExtendedEstimator:
         temperature_c: float = nan,
         network_wanted: bool = True,
     ) -> Estimate:
-        """Return the estimate at this sample, dt_s [s] after the one before; never raises on any float.
-
-        `corrected` then holds the current and the link position that the estimator was given.
-        """
+        """Return the estimate at this sample, dt_s [s] after the one before; never raises on any float."""
         self.corrected = current, link = self._inputs.step(
             dt_s,
             current_a,
@@ -391,7 +391,7 @@ def corrected_by_steps(
     columns: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
     temperature_c: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the corrected current and link position [n] where they depend on the estimates: one sample after another.
+    """Return the corrected current and link position [n], sample by sample: where they depend on the estimates.
 
     columns: current, motor position, motor velocity, link position, each [n].
     """

@@ -1,4 +1,4 @@
-"""Two independent views of one torque, weighted by their variances: motor current less loss, and torsion.
+"""Fusion of two independent measurements of one torque by their variances: motor current less loss, and torsion.
 
     tau_c = tau_raw - loss                 knows fast changes and any load; fails with friction
     tau_t = K d + K3 d^3 + D d' + H z      knows nothing of friction; fails with hysteresis and encoder errors
@@ -18,7 +18,7 @@ from typing import Final
 
 import numpy as np
 
-from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.joint import FusedSigma
 from jtqd.estimator.whole_observers import fading_maximum
 
@@ -56,10 +56,8 @@ def held(half_nm: float, before_nm: float, dt_s: float) -> float:
     return half_nm if half_nm >= faded else faded
 
 
-def held_many(
-    half_nm: FloatArray, dt_s: FloatArray, running: np.ndarray[tuple[int], np.dtype[np.bool_]]
-) -> FloatArray:
-    """Vectorised twin of `held` [n]; the memory begins anew after every sample that is not `running`."""
+def held_many(half_nm: FloatArray, dt_s: FloatArray, running: BoolArray) -> FloatArray:
+    """Vectorised twin of `held` [n]; the memory starts again after every sample that is not `running`."""
     out = np.zeros_like(half_nm)
     steps = dt_s[running]
     if len(steps) > _LONG and steps.min() >= 0.0 and steps.max() <= HOLD_S:

@@ -1,4 +1,4 @@
-"""Observer with its guard: starts, gaps, garbage and standstill of one joint, sample by sample.
+"""Guard around an observer: starts, gaps, garbage and standstill of one joint, sample by sample.
 
 | sample | status and what follows |
 |---|---|
@@ -24,8 +24,8 @@ LINK_SPEED_LIMIT_RAD_S: Final = 1e3
 """Largest link speed of a joint-side encoder that still means anything."""
 
 
-class Seen(Protocol):
-    """What the guard looks at in an observer's output [Nm, rad/s, joint side]."""
+class ObserverOutput(Protocol):
+    """Output of an observer, as far as the guard checks it [Nm, rad/s, joint side]."""
 
     @property
     def raw_nm(self) -> float:
@@ -40,11 +40,11 @@ class Seen(Protocol):
         """Velocity of the link encoder."""
 
 
-SeenT_co = TypeVar("SeenT_co", bound=Seen, covariant=True)
+OutputT_co = TypeVar("OutputT_co", bound=ObserverOutput, covariant=True)
 
 
-class SampleObserver(Protocol[SeenT_co]):
-    """An observer: from (current, motor position, motor velocity, link position) to its output."""
+class SampleObserver(Protocol[OutputT_co]):
+    """Observer fed sample by sample (`observer.Observer`, `observer.FusedObserver`)."""
 
     def start(
         self,
@@ -52,7 +52,7 @@ class SampleObserver(Protocol[SeenT_co]):
         motor_position_rad: float,
         motor_velocity_rad_s: float,
         link_position_rad: float,
-    ) -> SeenT_co:
+    ) -> OutputT_co:
         """Set the states to this sample."""
 
     def step(
@@ -62,16 +62,18 @@ class SampleObserver(Protocol[SeenT_co]):
         motor_position_rad: float,
         motor_velocity_rad_s: float,
         link_position_rad: float,
-    ) -> SeenT_co:
+    ) -> OutputT_co:
         """Advance by dt_s > 0."""
 
 
-class Tracker(Generic[SeenT_co]):
-    """Guard around an observer; `status` is that of the last step."""
+class Guard(Generic[OutputT_co]):
+    """Guard around an observer of one joint; `status` is that of the last step, STARTING before the first."""
 
     __slots__ = ("_leave", "_max_gap", "_observer", "_raw_limit", "_running", "_standing", "_stop", "status")
 
-    def __init__(self, observer: SampleObserver[SeenT_co], joint: Joint, settings: EstimatorSettings) -> None:
+    def __init__(
+        self, observer: SampleObserver[OutputT_co], joint: Joint, settings: EstimatorSettings
+    ) -> None:
         self._observer: Final = observer
         self._max_gap: Final = settings.max_gap_s
         self._stop: Final = settings.standstill_velocity_rad_s
@@ -92,7 +94,7 @@ class Tracker(Generic[SeenT_co]):
         motor_position_rad: float,
         motor_velocity_rad_s: float,
         link_position_rad: float,
-    ) -> SeenT_co | None:
+    ) -> OutputT_co | None:
         """Advance by dt_s to this sample; None when `status` is STARTING or INVALID."""
         total = current_a + motor_position_rad + motor_velocity_rad_s + link_position_rad
         if total - total != 0.0:  # NaN or infinite: one subtraction instead of four isfinite calls
@@ -100,19 +102,17 @@ class Tracker(Generic[SeenT_co]):
             self.status = INVALID
             return None
         if not self._running or not 0.0 < dt_s <= self._max_gap:
-            seen = self._observer.start(
-                current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad
-            )
+            out = self._observer.start(current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
             self._running = True
-            self._standing = abs(seen.joint_velocity_rad_s) < self._stop
+            self._standing = abs(out.joint_velocity_rad_s) < self._stop
             self.status = STARTING
             return None
-        seen = self._observer.step(
+        out = self._observer.step(
             dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad
         )
-        raw = seen.raw_nm
-        v = seen.joint_velocity_rad_s
-        link_velocity = seen.link_velocity_rad_s
+        raw = out.raw_nm
+        v = out.joint_velocity_rad_s
+        link_velocity = out.link_velocity_rad_s
         # written so that NaN fails too
         if not (
             -self._raw_limit <= raw <= self._raw_limit
@@ -127,4 +127,4 @@ class Tracker(Generic[SeenT_co]):
         else:
             self._standing = False
         self.status = STANDSTILL if self._standing else VALID
-        return seen
+        return out

@@ -1,17 +1,15 @@
-"""Loss torque of the joint from the four-quadrant efficiency of Eq. (8), bounded and continuous.
+"""Loss torque of a joint [Nm, joint side]: what friction takes between motor and link, tau_j = tau_raw - loss.
 
-In steady state tau_j = G Kt i - loss(i, v), v = omega_m/G. Inside a quadrant loss = G Kt i (1 - eta(i, v)),
-eta = tau_j/(G Kt i). What the paper leaves open is decided here, for estimator and emulated plant alike:
+tau_raw = G Kt i is the motor's torque at the joint, v = omega_m/G the velocity. Three laws, for estimator and emulated
+plant alike; each opposes the motion and is continuous everywhere:
 
-- Range. eta is evaluated at |v| in [0.2, 3] rad/s and |i| <= 7 A driving, <= 5 A back-driving (where the
-  quadratics turn; beyond the measured points they rise or fall without reason). Outside, eta is held.
-- Bounds. Driving 0.05 <= eta <= 1, back-driving 1 <= eta <= 4: the loss dissipates, sign(loss) = sign(v).
-- Reversal. The loss of the side of v is scaled by |tanh(v/w0)|, w0 = 0.02 rad/s: continuous, zero at v = 0,
-  and never feeding energy in, which a plain average of two unequal sides would.
-- Zero current. eta is 0/0 there. With weight exp(-(i/i_b)^2), i_b = 0.35 A, the loss turns into the additive
-  friction: at i = 0 it is that friction, at 1 A the weight is 3e-4.
+| law | depends on | used by |
+|---|---|---|
+| `FrictionModel` | velocity | method `tob`, and wherever the other two have no data |
+| `LossModel` | current and velocity: the four-quadrant efficiency of the paper's Eq. (8) | `efficiency`, `network` |
+| `AdditiveLossModel` | load, velocity, direction, temperature | `fused` |
 
-A joint without efficiency has the additive friction alone.
+Methods with the suffix _many are vectorised twins for whole runs.
 """
 
 from __future__ import annotations
@@ -25,16 +23,12 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import AdditiveLoss, Efficiency, Friction, Joint, LossSide, QuadrantPolynomial
 
-# Additive friction of the joint side: Coulomb + Stribeck + viscous, with a smooth direction.
-#
-#     tau_f(v) = tanh(v/w0) (Fc + Fs exp(-(v/vs)^2)) + Fv v          v = omega_m/G [rad/s], tau_f [Nm]
-#
-# w0 = 0.02 rad/s is twice the standstill threshold: below it the direction of friction is not known anyway,
-# above 0.1 rad/s the direction is +-1 to 1e-4.
-
-
 DIRECTION_VELOCITY_RAD_S: Final = 0.02
-"""w0: velocity of the joint side over which the direction of every loss turns."""
+"""w0: velocity of the joint side over which the direction of every loss turns.
+
+Twice the standstill threshold: below it the direction of friction is not known anyway; above 0.1 rad/s tanh(v/w0) is +-1
+to 1e-4.
+"""
 
 
 def static_friction(friction: Friction) -> float:
@@ -43,7 +37,10 @@ def static_friction(friction: Friction) -> float:
 
 
 class FrictionModel:
-    """tau_f(v) of this file with its constants at hand; odd in v, dissipative."""
+    """Additive friction: Coulomb + Stribeck + viscous, with a smooth direction; odd in v.
+
+    tau_f(v) = tanh(v/w0) (Fc + Fs exp(-(v/vs)^2)) + Fv v
+    """
 
     __slots__ = ("coulomb", "inverse_stribeck", "inverse_w0", "static", "stribeck", "viscous")
 
@@ -77,6 +74,7 @@ BACKDRIVING_CURRENT_MAX_A: Final = 5.0
 DRIVING_ETA: Final = (0.05, 1.0)
 BACKDRIVING_ETA: Final = (1.0, 4.0)
 BLEND_CURRENT_A: Final = 0.35
+_SLOWEST, _FASTEST = VELOCITY_RANGE_RAD_S
 _NO_BLEND_A: Final = 6.1 * BLEND_CURRENT_A  # the weight is below 1e-16 from here on
 
 # c00, c10, c01, c20, c11, c02 in |i| and |v|; eta low, eta high, |i| max, rmse
@@ -95,7 +93,18 @@ def _quadrant(p: QuadrantPolynomial, sign_i: float, sign_v: float, reciprocal: b
 
 
 class LossModel:
-    """loss(i, v) of one joint in plain floats, its vectorised twin, and what its uncertainty needs."""
+    """Loss by the four-quadrant efficiency of Eq. (8), bounded and continuous; additive friction for a joint without.
+
+    Inside a quadrant loss = G Kt i (1 - eta(i, v)), eta = tau_j/(G Kt i). What the paper leaves open is decided here:
+
+    - Range. eta is evaluated at |v| in [0.2, 3] rad/s and |i| <= 7 A driving, <= 5 A back-driving (where the
+      quadratics turn; beyond the measured points they rise or fall without reason). Outside, eta is held.
+    - Bounds. Driving 0.05 <= eta <= 1, back-driving 1 <= eta <= 4: the loss dissipates.
+    - Reversal. The loss of the side of v is scaled by |tanh(v/w0)|: continuous, zero at v = 0, and never feeding
+      energy in, which a plain average of two unequal sides would.
+    - Zero current. eta is 0/0 there. With weight exp(-(i/i_b)^2), i_b = 0.35 A, the loss turns into the additive
+      friction: at i = 0 it is that friction, at 1 A the weight is 3e-4.
+    """
 
     __slots__ = ("_friction", "_inverse_blend", "_quadrants", "_reciprocal", "_table", "torque_per_ampere")
 
@@ -105,7 +114,6 @@ class LossModel:
         self._inverse_blend: Final = 1.0 / BLEND_CURRENT_A
         e: Efficiency | None = joint.efficiency
         self._reciprocal: Final = e is not None and e.convention == "motor_over_joint"
-        # index: 2 when v < 0, plus 1 when i < 0
         quadrants: tuple[_Quadrant, ...] | None = None
         if e is not None:  # index: 2 when v < 0, plus 1 when i < 0
             quadrants = (
@@ -119,7 +127,7 @@ class LossModel:
 
     @property
     def has_efficiency(self) -> bool:
-        """False when the joint file gives friction only."""
+        """Whether the joint file has an efficiency, not friction alone."""
         return self._quadrants is not None
 
     def eta(self, current_a: float, joint_velocity_rad_s: float) -> float:
@@ -132,14 +140,14 @@ class LossModel:
         i, v = current_a, joint_velocity_rad_s
         c00, c10, c01, c20, c11, c02, low, high, i_max, _ = self._quadrants[2 * (v < 0.0) + (i < 0.0)]
         a = min(abs(i), i_max)
-        w = min(max(abs(v), 0.2), 3.0)
+        w = min(max(abs(v), _SLOWEST), _FASTEST)
         e = min(max(c00 + (c10 + c20 * a + c11 * w) * a + (c01 + c02 * w) * w, low), high)
         return 1.0 / e if self._reciprocal else e
 
     def loss(self, current_a: float, joint_velocity_rad_s: float) -> float:
         """Return the loss [Nm, joint side] with the sign of v; current [A], joint-side velocity [rad/s].
 
-        This runs in the plant and in the loop: branches instead of min/max, which cost a call each.
+        Called in every cycle: branches instead of min/max, which cost a call each.
         """
         quadrants = self._quadrants
         if quadrants is None:
@@ -163,7 +171,7 @@ class LossModel:
                 c00, c10, c01, c20, c11, c02, low, high, i_max, _ = quadrants[0]
             w = v
         x = a if a < i_max else i_max
-        y = 0.2 if w < 0.2 else (w if w < 3.0 else 3.0)
+        y = 0.2 if w < 0.2 else (w if w < 3.0 else 3.0)  # VELOCITY_RANGE_RAD_S
         e = c00 + (c10 + c20 * x + c11 * y) * x + (c01 + c02 * y) * y
         if e < low:
             e = low
@@ -172,7 +180,7 @@ class LossModel:
         if self._reciprocal:
             e = 1.0 / e
         size = self.torque_per_ampere * a * (1.0 - e if e < 1.0 else e - 1.0)
-        if w < 0.5:  # tanh(25) is 1 in float64
+        if w < 0.5:  # tanh(25) is 1 in float64; 50 is 1/w0
             size *= tanh(w * 50.0)
         if a < _NO_BLEND_A:
             r = a * self._inverse_blend
@@ -197,7 +205,7 @@ class LossModel:
         index = 2 * (v < 0.0) + (i < 0.0)
         c00, c10, c01, c20, c11, c02, low, high, i_max, _ = (row[index] for row in self._table)
         x = np.minimum(np.abs(i), i_max)
-        y = np.minimum(np.maximum(np.abs(v), 0.2), 3.0)
+        y = np.minimum(np.maximum(np.abs(v), _SLOWEST), _FASTEST)
         e: FloatArray = c00 + (c10 + c20 * x + c11 * y) * x + (c01 + c02 * y) * y
         e = np.minimum(np.maximum(e, low), high)
         return 1.0 / e if self._reciprocal else e
@@ -251,23 +259,6 @@ class LossModel:
         rmse = self._table[9][2 * (v < 0.0) + (i < 0.0)]
         size: FloatArray = rmse * self.torque_per_ampere * np.abs(i)
         return size * np.square(self._eta_many(i, v)) if self._reciprocal else size
-
-
-# Additive loss of the joint, dependent on load, speed, direction and temperature: ours, in place of an efficiency.
-#
-#     tau_j = tau_raw - loss(tau_raw, v, T)                      tau_raw = G Kt i_eff, v = omega_m/G
-#     L_d(x, a) = c_d(x) + Fs_d exp(-(a/vs)^2) + f_d(x) a + q_d(x) a^2 + h(T) a >= 0
-#                 d = sign(v), a = |v|, x = d tau_raw (load along the motion)
-#     h(T) = Fv (exp(-b (T - T0)) - 1)                       the lubricant's viscosity against that of the fit
-#     loss = (1+s)/2 L_+ - (1-s)/2 L_-,   s = tanh(v/w0), or the observer's: the same through the filter of tau_raw
-#
-# c, f and q are linear between load nodes. In contrast to a quotient eta = tau_j/tau_raw nothing is singular at zero
-# current, and the value is continuous over all quadrants: in the load by its nodes, in the direction by s. At v = 0 the
-# result is the middle of what friction can hold, [tau_raw - L_+, tau_raw + L_-], and (L_+ + L_-)/2 is half its width.
-#
-# At a fast reversal friction turns within a millisecond, tau_raw follows through the observer's filter, and the filtered
-# v crosses zero later still. A direction that took its sign from that v would be wrong by twice the friction meanwhile;
-# the direction at the motor, through the same filter as tau_raw, is not.
 
 
 _ONE_SIDED: Final = 1.0 - 1e-9
@@ -332,7 +323,23 @@ class _Side:
 
 
 class AdditiveLossModel:
-    """The loss with its constants at hand. temperature NaN (unknown) counts as the fit's own."""
+    """Loss by load, speed, direction and temperature: ours, in place of an efficiency.
+
+        L_d(x, a) = c_d(x) + Fs_d exp(-(a/vs)^2) + f_d(x) a + q_d(x) a^2 + h(T) a >= 0
+                    d = sign(v), a = |v|, x = d tau_raw (load along the motion)
+        h(T) = Fv (exp(-b (T - T0)) - 1)                   the lubricant's viscosity against that of the fit
+        loss = (1+s)/2 L_+ - (1-s)/2 L_-,   s = tanh(v/w0), or the observer's: the same through the filter of tau_raw
+
+    c, f and q are linear between load nodes. In contrast to a quotient eta = tau_j/tau_raw nothing is singular at zero
+    current. At v = 0 the result is the middle of what friction can hold, [tau_raw - L_+, tau_raw + L_-], and
+    (L_+ + L_-)/2 is half its width.
+
+    At a fast reversal friction turns within a millisecond, tau_raw follows through the observer's filter, and the
+    filtered v crosses zero later still. A direction that took its sign from that v would be wrong by twice the friction
+    meanwhile; the direction at the motor, through the same filter as tau_raw, is not.
+
+    A temperature that is not known (NaN) counts as that of the fit.
+    """
 
     __slots__ = ("_inverse_vs", "_inverse_w0", "_negative", "_per_k", "_positive", "_t0", "_viscous", "_vmax")
 
@@ -356,7 +363,7 @@ class AdditiveLossModel:
     def loss(
         self, raw_nm: float, velocity_rad_s: float, thermal: float, direction: float | None = None
     ) -> tuple[float, float]:
-        """Return (loss, half) [Nm]: the loss, and half the width that friction leaves open at this speed.
+        """Return (loss, half) [Nm]: the loss, and half the width of the interval that friction leaves open at this speed.
 
         thermal: h(T) [Nms/rad]; direction: s, -1 to 1, None for tanh(v/w0).
         """

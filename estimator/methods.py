@@ -1,4 +1,4 @@
-"""The estimator of a joint by its method: one door for the loop, one for whole runs.
+"""Estimator of a joint by method: `make_estimator` for samples one by one, `estimate_columns` for whole runs.
 
 Effects of the joint file are applied here, whatever the method: the estimators themselves take plain joints only.
 """
@@ -9,13 +9,13 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
-from jtqd.estimator.corrections import acting, needs_torque, plain_joint
+from jtqd.estimator.corrections import acting_effects, needs_torque, plain_joint
 from jtqd.estimator.estimator import (
     ExtendedEstimator,
     FusedEstimator,
     JointEstimator,
+    checked_fused,
     corrected_by_steps,
-    fused_parts,
 )
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.network import FusedNetwork, TorqueNetwork
@@ -43,7 +43,7 @@ def make_estimator(
         inner = FusedEstimator(plain, settings, _fused(plain, network))
     else:
         inner = JointEstimator(plain, settings, _paper(plain, network))
-    return ExtendedEstimator(joint, settings, inner) if acting(joint) else inner
+    return ExtendedEstimator(joint, settings, inner) if acting_effects(joint) else inner
 
 
 def estimate_columns(
@@ -67,15 +67,15 @@ def estimate_steps(
     dt_s: FloatArray,
     columns: JointColumns,
 ) -> EstimateRun:
-    """Return the estimates as `estimate_columns`, by time steps: dt_s[k] is the time since sample k-1, 0 begins anew."""
-    dt = dt_s
-    inputs = _corrected(joint, settings, network, dt, columns)
+    """Return the estimates as `estimate_columns`, by time steps: dt_s[k] is the time since sample k-1, 0 starts again."""
+    inputs = _corrected(joint, settings, network, dt_s, columns)
     joint = plain_joint(joint)
     if settings.method == "fused":
-        fused, used = fused_parts(joint, settings, _fused(joint, network))
-        seen = observe_run(joint, settings, fused.torsion, dt, *inputs, columns.temperature_c)
-        return estimate_observed(joint, settings, used, seen)
-    return estimate_run(joint, settings, _paper(joint, network), dt, *inputs)
+        used = _fused(joint, network)
+        torsion = checked_fused(joint, settings, used).torsion
+        observed = observe_run(joint, settings, torsion, dt_s, *inputs, columns.temperature_c)
+        return estimate_observed(joint, settings, used, observed)
+    return estimate_run(joint, settings, _paper(joint, network), dt_s, *inputs)
 
 
 def _corrected(
@@ -85,9 +85,9 @@ def _corrected(
     dt_s: FloatArray,
     columns: JointColumns,
 ) -> _Inputs:
-    """Return what the estimator of the plain joint is given; ValueError for a missing column."""
+    """Return the inputs of the plain joint's estimator; ValueError for a missing column."""
     inputs = _inputs(joint, columns)
-    if not acting(joint):
+    if not acting_effects(joint):
         return inputs
     if needs_torque(joint):
         estimator = make_estimator(joint, settings, network)
@@ -112,14 +112,14 @@ def _inputs(joint: Joint, columns: JointColumns) -> _Inputs:
 
 
 def _fused(joint: Joint, network: AnyNetwork | None) -> FusedNetwork | None:
-    """Return the network when method `fused` can use it."""
+    """Return the network if method `fused` can use it; ConfigError else."""
     if isinstance(network, TorqueNetwork):
         raise ConfigError(f"joint {joint.name}: found a network of method 'network', expected one of 'fused'")
     return network
 
 
 def _paper(joint: Joint, network: AnyNetwork | None) -> TorqueNetwork | None:
-    """Return the network when the paper's methods can use it."""
+    """Return the network if the paper's methods can use it; ConfigError else."""
     if isinstance(network, FusedNetwork):
         raise ConfigError(f"joint {joint.name}: found a network of method 'fused', expected one of 'network'")
     return network

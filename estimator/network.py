@@ -1,7 +1,8 @@
-"""The network of the paper's section III: six features in, torque out.
+"""Networks of one joint: files, metadata, and whether they fit the joint and the method.
 
-Its metadata, each value JSON: features, envelope_low and envelope_high (range of the training data per
-feature), sigma_nm (held-out standard deviation), joint (name), data_sha256 (training data).
+`TorqueNetwork` is that of the paper's section III (method `network`): six features in, torque out. `FusedNetwork` (method
+`fused`) gives a correction to the physics from speed, load, torsion and ripple angles. Both are ONNX files whose metadata
+say what they were trained on; how far each is trusted is in `validity`.
 """
 
 from __future__ import annotations
@@ -18,11 +19,9 @@ from jtqd.estimator.onnx_graph import OnnxGraph, finite
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.validity import Envelope, Trust
 
-# How a network is attached to a joint: what it must offer, whether it fits, how far it is trusted.
-
 
 class NetworkModel(Protocol):
-    """What is needed of a network; jtqd.estimator.network.TorqueNetwork has it."""
+    """Network as `JointEstimator` uses it: `TorqueNetwork`, or a stand-in."""
 
     @property
     def joint(self) -> str:
@@ -95,12 +94,17 @@ _KEYS: Final = ("envelope_low", "envelope_high", "sigma_nm", "joint", "data_sha2
 
 
 class TorqueNetwork:
-    """A loaded and checked network.
+    """Network of the paper, loaded and checked.
 
-    source: path of an ONNX file, or its bytes; sha256: expected hash of the bytes (hex), not checked when
-    None. Raises NetworkError for an unreadable or corrupt file, another hash, shape, type or missing
-    metadata. Public: `name`, `sha256`, `envelope_low`, `envelope_high` (6 floats each), `sigma_nm`,
-    `joint`, `data_sha256`; `run_one(x0..x5)` torque of one sample [Nm], `run_many([n, 6])` of many.
+    source: path of an ONNX file, or its bytes; sha256: expected hash of the bytes (hex), not checked when None. Metadata,
+    each value JSON: features, envelope_low and envelope_high (range of the training data per feature), sigma_nm (held-out
+    standard deviation), joint (name), data_sha256 (training data).
+
+    Public: `name`, `sha256`, `envelope_low`, `envelope_high` (6 floats each), `sigma_nm`, `joint`, `data_sha256`,
+    `bound` (samples go through a binding, see `OnnxGraph`); `run_one(x0..x5)` torque of one sample [Nm],
+    `run_many([n, 6])` of many.
+
+    Raises NetworkError for an unreadable or corrupt file, another hash, shape, type or missing metadata.
     """
 
     def __init__(self, source: bytes | str | os.PathLike[str], sha256: str | None = None) -> None:
@@ -128,13 +132,6 @@ class TorqueNetwork:
         return self._graph.run_many(features)
 
 
-# The fused estimator's network: a correction to the physics from speed, load, torsion and ripple angles.
-#
-# Metadata, each value JSON: features, envelope (`fused_trust.Envelope`), sigma_scale (4, quadrants in QUADRANTS'
-# order, factor on the physics' standard deviation where the network is in charge), input_low and input_high (range of
-# the training data per feature), joint, data_sha256.
-
-
 FUSED_FEATURES: Final = (
     "joint_velocity_rad_s",
     "motor_torque_nm",
@@ -150,7 +147,7 @@ _FUSED_KEYS: Final = ("envelope", "sigma_scale", "input_low", "input_high", "joi
 
 
 class FusedNetworkModel(Protocol):
-    """What the estimator needs of a network; FusedNetwork has it."""
+    """Network as `FusedEstimator` uses it: `FusedNetwork`, or a stand-in."""
 
     @property
     def joint(self) -> str:
@@ -172,7 +169,11 @@ class FusedNetworkModel(Protocol):
 
 
 class FusedNetwork:
-    """A loaded and checked network; arguments and errors as `jtqd.estimator.network.TorqueNetwork`.
+    """Network of method `fused`, loaded and checked; arguments and errors as `TorqueNetwork`.
+
+    Metadata, each value JSON: features, envelope (`validity.Envelope`), sigma_scale (4, quadrants in QUADRANTS' order,
+    factor on the physics' standard deviation where the network is in charge), input_low and input_high (range of the
+    training data per feature), joint, data_sha256.
 
     Public: `name`, `sha256`, `envelope`, `sigma_scale`, `joint`, `data_sha256`, `bound`; `run_one(x0..x6)` correction
     of one sample [Nm], `run_many([n, 7])` of many.

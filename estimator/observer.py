@@ -1,22 +1,21 @@
-"""Torque observer of Eqs. (4) and (7) in exact discrete form.
+"""Torque observers in exact discrete form: the paper's (Eqs. 4 and 7), and that of method `fused`.
+
+Symbols: i current [A], w motor velocity [rad/s], Kt torque constant, J rotor inertia (motor side), G gear ratio,
+g bandwidth [rad/s], theta_m and theta_l motor and link position [rad].
 
     tau_raw = [ g/(s+g) (i Kt + J g w) - J g w ] G            = G LPF(i Kt - J dw/dt), without any loss
-    tau_tob = tau_raw - g/(s+g) tau_f                         = Eq. (4), tau_f = G f_m
     v       = g/(s+g) w/G                                     velocity of the same age as tau_raw
 
-Symbols: i current [A], w motor velocity [rad/s], Kt torque constant, J rotor inertia (motor side), G gear
-ratio, g bandwidth [rad/s], tau_f friction [Nm, joint side].
-
-Discretisation: z' = g (u - z) is integrated exactly for an input that is linear between samples
-(first-order hold), with the measured step dt:
+Discretisation: z' = g (u - z) is integrated exactly for an input that is linear between samples (first-order hold),
+with the measured step dt:
 
     z_k = a z_(k-1) + b0 u_k + b1 u_(k-1),   a = exp(-g dt),  b0 = 1 - (1-a)/(g dt),  b1 = (1-a)/(g dt) - a
 
-The state starts at the first input, so a joint at rest or at constant speed has no start transient. A ramp
-is followed with a lag of exactly 1/g: the group delay at DC (5 ms at 200 rad/s).
+The state starts at the first input, so a joint at rest or at constant speed has no start transient. A ramp is followed
+with a lag of exactly 1/g: the group delay at DC (5 ms at 200 rad/s).
 
-The link velocity is the derivative of the link position through p/(s+p), exact for a position that is
-linear between samples: r_k = exp(-p dt) r_(k-1) + (1 - exp(-p dt)) (q_k - q_(k-1))/dt.
+The link velocity is the derivative of the link position through p/(s+p), exact for a position that is linear between
+samples: r_k = exp(-p dt) r_(k-1) + (1 - exp(-p dt)) (q_k - q_(k-1))/dt.
 """
 
 from __future__ import annotations
@@ -28,9 +27,11 @@ from jtqd.estimator.guard import RAW_LIMIT
 from jtqd.estimator.joint import Joint, Torsion
 from jtqd.estimator.losses import DIRECTION_VELOCITY_RAD_S, FrictionModel
 
+_new: Final = tuple.__new__  # a NamedTuple's own constructor costs twice as much
+
 
 class Observed(NamedTuple):
-    """Outputs of one step; torques [Nm, joint side], velocities [rad/s, joint side]."""
+    """Outputs of one step of `Observer`; torques [Nm, joint side], velocities [rad/s, joint side]."""
 
     raw_nm: float
     tob_nm: float
@@ -47,7 +48,9 @@ def first_order_hold(rate_rad_s: float, dt_s: float) -> tuple[float, float, floa
 
 
 class Observer:
-    """Step-by-step observer of one joint: plain floats, no allocation but its result.
+    """The paper's observer of one joint, sample by sample: plain floats, no allocation but its result.
+
+        tau_tob = tau_raw - g/(s+g) tau_f                         Eq. (4), tau_f = G f_m [Nm, joint side]
 
     joint: parameters; bandwidth_rad_s: g; link_bandwidth_rad_s: p of the link velocity.
     """
@@ -132,35 +135,15 @@ class Observer:
         return _new(Observed, (raw, raw - z_f, z_v, r))
 
 
-_new: Final = tuple.__new__  # a NamedTuple's own constructor costs twice as much
-
-
-# Observer of the fused estimator: motor torque, velocity, torsion torque and ripple angles of one age.
-#
-#     tau_raw = G [ g/(s+g) (i Kt + J g w) - J g w ]       motor torque at the joint without any loss (observer.py)
-#     d       = g/(s+g) (theta_m/G - theta_l - zero - e(theta_m))
-#     tau_t   = K d + K3 d^3 + D d' + H z,   z = (lo + hi)/2,   open = H (hi - lo)/2
-#     dlo = dhi = dd/travel, each held in [-1, 1]          Maxwell slip, between bounds: -1 and 1 at each start
-#     v       = g/(s+g) w/G
-#     c_n, s_n = g/(s+g) cos(n theta_m), g/(s+g) sin(n theta_m)     n = RIPPLE_ORDERS
-#     direction = g/(s+g) tanh(w/(G w0))                   of friction, as tau_raw knows it
-#
-# All pass the same filter (first-order hold, measured step), so a torque ripple A cos(n theta_m + phi), which
-# reaches tau_raw through that filter, is exactly linear in c_n and s_n at every speed, and friction that turns with
-# the motion is linear in `direction`, however fast the reversal. The slip follows the filtered deflection: an element
-# that slips would rectify the encoder's noise. Where it was when the observer started is not known: its bounds meet after
-# twice its travel in one direction, and until then `open` says what it may hold to either side of the middle.
-
-
 RIPPLE_ORDERS: Final = (2, 4)
 """Per motor revolution: twice the wave generator's turn, and its first harmonic."""
 
 
 class FusedObserved(NamedTuple):
-    """Outputs of one step; torques [Nm, joint side], velocities [rad/s, joint side], angles as filtered cos and sin.
+    """Outputs of one step of `FusedObserver`; torques [Nm, joint side], velocities [rad/s, joint side], filtered waves.
 
     raw_nm is NaN where the torsion is impossible: the guard then starts again, as for an impossible motor torque.
-    open_nm: half of what the torsion's slip leaves open, 0 once it is known and where there is none.
+    open_nm: half width of what the torsion's slip leaves open, 0 once the slip is known and where there is none.
     """
 
     raw_nm: float
@@ -175,8 +158,6 @@ class FusedObserved(NamedTuple):
     open_nm: float = 0.0
 
 
-_fused_observer_new: Final = tuple.__new__
-
 _Inputs = tuple[float, float, float, float, float, float, float, float]
 """What the filter takes: u = i Kt + J g w, v, deflection d, cos 2, sin 2, cos 4, sin 4, direction."""
 
@@ -185,7 +166,22 @@ _SETTLED_RAD_S: Final = 20.0 * DIRECTION_VELOCITY_RAD_S  # tanh(20) is 1 in floa
 
 
 class FusedObserver:
-    """Step-by-step observer of one joint; plain floats. torsion None: its torque is always 0."""
+    """Observer of method `fused` for one joint: motor torque, velocity, torsion torque and ripple angles of one age.
+
+        d       = g/(s+g) (theta_m/G - theta_l - zero - e(theta_m))          e: kinematic error
+        tau_t   = K d + K3 d^3 + D d' + H z,   z = (lo + hi)/2,   open = H (hi - lo)/2
+        dlo = dhi = dd/travel, each held in [-1, 1]          Maxwell slip, between bounds: -1 and 1 at each start
+        c_n, s_n = g/(s+g) cos(n theta_m), g/(s+g) sin(n theta_m)     n = RIPPLE_ORDERS
+        direction = g/(s+g) tanh(w/(G w0))                   of friction, as tau_raw knows it
+
+    All pass the same filter, so a torque ripple A cos(n theta_m + phi), which reaches tau_raw through that filter, is
+    exactly linear in c_n and s_n at every speed, and friction that turns with the motion is linear in `direction`,
+    however fast the reversal. The slip follows the filtered deflection: an element that slips would rectify the
+    encoder's noise. Where it was when the observer started is not known: its bounds meet after twice its travel in one
+    direction, and until then `open` is what it may hold to either side of the middle.
+
+    torsion None: its torque is always 0.
+    """
 
     __slots__ = (
         "_cos2",
@@ -234,7 +230,7 @@ class FusedObserver:
         self._d = 0.0
         self._torsion_limit: Final = RAW_LIMIT * joint.rated_torque_nm
         waves = [] if torsion is None else _waves(torsion)
-        # the ripple angles are there anyway: a kinematic error of their orders costs no further cos and sin
+        # a kinematic error of the ripple orders costs no further cos and sin
         two = [wave for wave in waves if wave[0] == RIPPLE_ORDERS[0]]
         four = [wave for wave in waves if wave[0] == RIPPLE_ORDERS[1]]
         self._cos2: Final = sum(c for _, c, _ in two)
@@ -300,7 +296,7 @@ class FusedObserver:
         return error
 
     def _torsion(self, d: float, dt_s: float) -> tuple[float, float]:
-        """Return (torque, open) [Nm] at the filtered deflection d [rad], dt_s after the last one; moves the slip to it."""
+        """Move the slip to the filtered deflection d [rad], dt_s after the last one; return (torque, open) [Nm] there."""
         step = d - self._d
         self._d = d
         torsion = d * (self._stiffness + self._cubic * d * d) + self._damping * step / dt_s
@@ -375,7 +371,7 @@ class FusedObserver:
         torsion, open_nm = self._torsion(zd, dt_s)
         if not -self._torsion_limit <= torsion <= self._torsion_limit:  # NaN included
             raw = nan
-        return _fused_observer_new(FusedObserved, (raw, zv, r, torsion, zc2, zs2, zc4, zs4, zs, open_nm))
+        return _new(FusedObserved, (raw, zv, r, torsion, zc2, zs2, zc4, zs4, zs, open_nm))
 
 
 def _waves(torsion: Torsion) -> list[tuple[float, float, float]]:

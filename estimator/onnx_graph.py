@@ -1,7 +1,7 @@
 """An ONNX graph run by ONNX Runtime: one thread, float64, checked before its first use. The only file that imports it.
 
-The graph takes "x" [N, n] (named features, SI units, normalisation inside) and gives [N, 1] torque [Nm]. What
-belongs to it travels in its metadata, each value JSON; who uses the graph says which keys it needs.
+The graph takes "x" [N, n] (named features, SI units, normalisation inside) and gives [N, 1] torque [Nm]. Its
+metadata hold one JSON value per key; the caller names the keys that must be there.
 
 A single sample goes through an I/O binding on two preallocated numpy buffers: no array is made per call.
 """
@@ -205,5 +205,5 @@ class OnnxGraph:
 
 
 def finite(value: object) -> bool:
-    """Tell a finite number from everything else that JSON may hold."""
+    """Return whether a value from JSON is a finite number; a bool is none."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

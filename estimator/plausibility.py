@@ -1,4 +1,4 @@
-"""Do the encoders and the current of one joint agree with each other? A sample in, bits of faults out. Pure.
+"""Plausibility of one joint's encoders and current against each other: a sample in, bits of faults out.
 
     slip     = theta_m(k) - theta_m(k-1) - omega_m dt       motor side: what the position moved beyond the drive's velocity
     mismatch = sum of slip, forgotten with FORGET_S         a drive's velocity lags: single slips mean little, their sum does
@@ -63,7 +63,7 @@ class PlausibilityLimits:
 
 
 class Plausibility:
-    """The checks of one joint.
+    """Plausibility checks of one joint, sample by sample; `mismatch_rad` is that of the last sample.
 
     joint: gear ratio, stiffness and rated torque; torque_limit: largest believable torque in rated torques; period_s: of the
     samples.
@@ -144,7 +144,7 @@ class Plausibility:
         return self._faults(dt_s, slip, motor_velocity_rad_s, change)
 
     def _faults(self, dt_s: float, slip: float, velocity: float, change: float) -> int:
-        """The slow path: starts, gaps, long constant currents and faults."""
+        """Return the faults of a sample that is not clearly good: starts, gaps, long constant currents, faults."""
         if self._low != self._low:  # NaN: the first sample
             self._low, self._high = self._twist - self._twist_limit, self._twist + self._twist_limit
             self.mismatch_rad = 0.0
@@ -155,7 +155,7 @@ class Plausibility:
             return faults
         if abs(slip) > self._jump + JUMP_RAD_S * dt_s:
             faults |= MOTOR_JUMP
-            self.mismatch_rad = 0.0  # told once: it is no velocity that is wrong
+            self.mismatch_rad = 0.0  # reported once: it is no velocity that is wrong
         elif abs(change) > self._twist_jump:
             faults |= LINK_JUMP
         if dt_s >= self._gap_s:

@@ -1,4 +1,4 @@
-"""A recorded run as arrays: checked once, read-only, columns that can be derived are derived on request.
+"""Run table: one recorded run as arrays, checked once, read-only; columns that can be derived are derived on request.
 
 Column names in messages are those of the files: `time_s`, `j1.current_a`, `j1.motor_position_rad`, ...
 """

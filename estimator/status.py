@@ -1,4 +1,7 @@
-"""Status codes of an estimate, as published on the bus (low or high nibble of the estimate PDO)."""
+"""Result of one estimate: torque, standard deviation and status.
+
+The status codes are those published on the bus (low or high nibble of the estimate PDO).
+"""
 
 from __future__ import annotations
 
@@ -8,9 +11,8 @@ from typing import Final, NamedTuple
 OFF: Final = 0
 STARTING: Final = 1
 VALID: Final = 2
-DEGRADED: Final = (
-    3  # the network is not alone in charge: outside its envelope, far from physics, or no time for it
-)
+# the network is not alone in charge: outside its envelope, far from physics, or no time for it
+DEGRADED: Final = 3
 STALE: Final = 4  # an input of this cycle is missing (set by the loop, never by the estimator)
 DRIVE_FAULT: Final = 5  # set by the loop, never by the estimator
 STANDSTILL: Final = 6  # known to an interval only; sigma is its half width
@@ -31,11 +33,8 @@ PUBLISHED: Final = frozenset((VALID, DEGRADED, STANDSTILL))
 """Only with these may a torque number leave the estimator."""
 
 
-# One step's result, whatever the method.
-
-
 class Estimate(NamedTuple):
-    """One step's result [Nm, joint side]; NaN where not computed or not to be published.
+    """Result of one step, whatever the method [Nm, joint side]; NaN where not computed or not to be published.
 
     torque_nm, sigma_nm are numbers with status VALID, DEGRADED and STANDSTILL only; tob_nm (classical
     observer), physics_nm (with losses, before any network) and network_nm are stages, for the record.

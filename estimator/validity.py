@@ -1,12 +1,13 @@
-"""How far an estimate can be trusted: standard deviations, standstill, the network's envelope.
+"""How far an estimate can be trusted: standard deviations, standstill, and where a network was trained.
 
-Everything exists twice: plain floats for the loop, arrays (suffix _many) for whole runs.
+| class | gives | method |
+|---|---|---|
+| `Uncertainty` | sigma of the physics in motion, value and sigma at standstill | `tob`, `efficiency`, `network` |
+| `Trust` | weight of the network: a range per feature, and the distance to physics | `network` |
+| `FusedTrust` | weight of the network: a map over speed and motor torque (`Envelope`) | `fused` |
 
-    physics, moving   sigma^2 = load^2 + (u_f tau_f(v))^2 + floor^2
-                      load: the efficiency table's RMSE as a torque; for the classical observer u_l |tau_raw|
-    standstill        tau_j in [tau_raw - loss(+), tau_raw - loss(-)]
-                      value: the middle; sigma: half the width, wider by u_f, + floor
-    network           weight w from the envelope and from its distance to physics; value and sigma are blended by w
+A weight is 1 where the network is alone in charge and 0 where nothing of it is left. Everything exists twice: plain floats
+for the loop, arrays (suffix _many) for whole runs.
 """
 
 from __future__ import annotations
@@ -28,7 +29,13 @@ FADE_START: Final = 0.75
 
 
 class Uncertainty:
-    """Standard deviations and standstill intervals of the physics estimates of one joint [Nm, joint side]."""
+    """Standard deviations and standstill intervals of the physics estimates of one joint [Nm, joint side].
+
+    moving        sigma^2 = load^2 + (u_f tau_f(v))^2 + floor^2
+                  load: the efficiency table's RMSE as a torque; for the classical observer u_l |tau_raw|
+    standstill    tau_j in [tau_raw - loss(+), tau_raw - loss(-)]
+                  value: the middle; sigma: half the width, wider by u_f, + floor
+    """
 
     __slots__ = (
         "_floor",
@@ -154,20 +161,11 @@ class Trust:
         return result
 
 
-# Where the fused estimator's network was trained: a map over speed and motor torque, and two simple ranges.
-#
-# A box per feature would count fast and heavy as known when the data has only fast or heavy. So the share of
-# trust is a table over (v, tau_raw), 1 in cells that several training runs have visited and 0 in others, bilinear
-# between cell centres; times 1 inside the training range of temperature and of the distance between torsion and
-# current, falling to 0 beside it. Outside of all this nothing of the network is left.
-
-
 TEMPERATURE_MARGIN_K: Final = 1.0
 """Beside the range of temperatures over which trust is lost."""
 
 DISTANCE_MARGIN: Final = 0.25
 """Part of the range beyond which a larger distance between torsion and current counts as unknown."""
-
 
 _LEAST: Final = 1e-6
 _MOST: Final = 1e6
@@ -176,7 +174,7 @@ _MOST: Final = 1e6
 
 @dataclass(frozen=True, slots=True)
 class Envelope:
-    """What the training data covered.
+    """What the training data of a fused network covered.
 
     velocity_step_rad_s, torque_step_nm: distance of cell centres; known: [2 nv + 1][2 nt + 1] of 0 and 1 over velocity
     and motor torque, its middle cell at zero; distance_nm: largest |torsion - current path|; temperature_c: lowest
@@ -240,7 +238,13 @@ def _checked_range(value: Any) -> tuple[float, float] | None:
 
 
 class FusedTrust:
-    """Weight of the network in [0, 1], continuous in all arguments."""
+    """Weight of a fused network in [0, 1], continuous in all arguments.
+
+    A box per feature would count fast and heavy as known when the data has only fast or heavy. So the weight is a table
+    over (v, tau_raw), 1 in cells that several training runs have visited and 0 in others, bilinear between cell centres;
+    times 1 inside the training range of temperature and of the distance between torsion and current, falling to 0 beside
+    it.
+    """
 
     __slots__ = (
         "_distance",
@@ -275,7 +279,7 @@ class FusedTrust:
         self._low, self._high = envelope.temperature_c or (0.0, 0.0)
 
     def weight(self, velocity_rad_s: float, raw_nm: float, distance_nm: float, temperature_c: float) -> float:
-        """Return the share of trust; a temperature of NaN is unknown, hence 0 where the data had one.
+        """Return the weight; a temperature of NaN is unknown, hence 0 where the data had one.
 
         raw_nm: motor torque; distance_nm: torsion less current path; finite both, as is the velocity.
         """

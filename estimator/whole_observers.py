@@ -1,7 +1,12 @@
-"""Observers and their guard over whole runs in arrays: twins of `observer`, `fused_observer` and `tracking` to 1e-9.
+"""Observers and their guard over whole runs in arrays: twins of `observer` and `guard` to 1e-9.
 
-Each gives None where the plain loop must do it: short runs, garbage among the samples (the guard then starts again at places
-that only the loop knows), a bandwidth too low for the stretches of `lanes`.
+First-order recursions z_k = a_k z_(k-1) + x_k, |a_k| <= 1, over long runs: many stretches of a run advance side by side.
+A stretch begins WARM_UP time constants early with any state, and has forgotten it by the time it counts: e^-45 is below what
+a float64 can resolve. Each step of the loop is one operation on all stretches, so that a run of n samples takes n/stretches
+steps. With a_k = 0 the recursion starts again at sample k.
+
+`observe_paper` and `observe_fused` return None where the plain loop must do it: short runs, garbage among the samples (the
+guard then starts again at places that only the loop knows), a bandwidth too low for the stretches.
 """
 
 from __future__ import annotations
@@ -19,15 +24,6 @@ from jtqd.estimator.observer import RIPPLE_ORDERS
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import STANDSTILL, STARTING, VALID
 
-# First-order recursions over long runs in arrays: many stretches of the run go forward side by side.
-#
-#     z_k = a_k z_(k-1) + x_k                      |a_k| <= 1
-#
-# A stretch begins WARM_UP time constants early with any state, and has forgotten it by the time it counts: e^-45 is
-# below what a float64 can tell apart. Each step of the loop is one operation on all stretches, so that a run of n samples
-# takes n/stretches steps. With a_k = 0 the recursion begins anew at sample k.
-
-
 WARM_UP: Final = 45.0
 _BLOCK: Final = 1 << 18
 """Samples that are laid out at a time: what they take in memory stays small."""
@@ -37,7 +33,7 @@ _LEAST: Final = 2000
 
 
 def warm_up_steps(a: FloatArray) -> int | None:
-    """Samples after which every state is forgotten, by the slowest a > 0; None when it takes too long to be worth it."""
+    """Return the samples after which every state is forgotten, by the slowest a > 0; None when too many to be worth it."""
     slow = a[a > 0.0]
     if len(a) < _LEAST or not len(slow):
         return None
@@ -61,7 +57,7 @@ def recursion(a: FloatArray, x: FloatArray) -> FloatArray | None:
 
 
 def _block(a: FloatArray, x: FloatArray, state: FloatArray, warm: int) -> FloatArray:
-    """z of one block; `state` is that before it."""
+    """Return z of one block; `state` is that before it."""
     rows, count = x.shape
     length = max(warm, _STRETCH)
     length += (9 - length) % 16  # columns a power of two apart would all meet in the same lines of the cache
@@ -170,17 +166,17 @@ def _filtered(steps: _Steps, inputs: FloatArray) -> FloatArray | None:
 def _link_velocity(
     rate_rad_s: float, steps: _Steps, dt_s: FloatArray, link_rad: FloatArray, v: FloatArray
 ) -> FloatArray | None:
-    """Filtered derivative of the link position [n]; it starts with the velocity v of the motor side."""
+    """Return the filtered derivative of the link position [n]; it starts with the velocity v of the motor side."""
     gone = -np.expm1(-rate_rad_s * np.where(steps.starts, 0.0, dt_s))
     slope = np.diff(link_rad, prepend=link_rad[0]) / np.where(steps.starts, 1.0, dt_s)
-    found = recursion(
+    filtered = recursion(
         np.where(steps.starts, 0.0, 1.0 - gone), np.where(steps.starts, v, gone * slope)[np.newaxis]
     )
-    return None if found is None else found[0]
+    return None if filtered is None else filtered[0]
 
 
 def _guard(steps: _Steps, v: FloatArray, settings: EstimatorSettings) -> _Status:
-    """Status [n] by the filtered velocity: standing until it is above twice the threshold."""
+    """Return the status [n] by the filtered velocity: standing until it is above twice the threshold."""
     speed, stop = np.abs(v), settings.standstill_velocity_rad_s
     decides = steps.starts | (speed < stop) | (speed > 2.0 * stop)
     last = np.maximum.accumulate(np.where(decides, np.arange(len(v)), 0))
@@ -190,7 +186,7 @@ def _guard(steps: _Steps, v: FloatArray, settings: EstimatorSettings) -> _Status
 
 
 def _plausible(joint: Joint, raw: FloatArray, link_velocity: FloatArray) -> bool:
-    """Nothing for the guard to refuse; NaN fails."""
+    """Return whether the guard would refuse nothing; NaN fails."""
     limit = RAW_LIMIT * joint.rated_torque_nm
     return bool((np.abs(raw) <= limit).all() and (np.abs(link_velocity) <= LINK_SPEED_LIMIT_RAD_S).all())
 
@@ -198,7 +194,7 @@ def _plausible(joint: Joint, raw: FloatArray, link_velocity: FloatArray) -> bool
 def observe_paper(
     joint: Joint, settings: EstimatorSettings, columns: _Columns
 ) -> tuple[_Status, FloatArray] | None:
-    """Status [n] and the rows of `observer.Observed` [4, n], NaN where it starts."""
+    """Return status [n] and the fields of `observer.Observed` [4, n], NaN where it starts."""
     dt, current, _, velocity, link = columns
     if not len(dt) or not np.isfinite(np.array(columns[1:])).all():
         return None
@@ -221,7 +217,7 @@ def observe_paper(
 def observe_fused(
     joint: Joint, settings: EstimatorSettings, torsion: Torsion | None, columns: _Columns
 ) -> tuple[_Status, FloatArray] | None:
-    """Status [n] and the rows of `fused_observer.FusedObserved` [10, n], NaN where it starts."""
+    """Return status [n] and the fields of `observer.FusedObserved` [10, n], NaN where it starts."""
     dt, current, angle, velocity, link = columns
     if not len(dt) or not np.isfinite(np.array(columns[1:])).all():
         return None
@@ -257,7 +253,7 @@ def observe_fused(
 def _kinematic_error(
     torsion: Torsion, angle: FloatArray, waves: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 ) -> FloatArray:
-    """The encoder's error [rad] over the motor angle [n]; `waves`: cos and sin of 2 and 4 times it."""
+    """Return the encoder's error [rad] over the motor angle [n]; `waves`: cos and sin of 2 and 4 times it."""
     ready: dict[float, tuple[FloatArray, ...]] = dict(zip(RIPPLE_ORDERS, (waves[:2], waves[2:]), strict=True))
     error = np.zeros_like(angle)
     for order, c, s in zip(torsion.orders_per_motor_rev, torsion.cos_rad, torsion.sin_rad, strict=True):
@@ -272,7 +268,7 @@ def _kinematic_error(
 def _torsion(
     torsion: Torsion | None, d: FloatArray, starts: npt.NDArray[np.bool_], dt_s: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """(torque, open) [Nm, n] at the filtered deflection d [rad, n]."""
+    """Return (torque, open) [Nm, n] at the filtered deflection d [rad, n]."""
     if torsion is None:
         return np.zeros_like(d), np.zeros_like(d)
     step = np.diff(d, prepend=d[0])
@@ -287,7 +283,7 @@ def _torsion(
 
 
 def _slip(steps: FloatArray, starts: npt.NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
-    """Bounds of the slip [n]; at a start they are -1 and 1."""
+    """Return the bounds of the slip [n]; at a start they are -1 and 1."""
     low, high = np.empty_like(steps), np.empty_like(steps)
     fresh = np.flatnonzero(starts).tolist()
     for first, end in zip(fresh, [*fresh[1:], len(steps)], strict=True):

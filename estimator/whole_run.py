@@ -1,7 +1,13 @@
-"""Vectorised twin of JointEstimator for whole runs: same numbers to 1e-9, a fraction of the time.
+"""Vectorised twins of the estimators for whole runs: same numbers to 1e-9, a fraction of the time.
 
-The observer is a recursion: long runs go through `observer_run` in arrays, short ones and those with garbage through a loop
-over the same code as in service. Losses, network, sigma and status are arrays.
+| for | instead of |
+|---|---|
+| `estimate_run` | `JointEstimator` |
+| `observe_run`, then `estimate_observed` | `FusedEstimator`; fits need the observed run alone |
+| `extended_run` | `ExtendedInputs` |
+
+The observer is a recursion: long runs go through `whole_observers` in arrays, short ones and those with garbage through a
+loop over the same code as in service. Losses, network, sigma and status are arrays.
 """
 
 from __future__ import annotations
@@ -17,7 +23,7 @@ from jtqd.estimator.corrections import (
     INVERSE_W0,
     Pairs,
     Smoothed,
-    acting,
+    acting_effects,
     at_motor,
     hooks_of,
     needs_torque,
@@ -26,22 +32,24 @@ from jtqd.estimator.corrections import (
 )
 from jtqd.estimator.effects.effect import State
 from jtqd.estimator.effects.functions import Whole
-from jtqd.estimator.estimator import STANDSTILL_SIGMAS, fused_parts
+from jtqd.estimator.estimator import STANDSTILL_SIGMAS, checked_fused
 from jtqd.estimator.fusion import Fusion, held_many, turning_many
-from jtqd.estimator.guard import Tracker
+from jtqd.estimator.guard import Guard
 from jtqd.estimator.joint import Joint, Torsion
 from jtqd.estimator.losses import AdditiveLossModel, LossModel
 from jtqd.estimator.network import FusedNetworkModel, NetworkModel, checked_network, trust_of
-from jtqd.estimator.observer import FusedObserved, FusedObserver, Observer
+from jtqd.estimator.observer import FusedObserved, FusedObserver, Observed, Observer
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import DEGRADED, INVALID, STANDSTILL, VALID
 from jtqd.estimator.validity import FADE_START, FusedTrust, Uncertainty
 from jtqd.estimator.whole_observers import observe_fused, observe_paper
 
+QuadrantArray = np.ndarray[tuple[int], np.dtype[np.intp]]
+
 
 @dataclass(frozen=True, slots=True)
 class EstimateRun:
-    """The fields of Estimate as read-only arrays [n] and the features [n, 6], NaN where not running."""
+    """Fields of `Estimate` as read-only arrays [n], and the network's features [n, 6 or 7], NaN where not running."""
 
     torque_nm: FloatArray
     sigma_nm: FloatArray
@@ -71,12 +79,7 @@ def estimate_run(  # noqa: PLR0917 - as JointEstimator and its step together
     Raises ConfigError as JointEstimator does, ValueError for arrays of different length.
     """
     used = checked_network(joint, settings, network)
-    columns = [
-        np.ascontiguousarray(column, np.float64)
-        for column in (dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
-    ]
-    if len({column.shape for column in columns}) != 1 or columns[0].ndim != 1:
-        raise ValueError(f"found arrays of shapes {[c.shape for c in columns]}, expected five of one length")
+    columns = _checked_columns(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
     status, raw, tob, v, link_velocity = _observe(joint, settings, columns)
     running = status != INVALID
     running &= ~np.isnan(raw)
@@ -107,35 +110,36 @@ def estimate_run(  # noqa: PLR0917 - as JointEstimator and its step together
     return EstimateRun(torque, sigma, status, tob, efficiency, answer, features)
 
 
+def _checked_columns(*arrays: FloatArray) -> list[FloatArray]:
+    """Return the five columns of a run [n] as contiguous arrays; ValueError for different lengths."""
+    columns = [np.ascontiguousarray(column, np.float64) for column in arrays]
+    if len({column.shape for column in columns}) != 1 or columns[0].ndim != 1:
+        raise ValueError(f"found arrays of shapes {[c.shape for c in columns]}, expected five of one length")
+    return columns
+
+
+def _by_steps(guard: Guard[Any], columns: list[FloatArray], width: int) -> tuple[StatusArray, FloatArray]:
+    """Return status [n] and the observer's outputs [width, n] sample by sample, NaN where the guard gives none."""
+    step = guard.step
+    status = np.empty(len(columns[0]), np.uint8)
+    rows: list[tuple[float, ...]] = []
+    nothing = (nan,) * width
+    for k, sample in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
+        rows.append(step(*sample) or nothing)
+        status[k] = guard.status
+    return status, np.array(rows, np.float64).reshape(-1, width).T.copy()
+
+
 def _observe(
     joint: Joint, settings: EstimatorSettings, columns: list[FloatArray]
 ) -> tuple[StatusArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Run the tracker: status [n] and raw, tob, joint velocity, link velocity [n], NaN where it has none."""
-    found = observe_paper(joint, settings, columns)
-    if found is not None:
-        raw, tob, v, link_velocity = found[1]
-        return found[0], raw, tob, v, link_velocity
-    tracker = Tracker(
-        Observer(joint, settings.bandwidth_rad_s, settings.link_bandwidth_rad_s), joint, settings
-    )
-    step = tracker.step
-    count = len(columns[0])
-    status = np.empty(count, np.uint8)
-    rows: list[tuple[float, ...]] = []
-    nothing = (np.nan,) * 4
-    for k, sample in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
-        rows.append(step(*sample) or nothing)
-        status[k] = tracker.status
-    raw, tob, v, link_velocity = np.array(rows, np.float64).reshape(-1, 4).T.copy()
+    """Return status [n] and raw, tob, joint velocity, link velocity [n] of the guarded observer, NaN where it has none."""
+    observed = observe_paper(joint, settings, columns)
+    if observed is None:
+        observer = Observer(joint, settings.bandwidth_rad_s, settings.link_bandwidth_rad_s)
+        observed = _by_steps(Guard(observer, joint, settings), columns, len(Observed._fields))
+    status, (raw, tob, v, link_velocity) = observed
     return status, raw, tob, v, link_velocity
-
-
-# Vectorised twin of FusedEstimator for whole runs: same numbers to 1e-9, a fraction of the time.
-#
-# Also the way in for fits: `observe_run` gives what the additive loss, the fusion and the network see.
-
-
-QuadrantArray = np.ndarray[tuple[int], np.dtype[np.intp]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,57 +177,38 @@ def observe_run(  # noqa: PLR0917 - as a sample, in arrays
 
     Raises ValueError for arrays of different length.
     """
-    columns = [
-        np.ascontiguousarray(column, np.float64)
-        for column in (dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
-    ]
-    if len({column.shape for column in columns}) != 1 or columns[0].ndim != 1:
-        raise ValueError(f"found arrays of shapes {[c.shape for c in columns]}, expected five of one length")
+    columns = _checked_columns(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
     count = len(columns[0])
     if temperature_c is None:
         temperature_c = np.full(count, np.nan)
     elif np.shape(temperature_c) != (count,):
         raise ValueError(f"found temperatures of shape {np.shape(temperature_c)}, expected ({count},)")
-    quick = observe_fused(joint, settings, torsion, columns)
-    if quick is not None:
-        return _observed(quick[0], quick[1].T, temperature_c, columns[0])
-    observer = FusedObserver(joint, torsion, settings.bandwidth_rad_s, settings.link_bandwidth_rad_s)
-    tracker = Tracker(observer, joint, settings)
-    step = tracker.step
-    status = np.empty(count, np.uint8)
-    rows: list[tuple[float, ...]] = []
-    nothing = (np.nan,) * len(FusedObserved._fields)
-    for k, sample in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
-        rows.append(step(*sample) or nothing)
-        status[k] = tracker.status
-    return _observed(status, np.array(rows, np.float64).reshape(-1, len(nothing)), temperature_c, columns[0])
-
-
-def _observed(
-    status: StatusArray, seen: FloatArray, temperature_c: FloatArray, dt_s: FloatArray
-) -> ObservedRun:
-    """Return outputs `seen` [n, fields of FusedObserved] by name."""
+    observed = observe_fused(joint, settings, torsion, columns)
+    if observed is None:
+        observer = FusedObserver(joint, torsion, settings.bandwidth_rad_s, settings.link_bandwidth_rad_s)
+        observed = _by_steps(Guard(observer, joint, settings), columns, len(FusedObserved._fields))
+    status, rows = observed
     return ObservedRun(
-        status,
-        seen[:, 0].copy(),
-        seen[:, 1].copy(),
-        seen[:, 3].copy(),
-        seen[:, 4:8].copy(),
-        np.asarray(temperature_c, np.float64),
-        seen[:, 8].copy(),
-        dt_s,
-        seen[:, 9].copy(),
+        status=status,
+        raw_nm=rows[0].copy(),
+        velocity_rad_s=rows[1].copy(),
+        torsion_nm=rows[3].copy(),
+        waves=rows[4:8].T.copy(),
+        temperature_c=np.asarray(temperature_c, np.float64),
+        direction=rows[8].copy(),
+        dt_s=columns[0],
+        open_nm=rows[9].copy(),
     )
 
 
-def network_features(seen: ObservedRun, current_path_nm: FloatArray) -> FloatArray:
+def network_features(observed: ObservedRun, current_path_nm: FloatArray) -> FloatArray:
     """Return FUSED_FEATURES [n, 7]; current_path_nm [n]: motor torque less loss."""
     return np.column_stack(
         (
-            seen.velocity_rad_s,
-            seen.raw_nm,
-            seen.torsion_nm - current_path_nm,
-            seen.waves,
+            observed.velocity_rad_s,
+            observed.raw_nm,
+            observed.torsion_nm - current_path_nm,
+            observed.waves,
         )
     )
 
@@ -235,20 +220,20 @@ def quadrant_many(raw_nm: FloatArray, velocity_rad_s: FloatArray) -> QuadrantArr
 
 
 def estimate_observed(
-    joint: Joint, settings: EstimatorSettings, network: FusedNetworkModel | None, seen: ObservedRun
+    joint: Joint, settings: EstimatorSettings, network: FusedNetworkModel | None, observed: ObservedRun
 ) -> EstimateRun:
     """Return the estimates of an observed run (observed with the joint's own torsion); features are [n, 7].
 
     Raises ConfigError as FusedEstimator does.
     """
-    fused, used = fused_parts(joint, settings, network)
-    status = seen.status.copy()
-    running = (status != INVALID) & ~np.isnan(seen.raw_nm)
-    at = _running_only(seen, running)
+    fused = checked_fused(joint, settings, network)
+    status = observed.status.copy()
+    running = (status != INVALID) & ~np.isnan(observed.raw_nm)
+    at = _running_only(observed, running)
     raw, v, torsion = at.raw_nm, at.velocity_rad_s, at.torsion_nm
     with np.errstate(invalid="ignore", over="ignore"):
         loss, half = AdditiveLossModel(fused.loss).loss_many(raw, v, at.temperature_c, at.direction)
-        wide = held_many(half, seen.dt_s, running)
+        wide = held_many(half, observed.dt_s, running)
         fusion = Fusion(fused.sigma, fused.torsion is not None)
         physics, sigma = fusion.fuse_many(raw, loss, wide, v, torsion, at.open_nm)
         features = network_features(at, raw - loss)
@@ -256,14 +241,14 @@ def estimate_observed(
         quadrant = quadrant_many(raw, v)
         scale = np.array(fused.sigma.scale)[quadrant]
         torque, answer = physics, np.full_like(raw, np.nan)
-        if used is not None:
+        if network is not None:
             correction = np.full_like(raw, np.nan)
-            correction[running] = used.run_many(features[running])
+            correction[running] = network.run_many(features[running])
             limit = settings.network_limit * joint.rated_torque_nm
-            weight = _weight(used, at, raw - loss, correction, limit)
+            weight = _weight(network, at, raw - loss, correction, limit)
             answer = physics + correction
             torque = physics + np.where(weight > 0.0, weight * turning_many(v) * correction, 0.0)
-            scale = scale + weight * (np.array(used.sigma_scale)[quadrant] - scale)
+            scale = scale + weight * (np.array(network.sigma_scale)[quadrant] - scale)
             status[(status == VALID) & (weight < 1.0)] = DEGRADED
         open_nm = (1.0 + settings.friction_uncertainty) * half + settings.sigma_floor * joint.rated_torque_nm
         standing = np.minimum(open_nm, STANDSTILL_SIGMAS * scale * sigma)
@@ -282,38 +267,35 @@ def estimate_observed(
     )
 
 
-def _running_only(seen: ObservedRun, running: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> ObservedRun:
+def _running_only(observed: ObservedRun, running: BoolArray) -> ObservedRun:
     """Return zeros where nothing was observed: the formulas then need no exceptions."""
     return replace(
-        seen,
-        raw_nm=np.where(running, seen.raw_nm, 0.0),
-        velocity_rad_s=np.where(running, seen.velocity_rad_s, 0.0),
-        torsion_nm=np.where(running, seen.torsion_nm, 0.0),
-        direction=np.where(running, seen.direction, 0.0),
-        open_nm=np.where(running, seen.open_nm, 0.0),
+        observed,
+        raw_nm=np.where(running, observed.raw_nm, 0.0),
+        velocity_rad_s=np.where(running, observed.velocity_rad_s, 0.0),
+        torsion_nm=np.where(running, observed.torsion_nm, 0.0),
+        direction=np.where(running, observed.direction, 0.0),
+        open_nm=np.where(running, observed.open_nm, 0.0),
     )
 
 
 def _weight(
     network: FusedNetworkModel,
-    seen: ObservedRun,
+    observed: ObservedRun,
     current_path_nm: FloatArray,
     correction_nm: FloatArray,
     limit_nm: float,
 ) -> FloatArray:
     """Return the network's share [n] without its fading at standstill; a correction of NaN gives 0."""
-    raw, v, distance = seen.raw_nm, seen.velocity_rad_s, seen.torsion_nm - current_path_nm
-    trust = FusedTrust(network.envelope).weight_many(v, raw, distance, seen.temperature_c)
+    raw, v, distance = observed.raw_nm, observed.velocity_rad_s, observed.torsion_nm - current_path_nm
+    trust = FusedTrust(network.envelope).weight_many(v, raw, distance, observed.temperature_c)
     size, fade = np.abs(correction_nm), FADE_START * limit_nm
     near = np.where(size > fade, (limit_nm - size) / max(limit_nm - fade, 1e-12), 1.0)
     return np.where(size <= limit_nm, np.minimum(trust, near), 0.0)
 
 
-# Vectorised twin of `extended_inputs` for whole runs: same numbers to 1e-9, a fraction of the time.
-
-
 class SmoothedRun(Whole):
-    """Twin of `Smoothed` over a run; share [n], 0 where a sample is not used."""
+    """Twin of `corrections.Smoothed` over a run; share [n], 0 where a sample is not used."""
 
     __slots__ = ("_share",)
 
@@ -342,7 +324,7 @@ def extended_run(  # noqa: PLR0917 - a sample, in arrays
 ) -> tuple[FloatArray, FloatArray]:
     """Return (i', theta_l') of a run, arrays [n]: twin of ExtendedInputs for joints without `needs_torque`."""
     assert not needs_torque(joint)
-    pairs = acting(joint)
+    pairs = acting_effects(joint)
     plain = replace(joint, effects=())
     with np.errstate(all="ignore"):  # what is not finite is put back below
         good = np.isfinite(current_a + motor_position_rad + motor_velocity_rad_s + link_position_rad)

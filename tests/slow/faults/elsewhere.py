@@ -148,9 +148,9 @@ ELSEWHERE = (
         "network: NaN, slow, far, corrupt, missing",
         "refused at the start, or left out in the cycle and counted by reason",
         (
-            "tests/estimator/test_estimator_network.py::test_a_network_that_gives_nan_is_refused",
-            "tests/estimator/test_estimator_network.py::test_unreadable_and_corrupt_files",
-            "tests/estimator/test_estimator_network.py::test_flipped_bytes_never_give_another_exception",
+            "tests/estimator/test_network.py::test_a_network_that_gives_nan_is_refused",
+            "tests/estimator/test_network.py::test_unreadable_and_corrupt_files",
+            "tests/estimator/test_network.py::test_flipped_bytes_never_give_another_exception",
             "tests/slow/test_fuzz_files.py::test_every_kind_of_file",
             "tests/daemon/loop/test_safety_published.py::test_the_network_that_is_dropped_is_counted_by_its_reason",
             "tests/daemon/loop/test_safety_overrun.py::test_a_network_that_has_become_slow_costs_two_cycles_and_then_only_itself",

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from jtqd.estimator.guard import Tracker
+from jtqd.estimator.guard import Guard
 from jtqd.estimator.observer import FusedObserver, Observer
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.whole_observers import (
@@ -96,10 +96,10 @@ def test_observers_over_a_run_are_those_of_the_loop(fused: bool) -> None:
     assert made is not None
     status, rows = made
     observer = FusedObserver(joint, torsion, 200.0, 200.0) if fused else Observer(joint, 200.0, 200.0)
-    tracker = Tracker(observer, joint, settings)  # type: ignore[type-var]
+    guard = Guard(observer, joint, settings)  # type: ignore[type-var]
     for k, sample in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
-        seen = tracker.step(*sample)
-        assert status[k] == tracker.status, k
+        seen = guard.step(*sample)
+        assert status[k] == guard.status, k
         if seen is None:
             assert np.isnan(rows[:, k]).all()
         else:
