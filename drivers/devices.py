@@ -10,8 +10,9 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from jtqd.drivers.boot_error import mismatch
 from jtqd.drivers.pdo import MappedObject, PdoMap
-from jtqd.drivers.sdo import Key, label, mismatch
+from jtqd.drivers.sdo import Key, label
 
 JTQD_NODE = 0x20
 COMMANDER_NODE = 0x21
@@ -111,6 +112,9 @@ class SensorProfile:
         """What boot must read."""
         keys = [(index, channel) for channel in self.channels for index in (UNIT_OBJECT, DECIMALS_OBJECT)]
         return tuple(key for key in keys if key not in self.given)
+
+
+Profile = DriveProfile | SensorProfile
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from jtqd.drivers.sdo import (
     VALUE_RANGE,
     WRITE_OF_READ_ONLY,
     SdoAbort,
+    label,
 )
 
 # Data types of CiA 301 7.4.7 that are numbers, with their struct letters. A BOOLEAN takes a byte in an SDO.
@@ -150,7 +151,7 @@ class ObjectStore:
         """Integer value, rights not asked; the read hook is."""
         entry = self.entry(index, subindex)
         if entry.data_type not in _LETTERS or entry.layout is None:
-            raise ValueError(f"{index:04X}h:{subindex} is not an integer")
+            raise ValueError(f"{label(index, subindex)} is not an integer")
         (value,) = entry.layout.unpack(self._value(entry))
         return int(value)
 
@@ -158,19 +159,19 @@ class ObjectStore:
         """Set a number (integer or REAL32/64); ValueError when it does not fit. No hook is called."""
         entry = self.entry(index, subindex)
         if entry.layout is None:
-            raise ValueError(f"{index:04X}h:{subindex} is not a number")
+            raise ValueError(f"{label(index, subindex)} is not a number")
         try:
             self._values[index, subindex] = entry.layout.pack(value)
         except (struct.error, OverflowError) as error:
             raise ValueError(
-                f"{index:04X}h:{subindex} {entry.name}: {value!r} does not fit: {error}"
+                f"{label(index, subindex)} {entry.name}: {value!r} does not fit: {error}"
             ) from error
 
     def set_text(self, index: int, subindex: int, text: str) -> None:
         """Set a VISIBLE_STRING."""
         entry = self.entry(index, subindex)
         if entry.data_type != VISIBLE_STRING:
-            raise ValueError(f"{index:04X}h:{subindex} {entry.name} is not a string")
+            raise ValueError(f"{label(index, subindex)} {entry.name} is not a string")
         self._values[index, subindex] = text.encode("ascii")
 
     def on_read(self, index: int, subindex: int, hook: ReadHook) -> None:
@@ -210,7 +211,7 @@ class ObjectStore:
             return value
         if entry.layout is None:
             raise ValueError(
-                f"{entry.index:04X}h:{entry.subindex} {entry.name}: hook gave a number for a string"
+                f"{label(entry.index, entry.subindex)} {entry.name}: hook gave a number for a string"
             )
         return entry.layout.pack(value)
 

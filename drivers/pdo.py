@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from jtqd.drivers.object_dictionary import ObjectStore
-from jtqd.drivers.sdo import DEVICE_STATE, NOT_MAPPABLE, PDO_TOO_LONG, VALUE_RANGE, SdoAbort
+from jtqd.drivers.sdo import DEVICE_STATE, NOT_MAPPABLE, PDO_TOO_LONG, VALUE_RANGE, SdoAbort, label
 
 MAX_PDO_BYTES = 8
 MAX_ENTRIES = 8  # whole bytes only: 8 entries fill a frame
@@ -50,7 +50,7 @@ class MappedObject:
     @property
     def label(self) -> str:
         """The object as "6064h:0"."""
-        return f"{self.index:04X}h:{self.subindex}"
+        return label(self.index, self.subindex)
 
     @property
     def word(self) -> int:
