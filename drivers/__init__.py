@@ -1,1 +1,21 @@
-"""Frame sockets, PDO codec, CANopen devices and boot: everything between a wire and numbers."""
+"""Everything between a wire and numbers: CAN frames, frame sockets, CANopen services, the devices on the bus, their boot.
+
+Frames come in and go out as 16 bytes (`struct can_frame`); numbers are those of object dictionaries and PDOs.
+It imports nothing else of jtqd. canopen and python-can are imported by `boot` (a process of its own) and `can_unix` alone,
+and canopen's EDS parser by `object_dictionary.read_eds` when it is called. Import the modules themselves:
+
+    frame, filters, receive     the 16 bytes, kernel filters, one system call for all frames that have come
+    frame_socket, hub           SocketCAN or a unix socket, alike to use; the hub of a unix bus, `python -m jtqd.drivers.hub`
+    object_dictionary, pdo      objects typed by an EDS, PDO mappings as `struct`, rules for changing them
+    sdo, sdo_client, sdo_server the protocol and a queue; blocking clients; the server
+    emcy, devices, bus_load     EMCY codes, what drives and sensor must map and scale, load of a configuration
+    boot_procedure, boot        one node by SDO (CiA 302-2); the whole bus, `python -m jtqd.drivers.boot`
+    can_unix, eds               unix bus for python-can; data sheets
+
+>>> from jtqd.drivers.devices import drive_tpdo2
+>>> pdo = drive_tpdo2(node=1)
+>>> f"{pdo.cob_id:X}h", pdo.names
+('281h', ('motor_velocity', 'current', 'statusword'))
+>>> pdo.layout.unpack(bytes.fromhex("10 27 00 00 F4 01 37 02"))
+(10000, 500, 567)
+"""

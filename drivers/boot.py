@@ -1,7 +1,7 @@
 """Boot of the bus as a short-lived process: `python -m jtqd.drivers.boot < request.json > report.json`.
 
 canopen and its threads live here and end here, so that nothing shares the loop's interpreter.
-The request is that of `jtqd.drivers.boot_procedure`. The report is
+The request is that of `jtqd.drivers.boot_request`. The report is
     {"ok": true, "duration_s", "nodes": {"1": {...}}, "absent": {"3": error}}               exit status 0
     {"ok": false, "error": {"node", "object", "expected", "found", "letter", "message"}}    exit status 1
 Boot is run again with a shorter list of nodes for a node that has come back.
@@ -21,142 +21,33 @@ from functools import partial
 import can
 import canopen
 
-from jtqd.drivers.boot_procedure import (
-    BootedNode,
-    BootRequest,
-    NodeBoot,
-    Profile,
-    RequestError,
-    node_report,
-    parse_request,
-    reset_during_boot,
-)
+from jtqd.drivers.boot_error import BootError
+from jtqd.drivers.boot_procedure import BootedNode, NodeBoot, reset_during_boot
+from jtqd.drivers.boot_request import BootRequest, RequestError, node_report, parse_request
+from jtqd.drivers.can_unix import UnixBus
+from jtqd.drivers.devices import Profile
 from jtqd.drivers.frame import CAN_RTR_FLAG, CAN_SFF_MASK
 from jtqd.drivers.object_dictionary import entries_to_json, read_eds
-from jtqd.drivers.sdo import BootError, NodeSdo
-
-# What the boot hears beside its SDO answers: heartbeats, other masters, errors of the bus. canopen's thread calls them.
-
-
-STATE_BOOT_UP = 0x00
-SYNC_LISTEN_S = 0.12  # a little more than the longest period that jtqd itself may have
-NOTIFIER_S = 0.01  # canopen's default of 1 s is what closing the network would wait for
-
-
-class Heartbeats:
-    """Newest NMT state of each node, from the notifier's thread."""
-
-    def __init__(self) -> None:
-        self._news = threading.Condition()
-        self._state: dict[int, int] = {}
-        self._restarted: set[int] = set()
-
-    def on_heartbeat(self, can_id: int, data: bytes, _timestamp: float) -> None:
-        """canopen callback; a frame that is not one byte is no heartbeat."""
-        if len(data) != 1:
-            return
-        with self._news:
-            self._state[can_id - 0x700] = data[0] & 0x7F
-            if data[0] == STATE_BOOT_UP:
-                self._restarted.add(can_id - 0x700)
-            self._news.notify_all()
-
-    def forget(self, node: int) -> None:
-        """What was heard so far does not count."""
-        with self._news:
-            self._state.pop(node, None)
-            self._restarted.discard(node)
-
-    def restarted(self, node: int) -> bool:
-        """A boot-up message came since `forget`."""
-        with self._news:
-            return node in self._restarted
-
-    def wait(self, node: int, wanted: int | None, timeout_s: float) -> int | None:
-        """Newest state once it is `wanted` (None: any), or what it is after `timeout_s`."""
-
-        def arrived() -> bool:
-            state = self._state.get(node)
-            return state is not None and (wanted is None or state == wanted)
-
-        with self._news:
-            self._news.wait_for(arrived, timeout_s)
-            return self._state.get(node)
-
-
-class ForeignMaster:
-    """Who else sends SYNC, or speaks with jtqd's own node-ID: with such a one on the bus nothing is begun."""
-
-    def __init__(self, network: canopen.Network, request: BootRequest) -> None:
-        self._network, self._request = network, request
-        self._since = time.monotonic()
-        self._syncs = self._namesakes = 0
-        if request.check_foreign_sync:
-            network.subscribe(request.settings.sync_cob_id, self._on_sync)
-            network.subscribe(0x700 + request.settings.master_node, self._on_namesake)
-
-    def _on_sync(self, *_: object) -> None:
-        self._syncs += 1
-
-    def _on_namesake(self, *_: object) -> None:
-        self._namesakes += 1
-
-    def announce(self) -> None:
-        """jtqd's own boot-up message: another one that is booting too hears it, and neither goes on."""
-        if self._request.check_foreign_sync:
-            self._network.send_message(0x700 + self._request.settings.master_node, [STATE_BOOT_UP])
-
-    def require_none(self) -> None:
-        """Raises BootError; waits until it has listened for a while."""
-        if not self._request.check_foreign_sync:
-            return
-        time.sleep(max(0.0, self._since + SYNC_LISTEN_S - time.monotonic()))
-        if self._syncs:
-            # It would make every input's cycle ambiguous.
-            where = f"COB-ID {self._request.settings.sync_cob_id:03X}h"
-            detail = f"another SYNC producer is on the bus ({where}, {self._syncs} frames during boot)"
-            raise BootError(None, where, expected="no SYNC", found=f"{self._syncs} frames", detail=detail)
-        if self._namesakes:
-            node = self._request.settings.master_node
-            where = f"COB-ID {0x700 + node:03X}h"
-            detail = (
-                f"another node {node:02X}h, jtqd's own node-ID, is on the bus (heartbeat or boot-up {where})"
-            )
-            raise BootError(None, where, expected="no such node", found="heartbeat", detail=detail)
-
-
-class BusErrors(can.Listener):  # type: ignore[misc]
-    """Keeps canopen's receiving thread from dying with a traceback, and the reason for the message."""
-
-    def __init__(self) -> None:
-        self.last: Exception | None = None
-
-    def on_message_received(self, msg: can.Message) -> None:
-        """Nothing: canopen's own listener does it."""
-
-    def on_error(self, exc: Exception) -> None:
-        """Keep the reason; a failing recv returns at once, so wait a little."""
-        self.last = exc
-        time.sleep(NOTIFIER_S)
-
+from jtqd.drivers.sdo_client import NetworkChannel, SdoClient
 
 NMT_START, NMT_PRE_OPERATIONAL = 0x01, 0x80
-STATE_STOPPED, STATE_OPERATIONAL, STATE_PRE_OPERATIONAL = 0x04, 0x05, 0x7F
-_UNIX = "unix:"
+STATE_BOOT_UP, STATE_STOPPED, STATE_OPERATIONAL, STATE_PRE_OPERATIONAL = 0x00, 0x04, 0x05, 0x7F
 _STATE_NAMES = {STATE_BOOT_UP: "boot-up", STATE_STOPPED: "stopped", STATE_PRE_OPERATIONAL: "pre-operational"}
+SYNC_LISTEN_S = 0.12  # a little more than the longest period that jtqd itself may have
+NOTIFIER_S = 0.01  # canopen's default of 1 s is what closing the network would wait for
+_UNIX = "unix:"
 
 
 @dataclass(frozen=True)
 class BootReport:
-    """All nodes operational, as configured."""
+    """A boot that went well: `nodes` are operational and configured, `absent` are optional ones and why they are not."""
 
     nodes: dict[int, BootedNode]
     duration_s: float
     absent: dict[int, BootError]
-    """Optional nodes that could not be booted, and why."""
 
     def as_json(self) -> dict[str, object]:
-        """The report of a boot that went well."""
+        """Return the report for JSON."""
         nodes = {str(number): node_report(node) for number, node in self.nodes.items()}
         absent = {str(number): error.report() for number, error in self.absent.items()}
         return {"ok": True, "duration_s": round(self.duration_s, 4), "nodes": nodes, "absent": absent}
@@ -187,7 +78,7 @@ def boot(request: BootRequest, bus: can.BusABC | None = None) -> BootReport:
 def _boot_nodes(
     network: canopen.Network, request: BootRequest
 ) -> tuple[dict[int, BootedNode], dict[int, BootError]]:
-    """(nodes that are operational, optional ones that are not and why)."""
+    """Return the nodes that are operational, and why optional ones are not."""
     heartbeats = Heartbeats()
     foreign = ForeignMaster(network, request)
     for profile in request.profiles:
@@ -228,12 +119,13 @@ def _boot_nodes(
 def _configure(
     network: canopen.Network, request: BootRequest, profile: Profile, heartbeats: Heartbeats
 ) -> BootedNode:
-    """One node up to its configuration; it is pre-operational then."""
+    """Identify and configure one node, which stays pre-operational."""
     node = profile.node_id
     was_operational = heartbeats.wait(node, None, 0.0) == STATE_OPERATIONAL
     # A running node would refuse to be re-mapped, and a stopped one does not answer SDO.
     network.send_message(0, [NMT_PRE_OPERATIONAL, node])
-    procedure = NodeBoot(NodeSdo(network, node, request.timeout_s(node)), profile, request.settings)
+    sdo = SdoClient(NetworkChannel(network, node), request.timeout_s(node))
+    procedure = NodeBoot(sdo, profile, request.settings)
     device_type = procedure.check_device_type()
     heartbeats.forget(node)  # a boot-up message up to its first answer is its own start
     booted = procedure.run(device_type)
@@ -244,7 +136,7 @@ def _configure(
 
 
 def _require_heartbeat(heartbeats: Heartbeats, node: int, wait_s: float) -> None:
-    """Start of error control: the node is heard before it is started."""
+    """Start error control: the node must be heard before it is started."""
     if heartbeats.wait(node, None, wait_s) is None:
         detail = f"no heartbeat {0x700 + node:03X}h within {wait_s:g} s"
         raise BootError(node, "1017h:0", expected="heartbeat", found="none", letter="K", detail=detail)
@@ -253,7 +145,7 @@ def _require_heartbeat(heartbeats: Heartbeats, node: int, wait_s: float) -> None
 
 
 def _require_operational(network: canopen.Network, heartbeats: Heartbeats, node: int, wait_s: float) -> None:
-    """The node says operational, if need be after a second start.
+    """Wait until the node is operational, if need be after a second start.
 
     A drive may still watch the heartbeat of a jtqd that ended a moment ago: not every device begins anew when 1016h is
     written. When that runs out it leaves operational (1029h), rightly, as it had no master; but it does so once.
@@ -271,7 +163,7 @@ def _require_operational(network: canopen.Network, heartbeats: Heartbeats, node:
 
 
 def open_bus(request: BootRequest) -> can.BusABC:
-    """A bus that receives the answers of the nodes and SYNC, and nothing else. Raises BootError."""
+    """Open a bus that receives the nodes' answers and heartbeats, SYNC and our own node-ID. Raises BootError."""
     identifiers = [base + profile.node_id for profile in request.profiles for base in (0x580, 0x700)]
     if request.check_foreign_sync:
         identifiers += [request.settings.sync_cob_id, 0x700 + request.settings.master_node]
@@ -280,8 +172,6 @@ def open_bus(request: BootRequest) -> can.BusABC:
     filters = [{"can_id": cob_id, "can_mask": mask, "extended": False} for cob_id in identifiers]
     try:
         if request.bus.startswith(_UNIX):
-            from jtqd.drivers.can_unix import UnixBus
-
             return UnixBus(channel=request.bus.removeprefix(_UNIX), can_filters=filters)
         return can.Bus(interface="socketcan", channel=request.bus, can_filters=filters)
     except (can.CanError, OSError) as error:
@@ -300,8 +190,105 @@ def _close(network: canopen.Network) -> None:
         logging.getLogger(__name__).debug("closing the network: %s", error)
 
 
+class Heartbeats:
+    """Newest NMT state of each node, from the notifier's thread."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._state: dict[int, int] = {}
+        self._restarted: set[int] = set()
+
+    def on_heartbeat(self, can_id: int, data: bytes, _timestamp: float) -> None:
+        """Take a heartbeat (canopen's callback); a frame that is not one byte is none."""
+        if len(data) != 1:
+            return
+        with self._changed:
+            self._state[can_id - 0x700] = data[0] & 0x7F
+            if data[0] == STATE_BOOT_UP:
+                self._restarted.add(can_id - 0x700)
+            self._changed.notify_all()
+
+    def forget(self, node: int) -> None:
+        """Discard what was heard so far."""
+        with self._changed:
+            self._state.pop(node, None)
+            self._restarted.discard(node)
+
+    def restarted(self, node: int) -> bool:
+        """Return whether a boot-up message came since `forget`."""
+        with self._changed:
+            return node in self._restarted
+
+    def wait(self, node: int, wanted: int | None, timeout_s: float) -> int | None:
+        """Return the newest state once it is `wanted` (None: any), or what it is after `timeout_s`."""
+
+        def arrived() -> bool:
+            state = self._state.get(node)
+            return state is not None and (wanted is None or state == wanted)
+
+        with self._changed:
+            self._changed.wait_for(arrived, timeout_s)
+            return self._state.get(node)
+
+
+class ForeignMaster:
+    """Watch for another SYNC producer, or another node with jtqd's own node-ID: the boot then refuses the bus."""
+
+    def __init__(self, network: canopen.Network, request: BootRequest) -> None:
+        self._network, self._request = network, request
+        self._since = time.monotonic()
+        self._syncs = self._own_ids = 0
+        if request.check_foreign_sync:
+            network.subscribe(request.settings.sync_cob_id, self._on_sync)
+            network.subscribe(0x700 + request.settings.master_node, self._on_own_id)
+
+    def _on_sync(self, *_: object) -> None:
+        self._syncs += 1
+
+    def _on_own_id(self, *_: object) -> None:
+        self._own_ids += 1
+
+    def announce(self) -> None:
+        """Send jtqd's own boot-up message: another one that is booting too hears it, and neither goes on."""
+        if self._request.check_foreign_sync:
+            self._network.send_message(0x700 + self._request.settings.master_node, [STATE_BOOT_UP])
+
+    def require_none(self) -> None:
+        """Wait until it has listened long enough. Raises BootError when somebody else is there."""
+        if not self._request.check_foreign_sync:
+            return
+        time.sleep(max(0.0, self._since + SYNC_LISTEN_S - time.monotonic()))
+        if self._syncs:
+            # it would make every input's cycle ambiguous
+            where = f"COB-ID {self._request.settings.sync_cob_id:03X}h"
+            detail = f"another SYNC producer is on the bus ({where}, {self._syncs} frames during boot)"
+            raise BootError(None, where, expected="no SYNC", found=f"{self._syncs} frames", detail=detail)
+        if self._own_ids:
+            node = self._request.settings.master_node
+            where = f"COB-ID {0x700 + node:03X}h"
+            detail = (
+                f"another node {node:02X}h, jtqd's own node-ID, is on the bus (heartbeat or boot-up {where})"
+            )
+            raise BootError(None, where, expected="no such node", found="heartbeat", detail=detail)
+
+
+class BusErrors(can.Listener):  # type: ignore[misc]
+    """Keep canopen's receiving thread from dying with a traceback, and the reason in `last`."""
+
+    def __init__(self) -> None:
+        self.last: Exception | None = None
+
+    def on_message_received(self, msg: can.Message) -> None:
+        """Do nothing: canopen's own listener takes the message."""
+
+    def on_error(self, exc: Exception) -> None:
+        """Keep the reason; a failing recv returns at once, so wait a little."""
+        self.last = exc
+        time.sleep(NOTIFIER_S)
+
+
 def main() -> int:
-    """Request on stdin, report on stdout, exit status 0 or 1; never a traceback."""
+    """Read a request from stdin, boot, print the report; return the exit status. Never a traceback."""
     logging.getLogger("canopen").setLevel(logging.CRITICAL)  # what it logs as error is in the report
     logging.getLogger("can").setLevel(logging.CRITICAL)
     try:

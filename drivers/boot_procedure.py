@@ -1,73 +1,32 @@
 """Boot of one node by SDO, in the order of CiA 302-2: device type, identity, configuration, heartbeat.
 
-Written against `SdoAccess`, so that a node in memory boots as one on a wire does. Every value written is read
-back and compared; the values found make the node's configuration hash.
+Written against `SdoAccess`, so that a node in memory boots as one on a wire does. Every value written is read back and
+compared; the values read make the node's configuration hash. No bus, no clock.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
+from jtqd.drivers.boot_error import BootError, mismatch
 from jtqd.drivers.devices import (
     EVENT_DRIVEN,
     EVENT_MS,
-    JTQD_NODE,
     OPERATING_MODE_OBJECT,
-    SYNC_COB_ID,
     TEMPERATURE,
     DriveProfile,
     DriveScaling,
-    Identity,
-    SensorProfile,
+    Profile,
     SensorScaling,
     drive_scaling,
-    parse_key,
     sensor_scaling,
 )
 from jtqd.drivers.pdo import CAN_ID, INVALID, NO_RTR, PdoMap
-from jtqd.drivers.sdo import BootError, Key, NodeObjects, SdoAccess, mismatch
+from jtqd.drivers.sdo import Key
+from jtqd.drivers.sdo_client import NodeObjects, SdoAccess
 
-# A node's configuration as one number: the hash over all that the boot has read back, and what 1020h holds of it. Pure.
-
-
-def configuration_sha256(found: Mapping[Key, int]) -> str:
-    """SHA-256 over every value found, in the order of the objects."""
-    lines = [f"{index:04X}h:{subindex}={value}\n" for (index, subindex), value in sorted(found.items())]
-    return hashlib.sha256("".join(lines).encode()).hexdigest()
-
-
-def signature(sha256: str) -> tuple[int, int]:
-    """The two words of 1020h for a configuration: the first 64 bits of its hash, never zero (zero: not configured).
-
-    CiA 301 calls them date and time; CiA 302-2 compares them with what the master expects and nothing else.
-    """
-    words = int(sha256[:8], 16), int(sha256[8:16], 16)
-    return words[0] or 1, words[1] or 1
-
-
-# Which of the objects that a boot has read say what a node's numbers mean: its PDOs and its scaling. Pure.
-#
-# They are read again in service (`daemon/bus/nodes.py`): where one has changed, the node's numbers mean
-# something else than before.
-
-
-_PDO_PARAMETERS = range(0x1800, 0x1C00)
-"""Communication and mapping parameters of TPDOs (CiA 301)."""
-
-
-def watched_objects(found: Mapping[Key, int], scaling: Collection[Key]) -> tuple[tuple[int, int, int], ...]:
-    """(index, sub-index, value) of the objects in `found` that belong to a TPDO, to `scaling` or to a channel's mode."""
-    return tuple(
-        (*key, value)
-        for key, value in sorted(found.items())
-        if key[0] in _PDO_PARAMETERS or key[0] == OPERATING_MODE_OBJECT or key in scaling
-    )
-
-
-Profile = DriveProfile | SensorProfile
 _IDENTITY = (
     ("vendor", "vendor-ID", "D"),
     ("product", "product code", "M"),
@@ -75,6 +34,7 @@ _IDENTITY = (
     ("serial", "serial number", "O"),
 )
 _TPDO_COUNT = 4  # TPDOs of the predefined connection set: those not used are switched off
+_PDO_PARAMETERS = range(0x1800, 0x1C00)  # communication and mapping parameters of TPDOs
 _SOFTWARE: Key = (0x100A, 0)
 VERIFY_CONFIGURATION = 0x1020
 _ERROR_BEHAVIOUR: Key = (0x1029, 1)
@@ -84,10 +44,15 @@ _INHIBIT_TIME, _EVENT_TIMER = 3, 5  # sub-indices of a PDO's communication param
 
 @dataclass(frozen=True)
 class BusSettings:
-    """What all nodes are told. None: left alone.
+    """Settings that are the same for all nodes.
 
-    `counter_overflow` is 1019h (0: SYNC without counter). `error_behaviour` is 1029h:1, what a node does when it misses
-    the master's heartbeat: 0 pre-operational, 1 nothing, 2 stopped.
+    Attributes:
+        master_node: node number of jtqd, whose heartbeat the drives watch for `master_timeout_ms` (1016h:1).
+        heartbeat_ms: 1017h.
+        sync_cob_id: 1005h must hold it.
+        counter_overflow: 1019h (0: SYNC without counter); None: left alone.
+        error_behaviour: 1029h:1, what a node does when it misses the master's heartbeat: 0 pre-operational, 1 nothing,
+            2 stopped; None: left alone.
     """
 
     master_node: int
@@ -100,7 +65,16 @@ class BusSettings:
 
 @dataclass(frozen=True)
 class BootedNode:
-    """What a node said and now holds. `gear_ratio` is None for a sensor."""
+    """A node as it was identified and configured.
+
+    Attributes:
+        serial: 1018h:4; 0: the device has none.
+        gear_ratio: 6091h; None for a sensor.
+        configuration_sha256: of all that the boot has read (`configuration_sha256`).
+        signed: 1020h holds the signature of this configuration.
+        watched: objects that its PDOs and scaling depend on (`watched_objects`).
+        notes: what the operator should know although nothing is wrong.
+    """
 
     node_id: int
     name: str
@@ -111,11 +85,8 @@ class BootedNode:
     tpdos: tuple[PdoMap, ...]
     configuration_sha256: str
     signed: bool = False
-    """1020h holds the signature of this configuration."""
     watched: tuple[tuple[int, int, int], ...] = ()
-    """Objects that its PDOs and scaling depend on (`drivers/boot_procedure.py`)."""
     notes: tuple[str, ...] = ()
-    """What the operator should know although nothing is wrong."""
 
 
 class NodeBoot:
@@ -136,10 +107,10 @@ class NodeBoot:
         self.configure_heartbeat()
         self.configure_error_behaviour()
         scaling, gear_ratio = self.read_scaling()
-        watched = watched_objects(self._objects.found, self._profile.scaling_objects)
-        sha256 = configuration_sha256(self._objects.found)
+        watched = watched_objects(self._objects.values, self._profile.scaling_objects)
+        sha256 = configuration_sha256(self._objects.values)
         signed = self.sign(sha256)
-        name = self._objects.optional((0x1008, 0)) or b""
+        name = self._objects.read((0x1008, 0)) or b""
         return BootedNode(
             node_id=self._node,
             name=name.rstrip(b"\0").decode("ascii", "replace"),
@@ -172,15 +143,12 @@ class NodeBoot:
             expected = getattr(self._profile.identity, field)
             if expected is None and field != "serial":
                 continue
-            raw = self._objects.optional((0x1018, subindex))
-            if raw is None and expected is None:
-                continue
-            found = -1 if raw is None else int.from_bytes(raw[:4], "little")
+            key = (0x1018, subindex)
+            found = self._objects.optional_number(key, 4)
             if expected is not None and found != expected:
-                said = "no such object" if raw is None else f"0x{found:08X}"
-                key = (0x1018, subindex)
-                raise mismatch(self._node, key, name, expected=f"0x{expected:08X}", found=said, letter=letter)
-            self._objects.found[0x1018, subindex] = serial = found
+                text = "no such object" if found is None else f"0x{found:08X}"
+                raise mismatch(self._node, key, name, expected=f"0x{expected:08X}", found=text, letter=letter)
+            serial = found or 0
         self._check_software()
         return serial
 
@@ -189,7 +157,7 @@ class NodeBoot:
         expected = self._profile.identity.software
         if expected is None:
             return
-        raw, key, name = self._objects.optional(_SOFTWARE), _SOFTWARE, "software version"
+        raw, key, name = self._objects.read(_SOFTWARE), _SOFTWARE, "software version"
         if raw is None:
             raise mismatch(self._node, key, name, expected=expected, found="no such object", letter="G")
         found = raw.rstrip(b"\0").decode("ascii", "replace")
@@ -197,12 +165,12 @@ class NodeBoot:
             raise mismatch(self._node, key, name, expected=expected, found=found, letter="H")
 
     def check_temperature(self) -> None:
-        """3001h of a drive that shall tell its joint's temperature; the value does not matter here."""
+        """3001h must be there on a drive whose temperature is asked for; its value does not matter here."""
         profile = self._profile
         if (
             isinstance(profile, DriveProfile)
             and profile.temperature
-            and self._objects.optional(TEMPERATURE) is None
+            and self._objects.read(TEMPERATURE) is None
         ):
             expected = "a value (the configuration asks for it)"
             what = "joint temperature"
@@ -221,12 +189,8 @@ class NodeBoot:
                 self._configure_pdo(0x1800 + number - 1, pdo)
 
     def _switch_off(self, communication: int) -> None:
-        raw = self._objects.optional((communication, 1))
-        if raw is None:
-            return
-        cob_id = int.from_bytes(raw[:4], "little")
-        self._objects.found[communication, 1] = cob_id
-        if not cob_id & INVALID:
+        cob_id = self._objects.optional_number((communication, 1), 4)
+        if cob_id is not None and not cob_id & INVALID:
             self._objects.put((communication, 1), cob_id | INVALID, 4, "COB-ID")
 
     def _configure_pdo(self, communication: int, pdo: PdoMap) -> None:
@@ -244,20 +208,20 @@ class NodeBoot:
         enabled = cob_id & NO_RTR | pdo.cob_id & CAN_ID
         self._objects.write((communication, 1), enabled, 4)
         # read back at the end and not after each write: a later write may undo an earlier one
-        self._objects.compare((mapping, 0), len(pdo.words), 1, "number of mapped objects")
+        self._objects.require((mapping, 0), len(pdo.words), 1, "number of mapped objects")
         for entry, word in enumerate(pdo.words, 1):
-            self._objects.compare((mapping, entry), word, 4, "mapping entry")
-        self._objects.compare((communication, 2), pdo.transmission_type, 1, "transmission type")
-        self._objects.compare((communication, 1), enabled, 4, "COB-ID")
+            self._objects.require((mapping, entry), word, 4, "mapping entry")
+        self._objects.require((communication, 2), pdo.transmission_type, 1, "transmission type")
+        self._objects.require((communication, 1), enabled, 4, "COB-ID")
 
     def _configure_timer(self, communication: int) -> None:
         """Event timer, and inhibit time where the node has one: a value that flickers must not fill the bus."""
-        if self._objects.optional((communication, _INHIBIT_TIME)) is not None:
+        if self._objects.read((communication, _INHIBIT_TIME)) is not None:
             self._objects.put((communication, _INHIBIT_TIME), 10 * EVENT_MS, 2, "inhibit time in 100 us")
         self._objects.put((communication, _EVENT_TIMER), EVENT_MS, 2, "event timer in ms")
 
     def configure_sync(self) -> None:
-        """1005h must be the SYNC that jtqd sends; 1019h tells a node that has it of the counter byte."""
+        """1005h must be the SYNC that jtqd sends; 1019h, where the node has it, announces the counter byte."""
         found = self._objects.number((0x1005, 0), 4)
         wanted = self._settings.sync_cob_id
         if found & CAN_ID != wanted:
@@ -265,7 +229,7 @@ class NodeBoot:
                 self._node, (0x1005, 0), "COB-ID SYNC", expected=f"{wanted:03X}h", found=f"0x{found:08X}"
             )
         overflow = self._settings.counter_overflow
-        if overflow is not None and self._objects.optional((0x1019, 0)) is not None:
+        if overflow is not None and self._objects.read((0x1019, 0)) is not None:
             self._objects.put((0x1019, 0), overflow, 1, "SYNC counter overflow")
 
     def configure_heartbeat(self) -> None:
@@ -277,14 +241,14 @@ class NodeBoot:
         self._objects.put((0x1017, 0), settings.heartbeat_ms, 2, "producer heartbeat time")
 
     def configure_error_behaviour(self) -> None:
-        """1029h:1 where the node has it; a drive without, or one told to do nothing about it, is named."""
+        """1029h:1 where the node has it; a note for a drive whose 6007h lets it run on without its master."""
         behaviour = self._settings.error_behaviour
         if behaviour is None:
             return
-        if self._objects.optional(_ERROR_BEHAVIOUR) is not None:
+        if self._objects.read(_ERROR_BEHAVIOUR) is not None:
             self._objects.put(_ERROR_BEHAVIOUR, behaviour, 1, "error behaviour")
         if isinstance(self._profile, DriveProfile):
-            option = self._objects.optional(_ABORT_OPTION)
+            option = self._objects.read(_ABORT_OPTION)
             if option is not None and not any(option):
                 self._notes.append(
                     "6007h abort connection option is 0: it does not stop when jtqd's heartbeat ends"
@@ -292,7 +256,7 @@ class NodeBoot:
 
     def sign(self, sha256: str) -> bool:
         """1020h, where the node has it: it keeps the signature until anybody changes its configuration (CiA 301)."""
-        if self._objects.optional((VERIFY_CONFIGURATION, 1)) is None:
+        if self._objects.read((VERIFY_CONFIGURATION, 1)) is None:
             return False
         for subindex, word in enumerate(signature(sha256), 1):
             self._objects.put((VERIFY_CONFIGURATION, subindex), word, 4, "configuration signature")
@@ -309,213 +273,41 @@ class NodeBoot:
         return sensor_scaling(profile, values), None
 
     def _check_channel(self, key: Key) -> None:
-        mode = self._objects.optional(key)
-        if mode is None:
-            return
-        self._objects.found[key] = found = int.from_bytes(mode[:1])
-        if found != 1:
+        found = self._objects.optional_number(key, 1)
+        if found not in (None, 1):
             expected = "1 (normal operation)"
             raise mismatch(self._node, key, "channel operating mode", expected=expected, found=str(found))
 
 
 def reset_during_boot(node: int) -> BootError:
-    """The node sent a boot-up message after it had been configured: its mapping is the default one again."""
+    """Return the error for a boot-up message after the configuration: the mapping is the default one again."""
     detail = "it restarted during boot (boot-up message): its configuration is lost"
     return BootError(node, "1000h:0", expected="no restart", found="boot-up message", detail=detail)
 
 
-# The boot request as JSON, checked into frozen profiles, and the report as JSON.
-#
-# {"bus": "can0", "master_node": 32, "heartbeat_ms": 100, "master_timeout_ms": 500, "answer_timeout_s": 0.5,
-#  "own_eds": "jtqd.eds",
-#  "sync": {"cob_id": 128, "counter_overflow": 240, "check_foreign": true},
-#  "nodes": [{"node": 1, "kind": "drive", "identity": {"vendor": 1953, "product": 1026}},
-#            {"node": 2, "kind": "drive", "given": {"6091h:1": 100}, "temperature": true},
-#            {"node": 3, "kind": "sensor", "channels": [1], "unit_words": {"0x00560000": 1.0}}]}
-#
-# Only "bus" and "nodes" with "node" and "kind" are needed. `given` replaces objects that are then not read;
-# `temperature` of a drive asks for TPDO3 with 3001h; a node that is not `mandatory` may be absent. "error_behaviour"
-# is 1029h:1; without it the nodes keep theirs.
+def configuration_sha256(values: Mapping[Key, int]) -> str:
+    """Return the SHA-256 over every value, in the order of the objects."""
+    lines = [f"{index:04X}h:{subindex}={value}\n" for (index, subindex), value in sorted(values.items())]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
-_TOP = {
-    "bus",
-    "nodes",
-    "master_node",
-    "own_eds",
-    "sync",
-    "heartbeat_ms",
-    "master_timeout_ms",
-    "answer_timeout_s",
-    "error_behaviour",
-}
-_NODE = {"node", "kind", "identity", "channels", "given", "unit_words", "temperature", "mandatory"}
-_OPTIONAL_TIMEOUT_S = 0.5
-"""An optional node is not waited for any longer: it is booted again when it appears."""
-_SYNC = {"cob_id", "counter_overflow", "check_foreign"}
+def signature(sha256: str) -> tuple[int, int]:
+    """Return the two words of 1020h for a configuration: the first 64 bits of its hash, never zero (not configured).
 
-
-class RequestError(ValueError):
-    """The request itself is wrong."""
-
-
-@dataclass(frozen=True)
-class BootRequest:
-    """Which nodes to boot on which bus.
-
-    `check_foreign_sync` is off when jtqd's own SYNC already runs. `own_eds` is a data sheet to be read for the
-    caller, who then does without the parser: its entries are in the report as "own_entries".
+    CiA 301 calls them date and time; CiA 302-2 compares them with what the master expects and nothing else.
     """
-
-    bus: str
-    profiles: tuple[Profile, ...]
-    settings: BusSettings
-    check_foreign_sync: bool = True
-    answer_timeout_s: float = 0.5
-    own_eds: str | None = None
-    optional: frozenset[int] = frozenset()
-
-    def timeout_s(self, node: int) -> float:
-        """How long a node may take for an answer."""
-        return (
-            min(self.answer_timeout_s, _OPTIONAL_TIMEOUT_S)
-            if node in self.optional
-            else self.answer_timeout_s
-        )
+    words = int(sha256[:8], 16), int(sha256[8:16], 16)
+    return words[0] or 1, words[1] or 1
 
 
-def parse_request(raw: object) -> BootRequest:
-    """Checked request; RequestError names the key, what was found and what is expected."""
-    top = _mapping(raw, "request", _TOP)
-    bus = top.get("bus")
-    if not isinstance(bus, str) or not bus:
-        raise RequestError(f"bus: found {bus!r}, expected a name like can0 or unix:PATH")
-    nodes = top.get("nodes")
-    if not isinstance(nodes, list) or not nodes:
-        raise RequestError(f"nodes: found {nodes!r}, expected a list of at least one node")
-    profiles = tuple(_profile(node, f"nodes[{position}]") for position, node in enumerate(nodes))
-    numbers = [profile.node_id for profile in profiles]
-    master = _integer(top, "master_node", 1, 127, JTQD_NODE)
-    if len({*numbers, master}) != len(numbers) + 1:
-        raise RequestError(f"nodes: {numbers} and master {master}, expected different node numbers")
-    sync = _mapping(top.get("sync", {}), "sync", _SYNC)
-    overflow = None
-    if sync.get("counter_overflow") is not None:
-        overflow = _integer(sync, "counter_overflow", 0, 240, 0)
-    settings = BusSettings(
-        master_node=master,
-        master_timeout_ms=_integer(top, "master_timeout_ms", 1, 0xFFFF, 500),
-        heartbeat_ms=_integer(top, "heartbeat_ms", 1, 0xFFFF, 100),
-        sync_cob_id=_integer(sync, "cob_id", 1, 0x7FF, SYNC_COB_ID),
-        counter_overflow=overflow,
-        error_behaviour=None
-        if top.get("error_behaviour") is None
-        else _integer(top, "error_behaviour", 0, 2, 0),
+def watched_objects(values: Mapping[Key, int], scaling: Collection[Key]) -> tuple[tuple[int, int, int], ...]:
+    """Return (index, sub-index, value) of all that the meaning of a node's numbers depends on.
+
+    These are the parameters of its TPDOs, its `scaling` objects, and the operating mode of a channel. They are read again in
+    service (`daemon/bus/nodes.py`): where one has changed, the node's numbers mean something else than before.
+    """
+    return tuple(
+        (*key, value)
+        for key, value in sorted(values.items())
+        if key[0] in _PDO_PARAMETERS or key[0] == OPERATING_MODE_OBJECT or key in scaling
     )
-    timeout = top.get("answer_timeout_s", 0.5)
-    if isinstance(timeout, bool) or not isinstance(timeout, int | float) or not 0 < timeout <= 60:
-        raise RequestError(f"answer_timeout_s: found {timeout!r}, expected seconds above 0 and at most 60")
-    own_eds = top.get("own_eds")
-    if own_eds is not None and not isinstance(own_eds, str):
-        raise RequestError(f"own_eds: found {own_eds!r}, expected a path")
-    optional = frozenset(
-        profile.node_id
-        for profile, node in zip(profiles, nodes, strict=True)
-        if not _truth(node, "mandatory", default=True)
-    )
-    foreign = bool(sync.get("check_foreign", True))
-    return BootRequest(bus, profiles, settings, foreign, float(timeout), own_eds, optional)
-
-
-def _profile(raw: object, where: str) -> Profile:
-    node = _mapping(raw, where, _NODE)
-    number = _integer(node, "node", 1, 127, None, where=where)
-    identity = _identity(node.get("identity"), f"{where}.identity")
-    try:
-        given = {
-            parse_key(key): value for key, value in _integers(node.get("given"), f"{where}.given").items()
-        }
-    except ValueError as error:
-        raise RequestError(f"{where}.given: {error}") from error
-    kind = node.get("kind")
-    if kind == "drive":
-        return DriveProfile(number, identity, given, _truth(node, "temperature", default=False, where=where))
-    if kind != "sensor":
-        raise RequestError(f"{where}.kind: found {kind!r}, expected 'drive' or 'sensor'")
-    channels = node.get("channels", [1])
-    if channels not in ([1], [1, 2]):
-        raise RequestError(f"{where}.channels: found {channels!r}, expected [1] or [1, 2]")
-    return SensorProfile(number, identity, tuple(channels), given, _unit_words(node, where))
-
-
-def _identity(raw: object, where: str) -> Identity:
-    fields = set(asdict(Identity()))
-    mapping = dict(_mapping({} if raw is None else raw, where, fields))
-    software = mapping.pop("software", None)
-    if software is not None and not isinstance(software, str):
-        raise RequestError(f"{where}.software: found {software!r}, expected a text")
-    return Identity(**_integers(mapping, where, fields), software=software)
-
-
-def _truth(mapping: Mapping[str, Any], key: str, *, default: bool, where: str = "node") -> bool:
-    value = mapping.get(key, default)
-    if not isinstance(value, bool):
-        raise RequestError(f"{where}.{key}: found {value!r}, expected true or false")
-    return value
-
-
-def _unit_words(node: Mapping[str, Any], where: str) -> dict[int, float]:
-    words = _mapping(node.get("unit_words", {}), f"{where}.unit_words", None)
-    try:
-        return {int(word, 0): float(nm) for word, nm in words.items()}
-    except (TypeError, ValueError) as error:
-        raise RequestError(f"{where}.unit_words: {error}, expected words and Nm per unit") from error
-
-
-def _mapping(raw: object, where: str, known: set[str] | None) -> Mapping[str, Any]:
-    if not isinstance(raw, dict):
-        raise RequestError(f"{where}: found {raw!r}, expected a mapping")
-    unknown = sorted(set(raw) - known) if known is not None else []
-    if unknown:
-        raise RequestError(f"{where}: unknown key {unknown[0]!r}, expected one of {sorted(known or ())}")
-    return raw
-
-
-def _integer(
-    mapping: Mapping[str, Any], key: str, low: int, high: int, default: int | None, *, where: str = ""
-) -> int:
-    value = mapping.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-        path = f"{where}.{key}" if where else key
-        raise RequestError(f"{path}: found {value!r}, expected a whole number {low}..{high}")
-    return value
-
-
-def _integers(raw: object, where: str, known: set[str] | None = None) -> dict[str, int]:
-    """A mapping of 32-bit numbers; null entries are left out."""
-    mapping = _mapping({} if raw is None else raw, where, known)
-    kept = {key: value for key, value in mapping.items() if value is not None}
-    return {key: _integer(kept, key, 0, 0xFFFF_FFFF, None, where=where) for key in kept}
-
-
-def node_report(node: BootedNode) -> dict[str, object]:
-    """One node of the report; `scaling` holds the fields of DriveScaling or SensorScaling."""
-    return {
-        "name": node.name,
-        "device_type": node.device_type,
-        "serial": node.serial,
-        "scaling": asdict(node.scaling),
-        "gear_ratio": node.gear_ratio,
-        "tpdos": [
-            {
-                "cob_id": pdo.cob_id,
-                "transmission_type": pdo.transmission_type,
-                "words": list(pdo.words),
-            }
-            for pdo in node.tpdos
-        ],
-        "configuration_sha256": node.configuration_sha256,
-        "signed": node.signed,
-        "watched": [list(each) for each in node.watched],
-        "notes": list(node.notes),
-    }

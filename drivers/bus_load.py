@@ -1,4 +1,4 @@
-"""Load of the bus by a configuration, before it runs: worst case and without stuff bits. Pure.
+"""Bus load of a configuration, before it runs: in the worst case and without stuff bits. Pure.
 
 The worst case of a data frame is 55 + 10 n bits (Davis et al. 2007, Real-Time Systems 35:239). A
 configuration above 95 % of it is refused: what is left must carry SDO, EMCY and a retransmission.
@@ -77,7 +77,7 @@ class BusLoad:
         return sum(row.unstuffed_bits for row in self.rows) / self.capacity_bits
 
     def table(self) -> list[dict[str, object]]:
-        """Rows in the order of priority: cob_id, who, bytes, per_cycle, worst_bits, share (of a cycle)."""
+        """Return the rows in the order of priority: cob_id, who, bytes, per_cycle, worst_bits, share (of a cycle)."""
         return [
             {
                 "cob_id": f"{row.cob_id:03X}h",
@@ -92,12 +92,12 @@ class BusLoad:
 
 
 def sync_row(counter: bool) -> Row:
-    """SYNC, with the counter byte of 1019h or without."""
+    """Return the row of SYNC, with the counter byte of 1019h or without."""
     return Row(SYNC_COB_ID, "SYNC", 1 if counter else 0)
 
 
 def pdo_row(who: str, pdo: PdoMap) -> Row:
-    """A synchronous PDO; BusLoadError for an event-driven one, which has no bound."""
+    """Return the row of a synchronous PDO. Raises BusLoadError for an event-driven one, which has no bound."""
     if not 1 <= pdo.transmission_type <= LAST_SYNC_TYPE:
         raise BusLoadError(
             f"PDO {pdo.cob_id:X}h of {who}: transmission type {pdo.transmission_type} is not bound to SYNC, "
@@ -107,13 +107,13 @@ def pdo_row(who: str, pdo: PdoMap) -> Row:
 
 
 def temperature_row(node: int, period_s: float = PERIOD_S) -> Row:
-    """TPDO3 of a drive: the boot's event timer and inhibit time let one come in EVENT_MS."""
+    """Return the row of a drive's TPDO3: the boot's event timer and inhibit time let one come in EVENT_MS."""
     pdo = drive_tpdo3(node)
     return Row(pdo.cob_id, f"drive {node} TPDO3", pdo.length, period_s * 1e3 / EVENT_MS)
 
 
 def heartbeat_row(who: str, node: int, heartbeat_ms: int, period_s: float = PERIOD_S) -> Row:
-    """Heartbeat of one node."""
+    """Return the row of one node's heartbeat."""
     if heartbeat_ms < 1:
         raise BusLoadError(f"heartbeat of {who}: {heartbeat_ms} ms, expected at least 1")
     return Row(0x700 + node, f"heartbeat {who}", HEARTBEAT_BYTES, period_s * 1e3 / heartbeat_ms)
@@ -131,9 +131,9 @@ def configured_load(
     bitrate: int = BITRATE,
     period_s: float = PERIOD_S,
 ) -> BusLoad:
-    """Load of drives (node numbers), sensors (node -> channels), SYNC, estimate, heartbeats and `extra`.
+    """Add up drives (node numbers), sensors (node -> channels), SYNC, estimate, heartbeats and `extra`.
 
-    `temperatures`: nodes among the drives that tell their joint's temperature.
+    `temperatures`: nodes among the drives that send their joint's temperature.
     """
     rows = [sync_row(sync_counter), pdo_row("jtqd estimate", estimate_tpdo(master))]
     rows.append(heartbeat_row("jtqd", master, heartbeat_ms, period_s))
@@ -150,7 +150,7 @@ def configured_load(
 
 
 def check_bus_load(load: BusLoad, limit: float = LIMIT) -> BusLoad:
-    """The load itself when it fits; BusLoadError above `limit` or when two rows share an identifier."""
+    """Return the load itself when it fits. Raises BusLoadError above `limit` or when two rows share an identifier."""
     seen: dict[int, str] = {}
     for row in load.rows:
         if row.cob_id in seen:

@@ -1,4 +1,4 @@
-"""What jtqd asks of a drive (CiA 402) and of a torque sensor (CiA 404): identity, PDOs, scaling.
+"""Devices on the bus: identity, PDOs and scaling of a drive (CiA 402) and of a torque sensor (CiA 404), PDO of jtqd.
 
 Scaling is computed from the devices' own objects. An object a device does not have, or has wrong, is given
 by the configuration instead ("608Fh:1" -> number); no factor is a constant of this code.
@@ -10,12 +10,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from jtqd.drivers.boot_error import mismatch
 from jtqd.drivers.pdo import MappedObject, PdoMap
-from jtqd.drivers.sdo import Key, label, mismatch
+from jtqd.drivers.sdo import Key, label
 
 JTQD_NODE = 0x20
 COMMANDER_NODE = 0x21
-"""Who may command the drives beside jtqd; they watch its heartbeat by 1016h:2."""
+"""Node that may command the drives beside jtqd; they watch its heartbeat by 1016h:2."""
 SYNC_COB_ID = 0x080
 
 # Objects that scale a drive's numbers, with the largest value that makes sense. All must be at least 1.
@@ -59,9 +60,11 @@ class Identity:
 
 @dataclass(frozen=True)
 class DriveProfile:
-    """A CiA 402 drive as jtqd wants it. `given` replaces scaling objects that are then not read.
+    """A CiA 402 drive as jtqd configures it.
 
-    temperature: it has 3001h, and shall send it by TPDO3.
+    Attributes:
+        given: scaling objects by the configuration, which are then not read.
+        temperature: it has 3001h, and shall send it by TPDO3.
     """
 
     node_id: int
@@ -78,15 +81,18 @@ class DriveProfile:
 
     @property
     def scaling_objects(self) -> tuple[Key, ...]:
-        """What boot must read."""
+        """Objects that the boot must read."""
         return tuple(key for key in DRIVE_SCALING_OBJECTS if key not in self.given)
 
 
 @dataclass(frozen=True)
 class SensorProfile:
-    """A CiA 404 torque sensor with the channels that are used, 1 or (1, 2).
+    """A CiA 404 torque sensor as jtqd configures it.
 
-    `unit_words` names a vendor's own 6131h words in Nm per unit.
+    Attributes:
+        channels: those in use, (1,) or (1, 2).
+        given: scaling objects by the configuration, which are then not read.
+        unit_words: Nm per unit of a vendor's own 6131h words.
     """
 
     node_id: int
@@ -108,9 +114,12 @@ class SensorProfile:
 
     @property
     def scaling_objects(self) -> tuple[Key, ...]:
-        """What boot must read."""
+        """Objects that the boot must read."""
         keys = [(index, channel) for channel in self.channels for index in (UNIT_OBJECT, DECIMALS_OBJECT)]
         return tuple(key for key in keys if key not in self.given)
+
+
+Profile = DriveProfile | SensorProfile
 
 
 @dataclass(frozen=True)
@@ -172,7 +181,7 @@ def sensor_tpdo2(node: int) -> PdoMap:
 
 
 def estimate_tpdo(node: int = JTQD_NODE) -> PdoMap:
-    """180h+20h: what jtqd publishes (2100h..2103h of jtqd.eds)."""
+    """180h+20h: the estimate (2100h..2103h of jtqd.eds)."""
     torques = [MappedObject(0x2100, joint, 16, True, f"torque_{joint}") for joint in (1, 2)]
     sigmas = [MappedObject(0x2101, joint, 8, False, f"sigma_{joint}") for joint in (1, 2)]
     status = MappedObject(0x2102, 0, 8, False, "status")
@@ -180,7 +189,7 @@ def estimate_tpdo(node: int = JTQD_NODE) -> PdoMap:
 
 
 def drive_scaling(profile: DriveProfile, read: Mapping[Key, int]) -> tuple[DriveScaling, float]:
-    """(scaling, gear ratio) from the objects read and given. BootError for a value that cannot be."""
+    """Return (scaling, gear ratio) from the objects read and given. Raises BootError for an impossible value."""
     values = {**read, **profile.given}
     for key, (name, highest) in DRIVE_SCALING_OBJECTS.items():
         if not 1 <= values[key] <= highest:
@@ -196,7 +205,7 @@ def drive_scaling(profile: DriveProfile, read: Mapping[Key, int]) -> tuple[Drive
 
 
 def sensor_scaling(profile: SensorProfile, read: Mapping[Key, int]) -> SensorScaling:
-    """Nm per unit of each used channel: unit word (CiA 303-2) and decimal digits. BootError as above."""
+    """Return Nm per unit of each used channel: unit word (CiA 303-2) over decimal digits. Raises BootError."""
     values = {**read, **profile.given}
     factors = {}
     for channel in profile.channels:
@@ -209,7 +218,7 @@ def sensor_scaling(profile: SensorProfile, read: Mapping[Key, int]) -> SensorSca
 
 
 def _nm_of_unit(profile: SensorProfile, channel: int, word: int) -> float:
-    """6131h: prefix exponent (signed byte), numerator, denominator, 0."""
+    """Decode 6131h: prefix exponent (signed byte), numerator, denominator, 0."""
     if word in profile.unit_words:
         return profile.unit_words[word]
     if word & 0x00FF_FFFF != JOULE << 16:
@@ -221,7 +230,7 @@ def _nm_of_unit(profile: SensorProfile, channel: int, word: int) -> float:
 
 
 def parse_key(text: str) -> Key:
-    """(index, sub-index) of "608Fh:1" or "6075h". ValueError otherwise."""
+    """Return (index, sub-index) of "608Fh:1" or "6075h". Raises ValueError."""
     index, _, subindex = text.partition("h")
     key = int(index, 16), int(subindex.removeprefix(":") or "0")
     if text not in (label(*key), f"{key[0]:04X}h"):

@@ -1,4 +1,4 @@
-"""EMCY messages (CiA 301, 7.2.7): the eight bytes, and the codes in words. Pure."""
+"""EMCY messages (CiA 301, 7.2.7): the eight bytes, the codes in words, and the history 1003h. Pure."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ CAN_OVERRUN, CAN_PASSIVE, HEARTBEAT_LOST, BUS_OFF_RECOVERED, COB_ID_COLLISION = 
     0x8150,
 )
 JOINT_FAULT, FAULT_LATCHED, NODE_CHANGED = 0xFF01, 0xFF02, 0xFF03
-"""Of jtqd: a joint has no torque because of a fault; one waits for a reset; a node is not configured as at its boot. The
-detail is the node-ID."""
+"""Of jtqd: a joint has no torque because of a fault; a latched fault waits for its reset; a node is not configured as at its
+boot. The detail is the node-ID."""
 PDO_SHORT, PDO_LONG, SYNC_LENGTH, PDO_TIMEOUT = 0x8210, 0x8220, 0x8240, 0x8250
 GENERIC, COMMUNICATION, MANUFACTURER = 0x01, 0x10, 0x80
 """Bits of 1001h."""
@@ -110,7 +110,7 @@ _REGISTER = (
 
 
 class Emergency(NamedTuple):
-    """One received message; what a short frame leaves out is zero, and `length` says how long it was."""
+    """One received message; what a short frame leaves out is zero, and `length` is that of the frame."""
 
     code: int
     register: int
@@ -119,13 +119,13 @@ class Emergency(NamedTuple):
 
 
 def parse(data: bytes) -> Emergency:
-    """Any frame of 0..8 bytes under an EMCY identifier: a short one is told as far as it goes, never an error."""
+    """Decode any frame of 0..8 bytes under an EMCY identifier; a short one as far as it goes, never an error."""
     code, register, manufacturer = EMCY.unpack(bytes(data[:8]).ljust(8, b"\0"))
     return Emergency(code, register, manufacturer, len(data))
 
 
 def name_of(code: int) -> str:
-    """The code in words: its own name, or that of its group (CiA 301 table 26, CiA 402)."""
+    """Return the code in words: its own name, or that of its group (CiA 301 table 26, CiA 402)."""
     if code in _EXACT:
         return _EXACT[code]
     group = _BY_HIGH_BYTE.get(code >> 8) or _BY_HIGH_BYTE.get(code >> 8 & 0xF0)
@@ -133,12 +133,12 @@ def name_of(code: int) -> str:
 
 
 def register_text(register: int) -> str:
-    """The bits of 1001h in words."""
+    """Return the bits of 1001h in words."""
     return ", ".join(name for bit, name in enumerate(_REGISTER) if register >> bit & 1) or "none"
 
 
 def describe(emergency: Emergency) -> str:
-    """One line: "EMCY 2310h (continuous overcurrent), register 03h (generic, current)"."""
+    """Return one line: "EMCY 2310h (continuous overcurrent), register 03h (generic, current)"."""
     code, register, manufacturer, length = emergency
     text = f"EMCY {code:04X}h ({name_of(code)}), register {register:02X}h ({register_text(register)})"
     if any(manufacturer):
@@ -146,31 +146,31 @@ def describe(emergency: Emergency) -> str:
     return text if length == 8 else f"{text}, a frame of {length} bytes"
 
 
-# Pre-defined error field 1003h: the newest error first, bounded, cleared by writing 0 (CiA 301, 7.5.2.4).
-
-
-INDEX = 0x1003
+HISTORY_INDEX = 0x1003
 
 
 class ErrorHistory:
-    """Keeps 1003h of a store; its depth is the number of sub-indices the EDS gives it."""
+    """Pre-defined error field 1003h of a store (CiA 301, 7.5.2.4): newest error first, cleared by writing 0.
+
+    Its depth is the number of sub-indices that the EDS gives it.
+    """
 
     def __init__(self, store: ObjectStore) -> None:
         self._store = store
-        self._depth = max(subindex for index, subindex in store.entries if index == INDEX)
-        store.on_write(INDEX, 0, self._clear)
+        self._depth = max(subindex for index, subindex in store.entries if index == HISTORY_INDEX)
+        store.on_write(HISTORY_INDEX, 0, self._clear)
 
     def push(self, error: int) -> None:
         """Put an error first (EMCY code in the low word); the oldest falls out when the field is full."""
-        count = self._store.number(INDEX, 0)
-        kept = [self._store.number(INDEX, subindex) for subindex in range(1, count + 1)]
+        count = self._store.number(HISTORY_INDEX, 0)
+        kept = [self._store.number(HISTORY_INDEX, subindex) for subindex in range(1, count + 1)]
         recent = [error, *kept][: self._depth]
         for subindex, value in enumerate(recent, 1):
-            self._store.set_number(INDEX, subindex, value)
-        self._store.set_number(INDEX, 0, len(recent))
+            self._store.set_number(HISTORY_INDEX, subindex, value)
+        self._store.set_number(HISTORY_INDEX, 0, len(recent))
 
     def _clear(self, data: bytes) -> None:
         if data != b"\0":
             raise SdoAbort(VALUE_RANGE)
         for subindex in range(1, self._depth + 1):
-            self._store.set_number(INDEX, subindex, 0)
+            self._store.set_number(HISTORY_INDEX, subindex, 0)

@@ -1,6 +1,7 @@
-"""Classic BPF twin of CAN_RAW_FILTER for the frames of a unix bus, run by the kernel before they are queued.
+"""Receive filters with the meaning of CAN_RAW_FILTER, run by the kernel: (frame.can_id & mask) == (filter.can_id & mask).
 
-`struct sock_filter` and SO_ATTACH_FILTER: linux/filter.h, asm-generic/socket.h.
+AF_CAN takes them as they are (`can_raw_filter`); on a unix bus a classic BPF program does the same (`attach`) before a frame
+is queued. `struct sock_filter` and SO_ATTACH_FILTER: linux/filter.h, asm-generic/socket.h.
 """
 
 from __future__ import annotations
@@ -19,9 +20,6 @@ from jtqd.drivers.frame import (
     CAN_SFF_MASK,
     FRAME_SIZE,
 )
-
-# Receive filters with the meaning of CAN_RAW_FILTER: (frame.can_id & mask) == (filter.can_id & mask).
-
 
 MAX_FILTERS = 512  # CAN_RAW_FILTER_MAX
 _CAN_FILTER = struct.Struct("=II")
@@ -45,7 +43,7 @@ def exact(can_id: int) -> CanFilter:
 
 
 def look_alikes(can_id: int) -> CanFilter:
-    """Return the filter for `can_id` in both formats, data and remote: for those who count the wrong ones."""
+    """Return the filter for `can_id` in both formats, data and remote, so that frames of the wrong kind can be counted."""
     return CanFilter(can_id & CAN_EFF_MASK, CAN_EFF_MASK)
 
 
@@ -53,7 +51,7 @@ def checked(filters: Iterable[CanFilter] | None) -> tuple[CanFilter, ...]:
     """Return `filters` as a tuple; None means everything.
 
     Raises ValueError for values beyond 32 bits, more than 512 filters, or the flag of inverted filters
-    (CAN_INV_FILTER, the same bit as CAN_ERR_FLAG), which the BPF twin does not know.
+    (CAN_INV_FILTER, the same bit as CAN_ERR_FLAG), which the BPF program does not know.
     """
     if filters is None:
         return EVERYTHING
@@ -72,6 +70,8 @@ def can_raw_filter(filters: Iterable[CanFilter]) -> bytes:
     """Return the value of setsockopt CAN_RAW_FILTER."""
     return b"".join(_CAN_FILTER.pack(*each) for each in filters)
 
+
+# The same as a BPF program ------------------------------------------------------------------------------------
 
 SO_ATTACH_FILTER = 26
 

@@ -39,14 +39,14 @@ def pack(can_id: int, data: bytes = b"") -> bytes:
 
 
 def is_valid_id(can_id: int) -> bool:
-    """Tell whether `can_id` fits 32 bits and, without CAN_EFF_FLAG, has no bits above the 11th."""
+    """Return whether `can_id` fits 32 bits and, without CAN_EFF_FLAG, has no bits above the 11th."""
     if not 0 <= can_id <= 0xFFFFFFFF:
         return False
     return bool(can_id & (CAN_EFF_FLAG | CAN_ERR_FLAG)) or not can_id & CAN_EFF_MASK & ~CAN_SFF_MASK
 
 
 def is_frame(frame16: bytes) -> bool:
-    """Tell whether these bytes are a frame that a CAN controller could send, or an error message."""
+    """Return whether these bytes are a frame that a CAN controller could send, or an error message."""
     if len(frame16) != FRAME_SIZE or frame16[4] > MAX_LENGTH:
         return False
     return is_valid_id(int.from_bytes(frame16[:4], "little"))
@@ -119,7 +119,7 @@ _ONE_RECESSIVE = 5  # state: last bit 1, run 1
 def stuffed_bits(can_id: int, data: bytes = b"") -> int:
     """Return the exact length in bits of this frame on the wire: CRC, stuff bits and intermission included.
 
-    A remote frame carries the length of `data` and no data. Eight bits at a time from tables; its plain twin,
+    A remote frame carries the length of `data` and no data. Eight bits at a time from tables; the plain version,
     one bit at a time, is in the tests.
     """
     remote = 1 if can_id & CAN_RTR_FLAG else 0

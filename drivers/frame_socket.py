@@ -1,4 +1,8 @@
-"""Frame socket: 16-byte CAN frames over AF_CAN raw (`can0`) or a unix bus (`unix:PATH`), alike to use."""
+"""Frame socket: 16-byte CAN frames over AF_CAN raw (`can0`) or a unix bus (`unix:PATH`), alike to use.
+
+`open_frame_socket` opens either; what goes wrong is a BusError in one of three classes that their user must treat
+differently. From parts up: the errors, the client socket of a unix bus, the AF_CAN socket, `FrameSocket`.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +19,6 @@ from jtqd.drivers import filters as bpf
 from jtqd.drivers.filters import CanFilter, can_raw_filter, checked
 from jtqd.drivers.frame import ECHO_BIT
 from jtqd.drivers.receive import NOTHING_YET, SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameReceiver
-
-# What can go wrong with a bus, in the three classes its user must treat differently.
 
 
 class BusError(Exception):
@@ -49,19 +51,20 @@ def from_errno(number: int, bus: str) -> BusError:
     return BusError(f"{bus}: {os.strerror(number)} (errno {number})")
 
 
-# Addresses of AF_UNIX sockets in directories of any depth.
-#
-# The kernel takes at most 107 bytes (`sun_path`, unix(7)). A longer path is reached through its directory, held open as a
-# descriptor: /proc/self/fd/N/NAME.
+# A unix bus: AF_UNIX SOCK_SEQPACKET, one 16-byte frame per message ----------------------------------------------
 
-
-LONGEST = 107
-"""Bytes of an address, without its end."""
+PREFIX = "unix:"
+BUFFER_BYTES = 1 << 20  # the kernel cuts it to net.core.rmem_max, wmem_max
+_CONNECT_TIMEOUT = struct.Struct("@ll").pack(2, 0)  # struct timeval
+_LONGEST_ADDRESS = 107  # bytes of `sun_path` without its end (unix(7))
 
 
 @contextmanager
 def reachable(path: Path | str) -> Iterator[str]:
-    """What to bind or connect to for the socket at `path`; valid within the `with`.
+    """Give the address to bind or connect to for the socket at `path`, in a directory of any depth.
+
+    A path too long for the kernel is reached through its directory, held open as a descriptor while the `with` lasts:
+    /proc/self/fd/N/NAME.
 
     Raises:
         OSError: a path is too long and its directory cannot be opened. A name that alone is too long stays as it is, and
@@ -69,7 +72,7 @@ def reachable(path: Path | str) -> Iterator[str]:
     """
     text = os.fspath(path)
     directory, name = os.path.split(text)
-    if len(os.fsencode(text)) <= LONGEST or not name:
+    if len(os.fsencode(text)) <= _LONGEST_ADDRESS or not name:
         yield text
         return
     descriptor = os.open(directory or ".", os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -77,14 +80,6 @@ def reachable(path: Path | str) -> Iterator[str]:
         yield f"/proc/self/fd/{descriptor}/{name}"
     finally:
         os.close(descriptor)
-
-
-# Opening a client socket of a unix bus: AF_UNIX SOCK_SEQPACKET, one 16-byte frame per message.
-
-
-PREFIX = "unix:"
-BUFFER_BYTES = 1 << 20  # the kernel cuts it to net.core.wmem_max
-_CONNECT_TIMEOUT = struct.Struct("@ll").pack(2, 0)  # struct timeval
 
 
 def require_directory(path: str) -> None:
@@ -124,8 +119,7 @@ def open_unix(path: str, filters: Sequence[CanFilter], error_frames: bool) -> so
     return sock
 
 
-# Opening an AF_CAN raw socket.
-
+# AF_CAN -------------------------------------------------------------------------------------------------------
 
 # linux/can.h and linux/can/raw.h; written out because a Python built without these headers lacks the names
 AF_CAN = 29
@@ -138,7 +132,6 @@ CAN_ERR_MASK = 0x1FFFFFFF
 MSG_CONFIRM = 0x800
 """In msg_flags of a received frame: sent by this very socket (net/can/raw.c, raw_rcv)."""
 
-_BUFFER_BYTES = 1 << 20  # the kernel cuts it to net.core.rmem_max / wmem_max
 _NO_CAN = frozenset({errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT})
 
 
@@ -147,8 +140,8 @@ def open_socketcan(
 ) -> socket.socket:
     """Return a non-blocking raw socket bound to `interface`; its filters are in force before it is bound.
 
-    Binding to an interface that is down succeeds, and the first receive then says ENETDOWN.
-    Raises BusError: no CAN in this kernel, no such interface, not a CAN interface, or what else bind says.
+    Binding to an interface that is down succeeds, and the first receive then fails with ENETDOWN.
+    Raises BusError: no CAN in this kernel, no such interface, not a CAN interface, or another error of bind.
     """
     try:
         sock = socket.socket(AF_CAN, socket.SOCK_RAW, CAN_RAW)
@@ -165,8 +158,8 @@ def open_socketcan(
             sock.setsockopt(SOL_CAN_RAW, CAN_RAW_ERR_FILTER, CAN_ERR_MASK)
         sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         sock.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
         sock.setblocking(False)
         sock.bind((interface,))
     except OSError as error:
@@ -181,7 +174,7 @@ def set_can_filters(sock: socket.socket, filters: Sequence[CanFilter]) -> None:
 
 
 def _bind_message(interface: str, error: OSError) -> str:
-    """Say in one line why `interface` could not be bound."""
+    """Return in one line why `interface` could not be bound."""
     try:
         socket.if_nametoindex(interface)
     except OSError:
@@ -191,10 +184,14 @@ def _bind_message(interface: str, error: OSError) -> str:
     return f"{interface}: {error}"
 
 
+# Either ---------------------------------------------------------------------------------------------------------
+
 CAPACITY = 32
+"""Frames that one `receive` takes at most."""
 _QUEUE_FULL = frozenset({errno.EAGAIN, errno.ENOBUFS, errno.ENOMEM})
 _MARKS = 0xFFFFFF  # bytes 5..7 of a frame, shifted down
 _NO_MARKS = bytes(3)
+_ECHO = bytes([ECHO_BIT])
 
 
 def open_frame_socket(
@@ -219,23 +216,28 @@ def open_frame_socket(
         if not bus[len(PREFIX) :]:
             raise BusError(f"{bus}: a path must follow `unix:`")
         sock = open_unix(bus[len(PREFIX) :], wanted, error_frames)
-        return FrameSocket(
-            sock, bus, unix=True, receive_own=receive_own, error_frames=error_frames, capacity=capacity
-        )
-    sock = open_socketcan(bus, wanted, receive_own, error_frames)
+    else:
+        sock = open_socketcan(bus, wanted, receive_own, error_frames)
+    unix = sock.family == socket.AF_UNIX
     return FrameSocket(
-        sock, bus, unix=False, receive_own=receive_own, error_frames=error_frames, capacity=capacity
+        sock, bus, unix=unix, receive_own=receive_own, error_frames=error_frames, capacity=capacity
     )
 
 
 class FrameSocket:
     """An open bus. Never blocks but in `wait`; not to be shared by two receiving threads.
 
-    After `receive` returned n, for i < n: `frames[16 * i : 16 * i + 16]`, `stamps_ns[i]` (kernel time stamp,
-    CLOCK_REALTIME, ns), `own[i]` (echo of a frame sent here), `lengths[i]` (bytes received, 16 expected).
-    Counters: `tx_dropped` (transmit queue full), `rx_dropped` (lost because this socket was read too late; on
-    a unix bus an upper bound, since the hub cannot see which of them a filter would have refused; `rx_dropped_before` is
-    added to what the kernel counts).
+    After `receive` returned n, the values for i < n hold.
+
+    Attributes:
+        frames: bytearray; frame i is `frames[16 * i : 16 * i + 16]`.
+        stamps_ns: kernel time stamp of frame i, CLOCK_REALTIME in ns.
+        own: whether frame i is the echo of one sent here.
+        lengths: bytes received, 16 expected.
+        tx_dropped: frames not sent because the transmit queue was full.
+        rx_dropped: frames lost because this socket was read too late. On a unix bus an upper bound, since the hub cannot
+            see which of them a filter would have refused.
+        rx_dropped_before: on AF_CAN added to what the kernel counts.
     """
 
     def __init__(
@@ -318,7 +320,7 @@ class FrameSocket:
         return n
 
     def wait(self, timeout_s: float | None) -> bool:
-        """Wait until `receive` has frames or an error to tell; False after `timeout_s` (None: wait for ever).
+        """Wait until `receive` has frames or an error to report; False after `timeout_s` (None: wait for ever).
 
         select(2) because its timeout has microseconds; poll and epoll of the standard library round to 1 ms.
         """
@@ -342,23 +344,23 @@ class FrameSocket:
         self._sock.close()
 
     def _nothing(self, n: int) -> int:
-        """Return 0 when nothing has arrived; raise what the kernel said otherwise."""
+        """Return 0 when nothing has arrived; raise the kernel's error otherwise."""
         if self._receiver.closed:
             raise self._failure(errno.EPIPE)
         if -n not in NOTHING_YET and n != 0:
             raise self._failure(-n)
-        if self._gone:  # the kernel says ENODEV once; this socket stays useless
+        if self._gone:  # the kernel reports ENODEV once; this socket stays useless
             raise self._failure(errno.ENODEV)
         return 0
 
     def _failure(self, number: int) -> BusError:
-        """Return the exception for `number` and remember that the bus has gone."""
+        """Return the exception for error `number`; remember when the bus has gone."""
         error = from_errno(number, self.bus)
         self._gone = self._gone or isinstance(error, BusGone)
         return error
 
     def _read_marks(self, n: int, heads: Sequence[int]) -> None:
-        """Read and clear what the hub has written into the padding: echo bit and count of lost frames."""
+        """Read and clear the hub's marks in the padding: echo bit and count of lost frames."""
         own = [False] * n
         for i in range(n):
             marks = heads[i] >> 40 & _MARKS
@@ -369,6 +371,3 @@ class FrameSocket:
             self.rx_dropped += lost - self._hub_drops & 0xFFFF  # a 16-bit count that wraps
             self._hub_drops = lost
         self.own = own
-
-
-_ECHO = bytes([ECHO_BIT])

@@ -2,7 +2,12 @@
 
 A client is an AF_UNIX SOCK_SEQPACKET connection; one message is one 16-byte `struct can_frame`. What a member
 sends, every other member receives; the sender too when it asks for the echo (bit 0 of byte 5). All members
-see the same order of frames. With a bit rate, frames first cross a modelled wire (jtqd.drivers.hub).
+see the same order of frames. With a bit rate, frames first cross a modelled wire.
+
+    WireModel    one frame at a time, the highest priority first, exact length with stuff bits; pure
+    listen       the listening socket and the life of its file
+    Hub          both, with clients and local ports
+    main         the command line
 """
 
 from __future__ import annotations
@@ -35,12 +40,6 @@ from jtqd.drivers.frame import (
 from jtqd.drivers.frame_socket import BUFFER_BYTES, PREFIX, BusError, reachable, require_directory
 from jtqd.drivers.receive import NOTHING_YET, SO_TIMESTAMPNS, FrameReceiver
 
-# Model of a classic CAN wire: one frame at a time, the highest priority first, exact stuffed length. Pure.
-#
-# Each sender is a controller with a first-in first-out queue: the head of its queue takes part in arbitration.
-# Times are integer nanoseconds on any one clock; nothing here reads a clock.
-
-
 _NS_PER_S = 1_000_000_000
 
 
@@ -56,12 +55,15 @@ class _Waiting(NamedTuple):
 
 
 class WireModel:
-    """A wire of `bitrate` bit/s.
+    """A classic CAN wire of `bitrate` bit/s. Times are integer nanoseconds on any one clock, and arguments.
 
-    A frame starts when the wire is free and somebody has one; whatever had been submitted by then arbitrates.
-    Submissions may be told late (a hub reads its sockets late, with the kernel's stamp of the send): only a
-    frame already started by an earlier `advance` keeps the wire. `queue_limit` bounds each sender's queue.
-    Counters: `bits` and `frames` transmitted.
+    Each sender is a controller with a first-in first-out queue of `queue_limit` frames; the head of its queue takes part in
+    arbitration. A frame starts when the wire is free and somebody has one; whatever had been submitted by then arbitrates.
+    Submissions may come late (a hub reads its sockets late, with the kernel's stamp of the send): only a frame already
+    started by an earlier `advance` keeps the wire.
+
+    Attributes:
+        bits, frames: transmitted so far.
     """
 
     def __init__(self, bitrate: int, queue_limit: int = 128) -> None:
@@ -149,9 +151,6 @@ class WireModel:
         return start, min(head for head in heads if head.submitted_ns <= start)
 
 
-# The listening socket of a unix bus and the life of its file.
-
-
 def listen(path: str, backlog: int) -> socket.socket:
     """Return a listening socket at `path`, mode 0600; the file of a dead hub is replaced.
 
@@ -208,15 +207,18 @@ _BATCH = 32
 _TX_QUEUE = 128
 _READ_BELOW = (
     _TX_QUEUE - _BATCH
-)  # a client with more frames waiting is not read: its own send then says EAGAIN
+)  # a client with more frames waiting is not read: its own send fails with EAGAIN
 _PAUSE_S = 0.1  # no accept for this long when the process is out of descriptors
 _OLDEST_SEND_NS = 1_000_000_000  # a send stamp older than this means that the clock was stepped
 _NO_MARKS = bytes(3)
+_ECHO_ONLY = bytes([ECHO_BIT, 0, 0])
+_ERROR_BYTE = CAN_ERR_FLAG >> 24
+_PR_SET_TIMERSLACK = 29
 
 
 @dataclass
 class HubCounters:
-    """What the hub has done and what it refused."""
+    """Frames and connections, accepted and refused."""
 
     frames: int = 0  # accepted from members
     malformed: int = 0  # not 16 bytes, more than 8 data bytes, or an impossible identifier
@@ -262,7 +264,7 @@ class _Client:
     def deliver(self, frame16: bytes, _stamp_ns: int) -> bool:
         """Send a frame to the client without waiting; False when its buffer is full.
 
-        Bytes 6 and 7 tell the client how many it has lost so far (modulo 65536), like SO_RXQ_OVFL of AF_CAN.
+        Bytes 6 and 7 count the frames that the client has lost so far (modulo 65536), like SO_RXQ_OVFL of AF_CAN.
         """
         if self.dropped:
             frame16 = frame16[:6] + (self.dropped & 0xFFFF).to_bytes(2, "little") + frame16[8:]
@@ -466,22 +468,6 @@ class Hub:
         self.counters.dropped += lost
 
 
-_ECHO_ONLY = bytes([ECHO_BIT, 0, 0])
-_ERROR_BYTE = CAN_ERR_FLAG >> 24
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run a hub until SIGINT or SIGTERM; see the module's docstring. Returns the exit status."""
-
-    return run(arguments)
-
-
-# Command line of the hub.
-
-
-_PR_SET_TIMERSLACK = 29
-
-
 class _StopError(Exception):
     """SIGINT or SIGTERM."""
 
@@ -490,8 +476,8 @@ def _stop(_number: int, _frame: FrameType | None) -> None:
     raise _StopError
 
 
-def run(arguments: list[str] | None) -> int:
-    """Run a hub until SIGINT or SIGTERM; exit status 0, or 1 when the bus cannot be made."""
+def main(arguments: list[str] | None = None) -> int:
+    """Run a hub until SIGINT or SIGTERM; return 0, or 1 when the bus cannot be made."""
     parser = argparse.ArgumentParser(
         prog="python -m jtqd.drivers.hub",
         description="CAN bus on a unix socket",

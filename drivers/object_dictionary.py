@@ -1,15 +1,15 @@
 """Object dictionary of a node: values by (index, sub-index), typed and guarded by its EDS (CiA 301, CiA 306).
 
-`read` and `write` are what a remote SDO client may do: access rights, lengths and limits hold, and a refusal
+`read` and `write` are those of a remote SDO client: access rights, lengths and limits hold, and a refusal
 is an `SdoAbort` with the code of CiA 301 table 22. `number`, `set_number`, `set_text` are the device's own
-hand on the same values and know no rights. Pure: no bus and no clock.
+access to the same values, without rights. Pure: no bus and no clock.
 """
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from jtqd.drivers.sdo import (
     VALUE_RANGE,
     WRITE_OF_READ_ONLY,
     SdoAbort,
+    label,
 )
 
 # Data types of CiA 301 7.4.7 that are numbers, with their struct letters. A BOOLEAN takes a byte in an SDO.
@@ -88,10 +89,10 @@ class Entry:
 
 
 class ObjectStore:
-    """Values of one node. SdoAbort refuses a client; ValueError says a number does not fit its object."""
+    """Values of one node. A client is refused by SdoAbort; ValueError: a number does not fit its object."""
 
     def __init__(self, entries: Path | str | Iterable[Entry], node_id: int) -> None:
-        """Dictionary of an EDS file, or of entries that were read from one (see `read_eds`)."""
+        """Take the entries of an EDS file, or those that were read from one (see `read_eds`)."""
         if not 1 <= node_id <= 127:
             raise ValueError(f"node id {node_id}, expected 1..127")
         self.node_id = node_id
@@ -103,24 +104,24 @@ class ObjectStore:
         self._on_read: dict[tuple[int, int], ReadHook] = {}
         self._on_write: dict[tuple[int, int], WriteHook] = {}
 
-    # What a remote client may do ----------------------------------------------------------------------
+    # Access of a remote client ------------------------------------------------------------------------
 
     def entry(self, index: int, subindex: int) -> Entry:
-        """Description of an object; SdoAbort 06020000h or 06090011h when there is none."""
+        """Return the description of an object. Raises SdoAbort 06020000h or 06090011h when there is none."""
         found = self.entries.get((index, subindex))
         if found is None:
             raise SdoAbort(NO_SUBINDEX if index in self._indices else NO_OBJECT)
         return found
 
     def read(self, index: int, subindex: int) -> bytes:
-        """Value as it goes into an SDO upload; SdoAbort when absent or write-only."""
+        """Return the value for an SDO upload. Raises SdoAbort when absent or write-only."""
         entry = self.entry(index, subindex)
         if not entry.readable:
             raise SdoAbort(READ_OF_WRITE_ONLY)
         return self._value(entry)
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
-        """SDO download: rights, length, limits, then the hook (may refuse by SdoAbort), then it is stored."""
+        """Store an SDO download after rights, length, limits and hook. Raises SdoAbort, as the hook may."""
         entry = self.check_write(index, subindex, len(data))
         if entry.layout is not None and (entry.low is not None or entry.high is not None):
             (value,) = entry.layout.unpack(data)
@@ -134,7 +135,7 @@ class ObjectStore:
         self._values[index, subindex] = data
 
     def check_write(self, index: int, subindex: int, length: int | None) -> Entry:
-        """What can be refused before the data: absent, not writable, wrong length (None: not announced)."""
+        """Refuse what can be refused before the data: absent, not writable, wrong length (None: not announced)."""
         entry = self.entry(index, subindex)
         if not entry.writable:
             raise SdoAbort(WRITE_OF_READ_ONLY)
@@ -144,58 +145,57 @@ class ObjectStore:
             raise SdoAbort(LENGTH_TOO_HIGH if length > entry.layout.size else LENGTH_TOO_LOW)
         return entry
 
-    # What the device itself does ----------------------------------------------------------------------
+    # Access of the device itself ----------------------------------------------------------------------
 
     def number(self, index: int, subindex: int = 0) -> int:
-        """Integer value, rights not asked; the read hook is."""
+        """Return an integer, regardless of rights; a read hook is called."""
         entry = self.entry(index, subindex)
         if entry.data_type not in _LETTERS or entry.layout is None:
-            raise ValueError(f"{index:04X}h:{subindex} is not an integer")
+            raise ValueError(f"{label(index, subindex)} is not an integer")
         (value,) = entry.layout.unpack(self._value(entry))
         return int(value)
 
     def set_number(self, index: int, subindex: int, value: float) -> None:
-        """Set a number (integer or REAL32/64); ValueError when it does not fit. No hook is called."""
+        """Set a number (integer or REAL32/64). No hook is called. Raises ValueError when it does not fit."""
         entry = self.entry(index, subindex)
         if entry.layout is None:
-            raise ValueError(f"{index:04X}h:{subindex} is not a number")
+            raise ValueError(f"{label(index, subindex)} is not a number")
         try:
             self._values[index, subindex] = entry.layout.pack(value)
         except (struct.error, OverflowError) as error:
             raise ValueError(
-                f"{index:04X}h:{subindex} {entry.name}: {value!r} does not fit: {error}"
+                f"{label(index, subindex)} {entry.name}: {value!r} does not fit: {error}"
             ) from error
 
     def set_text(self, index: int, subindex: int, text: str) -> None:
         """Set a VISIBLE_STRING."""
         entry = self.entry(index, subindex)
         if entry.data_type != VISIBLE_STRING:
-            raise ValueError(f"{index:04X}h:{subindex} {entry.name} is not a string")
+            raise ValueError(f"{label(index, subindex)} {entry.name} is not a string")
         self._values[index, subindex] = text.encode("ascii")
 
     def on_read(self, index: int, subindex: int, hook: ReadHook) -> None:
-        """`hook()` gives the value at each read: bytes, or a number that is packed to the object's type."""
+        """Call `hook()` for the value at each read: bytes, or a number that is packed to the object's type."""
         self._on_read[self._key(index, subindex)] = hook
 
     def on_write(self, index: int, subindex: int, hook: WriteHook) -> None:
-        """`hook(data)` is called before a download is stored; an SdoAbort from it refuses the value."""
+        """Call `hook(data)` before a download is stored; an SdoAbort from it refuses the value."""
         self._on_write[self._key(index, subindex)] = hook
 
     def has(self, index: int, subindex: int = 0) -> bool:
-        """The object exists."""
+        """Return whether the object exists."""
         return (index, subindex) in self.entries
 
     def restore(self, first: int = _FIRST_REAL_INDEX, last: int = 0xFFFF) -> None:
-        """Power-on values: 1000h..1FFFh at NMT reset communication, all at reset node (CiA 301, 7.3.2.2)."""
+        """Restore power-on values: 1000h..1FFFh at NMT reset communication, all at reset node (CiA 301, 7.3.2.2)."""
         for key, entry in self.entries.items():
             if first <= entry.index <= last:
                 self._values[key] = entry.default
 
     def keep_as_default(self, index: int, subindex: int) -> None:
-        """The present value (a serial number, say) becomes the power-on value."""
+        """Make the present value, such as a serial number, the power-on value."""
         entry = self.entry(index, subindex)
-        fields = {**entry.__dict__, "default": self._values[index, subindex]}
-        self.entries[index, subindex] = Entry(**fields)
+        self.entries[index, subindex] = replace(entry, default=self._values[index, subindex])
 
     def _key(self, index: int, subindex: int) -> tuple[int, int]:
         self.entry(index, subindex)
@@ -210,7 +210,7 @@ class ObjectStore:
             return value
         if entry.layout is None:
             raise ValueError(
-                f"{entry.index:04X}h:{entry.subindex} {entry.name}: hook gave a number for a string"
+                f"{label(entry.index, entry.subindex)} {entry.name}: hook gave a number for a string"
             )
         return entry.layout.pack(value)
 
@@ -220,7 +220,7 @@ class EdsError(ValueError):
 
 
 def read_eds(eds: Path | str, node_id: int) -> list[Entry]:
-    """Entries of an EDS file with $NODEID filled in.
+    """Read the entries of an EDS file, with $NODEID filled in.
 
     The parser is canopen's. It is loaded here and not with this module: it takes 20 MB, and a process that is
     handed its entries as JSON (`entries_to_json`, `entries_from_json`) does without. Raises EdsError.
@@ -229,7 +229,7 @@ def read_eds(eds: Path | str, node_id: int) -> list[Entry]:
 
     try:
         return [_entry(variable) for variable in _variables(import_od(str(eds), node_id))]
-    except Exception as error:  # the parser raises whatever its parts raise
+    except Exception as error:  # the parser has no exception class of its own
         reason = " ".join(str(error).split())[:200]
         raise EdsError(f"{eds}: not an EDS that can be read: {type(error).__name__}: {reason}") from None
 
@@ -238,12 +238,12 @@ _JSON_FIELDS = ("index", "subindex", "name", "data_type", "access", "mappable", 
 
 
 def entries_to_json(entries: Iterable[Entry]) -> list[list[Any]]:
-    """Entries as plain data."""
+    """Return entries as plain data for JSON."""
     return [[*(getattr(each, name) for name in _JSON_FIELDS), each.default.hex()] for each in entries]
 
 
 def entries_from_json(rows: Iterable[list[Any]]) -> list[Entry]:
-    """Inverse of `entries_to_json`."""
+    """Return entries from plain data: the inverse of `entries_to_json`."""
     result = []
     for *values, default in rows:
         fields = dict(zip(_JSON_FIELDS, values, strict=True))
@@ -258,7 +258,7 @@ def _layout(data_type: int) -> struct.Struct | None:
 
 
 def _variables(dictionary: Any) -> list[Any]:
-    """Every variable of a parsed EDS: plain ones, and the members of arrays and records."""
+    """Return every variable of a parsed EDS: plain ones, and the members of arrays and records."""
     variables: list[Any] = []
     for parsed in dictionary.values():
         if parsed.index < _FIRST_REAL_INDEX:

@@ -1,8 +1,12 @@
-"""PDO codec: a mapping becomes one precompiled little-endian `struct.Struct` (CiA 301, 7.4.7 and 7.2.2).
+"""PDO mappings as precompiled `struct.Struct`, and the rules for changing those of a node (CiA 301, 7.2.2, 7.4.7, 7.5.2).
 
-Made once from the mapping; afterwards a PDO is one `layout.unpack_from` or `layout.pack`. Only whole objects
-of 8, 16, 32 or 64 bits are mapped: a partial object is where other decoders read the wrong number, so it is
-refused when the map is made.
+`PdoMap` is made once from the mapping; afterwards a PDO is one `layout.unpack_from` or `layout.pack`, little endian. Only
+whole objects of 8, 16, 32 or 64 bits are mapped: a partial object is where other decoders read the wrong number, so it is
+refused when the map is made. `PdoParameters` guards 14xxh to 1Axxh of an object dictionary and reads the maps in force.
+
+>>> position = PdoMap(0x181, (MappedObject(0x6064, 0, 32, True, "position"),))
+>>> position.layout.unpack(position.layout.pack(-1000))
+(-1000,)
 """
 
 from __future__ import annotations
@@ -12,21 +16,21 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from jtqd.drivers.object_dictionary import ObjectStore
-from jtqd.drivers.sdo import DEVICE_STATE, NOT_MAPPABLE, PDO_TOO_LONG, VALUE_RANGE, SdoAbort
+from jtqd.drivers.sdo import DEVICE_STATE, NOT_MAPPABLE, PDO_TOO_LONG, VALUE_RANGE, SdoAbort, label
 
 MAX_PDO_BYTES = 8
 MAX_ENTRIES = 8  # whole bytes only: 8 entries fill a frame
-LOWEST_PDO_ID = (
-    0x181  # CiA 301, 7.3.5: 101h..180h, 581h.. and above are restricted or belong to other services
-)
-HIGHEST_PDO_ID = 0x57F
+LOWEST_PDO_ID, HIGHEST_PDO_ID = (
+    0x181,
+    0x57F,
+)  # CiA 301, 7.3.5: others are restricted or belong to other services
 LAST_SYNC_TYPE = 240  # transmission types 1..240: every n-th SYNC
 
 _SIGNED_LETTERS = {8: "b", 16: "h", 32: "i", 64: "q"}
 
 
 class PdoError(ValueError):
-    """A mapping that cannot be, or must not be, coded."""
+    """A mapping that is impossible or not supported."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,7 @@ class MappedObject:
     @property
     def label(self) -> str:
         """The object as "6064h:0"."""
-        return f"{self.index:04X}h:{self.subindex}"
+        return label(self.index, self.subindex)
 
     @property
     def word(self) -> int:
@@ -104,17 +108,11 @@ class PdoMap:
 
 
 def split_word(word: int) -> tuple[int, int, int]:
-    """(index, subindex, bits) of a mapping entry 0xIIIISSLL."""
+    """Return (index, subindex, bits) of a mapping entry 0xIIIISSLL."""
     return word >> 16 & 0xFFFF, word >> 8 & 0xFF, word & 0xFF
 
 
-# PDO parameters of a node's own object dictionary: the rules for changing them, and the maps in force.
-#
-# CiA 301, 7.5.2.33 to 7.5.2.38. Re-mapping goes: COB-ID bit 31 set (the PDO is destroyed), number of entries
-# 0, entries, number of entries n, COB-ID with bit 31 clear. A write out of that order is refused with
-# 08000022h, an object that is not there with 06020000h, one that may not be mapped with 06040041h, more than 8
-# bytes with 06040042h, a COB-ID or transmission type that cannot be with 06090030h.
-
+# PDO parameters of an object dictionary ---------------------------------------------------------------------------
 
 INVALID = 0x8000_0000  # COB-ID bit 31: the PDO does not exist
 EXTENDED = 0x2000_0000  # COB-ID bit 29: 29-bit identifier, not supported here
@@ -130,9 +128,15 @@ _INHIBIT_TIME, _SYNC_START = 3, 6
 
 
 class PdoParameters:
-    """Guards the PDO parameters of `store` and reads the active maps from it.
+    """PDO parameters of `store`: the rules for changing them (CiA 301, 7.5.2.33 to 7.5.2.38), and the maps in force.
 
-    `generation` grows with each accepted write: who keeps the maps reads them anew when it differs.
+    Re-mapping goes: COB-ID bit 31 set (the PDO is destroyed), number of entries 0, entries, number of entries n, COB-ID with
+    bit 31 clear. A write out of that order is refused with 08000022h, an object that is not there with 06020000h, one that
+    may not be mapped with 06040041h, more than 8 bytes with 06040042h, an impossible COB-ID or transmission type with
+    06090030h.
+
+    Attributes:
+        generation: grows with each accepted write; maps read before are out of date when it differs.
     """
 
     def __init__(self, store: ObjectStore) -> None:
@@ -145,19 +149,19 @@ class PdoParameters:
             self._guard_mapping(index)
 
     def tpdos(self) -> list[PdoMap]:
-        """TPDOs that exist and map something, in the order of their number."""
+        """Return the TPDOs that exist and map something, in the order of their number."""
         return self._active(self.tpdo_indices)
 
     def rpdos(self) -> list[PdoMap]:
-        """RPDOs that exist and map something."""
+        """Return the RPDOs that exist and map something."""
         return self._active(self.rpdo_indices)
 
     def _active(self, indices: tuple[int, ...]) -> list[PdoMap]:
-        found = (self.active_map(index) for index in indices)
-        return [pdo for pdo in found if pdo is not None]
+        maps = (self.active_map(index) for index in indices)
+        return [pdo for pdo in maps if pdo is not None]
 
     def active_map(self, communication_index: int) -> PdoMap | None:
-        """Map of one PDO (1400h.., 1800h..); None when it is switched off or empty."""
+        """Return the map of one PDO (1400h.., 1800h..); None when it is switched off or empty."""
         store = self._store
         cob_id = store.number(communication_index, 1)
         mapping = communication_index + _MAPPING_OFFSET
@@ -171,8 +175,6 @@ class PdoParameters:
         index, subindex, bits = split_word(word)
         entry = self._store.entry(index, subindex)
         return MappedObject(index, subindex, bits, entry.signed, entry.name)
-
-    # Rules --------------------------------------------------------------------------------------------------
 
     def _exists(self, communication_index: int) -> bool:
         return not self._store.number(communication_index, 1) & INVALID
@@ -209,8 +211,8 @@ class PdoParameters:
             raise SdoAbort(VALUE_RANGE)  # bits 0..29 may not change while the PDO exists
 
     def _check_transmission(self, value: int) -> None:
-        if not (
-            value <= LAST_SYNC_TYPE or value in _EVENT_TYPES
+        if (
+            value > LAST_SYNC_TYPE and value not in _EVENT_TYPES
         ):  # 252, 253 are RTR-only, which is not offered
             raise SdoAbort(VALUE_RANGE)
 

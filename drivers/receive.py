@@ -13,7 +13,7 @@ from jtqd.drivers.frame import FRAME_SIZE
 SO_TIMESTAMPNS = 35  # asm-generic/socket.h; SCM_TIMESTAMPNS is the same number
 SO_RXQ_OVFL = 40
 NOTHING_YET = frozenset({errno.EAGAIN, errno.EINTR, errno.ECONNRESET})
-"""Errors after which the next call tells more. A unix peer that ends with unread data makes ECONNRESET come
+"""Errors after which the next call gives more. A unix peer that ends with unread data makes ECONNRESET come
 before what it had sent; its frames and then the end follow."""
 _SOL_SOCKET = 1
 _MSG_TRUNC = 0x20
@@ -67,7 +67,7 @@ _HEADER_WORDS = _HEADER_SIZE // 8
 
 
 class FrameReceiver:
-    """Receives up to `capacity` messages of 16 bytes per call; not bound to one socket.
+    """Receive up to `capacity` messages of 16 bytes per call; not bound to one socket.
 
     After `receive` returned n > 0:
 

@@ -6,21 +6,20 @@ request ends the running one, as the client that lost its answer will start agai
 
 from __future__ import annotations
 
-import struct
-
 from jtqd.drivers.object_dictionary import ObjectStore
 from jtqd.drivers.sdo import (
+    HEADER,
+    INITIATE,
     LENGTH_TOO_HIGH,
     LENGTH_TOO_LOW,
     OUT_OF_MEMORY,
+    TOGGLE,
     TOGGLE_NOT_ALTERNATED,
     UNKNOWN_COMMAND,
     SdoAbort,
+    abort_frame,
 )
 
-_HEADER = struct.Struct("<BHB")
-_INITIATE = struct.Struct("<BHBI")
-_TOGGLE = 0x10
 MAX_DOWNLOAD_BYTES = 4096  # bounds the memory a client that never ends its transfer can take
 
 # Client command specifiers, bits 7..5 of byte 0
@@ -40,17 +39,17 @@ class _Transfer:
 
 
 class SdoServer:
-    """Answers requests to one `ObjectStore`. Never raises for what a client sends."""
+    """SDO server of one `ObjectStore`. It never raises for what a client sends."""
 
     def __init__(self, store: ObjectStore) -> None:
         self.store = store
         self._transfer: _Transfer | None = None
 
     def handle(self, request: bytes) -> bytes | None:
-        """Reply to one request; None when there is nothing to say (not 8 bytes, or the client's abort)."""
+        """Answer one request; None when no answer is due (not 8 bytes, or the client's abort)."""
         if len(request) != 8:
             return None
-        command, index, subindex = _HEADER.unpack_from(request)
+        command, index, subindex = HEADER.unpack_from(request)
         specifier = command >> 5
         if specifier == _ABORT:
             self._transfer = None
@@ -62,7 +61,7 @@ class SdoServer:
             return self._answer(specifier, command, index, subindex, request)
         except SdoAbort as abort:
             self._transfer = None
-            return _INITIATE.pack(0x80, index, subindex, abort.code)
+            return abort_frame(index, subindex, abort.code)
 
     def _answer(self, specifier: int, command: int, index: int, subindex: int, request: bytes) -> bytes:
         if specifier == _UPLOAD_INITIATE:
@@ -78,10 +77,10 @@ class SdoServer:
     def _upload(self, index: int, subindex: int) -> bytes:
         self._transfer = None
         data = self.store.read(index, subindex)
-        if 1 <= len(data) <= 4:  # expedited; no byte at all cannot be said in one frame
-            return _HEADER.pack(0x43 | (4 - len(data)) << 2, index, subindex) + data.ljust(4, b"\0")
+        if 1 <= len(data) <= 4:  # expedited; it has no code for an empty object
+            return HEADER.pack(0x43 | (4 - len(data)) << 2, index, subindex) + data.ljust(4, b"\0")
         self._transfer = _Transfer(index, subindex, upload=True, data=data)
-        return _INITIATE.pack(0x41, index, subindex, len(data))
+        return INITIATE.pack(0x41, index, subindex, len(data))
 
     def _upload_segment(self, command: int) -> bytes:
         transfer = self._running(command, upload=True)
@@ -89,7 +88,7 @@ class SdoServer:
         del transfer.data[:7]
         last = not transfer.data
         reply = bytes([transfer.toggle | (7 - len(segment)) << 1 | last]) + segment.ljust(7, b"\0")
-        transfer.toggle ^= _TOGGLE
+        transfer.toggle ^= TOGGLE
         if last:
             self._transfer = None
         return reply
@@ -106,10 +105,10 @@ class SdoServer:
             if size is not None and size > MAX_DOWNLOAD_BYTES:
                 raise SdoAbort(OUT_OF_MEMORY)
             self._transfer = _Transfer(index, subindex, upload=False, size=size)
-        return _INITIATE.pack(0x60, index, subindex, 0)
+        return INITIATE.pack(0x60, index, subindex, 0)
 
     def _own_length(self, index: int, subindex: int) -> int:
-        """Expedited without size: the object's type says how many of the four bytes count."""
+        """Return how many of the four bytes count in an expedited download without size: by the object's type."""
         return min(4, self.store.entry(index, subindex).bits // 8 or 4)
 
     def _download_segment(self, command: int, payload: bytes) -> bytes:
@@ -119,7 +118,7 @@ class SdoServer:
         if len(transfer.data) > limit:
             raise SdoAbort(OUT_OF_MEMORY if transfer.size is None else LENGTH_TOO_HIGH)
         reply = bytes([0x20 | transfer.toggle]).ljust(8, b"\0")
-        transfer.toggle ^= _TOGGLE
+        transfer.toggle ^= TOGGLE
         if command & 1:  # last segment
             if transfer.size is not None and len(transfer.data) < transfer.size:
                 raise SdoAbort(LENGTH_TOO_LOW)
@@ -131,6 +130,6 @@ class SdoServer:
         transfer = self._transfer
         if transfer is None or transfer.upload != upload:
             raise SdoAbort(UNKNOWN_COMMAND)
-        if command & _TOGGLE != transfer.toggle:
+        if command & TOGGLE != transfer.toggle:
             raise SdoAbort(TOGGLE_NOT_ALTERNATED)
         return transfer

@@ -403,7 +403,7 @@ class NodeCare:
         queue = self._queues[node]
         return {
             "repeats": queue.repeats,
-            "silences": queue.silences,
+            "silences": queue.timeouts,
             "refusals": queue.refusals,
             "ignored": queue.ignored,
         }

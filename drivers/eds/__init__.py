@@ -1,1 +1,5 @@
-"""Electronic data sheets (CiA 306) of the bench's devices and of jtqd itself."""
+"""Electronic data sheets (CiA 306): the .eds files of the bench's drive and torque sensor and of jtqd's own node.
+
+`generate` writes them from its tables; `own_objects` names the sub-indices of jtqd's objects for the daemon. Imports
+`drivers` only, and nothing at all on `import jtqd.drivers.eds`.
+"""

@@ -1,8 +1,9 @@
-"""Writes drive.eds, torque_sensor.eds and jtqd.eds beside this file: `python -m jtqd.drivers.eds.generate`.
+"""Write drive.eds, torque_sensor.eds and jtqd.eds beside this file: `python -m jtqd.drivers.eds.generate`.
 
-The files are what ships and what a configuration tool reads; these tables are how they are kept right, and a
-test compares the two. The vendor number is an emulation's, not one that CiA has assigned: a real drive or
-sensor brings its own EDS.
+The files are what ships and what a configuration tool reads; the tables at the end of this module are how they are kept
+right, and a test compares the two. From parts up: the description of objects, the writer (CiA 306), objects of the
+communication profile that the sheets share (CiA 301, 1000h..1FFFh), the three sheets. The vendor number is an emulation's,
+not one that CiA has assigned: a real drive or sensor brings its own EDS.
 """
 
 from __future__ import annotations
@@ -12,11 +13,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from jtqd.drivers.devices import estimate_tpdo
 from jtqd.drivers.eds.own_objects import BUS_FIELDS, COUNTERS, JOINT_PARAMETERS, NODES, VERSION
+from jtqd.drivers.pdo import NO_RTR
 
-# Writes an electronic data sheet by CiA 306 from a table of objects (the tables: `jtqd.drivers.eds.generate`).
-
-
+FOLDER = Path(__file__).parent
+VENDOR = 0x07A1
+REVISION = 0x0001_0000  # major 1 (CANopen behaviour), minor 0
 I8, I16, I32, U8, U16, U32, REAL32, TEXT = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x09
 VAR, ARRAY, RECORD = 7, 8, 9
 BIT_RATES = (10, 20, 50, 125, 250, 500, 800, 1000)
@@ -25,7 +28,14 @@ MANDATORY = (0x1000, 0x1001, 0x1018)
 
 @dataclass(frozen=True)
 class Var:
-    """One variable: a whole object or a sub-index. `default` is a number or text such as "$NODEID+0x80"."""
+    """One variable: a whole object or a sub-index.
+
+    Attributes:
+        access: ro, wo, rw, rwr, rww or const (CiA 306, 4.6.3).
+        default: a number, or text such as "$NODEID+0x80".
+        pdo: it may be mapped.
+        comment: unit or meaning, written as a comment line above its section.
+    """
 
     name: str
     data_type: int
@@ -39,7 +49,7 @@ class Var:
 
 @dataclass(frozen=True)
 class Entries:
-    """An array or a record. Sub-index 0 says the highest sub-index present, unless `sub0` is given."""
+    """An array or a record; sub-index 0 holds the highest sub-index present, unless `sub0` is given."""
 
     name: str
     object_type: int
@@ -54,7 +64,7 @@ class Entries:
 
 @dataclass(frozen=True)
 class Sheet:
-    """One EDS file."""
+    """One EDS file; `comments` are its [Comments] lines."""
 
     file_name: str
     description: str
@@ -65,7 +75,7 @@ class Sheet:
     objects: dict[int, Var | Entries]
     comments: Sequence[str] = ()
     vendor_name: str = "jtqd emulation"
-    vendor_number: int = 0x07A1
+    vendor_number: int = VENDOR
 
 
 def array(
@@ -75,17 +85,17 @@ def array(
     members: Sequence[tuple[str, int | float | str | None]],
     pdo: bool = False,
 ) -> Entries:
-    """An array of one type; `members` are (name, default) of sub-index 1 onwards."""
+    """Describe an array of one type; `members` are (name, default) of sub-index 1 onwards."""
     return Entries(name, ARRAY, {i: Var(n, data_type, access, d, pdo) for i, (n, d) in enumerate(members, 1)})
 
 
 def record(name: str, *members: Var) -> Entries:
-    """A record whose sub-indices run without a gap."""
+    """Describe a record whose sub-indices run without a gap."""
     return Entries(name, RECORD, dict(enumerate(members, 1)))
 
 
 def render(sheet: Sheet) -> str:
-    """Text of the EDS file."""
+    """Return the text of the EDS file. Its date is fixed, so that the same tables give the same bytes."""
     indices = sorted(sheet.objects)
     mandatory = [i for i in indices if i in MANDATORY]
     manufacturer = [i for i in indices if 0x2000 <= i <= 0x5FFF]
@@ -186,15 +196,13 @@ def _number(variable: Var) -> str:
     return str(default)
 
 
-# Objects of the communication profile (CiA 301, 1000h..1FFFh) that the data sheets share.
+# Objects of the communication profile -----------------------------------------------------------------------
 
-
-NO_RTR = 0x4000_0000  # bit 30 of a TPDO's COB-ID
 SYNC_PRODUCER = 0x4000_0000  # bit 30 of 1005h
 
 
 def device(device_type: int, name: str, hardware: str, software: str) -> dict[int, Var | Entries]:
-    """Device type, error register, names."""
+    """Describe device type, error register and names."""
     return {
         0x1000: Var("Device type", U32, "ro", device_type),
         0x1001: Var("Error register", U8, "ro", 0, pdo=True),
@@ -205,7 +213,7 @@ def device(device_type: int, name: str, hardware: str, software: str) -> dict[in
 
 
 def identity(vendor: int, product: int, revision: int) -> dict[int, Var | Entries]:
-    """1018h; the serial number is each device's own."""
+    """Describe 1018h; the serial number is each device's own."""
     members = [
         ("Vendor-ID", vendor),
         ("Product code", product),
@@ -216,7 +224,7 @@ def identity(vendor: int, product: int, revision: int) -> dict[int, Var | Entrie
 
 
 def errors(behaviour_access: str = "rw", behaviour: int = 0, inhibit: int = 0) -> dict[int, Var | Entries]:
-    """Error history, EMCY and error behaviour."""
+    """Describe error history, EMCY and error behaviour."""
     history = {i: Var(f"Standard error field {i}", U32, "ro", 0) for i in range(1, 9)}
     return {
         0x1003: Entries(
@@ -229,13 +237,13 @@ def errors(behaviour_access: str = "rw", behaviour: int = 0, inhibit: int = 0) -
 
 
 def verify_configuration(access: str) -> dict[int, Var | Entries]:
-    """1020h: the master's signature of the configuration; 0 when it was changed since, or never written."""
+    """Describe 1020h, the master's signature of the configuration; 0: changed since, or never written."""
     names = ("Configuration date", "Configuration time")
     return {0x1020: array("Verify configuration", U32, access, [(name, 0) for name in names])}
 
 
 def heartbeat(producer_ms: int = 0, consumed: int = 1) -> dict[int, Var | Entries]:
-    """Heartbeats consumed (the master's first), one produced."""
+    """Describe the heartbeats consumed (the master's first) and the one produced."""
     watched = [(f"Consumer heartbeat time {n}", 0) for n in range(1, consumed + 1)]
     return {
         0x1016: array("Consumer heartbeat time", U32, "rw", watched),
@@ -244,7 +252,7 @@ def heartbeat(producer_ms: int = 0, consumed: int = 1) -> dict[int, Var | Entrie
 
 
 def sync_consumer() -> dict[int, Var | Entries]:
-    """SYNC as its receiver sees it; 1019h says whether a counter byte is expected."""
+    """Describe SYNC as its receiver sees it; 1019h: whether a counter byte is expected."""
     return {
         0x1005: Var("COB-ID SYNC message", U32, "const", 0x80),
         0x1019: Var("Synchronous counter overflow value", U8, "rw", 0, low=0, high=240),
@@ -252,14 +260,14 @@ def sync_consumer() -> dict[int, Var | Entries]:
 
 
 def sdo_server() -> dict[int, Var | Entries]:
-    """The default SDO channel."""
+    """Describe the default SDO channel."""
     to_server = Var("COB-ID client to server", U32, "ro", "$NODEID+0x600")
     to_client = Var("COB-ID server to client", U32, "ro", "$NODEID+0x580")
     return {0x1200: record("SDO server parameter", to_server, to_client)}
 
 
 def rpdo(number: int, base: int, mapping: Sequence[int]) -> dict[int, Var | Entries]:
-    """RPDO `number` (1..4), valid from power-on, event-driven."""
+    """Describe RPDO `number` (1..4), valid from power-on, event-driven."""
     communication = record(
         "RPDO communication parameter",
         Var("COB-ID used by RPDO", U32, "rw", f"$NODEID+0x{base:X}"),
@@ -277,7 +285,7 @@ def tpdo(
     fixed: bool = False,
     event_ms: int = 0,
 ) -> dict[int, Var | Entries]:
-    """TPDO `number` (1..4), valid from power-on. Sub-index 4 is reserved and absent."""
+    """Describe TPDO `number` (1..4), valid from power-on. Sub-index 4 is reserved and absent."""
     access = "const" if fixed else "rw"
     members = {
         1: Var("COB-ID used by TPDO", U32, access, f"$NODEID+0x{NO_RTR + base:08X}"),
@@ -298,13 +306,11 @@ def _mapping(kind: str, mapping: Sequence[int], access: str) -> Entries:
     return Entries(f"{kind} mapping parameter", RECORD, entries, count)
 
 
-VENDOR = 0x07A1
-REVISION = 0x0001_0000  # major 1 (CANopen behaviour), minor 0
-FOLDER = Path(__file__).parent
+# The sheets -------------------------------------------------------------------------------------------------
 
 
 def drive() -> Sheet:
-    """CiA 402 servo drive with encoders on both sides of the gear."""
+    """Return the sheet of a CiA 402 servo drive with encoders on both sides of the gear."""
     objects: dict[int, Var | Entries] = {
         **device(0x0002_0192, "emulated joint drive", "1.0", "1.0"),
         **errors(),
@@ -380,7 +386,7 @@ def drive() -> Sheet:
 
 
 def torque_sensor() -> Sheet:
-    """CiA 404 measuring device with two torque channels."""
+    """Return the sheet of a CiA 404 measuring device with two torque channels."""
 
     def channels(name: str, data_type: int, access: str, *defaults: int, pdo: bool = False) -> Entries:
         return array(
@@ -426,7 +432,7 @@ def torque_sensor() -> Sheet:
 
 
 def jtqd() -> Sheet:
-    """The daemon's own node: SYNC producer with the estimate as its only PDO."""
+    """Return the sheet of the daemon's own node: SYNC producer with the estimate as its only PDO."""
     joints = [("Joint 1", 0), ("Joint 2", 0)]
     nodes = [(name, 0) for name in ("Joint 1", "Joint 2", "Sensor")]
     objects: dict[int, Var | Entries] = {
@@ -443,7 +449,7 @@ def jtqd() -> Sheet:
         **tpdo(
             1,
             0x180,
-            [0x2100_0110, 0x2100_0210, 0x2101_0108, 0x2101_0208, 0x2102_0008, 0x2103_0008],
+            estimate_tpdo().words,
             transmission=1,
             fixed=True,
         ),
@@ -481,7 +487,7 @@ SHEETS = (drive, torque_sensor, jtqd)
 
 
 def main() -> int:
-    """Write the three files; takes no argument."""
+    """Write the three files; there are no arguments."""
     if len(sys.argv) > 1:
         print(
             "usage: python -m jtqd.drivers.eds.generate   (writes the data sheets beside this file)",

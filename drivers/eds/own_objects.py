@@ -1,4 +1,4 @@
-"""Objects of jtqd's own node that are filled by position: one list for the data sheet and for the daemon."""
+"""Sub-indices of jtqd's own objects 2200h..2207h by name: one list for the data sheet and for the daemon."""
 
 COUNTERS = (
     "cycles",
@@ -38,7 +38,7 @@ COUNTERS = (
     "latches",
     "latch_resets",
 )
-"""Sub-indices 1.. of 2200h, in order: the names of the loop's counters. New ones come last: others know them by number."""
+"""Sub-indices 1.. of 2200h, in order: the loop's counters. New ones come last: receivers know them by number."""
 
 BUS_FIELDS = (
     "state",
@@ -57,7 +57,7 @@ BUS_FIELDS = (
     "downs",
 )
 """Sub-indices 1.. of 2205h (`daemon/bus/errors.py`): state 0 error active, 1 warning, 2 passive, 3 bus-off, 4
-interface down; the controller's two error counters as it told them last; then how often each thing has happened."""
+interface down; the controller's two error counters as last reported; then how often each error has occurred."""
 
 NODES = 3
 """Nodes of a bus: joint 1, joint 2, the sensor. Sub-indices 1.. of 1016h, 2206h and 2207h."""

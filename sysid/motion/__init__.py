@@ -1,1 +1,5 @@
-"""Motion of both joints over the bus: set-points, limits, CiA 402 sequences, and the node that commands the drives."""
+"""The commander: moves both joints through planned set-points on a bus on which jtqd runs, within limits.
+
+`shell.play` takes `setpoints.Setpoints` and `setpoints.Limits` and returns a `setpoints.MotionResult`; `commander.Commander`
+is the same without socket and clock. Imports `drivers` and `estimator.arrays`, nothing else of sysid.
+"""

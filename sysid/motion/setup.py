@@ -1,4 +1,13 @@
-"""All devices of the bench made ready for the motion, and put back after it, over a frame socket of its own."""
+"""Make both drives and the sensor ready for a motion, and put them back after it, by SDO.
+
+jtqd has booted the nodes: TPDOs, heartbeat and the watch over jtqd (1016h:1) are there. Here come mode of operation,
+interpolation time, temperature (TPDO3) and the watch over the commander (1016h:2). What is written is read back. Every
+failure is a BootError: one line with node, object, expected and found.
+
+    quick_stop, switch_off, reset_fault, set_up, release    one drive, over any `SdoAccess`: no bus, no clock
+    sensor_units                                            the sensor
+    BenchSetup                                              all of them, over a frame socket of its own
+"""
 
 from __future__ import annotations
 
@@ -9,6 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
+from jtqd.drivers.boot_error import BootError, mismatch
 from jtqd.drivers.boot_procedure import BusSettings, NodeBoot
 from jtqd.drivers.devices import (
     COMMANDER_NODE,
@@ -25,19 +35,8 @@ from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import FRAME, FRAME_SIZE, pack
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
 from jtqd.drivers.pdo import CAN_ID, INVALID, PdoMap, split_word
-from jtqd.drivers.sdo import (
-    NO_OBJECT,
-    NO_SUBINDEX,
-    BootError,
-    FrameSdo,
-    SdoAbort,
-    SdoAccess,
-    SdoSilence,
-    label,
-    mismatch,
-    no_answer,
-    refused,
-)
+from jtqd.drivers.sdo import Key
+from jtqd.drivers.sdo_client import RESPONSE_ID, FrameChannel, NodeObjects, SdoAccess, SdoClient
 from jtqd.sysid.motion.cia402 import (
     CST,
     CSV,
@@ -51,78 +50,21 @@ from jtqd.sysid.motion.cia402 import (
 )
 from jtqd.sysid.motion.setpoints import Limits, MotionError, Setpoints, Timing
 
-# SDO of one node with the node's name on everything that goes wrong. No bus, no clock.
-
-
-Key = tuple[int, int]
-
-
-class NamedSdo:
-    """SDO with the node's name on what goes wrong."""
-
-    def __init__(self, access: SdoAccess, node: int) -> None:
-        self._access, self.node = access, node
-
-    def number(self, key: Key, signed: bool = False) -> int:
-        """Upload. Raises BootError."""
-        found = self.optional(key, signed)
-        if found is None:
-            raise BootError(self.node, label(*key), detail=f"{label(*key)}: no such object in this device")
-        return found
-
-    def optional(self, key: Key, signed: bool = False) -> int | None:
-        """None when the device does not have the object."""
-        try:
-            return int.from_bytes(self._access.read(*key), "little", signed=signed)
-        except SdoSilence as silence:
-            raise no_answer(self.node, key, silence.waited_s, "") from silence
-        except SdoAbort as abort:
-            if abort.code in (NO_OBJECT, NO_SUBINDEX):
-                return None
-            raise refused(self.node, key, "read", abort.code) from abort
-
-    def write(self, key: Key, value: int, size: int) -> None:
-        """Download. Raises BootError."""
-        value &= (1 << 8 * size) - 1
-        try:
-            self._access.write(*key, value.to_bytes(size, "little"))
-        except SdoSilence as silence:
-            raise no_answer(self.node, key, silence.waited_s, "") from silence
-        except SdoAbort as abort:
-            raise refused(self.node, key, f"write of 0x{value:0{2 * size}X}", abort.code) from abort
-
-    def put(self, key: Key, value: int, size: int, signed: bool = False) -> None:
-        """Download and compare."""
-        self.write(key, value, size)
-        self.require(key, value, signed)
-
-    def require(self, key: Key, value: int, signed: bool = False) -> None:
-        """BootError unless the object holds `value`."""
-        found = self.number(key, signed)
-        if found != value:
-            raise mismatch(self.node, key, "read back", expected=f"0x{value:X}", found=f"0x{found:X}")
-
-
-# A drive made ready for the motion, and put back after it, by SDO. Written against `SdoAccess`: no bus, no clock.
-#
-# jtqd has booted the node: TPDOs, heartbeat and the watch over jtqd (1016h:1) are there. Here come mode of operation,
-# interpolation time, temperature (TPDO3) and the watch over the commander (1016h:2). What is written is read back. Every
-# failure is a BootError: one line with node, object, expected and found.
-
-
 INTERPOLATION_MS: Final = 2
 """60C2h: each drive gets every second set-point."""
 TEMPERATURE_TPDO: Final = 0x380
 """COB-ID of TPDO3, plus the node number: joint temperature, I16, 0.1 °C."""
 _POLL_S, _POLLS = 0.005, 200
-_STATUSWORD: Final = (0x6041, 0)
+_CONTROLWORD, _STATUSWORD, _MODE_DISPLAY = (0x6040, 0), (0x6041, 0), (0x6061, 0)
+_TARGET_VELOCITY, _TARGET_TORQUE = (0x60FF, 0), (0x6071, 0)
+_COMMANDER_WATCH = (0x1016, 2)
 
 Sleep = Callable[[float], None]
 
 
 @dataclass(frozen=True, slots=True)
 class DriveUnits:
-    """What the commander must know of a drive: identifiers and factors to SI, as the drive itself told them.
+    """What the commander must know of a drive: identifiers and factors to SI, as read from it.
 
     Attributes:
         node: node number; also the number of the joint.
@@ -141,11 +83,11 @@ class DriveUnits:
     temperature: bool
 
     def velocity_units(self, velocity_rad_s: float) -> int:
-        """60FFh of a joint side velocity: it counts as 606Ch does, on the motor side."""
+        """Return 60FFh of a joint side velocity: it counts as 606Ch does, on the motor side."""
         return round(velocity_rad_s * self.gear_ratio / self.scaling.motor_rad_s_per_unit)
 
     def current_units(self, current_a: float) -> int:
-        """6071h of a motor current.
+        """Return 6071h of a motor current.
 
         6071h is in 1/1000 of rated torque (6076h). The drive's own torque constant is 6076h / 6075h, so the torque of the
         current i is i * 6076h / 6075h, and 6071h becomes 1000 i / 6075h: the rated torque cancels.
@@ -164,40 +106,40 @@ class SensorUnits:
 
 def quick_stop(access: SdoAccess, node: int) -> None:
     """Let the drive brake by itself if it is powered; does not wait. Raises BootError."""
-    drive = NamedSdo(access, node)
-    if not _off(drive.number(_STATUSWORD)):
-        drive.write((0x6040, 0), QUICK_STOP_WORD, 2)
+    drive = NodeObjects(access, node)
+    if not _off(drive.number(_STATUSWORD, 2)):
+        drive.write(_CONTROLWORD, QUICK_STOP_WORD, 2)
 
 
 def switch_off(access: SdoAccess, node: int, sleep: Sleep) -> None:
-    """Bring the drive to a stop if it is powered, and take the power off; returns when it says so.
+    """Bring the drive to a stop if it is powered, and take the power off; wait for its statusword.
 
     Raises BootError when the drive is still powered a second later.
     """
-    drive = NamedSdo(access, node)
-    if not _off(drive.number(_STATUSWORD)):
+    drive = NodeObjects(access, node)
+    if not _off(drive.number(_STATUSWORD, 2)):
         quick_stop(access, node)
-        _wait(drive, _STATUSWORD, _off, sleep)  # with the option codes 5 to 8 (605Ah) it stays there
-    drive.write((0x6040, 0), DISABLE_VOLTAGE, 2)
-    word = _wait(drive, _STATUSWORD, _off, sleep)
+        _wait(drive, _STATUSWORD, 2, _off, sleep)  # with the option codes 5 to 8 (605Ah) it stays there
+    drive.write(_CONTROLWORD, DISABLE_VOLTAGE, 2)
+    word = _wait(drive, _STATUSWORD, 2, _off, sleep)
     if not _off(word):
         raise BootError(node, "6041h:0", detail=f"6041h:0: expected disabled, found {describe(word)}")
 
 
 def reset_fault(access: SdoAccess, node: int, sleep: Sleep) -> str | None:
-    """Reset a fault by a rising edge of bit 7 (transition 15); says which (603Fh), None when there was none.
+    """Reset a fault by a rising edge of bit 7 (transition 15); return which it was (603Fh), None when there was none.
 
     Raises BootError when the fault stays.
     """
-    drive = NamedSdo(access, node)
-    word = drive.number(_STATUSWORD)
+    drive = NodeObjects(access, node)
+    word = drive.number(_STATUSWORD, 2)
     if state_of(word) not in FAULTED:
         return None
-    code = drive.optional((0x603F, 0))
+    code = drive.optional_number((0x603F, 0), 2)
     fault = "fault" if code is None else f"fault {code:04X}h"
     for command in (DISABLE_VOLTAGE, FAULT_RESET, DISABLE_VOLTAGE):
-        drive.write((0x6040, 0), command, 2)
-    word = _wait(drive, _STATUSWORD, lambda word: state_of(word) not in FAULTED, sleep)
+        drive.write(_CONTROLWORD, command, 2)
+    word = _wait(drive, _STATUSWORD, 2, lambda word: state_of(word) not in FAULTED, sleep)
     if state_of(word) in FAULTED:
         raise BootError(node, "6041h:0", detail=f"{fault} cannot be reset: {describe(word)}")
     return fault
@@ -206,68 +148,71 @@ def reset_fault(access: SdoAccess, node: int, sleep: Sleep) -> str | None:
 def set_up(
     access: SdoAccess, profile: DriveProfile, mode: int, timeout_ms: int, sleep: Sleep, *, temperature: bool
 ) -> DriveUnits:
-    """Mode, targets at zero, 60C2h, TPDO3 if `temperature` is wanted, and last the watch over the commander.
+    """Set mode, targets of zero, 60C2h, TPDO3 if `temperature` is wanted, and last the watch over the commander.
 
     The drive must be off (`switch_off`, `reset_fault`). Raises BootError.
     """
     node = profile.node_id
-    drive = NamedSdo(access, node)
+    drive = NodeObjects(access, node)
     boot = NodeBoot(access, profile, BusSettings(master_node=JTQD_NODE))
     boot.check_device_type()
     boot.check_identity()
     scaling, gear_ratio = boot.read_scaling()
     assert isinstance(scaling, DriveScaling)
     assert gear_ratio is not None
-    if drive.number((0x6076, 0)) < 1:
+    if drive.number((0x6076, 0), 4) < 1:
         raise mismatch(node, (0x6076, 0), "motor rated torque in mNm", expected="1..", found="0")
     heartbeat_ms = _heartbeat(drive)
     for communication, pdo in ((0x1400, drive_rpdo1(node)), (0x1401, drive_rpdo2(node))):
         _require_rpdo(drive, communication, pdo)
-    drive.put((0x60FF, 0), 0, 4)
-    drive.put((0x6071, 0), 0, 2)
+    _zero_targets(drive)
     drive.write((0x6060, 0), mode, 1)
-    found = _wait(drive, (0x6061, 0), lambda display: display == mode, sleep)
+    found = _wait(drive, _MODE_DISPLAY, 1, lambda display: display == mode, sleep)
     if found != mode:
-        raise mismatch(node, (0x6061, 0), "mode of operation display", expected=str(mode), found=str(found))
-    drive.put((0x60C2, 1), INTERPOLATION_MS, 1)
-    drive.put((0x60C2, 2), -3, 1, signed=True)
+        raise mismatch(node, _MODE_DISPLAY, "mode of operation display", expected=str(mode), found=str(found))
+    drive.put((0x60C2, 1), INTERPOLATION_MS, 1, "interpolation time period value")
+    drive.put((0x60C2, 2), -3, 1, "interpolation time index")  # ms
     if temperature:
         _switch_on_temperature(drive)
-    drive.put((0x1016, 2), COMMANDER_NODE << 16 | timeout_ms, 4)
+    drive.put(_COMMANDER_WATCH, COMMANDER_NODE << 16 | timeout_ms, 4, "consumer heartbeat time")
     return DriveUnits(node, mode, gear_ratio, scaling, heartbeat_ms, temperature)
 
 
 def sensor_units(access: SdoAccess, profile: SensorProfile) -> SensorUnits:
-    """Read what the sensor says about itself. Raises BootError."""
+    """Read the sensor's units and heartbeat. Raises BootError."""
     boot = NodeBoot(access, profile, BusSettings(master_node=JTQD_NODE))
     boot.check_device_type()
     boot.check_identity()
     scaling, _ = boot.read_scaling()
     assert isinstance(scaling, SensorScaling)
     factors = tuple(scaling.nm_per_unit[channel] for channel in profile.channels)
-    return SensorUnits(profile.node_id, factors, _heartbeat(NamedSdo(access, profile.node_id)))
+    return SensorUnits(profile.node_id, factors, _heartbeat(NodeObjects(access, profile.node_id)))
 
 
 def release(access: SdoAccess, node: int, sleep: Sleep) -> None:
-    """After the motion: the drive is off, its targets are zero, and it watches the commander no longer.
+    """Switch the drive off after the motion, set its targets to zero, and end its watch over the commander.
 
     Raises BootError: it did not answer, or is still powered.
     """
     switch_off(access, node, sleep)
-    drive = NamedSdo(access, node)
-    drive.put((0x1016, 2), 0, 4)
-    drive.put((0x60FF, 0), 0, 4)
-    drive.put((0x6071, 0), 0, 2)
+    drive = NodeObjects(access, node)
+    drive.put(_COMMANDER_WATCH, 0, 4, "consumer heartbeat time")
+    _zero_targets(drive)
 
 
-def _wait(drive: NamedSdo, key: Key, wanted: Callable[[int], bool], sleep: Sleep) -> int:
-    """Read `key` until it is as wanted, for a second at most; what it is then."""
-    found = drive.number(key)
+def _zero_targets(drive: NodeObjects) -> None:
+    drive.put(_TARGET_VELOCITY, 0, 4, "target velocity")
+    drive.put(_TARGET_TORQUE, 0, 2, "target torque")
+
+
+def _wait(drive: NodeObjects, key: Key, size: int, wanted: Callable[[int], bool], sleep: Sleep) -> int:
+    """Read `key` until it is as wanted, for a second at most; return its value then."""
+    found = drive.number(key, size)
     for _ in range(_POLLS):
         if wanted(found):
             break
         sleep(_POLL_S)
-        found = drive.number(key)
+        found = drive.number(key, size)
     return found
 
 
@@ -275,35 +220,35 @@ def _off(statusword: int) -> bool:
     return state_of(statusword) not in POWERED
 
 
-def _heartbeat(node: NamedSdo) -> int:
-    """1017h: the loss of a node must be noticed."""
-    period_ms = node.number((0x1017, 0))
+def _heartbeat(node: NodeObjects) -> int:
+    """Return 1017h; a node without a heartbeat could be lost without notice."""
+    period_ms = node.number((0x1017, 0), 2)
     if not period_ms:
         key = (0x1017, 0)
         raise mismatch(node.node, key, "producer heartbeat time in ms", expected="1..", found="0")
     return period_ms
 
 
-def _require_rpdo(drive: NamedSdo, communication: int, pdo: PdoMap) -> None:
-    """An RPDO must be mapped as the commander sends it: its mapping cannot be changed while the node is operational."""
-    cob_id = drive.number((communication, 1))
+def _require_rpdo(drive: NodeObjects, communication: int, pdo: PdoMap) -> None:
+    """Require an RPDO to be mapped as the commander sends it: an operational node does not let it be changed."""
+    cob_id = drive.number((communication, 1), 4)
     if cob_id & (INVALID | CAN_ID) != pdo.cob_id:
         key = (communication, 1)
         raise mismatch(
             drive.node, key, "COB-ID of RPDO", expected=f"{pdo.cob_id:X}h", found=f"0x{cob_id:08X}"
         )
     mapping = communication + 0x200
-    count = drive.number((mapping, 0))
-    words = tuple(drive.number((mapping, entry)) for entry in range(1, count + 1))
+    count = drive.number((mapping, 0), 1)
+    words = tuple(drive.number((mapping, entry), 4) for entry in range(1, count + 1))
     if words != pdo.words:
         wanted, found = (" ".join(f"{word:08X}" for word in each) for each in (pdo.words, words))
         raise mismatch(drive.node, (mapping, 1), "mapping of RPDO", expected=wanted, found=found or "nothing")
 
 
-def _switch_on_temperature(drive: NamedSdo) -> None:
-    """TPDO3 must carry one 16-bit number first; jtqd's boot may have switched it off."""
-    cob_id, count = drive.optional((0x1802, 1)), drive.optional((0x1A02, 0))
-    word = drive.optional((0x1A02, 1)) if count else None
+def _switch_on_temperature(drive: NodeObjects) -> None:
+    """Switch on TPDO3, which must carry a 16-bit number first; jtqd's boot may have switched it off."""
+    cob_id, count = drive.optional_number((0x1802, 1), 4), drive.optional_number((0x1A02, 0), 1)
+    word = drive.optional_number((0x1A02, 1), 4) if count else None
     if cob_id is None or word is None or split_word(word)[2] != 16:
         detail = "no TPDO3 with a temperature of 16 bits (1A02h:1): the limit of temperature cannot be kept"
         raise BootError(drive.node, "1A02h:1", detail=detail)
@@ -313,14 +258,14 @@ def _switch_on_temperature(drive: NamedSdo) -> None:
             drive.node, (0x1802, 1), "COB-ID of TPDO3", expected=f"{wanted:X}h", found=f"0x{cob_id:08X}"
         )
     if cob_id & INVALID:
-        drive.put((0x1802, 1), cob_id & ~INVALID, 4)
+        drive.put((0x1802, 1), cob_id & ~INVALID, 4, "COB-ID of TPDO3")
 
 
 _HEARTBEAT = pack(0x700 + COMMANDER_NODE, b"\x05")
 
 
 class BenchSetup:
-    """SDO to both drives and the sensor. Raises BusError when the bus cannot be opened."""
+    """All devices of the bench, over a frame socket. Raises BusError when the bus cannot be opened."""
 
     def __init__(
         self,
@@ -333,17 +278,17 @@ class BenchSetup:
         self._socket = open_frame_socket(bus, [exact(SYNC_COB_ID), exact(0x700 + COMMANDER_NODE)])
         self._drives, self._sensor, self._timing = drives, sensor, timing
         self._beating = False
-        self._access = {node: FrameSdo(self._socket, node) for node in nodes}
+        self._access = {node: SdoClient(FrameChannel(self._socket, node)) for node in nodes}
 
     def prepare(
         self, setpoints: Setpoints, limits: Limits
     ) -> tuple[tuple[DriveUnits, DriveUnits], SensorUnits | None]:
-        """Both drives off and free of faults, modes set, targets zero, watching our heartbeat; their units and the sensor's.
+        """Bring both drives to: off, free of faults, modes set, targets zero, watching our heartbeat; return all units.
 
         Raises MotionError; what was set is put back then. A second commander is noticed before anything is touched.
         """
         try:
-            self._require_company()
+            self._require_jtqd_alone()
         except BusError as error:
             raise MotionError(str(error)) from None
         try:
@@ -352,8 +297,8 @@ class BenchSetup:
             self.release(beating=False)
             raise MotionError(str(error)) from None
 
-    def _require_company(self) -> None:
-        """jtqd's SYNC is there, and no other commander: for two periods of our own heartbeat nobody else sends it."""
+    def _require_jtqd_alone(self) -> None:
+        """Require jtqd's SYNC, and no other commander: for two periods of our own heartbeat nobody else sends it."""
         socket, frames = self._socket, self._socket.frames
         heard = set()
         end_s = time.monotonic() + 2.0 * self._timing.own_heartbeat_s
@@ -365,7 +310,7 @@ class BenchSetup:
             raise MotionError(f"another commander is on the bus (node {COMMANDER_NODE:02X}h): end it first")
         if SYNC_COB_ID not in heard:
             raise MotionError(f"no SYNC on {socket.bus}: jtqd must run on this bus")
-        socket.set_filters([exact(0x580 + node) for node in self._access])
+        socket.set_filters([exact(RESPONSE_ID + node) for node in self._access])
 
     def _prepare(
         self, setpoints: Setpoints, limits: Limits
@@ -394,7 +339,7 @@ class BenchSetup:
         return (units[0], units[1]), found
 
     def release(self, *, beating: bool) -> str:
-        """Both drives off for certain, targets zero, no longer watching us; "" or what could not be done, in one line.
+        """Release both drives for certain; return "", or what could not be done, in one line.
 
         `beating`: our heartbeat has been heard, so it goes on until nobody watches it any more.
         """

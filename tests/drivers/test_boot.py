@@ -10,7 +10,9 @@ import can
 import pytest
 
 from jtqd.drivers.boot import boot
-from jtqd.drivers.boot_procedure import BusSettings, NodeBoot, RequestError, parse_request
+from jtqd.drivers.boot_error import BootError
+from jtqd.drivers.boot_procedure import BusSettings, NodeBoot
+from jtqd.drivers.boot_request import RequestError, parse_request
 from jtqd.drivers.devices import (
     DriveProfile,
     Identity,
@@ -22,7 +24,6 @@ from jtqd.drivers.devices import (
     sensor_tpdo2,
 )
 from jtqd.drivers.pdo import PdoParameters
-from jtqd.drivers.sdo import BootError
 from tests.drivers.canopen_nodes import HubResponder, Responder, TestNode, drive_store, sensor_store
 from tests.paths import ROOT
 

@@ -5,7 +5,7 @@ import uuid
 import can
 
 from jtqd.drivers.boot import boot
-from jtqd.drivers.boot_procedure import parse_request
+from jtqd.drivers.boot_request import parse_request
 from tests.drivers.canopen_nodes import Responder, TestNode, drive_store
 
 

@@ -2,6 +2,7 @@ import math
 
 import pytest
 
+from jtqd.drivers.boot_error import BootError
 from jtqd.drivers.devices import (
     DriveProfile,
     SensorProfile,
@@ -15,7 +16,6 @@ from jtqd.drivers.devices import (
     sensor_tpdo1,
     sensor_tpdo2,
 )
-from jtqd.drivers.sdo import BootError
 
 DRIVE = {
     (0x608F, 1): 65536,

@@ -14,7 +14,7 @@ from jtqd.daemon.config import load_config
 from jtqd.daemon.shared.child_process import Child
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
 from jtqd.drivers.boot import boot
-from jtqd.drivers.boot_procedure import parse_request
+from jtqd.drivers.boot_request import parse_request
 from jtqd.drivers.filters import CanFilter
 from jtqd.drivers.frame import CAN_RTR_FLAG, FRAME, pack
 from jtqd.drivers.frame_socket import open_frame_socket

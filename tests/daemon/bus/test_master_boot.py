@@ -8,9 +8,10 @@ import can
 import pytest
 
 from jtqd.drivers.boot import BootReport, boot
-from jtqd.drivers.boot_procedure import RequestError, parse_request, signature
+from jtqd.drivers.boot_error import BootError
+from jtqd.drivers.boot_procedure import signature
+from jtqd.drivers.boot_request import RequestError, parse_request
 from jtqd.drivers.devices import drive_tpdo1
-from jtqd.drivers.sdo import BootError
 from tests.drivers.canopen_nodes import Responder, TestNode, drive_store, sensor_store
 
 REQUEST: dict[str, Any] = {

@@ -1,18 +1,13 @@
 """Drives made ready by SDO: against the emulated drives, and with devices that are not as they should be."""
 
-import struct
-from collections.abc import Callable
-
 import pytest
 
+from jtqd.drivers.boot_error import BootError
 from jtqd.drivers.devices import DriveProfile, SensorProfile
-from jtqd.drivers.frame import FRAME, pack
-from jtqd.drivers.sdo import NO_OBJECT, NO_SUBINDEX, BootError, FrameSdo, SdoAbort, SdoSilence
-from jtqd.drivers.sdo_server import SdoServer
+from jtqd.drivers.sdo import NO_OBJECT, NO_SUBINDEX, SdoAbort
 from jtqd.sim_can import drive_node as cia402
 from jtqd.sysid.motion.cia402 import CST, CSV
 from jtqd.sysid.motion.setup import quick_stop, release, reset_fault, sensor_units, set_up, switch_off
-from tests.drivers.canopen_nodes import drive_store
 from tests.sysid.motion.motion_helpers import BenchAccess, LockStep
 
 
@@ -77,7 +72,7 @@ def test_the_sensor_says_how_it_counts(lock: LockStep) -> None:
         ({(0x1601, 0): 0}, "node 1: 1601h:1 mapping of RPDO: expected 60FF0020, found nothing"),
         ({(0x6061, 0): 8}, "node 1: 6061h:0 mode of operation display: expected 9, found 8"),
         ({(0x6060, 0): SdoAbort(0x0609_0030)}, "node 1: 6060h:0: write of 0x09 refused: value out of range (06090030h)"),
-        ({(0x60C2, 1): 1}, "node 1: 60C2h:1 read back: expected 0x2, found 0x1"),
+        ({(0x60C2, 1): 1}, "node 1: 60C2h:1 interpolation time period value read back: expected 0x02, found 0x01"),
         ({(0x1802, 1): SdoAbort(NO_OBJECT)}, "node 1: no TPDO3 with a temperature of 16 bits (1A02h:1): "),
         ({(0x1A02, 0): 0}, "node 1: no TPDO3 with a temperature of 16 bits (1A02h:1): "),
         ({(0x1A02, 1): 0x3001_0020}, "node 1: no TPDO3 with a temperature of 16 bits (1A02h:1): "),
@@ -152,82 +147,3 @@ def test_after_the_motion_nobody_watches_and_the_targets_are_zero(lock: LockStep
     assert (store.number(0x1016, 2), store.number(0x6071), store.number(0x60FF)) == (0, 0, 0)
     lock.sleep(1.0)
     assert lock.bench.drives[1].machine.state == cia402.SWITCH_ON_DISABLED, "no fault by a missing heartbeat"
-
-
-# SDO over a frame socket ------------------------------------------------------------------------------------
-
-
-class FakeSocket:
-    """A frame socket with one node behind it; `answers` may change or drop the reply to request number n."""
-
-    def __init__(self, answer: Callable[[int, bytes], list[tuple[int, bytes]]] | None = None) -> None:
-        self.store = drive_store(5)
-        self.server = SdoServer(self.store)
-        self.frames = bytearray(16 * 32)
-        self.requests: list[bytes] = []
-        self.waiting: list[bytes] = []
-        self.answer = answer or (lambda n, reply: [(0x585, reply)])
-
-    def send(self, frame16: bytes) -> bool:
-        can_id, length, data = FRAME.unpack(frame16)
-        assert (can_id, length) == (0x605, 8)
-        self.requests.append(data)
-        reply = self.server.handle(data)
-        if reply is not None:
-            self.waiting += [pack(*each) for each in self.answer(len(self.requests), reply)]
-        return True
-
-    def wait(self, timeout_s: float | None) -> bool:
-        return bool(self.waiting)
-
-    def receive(self) -> int:
-        count = len(self.waiting)
-        self.frames[: 16 * count] = b"".join(self.waiting)
-        self.waiting = []
-        return count
-
-
-def test_sdo_transcripts() -> None:
-    socket = FakeSocket()
-    sdo = FrameSdo(socket, 5)
-    assert sdo.read(0x1000, 0) == (0x0002_0192).to_bytes(4, "little")
-    assert sdo.read(0x60C2, 1) == b"\x01"
-    sdo.write(0x6040, 0, b"\x06\x00")
-    sdo.write(0x60FF, 0, struct.pack("<i", -5))
-    assert [request.hex() for request in socket.requests] == [
-        "4000100000000000",
-        "40c2600100000000",
-        "2b40600006000000",
-        "23ff6000fbffffff",
-    ]
-    assert socket.store.number(0x60FF) == -5
-    with pytest.raises(ValueError, match=r"1\.\.4 bytes"):
-        sdo.write(0x6040, 0, b"")
-
-
-def test_sdo_refusals_and_long_objects_are_aborts() -> None:
-    socket = FakeSocket()
-    sdo = FrameSdo(socket, 5)
-    with pytest.raises(SdoAbort) as refused:
-        sdo.write(0x6041, 0, b"\0\0")
-    assert refused.value.code == 0x0601_0002
-    with pytest.raises(SdoAbort) as refused:
-        sdo.read(0x1008, 0)
-    assert refused.value.code == 0x0607_0012
-    assert socket.requests[-1].hex() == "8008100012000706", "the server is told"
-    assert sdo.read(0x1000, 0), "and is ready again"
-
-
-def test_sdo_asks_again_and_takes_no_answer_that_is_not_its_own() -> None:
-    """The first reply is lost; the second comes behind one of another node, a short one and one to another object."""
-    others = [(0x586, bytes(8)), (0x585, b"\x43\x00\x10"), (0x585, b"\x43\x18\x10\x01\x99\x00\x00\x00")]
-    socket = FakeSocket(lambda n, reply: [] if n == 1 else [*others, (0x585, reply)])
-    assert FrameSdo(socket, 5).read(0x1000, 0) == (0x0002_0192).to_bytes(4, "little")
-    assert len(socket.requests) == 2
-
-
-def test_sdo_silence_ends_in_time() -> None:
-    socket = FakeSocket(lambda n, reply: [])
-    with pytest.raises(SdoSilence, match=r"no answer within 0\.15 s"):
-        FrameSdo(socket, 5, 0.15).read(0x1000, 0)
-    assert len(socket.requests) == 2

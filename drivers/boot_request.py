@@ -1,0 +1,221 @@
+"""Request and report of the boot process as JSON; the request is checked into frozen profiles.
+
+    {"bus": "can0", "master_node": 32, "heartbeat_ms": 100, "master_timeout_ms": 500, "answer_timeout_s": 0.5,
+     "own_eds": "jtqd.eds", "error_behaviour": 0,
+     "sync": {"cob_id": 128, "counter_overflow": 240, "check_foreign": true},
+     "nodes": [{"node": 1, "kind": "drive", "identity": {"vendor": 1953, "product": 1026}},
+               {"node": 2, "kind": "drive", "given": {"6091h:1": 100}, "temperature": true},
+               {"node": 3, "kind": "sensor", "channels": [1], "unit_words": {"0x00560000": 1.0}, "mandatory": false}]}
+
+Only "bus" and "nodes" with "node" and "kind" are needed. `given` replaces objects that are then not read; `temperature` of
+a drive asks for TPDO3 with 3001h; a node that is not `mandatory` may be absent. "error_behaviour" is 1029h:1; without it
+the nodes keep theirs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from jtqd.drivers.boot_procedure import BootedNode, BusSettings
+from jtqd.drivers.devices import (
+    JTQD_NODE,
+    SYNC_COB_ID,
+    DriveProfile,
+    Identity,
+    Profile,
+    SensorProfile,
+    parse_key,
+)
+from jtqd.drivers.sdo import Key
+
+_TOP = {
+    "bus",
+    "nodes",
+    "master_node",
+    "own_eds",
+    "sync",
+    "heartbeat_ms",
+    "master_timeout_ms",
+    "answer_timeout_s",
+    "error_behaviour",
+}
+_SYNC = {"cob_id", "counter_overflow", "check_foreign"}
+_NODE = {"node", "kind", "identity", "channels", "given", "unit_words", "temperature", "mandatory"}
+_OPTIONAL_TIMEOUT_S = 0.5
+"""An optional node is not waited for any longer: it is booted again when it appears."""
+
+
+class RequestError(ValueError):
+    """The request itself is wrong; the message names the key, what was found and what is expected."""
+
+
+@dataclass(frozen=True)
+class BootRequest:
+    """Which nodes to boot on which bus.
+
+    Attributes:
+        bus: CAN interface or unix:PATH.
+        check_foreign_sync: refuse a bus with another SYNC producer; off when jtqd's own SYNC already runs.
+        answer_timeout_s: longest wait for the answer of a mandatory node.
+        own_eds: data sheet to be read for the caller, who then does without the parser: its entries are in the report as
+            "own_entries".
+        optional: nodes that may be absent.
+    """
+
+    bus: str
+    profiles: tuple[Profile, ...]
+    settings: BusSettings
+    check_foreign_sync: bool = True
+    answer_timeout_s: float = 0.5
+    own_eds: str | None = None
+    optional: frozenset[int] = frozenset()
+
+    def timeout_s(self, node: int) -> float:
+        """Return how long a node may take for an answer."""
+        longest = _OPTIONAL_TIMEOUT_S if node in self.optional else self.answer_timeout_s
+        return min(self.answer_timeout_s, longest)
+
+
+def parse_request(raw: object) -> BootRequest:
+    """Check a request as it comes from JSON. Raises RequestError."""
+    top = _mapping(raw, "request", _TOP)
+    bus = top.get("bus")
+    if not isinstance(bus, str) or not bus:
+        raise RequestError(f"bus: found {bus!r}, expected a name like can0 or unix:PATH")
+    nodes = top.get("nodes")
+    if not isinstance(nodes, list) or not nodes:
+        raise RequestError(f"nodes: found {nodes!r}, expected a list of at least one node")
+    profiles = tuple(_profile(node, f"nodes[{position}]") for position, node in enumerate(nodes))
+    numbers = [profile.node_id for profile in profiles]
+    master = _integer(top, "master_node", 1, 127, JTQD_NODE)
+    if len({*numbers, master}) != len(numbers) + 1:
+        raise RequestError(f"nodes: {numbers} and master {master}, expected different node numbers")
+    sync = _mapping(top.get("sync", {}), "sync", _SYNC)
+    settings = BusSettings(
+        master_node=master,
+        master_timeout_ms=_integer(top, "master_timeout_ms", 1, 0xFFFF, 500),
+        heartbeat_ms=_integer(top, "heartbeat_ms", 1, 0xFFFF, 100),
+        sync_cob_id=_integer(sync, "cob_id", 1, 0x7FF, SYNC_COB_ID),
+        counter_overflow=_optional_integer(sync, "counter_overflow", 0, 240),
+        error_behaviour=_optional_integer(top, "error_behaviour", 0, 2),
+    )
+    timeout = top.get("answer_timeout_s", 0.5)
+    if isinstance(timeout, bool) or not isinstance(timeout, int | float) or not 0 < timeout <= 60:
+        raise RequestError(f"answer_timeout_s: found {timeout!r}, expected seconds above 0 and at most 60")
+    own_eds = top.get("own_eds")
+    if own_eds is not None and not isinstance(own_eds, str):
+        raise RequestError(f"own_eds: found {own_eds!r}, expected a path")
+    optional = frozenset(
+        profile.node_id
+        for profile, node in zip(profiles, nodes, strict=True)
+        if not _boolean(node, "mandatory", default=True)
+    )
+    foreign = bool(sync.get("check_foreign", True))
+    return BootRequest(bus, profiles, settings, foreign, float(timeout), own_eds, optional)
+
+
+def _profile(raw: object, where: str) -> Profile:
+    node = _mapping(raw, where, _NODE)
+    number = _integer(node, "node", 1, 127, None, where=where)
+    identity = _identity(node.get("identity"), f"{where}.identity")
+    given = _given(node.get("given"), f"{where}.given")
+    kind = node.get("kind")
+    if kind == "drive":
+        temperature = _boolean(node, "temperature", default=False, where=where)
+        return DriveProfile(number, identity, given, temperature)
+    if kind != "sensor":
+        raise RequestError(f"{where}.kind: found {kind!r}, expected 'drive' or 'sensor'")
+    channels = node.get("channels", [1])
+    if channels not in ([1], [1, 2]):
+        raise RequestError(f"{where}.channels: found {channels!r}, expected [1] or [1, 2]")
+    return SensorProfile(number, identity, tuple(channels), given, _unit_words(node, where))
+
+
+def _identity(raw: object, where: str) -> Identity:
+    fields = set(asdict(Identity()))
+    mapping = dict(_mapping({} if raw is None else raw, where, fields))
+    software = mapping.pop("software", None)
+    if software is not None and not isinstance(software, str):
+        raise RequestError(f"{where}.software: found {software!r}, expected a text")
+    return Identity(**_integers(mapping, where, fields), software=software)
+
+
+def _given(raw: object, where: str) -> dict[Key, int]:
+    """Values by object: {"6091h:1": 100}."""
+    try:
+        return {parse_key(key): value for key, value in _integers(raw, where).items()}
+    except RequestError:
+        raise
+    except ValueError as error:
+        raise RequestError(f"{where}: {error}") from error
+
+
+def _unit_words(node: Mapping[str, Any], where: str) -> dict[int, float]:
+    words = _mapping(node.get("unit_words", {}), f"{where}.unit_words", None)
+    try:
+        return {int(word, 0): float(nm) for word, nm in words.items()}
+    except (TypeError, ValueError) as error:
+        raise RequestError(f"{where}.unit_words: {error}, expected words and Nm per unit") from error
+
+
+def _mapping(raw: object, where: str, known: set[str] | None) -> Mapping[str, Any]:
+    """A mapping with keys of `known` only; None: any."""
+    if not isinstance(raw, dict):
+        raise RequestError(f"{where}: found {raw!r}, expected a mapping")
+    unknown = sorted(set(raw) - known) if known is not None else []
+    if unknown:
+        raise RequestError(f"{where}: unknown key {unknown[0]!r}, expected one of {sorted(known or ())}")
+    return raw
+
+
+def _boolean(mapping: Mapping[str, Any], key: str, *, default: bool, where: str = "node") -> bool:
+    value = mapping.get(key, default)
+    if not isinstance(value, bool):
+        raise RequestError(f"{where}.{key}: found {value!r}, expected true or false")
+    return value
+
+
+def _integer(
+    mapping: Mapping[str, Any], key: str, low: int, high: int, default: int | None, *, where: str = ""
+) -> int:
+    value = mapping.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        path = f"{where}.{key}" if where else key
+        raise RequestError(f"{path}: found {value!r}, expected a whole number {low}..{high}")
+    return value
+
+
+def _optional_integer(mapping: Mapping[str, Any], key: str, low: int, high: int) -> int | None:
+    return None if mapping.get(key) is None else _integer(mapping, key, low, high, None)
+
+
+def _integers(raw: object, where: str, known: set[str] | None = None) -> dict[str, int]:
+    """A mapping of 32-bit numbers; null entries are left out."""
+    mapping = _mapping({} if raw is None else raw, where, known)
+    kept = {key: value for key, value in mapping.items() if value is not None}
+    return {key: _integer(kept, key, 0, 0xFFFF_FFFF, None, where=where) for key in kept}
+
+
+def node_report(node: BootedNode) -> dict[str, object]:
+    """Return one node of the report; `scaling` holds the fields of DriveScaling or SensorScaling."""
+    return {
+        "name": node.name,
+        "device_type": node.device_type,
+        "serial": node.serial,
+        "scaling": asdict(node.scaling),
+        "gear_ratio": node.gear_ratio,
+        "tpdos": [
+            {
+                "cob_id": pdo.cob_id,
+                "transmission_type": pdo.transmission_type,
+                "words": list(pdo.words),
+            }
+            for pdo in node.tpdos
+        ],
+        "configuration_sha256": node.configuration_sha256,
+        "signed": node.signed,
+        "watched": [list(each) for each in node.watched],
+        "notes": list(node.notes),
+    }
