@@ -69,7 +69,7 @@ class Definition:
         about: what it is about (`JOINT` .. `MACHINE`).
         severity: INFO, WARNING or ERROR of `jtqd.daemon.shared.notices`.
         text: one sentence in the present tense; {} takes the details.
-        ended: what the line at its end says, before "after 2.3 s".
+        ended: what the line at its end says, before "after 2.3 s"; "" where an event says so.
         topic: of the event that a line becomes (`jtqd.daemon.shared.notices.Notice`).
         emcy: of the EMCY messages of its begin and end; None: none.
         hold_s: a change that does not last so long is none.
@@ -150,7 +150,6 @@ _ROWS = (
         NODE,
         WARNING,
         "{}",
-        "configured as at the boot again",
         topic="boot",
         emcy=Emcy(emcy.NODE_CHANGED, emcy.MANUFACTURER),
     ),
@@ -321,7 +320,7 @@ class _State:
         self._unlogged, self._unlogged_s = 0, 0.0
         self._logged, self._not_before_s = False, -inf
         self._again = False
-        self._silent = False
+        self._texts: dict[str, float] = {}
 
     def update(self, reading: bool, now_s: float, since_s: float) -> bool:
         """Take a reading; True when the condition begins or ends with it."""
@@ -343,13 +342,19 @@ class _State:
         return True
 
     def describe(self, text: str, *, again: bool = False) -> None:
-        """Details that are known now; `again`: worth another line."""
-        self._again = self._again or (again and self.present and text != self.text)
+        """Take the text that holds now; `again`: worth another line."""
+        self._again = self._again or again
         self.text = text
 
     def no_end_line(self) -> None:
-        """It has ended because another condition took its place, whose line says so."""
-        self._logged, self._unlogged, self._unlogged_s = False, 0, 0.0
+        """Leave out the line that its end would have: another one says so."""
+        self._logged = self._again = False
+        self._unlogged, self._unlogged_s = 0, 0.0
+
+    def _may_repeat(self, now_s: float) -> bool:
+        """Another line about what is present: with details that no line had of late."""
+        self._texts = {text: at_s for text, at_s in self._texts.items() if now_s - at_s < QUIET_S}
+        return self._again and self.text not in self._texts
 
     def line(self, now_s: float) -> Line | None:
         """The line that is due, if any."""
@@ -358,11 +363,15 @@ class _State:
             return None
         may = now_s >= self._not_before_s
         if self.present:
-            if not may or (self._logged and not self._again):
+            if not (self._may_repeat(now_s) if self._logged else may):
                 return None
             self._logged, self._again, self._not_before_s = True, False, now_s + QUIET_S
+            self._texts[self.text] = now_s
             return Line(definition, self.subject, definition.severity, f"{self.subject.name}: {self.text}")
         if not self._unlogged or not (self._logged or may):
+            return None
+        if not definition.ended:
+            self.no_end_line()
             return None
         text = f"{self.subject.name}: {definition.ended} after {self._unlogged_s:.1f} s"
         if self._unlogged > 1:
@@ -370,7 +379,7 @@ class _State:
         if not self._logged:
             text += f": {self.text}"
             self._not_before_s = now_s + QUIET_S
-        self._logged, self._again, self._unlogged, self._unlogged_s = False, False, 0, 0.0
+        self.no_end_line()
         return Line(definition, self.subject, INFO, text)
 
 
@@ -394,7 +403,7 @@ class Conditions:
         details: str | Callable[[], str] = "",
         *,
         since_s: float | None = None,
-        log_changes: bool = False,
+        log_again: bool = False,
         superseded: bool = False,
     ) -> None:
         """Take what a part has observed; call it with every reading or with every change.
@@ -406,7 +415,7 @@ class Conditions:
             now_s: time of the observation.
             details: for the text's {}; a function is asked only where the text is needed.
             since_s: when it began or ended, where that is known better than by `now_s`.
-            log_changes: another text while it is present is worth another line.
+            log_again: although it is present already, these details are worth another line.
             superseded: it ended because another condition has taken its place: no line.
         """
         key = name, subject.name
@@ -418,7 +427,7 @@ class Conditions:
         changed = state.update(present, now_s, now_s if since_s is None else since_s)
         if state.present and present:
             text = details() if callable(details) else details
-            state.describe(state.definition.text.format(text), again=log_changes and not changed)
+            state.describe(state.definition.text.format(text), again=log_again and not changed)
         if not changed:
             return
         if superseded:
