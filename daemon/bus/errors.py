@@ -1,22 +1,19 @@
-"""Errors that the loop has counted or noted in the snapshot, as EMCY of jtqd and lines for the operator. Pure.
+"""Errors on the bus: state of the CAN controller, EMCY of the nodes, and jtqd's own EMCY with 1001h and 1003h. Pure.
 
-Deadlines and lengths of PDOs (`daemon/loop/input_pdos.py`), faults of the joints, another SYNC producer, lost frames.
+`BusState` follows the error messages of the controller's driver. `EmcyLog` keeps what the nodes report. `OwnErrors` is the
+view of jtqd's conditions (`jtqd.daemon.shared.conditions`) as a CANopen node shows it.
 """
 
 from __future__ import annotations
 
 import struct
 from collections import deque
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Iterable
 from math import inf
 from typing import NamedTuple
 
-from jtqd.daemon.config import Config
-from jtqd.daemon.loop.input_pdos import PdoWatch, watched_pdos
+from jtqd.daemon.shared.conditions import Change
 from jtqd.daemon.shared.log_lines import RateLimit
-from jtqd.daemon.shared.snapshot import View
-from jtqd.drivers import emcy
-from jtqd.drivers.devices import SYNC_COB_ID
 from jtqd.drivers.eds.own_objects import BUS_FIELDS
 from jtqd.drivers.emcy import COMMUNICATION, EMCY, GENERIC, NO_ERROR, Emergency, ErrorHistory, describe, parse
 from jtqd.drivers.object_dictionary import ObjectStore
@@ -217,6 +214,18 @@ class OwnErrors:
         self._queue: dict[Error, int] = {}  # errors with something to tell -> joints
         self._not_before = -inf
 
+    def follow(self, change: Change) -> None:
+        """Let a condition's error come or go with it; conditions without an EMCY code are passed over."""
+        emcy, subject = change.definition.emcy, change.subject
+        if emcy is None:
+            return
+        detail = emcy.detail + subject.number
+        if change.present:
+            joints = subject.joints if emcy.names_joints else 0
+            self.come(emcy.code, detail, joints=joints, register=emcy.register)
+        else:
+            self.gone(emcy.code, detail)
+
     def present(self, code: int, detail: int = 0) -> bool:
         """It has come and not gone."""
         return (code, detail) in self._present
@@ -282,83 +291,3 @@ class OwnErrors:
         for bits, _ in self._present.values():
             register |= bits
         return register
-
-
-_QUIET_S = 1.0
-"""An error that shows by a counter is over when the counter has stood still for so long."""
-_OVERRUN_RX, _OVERRUN_TX = 1, 2
-
-
-class LoopErrors:
-    """Call `watch` with each reading of the snapshot.
-
-    Args:
-        config: in force.
-        errors: where they come and go.
-        say: takes topic, node and line for the operator.
-    """
-
-    def __init__(self, config: Config, errors: OwnErrors, say: Callable[[str, int, str], None]) -> None:
-        self._config, self._errors, self._say = config, errors, say
-        self._pdos = PdoWatch(watched_pdos(config))
-        self._limit = RateLimit()
-        self._counted: dict[str, int] = {}
-        self._counter_until: dict[tuple[int, int], float] = {}
-
-    def watch(self, view: View, absent: Collection[int], now_s: float) -> bool:
-        """True when the loop's calls have met an interface that is down; PDOs of `absent` nodes are not missed."""
-        self._watch_pdos(view, absent, now_s)
-        self._watch_counters(view, now_s)
-        self._watch_faults(view)
-        return self._rose(view, "bus_errors")
-
-    def _watch_pdos(self, view: View, absent: Collection[int], now_s: float) -> None:
-        for code, pdo, present in self._pdos.events(view.inputs, absent, now_s):
-            if not present:
-                self._errors.gone(code, pdo.cob_id)
-                continue
-            new = self._errors.come(code, pdo.cob_id, joints=pdo.joints)
-            # What is missing the operator is told by joint (`daemon/supervisor/health.py`).
-            if (
-                new
-                and code != emcy.PDO_TIMEOUT
-                and self._limit.may_say((code, pdo.cob_id), now_s) is not None
-            ):
-                self._say("pdo", pdo.node, f"{pdo.name}: {emcy.name_of(code)} ({code:04X}h): it is not used")
-
-    def _watch_faults(self, view: View) -> None:
-        """EMCY of the joints' faults; the operator is told by `daemon/supervisor/health.py`."""
-        for n, (joint, seen) in enumerate(zip(self._config.joints, view.joints, strict=True)):
-            for code, bits in (
-                (emcy.JOINT_FAULT, seen.input_flags >> 8 | seen.latched),
-                (emcy.FAULT_LATCHED, seen.latched),
-            ):
-                if bits:
-                    self._errors.come(code, joint.node_id, joints=1 << n, register=emcy.MANUFACTURER)
-                else:
-                    self._errors.gone(code, joint.node_id)
-
-    def _watch_counters(self, view: View, now_s: float) -> None:
-        """Errors that show by a counter of the loop."""
-        foreign = "another SYNC producer: no input of its cycles is used"
-        self._counter_error(view, "foreign_sync", emcy.COB_ID_COLLISION, SYNC_COB_ID, foreign, now_s)
-        lost = "received frames were lost: the loop's socket was read too late"
-        self._counter_error(view, "rx_dropped", emcy.CAN_OVERRUN, _OVERRUN_RX, lost, now_s)
-        full = "frames could not be sent: the transmit queue is full"
-        self._counter_error(view, "tx_dropped", emcy.CAN_OVERRUN, _OVERRUN_TX, full, now_s)
-
-    def _rose(self, view: View, name: str) -> bool:
-        value = view.counters[name]
-        before, self._counted[name] = self._counted.get(name, 0), value
-        return value > before
-
-    def _counter_error(  # noqa: PLR0917 - a table row
-        self, view: View, name: str, code: int, detail: int, text: str, now_s: float
-    ) -> None:
-        error = code, detail
-        if self._rose(view, name):
-            self._counter_until[error] = now_s + _QUIET_S
-            if self._errors.come(code, detail, joints=3) and self._limit.may_say(error, now_s) is not None:
-                self._say("sync" if name == "foreign_sync" else "bus", 0, f"bus: {text}")
-        elif now_s >= self._counter_until.get(error, 0.0):
-            self._errors.gone(code, detail)

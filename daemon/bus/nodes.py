@@ -40,11 +40,16 @@ _OTHERS = 16
 
 
 class NodeEvent(NamedTuple):
-    """Something to tell. `kind`: lost, never, back, restarted, state, doubled, malformed, foreign; `line` may be None."""
+    """Something that has happened to a node.
+
+    `kind`: lost, never, back, doubled and single begin and end conditions, with details in `text`; restarted, state,
+    malformed and foreign are events with a whole line, or "" where there were too many of late. `since_s`: when.
+    """
 
     kind: str
     node: int
-    line: str | None
+    text: str
+    since_s: float
 
 
 class _Watch:
@@ -121,10 +126,7 @@ class NodeWatch:
                 self._event("restarted", node, watch, now_s, lambda: "it has restarted (boot-up message)")
             )
         elif watch.state == LOST:
-            away = now_s - watch.lost_s
-            events.append(
-                self._event("back", node, watch, now_s, lambda: f"heartbeat is back after {away:.1f} s")
-            )
+            events.append(NodeEvent("back", node, "", now_s))
         if watch.state in (WAITING, LOST):
             watch.state = ACTIVE
         if data[0] and watch.said is not None and data[0] != watch.said:
@@ -149,9 +151,8 @@ class NodeWatch:
             watch.state, watch.lost_s = LOST, max(watch.heard_s, watch.since_s)
             watch.window.clear()
             self.lost_count += 1
-            what = "no heartbeat at all" if never else "no heartbeat"
-            text = f"{what} for {self._timeout_s:g} s"
-            events.append(self._event("never" if never else "lost", node, watch, now_s, partial(str, text)))
+            kind, text = ("never", " since its boot") if never else ("lost", "")
+            events.append(NodeEvent(kind, node, f"{self._timeout_s:g} s{text}", watch.lost_s))
         return events
 
     def _rate(self, node: int, watch: _Watch, now_s: float) -> list[NodeEvent]:
@@ -167,10 +168,8 @@ class NodeWatch:
         if doubled == watch.doubled:
             return []
         watch.doubled = doubled
-        if not doubled:
-            return [NodeEvent("single", node, None)]
-        text = f"{_WINDOW} heartbeats in {passed:.1f} s: are there two nodes with this node-ID?"
-        return [self._event("doubled", node, watch, now_s, lambda: text)]
+        text = f"{_WINDOW} heartbeats in {passed:.1f} s" if doubled else ""
+        return [NodeEvent("doubled" if doubled else "single", node, text, now_s)]
 
     def _foreign(self, node: int, data: bytes) -> list[NodeEvent]:
         """CiA 302-2, status A: not in the network list. Said once."""
@@ -178,16 +177,15 @@ class NodeWatch:
             return []
         self._known.add(node)
         line = f"node {node}: it is on the bus and not in the configuration (status A)"
-        return [NodeEvent("foreign", node, line)]
+        return [NodeEvent("foreign", node, line, 0.0)]
 
     @staticmethod
     def _event(kind: str, node: int, watch: _Watch, now_s: float, text: Callable[[], str]) -> NodeEvent:
         unsaid = watch.limit.may_say(kind, now_s)
         if unsaid is None:
-            return NodeEvent(kind, node, None)
-        return NodeEvent(
-            kind, node, f"node {node}: {text()}" + (f" ({unsaid} more before)" if unsaid else "")
-        )
+            return NodeEvent(kind, node, "", now_s)
+        line = f"node {node}: {text()}" + (f" ({unsaid} more before)" if unsaid else "")
+        return NodeEvent(kind, node, line, now_s)
 
 
 # Is a node still configured as it was at its boot? Its objects are read again in service, one at a time. Pure.
@@ -329,7 +327,7 @@ class NodeCare:
         say: takes topic, node and line for the operator.
 
     Attributes:
-        changed: nodes that were found to be configured otherwise and have not been configured since.
+        changed: nodes that were found to be configured otherwise and have not been configured since, with what was found.
     """
 
     def __init__(
@@ -348,7 +346,7 @@ class NodeCare:
         self._others_until: dict[int, float] = {}
         self._check_due = self._probe_due = self._boot_ended = 0.0
         self._check_turn = 0
-        self.changed: set[int] = set()
+        self.changed: dict[int, str] = {}
 
     @property
     def busy(self) -> int:
@@ -376,7 +374,7 @@ class NodeCare:
 
     def configured(self, node: int, report: dict[str, Any], now_s: float) -> None:
         """The node has been booted, with its part of the boot report."""
-        self.changed.discard(node)
+        self.changed.pop(node, None)
         self._heartbeats.watch(node, now_s)
         self._checks[node] = ConfigurationWatch(report)
 
@@ -463,12 +461,13 @@ class NodeCare:
         finding = watch.result(result.value, result.refusal)
         if finding is None:
             return
-        self._say("boot", node, f"node {node}: {finding.text}")
-        if finding.changed:
-            del self._checks[node]
-            self.changed.add(node)
-            self._reader.note_doubt(node)
-            self._returning.request(node, finding.text)
+        if not finding.changed:
+            self._say("boot", node, f"node {node}: {finding.text}")
+            return
+        del self._checks[node]
+        self.changed[node] = finding.text
+        self._reader.note_doubt(node)
+        self._returning.request(node, finding.text)
 
 
 def _nothing(_result: SdoResult) -> None:

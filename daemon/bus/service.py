@@ -19,15 +19,16 @@ from jtqd.daemon.bus.errors import (
     DOWN,
     PASSIVE,
     STATE_NAMES,
+    WARNING,
     BusChange,
     BusState,
     EmcyLog,
-    LoopErrors,
     OwnErrors,
 )
 from jtqd.daemon.bus.nodes import NodeCare, NodeEvent, NodeWatch
 from jtqd.daemon.bus.own_node import OwnNode
 from jtqd.daemon.config import Config
+from jtqd.daemon.shared.conditions import THE_BUS, Conditions, Subject
 from jtqd.daemon.shared.log_lines import RateLimit
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.drivers import emcy
@@ -102,6 +103,18 @@ _BATCHES = 8
 _REPORT_S = 0.5
 _NMT = {1: "start", 2: "stop", 128: "enter pre-operational", 129: "reset node", 130: "reset communication"}
 
+_BUS_CONDITIONS = {WARNING: "bus_warning", PASSIVE: "bus_passive", BUS_OFF: "bus_off", DOWN: "bus_down"}
+_NODE_CONDITIONS = {
+    "lost": ("node_lost", True),
+    "never": ("node_lost", True),
+    "back": ("node_lost", False),
+    "restarted": ("node_lost", False),
+    "doubled": ("node_doubled", True),
+    "single": ("node_doubled", False),
+}
+"""What an event of `NodeWatch` begins or ends."""
+_NODE_LINES = ("restarted", "state", "malformed", "foreign")
+
 Say = Callable[[str, int, str], None]
 
 
@@ -130,8 +143,9 @@ class BusService:
         reader: snapshot of the loop.
         store: object dictionary of the own node.
         returning: boots nodes in service.
-        say: takes topic, node and line for the operator.
-        directory: where `bus_report.FILE` is kept up to date; None: nowhere.
+        conditions: take what is observed here; each change of one that has a code is an EMCY.
+        say: takes topic, node and line of an event.
+        directory: where `bus.json` is kept up to date; None: nowhere.
     """
 
     def __init__(
@@ -143,12 +157,15 @@ class BusService:
         reader: SnapshotReader,
         store: ObjectStore,
         returning: ReturningNodes,
+        conditions: Conditions,
         say: Say,
         directory: Path | None = None,
     ) -> None:
         self.socket = socket
-        self._config, self._say = config, say
-        self._nodes = nodes = nodes_of(config)
+        self._config, self._say, self._conditions = config, say, conditions
+        nodes = nodes_of(config)
+        joints = {joint.node_id: 1 << n for n, joint in enumerate(config.joints)}
+        self._subjects = {node: Subject(f"node {node}", node, joints.get(node, 0), node) for node in nodes}
         self.bus, self.emergencies = BusState(), EmcyLog(nodes)
         self.heartbeats = NodeWatch(
             tuple(nodes),
@@ -157,6 +174,7 @@ class BusService:
             config.heartbeat_timeout_ms * 1e-3,
         )
         self.errors = OwnErrors(store)
+        conditions.subscribe(self.errors.follow)
         self.own = OwnNode(store, config, reader)
         self.own.bus, self.own.nodes, self.own.emergencies = (
             self.bus.values,
@@ -164,12 +182,12 @@ class BusService:
             self._emergency,
         )
         self.care = NodeCare(nodes, reader, returning, self.heartbeats, say)
-        self._loop = LoopErrors(config, self.errors, say)
         self._limit = RateLimit()
         self._report_due = 0.0
         self._view = reader.read()
         self.foreign_nmt = 0
         self._heard = False
+        self._refused_calls = 0
         self._report = None if directory is None else BusReport(directory)
         self._first = report
 
@@ -200,12 +218,14 @@ class BusService:
             self._bus_change(self.bus.down(), now_s)
         self.own.watch(view.cycle)
         if all_taken:
-            self._node_events(self.heartbeats.tick(now_s))
-        failed = self._loop.watch(view, self.care.absent, now_s)
-        if failed and not self._heard:
+            self._node_events(self.heartbeats.tick(now_s), now_s)
+        refused, self._refused_calls = self._refused_calls, view.counters["bus_errors"]
+        if self._refused_calls > refused and not self._heard:
             self._bus_change(self.bus.down(), now_s)
         requests = self.care.turn(view, now_s)
-        self._node_changes()
+        for node, subject in self._subjects.items():
+            text = self.care.changed.get(node)
+            self._conditions.update("node_changed", subject, text is not None, now_s, text or "")
         with suppress(BusDown):
             for node, request in requests:
                 self.socket.send(pack(0x600 + node, request))
@@ -244,7 +264,7 @@ class BusService:
         if can_id == 0x600 + self._config.node_id:
             self._on_request(data)
         elif can_id >= 0x700:
-            self._node_events(self.heartbeats.receive(can_id - 0x700, data, now_s))
+            self._node_events(self.heartbeats.receive(can_id - 0x700, data, now_s), now_s)
         elif can_id >= 0x600:
             self.care.on_foreign_request(can_id - 0x600, now_s)
         elif can_id >= 0x580:
@@ -264,6 +284,10 @@ class BusService:
         line = self.emergencies.receive(node, data, now_s)
         if line is not None:
             self._say("emcy", node, line)
+        last, subject = self.emergencies.last(node), self._subjects.get(node)
+        if last is not None and subject is not None:
+            error = last.code != emcy.NO_ERROR or last.register != 0
+            self._conditions.update("node_error", subject, error, now_s, describe(last))
 
     def _on_nmt(self, data: bytes, now_s: float) -> None:
         """jtqd is the NMT master; a command that is not of its own boots comes from somebody else."""
@@ -280,45 +304,31 @@ class BusService:
             return
         before, after = change
         counts = self.bus.counts
-        if after == PASSIVE:
-            self.errors.come(emcy.CAN_PASSIVE)
-        elif before == PASSIVE:
-            self.errors.gone(emcy.CAN_PASSIVE)
+        numbers = f"TEC {counts['tx_errors']}, REC {counts['rx_errors']}"
+        detail = f" ({numbers})" if counts["tx_errors"] or counts["rx_errors"] else ""
+        for state, name in _BUS_CONDITIONS.items():
+            text = f"{STATE_NAMES[before]}{detail}"
+            superseded = after != ACTIVE
+            self._conditions.update(name, THE_BUS, state == after, now_s, text, superseded=superseded)
         if before == BUS_OFF and after == ACTIVE:
             self.errors.happened(emcy.BUS_OFF_RECOVERED)
-        if self._limit.may_say(("bus", before, after), now_s) is not None:
-            numbers = f"TEC {counts['tx_errors']}, REC {counts['rx_errors']}"
-            detail = f" ({numbers})" if counts["tx_errors"] or counts["rx_errors"] else ""
-            self._say("bus", 0, f"bus: {STATE_NAMES[after]}, before: {STATE_NAMES[before]}{detail}")
 
     # Nodes ----------------------------------------------------------------------------------------------------------------
 
-    def _node_events(self, events: list[NodeEvent]) -> None:
-        for kind, node, line in events:
-            if kind in ("lost", "never"):
-                self.errors.come(emcy.HEARTBEAT_LOST, node, joints=self._joints_of(node))
-            elif kind == "back":
-                self.errors.gone(emcy.HEARTBEAT_LOST, node)
-            elif kind == "doubled":
-                self.errors.come(emcy.COB_ID_COLLISION, 0x700 + node)
-            elif kind == "single":
-                self.errors.gone(emcy.COB_ID_COLLISION, 0x700 + node)
+    def _node_events(self, events: list[NodeEvent], now_s: float) -> None:
+        for kind, node, text, since_s in events:
             if kind == "restarted":
                 self.care.restarted(node)
-                self.errors.gone(emcy.HEARTBEAT_LOST, node)
-            if line is not None and not (kind in ("restarted", "state") and node == self.care.busy):
-                self._say("heartbeat", node, line)
-
-    def _node_changes(self) -> None:
-        for node in self._nodes:
-            if node in self.care.changed:
-                joints = self._joints_of(node)
-                self.errors.come(emcy.NODE_CHANGED, node, joints=joints, register=emcy.MANUFACTURER)
-            else:
-                self.errors.gone(emcy.NODE_CHANGED, node)
-
-    def _joints_of(self, node: int) -> int:
-        return sum(1 << n for n, joint in enumerate(self._config.joints) if joint.node_id == node)
+            if kind in _NODE_CONDITIONS:
+                name, present = _NODE_CONDITIONS[kind]
+                subject = self._subjects[node]
+                self._conditions.update(name, subject, present, now_s, text, since_s=since_s)
+            if (
+                kind in _NODE_LINES
+                and text
+                and not (kind in ("restarted", "state") and node == self.care.busy)
+            ):
+                self._say("heartbeat", node, text)
 
     # What the own node shows ----------------------------------------------------------------------------------------------
 

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from jtqd.daemon.bus.boot import boot_request, bus_load_of
 from jtqd.daemon.cli.checks import FAIL, GOOD, SKIP, WARN, CheckResult, as_json, exit_status, share, show
-from jtqd.daemon.cli.reading import NMT_STATES, Daemon, find_daemons, on_bus
+from jtqd.daemon.cli.reading import Daemon, find_daemons, on_bus
 from jtqd.daemon.cli.traffic import (
     SYNC,
     NodeCount,
@@ -35,6 +35,7 @@ from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.loop import realtime
 from jtqd.daemon.loop.realtime import stolen_s
 from jtqd.daemon.shared.child_process import Child, ChildError
+from jtqd.daemon.shared.reasons import NMT_STATES
 from jtqd.daemon.shared.snapshot import LATE_BIN_NS, SnapshotError, SnapshotReader, View
 from jtqd.drivers.bus_load import LIMIT
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_SFF_MASK

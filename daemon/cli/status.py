@@ -20,20 +20,17 @@ from rich.text import Text
 
 from jtqd.daemon.cli.checks import NOTHING, duration, histogram, number, share, size
 from jtqd.daemon.cli.reading import (
-    NMT_STATES,
     RUNNING,
     CurrentLog,
     Daemon,
     Found,
     Reading,
     Watch,
-    drive_state,
     find_daemons,
     on_bus,
-    reason,
-    silent_s,
 )
 from jtqd.daemon.shared.notices import ERROR, WARNING, Notice
+from jtqd.daemon.shared.reasons import NMT_STATES, drive_state, joint_reason, silent_s
 from jtqd.daemon.shared.runtime_dir import About
 from jtqd.daemon.shared.snapshot import BUS_COUNTERS, LATE_BIN_NS, WORK_BIN_NS, SnapshotReader, View
 from jtqd.daemon.supervisor.table import COLOURS, bus_load, plain_line
@@ -134,7 +131,7 @@ def _joint(reading: Reading, number: int) -> dict[str, Any]:
         "joint": number,
         "name": about.joints[n].name,
         "status": NAMES.get(seen.status, str(seen.status)),
-        "reason": reason(about, number, view, earlier) or None,
+        "reason": joint_reason(about, number, view, earlier) or None,
         "since_s": (view.cycle - view.status_since[n]) * view.period_s,
         "torque_nm": _number(seen.torque_nm if known else nan),
         "sigma_nm": _number(seen.sigma_nm if known else nan),
@@ -290,7 +287,7 @@ def _joints(about: About, view: View, *, still: bool) -> Columns:
 def _reasons(about: About, view: View, earlier: View) -> Iterator[Text]:
     """Always a line for each joint, so that the picture does not jump."""
     for joint, seen, since in zip(about.joints, view.joints, view.status_since, strict=True):
-        why = reason(about, joint.number, view, earlier)
+        why = joint_reason(about, joint.number, view, earlier)
         name = NAMES.get(seen.status, str(seen.status))
         lasting = duration((view.cycle - since) * view.period_s)
         yield Text.assemble(

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from math import nan
-from typing import NamedTuple
 
 from jtqd.daemon.config import Config
-from jtqd.daemon.shared.snapshot import InputView
+from jtqd.daemon.shared.cycle_record import TEMPERATURE_LIFE_S
 from jtqd.drivers.devices import (
     NOT_MEASURED,
     TEMPERATURE_C_PER_UNIT,
@@ -19,7 +17,6 @@ from jtqd.drivers.devices import (
     sensor_tpdo1,
     sensor_tpdo2,
 )
-from jtqd.drivers.emcy import PDO_LONG, PDO_SHORT, PDO_TIMEOUT
 from jtqd.drivers.pdo import PdoMap
 
 # What the intake knows of one synchronous input PDO: its frame of this cycle, its debt, and when it usually comes. Pure.
@@ -128,15 +125,13 @@ class InputState:
             self.band_high_ns -= int((self.band_high_ns - delay_ns) * _BAND_LEAK)
 
 
-# Temperature of one joint: what its drive told last by TPDO3, for as long as that is worth something. Pure.
+# Temperature of one joint: what its drive sent last by TPDO3, for as long as that is worth something. Pure.
 #
 # TPDO3 comes by an event timer, not with SYNC, so it belongs to no cycle: a value holds from the cycle that took its frame
-# until the next one, or until it is LIFE_S old. Its age is counted in slots and not by stamps, because CLOCK_REALTIME may be
-# stepped, and so that the frames and cycle numbers of a log alone say what each cycle had.
+# until the next one, or until it is TEMPERATURE_LIFE_S old. Its age is counted in slots and not by stamps, because
+# CLOCK_REALTIME may be stepped, and so that the frames and cycle numbers of a log alone say what each cycle had.
 
 
-LIFE_S = 2.0
-"""Four frames in a row are missing then; a joint needs minutes to become noticeably warmer."""
 _NEVER = 1 << 62
 _FIELD = struct.Struct("<h")
 
@@ -191,82 +186,6 @@ UNKNOWN = JointTemperature(0, 0, "none", 0)
 """Of a joint whose drive tells none."""
 
 
-# Deadline and length of each input PDO, from the loop's counts: errors 8250h, 8210h and 8220h, each by itself. Pure.
-#
-# The loop decides per cycle; this says what lasts. A PDO has timed out (8250h) when it brought no valid input for
-# `TIMEOUT_CYCLES` cycles in a row, and is back with the next valid one. A frame of a wrong length is never used: a short
-# one cannot be (8210h), and of a longer one CiA 301 allows to take the first bytes (8220h), but a node that sends another
-# length than was configured has lost its mapping, and then the first bytes are not what we think they are. These errors
-# are over when none came for `LENGTH_S`.
-
-
-TIMEOUT_CYCLES = 20
-LENGTH_S = 1.0
-
-
-class WatchedPdo(NamedTuple):
-    """One input PDO: identifier, producer, name for people, and the joints that need it (bit 0 joint 1, bit 1 joint 2)."""
-
-    cob_id: int
-    node: int
-    name: str
-    joints: int
-
-
-class PdoEvent(NamedTuple):
-    """An error has come (`present`) or gone."""
-
-    code: int
-    pdo: WatchedPdo
-    present: bool
-
-
-class _State:
-    def __init__(self) -> None:
-        self.missed = -1  # nothing has been read yet
-        self.in_a_row = 0
-        self.short = self.long = 0
-        self.timed_out = False
-        self.until = {PDO_SHORT: 0.0, PDO_LONG: 0.0}
-        self.present = {PDO_SHORT: False, PDO_LONG: False}
-
-
-class PdoWatch:
-    """Call `events` with each reading of the snapshot; `pdos` in the order of the snapshot's inputs."""
-
-    def __init__(self, pdos: Sequence[WatchedPdo]) -> None:
-        self._pdos = [(pdo, _State()) for pdo in pdos]
-
-    def events(self, inputs: Sequence[InputView], absent: Collection[int], now_s: float) -> list[PdoEvent]:
-        """What has come or gone; PDOs of `absent` nodes (optional ones) are not missed."""
-        told: list[PdoEvent] = []
-        for (pdo, state), seen in zip(self._pdos, inputs, strict=False):
-            # A loss between two readings, over by now, counts too, with what the last reading saw of it.
-            missed = 0 if state.missed < 0 else seen.missed - state.missed
-            if missed:
-                missed += state.in_a_row
-            state.missed, state.in_a_row = seen.missed, seen.in_a_row
-            expected = pdo.node not in absent
-            timed_out = seen.in_a_row >= TIMEOUT_CYCLES and expected
-            if timed_out != state.timed_out:
-                told.append(PdoEvent(PDO_TIMEOUT, pdo, timed_out))
-            elif not timed_out and missed - seen.in_a_row >= TIMEOUT_CYCLES and expected:
-                told += [PdoEvent(PDO_TIMEOUT, pdo, True), PdoEvent(PDO_TIMEOUT, pdo, False)]
-            state.timed_out = timed_out
-            for code, count, before in (
-                (PDO_SHORT, seen.short, state.short),
-                (PDO_LONG, seen.long, state.long),
-            ):
-                if count != before:
-                    state.until[code] = now_s + LENGTH_S
-                present = now_s < state.until[code]
-                if present != state.present[code]:
-                    told.append(PdoEvent(code, pdo, present))
-                    state.present[code] = present
-            state.short, state.long = seen.short, seen.long
-        return told
-
-
 def input_pdos(config: Config) -> list[InputPdo]:
     """Expected PDOs: both TPDOs of each drive, then one per sensor channel in use."""
 
@@ -285,15 +204,6 @@ def input_pdos(config: Config) -> list[InputPdo]:
     return pdos
 
 
-def watched_pdos(config: Config) -> list[WatchedPdo]:
-    """The same PDOs as `input_pdos`, in the same order, with the joints that cannot do without."""
-    joints = {joint.node_id: 1 << n for n, joint in enumerate(config.joints)}
-    return [
-        WatchedPdo(pdo.cob_id, pdo.node_id, pdo.name, joints.get(pdo.node_id, 0))
-        for pdo in input_pdos(config)
-    ]
-
-
 def sensor_index(config: Config, channel: int | None) -> int | None:
     """Index of a sensor channel's PDO among them; None without channel or sensor."""
     if channel is None or config.sensor is None:
@@ -303,7 +213,7 @@ def sensor_index(config: Config, channel: int | None) -> int | None:
 
 def joint_temperatures(config: Config) -> list[JointTemperature]:
     """Temperature of each joint whose drive tells one, in the order of the joints; all unknown yet."""
-    life = round(LIFE_S * 1e9 / config.period_ns)
+    life = round(TEMPERATURE_LIFE_S * 1e9 / config.period_ns)
     return [
         JointTemperature(cob_id, node, f"{cob_id:03X}h drive {node} TPDO3", life)
         for node, cob_id in (

@@ -14,6 +14,7 @@ from jtqd.daemon.loop.joint_status import (
     JointRules,
     JointSafety,
 )
+from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_POSITION, FLAG_SENSOR, FLAG_TEMPERATURE
 from jtqd.estimator import status as st
 from jtqd.estimator.methods import AnyEstimator
 
@@ -47,8 +48,6 @@ class Unwrap:
 
 STAMP_ACCURACY_NS = 5_000
 """Kernel software stamps differ by a few us from the time on the wire."""
-FLAG_POSITION, FLAG_MOTION, FLAG_SENSOR, FLAG_TEMPERATURE = 1, 2, 4, 8
-"""`input_flags` of record and snapshot: TPDO1, TPDO2 and the sensor's PDO are of this cycle; the temperature is known."""
 _PUBLISHED, _STANDSTILL, _field = estimate_pdo.PUBLISHED_STATUSES, st.STANDSTILL, estimate_pdo.field
 
 

@@ -23,6 +23,7 @@ from typing import Any, Final, Protocol
 
 from jtqd.daemon.config import Config, SafetySettings
 from jtqd.daemon.shared import cycle_record as faults
+from jtqd.daemon.shared.cycle_record import FLAG_LATCHED, FLAG_NETWORK_SKIPPED
 from jtqd.daemon.shared.snapshot import COUNTERS
 from jtqd.estimator import status as st
 from jtqd.estimator.joint import Joint
@@ -235,10 +236,6 @@ def _worse(a: int, b: int) -> int:
 
 # What one joint counts: why its network was dropped, its faults, and its squared errors against the sensor.
 
-
-FLAG_NETWORK_SKIPPED, FLAG_LATCHED = 0x10, 0x20
-"""Bits of `input_flags`: no time for the network; a fault is latched. Bits 8 to 15: low byte of
-`daemon/shared/cycle_record.py`."""
 
 _FALLBACKS, _LATCHES = COUNTERS.index("network_fallbacks"), COUNTERS.index("latches")
 _NOT_FINITE, _FAR, _OUTSIDE, _NO_TIME = (

@@ -22,8 +22,6 @@ from typing import Any
 from jtqd.daemon.loop import realtime
 from jtqd.daemon.loop.cycle import Cycle
 from jtqd.daemon.loop.estimate_pdo import PUBLISHED_STATUSES
-from jtqd.daemon.loop.joint import FLAG_MOTION, FLAG_POSITION
-from jtqd.daemon.loop.joint_status import FLAG_NETWORK_SKIPPED
 from jtqd.daemon.loop.process import (
     Stop,
     answer,
@@ -37,6 +35,7 @@ from jtqd.daemon.loop.process import (
 )
 from jtqd.daemon.reload.handover import Refused, Taker
 from jtqd.daemon.shared import cycle_record as cr
+from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_NETWORK_SKIPPED, FLAG_POSITION
 from jtqd.daemon.shared.ring import RingError, RingReader
 from jtqd.daemon.shared.snapshot import SnapshotError
 from jtqd.drivers.frame_socket import BusDown, open_frame_socket

@@ -20,19 +20,14 @@ from jtqd.daemon.loop import estimate_pdo
 from jtqd.daemon.loop.cycle import STARTING_CYCLES
 from jtqd.daemon.loop.input_pdos import JointTemperature, input_pdos, joint_temperatures
 from jtqd.daemon.loop.intake import Intake
-from jtqd.daemon.loop.joint import FLAG_TEMPERATURE, JointCycle
-from jtqd.daemon.loop.joint_status import (
-    FLAG_LATCHED,
-    FLAG_NETWORK_SKIPPED,
-    JointSafety,
-    JointStatus,
-    drive_status,
-)
+from jtqd.daemon.loop.joint import JointCycle
+from jtqd.daemon.loop.joint_status import JointSafety, JointStatus, drive_status
 from jtqd.daemon.replay.frames import Frames, Pdo, offsets
 from jtqd.daemon.replay.origin import SAMPLE, Origin
 from jtqd.daemon.replay.runs import Steps
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared import cycle_record as faults
+from jtqd.daemon.shared.cycle_record import FLAG_LATCHED, FLAG_NETWORK_SKIPPED, FLAG_TEMPERATURE
 from jtqd.daemon.shared.snapshot import COUNTERS
 from jtqd.estimator.arrays import CodeArray, FloatArray, RecordArray
 from jtqd.estimator.joint import Joint

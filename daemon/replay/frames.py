@@ -15,8 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from jtqd.daemon.loop.input_pdos import InputPdo, input_pdos, joint_temperatures
-from jtqd.daemon.loop.joint import FLAG_MOTION, FLAG_POSITION, FLAG_SENSOR, JointInputs
+from jtqd.daemon.loop.joint import JointInputs
 from jtqd.daemon.replay.origin import Origin
+from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_POSITION, FLAG_SENSOR
 from jtqd.estimator.arrays import BoolArray, FloatArray, IntegerArray, RecordArray
 
 _ESTIMATE_LENGTH = 8

@@ -20,8 +20,8 @@ from jtqd.daemon.config import Config
 from jtqd.daemon.logs.errors import LogError
 from jtqd.daemon.logs.log_file import LogFile
 from jtqd.daemon.logs.reader import iter_messages, iter_topics, read_attachments, read_topic, read_topics
-from jtqd.daemon.loop.joint import FLAG_MOTION, FLAG_POSITION
 from jtqd.daemon.replay.origin import FRAMES, JOINT, Origin, check_fields, open_origin
+from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_POSITION
 from jtqd.estimator.arrays import RecordArray
 
 # Where the state of an estimator is known and where it is not: a log may begin in the middle, or have lost cycles. Pure.

@@ -48,6 +48,13 @@ FLAG_WITHDRAWN = 0x10
 FLAG_RESET = 0x20
 """Latched faults were reset just before this cycle's estimate (`JointCycle.reset_latch`)."""
 
+FLAG_POSITION, FLAG_MOTION, FLAG_SENSOR, FLAG_TEMPERATURE = 1, 2, 4, 8
+"""`input_flags` of record and snapshot: TPDO1, TPDO2 and the sensor's PDO are of this cycle; the temperature is known."""
+FLAG_NETWORK_SKIPPED, FLAG_LATCHED = 0x10, 0x20
+"""... no time for the network; a fault is latched. Bits 8 to 15: low byte of the faults below."""
+TEMPERATURE_LIFE_S = 2.0
+"""Four frames in a row are missing then; a joint needs minutes to become noticeably warmer."""
+
 
 class Header(NamedTuple):
     """Times in integer ns; `cycle` counts cycles since the start, missed slots included."""

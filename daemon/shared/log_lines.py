@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping
 from math import inf
 from typing import TextIO
 
+from jtqd.daemon.shared.notices import ERROR as NOTICE_ERROR
+from jtqd.daemon.shared.notices import INFO as NOTICE_INFO
 from jtqd.daemon.shared.notices import WARNING as NOTICE_WARNING
 from jtqd.daemon.shared.notices import Notices
 
@@ -54,6 +56,8 @@ class RateLimit:
 
 ERROR, WARNING, NOTICE, INFO = 3, 4, 5, 6
 """Priorities of syslog(3)."""
+_PRIORITIES = {NOTICE_INFO: NOTICE, NOTICE_WARNING: WARNING, NOTICE_ERROR: ERROR}
+"""Of the levels of a notice."""
 BURST, WINDOW_S = 5, 30.0
 
 
@@ -121,8 +125,8 @@ class Teller:
         self._say = say
         self.notices: Notices | None = None
 
-    def __call__(self, topic: str, node: int, line: str, kind: str = "") -> None:
-        """One line; `topic` and `node` as in `notices.Notice`, `kind` as in `Say`."""
-        self._say(line, WARNING, kind)
+    def __call__(self, topic: str, node: int, line: str, kind: str = "", level: int = NOTICE_WARNING) -> None:
+        """One line; `topic`, `node` and `level` as in `notices.Notice`, `kind` as in `Say`."""
+        self._say(line, _PRIORITIES[level], kind)
         if self.notices is not None:
-            self.notices.add(NOTICE_WARNING, topic, node, line)
+            self.notices.add(level, topic, node, line)

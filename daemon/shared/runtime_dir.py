@@ -10,7 +10,6 @@ import fcntl
 import hashlib
 import json
 import os
-import platform
 import re
 import time
 from contextlib import suppress
@@ -18,9 +17,6 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
-
-from jtqd.daemon.config import Config, JointConfig
-from jtqd.daemon.loop.input_pdos import input_pdos, sensor_index
 
 _LOCK = "lock"
 _ATTEMPTS = 100
@@ -127,7 +123,6 @@ def instance_name(bus: str) -> str:
 
 FILE = "about.json"
 SCHEMA = "jtqd.about/1"
-_PACKAGES = ("jtqd", "numpy", "onnxruntime", "python-can", "canopen", "mcap")
 
 
 class AboutError(Exception):
@@ -188,34 +183,6 @@ class About:
         return start_ticks(self.pid) == self.started_ticks
 
 
-def about(config: Config, *, bus: str, instance: str, log_directory: Path | None) -> About:
-    """What this process has to say of itself."""
-    names = tuple(pdo.name for pdo in input_pdos(config))
-    one, two = (_joint(config, number, joint, names) for number, joint in enumerate(config.joints))
-    return About(
-        bus=bus,
-        instance=instance,
-        pid=os.getpid(),
-        started=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        started_ticks=start_ticks(os.getpid()) or 0,
-        configuration=str(config.path.resolve()),
-        configuration_sha256=config.sha256,
-        method=config.estimator.method,
-        node=config.node_id,
-        bitrate=config.bitrate,
-        period_us=config.period_ns // 1000,
-        deadline_us=config.input_deadline_ns / 1000,
-        heartbeat_ms=config.heartbeat_ms,
-        joints=(one, two),
-        sensor_node=config.sensor.node_id if config.sensor else None,
-        inputs=names,
-        log_directory=str(log_directory.resolve()) if log_directory else None,
-        log_prefix=f"jtqd-{instance}-",
-        versions={name: installed(name) or "not installed" for name in _PACKAGES}
-        | {"python": platform.python_version(), "kernel": platform.release()},
-    )
-
-
 def write_about(directory: Path, content: About) -> None:
     """Write it whole or not at all. Raises OSError."""
     new = directory / (FILE + ".new")
@@ -260,23 +227,6 @@ def installed(name: str) -> str | None:
         return version(name)
     except PackageNotFoundError:
         return None
-
-
-def _joint(config: Config, number: int, joint: JointConfig, names: tuple[str, ...]) -> AboutJoint:
-    sensor = sensor_index(config, joint.sensor_channel)
-    rated = joint.joint.rated_torque_nm
-    return AboutJoint(
-        number=joint.number,
-        name=joint.joint.name,
-        node=joint.node_id,
-        rated_torque_nm=rated,
-        torque_limit_nm=config.estimator.torque_limit * rated,
-        network=joint.network.path.name if joint.network else None,
-        network_limit_nm=config.estimator.network_limit * rated,
-        inputs=names[2 * number : 2 * number + 2],
-        sensor=None if sensor is None else names[sensor],
-        temperature=joint.temperature,
-    )
 
 
 def _plain(content: About) -> dict[str, Any]:

@@ -1,355 +1,339 @@
-"""What the operator is told while the loop runs: lost inputs, faults of the joints, estimates far from the sensor."""
+"""Derive conditions from readings of the loop's snapshot: joints, input PDOs, nodes, bus counters, loop. Pure.
+
+The loop only counts; this runs in the supervisor, some twenty times a second, and costs no cycle anything. What the
+supervisor sees of the bus itself (heartbeats, controller state, configuration) is observed by `jtqd.daemon.bus`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from math import inf, isfinite
+from typing import NamedTuple
 
 from jtqd.daemon.config import Config
-from jtqd.daemon.loop.input_pdos import LIFE_S, input_pdos, joint_temperatures, sensor_index
-from jtqd.daemon.loop.joint import FLAG_MOTION, FLAG_POSITION, FLAG_SENSOR, FLAG_TEMPERATURE
-from jtqd.daemon.shared.cycle_record import MEANINGS, NAMES
-from jtqd.daemon.shared.log_lines import RateLimit, Teller
-from jtqd.daemon.shared.snapshot import JointView, View
-from jtqd.estimator.status import PUBLISHED, STALE
+from jtqd.daemon.loop.input_pdos import input_pdos, joint_temperatures, sensor_index
+from jtqd.daemon.shared.conditions import (
+    DEVIATION_S,
+    DEVIATION_SIGMAS,
+    THE_BUS,
+    THE_LOOP,
+    THE_RECORDER,
+    Conditions,
+    Subject,
+)
+from jtqd.daemon.shared.cycle_record import FLAG_TEMPERATURE, TEMPERATURE_LIFE_S
+from jtqd.daemon.shared.reasons import (
+    NMT_STATES,
+    NOT_OPERATIONAL,
+    degraded_reason,
+    drive_reason,
+    fault_meanings,
+    sensor_reason,
+    stale_reason,
+    unready_reason,
+)
+from jtqd.daemon.shared.snapshot import InputView, JointView, View
+from jtqd.drivers.emcy import PDO_LONG, PDO_SHORT, PDO_TIMEOUT
+from jtqd.estimator import status as st
 
-# Something that comes and goes, told in few lines: neither a flicker nor a flapping contact floods the log.
-
-
-_HOLD_S = 0.1
-"""A change that does not last so long is none; counters and the log's events have it all the same."""
-_QUIET_S = 5.0
-"""Between two lines that tell a loss. Its end is told at once."""
-
-
-class Presence:
-    """Makes "lost: cause" and "back after 2.3 s" out of readings.
-
-    A loss that comes too soon after the last one is told together with its end, or with those that follow.
-    """
-
-    def __init__(self) -> None:
-        self.lost = False
-        self._reading, self._since = False, -inf
-        self._began = 0.0
-        self._losses, self._lost_s = 0, 0.0
-        self._cause = ""
-        self._said = False
-        self._not_before = -inf
-
-    def update(self, lost: bool, now_s: float, cause: Callable[[], str]) -> str | None:
-        """The line that is due, if any; call it with every reading. `cause` is asked when a loss has lasted."""
-        if lost != self._reading:
-            self._reading, self._since = lost, now_s
-        if lost != self.lost and now_s - self._since >= _HOLD_S:
-            self.lost = lost
-            if lost:
-                self._began, self._losses, self._cause = self._since, self._losses + 1, cause()
-            else:
-                self._lost_s += self._since - self._began
-        may_say = self._said or now_s >= self._not_before
-        if self.lost:
-            return self._tell_loss(now_s) if may_say and not self._said else None
-        return self._tell_return(now_s) if may_say and self._losses else None
-
-    def _tell_loss(self, now_s: float) -> str:
-        self._said, self._not_before = True, now_s + _QUIET_S
-        return f"lost: {self._cause}"
-
-    def _tell_return(self, now_s: float) -> str:
-        text = f"back after {self._lost_s:.1f} s"
-        if self._losses > 1:
-            text += f", lost {self._losses} times"
-        if not self._said:
-            text += f": {self._cause}"
-            self._not_before = now_s + _QUIET_S
-        self._said, self._losses, self._lost_s = False, 0, 0.0
-        return text
-
-
-# A warning when an estimate stays further from the torque sensor than its sigma allows: one of the two is wrong.
-#
-# Pure: readings of the snapshot and times in, lines out. It runs in the supervisor, beside the loop.
-
-
-FAR, NEAR = 3.0, 2.0
-"""An episode begins beyond FAR times sigma and ends within NEAR: on the edge it does not begin again and again."""
-LASTING_S = 1.0
-"""Both must last so long: delays and friction at a reversal are over sooner."""
+NEAR_SIGMAS = 2.0
+"""A deviation ends within so many sigmas: on the edge it does not begin again and again."""
 _GAP_S = 0.5
 """Readings further apart say nothing about the time between them."""
+COUNTER_QUIET_S = 1.0
+"""A condition that shows by a counter has ended when the counter has stood still for so long."""
+_STOPPED_S = 0.25
+"""The snapshot is written every 8th cycle."""
+TIMEOUT_CYCLES = 20
+"""Cycles in a row without a valid frame of a PDO: timeout (EMCY 8250h)."""
+LENGTH_S = 1.0
+"""Errors of the length (EMCY 8210h, 8220h) have ended when no frame of a wrong length came for so long."""
+_COUNTED = (
+    ("foreign_sync", "foreign_sync", THE_BUS),
+    ("rx_dropped", "receive_overrun", THE_BUS),
+    ("tx_dropped", "transmit_overrun", THE_BUS),
+    ("sync_errors", "sync_late", THE_BUS),
+    ("missed", "late_loop", THE_LOOP),
+)
+"""Counter of the loop, condition that is present while it rises, subject."""
 
 
-class _Joint:
-    """One joint's episode, and since when the readings have been asking for a change."""
+def joint_subjects(config: Config) -> tuple[Subject, ...]:
+    """Joint 1 and 2."""
+    return tuple(
+        Subject(f"joint {joint.number}", joint.node_id, joints=1 << n)
+        for n, joint in enumerate(config.joints)
+    )
 
-    def __init__(self) -> None:
-        self.far = False
-        self.since_s = inf
-        self.last_s = -inf
+
+def node_subjects(config: Config) -> dict[int, Subject]:
+    """Every node of the configuration, by its node-ID."""
+    nodes = {
+        joint.node_id: Subject(f"node {joint.node_id}", joint.node_id, 1 << n, joint.node_id)
+        for n, joint in enumerate(config.joints)
+    }
+    if config.sensor is not None:
+        number = config.sensor.node_id
+        nodes[number] = Subject(f"node {number}", number, 0, number)
+    return nodes
 
 
-class DeviationWatch:
-    """Call `lines` with each reading of the snapshot, some twenty times a second.
+# Deviation ----------------------------------------------------------------------------------------------------------------
 
-    Attributes:
-        episodes: how many there were of joint 1 and 2.
+
+class Deviation:
+    """Whether one joint's estimate stays further from the torque sensor than its sigma allows: one of the two is wrong.
+
+    It begins after DEVIATION_S beyond DEVIATION_SIGMAS and ends after as long within NEAR_SIGMAS: delays and friction at
+    a reversal are over sooner.
     """
 
     def __init__(self) -> None:
-        self.episodes = [0, 0]
-        self._joints = (_Joint(), _Joint())
-        self._cycle = -1
+        self.present = False
+        self._since_s = inf
+        self._last_s = -inf
 
-    def lines(self, view: View, now_s: float) -> list[str]:
-        """One line for each episode that begins now (CLOCK_MONOTONIC)."""
-        if view.cycle == self._cycle:
-            return []
-        self._cycle = view.cycle
-        said = []
-        for n, (joint, seen) in enumerate(zip(self._joints, view.joints, strict=True)):
-            if _update(joint, _sigmas(seen), now_s) and joint.far:
-                self.episodes[n] += 1
-                said.append(
-                    f"joint {n + 1}: the estimate has been more than {FAR:g} sigma away from the torque sensor for "
-                    f"{LASTING_S:g} s: {seen.torque_nm:.2f} Nm against {seen.sensor_nm:.2f} Nm, "
-                    f"sigma {seen.sigma_nm:.2f} Nm"
-                )
-        return said
-
-
-def _sigmas(seen: JointView) -> float | None:
-    """Distance between estimate and sensor in sigmas; None where one of them is missing."""
-    difference = abs(seen.torque_nm - seen.sensor_nm)
-    if seen.status not in PUBLISHED or not isfinite(difference) or not seen.sigma_nm > 0.0:
-        return None
-    return difference / seen.sigma_nm
+    def update(self, seen: JointView, now_s: float) -> bool:
+        """Take a reading; True while the estimate is too far. A reading without a number is passed over."""
+        difference = abs(seen.torque_nm - seen.sensor_nm)
+        if seen.status not in st.PUBLISHED or not isfinite(difference) or not seen.sigma_nm > 0.0:
+            return self.present
+        sigmas = difference / seen.sigma_nm
+        changes = sigmas < NEAR_SIGMAS if self.present else sigmas > DEVIATION_SIGMAS
+        if not changes:
+            self._since_s = inf
+        elif self._since_s == inf or now_s - self._last_s > _GAP_S:
+            self._since_s = now_s
+        self._last_s = now_s
+        if changes and now_s - self._since_s >= DEVIATION_S:
+            self.present, self._since_s = not self.present, inf
+        return self.present
 
 
-def _update(joint: _Joint, sigmas: float | None, now_s: float) -> bool:
-    """Take in a reading; True when an episode begins or ends. One without a number is passed over."""
-    if sigmas is None:
-        return False
-    asks = sigmas < NEAR if joint.far else sigmas > FAR
-    if not asks:
-        joint.since_s = inf
-    elif joint.since_s == inf or now_s - joint.last_s > _GAP_S:
-        joint.since_s = now_s
-    joint.last_s = now_s
-    if not asks or now_s - joint.since_s < LASTING_S:
-        return False
-    joint.far, joint.since_s = not joint.far, inf
-    return True
+# Deadline and length of each input PDO ------------------------------------------------------------------------------------
 
 
-# Lines for the operator when a joint has no torque because of a fault, when a fault is latched, and when all is well again.
-#
-# Pure: readings of the snapshot and times in, lines out. It runs in the supervisor, so that no line costs the loop anything.
+class PdoChange(NamedTuple):
+    """An error (EMCY code) of a PDO has begun (`present`) or ended."""
+
+    code: int
+    pdo: Subject
+    present: bool
 
 
-class FaultWatch:
-    """Call `lines` with each reading of the snapshot, some twenty times a second.
+class _PdoState:
+    def __init__(self) -> None:
+        self.missed = -1  # nothing has been read yet
+        self.in_a_row = 0
+        self.short = self.long = 0
+        self.timed_out = False
+        self.until = {PDO_SHORT: 0.0, PDO_LONG: 0.0}
+        self.present = {PDO_SHORT: False, PDO_LONG: False}
 
-    Attributes:
-        present: faults of joint 1 and 2 as of the last reading, bits of `daemon/shared/cycle_record.py`.
-        latched: those that are latched.
+
+class PdoWatch:
+    """Errors 8250h, 8210h and 8220h of each input PDO by itself, from the loop's counts.
+
+    The loop decides per cycle; this says what lasts. A PDO has timed out when it brought no valid input for
+    `TIMEOUT_CYCLES` cycles in a row, and is back with the next valid one. A frame of a wrong length is never used: a short
+    one cannot be, and of a longer one CiA 301 allows to take the first bytes, but a node that sends another length than
+    was configured has lost its mapping, and then the first bytes are not what we think they are.
+
+    Args:
+        pdos: in the order of the snapshot's inputs; their `node` is the producer.
     """
 
-    def __init__(self) -> None:
-        self.present, self.latched = [0, 0], [0, 0]
-        self._since_s = [0.0, 0.0]
-        self._limits = (RateLimit(), RateLimit())
+    def __init__(self, pdos: Sequence[Subject]) -> None:
+        self._pdos = [(pdo, _PdoState()) for pdo in pdos]
 
-    def lines(self, view: View, now_s: float) -> list[str]:
-        """What has to be told now (CLOCK_MONOTONIC)."""
-        said = []
-        for n, seen in enumerate(view.joints):
-            line = self._line(n, seen, now_s)
-            if line is not None:
-                said.append(f"joint {n + 1}: {line}")
-        return said
-
-    def _line(self, n: int, seen: JointView, now_s: float) -> str | None:
-        present = seen.input_flags >> 8 | seen.latched
-        before, self.present[n] = self.present[n], present
-        held, self.latched[n] = self.latched[n], seen.latched
-        new = present & ~before | seen.latched & ~held
-        if new:
-            if not before:
-                self._since_s[n] = now_s
-            if self._limits[n].may_say(new, now_s) is None:
-                return None
-            end = "; latched: `jtq control reset` releases it" if seen.latched & new else ""
-            return f"no torque: {_meanings(new)}{end}"
-        if before and not present and self._limits[n].may_say(0, now_s) is not None:
-            return f"no fault any more after {now_s - self._since_s[n]:.1f} s"
-        return None
-
-
-def _meanings(bits: int) -> str:
-    return ", ".join(f"{MEANINGS[bit]} ({name})" for bit, name in NAMES.items() if bits & bit)
+    def changes(self, inputs: Sequence[InputView], absent: Collection[int], now_s: float) -> list[PdoChange]:
+        """Take a reading; PDOs of `absent` nodes (optional ones) do not time out."""
+        found: list[PdoChange] = []
+        for (pdo, state), seen in zip(self._pdos, inputs, strict=False):
+            # A loss between two readings, over by now, counts too, with what the last reading saw of it.
+            missed = 0 if state.missed < 0 else seen.missed - state.missed
+            if missed:
+                missed += state.in_a_row
+            state.missed, state.in_a_row = seen.missed, seen.in_a_row
+            expected = pdo.node not in absent
+            timed_out = seen.in_a_row >= TIMEOUT_CYCLES and expected
+            if timed_out != state.timed_out:
+                found.append(PdoChange(PDO_TIMEOUT, pdo, timed_out))
+            elif not timed_out and missed - seen.in_a_row >= TIMEOUT_CYCLES and expected:
+                found += [PdoChange(PDO_TIMEOUT, pdo, True), PdoChange(PDO_TIMEOUT, pdo, False)]
+            state.timed_out = timed_out
+            for code, count, before in (
+                (PDO_SHORT, seen.short, state.short),
+                (PDO_LONG, seen.long, state.long),
+            ):
+                if count != before:
+                    state.until[code] = now_s + LENGTH_S
+                present = now_s < state.until[code]
+                if present != state.present[code]:
+                    found.append(PdoChange(code, pdo, present))
+                    state.present[code] = present
+            state.short, state.long = seen.short, seen.long
+        return found
 
 
-# Lines for the operator when a joint's inputs, torque sensor or temperature are lost and come back, with the cause.
-#
-# Pure: readings of the snapshot and times in, lines out. It runs in the supervisor, so that no line costs the loop anything.
+_PDO_CONDITIONS = {PDO_TIMEOUT: "pdo_timeout", PDO_SHORT: "pdo_short", PDO_LONG: "pdo_long"}
 
 
-_OPERATIONAL = 5
-_STATES = {4: "stopped", 127: "pre-operational"}
-"""Heartbeat states in which a node sends no PDO (CiA 301)."""
-_ON_THE_BUS = (
-    ("bus_errors", "the bus is down"),
-    ("foreign_sync", "another SYNC is on the bus"),
-    ("sync_errors", "the own SYNC waits in the transmit queue"),
-)
-"""Counters whose rise makes every input of the bus doubtful, and what that means."""
-_ON_THE_PDO = (
-    ("late_frames", "late frames on the bus"),
-    ("rejected_frames", "frames of a wrong format on the bus"),
-)
-_SENSOR_STATUS = {1: "not valid", 2: "positive overload", 4: "negative overload"}
-"""6150h of CiA 404."""
+def pdo_subjects(config: Config) -> list[Subject]:
+    """Input PDOs in the order of the snapshot's inputs, with the joints that cannot do without."""
+    joints = {joint.node_id: 1 << n for n, joint in enumerate(config.joints)}
+    return [
+        Subject(pdo.name, pdo.cob_id, joints.get(pdo.node_id, 0), pdo.node_id) for pdo in input_pdos(config)
+    ]
+
+
+# All of them --------------------------------------------------------------------------------------------------------------
 
 
 @dataclass
-class _InputWatchJoint:
+class _Joint:
     """One joint's PDOs by name, and the counters when it was last well."""
 
-    number: int
+    subject: Subject
     node: int
     names: tuple[str, str]
     sensor: str | None
     sensor_node: int | None
     temperature: str | None
     well: dict[str, int] = field(default_factory=dict)
-    inputs: Presence = field(default_factory=Presence)
-    reference: Presence = field(default_factory=Presence)
-    warmth: Presence = field(default_factory=Presence)
+    faults: int = 0
+    latched: int = 0
+    deviation: Deviation = field(default_factory=Deviation)
 
 
-class InputWatch:
-    """Call `lines` with each reading of the snapshot, some twenty times a second."""
-
-    def __init__(self, config: Config) -> None:
-        names = [pdo.name for pdo in input_pdos(config)]
-        temperatures = {each.node_id: each.name for each in joint_temperatures(config)}
-        self._joints = []
-        for n, joint in enumerate(config.joints):
-            sensor = sensor_index(config, joint.sensor_channel)
-            own = (names[2 * n], names[2 * n + 1])
-            reference = None if sensor is None else names[sensor]
-            source = None if sensor is None or config.sensor is None else config.sensor.node_id
-            self._joints.append(
-                _InputWatchJoint(
-                    joint.number, joint.node_id, own, reference, source, temperatures.get(joint.node_id)
-                )
-            )
-
-    def lines(self, view: View, now_s: float) -> list[str]:
-        """What has to be told now (CLOCK_MONOTONIC)."""
-        said = []
-        for joint, seen in zip(self._joints, view.joints, strict=True):
-            stale = seen.status == STALE
-            if not stale or not joint.well:
-                joint.well = view.counters
-            line = joint.inputs.update(stale, now_s, partial(_cause, joint, seen, view))
-            if line:
-                said.append(f"joint {joint.number}: inputs {line}")
-            if joint.sensor is not None:
-                gone = not isfinite(seen.sensor_nm)
-                line = joint.reference.update(gone, now_s, partial(_sensor_cause, joint, seen, view))
-                if line:
-                    said.append(f"joint {joint.number}: torque sensor {line}")
-            if joint.temperature is not None:
-                # It comes twice a second: at the start nobody can have it yet.
-                gone = not seen.input_flags & FLAG_TEMPERATURE and view.cycle * view.period_s > LIFE_S
-                cause = f"{joint.temperature} not received for {LIFE_S:g} s, or it says not measured"
-                line = joint.warmth.update(gone, now_s, partial(str, cause))
-                if line:
-                    said.append(f"joint {joint.number}: temperature {line}")
-        return said
-
-
-def _cause(joint: _InputWatchJoint, seen: JointView, view: View) -> str:
-    return stale_cause(joint.node, joint.names, seen, view, joint.well)
-
-
-def stale_cause(node: int, names: Sequence[str], seen: JointView, view: View, well: Mapping[str, int]) -> str:
-    """Why a joint's inputs are not used. The likeliest cause first: what explains more comes before what explains less.
+class Health:
+    """Call `observe` with each reading of the snapshot.
 
     Args:
-        node: its drive.
-        names: of its TPDO1 and TPDO2.
-        seen: the joint's estimate.
-        view: the reading it is from.
-        well: the counters of an earlier reading; what has risen since then may be the cause.
+        config: in force; nodes and PDOs are those of the start.
+        conditions: the set to be kept up to date.
     """
 
-    def rose(name: str) -> bool:
-        return view.counters[name] > well[name]
+    def __init__(self, config: Config, conditions: Conditions) -> None:
+        self._conditions = conditions
+        names = [pdo.name for pdo in input_pdos(config)]
+        temperatures = {each.node_id: each.name for each in joint_temperatures(config)}
+        self._joints: list[_Joint] = []
+        for n, (joint, subject) in enumerate(zip(config.joints, joint_subjects(config), strict=True)):
+            sensor = sensor_index(config, joint.sensor_channel)
+            self._joints.append(
+                _Joint(
+                    subject,
+                    joint.node_id,
+                    (names[2 * n], names[2 * n + 1]),
+                    None if sensor is None else names[sensor],
+                    None if sensor is None or config.sensor is None else config.sensor.node_id,
+                    temperatures.get(joint.node_id),
+                )
+            )
+        self._nodes = node_subjects(config)
+        self._pdos = PdoWatch(pdo_subjects(config))
+        self._counters: dict[str, tuple[int, float]] = {}
+        self._cycle, self._advanced_s = -1, -inf
+        self.use(config)
 
-    unready = _unready(node, view)
-    if unready:
-        return unready
-    state = _STATES.get(view.node_states[node])
-    if state:
-        return f"node {node} is {state}"
-    for counter, meaning in _ON_THE_BUS:
-        if rose(counter):
-            return meaning
-    missing = [
-        name
-        for name, flag in zip(names, (FLAG_POSITION, FLAG_MOTION), strict=True)
-        if not seen.input_flags & flag
-    ]
-    if not missing:
-        return "the estimate is not ready before the next SYNC"
-    what = f"{' and '.join(missing)} not received in time"
-    hints = [meaning for counter, meaning in _ON_THE_PDO if rose(counter)]
-    return f"{what} ({', '.join(hints)})" if hints else what
+    def use(self, config: Config) -> None:
+        """Take the limits of a configuration that has come into force."""
+        limit = config.estimator.network_limit
+        self._network_limits_nm = [limit * joint.joint.rated_torque_nm for joint in config.joints]
 
+    def observe(
+        self, view: View, now_s: float, *, absent: Collection[int] = (), cycles_lost: int = 0
+    ) -> None:
+        """Update the conditions from a reading.
 
-def _unready(node: int, view: View) -> str:
-    """Of a node that nobody believes: it restarted, is configured otherwise, or was never there. Empty for the others."""
-    if node not in view.unconfigured:
-        return ""
-    if not view.node_heard_ns[node] and not view.node_states[node]:
-        return f"node {node} is not there"
-    if view.node_states[node] == _OPERATIONAL:
-        return f"node {node} is not configured as it was"
-    return f"node {node} has restarted and is not configured yet"
+        Args:
+            view: the reading.
+            now_s: CLOCK_MONOTONIC.
+            absent: optional nodes that are not there; their PDOs are not missed.
+            cycles_lost: cycles that the recorder has lost so far.
+        """
+        advanced = view.cycle != self._cycle
+        if advanced:
+            self._cycle, self._advanced_s = view.cycle, now_s
+        stopped = now_s - self._advanced_s > _STOPPED_S
+        self._conditions.update(
+            "loop_stopped",
+            THE_LOOP,
+            stopped,
+            now_s,
+            f"{_STOPPED_S:g} s",
+            since_s=self._advanced_s if stopped else now_s,
+        )
+        for change in self._pdos.changes(view.inputs, absent, now_s):
+            name = _PDO_CONDITIONS[change.code]
+            self._conditions.update(name, change.pdo, change.present, now_s, str(TIMEOUT_CYCLES))
+        for counter, name, subject in _COUNTED:
+            self._observe_counter(name, subject, view.counters[counter], now_s)
+        self._observe_counter("cycles_lost", THE_RECORDER, cycles_lost, now_s)
+        for joint, seen, limit_nm in zip(self._joints, view.joints, self._network_limits_nm, strict=True):
+            self._observe_inputs(joint, seen, view, now_s)
+            self._observe_status(joint, seen, limit_nm, now_s)
+            if advanced:
+                far = joint.deviation.update(seen, now_s)
+                text = (
+                    f"{seen.torque_nm:.2f} Nm against {seen.sensor_nm:.2f} Nm, sigma {seen.sigma_nm:.2f} Nm"
+                )
+                if far != self._conditions.is_present("deviation", joint.subject.name):
+                    self._conditions.update("deviation", joint.subject, far, now_s, text)
+        for node, subject in self._nodes.items():
+            self._observe_node(node, subject, view, absent, now_s)
 
+    def _observe_inputs(self, joint: _Joint, seen: JointView, view: View, now_s: float) -> None:
+        conditions, subject = self._conditions, joint.subject
+        stale = seen.status == st.STALE
+        if not stale or not joint.well:
+            joint.well = view.counters
+        why = partial(stale_reason, joint.node, joint.names, seen, view, joint.well)
+        conditions.update("stale_input", subject, stale, now_s, why)
+        if joint.sensor is not None:
+            why = partial(sensor_reason, joint.sensor_node, joint.sensor, seen, view)
+            conditions.update("sensor_lost", subject, not isfinite(seen.sensor_nm), now_s, why)
+        if joint.temperature is not None:
+            # It comes twice a second: at the start nobody can have it yet.
+            gone = not seen.input_flags & FLAG_TEMPERATURE and view.cycle * view.period_s > TEMPERATURE_LIFE_S
+            text = f"{joint.temperature} not received for {TEMPERATURE_LIFE_S:g} s, or it says not measured"
+            conditions.update("temperature_lost", subject, gone, now_s, text)
 
-def _sensor_cause(joint: _InputWatchJoint, seen: JointView, view: View) -> str:
-    if not seen.input_flags & FLAG_SENSOR:
-        if joint.sensor_node is not None and (unready := _unready(joint.sensor_node, view)):
-            return unready
-        return f"{joint.sensor} not received in time"
-    reasons = [text for bit, text in _SENSOR_STATUS.items() if seen.sensor_status & bit]
-    return f"{joint.sensor} says {', '.join(reasons) or 'no number'}"
+    def _observe_status(self, joint: _Joint, seen: JointView, limit_nm: float, now_s: float) -> None:
+        conditions, subject = self._conditions, joint.subject
+        present = seen.input_flags >> 8 | seen.latched
+        faults = fault_meanings(present, names=True)
+        joins = bool(present & ~joint.faults)
+        conditions.update("joint_fault", subject, present != 0, now_s, faults, log_again=joins)
+        latched = fault_meanings(seen.latched, names=True)
+        joins = bool(seen.latched & ~joint.latched)
+        conditions.update("fault_latched", subject, seen.latched != 0, now_s, latched, log_again=joins)
+        joint.faults, joint.latched = present, seen.latched
+        drive = partial(drive_reason, joint.node, seen)
+        conditions.update("drive_fault", subject, seen.status == st.DRIVE_FAULT, now_s, drive)
+        conditions.update("drive_off", subject, seen.status == st.OFF, now_s, drive)
+        why = partial(degraded_reason, seen, limit_nm)
+        conditions.update("degraded", subject, seen.status == st.DEGRADED, now_s, why)
 
+    def _observe_counter(self, name: str, subject: Subject, value: int, now_s: float) -> None:
+        before, until_s = self._counters.get(name, (0, -inf))
+        if value > before:
+            until_s = now_s + COUNTER_QUIET_S
+        self._counters[name] = value, until_s
+        self._conditions.update(name, subject, now_s < until_s, now_s)
 
-class Watches:
-    """Call `turn` with each reading of the snapshot; lines go to `tell`."""
-
-    def __init__(self, config: Config, tell: Teller) -> None:
-        self._tell = tell
-        self._inputs, self._faults, self._deviation = InputWatch(config), FaultWatch(), DeviationWatch()
-
-    @property
-    def deviations(self) -> tuple[int, int]:
-        """How often the estimate of joint 1 and 2 stayed far from the sensor."""
-        one, two = self._deviation.episodes
-        return one, two
-
-    def turn(self, view: View, now_s: float) -> None:
-        """Say what has changed; `now_s` is CLOCK_MONOTONIC."""
-        for line in self._inputs.lines(view, now_s):
-            self._tell("input", 0, line, line.split(":")[0])
-        for line in self._faults.lines(view, now_s):
-            self._tell("fault", 0, line, line.split(":")[0])
-        for line in self._deviation.lines(view, now_s):
-            self._tell("input", 0, line, "deviation")
+    def _observe_node(
+        self, node: int, subject: Subject, view: View, absent: Collection[int], now_s: float
+    ) -> None:
+        conditions = self._conditions
+        conditions.update("node_absent", subject, node in absent, now_s)
+        unready = "" if node in absent else unready_reason(node, view)
+        conditions.update(
+            "node_unconfigured", subject, bool(unready), now_s, unready.removeprefix(f"node {node} ")
+        )
+        state = view.node_states[node]
+        idle = not unready and state in NOT_OPERATIONAL
+        conditions.update("node_not_operational", subject, idle, now_s, NMT_STATES.get(state, ""))

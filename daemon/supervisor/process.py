@@ -29,12 +29,14 @@ from jtqd.daemon.recording.keeper import Keeper
 from jtqd.daemon.recording.request import recording_request
 from jtqd.daemon.reload.files import SOCKET, Reload, ReloadError
 from jtqd.daemon.shared.child_process import Child, ChildError, ChildSilence
+from jtqd.daemon.shared.conditions import JOINT, PDO, THE_MACHINE, Conditions, ConditionsFile
 from jtqd.daemon.shared.log_lines import ERROR, WARNING, Say, Teller
 from jtqd.daemon.shared.notices import FILE as NOTICES
 from jtqd.daemon.shared.notices import Notices
-from jtqd.daemon.shared.runtime_dir import About, about, claim, instance_name, remove, write_about
+from jtqd.daemon.shared.runtime_dir import About, claim, instance_name, remove, write_about
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
-from jtqd.daemon.supervisor.health import Watches
+from jtqd.daemon.supervisor.description import about
+from jtqd.daemon.supervisor.health import Health
 from jtqd.daemon.supervisor.service import Service
 from jtqd.daemon.supervisor.summary import Summary, summary_of
 from jtqd.daemon.supervisor.table import Display
@@ -167,6 +169,28 @@ def put_back(config: Config, send: Callable[[bytes], bool]) -> None:
 
 
 _LOOP_END_S = 3.0
+_STOLEN_PERIOD_S = 1.0
+
+
+class StolenTime:
+    """Processor time that a hypervisor takes away, looked at once a second: the condition, and the sum since the start."""
+
+    def __init__(self, conditions: Conditions) -> None:
+        self._conditions = conditions
+        self._first_s = self._last_s = stolen_s()
+        self._due_s = 0.0
+
+    def observe(self, now_s: float) -> None:
+        """Look when it is time (CLOCK_MONOTONIC)."""
+        if now_s < self._due_s:
+            return
+        self._due_s = now_s + _STOLEN_PERIOD_S
+        before, self._last_s = self._last_s, stolen_s()
+        self._conditions.update("stolen_time", THE_MACHINE, self._last_s > before, now_s)
+
+    def total_s(self) -> float:
+        """Taken since the start [s]."""
+        return stolen_s() - self._first_s
 
 
 class Supervisor:
@@ -220,7 +244,9 @@ class Supervisor:
         self._service = Service(
             config, self._directory, self._instance, self._say, save=self._recorder.save, renew=self._renew
         )
-        self._watches = Watches(config, self._tell)
+        self._conditions = Conditions()
+        self._conditions_file = ConditionsFile(self._directory)
+        self._health = Health(config, self._conditions)
         signal.signal(signal.SIGHUP, self._on_reload)
 
     def stop(self) -> None:
@@ -272,6 +298,9 @@ class Supervisor:
             return None
         for line in running["refused"]:
             self._say(f"not granted: {line}", WARNING)
+        if running["refused"]:
+            text = "not granted: " + "; ".join(running["refused"])
+            self._conditions.update("not_granted", THE_MACHINE, True, time.monotonic(), text)
         reader = SnapshotReader(self._snapshot, supervisor=True)
         self._tell.notices = Notices(self._directory / NOTICES)
         self._record(report)
@@ -285,6 +314,7 @@ class Supervisor:
             reader=reader,
             store=store,
             returning=ReturningNodes(self._config, self._bus, report, self._child, self._tell),
+            conditions=self._conditions,
             say=self._tell,
             directory=self._directory,
         )
@@ -292,9 +322,9 @@ class Supervisor:
         self._bus_service.begin(time.monotonic())
         self._report = report
         self._service.open(reader, Reload(self._loop_request(), report, self._child, self._check_reloaded))
-        stolen_before_s = stolen_s()
+        began_s, self._stolen = time.monotonic(), StolenTime(self._conditions)
         result = self._watch(loop, node, reader, bench)
-        stolen = stolen_s() - stolen_before_s
+        stolen = self._stolen.total_s()
         self._leave()
         failed = result.get("error") or result.get("failed")
         if failed:
@@ -305,7 +335,8 @@ class Supervisor:
             result,
             running["refused"],
             recording,
-            deviations=self._watches.deviations,
+            history=self._conditions.history(time.monotonic()),
+            began_s=began_s,
             stolen_s=stolen,
         )
 
@@ -384,10 +415,22 @@ class Supervisor:
                     self._live.watch()
                 node.recorder_lost = self._recorder.lost
                 view, now = reader.read(), time.monotonic()
+                self._health.observe(
+                    view, now, absent=self._bus_service.care.absent, cycles_lost=node.recorder_lost
+                )
+                self._stolen.observe(now)
                 self._serve(view, now)
+                self._report_conditions(now)
                 loop = self._loop_now(loop, view, node.recorder_lost, stopping=stopping > 0.0)
-                self._watches.turn(view, now)
                 display.turn(now)
+
+    def _report_conditions(self, now: float) -> None:
+        """Log the lines that are due and keep `conditions.json` up to date."""
+        for line in self._conditions.lines(now):
+            # What concerns a joint may come and go with its cable: few lines of each joint reach the operator.
+            kind = line.subject.name if line.definition.about in (JOINT, PDO) else ""
+            self._tell(line.definition.topic, line.subject.node, line.text, kind, line.severity)
+        self._conditions_file.write(self._conditions.present())
 
     def _serve(self, view: View, now: float) -> None:
         """The own node's duties, for as long as there is a bus; what became of it the loop says."""
@@ -427,6 +470,7 @@ class Supervisor:
     def _renew(self, config: Config) -> None:
         """Another configuration is in force: say so wherever it shows."""
         self._config = config
+        self._health.use(config)
         self._node.set_parameters(config)
         write_about(self._directory, replace(self._own_description(), started=self._about.started))
         self._record(self._report, again=True)

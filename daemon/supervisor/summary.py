@@ -1,14 +1,20 @@
-"""What a run of jtqd says at its end."""
+"""The final summary of a run of jtqd: timing, accuracy, conditions that happened, counters and the log, as text and JSON."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isfinite
 from typing import Any
 
+from jtqd.daemon.shared.conditions import CATALOGUE, Occurrences
+from jtqd.daemon.shared.notices import INFO
 from jtqd.daemon.shared.snapshot import SnapshotReader
-from jtqd.daemon.supervisor.health import FAR, LASTING_S
 
+_AGES = (
+    "              (estimate and sensor of the same cycle: a fused estimate is about 5 ms old by then, and the RMSE\n"
+    "              includes what that delay costs)"
+)
 _REFUSED = ("overruns", "latches", "latch_resets")
 """Counters beside those of the faults (docs/safety.md)."""
 
@@ -29,8 +35,8 @@ class Summary:
     error: str | None
     inputs: dict[str, dict[str, int]]
     """Late, lost, duplicate and rejected frames of each PDO by its name."""
-    deviations: tuple[int, int]
-    """How often each joint's estimate stayed far from the sensor (`daemon/supervisor/health.py`)."""
+    conditions: tuple[Occurrences, ...] = ()
+    """What happened (`jtqd.daemon.shared.conditions`); `first_s` counts from the begin of the run."""
     stolen_s: float = 0.0
     """What a hypervisor took from the processors meanwhile (`daemon/loop/realtime.py`)."""
 
@@ -50,7 +56,11 @@ class Summary:
             "work_us": dict(zip(("p50", "p99", "max"), map(_json, self.work_us), strict=True)),
             "late_us": dict(zip(("p50", "p99", "max"), map(_json, self.late_us), strict=True)),
             "rmse_nm": {"joint_1": _json(self.rmse_nm[0]), "joint_2": _json(self.rmse_nm[1])},
-            "deviations": {"joint_1": self.deviations[0], "joint_2": self.deviations[1]},
+            "deviations": {"joint_1": self._deviations(1), "joint_2": self._deviations(2)},
+            "conditions": [
+                each._asdict() | {"total_s": round(each.total_s, 3), "first_s": round(each.first_s, 3)}
+                for each in self.conditions
+            ],
             "counters": self.counters,
             "stolen_s": round(self.stolen_s, 2),
             "not_granted": list(self.refused),
@@ -58,6 +68,13 @@ class Summary:
             "recording": self.recording,
             "error": self.error,
         }
+
+    def _deviations(self, joint: int) -> int:
+        return sum(
+            each.times
+            for each in self.conditions
+            if (each.name, each.subject) == ("deviation", f"joint {joint}")
+        )
 
     def text(self) -> str:
         """The same for people."""
@@ -76,11 +93,15 @@ class Summary:
         for joint, rmse in enumerate(self.rmse_nm, start=1):
             shown = f"{rmse:.3f} Nm against the sensor while it moves" if isfinite(rmse) else "no reference"
             lines.append(f"RMSE joint {joint}  {shown}")
-        lines += [
-            f"deviation     joint {joint}: {count} times more than {FAR:g} sigma from the sensor for {LASTING_S:g} s"
-            for joint, count in enumerate(self.deviations, start=1)
-            if count
-        ]
+        if any(map(isfinite, self.rmse_nm)):
+            lines.append(_AGES)
+        happened = [each for each in self.conditions if CATALOGUE[each.name].severity > INFO]
+        for n, each in enumerate(happened):
+            times = "once" if each.times == 1 else f"{each.times} times"
+            lines.append(
+                f"{'' if n else 'conditions':<13} {each.subject}: {each.name.replace('_', ' ')} {times}, "
+                f"{each.total_s:.1f} s in all, first after {each.first_s:.1f} s"
+            )
         refused = [
             f"{name.removeprefix('fault_').replace('_', ' ')} {count}"
             for name, count in counters.items()
@@ -140,7 +161,8 @@ def summary_of(
     refused: list[str],
     recording: dict[str, Any] | None,
     *,
-    deviations: tuple[int, int],
+    history: Sequence[Occurrences],
+    began_s: float,
     stolen_s: float,
 ) -> Summary:
     """The summary of a run that has ended.
@@ -150,7 +172,9 @@ def summary_of(
         result: last answer of the loop.
         refused: what the kernel did not grant.
         recording: the recorder's account, None where nothing was recorded.
-        deviations, stolen_s: as in `Summary`.
+        history: conditions that happened.
+        began_s: begin of the run (CLOCK_MONOTONIC).
+        stolen_s: as in `Summary`.
     """
     view = reader.read()
     p50, p99, worst = reader.work_us(0.5, 0.99, 1.0)
@@ -167,6 +191,6 @@ def summary_of(
         recording=recording,
         error=result.get("error") or result.get("failed"),
         inputs=result.get("counters", {}),
-        deviations=deviations,
+        conditions=tuple(each._replace(first_s=max(0.0, each.first_s - began_s)) for each in history),
         stolen_s=stolen_s,
     )

@@ -18,8 +18,7 @@ from mcap.reader import make_reader
 
 from jtqd.daemon.logs.reader import read_topic
 from jtqd.daemon.loop.estimate_pdo import decode
-from jtqd.daemon.loop.joint import FLAG_MOTION, FLAG_POSITION
-from jtqd.daemon.loop.joint_status import FLAG_NETWORK_SKIPPED
+from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_NETWORK_SKIPPED, FLAG_POSITION
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.drivers.can_unix import UnixBus
 from jtqd.drivers.filters import exact

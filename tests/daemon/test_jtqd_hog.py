@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from jtqd.daemon.logs.reader import read_topic
-from jtqd.daemon.loop.joint import FLAG_MOTION, FLAG_POSITION
+from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_POSITION
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.estimator.status import PUBLISHED
 from tests.daemon.slow_bench import slow_configuration

@@ -12,6 +12,7 @@ from jtqd.daemon.bus.boot import ReturningNodes, boot_request
 from jtqd.daemon.bus.service import BusService, service_filters
 from jtqd.daemon.config import load_config
 from jtqd.daemon.shared.child_process import Child
+from jtqd.daemon.shared.conditions import Conditions
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
 from jtqd.drivers.boot import boot
 from jtqd.drivers.boot_request import parse_request
@@ -51,6 +52,7 @@ class MasterBench:
         self.responder = HubResponder(self.path, [*self.drives, *([self.sensor] if with_sensor else [])])
         self.snapshot = Snapshot(directory / "snapshot", 1e-3, 0.8)
         self.reader = SnapshotReader(directory / "snapshot", supervisor=True)
+        self.conditions = Conditions()
         self.lines: list[str] = []
         self.heard: list[tuple[int, bytes]] = []
         self.children: list[Child] = []
@@ -72,6 +74,7 @@ class MasterBench:
             reader=self.reader,
             store=ObjectStore(EDS / "jtqd.eds", OWN),
             returning=self.returning,
+            conditions=self.conditions,
             say=self._say,
             directory=self._directory,
         )
@@ -101,7 +104,9 @@ class MasterBench:
         """Turn until `until()`; False: not within the time."""
         deadline = time.monotonic() + longest_s
         while time.monotonic() < deadline:
-            self.service.turn(self.reader.read(), time.monotonic())
+            now_s = time.monotonic()
+            self.service.turn(self.reader.read(), now_s)
+            self.lines += [line.text for line in self.conditions.lines(now_s)]
             self._listen()
             if until():
                 return True

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import pytest
 
-from jtqd.daemon.bus.errors import BusState, EmcyLog, LoopErrors, OwnErrors
+from jtqd.daemon.bus.errors import BusState, EmcyLog, OwnErrors
 from jtqd.daemon.bus.nodes import NodeWatch
-from jtqd.daemon.config import load_config
-from jtqd.daemon.loop.input_pdos import TIMEOUT_CYCLES, PdoEvent, PdoWatch, WatchedPdo
+from jtqd.daemon.shared.conditions import Subject
 from jtqd.daemon.shared.snapshot import InputView
-from jtqd.daemon.supervisor.health import FaultWatch
+from jtqd.daemon.supervisor.health import TIMEOUT_CYCLES, PdoChange, PdoWatch
 from jtqd.drivers.object_dictionary import ObjectStore
-from tests.daemon.supervisor.watch_views import WELL, view
+from tests.daemon.supervisor.watch_views import WELL, Observer, view
 from tests.drivers.canopen_nodes import EDS
 
-PDO = WatchedPdo(0x181, 1, "181h drive 1 TPDO1", 1)
+PDO = Subject("181h drive 1 TPDO1", 0x181, 1, node=1)
 SEEN = InputView(*(0,) * 12)
 ERR = 0x2000_0000
 
@@ -74,12 +73,12 @@ def test_error_counters_stay_until_a_message_brings_others() -> None:
 
 def test_the_twentieth_cycle_is_the_deadline_and_absent_nodes_have_none() -> None:
     watch = PdoWatch([PDO])
-    watch.events([SEEN], (), 0.0)
+    watch.changes([SEEN], (), 0.0)
     row = SEEN._replace(missed=TIMEOUT_CYCLES, in_a_row=TIMEOUT_CYCLES)
-    assert watch.events([row], (), 0.1) == [PdoEvent(0x8250, PDO, True)]
+    assert watch.changes([row], (), 0.1) == [PdoChange(0x8250, PDO, True)]
     watch = PdoWatch([PDO])
-    watch.events([SEEN], {1}, 0.0)
-    assert watch.events([row._replace(in_a_row=0)], {1}, 0.1) == []
+    watch.changes([SEEN], {1}, 0.0)
+    assert watch.changes([row._replace(in_a_row=0)], {1}, 0.1) == []
 
 
 def test_another_register_is_another_message() -> None:
@@ -90,22 +89,23 @@ def test_another_register_is_another_message() -> None:
 
 
 def test_a_counters_error_lasts_a_second_and_a_latch_alone_is_a_fault_too(errors: OwnErrors) -> None:
-    loop = LoopErrors(load_config(None), errors, lambda *_: None)
-    loop.watch(view(1), (), 10.0)
-    loop.watch(view(2, rx_dropped=3), (), 10.1)
+    watch = Observer()
+    watch.conditions.subscribe(errors.follow)
+    watch.lines(view(1), 10.0)
+    watch.lines(view(2, rx_dropped=3), 10.1)
     for now in (10.2, 11.0):
-        loop.watch(view(3, rx_dropped=3), (), now)
+        watch.lines(view(3, rx_dropped=3), now)
         assert errors.present(0x8110, 1), now
-    loop.watch(view(4, rx_dropped=3), (), 11.2)
+    watch.lines(view(4, rx_dropped=3), 11.2)
     assert not errors.present(0x8110, 1)
-    loop.watch(view(5, WELL._replace(latched=0x100)), (), 11.3)
+    watch.lines(view(5, WELL._replace(latched=0x100)), 11.3)
     assert errors.present(0xFF01, 1)
     assert errors.present(0xFF02, 1)
     assert not errors.present(0xFF01, 2)
 
 
 def test_a_fault_that_is_joined_by_another_has_lasted_from_the_first_on() -> None:
-    watch, lines = FaultWatch(), []
+    watch, lines = Observer(), []
     flags = {0.0: 0x04, 2.0: 0x0C, 4.0: 0x0C, 9.0: 0}
     for now, bits in flags.items():
         lines += watch.lines(view(int(now), WELL._replace(input_flags=bits << 8)), now)
@@ -114,8 +114,8 @@ def test_a_fault_that_is_joined_by_another_has_lasted_from_the_first_on() -> Non
 
 
 def test_a_fault_that_is_latched_later_says_so() -> None:
-    watch = FaultWatch()
+    watch = Observer()
     fault = WELL._replace(input_flags=0x0400)
     assert len(watch.lines(view(1, fault), 0.0)) == 1
     (line,) = watch.lines(view(2, fault._replace(latched=0x04)), 10.0)
-    assert line.endswith("latched: `jtq control reset` releases it")
+    assert line == "joint 1: latched: the motor position jumped (motor_jump); `jtq control reset` releases it"

@@ -32,10 +32,10 @@ def test_a_node_that_never_comes_and_one_that_stops_are_told() -> None:
     assert kinds(watch.tick(0.31)) == [("never", 3)]
     watch.receive(1, b"\x05", 0.32)
     (lost,) = watch.tick(0.36)
-    assert (lost.kind, lost.node, lost.line) == ("lost", 2, "node 2: no heartbeat for 0.3 s")
+    assert lost == ("lost", 2, "0.3 s", 0.05)
     assert [watch.state(node) for node in (1, 2, 3)] == [HEARD, LOST, LOST]
     (back,) = watch.receive(2, b"\x05", 2.05)
-    assert back.line == "node 2: heartbeat is back after 2.0 s"
+    assert back == ("back", 2, "", 2.05)
     assert watch.lost_count == 2
 
 
@@ -60,7 +60,7 @@ def test_a_toggling_state_is_few_lines() -> None:
     watch, lines = make_watch(), []
     for n in range(1000):
         events = watch.receive(1, b"\x05" if n % 2 else b"\x7f", 0.1 * n)
-        lines += [event.line for event in events if event.line]
+        lines += [event.text for event in events if event.text]
     assert 2 <= len(lines) <= 25, "100 s of toggling"
 
 
@@ -80,7 +80,7 @@ def test_a_restart_and_a_node_that_is_not_in_the_configuration() -> None:
     watch = make_watch()
     assert kinds(watch.receive(1, b"\x00", 0.1)) == [("restarted", 1)]
     (foreign,) = watch.receive(9, b"\x00", 0.1)
-    assert foreign.line == "node 9: it is on the bus and not in the configuration (status A)"
+    assert foreign.text == "node 9: it is on the bus and not in the configuration (status A)"
     assert watch.receive(9, b"\x7f", 0.2) == [], "once"
     assert watch.receive(0x20, b"\x05", 0.2) == watch.receive(0x21, b"\x05", 0.2) == []
     for node in range(40, 127):  # somebody tries them all: bounded

@@ -7,17 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.daemon.bus.errors import LoopErrors, OwnErrors
+from jtqd.daemon.bus.errors import OwnErrors
 from jtqd.daemon.bus.own_node import OwnNode
 from jtqd.daemon.config import load_config
 from jtqd.daemon.shared import cycle_record as faults
 from jtqd.daemon.shared.snapshot import COUNTERS, JointView, Snapshot, SnapshotReader, View
-from jtqd.daemon.supervisor.health import FaultWatch
 from jtqd.daemon.supervisor.summary import Summary
 from jtqd.drivers.eds.own_objects import COUNTERS as OWN_COUNTERS
 from jtqd.drivers.object_dictionary import ObjectStore, read_eds
 from jtqd.estimator.status import INVALID, VALID
-from tests.daemon.supervisor.watch_views import WELL, view
+from tests.daemon.supervisor.watch_views import WELL, Observer, view
 from tests.paths import JTQD_EDS
 
 JUMP, TORSION = faults.BITS["motor_jump"], faults.BITS["torsion"]
@@ -32,7 +31,7 @@ def reading(n: int, one: JointView = WELL, two: JointView = WELL) -> View:
 
 
 def test_a_fault_is_told_when_it_begins_and_when_all_are_over() -> None:
-    watch = FaultWatch()
+    watch = Observer()
     assert watch.lines(reading(1), 0.0) == []
     assert watch.lines(reading(2, faulty(TORSION)), 1.0) == [
         "joint 1: no torque: motor and link position are further apart than the gear can be twisted (torsion)"
@@ -42,16 +41,20 @@ def test_a_fault_is_told_when_it_begins_and_when_all_are_over() -> None:
 
 
 def test_a_latched_fault_says_how_it_is_released() -> None:
-    watch = FaultWatch()
+    watch = Observer()
     assert watch.lines(reading(1, WELL, faulty(JUMP, JUMP)), 0.0) == [
-        "joint 2: no torque: the motor position jumped (motor_jump); latched: `jtq control reset` releases it"
+        "joint 2: no torque: the motor position jumped (motor_jump)",
+        "joint 2: latched: the motor position jumped (motor_jump); `jtq control reset` releases it",
     ]
     assert watch.lines(reading(2, WELL, WELL._replace(latched=JUMP)), 1.0) == []
-    assert watch.lines(reading(3), 2.0) == ["joint 2: no fault any more after 2.0 s"]
+    assert watch.lines(reading(3), 2.0) == [
+        "joint 2: no fault any more after 2.0 s",
+        "joint 2: latched faults released after 2.0 s",
+    ]
 
 
 def test_a_fault_that_comes_and_goes_is_few_lines() -> None:
-    watch = FaultWatch()
+    watch = Observer()
     lines = [
         line
         for n in range(2000)
@@ -96,11 +99,12 @@ def test_faults_and_latches_are_emcy_with_the_drives_node(
 ) -> None:
     store, _, _ = node
     errors = OwnErrors(store)
-    loop_errors = LoopErrors(load_config(None), errors, lambda *_: None)
+    watch = Observer()
+    watch.conditions.subscribe(errors.follow)
     store.set_number(0x1015, 0, 0)
 
     def told(one: JointView, two: JointView) -> list[str]:
-        loop_errors.watch(reading(1, one, two), (), 0.0)
+        watch.lines(reading(1, one, two), 0.0)
         return [message.hex(" ") for message in iter(lambda: errors.tick(0.0), None)]
 
     assert told(WELL, WELL) == []
@@ -124,7 +128,7 @@ def test_the_summary_says_why_there_was_no_torque() -> None:
     def lines(**counters: int) -> list[str]:
         counted = dict.fromkeys(COUNTERS, 0) | counters
         us = (1.0, 2.0, 3.0)
-        text = Summary(9, 0, 0, us, us, (0.1, 0.1), counted, (), None, None, {}, (0, 0)).text()
+        text = Summary(9, 0, 0, us, us, (0.1, 0.1), counted, (), None, None, {}).text()
         return [line for line in text.splitlines() if line.startswith("no torque")]
 
     assert lines() == []
@@ -140,7 +144,7 @@ def test_the_summary_tells_stolen_time_where_there_was_any() -> None:
         (0.318, ["processors    taken away for 0.32 s by the hypervisor (stolen time)"]),
     ):
         told = Summary(
-            9, 0, 0, us, us, (0.1, 0.1), dict.fromkeys(COUNTERS, 0), (), None, None, {}, (0, 0), stolen_s
+            9, 0, 0, us, us, (0.1, 0.1), dict.fromkeys(COUNTERS, 0), (), None, None, {}, (), stolen_s
         )
         assert [line for line in told.text().splitlines() if line.startswith("processors")] == lines
         assert told.content()["stolen_s"] == round(stolen_s, 2)

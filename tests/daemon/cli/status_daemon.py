@@ -10,8 +10,9 @@ from rich.console import Console
 from jtqd.daemon.cli.reading import Daemon, Watch
 from jtqd.daemon.cli.status import StatusView
 from jtqd.daemon.config import load_config
-from jtqd.daemon.shared.runtime_dir import About, about, write_about
+from jtqd.daemon.shared.runtime_dir import About, write_about
 from jtqd.daemon.shared.snapshot import COUNTERS, INPUT, Snapshot
+from jtqd.daemon.supervisor.description import about
 
 NAN = float("nan")
 ONE = (-117.94, 0.48, NAN, -117.0, -117.9, -118.48, 0x27, 2, 0, 15, 0)

@@ -14,7 +14,8 @@ import pytest
 from jtqd.daemon.cli.reading import Watch, find_daemons, on_bus
 from jtqd.daemon.config import load_config
 from jtqd.daemon.shared.notices import Notices
-from jtqd.daemon.shared.runtime_dir import AboutError, about, read_about, start_ticks, write_about
+from jtqd.daemon.shared.runtime_dir import AboutError, read_about, start_ticks, write_about
+from jtqd.daemon.supervisor.description import about
 from tests.daemon.cli.status_daemon import described, running
 
 

@@ -3,11 +3,12 @@
 import pytest
 
 from jtqd.daemon.cli.checks import duration, histogram, number, share, size
-from jtqd.daemon.cli.reading import drive_state, reason, silent_s
 from jtqd.daemon.config import load_config
 from jtqd.daemon.shared.cycle_record import DRIVE_FAULT
-from jtqd.daemon.shared.runtime_dir import About, about
+from jtqd.daemon.shared.reasons import drive_state, joint_reason, silent_s
+from jtqd.daemon.shared.runtime_dir import About
 from jtqd.daemon.shared.snapshot import InputView, JointView
+from jtqd.daemon.supervisor.description import about
 from jtqd.estimator import status as st
 from jtqd.estimator.plausibility import LINK_JUMP, MOTOR_JUMP
 from tests.daemon.supervisor.watch_views import NAN, WELL, view
@@ -20,7 +21,7 @@ def bench() -> About:
 
 def why(bench: About, one: JointView, **more: int) -> str:
     now = view(1000, one, **more)
-    return reason(bench, 1, now, view(900))
+    return joint_reason(bench, 1, now, view(900))
 
 
 def test_a_good_estimate_needs_no_reason(bench: About) -> None:
@@ -40,14 +41,16 @@ def test_stale_names_the_pdo_the_node_or_the_bus(bench: About) -> None:
     )
     heard = tuple(1_000_000_000 if node == 1 else 0 for node in range(128))
     silent = view(1000, stale)._replace(sync_realtime_ns=3_500_000_000, node_heard_ns=heard)
-    assert reason(bench, 1, silent, view(900)) == "node 1 is silent: no heartbeat for 2.5 s"
+    assert joint_reason(bench, 1, silent, view(900)) == "node 1 is silent: no heartbeat for 2.5 s"
     assert silent_s(silent._replace(sync_realtime_ns=1_200_000_000), 1, 100) is None
     assert silent_s(silent, 2, 100) is None, "one that has never been heard is not silent"
     unready = view(1000, stale, unconfigured=(1,))
-    assert reason(bench, 1, unready, view(900)) == "node 1 is not configured as it was"
+    assert joint_reason(bench, 1, unready, view(900)) == "node 1 is not configured as it was"
     restarted = view(1000, stale, unconfigured=(1,), states={1: 127})
-    assert reason(bench, 1, restarted, view(900)).startswith("node 1 has restarted")
-    assert reason(bench, 1, view(1000, stale, states={1: 127}), view(900)) == "node 1 is pre-operational"
+    assert joint_reason(bench, 1, restarted, view(900)).startswith("node 1 has restarted")
+    assert (
+        joint_reason(bench, 1, view(1000, stale, states={1: 127}), view(900)) == "node 1 is pre-operational"
+    )
 
 
 def test_drive_states(bench: About) -> None:
@@ -81,8 +84,8 @@ def test_degraded_and_invalid(bench: About) -> None:
 
 def test_starting_and_standstill(bench: About) -> None:
     starting = WELL._replace(status=st.STARTING)
-    assert reason(bench, 1, view(8, starting), view(0)) == "the first cycles"
-    assert reason(bench, 1, view(800, starting), view(0)).startswith("the observer starts again")
+    assert joint_reason(bench, 1, view(8, starting), view(0)) == "the first cycles"
+    assert joint_reason(bench, 1, view(800, starting), view(0)).startswith("the observer starts again")
     assert "half the interval" in why(bench, WELL._replace(status=st.STANDSTILL))
 
 

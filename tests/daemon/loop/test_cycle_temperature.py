@@ -13,8 +13,8 @@ import pytest
 
 from jtqd.daemon.loop.estimate_pdo import decode
 from jtqd.daemon.loop.input_pdos import JointTemperature
-from jtqd.daemon.loop.joint import FLAG_TEMPERATURE
 from jtqd.daemon.shared import cycle_record as cr
+from jtqd.daemon.shared.cycle_record import FLAG_TEMPERATURE
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.estimator.methods import AnyEstimator, load_network, make_estimator
 from jtqd.estimator.settings import EstimatorSettings

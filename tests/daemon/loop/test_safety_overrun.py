@@ -14,9 +14,10 @@ import pytest
 from jtqd.daemon.loop.estimate_pdo import decode
 from jtqd.daemon.loop.intake import Intake
 from jtqd.daemon.loop.joint import JointCycle, JointInputs
-from jtqd.daemon.loop.joint_status import FLAG_NETWORK_SKIPPED, JointSafety
+from jtqd.daemon.loop.joint_status import JointSafety
 from jtqd.daemon.loop.schedule import RESERVED_NS, NetworkBudget
 from jtqd.daemon.shared import cycle_record as cr
+from jtqd.daemon.shared.cycle_record import FLAG_NETWORK_SKIPPED
 from jtqd.daemon.shared.snapshot import COUNTERS, SnapshotReader
 from jtqd.estimator.estimator import FusedEstimator
 from jtqd.estimator.joint import Effect

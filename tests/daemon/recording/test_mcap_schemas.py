@@ -6,8 +6,6 @@ import struct
 
 import pytest
 
-from jtqd.daemon.loop import joint as joint_cycle
-from jtqd.daemon.loop import joint_status
 from jtqd.daemon.recording import messages, schemas
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared import cycle_record as faults
@@ -196,11 +194,11 @@ def test_status_constants_are_those_of_the_pdo():
     flags |= {"BEFORE_NEXT_SYNC": cr.FLAG_BEFORE_NEXT_SYNC, "SYNC_CONFIRMED": cr.FLAG_SYNC_CONFIRMED}
     inputs = ("POSITION", "MOTION", "SENSOR", "TEMPERATURE")
     names = ("INPUT_TPDO1", "INPUT_TPDO2", "INPUT_SENSOR", "INPUT_TEMPERATURE")
-    flags |= {name: getattr(joint_cycle, f"FLAG_{part}") for name, part in zip(names, inputs, strict=True)}
+    flags |= {name: getattr(cr, f"FLAG_{part}") for name, part in zip(names, inputs, strict=True)}
     flags |= {"WITHDRAWN": cr.FLAG_WITHDRAWN, "LATCHES_RESET": cr.FLAG_RESET}
     flags |= {
-        "NETWORK_SKIPPED": joint_status.FLAG_NETWORK_SKIPPED,
-        "FAULT_LATCHED": joint_status.FLAG_LATCHED,
+        "NETWORK_SKIPPED": cr.FLAG_NETWORK_SKIPPED,
+        "FAULT_LATCHED": cr.FLAG_LATCHED,
     }
     flags |= {f"FAULT_{faults.NAMES[bit].upper()}": bit << 8 for bit in faults.COUNTED}
     assert flags.items() <= JOINT.constants.items()

@@ -2,22 +2,28 @@
 
 import pytest
 
-from jtqd.daemon.supervisor.health import DeviationWatch
 from jtqd.estimator.status import STALE
-from tests.daemon.supervisor.watch_views import NAN, WELL, view
+from tests.daemon.supervisor.watch_views import NAN, WELL, Observer, view
 
 
 def watched(sigmas, period=0.05):
-    """Readings of joint 2 so many sigmas above the sensor (None: no estimate); when lines came, and the count."""
-    watch, when = DeviationWatch(), []
+    """Readings of joint 2 so many sigmas above the sensor (None: no estimate); when it began, and its text."""
+    watch, when = Observer(), []
     for n, distance in enumerate(sigmas):
         joint = WELL._replace(torque_nm=10.0 + 0.5 * (distance or 0.0), sigma_nm=0.5)
         if distance is None:
             joint = WELL._replace(torque_nm=NAN, sigma_nm=NAN, status=STALE)
-        when += [(n, line) for line in watch.lines(view(8 * n, two=joint), n * period)]
-    assert watch.episodes[0] == 0
-    assert watch.episodes[1] == len(when)
+        before = far(watch)
+        watch.lines(view(8 * n, two=joint), n * period)
+        if far(watch) and not before:
+            when.append((n, far(watch)[0].line))
+    (times,) = [each.times for each in watch.conditions.history(0.0) if each.name == "deviation"] or [0]
+    assert times == len(when)
     return when
+
+
+def far(watch):
+    return [each for each in watch.conditions.present() if each.name == "deviation"]
 
 
 def test_the_line_names_joint_and_numbers():
@@ -55,13 +61,17 @@ def test_what_is_not_known_is_neither_far_nor_near():
     ((at, _),) = watched(([4.0] * 9 + [None]) * 4)
     assert at == 20, "a moment without a number is passed over"
     assert len(watched([4.0] * 25 + [None] * 100 + [4.0] * 25)) == 1, "the episode has not ended"
-    watch = DeviationWatch()
+    watch = Observer()
     blind = WELL._replace(torque_nm=90.0, sensor_nm=NAN)
-    assert [line for n in range(100) for line in watch.lines(view(8 * n, blind), 0.05 * n)] == []
+    for n in range(100):
+        watch.lines(view(8 * n, blind), 0.05 * n)
+    assert far(watch) == []
 
 
 def test_readings_far_apart_or_of_one_cycle_are_no_duration():
     assert watched([4.0] * 40, period=0.6) == []
-    watch = DeviationWatch()
-    far = view(8, WELL._replace(torque_nm=20.0))
-    assert [line for n in range(100) for line in watch.lines(far, 0.05 * n)] == []
+    watch = Observer()
+    reading = view(8, WELL._replace(torque_nm=20.0))
+    for n in range(100):
+        watch.lines(reading, 0.05 * n)
+    assert far(watch) == []

@@ -3,21 +3,20 @@
 import pytest
 
 from jtqd.daemon.config import load_config
-from jtqd.daemon.supervisor.health import InputWatch
 from jtqd.estimator.status import OFF, STALE
 from jtqd.models.files import shipped
-from tests.daemon.supervisor.watch_views import NAN, WELL, view
+from tests.daemon.supervisor.watch_views import NAN, WELL, Observer, view
 
 STALE_NO_MOTION = WELL._replace(torque_nm=NAN, status=STALE, input_flags=1 | 4)
 
 
 def told(lost, before=None, seconds=0.5):
     """Lines of a loss that follows healthy readings."""
-    watch = InputWatch(load_config(None))
+    watch = Observer()
     lines = watch.lines(before or view(0), 0.0)
     for n in range(1, round(seconds / 0.05) + 1):
-        lines += watch.lines(lost, 0.05 * n)
-    return lines
+        lines += watch.lines(lost._replace(cycle=8 * n), 0.05 * n)
+    return [line for line in lines if "SYNC producer" not in line]
 
 
 def test_healthy_and_switched_off_joints_are_no_news():
@@ -82,7 +81,7 @@ def test_the_sensor_has_its_own_line(flags, status, cause):
 
 def warmth(known, *, seconds, start_s=100.0):
     """Lines while joint 1's temperature is known or not (one flag per 50 ms); the loop has run for `start_s`."""
-    watch = InputWatch(load_config(None))
+    watch = Observer()
     lines = []
     for n in range(round(seconds / 0.05)):
         joint = WELL if known(0.05 * n) else WELL._replace(input_flags=7)
@@ -108,13 +107,13 @@ def test_joints_without_a_temperature_are_not_told_of(tmp_path):
     path = shipped("bench.yaml").parent
     config = tmp_path / "c.yaml"
     config.write_text(text.replace("file: ", f"file: {path}/"))
-    watch = InputWatch(load_config(config))
+    watch = Observer(load_config(config))
     cold = WELL._replace(input_flags=7)
     assert not any(watch.lines(view(100_000 + 50 * n, cold, cold), 0.05 * n) for n in range(200))
 
 
 def test_the_end_is_told():
-    watch = InputWatch(load_config(None))
+    watch = Observer()
     lines = []
     for n in range(100):
         lost = 20 <= n < 60

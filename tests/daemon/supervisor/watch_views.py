@@ -1,6 +1,11 @@
 """Readings of the snapshot for the tests of what watches them."""
 
+from collections.abc import Collection
+
+from jtqd.daemon.config import Config, load_config
+from jtqd.daemon.shared.conditions import Conditions
 from jtqd.daemon.shared.snapshot import COUNTERS, JointView, View
+from jtqd.daemon.supervisor.health import Health
 from jtqd.estimator.status import VALID
 
 NAN = float("nan")
@@ -33,3 +38,20 @@ def view(
         bytes(nodes),
         unconfigured,
     )
+
+
+class Observer:
+    """Conditions that follow from readings of the snapshot, as in the supervisor."""
+
+    def __init__(self, config: Config | None = None) -> None:
+        self.conditions = Conditions()
+        self.health = Health(config or load_config(None), self.conditions)
+
+    def lines(self, reading: View, now_s: float, absent: Collection[int] = ()) -> list[str]:
+        """Take a reading; lines for the operator that are due."""
+        self.health.observe(reading, now_s, absent=absent)
+        return [line.text for line in self.conditions.lines(now_s)]
+
+    def present(self) -> list[tuple[str, str]]:
+        """(name, subject) of every condition that is present."""
+        return [(each.name, each.subject) for each in self.conditions.present()]

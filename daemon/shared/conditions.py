@@ -1,0 +1,515 @@
+"""What is wrong now with a joint, a node, a PDO, the bus, the loop, the recorder or the machine. Pure but for the file.
+
+`CATALOGUE` is the one list of everything that jtqd reports as present for some time, with its severity, its text and its
+EMCY code. The supervisor's parts observe and call `Conditions.update`; everybody else sees a view of the same set:
+
+    journal, standard error, /events    a line when a condition begins and when it ends (`Conditions.lines`)
+    EMCY, 1001h, 1003h                  `Conditions.subscribe`, each change at once
+    conditions.json                     `present()`, for `jtq status`, `jtq check`, the recorder's and live /diagnostics
+    metrics, final summary              `present()`, `history()`
+
+What only happens (a boot-up message, an EMCY of a node, an NMT command of somebody else) is no condition but an event
+(`jtqd.daemon.shared.notices`).
+
+>>> conditions = Conditions()
+>>> drive = Subject("node 2", 2, joints=0b10)
+>>> conditions.update("node_lost", drive, True, 10.0, "0.3 s")
+>>> [(each.name, each.subject, each.text) for each in conditions.present()]
+[('node_lost', 'node 2', 'no heartbeat for 0.3 s')]
+>>> conditions.update("node_lost", drive, False, 12.5)
+>>> [each.text for each in conditions.lines(12.5)]
+['node 2: heartbeat is back after 2.5 s: no heartbeat for 0.3 s']
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from math import inf
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from jtqd.daemon.shared.notices import ERROR, INFO, WARNING
+from jtqd.drivers import emcy
+from jtqd.drivers.devices import SYNC_COB_ID
+
+FILE = "conditions.json"
+"""Name of the file in the runtime directory of a daemon."""
+SCHEMA = "jtqd.conditions/1"
+
+SEVERITIES: Final = {INFO: "info", WARNING: "warning", ERROR: "error"}
+JOINT, NODE, PDO, BUS, LOOP, RECORDER, MACHINE = "joint", "node", "PDO", "bus", "loop", "recorder", "machine"
+"""What a condition can be about."""
+QUIET_S: Final = 5.0
+"""Between two lines that begin the same condition of the same subject."""
+DEVIATION_SIGMAS, DEVIATION_S = 3.0, 1.0
+"""`deviation`: so many sigmas between estimate and torque sensor, for so long."""
+
+
+class Emcy(NamedTuple):
+    """How a condition shows in EMCY messages of jtqd: code, bits of 1001h, and bytes 5 to 7."""
+
+    code: int
+    register: int = emcy.COMMUNICATION
+    detail: int = 0
+    """Added to the subject's number."""
+    names_joints: bool = True
+    """Byte 7 holds the joints that are concerned."""
+
+
+@dataclass(frozen=True)
+class Definition:
+    """One row of the catalogue.
+
+    Attributes:
+        name: as in files, metrics and docs.
+        about: what it is about (`JOINT` .. `MACHINE`).
+        severity: INFO, WARNING or ERROR of `jtqd.daemon.shared.notices`.
+        text: one sentence in the present tense; {} takes the details.
+        ended: what the line at its end says, before "after 2.3 s"; "" where an event says so.
+        topic: of the event that a line becomes (`jtqd.daemon.shared.notices.Notice`).
+        emcy: of the EMCY messages of its begin and end; None: none.
+        hold_s: a change that does not last so long is none.
+        logged: a line when it begins and when it ends; not where lines of another condition or of events say the same.
+    """
+
+    name: str
+    about: str
+    severity: int
+    text: str
+    ended: str = ""
+    topic: str = "input"
+    emcy: Emcy | None = None
+    hold_s: float = 0.0
+    logged: bool = True
+
+
+_HOLD_S = 0.1
+_ROWS = (
+    # Joints
+    Definition("stale_input", JOINT, WARNING, "inputs lost: {}", "inputs back", hold_s=_HOLD_S),
+    Definition("sensor_lost", JOINT, WARNING, "torque sensor lost: {}", "torque sensor back", hold_s=_HOLD_S),
+    Definition(
+        "temperature_lost", JOINT, WARNING, "temperature lost: {}", "temperature back", hold_s=_HOLD_S
+    ),
+    Definition(
+        "joint_fault",
+        JOINT,
+        ERROR,
+        "no torque: {}",
+        "no fault any more",
+        topic="fault",
+        emcy=Emcy(emcy.JOINT_FAULT, emcy.MANUFACTURER),
+    ),
+    Definition(
+        "fault_latched",
+        JOINT,
+        ERROR,
+        "latched: {}; `jtq control reset` releases it",
+        "latched faults released",
+        topic="fault",
+        emcy=Emcy(emcy.FAULT_LATCHED, emcy.MANUFACTURER),
+    ),
+    Definition(
+        "drive_fault", JOINT, ERROR, "{}", "drive not in fault any more", topic="fault", hold_s=_HOLD_S
+    ),
+    Definition("drive_off", JOINT, INFO, "{}", logged=False),
+    Definition("degraded", JOINT, INFO, "{}", logged=False),
+    Definition(
+        "deviation",
+        JOINT,
+        WARNING,
+        f"the estimate has been more than {DEVIATION_SIGMAS:g} sigma away from the torque sensor "
+        f"for {DEVIATION_S:g} s: {{}}",
+        "the estimate agrees with the torque sensor again",
+    ),
+    # Nodes and their PDOs
+    Definition(
+        "node_lost",
+        NODE,
+        WARNING,
+        "no heartbeat for {}",
+        "heartbeat is back",
+        topic="heartbeat",
+        emcy=Emcy(emcy.HEARTBEAT_LOST),
+    ),
+    Definition(
+        "node_doubled",
+        NODE,
+        WARNING,
+        "{}: are there two nodes with this node-ID?",
+        "one producer of heartbeats again",
+        topic="heartbeat",
+        emcy=Emcy(emcy.COB_ID_COLLISION, detail=0x700, names_joints=False),
+    ),
+    Definition(
+        "node_changed",
+        NODE,
+        WARNING,
+        "{}",
+        topic="boot",
+        emcy=Emcy(emcy.NODE_CHANGED, emcy.MANUFACTURER),
+    ),
+    Definition("node_absent", NODE, WARNING, "optional node, not there", topic="boot", logged=False),
+    Definition("node_unconfigured", NODE, WARNING, "{}", topic="boot", logged=False),
+    Definition("node_not_operational", NODE, WARNING, "{}", topic="heartbeat", logged=False),
+    Definition("node_error", NODE, WARNING, "reports {}", topic="emcy", logged=False),
+    Definition(
+        "pdo_timeout",
+        PDO,
+        WARNING,
+        "no valid frame for {} cycles in a row",
+        topic="pdo",
+        emcy=Emcy(emcy.PDO_TIMEOUT),
+        logged=False,
+    ),
+    Definition(
+        "pdo_short",
+        PDO,
+        WARNING,
+        f"{emcy.name_of(emcy.PDO_SHORT)} ({emcy.PDO_SHORT:04X}h): it is not used",
+        "length as mapped again",
+        topic="pdo",
+        emcy=Emcy(emcy.PDO_SHORT),
+    ),
+    Definition(
+        "pdo_long",
+        PDO,
+        WARNING,
+        f"{emcy.name_of(emcy.PDO_LONG)} ({emcy.PDO_LONG:04X}h): it is not used",
+        "length as mapped again",
+        topic="pdo",
+        emcy=Emcy(emcy.PDO_LONG),
+    ),
+    # Bus
+    Definition("bus_warning", BUS, WARNING, "error warning, before: {}", "error active", topic="bus"),
+    Definition(
+        "bus_passive",
+        BUS,
+        WARNING,
+        "error passive, before: {}",
+        "error active",
+        topic="bus",
+        emcy=Emcy(emcy.CAN_PASSIVE, names_joints=False),
+    ),
+    Definition("bus_off", BUS, ERROR, "bus-off, before: {}", "error active", topic="bus"),
+    Definition("bus_down", BUS, ERROR, "interface down, before: {}", "error active", topic="bus"),
+    Definition(
+        "foreign_sync",
+        BUS,
+        ERROR,
+        "another SYNC producer: no input of its cycles is used",
+        "no other SYNC producer any more",
+        topic="sync",
+        emcy=Emcy(emcy.COB_ID_COLLISION, detail=SYNC_COB_ID),
+    ),
+    Definition(
+        "sync_late", BUS, WARNING, "the own SYNC waits in the transmit queue", topic="sync", logged=False
+    ),
+    Definition(
+        "receive_overrun",
+        BUS,
+        WARNING,
+        "received frames were lost: the loop's socket was read too late",
+        "no received frame lost any more",
+        topic="bus",
+        emcy=Emcy(emcy.CAN_OVERRUN, detail=1),
+    ),
+    Definition(
+        "transmit_overrun",
+        BUS,
+        WARNING,
+        "frames could not be sent: the transmit queue is full",
+        "frames are sent again",
+        topic="bus",
+        emcy=Emcy(emcy.CAN_OVERRUN, detail=2),
+    ),
+    # Loop, recorder, machine
+    Definition("loop_stopped", LOOP, ERROR, "no cycle for {}", "cycles again", topic="loop"),
+    Definition(
+        "late_loop", LOOP, WARNING, "cycles are missed: the loop comes too late", topic="loop", logged=False
+    ),
+    Definition(
+        "cycles_lost", RECORDER, ERROR, "cycles are lost: they are in no log", topic="recorder", logged=False
+    ),
+    Definition(
+        "stolen_time", MACHINE, INFO, "a hypervisor takes processor time away", topic="machine", logged=False
+    ),
+    Definition("not_granted", MACHINE, WARNING, "{}", topic="machine", logged=False),
+)
+CATALOGUE: Final = {row.name: row for row in _ROWS}
+
+
+class Subject(NamedTuple):
+    """What a condition is about: "joint 1", "node 3", "281h drive 1 TPDO2", "bus".
+
+    `number` is the drive's node-ID, the node-ID, the COB-ID or 0: the detail of EMCY messages. `joints`: bit 0 joint 1,
+    bit 1 joint 2. `node`: node-ID of its events; 0 for none.
+    """
+
+    name: str
+    number: int = 0
+    joints: int = 0
+    node: int = 0
+
+
+THE_BUS: Final = Subject("bus", joints=3)
+THE_LOOP, THE_RECORDER, THE_MACHINE = Subject("loop"), Subject("recorder"), Subject("machine")
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One that is present; `since_ns` is CLOCK_MONOTONIC."""
+
+    name: str
+    subject: str
+    severity: int
+    text: str
+    since_ns: int
+
+    @property
+    def line(self) -> str:
+        """Subject and text."""
+        return f"{self.subject}: {self.text}"
+
+
+class Change(NamedTuple):
+    """A condition has begun (`present`) or ended."""
+
+    definition: Definition
+    subject: Subject
+    present: bool
+
+
+class Line(NamedTuple):
+    """One line for the operator; `severity` INFO at the end of a condition."""
+
+    definition: Definition
+    subject: Subject
+    severity: int
+    text: str
+
+
+class Occurrences(NamedTuple):
+    """How often a condition was present, for how long altogether, and when first (CLOCK_MONOTONIC)."""
+
+    name: str
+    subject: str
+    times: int
+    total_s: float
+    first_s: float
+
+
+class _State:
+    """One condition of one subject: present or not, since when, and which lines about it are due.
+
+    A begin that comes sooner than QUIET_S after the last line that told one is told together with its end, or with
+    those that follow: neither a flicker nor a flapping contact floods the log.
+    """
+
+    def __init__(self, definition: Definition, subject: Subject) -> None:
+        self.definition, self.subject = definition, subject
+        self.present = False
+        self.text = ""
+        self.since_s = self.first_s = 0.0
+        self.count, self.total_s = 0, 0.0
+        self._reading, self._reading_since_s = False, -inf
+        self._unlogged, self._unlogged_s = 0, 0.0
+        self._logged, self._not_before_s = False, -inf
+        self._again = False
+        self._texts: dict[str, float] = {}
+
+    def update(self, reading: bool, now_s: float, since_s: float) -> bool:
+        """Take a reading; True when the condition begins or ends with it."""
+        if reading != self._reading:
+            self._reading, self._reading_since_s = reading, since_s
+        if reading == self.present or now_s - self._reading_since_s < self.definition.hold_s:
+            return False
+        self.present = reading
+        if reading:
+            self.since_s, self.count, self._unlogged = (
+                self._reading_since_s,
+                self.count + 1,
+                self._unlogged + 1,
+            )
+            self.first_s = self.first_s if self.count > 1 else self.since_s
+        else:
+            lasted_s = self._reading_since_s - self.since_s
+            self.total_s, self._unlogged_s = self.total_s + lasted_s, self._unlogged_s + lasted_s
+        return True
+
+    def describe(self, text: str, *, again: bool = False) -> None:
+        """Take the text that holds now; `again`: worth another line."""
+        self._again = self._again or again
+        self.text = text
+
+    def no_end_line(self) -> None:
+        """Leave out the line that its end would have: another one says so."""
+        self._logged = self._again = False
+        self._unlogged, self._unlogged_s = 0, 0.0
+
+    def _may_repeat(self, now_s: float) -> bool:
+        """Another line about what is present: with details that no line had of late."""
+        self._texts = {text: at_s for text, at_s in self._texts.items() if now_s - at_s < QUIET_S}
+        return self._again and self.text not in self._texts
+
+    def line(self, now_s: float) -> Line | None:
+        """The line that is due, if any."""
+        definition = self.definition
+        if not definition.logged:
+            return None
+        may = now_s >= self._not_before_s
+        if self.present:
+            if not (self._may_repeat(now_s) if self._logged else may):
+                return None
+            self._logged, self._again, self._not_before_s = True, False, now_s + QUIET_S
+            self._texts[self.text] = now_s
+            return Line(definition, self.subject, definition.severity, f"{self.subject.name}: {self.text}")
+        if not self._unlogged or not (self._logged or may):
+            return None
+        if not definition.ended:
+            self.no_end_line()
+            return None
+        text = f"{self.subject.name}: {definition.ended} after {self._unlogged_s:.1f} s"
+        if self._unlogged > 1:
+            text += f", {self._unlogged} times"
+        if not self._logged:
+            text += f": {self.text}"
+            self._not_before_s = now_s + QUIET_S
+        self.no_end_line()
+        return Line(definition, self.subject, INFO, text)
+
+
+class Conditions:
+    """The set of conditions of one daemon. Times are CLOCK_MONOTONIC [s], arguments of every call."""
+
+    def __init__(self) -> None:
+        self._states: dict[tuple[str, str], _State] = {}
+        self._listeners: list[Callable[[Change], None]] = []
+
+    def subscribe(self, listener: Callable[[Change], None]) -> None:
+        """Call `listener` with each change, at once and in order."""
+        self._listeners.append(listener)
+
+    def update(
+        self,
+        name: str,
+        subject: Subject,
+        present: bool,
+        now_s: float,
+        details: str | Callable[[], str] = "",
+        *,
+        since_s: float | None = None,
+        log_again: bool = False,
+        superseded: bool = False,
+    ) -> None:
+        """Take what a part has observed; call it with every reading or with every change.
+
+        Args:
+            name: of the catalogue.
+            subject: what it is about.
+            present: as observed.
+            now_s: time of the observation.
+            details: for the text's {}; a function is asked only where the text is needed.
+            since_s: when it began or ended, where that is known better than by `now_s`.
+            log_again: although it is present already, these details are worth another line.
+            superseded: it ended because another condition has taken its place: no line.
+        """
+        key = name, subject.name
+        state = self._states.get(key)
+        if state is None:
+            if not present:
+                return
+            state = self._states[key] = _State(CATALOGUE[name], subject)
+        changed = state.update(present, now_s, now_s if since_s is None else since_s)
+        if state.present and present:
+            text = details() if callable(details) else details
+            state.describe(state.definition.text.format(text), again=log_again and not changed)
+        if not changed:
+            return
+        if superseded:
+            state.no_end_line()
+        for listener in self._listeners:
+            listener(Change(state.definition, subject, state.present))
+
+    def lines(self, now_s: float) -> list[Line]:
+        """Lines for the operator that are due; each is returned once."""
+        return [line for state in self._states.values() if (line := state.line(now_s)) is not None]
+
+    def present(self) -> list[Condition]:
+        """Every condition that is present, the worst first, then the oldest."""
+        found = [
+            Condition(
+                state.definition.name,
+                state.subject.name,
+                state.definition.severity,
+                state.text,
+                round(state.since_s * 1e9),
+            )
+            for state in self._states.values()
+            if state.present
+        ]
+        return sorted(found, key=lambda each: (-each.severity, each.since_ns))
+
+    def is_present(self, name: str, subject: str) -> bool:
+        """True while this condition of this subject is present."""
+        state = self._states.get((name, subject))
+        return state is not None and state.present
+
+    def history(self, now_s: float) -> list[Occurrences]:
+        """Every condition that was present at any time, in the order of the first time."""
+        found = [
+            Occurrences(
+                state.definition.name,
+                state.subject.name,
+                state.count,
+                state.total_s + (now_s - state.since_s if state.present else 0.0),
+                state.first_s,
+            )
+            for state in self._states.values()
+            if state.count
+        ]
+        return sorted(found, key=lambda each: each.first_s)
+
+
+class ConditionsFile:
+    """Keeps `conditions.json` in `directory` up to date; what cannot be written is left out, as nothing depends on it."""
+
+    def __init__(self, directory: Path) -> None:
+        self._path, self._new = directory / FILE, directory / (FILE + ".new")
+        self._last: Sequence[Condition] | None = None
+
+    def write(self, present: Sequence[Condition]) -> None:
+        """Replace the file as a whole when something has changed."""
+        if present == self._last:
+            return
+        with suppress(OSError):
+            rows = [asdict(each) for each in present]
+            with open(self._new, "w", encoding="utf-8") as file:
+                os.fchmod(file.fileno(), 0o640)
+                json.dump({"schema": SCHEMA, "conditions": rows}, file)
+            self._new.replace(self._path)
+            self._last = present
+
+
+def read_conditions(directory: Path) -> list[Condition]:
+    """Conditions of the daemon with this runtime directory, the worst first; none where there is no file of this version.
+
+    They are as of the supervisor's last look: whether that still runs, `jtqd.daemon.shared.runtime_dir.About.running` tells.
+    """
+    try:
+        content = json.loads((directory / FILE).read_text(encoding="utf-8"))
+        if content["schema"] != SCHEMA:
+            return []
+        return [Condition(**each) for each in content["conditions"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+
+
+def worst(conditions: Iterable[Condition], subject: str) -> Condition | None:
+    """The worst condition of this subject, the oldest of them; None where there is none."""
+    own = [each for each in conditions if each.subject == subject]
+    return max(own, key=lambda each: (each.severity, -each.since_ns), default=None)

@@ -1,0 +1,197 @@
+"""Why a joint has the status it has, and why its inputs are missing, in words. Pure: from a snapshot and `about.json`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import isfinite
+
+from jtqd.daemon.shared.cycle_record import (
+    FLAG_MOTION,
+    FLAG_NETWORK_SKIPPED,
+    FLAG_POSITION,
+    FLAG_SENSOR,
+    MEANINGS,
+    NAMES,
+)
+from jtqd.daemon.shared.runtime_dir import About, AboutJoint
+from jtqd.daemon.shared.snapshot import JointView, View
+from jtqd.estimator import status as st
+
+NMT_STATES = {0: "boot-up", 4: "stopped", 5: "operational", 127: "pre-operational"}
+"""Heartbeat states of CiA 301."""
+OPERATIONAL, NOT_OPERATIONAL = 5, (4, 127)
+"""Heartbeat states in which a node sends its PDOs, and in which it sends none."""
+SILENT_AFTER = 3.0
+"""Heartbeat periods without a heartbeat after which a node is silent."""
+_FIRST_CYCLES = 20
+_HELD = "held until enough cycles in a row were good"
+"""Hysteresis of `jtqd.daemon.loop.joint_status`."""
+_DRIVE_STATES = {
+    0x00: "not ready to switch on",
+    0x40: "switch on disabled",
+    0x21: "ready to switch on",
+    0x23: "switched on, not enabled",
+    0x27: "operation enabled",
+    0x07: "quick stop active",
+    0x0F: "fault reaction active",
+    0x08: "fault",
+}
+_STATUS_OF_STATE = {0x27: None, 0x07: None, 0x0F: st.DRIVE_FAULT, 0x08: st.DRIVE_FAULT}
+"""As `jtqd.daemon.loop.joint_status.drive_status`: None where the motor carries current; every other state is off."""
+_ON_THE_BUS = (
+    ("bus_errors", "the bus is down"),
+    ("foreign_sync", "another SYNC is on the bus"),
+    ("sync_errors", "the own SYNC waits in the transmit queue"),
+)
+"""Counters whose rise makes every input of the bus doubtful, and what that means."""
+_ON_THE_PDO = (
+    ("late_frames", "late frames on the bus"),
+    ("rejected_frames", "frames of a wrong format on the bus"),
+)
+_SENSOR_STATUS = {1: "not valid", 2: "positive overload", 4: "negative overload"}
+"""6150h of CiA 404."""
+
+
+def joint_reason(about: About, number: int, view: View, earlier: View) -> str:
+    """Explain the status of joint 1 or 2; "" where nothing needs a reason.
+
+    Args:
+        about: of the daemon.
+        number: 1 or 2.
+        view: the reading.
+        earlier: one from a moment before; what has been counted since then points at a cause.
+    """
+    joint, seen = about.joints[number - 1], view.joints[number - 1]
+    if seen.latched:
+        return f"latched: {fault_meanings(seen.latched)}; `jtq control reset` releases it"
+    match seen.status:
+        case st.STALE:
+            reason = _stale(about, joint, seen, view, earlier)
+        case st.OFF | st.DRIVE_FAULT:
+            reason = drive_reason(joint.node, seen)
+        case st.STARTING if view.cycle <= _FIRST_CYCLES:
+            reason = "the first cycles"
+        case st.STARTING:
+            reason = "the observer starts again after a gap in the inputs"
+        case st.STANDSTILL:
+            reason = (
+                "slower than the standstill velocity: friction hides the torque, sigma is half the interval"
+            )
+        case st.DEGRADED:
+            reason = degraded_reason(seen, joint.network_limit_nm)
+        case st.INVALID:
+            faults = seen.input_flags >> 8
+            reason = fault_meanings(faults) if faults else f"a fault is over; {_HELD}"
+        case _:
+            reason = ""
+    return reason
+
+
+def fault_meanings(faults: int, *, names: bool = False) -> str:
+    """Faults (`jtqd.daemon.shared.cycle_record`) in words, with their names where wanted."""
+    each = (f"{MEANINGS[bit]} ({NAMES[bit]})" if names else MEANINGS[bit] for bit in NAMES if faults & bit)
+    return ", ".join(each) or "an unknown fault"
+
+
+def drive_state(statusword: int) -> str:
+    """State of a CiA 402 drive by its statusword (6041h)."""
+    return _DRIVE_STATES.get(_state_bits(statusword), f"statusword {statusword:04X}h")
+
+
+def drive_reason(node: int, seen: JointView) -> str:
+    """Explain status 0 (off) or 5 (drive fault) by the drive's state."""
+    word = seen.statusword
+    state = f"drive {node}: {drive_state(word)} (6041h {word:04X}h)"
+    now = _STATUS_OF_STATE.get(_state_bits(word), st.OFF)
+    return state if now == seen.status else f"{state}; {_HELD}"
+
+
+def _state_bits(statusword: int) -> int:
+    short = statusword & 0x4F
+    return (
+        short if short in (0x00, 0x40, 0x0F, 0x08) else statusword & 0x6F
+    )  # bit 5 does not count in the first
+
+
+def degraded_reason(seen: JointView, network_limit_nm: float) -> str:
+    """Explain status 3 (degraded): why the network is not in charge; `network_limit_nm`: how far from physics it may be."""
+    if seen.input_flags & FLAG_NETWORK_SKIPPED:
+        return "no time for the network in this cycle: physics only"
+    if not isfinite(seen.network_nm):
+        return "the network's answer is not a number: physics only"
+    apart = abs(seen.network_nm - seen.physics_nm)
+    if apart > network_limit_nm:
+        return (
+            f"the network is {apart:.1f} Nm from physics, trusted to {network_limit_nm:.1f} Nm: physics only"
+        )
+    return "outside what the network was trained on: physics, with less or nothing of the network"
+
+
+def _stale(about: About, joint: AboutJoint, seen: JointView, view: View, earlier: View) -> str:
+    silence = silent_s(view, joint.node, about.heartbeat_ms)
+    if silence is not None:
+        return f"node {joint.node} is silent: no heartbeat for {silence:.1f} s"
+    both = FLAG_POSITION | FLAG_MOTION
+    if seen.input_flags & both == both and view.counters["overruns"] == earlier.counters["overruns"]:
+        return f"the inputs are back; {_HELD}"
+    return stale_reason(joint.node, joint.inputs, seen, view, earlier.counters)
+
+
+def stale_reason(
+    node: int, names: Sequence[str], seen: JointView, view: View, earlier: Mapping[str, int]
+) -> str:
+    """Explain status 4 (stale). The likeliest cause first: what explains more comes before what explains less.
+
+    Args:
+        node: the joint's drive.
+        names: of its TPDO1 and TPDO2.
+        seen: the joint's estimate.
+        view: the reading it is from.
+        earlier: counters of an earlier reading; what has risen since then may be the cause.
+    """
+
+    def rose(name: str) -> bool:
+        return view.counters[name] > earlier[name]
+
+    unready = unready_reason(node, view)
+    if unready:
+        return unready
+    if view.node_states[node] in NOT_OPERATIONAL:
+        return f"node {node} is {NMT_STATES[view.node_states[node]]}"
+    for counter, meaning in _ON_THE_BUS:
+        if rose(counter):
+            return meaning
+    flags = (FLAG_POSITION, FLAG_MOTION)
+    missing = [name for name, flag in zip(names, flags, strict=True) if not seen.input_flags & flag]
+    if not missing:
+        return "the estimate is not ready before the next SYNC"
+    what = f"{' and '.join(missing)} not received in time"
+    hints = [meaning for counter, meaning in _ON_THE_PDO if rose(counter)]
+    return f"{what} ({', '.join(hints)})" if hints else what
+
+
+def unready_reason(node: int, view: View) -> str:
+    """Explain why nothing of a node is used: it restarted, is configured otherwise, or is not there; "" for the others."""
+    if node not in view.unconfigured:
+        return ""
+    if not view.node_heard_ns[node] and not view.node_states[node]:
+        return f"node {node} is not there"
+    if view.node_states[node] == OPERATIONAL:
+        return f"node {node} is not configured as it was"
+    return f"node {node} has restarted and is not configured yet"
+
+
+def sensor_reason(node: int | None, name: str, seen: JointView, view: View) -> str:
+    """Explain why there is no torque of the sensor `node`, whose input PDO is `name`."""
+    if not seen.input_flags & FLAG_SENSOR:
+        unready = "" if node is None else unready_reason(node, view)
+        return unready or f"{name} not received in time"
+    reasons = [text for bit, text in _SENSOR_STATUS.items() if seen.sensor_status & bit]
+    return f"{name} says {', '.join(reasons) or 'no number'}"
+
+
+def silent_s(view: View, node: int, heartbeat_ms: int) -> float | None:
+    """For how long a node has been silent [s]; None while its heartbeats come, or none has ever come."""
+    heard = view.node_heard_ns[node]
+    age_s = (view.sync_realtime_ns - heard) * 1e-9
+    return age_s if heard and age_s > SILENT_AFTER * heartbeat_ms * 1e-3 else None

@@ -1,0 +1,127 @@
+"""The set of conditions: few lines however much happens, the file, and the catalogue."""
+
+from itertools import pairwise
+
+from jtqd.daemon.shared.conditions import (
+    CATALOGUE,
+    Conditions,
+    ConditionsFile,
+    Subject,
+    read_conditions,
+    worst,
+)
+
+JOINT = Subject("joint 1", 1, 1)
+STEP = 1.0 / 16.0  # exact in binary; two of them are longer than what counts as a flicker
+
+
+def told(*spans: tuple[float, float], until: float) -> list[tuple[float, str]]:
+    """What is logged, and when, of something that is lost from .. to; the cause is the time it is asked for."""
+    conditions, lines = Conditions(), []
+    for n in range(round(until / STEP) + 1):
+        now = n * STEP
+        lost = any(start <= now < end for start, end in spans)
+        # Only the text at the begin counts here.
+        begun = conditions.is_present("stale_input", "joint 1")
+        text = conditions.present()[0].text.removeprefix("inputs lost: ") if begun else f"asked at {now}"
+        conditions.update("stale_input", JOINT, lost, now, text)
+        lines += [(now, line.text) for line in conditions.lines(now)]
+    return [(now, line.removeprefix("joint 1: inputs ")) for now, line in lines]
+
+
+def test_nothing_lost_nothing_said():
+    assert told(until=10) == []
+
+
+def test_a_loss_and_its_end_are_one_line_each_at_once():
+    assert told((1.0, 3.25), until=10) == [(1.125, "lost: asked at 1.125"), (3.375, "back after 2.2 s")]
+
+
+def test_what_does_not_last_is_not_told():
+    assert told(*((1.0 + 0.25 * n, 1.125 + 0.25 * n) for n in range(20)), until=10) == []
+    assert told((1.0, 2.0), (2.0625, 3.0), until=10) == [
+        (1.125, "lost: asked at 1.125"),
+        (3.125, "back after 2.0 s"),
+    ]
+
+
+def test_a_flapping_contact_is_two_lines_in_five_seconds_and_nothing_is_left_out():
+    lines = told(*((1.0 + 0.5 * n, 1.25 + 0.5 * n) for n in range(40)), until=30)
+    assert lines[:2] == [(1.125, "lost: asked at 1.125"), (1.375, "back after 0.2 s")]
+    assert all(later - earlier >= 5.0 for earlier, later in pairwise(at for at, _ in lines[::2]))
+    assert len(lines) <= 2 * 5
+    ends = [line for _, line in lines if line.startswith("back")]
+    assert sum(int(line.split(", ")[1].split()[0]) if "times" in line else 1 for line in ends) == 40
+
+
+def test_a_loss_that_was_too_soon_to_be_told_is_told_with_its_end_and_cause():
+    assert told((1.0, 1.5), (2.0, 2.5), until=10)[2:] == [
+        (6.125, "back after 0.5 s: inputs lost: asked at 2.125")
+    ]
+
+
+def test_a_loss_too_soon_that_lasts_is_told_as_soon_as_allowed():
+    assert told((1.0, 1.5), (2.0, 9.0), until=10)[2:] == [
+        (6.125, "lost: asked at 2.125"),
+        (9.125, "back after 7.0 s"),
+    ]
+
+
+def test_two_losses_are_two_and_the_next_line_waits_for_its_time():
+    lines = told((1.0, 1.5), (2.0, 2.5), (3.0, 3.5), (7.0, 7.5), until=20)
+    assert lines[2] == (6.125, "back after 1.0 s, 2 times: inputs lost: asked at 3.125")
+    assert lines[3] == (11.125, "back after 0.5 s: inputs lost: asked at 7.125")
+
+
+def test_the_catalogue_is_complete_and_consistent():
+    for definition in CATALOGUE.values():
+        assert not (definition.emcy and definition.hold_s), "an EMCY is sent at once"
+        assert definition.text.count("{}") <= 1
+        assert definition.ended or not definition.logged or definition.name == "node_changed"
+
+
+def test_a_condition_that_is_superseded_has_no_line_at_its_end():
+    conditions, bus = Conditions(), Subject("bus")
+    conditions.update("bus_passive", bus, True, 1.0, "error active")
+    assert [line.text for line in conditions.lines(1.0)] == ["bus: error passive, before: error active"]
+    conditions.update("bus_passive", bus, False, 2.0, superseded=True)
+    conditions.update("bus_off", bus, True, 2.0, "error passive")
+    assert [line.text for line in conditions.lines(2.0)] == ["bus: bus-off, before: error passive"]
+    conditions.update("bus_off", bus, False, 3.5)
+    assert [line.text for line in conditions.lines(3.5)] == ["bus: error active after 1.5 s"]
+
+
+def test_history_counts_and_adds_up():
+    conditions = Conditions()
+    for begin, end in ((1.0, 2.0), (3.0, 3.5)):
+        conditions.update("foreign_sync", JOINT, True, begin)
+        conditions.update("foreign_sync", JOINT, False, end)
+    conditions.update("foreign_sync", JOINT, True, 4.0)
+    (found,) = conditions.history(4.25)
+    assert found == ("foreign_sync", "joint 1", 3, 1.75, 1.0)
+
+
+def test_listeners_hear_each_change_once_and_in_order():
+    conditions, heard = Conditions(), []
+    conditions.subscribe(lambda change: heard.append((change.definition.name, change.present)))
+    for present in (False, True, True, False, False):
+        conditions.update("pdo_timeout", JOINT, present, 0.0, "20")
+    assert heard == [("pdo_timeout", True), ("pdo_timeout", False)]
+
+
+def test_the_file_shows_what_is_present_the_worst_first(tmp_path):
+    conditions, file = Conditions(), ConditionsFile(tmp_path)
+    assert read_conditions(tmp_path) == []
+    conditions.update("drive_off", JOINT, True, 1.0, "drive 1: switch on disabled (6041h 0040h)")
+    conditions.update("joint_fault", JOINT, True, 2.0, "the motor position jumped (motor_jump)")
+    file.write(conditions.present())
+    found = read_conditions(tmp_path)
+    assert found == conditions.present()
+    assert [(each.name, each.since_ns) for each in found] == [
+        ("joint_fault", 2_000_000_000),
+        ("drive_off", 1_000_000_000),
+    ]
+    assert worst(found, "joint 1") == found[0]
+    assert worst(found, "joint 2") is None
+    (tmp_path / "conditions.json").write_text('{"schema": "jtqd.conditions/1", "conditions": [{}]}')
+    assert read_conditions(tmp_path) == []
