@@ -567,7 +567,7 @@ def _bus(name: str, config: Config, daemon: Daemon | None) -> Iterator[str]:
         return
     with tempfile.TemporaryDirectory(prefix="jtq-check-") as directory:
         path = Path(directory) / "bus"
-        bench = Child("sim_can", ["--bus", f"unix:{path}"], name="the emulated bench")
+        bench = Child("jtqd.sim_can", ["--bus", f"unix:{path}"], name="the emulated bench")
         try:
             until = time.monotonic() + _BENCH_WAIT_S
             while not path.exists():

@@ -99,7 +99,7 @@ def start_bench(config: Config, bus: str, start_child: StartChild) -> Child:
     """The emulated bench on `bus` ("unix:PATH"). Raises SupervisorError."""
     path = Path(bus.removeprefix("unix:"))
     path.unlink(missing_ok=True)
-    bench = start_child("sim_can", ["--bus", bus], "the emulated bench")
+    bench = start_child("jtqd.sim_can", ["--bus", bus], "the emulated bench")
     deadline = time.monotonic() + _WARM_UP_TIMEOUT_S
     while not path.exists():
         if not bench.alive():

@@ -240,7 +240,7 @@ def config_file(run: str, after: bool) -> Path:
 def playing(bus: str, run: Path, said: Path) -> Iterator[subprocess.Popen[bytes]]:
     """`jtq sim --play` on the bus, ready; ended with the context. Its log goes to `said`. Raises PlayError."""
     joints = ",".join(str(number) for number in JOINTS)
-    command = [sys.executable, "-m", "sim_can", "--bus", bus, "--play", str(run), "--joints", joints]
+    command = [sys.executable, "-m", "jtqd.sim_can", "--bus", bus, "--play", str(run), "--joints", joints]
     read_end, write_end = os.pipe()
     with said.open("wb") as log, os.fdopen(read_end, "rb") as pipe:
         process = subprocess.Popen(command, stderr=write_end, stdin=subprocess.DEVNULL)

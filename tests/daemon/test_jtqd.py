@@ -179,7 +179,7 @@ def test_a_network_of_another_method_is_refused_in_one_line(
 def bench(tmp_path: Path) -> Iterator[str]:
     """The emulated bench as a process; the address of its bus."""
     bus = f"unix:{tmp_path / 'bus'}"
-    process = subprocess.Popen([sys.executable, "-m", "sim_can", "--bus", bus])
+    process = subprocess.Popen([sys.executable, "-m", "jtqd.sim_can", "--bus", bus])
     until_it_listens(bus, process)
     yield bus
     process.terminate()

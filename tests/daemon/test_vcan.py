@@ -28,7 +28,7 @@ def run_once(directory: Path) -> tuple[dict[str, Any], list[tuple[float, int, by
     dump = directory / "dump.log"
     environment = {**os.environ, "RUNTIME_DIRECTORY": str(directory)}
     bench = subprocess.Popen(
-        [sys.executable, "-m", "sim_can", "--bus", INTERFACE, "--seed", "1"],
+        [sys.executable, "-m", "jtqd.sim_can", "--bus", INTERFACE, "--seed", "1"],
         stderr=subprocess.PIPE,
         text=True,
     )
@@ -99,7 +99,7 @@ def test_ten_thousand_cycles_without_a_miss_and_twice_the_same(tmp_path: Path) -
 def bench() -> Iterator[None]:
     """`jtq sim` on the interface."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "sim_can", "--bus", INTERFACE], stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", "jtqd.sim_can", "--bus", INTERFACE], stderr=subprocess.PIPE, text=True
     )
     assert process.stderr is not None
     assert "ready" in process.stderr.readline()

@@ -95,7 +95,7 @@ def play(name: str, out: Path) -> Path:
     scene = SCENES[name]
     with tempfile.TemporaryDirectory() as scratch:
         bench = subprocess.Popen(
-            [sys.executable, "-m", "sim_can", "--bus", INTERFACE, "--seed", "1"],
+            [sys.executable, "-m", "jtqd.sim_can", "--bus", INTERFACE, "--seed", "1"],
             stderr=subprocess.PIPE,
             text=True,
         )

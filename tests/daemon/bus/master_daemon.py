@@ -43,7 +43,7 @@ class Daemon:
         self.emcys: list[bytes] = []
         self.statuses: list[tuple[int, int]] = []
         self.bench = subprocess.Popen(
-            [sys.executable, "-m", "sim_can", "--bus", self.bus], stderr=subprocess.PIPE, text=True
+            [sys.executable, "-m", "jtqd.sim_can", "--bus", self.bus], stderr=subprocess.PIPE, text=True
         )
         self.socket = open_frame_socket(self.bus, [exact(0x0A0), exact(0x1A0)])
         logs = str(directory / record) if record else "none"

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.socketcan
 @pytest.fixture
 def bench() -> Iterator[None]:
     """`jtq sim` on the interface."""
-    with process("-m", "sim_can", "--bus", INTERFACE) as sim:
+    with process("-m", "jtqd.sim_can", "--bus", INTERFACE) as sim:
         assert sim.stderr is not None
         assert "ready" in sim.stderr.readline()
         yield

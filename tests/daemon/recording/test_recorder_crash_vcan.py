@@ -29,7 +29,7 @@ HOUR_NS = 3600 * 10**9
 def bench() -> Iterator[None]:
     """`jtq sim` on the interface."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "sim_can", "--bus", INTERFACE], stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", "jtqd.sim_can", "--bus", INTERFACE], stderr=subprocess.PIPE, text=True
     )
     assert process.stderr is not None
     assert "ready" in process.stderr.readline()

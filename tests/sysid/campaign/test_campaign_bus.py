@@ -96,7 +96,7 @@ def campaign_process(cmdline: Path) -> bool:
     return any(
         each in words
         for each in (
-            b"sim_can",
+            b"jtqd.sim_can",
             b"jtqd.daemon.jtqd",
             b"jtqd.daemon.loop.process",
             b"jtqd.daemon.recording.recorder",

@@ -52,7 +52,9 @@ def bus(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     directory = tmp_path_factory.mktemp("motion")
     address = f"unix:{directory / 'bus'}"
     bench = subprocess.Popen(
-        [sys.executable, "-m", "sim_can", "--bus", address, "--seed", "1"], stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", "jtqd.sim_can", "--bus", address, "--seed", "1"],
+        stderr=subprocess.PIPE,
+        text=True,
     )
     assert bench.stderr is not None
     assert "ready" in bench.stderr.readline()
@@ -202,7 +204,7 @@ def test_a_progress_callback_that_raises_leaves_both_drives_off(bus: str) -> Non
 
 def test_without_jtqd_there_is_no_sync_and_no_motion(tmp_path: Path) -> None:
     bench = subprocess.Popen(
-        [sys.executable, "-m", "sim_can", "--bus", f"unix:{tmp_path / 'bus'}"],
+        [sys.executable, "-m", "jtqd.sim_can", "--bus", f"unix:{tmp_path / 'bus'}"],
         stderr=subprocess.PIPE,
         text=True,
     )

@@ -25,7 +25,7 @@ EXACT = bool(os.environ.get("JTQD_IN_BENCH_KERNEL"))
 def jtqd(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     """The bench and jtqd, which publishes."""
     bench = subprocess.Popen(
-        [sys.executable, "-m", "sim_can", "--bus", INTERFACE, "--seed", "1"],
+        [sys.executable, "-m", "jtqd.sim_can", "--bus", INTERFACE, "--seed", "1"],
         stderr=subprocess.PIPE,
         text=True,
     )
