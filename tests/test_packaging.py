@@ -103,6 +103,7 @@ def run(command: list[str | Path], directory: Path, *, path: str = "") -> subpro
     environment = {
         name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))
     }
+    environment["RUNTIME_DIRECTORY"] = f"{directory}-run"  # another jtqd of this machine is none of ours
     if path:
         environment["PYTHONPATH"] = path
     return subprocess.run(

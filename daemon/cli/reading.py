@@ -1,4 +1,8 @@
-"""One look at a running daemon: its snapshot twice, its recorder's account, its disk. Reads only."""
+"""Running daemons of this machine: find them (`find_daemons`), read one (`Watch`), explain a status (`reason`).
+
+Everything comes from the runtime directories: snapshot, `about.json`, notices, the recorder's account. Nothing is written,
+and no lock is held that anybody waits for.
+"""
 
 from __future__ import annotations
 
@@ -22,9 +26,6 @@ from jtqd.daemon.shared.snapshot import JointView, SnapshotError, SnapshotReader
 from jtqd.daemon.supervisor.health import stale_cause
 from jtqd.estimator import status as st
 
-# Running daemons of this machine, found by their runtime directories. Reads only; holds no lock anybody waits for.
-
-
 _SHARED = ("/dev/shm", "/run/jtqd/*", "/run/user/*")
 
 
@@ -35,8 +36,8 @@ class Daemon(NamedTuple):
     about: About
 
 
-class Found(NamedTuple):
-    """What a search came upon."""
+class DaemonSearch(NamedTuple):
+    """Runtime directories of jtqd on this machine."""
 
     daemons: tuple[Daemon, ...]
     closed: tuple[Path, ...]
@@ -54,7 +55,7 @@ def places() -> list[Path]:
     return list(dict.fromkeys(found))
 
 
-def find_daemons(roots: Iterable[Path] | None = None) -> Found:
+def find_daemons(roots: Iterable[Path] | None = None) -> DaemonSearch:
     """Every daemon that runs, by the name of its bus; `roots`: where to look instead of `places()`."""
     daemons, closed, left_over = [], [], []
     for root in places() if roots is None else roots:
@@ -71,15 +72,46 @@ def find_daemons(roots: Iterable[Path] | None = None) -> Found:
                     daemons.append(Daemon(directory, content))
                 else:
                     left_over.append(directory)
-    return Found(tuple(sorted(daemons, key=lambda each: each.about.bus)), tuple(closed), tuple(left_over))
+    return DaemonSearch(
+        tuple(sorted(daemons, key=lambda each: each.about.bus)), tuple(closed), tuple(left_over)
+    )
 
 
-def on_bus(found: Found, bus: str) -> Daemon | None:
+def on_bus(search: DaemonSearch, bus: str) -> Daemon | None:
     """The daemon on `bus`: as its --bus was written, or as the name of its instance; "sim" is one that emulates."""
-    for daemon in found.daemons:
+    for daemon in search.daemons:
         if bus in (daemon.about.bus, daemon.about.instance):
             return daemon
     return None
+
+
+class NoDaemonError(Exception):
+    """No daemon to talk to, or more than one; the message is for the operator."""
+
+    def __init__(self, message: str, exit_status: int) -> None:
+        super().__init__(message)
+        self.exit_status = exit_status
+
+
+def choose_daemon(bus: str | None) -> Daemon:
+    """Return the daemon on `bus`, or the only one that runs.
+
+    Raises:
+        NoDaemonError: none runs there (exit status 1), or several run and no bus is named (2).
+    """
+    search = find_daemons()
+    others = "".join(f"\n  --bus {each.about.instance:<24} pid {each.about.pid}" for each in search.daemons)
+    closed = "".join(f"\n  {path} belongs to others: join its group to look at it" for path in search.closed)
+    if bus is not None:
+        daemon = on_bus(search, bus)
+        if daemon is None:
+            raise NoDaemonError(f"no jtqd runs on {bus}{others}{closed}", 1)
+        return daemon
+    if not search.daemons:
+        raise NoDaemonError(f"no jtqd runs here{closed}", 1)
+    if len(search.daemons) > 1:
+        raise NoDaemonError(f"several daemons run: which one?{others}", 2)
+    return search.daemons[0]
 
 
 def _subdirectories(root: Path) -> list[Path]:
@@ -87,9 +119,6 @@ def _subdirectories(root: Path) -> list[Path]:
         return sorted(each for each in root.glob("jtqd-*-*") if each.is_dir())
     except OSError:
         return []
-
-
-# Why an estimate has the status it has, in words, from what the snapshot and `about.json` hold. Pure.
 
 
 NMT_STATES = {0: "boot-up", 4: "stopped", 5: "operational", 127: "pre-operational"}
@@ -139,26 +168,24 @@ def reason(about: About, number: int, view: View, earlier: View) -> str:
         return f"latched: {_meanings(seen.latched)}; `jtq control reset` releases it"
     match seen.status:
         case st.STALE:
-            found = _stale(about, joint, seen, view, earlier)
+            why = _stale(about, joint, seen, view, earlier)
         case st.OFF | st.DRIVE_FAULT:
             state = f"drive {joint.node}: {drive_state(seen.statusword)} (6041h {seen.statusword:04X}h)"
-            found = state if drive_status(seen.statusword) == seen.status else f"{state}; {_HELD}"
+            why = state if drive_status(seen.statusword) == seen.status else f"{state}; {_HELD}"
         case st.STARTING if view.cycle <= _FIRST_CYCLES:
-            found = "the first cycles"
+            why = "the first cycles"
         case st.STARTING:
-            found = "the observer starts again after a gap in the inputs"
+            why = "the observer starts again after a gap in the inputs"
         case st.STANDSTILL:
-            found = (
-                "slower than the standstill velocity: friction hides the torque, sigma is half the interval"
-            )
+            why = "slower than the standstill velocity: friction hides the torque, sigma is half the interval"
         case st.DEGRADED:
-            found = _degraded(joint, seen)
+            why = _degraded(joint, seen)
         case st.INVALID:
             faults = seen.input_flags >> 8
-            found = _meanings(faults) if faults else f"a fault is over; {_HELD}"
+            why = _meanings(faults) if faults else f"a fault is over; {_HELD}"
         case _:
-            found = ""
-    return found
+            why = ""
+    return why
 
 
 def _meanings(faults: int) -> str:
