@@ -1,4 +1,7 @@
-"""`jtq`, the toolbox: finds the subcommand's module and hands the arguments over; nothing else is loaded."""
+"""`jtq`, the toolbox: finds the subcommand's module and hands the arguments over; nothing else is loaded.
+
+Every command is a module with `main(argv) -> int` and `parser() -> argparse.ArgumentParser`.
+"""
 
 from __future__ import annotations
 
@@ -7,70 +10,77 @@ import importlib
 import os
 import sys
 
-COMMANDS = {
-    "sim": ("jtqd.sim_can.command", "emulate the bench on a bus, or play a measured run on it"),
-    "campaign": (
-        "jtqd.sysid.campaign.command",
-        "drive both joints through a campaign of runs, and keep them",
-    ),
-    "excitation": (
-        "jtqd.sysid.excitation.command",
-        "design excitation runs, or compare the ways to get them",
-    ),
-    "fit": (
-        "jtqd.sysid.fit.command",
-        "fit a section of a joint file to measured runs: efficiency, friction, losses",
-    ),
-    "reproduce": ("jtqd.sysid.reproduce", "campaigns, fits, training and evaluation from nothing"),
-    "train": ("jtqd.sysid.train.command", "train networks on recorded runs (extra: train)"),
-    "evaluate": (
-        "jtqd.sysid.evaluate.command",
-        "all methods beside the torque sensor on runs never trained on: report and figures",
-    ),
-    "diagnose": (
-        "jtqd.sysid.diagnosis.command",
-        "what the simulation gets wrong on measured runs, its cause by name, the extended joint file",
-    ),
-    "export": ("jtqd.daemon.logs.export_command", "a log as CSV, Parquet or candump lines; the bus as a DBC"),
-    "recover": ("jtqd.daemon.logs.recover_command", "repair logs left by a crash, or damaged"),
-    "replay": (
-        "jtqd.daemon.replay.command",
-        "run the estimator over a log again: is it what was published, and what would another model say",
-    ),
-    "batch": (
-        "jtqd.sysid.batch.command",
-        "diagnose or replay many logs, here or on a dask cluster; one page over all",
-    ),
-    "plot": ("jtqd.sysid.plot", "draw a log: estimate beside the torque sensor"),
-    "control": ("jtqd.daemon.cli.control", "orders to a running jtqd: ping, reload, reset, save"),
-    "bus-load": ("jtqd.daemon.cli.bus_load", "worst-case load of the bus by a configuration"),
-    "layout": ("jtqd.daemon.live.layout", "layout file for Foxglove and Lichtblick"),
-    "status": ("jtqd.daemon.cli.status", "how a running jtqd is doing, live"),
-    "check": ("jtqd.daemon.cli.check", "self-test of a bus and of this machine's timing"),
-    "doctor": (
-        "jtqd.daemon.cli.doctor",
-        "is this machine fit for jtqd? kernel, rights, interface, files",
-    ),
-    "completion": ("jtqd.daemon.cli.completion_command", "completion for bash, zsh or fish"),
-    "man": ("jtqd.daemon.cli.man_command", "manual page of jtq, made from its help"),
-    "measured": (
-        "jtqd.sysid.measured.offline",
-        "estimate measured runs before and after fitting the joint file's friction",
-    ),
+from jtqd import __version__
+
+GROUPS = {
+    "run: the bus, the daemon and this machine": {
+        "sim": ("jtqd.sim_can.command", "emulate the bench on a bus, or play a measured run on it"),
+        "status": ("jtqd.daemon.cli.status", "show how a running jtqd is doing, live"),
+        "control": ("jtqd.daemon.cli.control", "send an order to a running jtqd: ping, reload, reset, save"),
+        "check": ("jtqd.daemon.cli.check", "measure a bus and the timing of this machine, and judge them"),
+        "doctor": (
+            "jtqd.daemon.cli.doctor",
+            "examine kernel, rights, CAN interface and files of this machine",
+        ),
+        "bus-load": ("jtqd.daemon.cli.bus_load", "compute the worst-case bus load of a configuration"),
+        "completion": ("jtqd.daemon.cli.completion", "print a completion script for bash, zsh, tcsh or fish"),
+    },
+    "look: pictures of the estimate": {
+        "plot": ("jtqd.sysid.plot", "draw the estimate of a log beside the torque sensor"),
+        "layout": ("jtqd.daemon.live.layout", "write a layout file for Foxglove and Lichtblick"),
+    },
+    "log: recorded cycles": {
+        "export": (
+            "jtqd.daemon.logs.export_command",
+            "write a log as CSV, Parquet or candump lines, or the bus as a DBC",
+        ),
+        "recover": (
+            "jtqd.daemon.logs.recover_command",
+            "repair logs that a crash has left, or that are damaged",
+        ),
+        "replay": ("jtqd.daemon.replay.command", "run the estimator over a log again, and compare"),
+        "batch": ("jtqd.sysid.batch.command", "diagnose or replay many logs, here or on a dask cluster"),
+    },
+    "identify: parameters and networks from measured runs": {
+        "campaign": (
+            "jtqd.sysid.campaign.command",
+            "drive both joints through a campaign of runs, and record them",
+        ),
+        "excitation": ("jtqd.sysid.excitation.command", "design excitation trajectories"),
+        "fit": ("jtqd.sysid.fit.command", "fit efficiency, friction or losses of a joint file to runs"),
+        "train": ("jtqd.sysid.train.command", "train a network per joint on runs (extra: train)"),
+        "evaluate": (
+            "jtqd.sysid.evaluate.command",
+            "score all methods against the torque sensor on other runs",
+        ),
+        "diagnose": (
+            "jtqd.sysid.diagnosis.command",
+            "find what the simulation gets wrong on runs, and extend the joint file",
+        ),
+        "reproduce": ("jtqd.sysid.reproduce", "repeat campaigns, fits, training and evaluation from nothing"),
+        "measured": (
+            "jtqd.sysid.measured.offline",
+            "score the observer on the measured Kinova runs that ship",
+        ),
+    },
 }
-"""Subcommand -> (module with `main(argv) -> int`, one line of help)."""
+"""Heading -> subcommand -> (module, one line of help)."""
+
+COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
 
 
 def _help() -> str:
     width = max(map(len, COMMANDS))
-    rows = "\n".join(f"  {name:<{width}}  {text}" for name, (_, text) in COMMANDS.items())
+    groups = "\n".join(
+        f"{heading}\n" + "".join(f"  {name:<{width}}  {text}\n" for name, (_, text) in group.items())
+        for heading, group in GROUPS.items()
+    )
     return (
-        f"usage: jtq COMMAND ...\n\nToolbox around jtqd.\n\ncommands:\n{rows}\n\n"
+        f"usage: jtq COMMAND ...\n       jtq --version\n\nToolbox around jtqd.\n\n{groups}\n"
         "examples:\n"
         "  jtq sim --bus vcan0               emulated bench on a CAN interface\n"
-        "  jtq status                        how the daemon here is doing\n"
+        "  jtq status                        how the daemon on this machine is doing\n"
         "  jtq COMMAND --help                options and examples of a command\n"
-        "  source <(jtq completion bash)     completion in this shell\n"
     )
 
 
@@ -80,20 +90,24 @@ def main(argv: list[str] | None = None) -> int:
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(_help(), end="")
         return 0 if arguments else 2
-    command = COMMANDS.get(arguments[0])
+    name = arguments[0]
+    if name == "--version":
+        print(f"jtqd {__version__}")
+        return 0
+    command = COMMANDS.get(name)
     if command is None:
-        near = difflib.get_close_matches(arguments[0], COMMANDS, n=1)
+        near = difflib.get_close_matches(name, COMMANDS, n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
-        print(f"jtq: no command {arguments[0]!r}{hint} (jtq --help lists them)", file=sys.stderr)
+        print(f"jtq: no command {name!r}{hint} (jtq --help lists them)", file=sys.stderr)
         return 2
     try:
         status = importlib.import_module(command[0]).main(arguments[1:])
         sys.stdout.flush()
-    except KeyboardInterrupt:  # Ctrl-C: whoever pressed it knows
+    except KeyboardInterrupt:
         return 130
-    except OSError as error:  # a full disk, a directory that is not there, a pipe that was closed
+    except OSError as error:  # a full disk, a missing directory, a closed pipe
         if not isinstance(error, BrokenPipeError):  # `| head` has what it wanted
-            print(f"jtq {arguments[0]}: {error.filename or 'output'}: {error.strerror}", file=sys.stderr)
+            print(f"jtq {name}: {error.filename or 'output'}: {error.strerror}", file=sys.stderr)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     return int(status or 0)

@@ -13,6 +13,7 @@ from types import FrameType
 from typing import Any
 
 # What is heavy to load is loaded in `_run`: Ctrl-C must find its handler there, also in the first second.
+from jtqd import __version__
 from jtqd.daemon.live.address import NEEDED, Address, address, installed
 from jtqd.estimator.checked import seconds
 
@@ -57,6 +58,7 @@ def parser() -> argparse.ArgumentParser:
         help="serve Foxglove or Lichtblick, read-only, 50 Hz (default: 127.0.0.1:8765; extra: live)",
     )
     result.add_argument("--json", action="store_true", help="print the final summary as JSON")
+    result.add_argument("--version", action="version", version=f"jtqd {__version__}")
     return result
 
 

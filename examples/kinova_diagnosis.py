@@ -171,9 +171,9 @@ def write(directory: Path, results: Sequence[Diagnosed], sha256: Mapping[str, st
 def main(arguments: list[str] | None = None) -> int:
     """Command line; results on stdout, log on stderr. Exit status 0 done, 1 failure, 2 usage."""
     parser = argparse.ArgumentParser(
-        prog=f"python -m sysid.{BY}",
+        prog=f"python -m examples.{BY}",
         description="Diagnose the seven joints of the measured Kinova Gen3 arm and draw the figures of the docs page.",
-        epilog=f"example:\n  python -m sysid.{BY} --out measured_diagnosis",
+        epilog=f"example:\n  python -m examples.{BY} --out measured_diagnosis",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where reports and figures go")

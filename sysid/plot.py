@@ -20,8 +20,8 @@ _SHADES = {STANDSTILL: "#dcecf2", DEGRADED: "#fbe8c8"}
 _OTHER = "#f3d6d6"
 
 
-def main(argv: list[str]) -> int:
-    """Draw one joint of a log; exit status 0 done, 1 failure, 2 usage."""
+def parser() -> argparse.ArgumentParser:
+    """Return the arguments of `jtq plot`."""
     parser = argparse.ArgumentParser(
         prog="jtq plot",
         description="Draw the estimate of one joint beside the torque sensor from a log of jtqd.",
@@ -33,7 +33,12 @@ def main(argv: list[str]) -> int:
         "--out", type=Path, required=True, metavar="FILE", help="picture to write (png, svg, pdf)"
     )
     parser.add_argument("--json", action="store_true", help="print the path and the RMSE as JSON")
-    arguments = parser.parse_args(argv)
+    return parser
+
+
+def main(argv: list[str]) -> int:
+    """Draw one joint of a log; exit status 0 done, 1 failure, 2 usage."""
+    arguments = parser().parse_args(argv)
     joint = arguments.joint
     try:
         rmse = draw(read_topic(arguments.log, f"/joint/{joint}/state"), joint, arguments.out)

@@ -52,7 +52,7 @@ class Step(NamedTuple):
 
 def main(argv: list[str]) -> int:
     """Run all steps; exit status 0 done, 1 a step failed, 2 usage, 3 done with findings."""
-    options = _parser().parse_args(argv)
+    options = parser().parse_args(argv)
     out: Path = options.out
     worst = 0
     try:
@@ -102,7 +102,8 @@ def _runs_done(campaign: Path) -> int:
     return sum(run["status"] == DONE for run in runs)
 
 
-def _parser() -> argparse.ArgumentParser:
+def parser() -> argparse.ArgumentParser:
+    """Return the arguments of `jtq reproduce`."""
     parser = argparse.ArgumentParser(
         prog="jtq reproduce",
         description="Campaigns, fits, training and evaluation on the emulated bench, over the bus, from nothing.",

@@ -99,7 +99,7 @@ sysctl -q -e -p /etc/sysctl.d/60-jtqd.conf || echo "install.sh: sysctl: some set
 # not more than 20 GB (a day) each.
 half='import shutil, sys; print(max(1000, min(20000, shutil.disk_usage("/var/log").free // 2_000_000 // len(sys.argv[1:]))))'
 budget_mb=${interfaces:+$("$prefix/bin/python" -c "$half" $interfaces)}
-shipped=$(cd / && "$prefix/bin/python" -c 'import models, os; print(os.path.dirname(models.__file__))')
+shipped=$(cd / && "$prefix/bin/python" -c 'import jtqd.models, os; print(os.path.dirname(jtqd.models.__file__))')
 for interface in $interfaces; do
     file=/etc/jtqd/$interface.yaml
     if [ ! -e "$file" ]; then
@@ -117,5 +117,5 @@ if managed; then
     systemctl daemon-reload
     for interface in ${enable:+$interfaces}; do systemctl enable --now "can-up@$interface" "jtqd@$interface"; done
 fi
-version=$(cd / && "$prefix/bin/python" -c 'from importlib.metadata import version; print(version("jtqd"))')
+version=$(cd / && "$prefix/bin/python" -c 'import jtqd; print(jtqd.__version__)')
 echo "install.sh: jtqd $version in $prefix"

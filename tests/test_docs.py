@@ -19,7 +19,9 @@ FILE = re.compile(
 )
 MODULE = re.compile(r"python -m ((?:jtqd|examples|tests)[\w.]*)")
 LINK = re.compile(r"\]\((?!https?:|mailto:)([^)#]*)(#[^)]*)?\)")
-IMPORT = re.compile(r"^ *(from (?:jtqd|examples)[\w.]* import (?:\([^)]*\)|[^\n]+)|import jtqd[\w.]*)", re.MULTILINE)
+IMPORT = re.compile(
+    r"^ *(from (?:jtqd|examples)[\w.]* import (?:\([^)]*\)|[^\n]+)|import jtqd[\w.]*)", re.MULTILINE
+)
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
@@ -45,7 +47,9 @@ def test_imports_are_there(page: Path) -> None:
         if isinstance(node, ast.ImportFrom):
             module = importlib.import_module(str(node.module))
             for alias in node.names:
-                assert hasattr(module, alias.name) or importlib.import_module(f"{node.module}.{alias.name}"), line
+                assert hasattr(module, alias.name) or importlib.import_module(
+                    f"{node.module}.{alias.name}"
+                ), line
 
 
 @pytest.mark.parametrize("number", range(len(BLOCK.findall((ROOT / "docs" / "api.md").read_text()))))
@@ -55,6 +59,9 @@ def test_the_examples_of_the_api_run(
     """Each block alone, in an empty directory; what stands behind `#>` is what the line before it prints."""
     monkeypatch.chdir(tmp_path)
     code = BLOCK.findall((ROOT / "docs" / "api.md").read_text())[number]
-    exec(compile(code, f"docs/api.md, example {number + 1}", "exec"), {"__name__": "example", "GOLDEN": ROOT / "tests" / "golden"})
+    exec(
+        compile(code, f"docs/api.md, example {number + 1}", "exec"),
+        {"__name__": "example", "GOLDEN": ROOT / "tests" / "golden"},
+    )
     expected = re.findall(r"#> (.*)", code)
     assert capsys.readouterr().out.splitlines() == expected

@@ -122,4 +122,6 @@ def test_every_room_says_what_it_is_for() -> None:
     for name, path in modules().items():
         if path.name == "__init__.py":
             lines = (ast.get_docstring(ast.parse(path.read_text())) or "").splitlines()
-            assert len(lines) >= 3, f"{name}: its __init__ has {len(lines)} lines of docstring, expected at least 3"
+            assert len(lines) >= 3, (
+                f"{name}: its __init__ has {len(lines)} lines of docstring, expected at least 3"
+            )

@@ -21,19 +21,24 @@ What really is on a bus is measured by `jtq check`.
 exit status: 0 it fits, 1 it does not or cannot be read, 2 usage"""
 
 
-def main(argv: list[str]) -> int:
-    """Print the table; exit status 0 it fits, 1 it does not or cannot be read, 2 usage."""
-    parser = argparse.ArgumentParser(
+def parser() -> argparse.ArgumentParser:
+    """Arguments of `jtq bus-load`."""
+    made = argparse.ArgumentParser(
         prog="jtq bus-load",
         description="Worst-case load of the bus by a configuration; jtqd refuses one above 95 %.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
+    made.add_argument(
         "--config", type=Path, metavar="FILE", help="configuration (default: the bench that ships)"
     )
-    parser.add_argument("--json", action="store_true", help="print as JSON")
-    arguments = parser.parse_args(argv)
+    made.add_argument("--json", action="store_true", help="print as JSON")
+    return made
+
+
+def main(argv: list[str]) -> int:
+    """Print the table; exit status 0 it fits, 1 it does not or cannot be read, 2 usage."""
+    arguments = parser().parse_args(argv)
     try:
         config = load_config(arguments.config)
     except ConfigError as error:

@@ -1,4 +1,4 @@
-"""`jtq control`: orders to a running jtqd, over the socket that only its own user and root may open."""
+"""`jtq control`: send an order to a running jtqd, over the socket that only its own user and root may open."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from jtqd.daemon.cli.reading import Daemon, find_daemons, on_bus
+from jtqd.daemon.cli.reading import NoDaemonError, choose_daemon
 from jtqd.daemon.supervisor.control import FILE, REPLY_BYTES, VERBS
 from jtqd.drivers.frame_socket import reachable
 
@@ -21,37 +21,33 @@ _EXAMPLES = """examples:
   jtq control save --json              write the flight recording now
 
 exit status: 0 done, 1 refused or no daemon (the line on standard error says why), 2 usage"""
-_SAID = {
+_DONE = {
     "ping": "jtqd on {bus} answers, process {pid}, cycle {cycle}",
-    "reload": "jtqd on {bus} has taken over the new files at cycle {cycle}, {missed} cycles missed",
+    "reload": "jtqd on {bus} has taken over the new files at cycle {cycle}, {missed} missed",
     "reset": "jtqd on {bus} has released its latched faults: {released}",
     "save": "jtqd on {bus} writes the flight recording",
 }
 
 
-class _Refused(Exception):  # noqa: N818 - an answer, not an error of ours
-    """One line for the operator."""
-
-
 def parser() -> argparse.ArgumentParser:
-    """Arguments of `jtq control`."""
+    """Return the arguments of `jtq control`."""
     result = argparse.ArgumentParser(
         prog="jtq control",
         description="Give an order to a running jtqd. Only its own user and root may.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    result.add_argument("verb", choices=VERBS, help="what it shall do")
+    result.add_argument("verb", choices=VERBS, help="the order")
     result.add_argument("--bus", help="which daemon, by its bus (default: the only one that runs)")
     result.add_argument("--json", action="store_true", help="print the reply as JSON")
     return result
 
 
 def main(argv: list[str]) -> int:
-    """Returns the exit status."""
+    """Send the order and print the reply; returns the exit status."""
     arguments = parser().parse_args(argv)
     try:
-        daemon = _chosen(arguments.bus)
+        daemon = choose_daemon(arguments.bus)
         reply = ask(daemon.directory / FILE, {"verb": arguments.verb}, _TIMEOUT_S.get(arguments.verb, 10.0))
     except (FileNotFoundError, ConnectionRefusedError):
         reply = {"ok": False, "error": "jtqd takes no orders now: it is starting or ending"}
@@ -59,13 +55,13 @@ def main(argv: list[str]) -> int:
     except TimeoutError:
         reply = {"ok": False, "error": "jtqd did not answer in time"}
         daemon = None
-    except (_Refused, OSError, ValueError) as error:
+    except (NoDaemonError, OSError, ValueError) as error:
         reply = {"ok": False, "error": getattr(error, "strerror", None) or str(error)}
         daemon = None
     if arguments.json:
         print(json.dumps(reply))
     elif reply["ok"] and daemon is not None:
-        print(_SAID[arguments.verb].format(**{"bus": daemon.about.bus} | reply))
+        print(_DONE[arguments.verb].format(**{"bus": daemon.about.bus} | reply))
     if not reply["ok"]:
         print(f"jtq control: {arguments.verb}: {reply['error']}", file=sys.stderr)
     return 0 if reply["ok"] else 1
@@ -83,22 +79,5 @@ def ask(path: Path, request: dict[str, Any], timeout_s: float) -> dict[str, Any]
         raise ConnectionError(f"{path}: jtqd closed the connection without a reply")
     reply = json.loads(data)
     if not isinstance(reply, dict) or not isinstance(reply.get("ok"), bool):
-        raise ValueError(f"{path}: found a reply of another kind")
+        raise ValueError(f"{path}: found a reply without 'ok', expected a JSON object with it")
     return reply
-
-
-def _chosen(bus: str | None) -> Daemon:
-    found = find_daemons()
-    if bus is not None:
-        daemon = on_bus(found, bus)
-        if daemon is None:
-            closed = " (some directories may only be read by their owner)" if found.closed else ""
-            raise _Refused(f"no jtqd runs on {bus}{closed}")
-        return daemon
-    if len(found.daemons) == 1:
-        return found.daemons[0]
-    if not found.daemons:
-        closed = "; some runtime directories may only be read by their owner" if found.closed else ""
-        raise _Refused(f"no jtqd runs{closed}")
-    names = ", ".join(daemon.about.bus for daemon in found.daemons)
-    raise _Refused(f"several run ({names}): choose one with --bus")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import json
 import os
 import re
 import shutil
@@ -13,32 +12,16 @@ from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 
-from rich.console import Console
-
 from jtqd.daemon.bus.boot import bus_load_of
-from jtqd.daemon.cli.checks import (
-    FAIL,
-    GOOD,
-    SKIP,
-    WARN,
-    CheckResult,
-    as_json,
-    exit_status,
-    share,
-    show,
-    size,
-)
-from jtqd.daemon.cli.machine import can_findings, kernel_findings
-from jtqd.daemon.cli.reading import Found, find_daemons, places
+from jtqd.daemon.cli.checks import FAIL, GOOD, SKIP, WARN, CheckResult, report, share, size
+from jtqd.daemon.cli.machine import check_can, check_kernel
+from jtqd.daemon.cli.reading import DaemonSearch, find_daemons, places
 from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.loop.process import build_estimator
 from jtqd.daemon.shared.runtime_dir import installed
 from jtqd.drivers.bus_load import BusLoadError, check_bus_load
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.onnx_graph import NetworkError
-
-# Files that jtqd needs and directories that it writes, packages, the unit, and what dead daemons have left.
-
 
 _UNITS = (
     "/etc/systemd/system",
@@ -54,7 +37,7 @@ _SHM_FREE = 64 << 20
 _BYTES_AN_HOUR = 1.1e9
 
 
-def file_findings(config: Config) -> Iterator[CheckResult]:
+def check_files(config: Config) -> Iterator[CheckResult]:
     """Configuration, joint files, models and their hashes; the configuration has been read already."""
     load = bus_load_of(config)
     yield CheckResult(
@@ -79,11 +62,11 @@ def file_findings(config: Config) -> Iterator[CheckResult]:
             yield CheckResult(item, GOOD, f"{joint.joint.name}: {shown}{network}: loads and runs")
 
 
-def directory_findings(log: Path | None, roots: list[Path]) -> Iterator[CheckResult]:
-    """Where logs and shared memory go, for this user; `log` None: where none has been said and none is usual."""
+def check_directories(log: Path | None, roots: list[Path]) -> Iterator[CheckResult]:
+    """Where logs and shared memory go, for this user; `log` None: none is named and the usual one does not exist."""
     if log is None:
         yield CheckResult(
-            "log directory", SKIP, "jtqd writes to ./logs unless told: --record DIR, $LOGS_DIRECTORY"
+            "log directory", SKIP, "jtqd writes to ./logs without --record DIR or $LOGS_DIRECTORY"
         )
     else:
         yield _directory(
@@ -111,7 +94,7 @@ def _directory(item: str, path: Path, wanted: int, what: str) -> CheckResult:
     return CheckResult(item, GOOD, text)
 
 
-def package_findings() -> Iterator[CheckResult]:
+def check_packages() -> Iterator[CheckResult]:
     """Installed versions against what jtqd's own package asks for."""
     try:
         wanted = [each for each in requires("jtqd") or () if "extra ==" not in each]
@@ -123,16 +106,16 @@ def package_findings() -> Iterator[CheckResult]:
             "pip install .",
         )
         return
-    found, wrong = [], []
+    versions, wrong = [], []
     for line in wanted:
         name, limits = requirement(line)
         version = installed(name)
-        found.append(f"{name} {version}")
+        versions.append(f"{name} {version}")
         if version is None:
             wrong.append(f"{name} is missing")
         elif not all(fits(version, *limit) for limit in limits):
-            wrong.append(f"{name} {version}, wanted {line.removeprefix(name)}")
-    text = f"jtqd {installed('jtqd')}, " + ", ".join(found)
+            wrong.append(f"{name} {version}, expected {line.removeprefix(name)}")
+    text = f"jtqd {installed('jtqd')}, " + ", ".join(versions)
     if wrong:
         yield CheckResult(
             "packages", FAIL, "; ".join(wrong), "pip install --upgrade jtqd, in its own environment"
@@ -158,11 +141,11 @@ def fits(version: str, operator: str, limit: str) -> bool:
 
 
 def _numbers(version: str) -> tuple[int, ...]:
-    found = re.match(r"\d+(?:\.\d+)*", version)
-    return tuple(map(int, found[0].split("."))) if found else ()
+    match = re.match(r"\d+(?:\.\d+)*", version)
+    return tuple(map(int, match[0].split("."))) if match else ()
 
 
-def unit_finding() -> CheckResult:
+def check_unit() -> CheckResult:
     """The systemd unit."""
     if not Path("/run/systemd/system").exists():
         return CheckResult("systemd unit", SKIP, "systemd does not run here")
@@ -175,9 +158,9 @@ def unit_finding() -> CheckResult:
     )
 
 
-def left_over_findings(log: Path | None, found: Found) -> Iterator[CheckResult]:
+def check_leftovers(log: Path | None, search: DaemonSearch) -> Iterator[CheckResult]:
     """Logs without an end and runtime directories of daemons that were killed."""
-    running = [each.about for each in found.daemons]
+    running = [each.about for each in search.daemons]
     text = ", ".join(f"{each.instance} (process {each.pid})" for each in running) or "none"
     yield CheckResult("running jtqd", GOOD, text)
     directories = {Path(each.log_directory) for each in running if each.log_directory} | (
@@ -197,11 +180,11 @@ def left_over_findings(log: Path | None, found: Found) -> Iterator[CheckResult]:
         yield CheckResult("unended logs", WARN, names, "left by a crash: jtq recover FILE")
     else:
         yield CheckResult("unended logs", GOOD, "none")
-    if found.left_over:
+    if search.left_over:
         yield CheckResult(
             "left over",
             WARN,
-            ", ".join(map(str, found.left_over)),
+            ", ".join(map(str, search.left_over)),
             "of daemons that were killed; the next start on the same bus takes it over, or remove it",
         )
 
@@ -218,31 +201,30 @@ _USUAL_LOGS = Path("/var/log/jtqd")
 
 
 def parser() -> argparse.ArgumentParser:
-    """Options of `jtq doctor`."""
-    made = argparse.ArgumentParser(
+    """Return the arguments of `jtq doctor`."""
+    result = argparse.ArgumentParser(
         prog="jtq doctor",
-        description="Is this machine fit for jtqd? GOOD, WARN or FAIL for each item, and what to do. It changes nothing.",
+        description="Examine whether this machine is fit for jtqd: GOOD, WARN or FAIL for each item, and what to do. "
+        "Nothing is changed.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    made.add_argument("--bus", help="interface, unix:PATH or sim (default: every CAN interface)")
-    made.add_argument(
+    result.add_argument("--bus", help="interface, unix:PATH or sim (default: every CAN interface)")
+    result.add_argument(
         "--config", type=Path, metavar="FILE", help="configuration (default: the bench that ships)"
     )
-    made.add_argument("--record", type=Path, metavar="DIR", help="directory of the logs (default: as jtqd's)")
-    made.add_argument("--json", action="store_true", help="print as JSON")
-    return made
+    result.add_argument(
+        "--record", type=Path, metavar="DIR", help="directory of the logs (default: as jtqd's)"
+    )
+    result.add_argument("--json", action="store_true", help="print as JSON")
+    return result
 
 
 def main(argv: list[str]) -> int:
-    """Examine; returns the exit status."""
+    """Examine and report; returns the exit status."""
     arguments = parser().parse_args(argv)
-    findings = list(examine(arguments.bus, arguments.config, arguments.record or _log_directory()))
-    if arguments.json:
-        print(json.dumps(as_json(SCHEMA, findings, bus=arguments.bus)))
-    else:
-        show(Console(), findings)
-    return exit_status(findings)
+    results = list(examine(arguments.bus, arguments.config, arguments.record or _log_directory()))
+    return report(results, SCHEMA if arguments.json else None, bus=arguments.bus)
 
 
 def examine(bus: str | None, path: Path | None, log: Path | None) -> Iterator[CheckResult]:
@@ -253,16 +235,16 @@ def examine(bus: str | None, path: Path | None, log: Path | None) -> Iterator[Ch
     except ConfigError as error:
         broken, config = str(error), load_config(None)
     needs_can = bus is None or not (bus == "sim" or bus.startswith("unix:"))
-    yield from kernel_findings(config.realtime, can=needs_can)
-    yield from can_findings(bus, config)
+    yield from check_kernel(config.realtime, can=needs_can)
+    yield from check_can(bus, config)
     if broken:
         yield CheckResult("configuration", FAIL, broken, "jtqd will not start with it")
     else:
-        yield from file_findings(config)
-    yield from directory_findings(log, places())
-    yield from package_findings()
-    yield unit_finding()
-    yield from left_over_findings(log, find_daemons())
+        yield from check_files(config)
+    yield from check_directories(log, places())
+    yield from check_packages()
+    yield check_unit()
+    yield from check_leftovers(log, find_daemons())
 
 
 def _log_directory() -> Path | None:

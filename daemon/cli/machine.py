@@ -1,4 +1,7 @@
-"""The CAN interface as the kernel and `ip` describe it."""
+"""Checks of this machine: kernel and rights of this user (`check_kernel`), CAN interfaces (`check_can`).
+
+Kernel and rights are judged as far as the loop depends on them, an interface by what the kernel and `ip` report of it.
+"""
 
 from __future__ import annotations
 
@@ -21,9 +24,6 @@ from jtqd.daemon.cli.checks import FAIL, GOOD, SKIP, WARN, CheckResult
 from jtqd.daemon.config import Config, Realtime
 from jtqd.drivers.frame_socket import AF_CAN, CAN_RAW, BusError, open_frame_socket
 
-# Kernel and real-time rights of this machine, as far as the loop depends on them.
-
-
 _CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
 _LOCKED_BYTES = 256 << 20
 """What the loop has touched when it begins, with room to spare."""
@@ -32,7 +32,7 @@ _GOOD_CLOCKS = ("tsc", "arch_sys_counter", "kvm-clock", "hyperv_clocksource_tsc_
 _SYS = Path("/sys/devices/system")
 
 
-def kernel_findings(wanted: Realtime, *, can: bool) -> Iterator[CheckResult]:
+def check_kernel(wanted: Realtime, *, can: bool) -> Iterator[CheckResult]:
     """Every item about the kernel and the rights of this user; `can`: SocketCAN is wanted."""
     yield _kernel()
     yield _tick()
@@ -46,6 +46,7 @@ def kernel_findings(wanted: Realtime, *, can: bool) -> Iterator[CheckResult]:
 
 
 def _text(path: str | Path) -> str:
+    """Content of a file, "" where it cannot be read."""
     with suppress(OSError):
         return Path(path).read_text(errors="replace").strip()
     return ""
@@ -72,7 +73,7 @@ def _kernel() -> CheckResult:
 
 
 def build_options() -> dict[str, str]:
-    """What the running kernel was built with, e.g. {"CONFIG_HZ": "250"}; empty where it does not tell."""
+    """What the running kernel was built with, e.g. {"CONFIG_HZ": "250"}; empty where that is not published."""
     with suppress(OSError, EOFError), gzip.open("/proc/config.gz", "rt") as file:
         return dict(re.findall(r"^(CONFIG_\w+)=(.*)$", file.read(), re.MULTILINE))
     return dict(re.findall(r"^(CONFIG_\w+)=(.*)$", _text(f"/boot/config-{platform.release()}"), re.MULTILINE))
@@ -80,7 +81,7 @@ def build_options() -> dict[str, str]:
 
 def _tick() -> CheckResult:
     hz = build_options().get("CONFIG_HZ")
-    shown = f"HZ {hz}" if hz else "HZ unknown (the kernel does not tell its configuration)"
+    shown = f"HZ {hz}" if hz else "HZ unknown (the kernel does not publish its configuration)"
     resolution = time.clock_getres(time.CLOCK_MONOTONIC)
     if resolution <= 1e-6:
         return CheckResult("timers", GOOD, f"high resolution ({resolution * 1e9:.0f} ns), {shown}")
@@ -110,7 +111,7 @@ def _clock() -> CheckResult:
         )
     if name not in _GOOD_CLOCKS and name != "unknown":
         return CheckResult(
-            "clocksource", WARN, text, "not one that is known to be steady: kernel log, `clocksource`"
+            "clocksource", WARN, text, "not known to be steady: see `clocksource` in the kernel log"
         )
     return CheckResult("clocksource", GOOD, text)
 
@@ -130,8 +131,8 @@ def _can_sockets(*, wanted: bool) -> CheckResult:
 
 
 def _capability(number: int) -> bool:
-    found = re.search(r"^CapEff:\s*([0-9a-f]+)", _text("/proc/self/status"), re.MULTILINE)
-    return bool(found and int(found[1], 16) >> number & 1)
+    match = re.search(r"^CapEff:\s*([0-9a-f]+)", _text("/proc/self/status"), re.MULTILINE)
+    return bool(match and int(match[1], 16) >> number & 1)
 
 
 def _priority(wanted: Realtime) -> CheckResult:
@@ -159,7 +160,7 @@ def _priority(wanted: Realtime) -> CheckResult:
 def _throttling(wanted: Realtime) -> CheckResult:
     runtime, period = (_text(f"/proc/sys/kernel/sched_rt_{name}_us") for name in ("runtime", "period"))
     if not runtime or not period:
-        return CheckResult("RT throttling", SKIP, "the kernel does not tell")
+        return CheckResult("RT throttling", SKIP, "the kernel does not report it")
     if int(runtime) < 0:
         return CheckResult("RT throttling", GOOD, "off: a real-time process may take a whole CPU")
     part = int(runtime) / int(period)
@@ -189,11 +190,11 @@ def _memory(wanted: Realtime) -> CheckResult:
 
 def _cpus(text: str) -> set[int]:
     """A CPU list of the kernel, "0-2,5"."""
-    found: set[int] = set()
+    cpus: set[int] = set()
     for part in filter(None, text.split(",")):
         first, _, last = part.partition("-")
-        found |= set(range(int(first), int(last or first) + 1))
-    return found
+        cpus |= set(range(int(first), int(last or first) + 1))
+    return cpus
 
 
 def _cpu(wanted: Realtime) -> CheckResult:
@@ -204,7 +205,7 @@ def _cpu(wanted: Realtime) -> CheckResult:
         hint = f"realtime: {{cpu: {min(_cpus(isolated))}}} would use the isolated one" if isolated else ""
         return CheckResult("CPU", WARN if hint else GOOD, text, hint)
     if wanted.cpu not in _cpus(_text(_SYS / "cpu/online")):
-        return CheckResult("CPU", FAIL, f"{wanted.cpu} by the configuration: not there", "realtime.cpu")
+        return CheckResult("CPU", FAIL, f"{wanted.cpu} by the configuration: does not exist", "realtime.cpu")
     if wanted.cpu not in _cpus(isolated):
         return CheckResult(
             "CPU",
@@ -216,11 +217,11 @@ def _cpu(wanted: Realtime) -> CheckResult:
 
 
 def _governor() -> CheckResult:
-    found = {_text(path) for path in _SYS.glob("cpu/cpu[0-9]*/cpufreq/scaling_governor")} - {""}
-    if not found:
+    governors = {_text(path) for path in _SYS.glob("cpu/cpu[0-9]*/cpufreq/scaling_governor")} - {""}
+    if not governors:
         return CheckResult("cpufreq", GOOD, "the kernel does not scale the frequency")
-    text = f"governor {', '.join(sorted(found))}"
-    if found == {"performance"}:
+    text = f"governor {', '.join(sorted(governors))}"
+    if governors == {"performance"}:
         return CheckResult("cpufreq", GOOD, text)
     return CheckResult(
         "cpufreq", WARN, text, "cpupower frequency-set -g performance: a slow clock makes a cycle long"
@@ -236,10 +237,10 @@ _COUNTED = ("error_warning", "error_passive", "bus_off")
 
 def interfaces() -> list[str]:
     """Names of the CAN interfaces of this machine."""
-    return sorted(path.parent.name for path in _NET.glob("*/type") if _read(path) == _ARPHRD_CAN)
+    return sorted(path.parent.name for path in _NET.glob("*/type") if _text(path) == _ARPHRD_CAN)
 
 
-def can_findings(bus: str | None, config: Config) -> Iterator[CheckResult]:
+def check_can(bus: str | None, config: Config) -> Iterator[CheckResult]:
     """Every item about the bus; None: all CAN interfaces there are."""
     if bus is None:
         names = interfaces()
@@ -261,16 +262,10 @@ def can_findings(bus: str | None, config: Config) -> Iterator[CheckResult]:
         yield CheckResult(
             bus, FAIL, f"no such interface; CAN interfaces here: {here}", "driver loaded? name correct?"
         )
-    elif _read(_NET / bus / "type") != _ARPHRD_CAN:
+    elif _text(_NET / bus / "type") != _ARPHRD_CAN:
         yield CheckResult(bus, FAIL, "not a CAN interface")
     else:
         yield from _interface(bus, config)
-
-
-def _read(path: Path) -> str:
-    with suppress(OSError):
-        return path.read_text().strip()
-    return ""
 
 
 def _opened(bus: str) -> CheckResult:
@@ -295,13 +290,13 @@ def link_of(name: str) -> dict[str, Any]:
             timeout=5,
             check=True,
         )
-        found: Any = json.loads(done.stdout)
-        return dict(found[0])
+        links: Any = json.loads(done.stdout)
+        return dict(links[0])
     return {}
 
 
 def _interface(name: str, config: Config) -> Iterator[CheckResult]:
-    up = int(_read(_NET / name / "flags") or "0", 16) & 1
+    up = int(_text(_NET / name / "flags") or "0", 16) & 1
     link = link_of(name)
     info = link.get("linkinfo", {})
     data = info.get("info_data", {})
@@ -313,7 +308,7 @@ def _interface(name: str, config: Config) -> Iterator[CheckResult]:
             name, FAIL, "down", f"ip link set {name} up type can bitrate {config.bitrate} restart-ms 100"
         )
     )
-    queue = int(_read(_NET / name / "tx_queue_len") or "0")
+    queue = int(_text(_NET / name / "tx_queue_len") or "0")
     yield CheckResult(
         f"{name} queue",
         GOOD if queue >= _QUEUE else WARN,
@@ -337,7 +332,7 @@ def _interface(name: str, config: Config) -> Iterator[CheckResult]:
         yield CheckResult(
             f"{name} drops",
             WARN,
-            f"{text} since it is there",
+            f"{text} since the interface exists",
             "queue too short, or a controller that overruns",
         )
 
@@ -378,5 +373,5 @@ def _state(name: str, data: dict[str, Any], link: dict[str, Any]) -> CheckResult
 
 def _dropped(name: str) -> dict[str, int]:
     names = ("rx_dropped", "tx_dropped", "rx_over_errors", "tx_errors", "rx_errors")
-    counts = {each: int(_read(_NET / name / "statistics" / each) or "0") for each in names}
+    counts = {each: int(_text(_NET / name / "statistics" / each) or "0") for each in names}
     return {each: count for each, count in counts.items() if count}

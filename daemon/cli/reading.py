@@ -1,4 +1,8 @@
-"""One look at a running daemon: its snapshot twice, its recorder's account, its disk. Reads only."""
+"""Running daemons of this machine: find them (`find_daemons`), read one (`Watch`), explain a status (`reason`).
+
+Everything comes from the runtime directories: snapshot, `about.json`, notices, the recorder's account. Nothing is written,
+and no lock is held that anybody waits for.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +20,6 @@ from jtqd.daemon.shared.notices import Notice, NoticesError, NoticesReader
 from jtqd.daemon.shared.runtime_dir import FILE, About, AboutError, read_about
 from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader, View
 
-# Running daemons of this machine, found by their runtime directories. Reads only; holds no lock anybody waits for.
-
-
 _SHARED = ("/dev/shm", "/run/jtqd/*", "/run/user/*")
 
 
@@ -29,8 +30,8 @@ class Daemon(NamedTuple):
     about: About
 
 
-class Found(NamedTuple):
-    """What a search came upon."""
+class DaemonSearch(NamedTuple):
+    """Runtime directories of jtqd on this machine."""
 
     daemons: tuple[Daemon, ...]
     closed: tuple[Path, ...]
@@ -48,7 +49,7 @@ def places() -> list[Path]:
     return list(dict.fromkeys(found))
 
 
-def find_daemons(roots: Iterable[Path] | None = None) -> Found:
+def find_daemons(roots: Iterable[Path] | None = None) -> DaemonSearch:
     """Every daemon that runs, by the name of its bus; `roots`: where to look instead of `places()`."""
     daemons, closed, left_over = [], [], []
     for root in places() if roots is None else roots:
@@ -65,15 +66,46 @@ def find_daemons(roots: Iterable[Path] | None = None) -> Found:
                     daemons.append(Daemon(directory, content))
                 else:
                     left_over.append(directory)
-    return Found(tuple(sorted(daemons, key=lambda each: each.about.bus)), tuple(closed), tuple(left_over))
+    return DaemonSearch(
+        tuple(sorted(daemons, key=lambda each: each.about.bus)), tuple(closed), tuple(left_over)
+    )
 
 
-def on_bus(found: Found, bus: str) -> Daemon | None:
+def on_bus(search: DaemonSearch, bus: str) -> Daemon | None:
     """The daemon on `bus`: as its --bus was written, or as the name of its instance; "sim" is one that emulates."""
-    for daemon in found.daemons:
+    for daemon in search.daemons:
         if bus in (daemon.about.bus, daemon.about.instance):
             return daemon
     return None
+
+
+class NoDaemonError(Exception):
+    """No daemon to talk to, or more than one; the message is for the operator."""
+
+    def __init__(self, message: str, exit_status: int) -> None:
+        super().__init__(message)
+        self.exit_status = exit_status
+
+
+def choose_daemon(bus: str | None) -> Daemon:
+    """Return the daemon on `bus`, or the only one that runs.
+
+    Raises:
+        NoDaemonError: none runs there (exit status 1), or several run and no bus is named (2).
+    """
+    search = find_daemons()
+    others = "".join(f"\n  --bus {each.about.instance:<24} pid {each.about.pid}" for each in search.daemons)
+    closed = "".join(f"\n  {path} belongs to others: join its group to look at it" for path in search.closed)
+    if bus is not None:
+        daemon = on_bus(search, bus)
+        if daemon is None:
+            raise NoDaemonError(f"no jtqd runs on {bus}{others}{closed}", 1)
+        return daemon
+    if not search.daemons:
+        raise NoDaemonError(f"no jtqd runs here{closed}", 1)
+    if len(search.daemons) > 1:
+        raise NoDaemonError(f"several daemons run: which one?{others}", 2)
+    return search.daemons[0]
 
 
 def _subdirectories(root: Path) -> list[Path]:

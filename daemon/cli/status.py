@@ -1,4 +1,7 @@
-"""`jtq status`: how a running jtqd is doing. It reads shared memory and can never slow the loop."""
+"""`jtq status`: how a running jtqd is doing. It reads shared memory and can never slow the loop.
+
+A reading is shown as a picture at the width of the terminal (`StatusView`), or as plain data for JSON (`content`).
+"""
 
 from __future__ import annotations
 
@@ -18,14 +21,15 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from jtqd.daemon.cli.checks import NOTHING, duration, histogram, number, share, size
+from jtqd.daemon.cli.checks import NOTHING, duration, histogram, number, plural, share, size
 from jtqd.daemon.cli.reading import (
     RUNNING,
     CurrentLog,
     Daemon,
-    Found,
+    NoDaemonError,
     Reading,
     Watch,
+    choose_daemon,
     find_daemons,
     on_bus,
 )
@@ -36,16 +40,13 @@ from jtqd.daemon.shared.snapshot import BUS_COUNTERS, LATE_BIN_NS, WORK_BIN_NS, 
 from jtqd.daemon.supervisor.table import COLOURS, bus_load, plain_line
 from jtqd.estimator.status import NAMES, PUBLISHED
 
-# A reading as plain data for JSON: `jtq status --json`.
-
-
 SCHEMA = "jtq.status/1"
 
 
 def content(reading: Reading) -> dict[str, Any]:
     """Everything the picture shows; null where a number is not known."""
     about, view = reading.daemon.about, reading.view
-    found: dict[str, Any] = {
+    result: dict[str, Any] = {
         "schema": SCHEMA,
         "bus": about.bus,
         "instance": about.instance,
@@ -58,8 +59,8 @@ def content(reading: Reading) -> dict[str, Any]:
         "versions": about.versions,
     }
     if view is None or reading.earlier is None:
-        return found
-    found |= {
+        return result
+    result |= {
         "cycle": view.cycle,
         "joints": [_joint(reading, number) for number in (1, 2)],
         "inputs": [
@@ -97,7 +98,7 @@ def content(reading: Reading) -> dict[str, Any]:
             for node, what in sorted(about.nodes.items())
         ],
     }
-    found["notices"] = [
+    result["notices"] = [
         {
             "realtime_ns": each.realtime_ns,
             "level": each.level,
@@ -108,7 +109,7 @@ def content(reading: Reading) -> dict[str, Any]:
         for each in reading.notices
     ]
     log = reading.log
-    found["recorder"] = log and {
+    result["recorder"] = log and {
         "path": str(log.path) if log.path else None,
         "bytes": log.size,
         "written": log.account.written,
@@ -117,7 +118,7 @@ def content(reading: Reading) -> dict[str, Any]:
         "disk_free": log.disk_free,
         "disk_size": log.disk_size,
     }
-    return found
+    return result
 
 
 def _joint(reading: Reading, number: int) -> dict[str, Any]:
@@ -154,9 +155,6 @@ def _quantiles(values: tuple[float, float, float]) -> dict[str, float | None]:
 
 def _number(value: float) -> float | None:
     return value if isfinite(value) else None
-
-
-# The picture of `jtq status`: joints, inputs, loop, bus, nodes and recorder of one daemon, at the width of the terminal.
 
 
 _HEAD = "bold"
@@ -376,11 +374,13 @@ def _log(log: CurrentLog | None) -> Iterator[RenderableType]:
         yield _line("recorder", "no recording")
         return
     lost = Text(f"{log.account.lost} lost", style="bold red" if log.account.lost else "")
-    held = f", {log.account.let_go} let go (flight recorder)" if log.account.let_go else ""
+    held = f", {log.account.let_go} dropped (flight recorder)" if log.account.let_go else ""
     yield _line(
         "recorder",
         Text.assemble(
-            f"{log.account.written} cycles written, ", lost, f"{held}, {size(log.size)} in this file"
+            f"{plural(log.account.written, 'cycle')} written, ",
+            lost,
+            f"{held}, {size(log.size)} in this file",
         ),
     )
     yield _line("", str(log.path) if log.path else "no file is being written")
@@ -417,64 +417,37 @@ _BETWEEN_S = 0.3
 """Between the two readings of one picture: bus load and causes need what has changed."""
 
 
-class _NotOneError(Exception):
-    """No daemon to look at, or more than one; the message is for the operator."""
-
-    def __init__(self, message: str, exit_status: int) -> None:
-        super().__init__(message)
-        self.exit_status = exit_status
-
-
 def parser() -> argparse.ArgumentParser:
-    """Options of `jtq status`."""
-    made = argparse.ArgumentParser(
+    """Return the arguments of `jtq status`."""
+    result = argparse.ArgumentParser(
         prog="jtq status",
         description="How a running jtqd is doing: torque, status with its reason, inputs, timing, bus, nodes, log.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    made.add_argument("--bus", help="whose daemon: can0, unix:PATH or sim (default: the only one that runs)")
-    made.add_argument("--once", action="store_true", help="one picture, then end")
-    made.add_argument("--json", action="store_true", help="one reading as JSON, then end")
-    return made
+    result.add_argument(
+        "--bus", help="whose daemon: can0, unix:PATH or sim (default: the only one that runs)"
+    )
+    result.add_argument("--once", action="store_true", help="one picture, then end")
+    result.add_argument("--json", action="store_true", help="one reading as JSON, then end")
+    return result
 
 
 def main(argv: list[str]) -> int:
     """Show it; returns the exit status."""
     arguments = parser().parse_args(argv)
     try:
-        daemon = _chosen(find_daemons(), arguments.bus)
+        daemon = choose_daemon(arguments.bus)
         if arguments.json or arguments.once:
             return _once(daemon, as_json=arguments.json)
         os.nice(5)
         console = Console()
         return _live(console, daemon) if console.is_terminal else _lines(daemon)
-    except _NotOneError as error:
+    except NoDaemonError as error:
         print(f"jtq status: {error}", file=sys.stderr)
         return error.exit_status
     except KeyboardInterrupt:
         return 0
-
-
-def _chosen(found: Found, bus: str | None) -> Daemon:
-    if bus is not None:
-        daemon = on_bus(found, bus)
-        if daemon is None:
-            raise _NotOneError(f"no jtqd runs on {bus}{_others(found)}{_closed(found)}", 1)
-        return daemon
-    if not found.daemons:
-        raise _NotOneError(f"no jtqd runs here{_closed(found)}", 1)
-    if len(found.daemons) > 1:
-        raise _NotOneError(f"several daemons run: which one?{_others(found)}", 2)
-    return found.daemons[0]
-
-
-def _others(found: Found) -> str:
-    return "".join(f"\n  --bus {each.about.instance:<24} pid {each.about.pid}" for each in found.daemons)
-
-
-def _closed(found: Found) -> str:
-    return "".join(f"\n  {path} belongs to others: join its group to look at it" for path in found.closed)
 
 
 def _twice(daemon: Daemon) -> Reading:

@@ -1,4 +1,4 @@
-"""What goes over a bus, frame by frame, counted against a configuration. Pure: stamps and bytes in, counts out.
+"""Traffic of a bus, counted frame by frame against a configuration (`Traffic`), and the loops that listen or drive it.
 
 A cycle runs from one SYNC to the next. It is complete when every input PDO came in it exactly once, before the deadline. The
 cycle that was running when listening began and the one that was running when it ended count for nothing.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from jtqd.daemon.bus.boot import bus_load_of
@@ -28,15 +29,12 @@ from jtqd.drivers.frame import (
 )
 from jtqd.drivers.frame_socket import BusDown, FrameSocket
 
-# A histogram of times that may run for hours: bins of fixed width, exact maximum. Pure.
-
-
 _BIN_NS = 2_000
 _BINS = 5_000
 
 
 class TimeHistogram:
-    """Times in ns, below zero counted as zero; above 10 ms the bins are exact to their maximum only."""
+    """Histogram of times in ns for hours of them: bins of 2 us up to 10 ms, exact maximum; below zero counts as zero."""
 
     __slots__ = ("_bins", "count", "largest_ns")
 
@@ -46,17 +44,17 @@ class TimeHistogram:
         self.largest_ns = 0
 
     def add(self, ns: int) -> None:
-        """One more."""
+        """Count one time."""
         self.count += 1
         self.largest_ns = max(self.largest_ns, ns)
         self._bins[min(max(ns, 0) // _BIN_NS, _BINS - 1)] += 1
 
     def quantile_us(self, share: float) -> float:
         """Upper edge of the bin that holds this share of them [us], at most the maximum; NaN without data."""
-        wanted, seen = share * self.count, 0
+        target, seen = share * self.count, 0
         for n, count in enumerate(self._bins):
             seen += count
-            if count and seen >= wanted:
+            if count and seen >= target:
                 edge_ns = self.largest_ns if n == _BINS - 1 else (n + 1) * _BIN_NS
                 return min(edge_ns, max(self.largest_ns, 0)) / 1000.0
         return float("nan")
@@ -251,14 +249,11 @@ class Traffic:
 
 
 def described(can_id: int) -> str:
-    """An identifier for people: "181h", "18FF00A0h (29 bit)", "181h (remote)"."""
+    """Format an identifier: "181h", "18FF00A0h (29 bit)", "181h (remote)"."""
     extended = bool(can_id & CAN_EFF_FLAG)
     identifier = can_id & (CAN_EFF_MASK if extended else CAN_SFF_MASK)
-    marks = [word for word, is_so in (("29 bit", extended), ("remote", can_id & CAN_RTR_FLAG)) if is_so]
+    marks = [word for word, applies in (("29 bit", extended), ("remote", can_id & CAN_RTR_FLAG)) if applies]
     return f"{identifier:0{8 if extended else 3}X}h" + (f" ({', '.join(marks)})" if marks else "")
-
-
-# The shell of `jtq check`: takes frames from a bus on an absolute time grid, and sends SYNC and heartbeat when it may.
 
 
 _OPERATIONAL = b"\x05"
@@ -279,7 +274,7 @@ class Timing:
 def listen(
     socket: FrameSocket, traffic: Traffic, seconds: float, period_ns: int, *, timed: bool
 ) -> Timing | None:
-    """Hear everything for `seconds`. Raises BusError.
+    """Count everything on the bus for `seconds`. Raises BusError.
 
     Args:
         socket: without filters.
@@ -339,37 +334,26 @@ def silent(socket: FrameSocket, seconds: float) -> bool:
     return True
 
 
-class _slots:  # noqa: N801 - a generator with a name of its own
-    """Slots of an absolute grid, each when its time has come; those that are too late are counted and skipped."""
-
-    def __init__(self, seconds: float, period_ns: int, timing: Timing) -> None:
-        start_ns = time.monotonic_ns() + period_ns
-        self._grid, self._end_ns = Grid(start_ns, period_ns), start_ns + round(seconds * 1e9)
-        self._timing = timing
-        self._number = -1
-
-    def __iter__(self) -> _slots:
-        return self
-
-    def __next__(self) -> int:
-        grid = self._grid
-        if self._number >= 0:
-            grid.advance(time.monotonic_ns())
-        self._number += 1
-        while grid.slot_ns < self._end_ns:
-            pause_ns = grid.slot_ns - time.monotonic_ns()
-            if pause_ns > 0:
-                time.sleep(pause_ns * 1e-9)
+def _slots(seconds: float, period_ns: int, timing: Timing) -> Iterator[int]:
+    """Yield the slots of an absolute grid, each when its time has come; those that are too late are counted and skipped."""
+    start_ns = time.monotonic_ns() + period_ns
+    grid, end_ns, number = Grid(start_ns, period_ns), start_ns + round(seconds * 1e9), 0
+    while grid.slot_ns < end_ns:
+        pause_ns = grid.slot_ns - time.monotonic_ns()
+        if pause_ns > 0:
+            time.sleep(pause_ns * 1e-9)
+        now_ns = time.monotonic_ns()
+        timing.lateness.add(now_ns - grid.slot_ns)
+        if grid.too_late(
+            now_ns
+        ):  # as in the loop: a SYNC that late would leave its successor less than half a cycle
+            grid.missed += 1
+        else:
+            yield number
+            number += 1
             now_ns = time.monotonic_ns()
-            self._timing.lateness.add(now_ns - grid.slot_ns)
-            if not grid.too_late(now_ns):
-                return self._number
-            grid.missed += (
-                1  # as the loop does: a SYNC that late would leave its successor less than half a cycle
-            )
-            grid.advance(now_ns)
-        self._timing.missed = grid.missed
-        raise StopIteration
+        grid.advance(now_ns)
+    timing.missed = grid.missed
 
 
 def _send(socket: FrameSocket, frame: bytes) -> bool:

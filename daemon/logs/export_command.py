@@ -29,7 +29,8 @@ exit status: 0 done, 1 failure, 2 usage, 3 done, but cycles with a missing value
 _DBC = "bus.dbc"
 
 
-def _parser() -> argparse.ArgumentParser:
+def parser() -> argparse.ArgumentParser:
+    """Return the arguments of `jtq export`."""
     parser = argparse.ArgumentParser(
         prog="jtq export",
         description="Write a log as a table (CSV, Parquet), as lines of candump, or the DBC of its bus.",
@@ -69,17 +70,17 @@ def _seconds(text: str) -> float:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; returns its exit status."""
-    parser = _parser()
-    options = parser.parse_intermixed_args(argv)  # options may stand before the logs
+    command = parser()
+    options = command.parse_intermixed_args(argv)  # options may stand before the logs
     of_config = options.what == "dbc" and options.config is not None
     if of_config == bool(options.logs):
-        parser.error("expected a log" + (" or --config" if options.what == "dbc" else "") + ", and not both")
+        command.error("expected a log" + (" or --config" if options.what == "dbc" else "") + ", and not both")
     if options.what in ("csv", "parquet") and options.out is None:
-        parser.error("expected --out FILE")
+        command.error("expected --out FILE")
     if options.out is None and options.json:
-        parser.error("--json needs --out FILE: standard output takes one of them")
+        command.error("--json needs --out FILE: standard output takes one of them")
     if options.out is not None and any(_same(options.out, log) for log in options.logs):
-        parser.error(f"--out {options.out}: that is the log")
+        command.error(f"--out {options.out}: that is the log")
     try:
         result = _export(options)
     except (LogError, OSError) as error:

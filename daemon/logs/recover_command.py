@@ -27,8 +27,8 @@ checked from its first byte to its last. Files that a recorder is writing are re
 exit status: 0 nothing lost, 3 repaired with loss, 1 failure, 2 usage"""
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; returns its exit status."""
+def parser() -> argparse.ArgumentParser:
+    """Return the arguments of `jtq recover`."""
     parser = argparse.ArgumentParser(
         prog="jtq recover",
         description="Repair MCAP files in place: torn by a crash, cut short, damaged within. Never loses what was readable.",
@@ -38,10 +38,16 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("logs", nargs="+", type=Path, metavar="FILE|DIR")
     parser.add_argument("--json", action="store_true", help="results as JSON on standard output")
     parser.add_argument("--dry-run", action="store_true", help="say what would be done, change nothing")
-    options = parser.parse_args(argv)
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; returns its exit status."""
+    command = parser()
+    options = command.parse_args(argv)
     for path in options.logs:
         if not path.is_dir() and not path.name.endswith(_ENDINGS):
-            parser.error(f"found {path}, expected a directory or a file named *.mcap or *.mcap{ACTIVE}")
+            command.error(f"found {path}, expected a directory or a file named *.mcap or *.mcap{ACTIVE}")
     results: list[Recovery] = []
     failures: list[dict[str, str]] = []
     for path in _files(options.logs):

@@ -43,7 +43,7 @@ exit status: 0 every group finished (whatever was found), 3 some failed, 1 the b
 
 def main(argv: list[str]) -> int:
     """Run a batch; returns the exit status."""
-    options = _parser().parse_args(argv)
+    options = parser().parse_args(argv)
     needed = [name for name in ("jinja2",) if importlib.util.find_spec(name) is None]
     if needed:
         print(f"{BY}: {', '.join(needed)} not installed: pip install 'jtqd[train]'", file=sys.stderr)
@@ -119,7 +119,8 @@ def _lines(mapping: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _parser() -> argparse.ArgumentParser:
+def parser() -> argparse.ArgumentParser:
+    """Return the arguments of `jtq batch`."""
     parser = argparse.ArgumentParser(
         prog=BY,
         description="Run one command over many logs, on this machine or on a dask cluster, and sum up.",

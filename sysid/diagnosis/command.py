@@ -37,7 +37,7 @@ _OWN: Final = (FINDINGS, REPORT, PLAN, FILE, *(f"extended.joint{n}.yaml" for n i
 
 def main(argv: list[str]) -> int:
     """Diagnose and write; exit status 0 no gap, 3 any other verdict, 1 failure, 2 usage."""
-    options = _parser().parse_args(argv)
+    options = parser().parse_args(argv)
     missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
     if missing:
         print(f"{BY}: {', '.join(missing)} not installed: pip install 'jtqd[train]'", file=sys.stderr)
@@ -107,7 +107,8 @@ def _with_channels(findings: Findings, checked: Checked, notes: tuple[str, ...])
     return findings
 
 
-def _parser() -> argparse.ArgumentParser:
+def parser() -> argparse.ArgumentParser:
+    """Return the arguments of `jtq diagnose`."""
     parser = argparse.ArgumentParser(
         prog=BY,
         description="Measure what a joint file's simulation gets wrong on recorded runs and name the cause, "

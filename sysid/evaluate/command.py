@@ -29,7 +29,7 @@ _NEEDED: Final = ("matplotlib", "jinja2", "onnx")
 
 def main(argv: list[str]) -> int:
     """Evaluate and write; exit status 0 done, 1 failure (a trained-on run included), 2 usage, 3 done with findings."""
-    options = _parser().parse_args(argv)
+    options = parser().parse_args(argv)
     missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
     if missing:
         print(f"{BY}: {', '.join(missing)} not installed: pip install 'jtqd[train]'", file=sys.stderr)
@@ -56,7 +56,8 @@ def main(argv: list[str]) -> int:
     return 3 if result.findings else 0
 
 
-def _parser() -> argparse.ArgumentParser:
+def parser() -> argparse.ArgumentParser:
+    """Return the arguments of `jtq evaluate`."""
     parser = argparse.ArgumentParser(
         prog=BY,
         description="Compare all methods with the torque sensor on runs that no model has seen (the paper's section IV).",

@@ -120,7 +120,7 @@ EFFICIENCY_BY = "jtq fit efficiency"
 
 def efficiency_main(argv: list[str]) -> int:
     """Fit and write; exit status 0 done, 1 failure, 2 usage, 3 findings (then nothing is written)."""
-    options = parse_fit(_parser(), argv)
+    options = parse_fit(efficiency_parser(), argv)
     if options.plot is not None and importlib.util.find_spec("matplotlib") is None:
         print(
             f"{EFFICIENCY_BY}: --plot: matplotlib is not installed (it is in the extra 'train')",
@@ -173,7 +173,8 @@ def analyse(joint: Joint, runs: list[InputRun], number: int, options: argparse.N
     )
 
 
-def _parser() -> argparse.ArgumentParser:
+def efficiency_parser() -> argparse.ArgumentParser:
+    """Return the arguments of `jtq fit efficiency`."""
     parser = fit_parser(
         "efficiency",
         "Fit the paper's Eq. (8) to the plateaus of measured runs, quadrant by quadrant.",
@@ -256,15 +257,20 @@ def _draw(joint: Joint, result: EfficiencyResult, path: Path) -> None:
 FRICTION_BY = "jtq fit friction"
 
 
-def friction_main(argv: list[str]) -> int:
-    """Fit and write; exit status 0 done, 1 failure, 2 usage, 3 findings (then nothing is written)."""
+def friction_parser() -> argparse.ArgumentParser:
+    """Return the arguments of `jtq fit friction`."""
     parser = fit_parser(
         "friction",
         "Fit Coulomb and viscous friction to the plateaus at no load: motor current or joint torque next to zero.",
         "  jtq fit friction campaigns/efficiency --joint joint1.yaml --out joint1.friction.yaml",
     )
     add_plateau_options(parser)
-    options = parse_fit(parser, argv)
+    return parser
+
+
+def friction_main(argv: list[str]) -> int:
+    """Fit and write; exit status 0 done, 1 failure, 2 usage, 3 findings (then nothing is written)."""
+    options = parse_fit(friction_parser(), argv)
     try:
         joint = load_joint(options.joint)
         runs = read_runs(options.runs, options.columns)
@@ -326,14 +332,16 @@ _EXAMPLE = (
 )
 
 
+def losses_parser() -> argparse.ArgumentParser:
+    """Return the arguments of `jtq fit losses`."""
+    return fit_parser(
+        "losses", "Additive loss over load, speed, direction and temperature; torsion; sigma.", _EXAMPLE
+    )
+
+
 def losses_main(argv: list[str]) -> int:
     """Fit and write; exit status 0 done, 1 failure, 2 usage, 3 findings (then nothing is written)."""
-    options = parse_fit(
-        fit_parser(
-            "losses", "Additive loss over load, speed, direction and temperature; torsion; sigma.", _EXAMPLE
-        ),
-        argv,
-    )
+    options = parse_fit(losses_parser(), argv)
     try:
         joint = load_joint(options.joint)
         runs = read_runs(options.runs, options.columns)
@@ -419,6 +427,29 @@ KINDS: Final = {
     "losses": (losses_main, "additive loss over load and velocity, from whole runs: losses"),
 }
 """Kind -> (its `main(argv) -> int`, one line of help)."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the arguments of `jtq fit`, a subcommand for each kind."""
+    parser = argparse.ArgumentParser(
+        prog="jtq fit",
+        description="Fit one section of a joint file to measured runs and write a new joint file.",
+    )
+    kinds = parser.add_subparsers(dest="kind", metavar="KIND")
+    for name, made in (
+        ("efficiency", efficiency_parser()),
+        ("friction", friction_parser()),
+        ("losses", losses_parser()),
+    ):
+        kinds.add_parser(
+            name,
+            help=KINDS[name][1],
+            description=made.description,
+            epilog=made.epilog,
+            parents=[made],
+            add_help=False,
+        )
+    return parser
 
 
 def main(argv: list[str]) -> int:

@@ -198,8 +198,8 @@ def _save(joint: Joint, path: Path) -> None:
     )
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Command line; results on stdout, log on stderr. Exit status 0 done, 1 failure, 2 usage."""
+def parser() -> argparse.ArgumentParser:
+    """Return the arguments of `jtq measured`."""
     parser = argparse.ArgumentParser(
         prog="jtq measured",
         description="Score the torque observer on the Kinova Gen3 runs, before and after fitting friction.",
@@ -216,10 +216,16 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--joint-files", type=Path, help="folder for the fitted joint files (default: the --out folder)"
     )
-    options = parser.parse_args(arguments)
+    return parser
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line; results on stdout, log on stderr. Exit status 0 done, 1 failure, 2 usage."""
+    command = parser()
+    options = command.parse_args(arguments)
     if options.bus is not None:
         if options.joint_files is not None:
-            parser.error("--joint-files: nothing is fitted with --bus")
+            command.error("--joint-files: nothing is fitted with --bus")
         from jtqd.sysid.measured import bus as measured_bus
 
         return measured_bus.run(options.bus, options.out, options.json)

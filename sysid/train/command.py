@@ -147,7 +147,7 @@ _EXAMPLES = """examples:
 
 def main(argv: list[str]) -> int:
     """Train and write; exit status 0 done, 1 failure, 2 usage, 3 findings in the data (then nothing is written)."""
-    options = _parser().parse_args(argv)
+    options = parser().parse_args(argv)
     try:
         joints = [load_joint(path) for path in options.joint]
         _require_writable(options.out)
@@ -192,7 +192,8 @@ def _require_writable(directory: Path) -> None:
         raise ConfigError(f"--out {directory}: files cannot be made there: {reason}") from None
 
 
-def _parser() -> argparse.ArgumentParser:
+def parser() -> argparse.ArgumentParser:
+    """Return the arguments of `jtq train`."""
     parser = argparse.ArgumentParser(
         prog="jtq train",
         description="Train a network per joint on recorded runs; split by run, never by sample.",

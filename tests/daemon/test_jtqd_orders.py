@@ -27,7 +27,9 @@ PERIOD_US = 5000
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[str]:
     bus = f"unix:{tmp_path / 'bus'}"
-    process = subprocess.Popen([sys.executable, "-m", "jtqd.sim_can", "--bus", bus], stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "jtqd.sim_can", "--bus", bus], stderr=subprocess.DEVNULL
+    )
     until((tmp_path / "bus").exists)
     yield bus
     process.terminate()

@@ -72,20 +72,33 @@ def _repack(distribution: importlib.metadata.Distribution, directory: Path) -> N
                 wheel.write(file.locate(), str(file))
 
 
-def _own_wheel(directory: Path) -> Path:
-    """Built from a copy: setuptools leaves its traces beside the sources."""
-    copy = directory / "source"
-    for item in ("pyproject.toml", "README.md", "LICENSE"):
-        copy.mkdir(exist_ok=True)
+def copy_sources(copy: Path) -> Path:
+    """What the wheel is built from; setuptools leaves its traces beside the sources, so they are copied."""
+    copy.mkdir(parents=True)
+    for item in ("pyproject.toml", "MANIFEST.in", "README.md", "CHANGELOG.md", "LICENSE"):
         shutil.copy2(ROOT / item, copy / item)
-    for package in ("daemon", "drivers", "estimator", "models", "sim_can", "sysid"):
-        shutil.copytree(ROOT / package, copy / package, ignore=shutil.ignore_patterns("__pycache__"))
+    unwanted = shutil.ignore_patterns("__pycache__", "*.egg-info")
+    shutil.copytree(ROOT / "src", copy / "src", symlinks=True, ignore=unwanted)
+    for link in (ROOT / "src" / "jtqd").iterdir():
+        if link.is_symlink():
+            shutil.copytree(ROOT / link.name, copy / link.name, ignore=unwanted)
+    return copy
+
+
+def build_wheel(source: Path, directory: Path) -> Path:
+    """Build jtqd's wheel from a source tree or an sdist into `directory`, without network."""
     subprocess.run(
         [
             *(sys.executable, "-m", "pip", "wheel", "--quiet", "--disable-pip-version-check"),
-            *("--no-deps", "--no-build-isolation", "--wheel-dir", str(directory), str(copy)),
+            *("--no-deps", "--no-build-isolation", "--wheel-dir", str(directory), str(source)),
         ],
         check=True,
     )
-    shutil.rmtree(copy)
     return next(directory.glob("jtqd-*.whl"))
+
+
+def _own_wheel(directory: Path) -> Path:
+    copy = copy_sources(directory / "source")
+    wheel = build_wheel(copy, directory)
+    shutil.rmtree(copy)
+    return wheel

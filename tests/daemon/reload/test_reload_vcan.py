@@ -52,7 +52,9 @@ class Run:
         """Start; after 1 s, and every 0.3 s from then on, one of the actions; until the end."""
         python, dump = sys.executable, self.directory / "dump"
         bench = subprocess.Popen(
-            [python, "-m", "jtqd.sim_can", "--bus", INTERFACE, "--seed", "1"], stderr=subprocess.PIPE, text=True
+            [python, "-m", "jtqd.sim_can", "--bus", INTERFACE, "--seed", "1"],
+            stderr=subprocess.PIPE,
+            text=True,
         )
         assert bench.stderr is not None
         assert "ready" in bench.stderr.readline()

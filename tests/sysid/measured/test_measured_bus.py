@@ -141,7 +141,9 @@ def test_a_unix_bus_outlives_the_run_that_was_played_on_it(tmp_path) -> None:
     run.write_text("time_s,j1.current_a,j1.link_position_rad,j2.current_a,j2.link_position_rad\n" + rows)
     bus = f"unix:{tmp_path}/bus"
     play = subprocess.Popen(
-        [sys.executable, "-m", "jtqd.sim_can", "--bus", bus, "--play", str(run)], stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", "jtqd.sim_can", "--bus", bus, "--play", str(run)],
+        stderr=subprocess.PIPE,
+        text=True,
     )
     try:
         assert play.stderr.readline() == f"bench ready on {bus}\n"

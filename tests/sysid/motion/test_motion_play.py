@@ -52,7 +52,9 @@ def bus(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     directory = tmp_path_factory.mktemp("motion")
     address = f"unix:{directory / 'bus'}"
     bench = subprocess.Popen(
-        [sys.executable, "-m", "jtqd.sim_can", "--bus", address, "--seed", "1"], stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", "jtqd.sim_can", "--bus", address, "--seed", "1"],
+        stderr=subprocess.PIPE,
+        text=True,
     )
     assert bench.stderr is not None
     assert "ready" in bench.stderr.readline()

@@ -129,7 +129,7 @@ def test_check_beside_a_daemon_listens_and_finds_what_does_not_belong(tmp_path: 
         if EXACT:
             assert (code, seen["result"]) == (0, "GOOD"), seen
             texts = {each["item"]: each["text"] for each in seen["items"]}
-            assert texts["SYNC"].startswith("1000.0 per s, wanted 1000")
+            assert texts["SYNC"].startswith("1000.0 per s, expected 1000")
             assert "; 0 of " in texts["jtqd's timing"]
         code, _, said = jtq("check", "1", "--bus", INTERFACE, "--drive-sync", runtime=tmp_path)
         assert code == 1

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from jtqd.daemon.cli.check import check_bus, main, own_timing, stolen_time
+from jtqd.daemon.cli.bus_checks import check_bus, check_own_timing, check_stolen_time
+from jtqd.daemon.cli.check import main
 from jtqd.daemon.cli.checks import FAIL, GOOD, SKIP, WARN, CheckResult, show
 from jtqd.daemon.cli.traffic import TimeHistogram, Timing, Traffic, described
 from jtqd.daemon.config import Config, load_config
@@ -69,9 +70,9 @@ def judged(config: Config, frames: Iterator, lost: int = 0) -> dict[str, CheckRe
 def test_a_bus_as_configured_is_good_in_every_item(config: Config) -> None:
     found = judged(config, bus(1000))
     assert {each.level for each in found.values()} == {GOOD}, found
-    assert found["SYNC"].text == "1000.0 per s, wanted 1000; off the period: p50 0, p99 0, max 0 us"
+    assert found["SYNC"].text == "1000.0 per s, expected 1000; off the period: p50 0, p99 0, max 0 us"
     assert (
-        found["181h drive 1 TPDO1"].text == "1 per SYNC, wanted 1; after SYNC: p50 335, p99 335, max 335 us"
+        found["181h drive 1 TPDO1"].text == "1 per SYNC, expected 1; after SYNC: p50 335, p99 335, max 335 us"
     )
     assert found["success rate"].text.startswith("1.0000: 1000 of 1000 cycles")
     assert found["1A0h jtqd estimate"].text == "1 per SYNC; with a number: joint 1 100.0 %, joint 2 100.0 %"
@@ -168,10 +169,10 @@ def test_heartbeats_states_restarts_and_emergencies(config: Config) -> None:
     found = judged(config, bus(1000, change))
     assert found["heartbeat drive 1"].level == WARN
     assert "longest silence 300 ms" in found["heartbeat drive 1"].text
-    assert found["heartbeat drive 2"].text.endswith("restarted 1 times")
+    assert found["heartbeat drive 2"].text.endswith("; 1 restart")
     assert found["heartbeat drive 2"].text.startswith("pre-operational")
     assert found["heartbeat sensor 3"].level == FAIL
-    assert found["heartbeat jtqd"].text.endswith("1 emergencies, last 8250h")
+    assert found["heartbeat jtqd"].text.endswith("1 EMCY, last 8250h")
 
 
 def test_strangers_look_alikes_and_error_messages(config: Config) -> None:
@@ -213,23 +214,23 @@ def test_own_timing() -> None:
             found.echo.add(70 * US)
         return found
 
-    assert [each.level for each in own_timing(timing(50, 0), MS, [], driven=True)] == [GOOD, GOOD]
-    assert [each.level for each in own_timing(timing(200, 0), MS, [], driven=False)] == [WARN]
-    assert [each.level for each in own_timing(timing(50, 1), MS, [], driven=False)] == [WARN]
-    assert [each.level for each in own_timing(timing(50, 11), MS, [], driven=False)] == [FAIL]
-    assert [each.level for each in own_timing(timing(600, 0), MS, [], driven=False)] == [FAIL]
+    assert [each.level for each in check_own_timing(timing(50, 0), MS, [], driven=True)] == [GOOD, GOOD]
+    assert [each.level for each in check_own_timing(timing(200, 0), MS, [], driven=False)] == [WARN]
+    assert [each.level for each in check_own_timing(timing(50, 1), MS, [], driven=False)] == [WARN]
+    assert [each.level for each in check_own_timing(timing(50, 11), MS, [], driven=False)] == [FAIL]
+    assert [each.level for each in check_own_timing(timing(600, 0), MS, [], driven=False)] == [FAIL]
     for echoes, level in ((999, GOOD), (998, FAIL)):  # the last one may still be on its way
         found = timing(50, 0)
         found.echo = TimeHistogram()
         for _ in range(echoes):
             found.echo.add(70 * US)
-        assert [each.level for each in own_timing(found, MS, [], driven=True)] == [GOOD, level]
-    (one,) = own_timing(timing(50, 0), MS, ["SCHED_FIFO priority 80: refused"], driven=False)
+        assert [each.level for each in check_own_timing(found, MS, [], driven=True)] == [GOOD, level]
+    (one,) = check_own_timing(timing(50, 0), MS, ["SCHED_FIFO priority 80: refused"], driven=False)
     assert one.text.startswith("without real-time scheduling")
 
 
 def test_stolen_time_is_judged_by_its_share_of_one_processor() -> None:
-    found = [stolen_time(stolen, 10.0) for stolen in (0.0, 0.009, 0.01, 3.0)]
+    found = [check_stolen_time(stolen, 10.0) for stolen in (0.0, 0.009, 0.01, 3.0)]
     assert [each.level for each in found] == [GOOD, GOOD, WARN, WARN]
     assert [bool(each.hint) for each in found] == [False, False, True, True]
     assert found[-1].text.startswith("30.0% of a processor")

@@ -12,10 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.daemon.cli import machine as doctor_can
-from jtqd.daemon.cli import machine as doctor_kernel
-from jtqd.daemon.cli.checks import FAIL, GOOD, SKIP, WARN, CheckResult, exit_status
-from jtqd.daemon.cli.doctor import directory_findings, fits, main, requirement
+from jtqd.daemon.cli import machine
+from jtqd.daemon.cli.checks import FAIL, GOOD, SKIP, WARN
+from jtqd.daemon.cli.doctor import check_directories, fits, main, requirement
 from jtqd.daemon.config import Realtime, load_config
 from jtqd.models.files import shipped
 from tests.drivers.hub_helpers import until_it_listens
@@ -127,8 +126,8 @@ def as_nobody() -> list[tuple[str, str, str]]:
             os.setgid(65534)
             os.setuid(65534)
             found = [
-                *doctor_kernel.kernel_findings(Realtime(80, None, True), can=False),
-                *directory_findings(Path("/root/logs"), [Path("/dev/shm")]),
+                *machine.check_kernel(Realtime(80, None, True), can=False),
+                *check_directories(Path("/root/logs"), [Path("/dev/shm")]),
             ]
             os.write(writable, json.dumps([(each.item, each.level, each.text) for each in found]).encode())
         finally:
@@ -207,19 +206,19 @@ def test_a_real_controller(
     (can0 / "statistics" / "rx_over_errors").write_text("3\n")
     link = json.loads(json.dumps(LINK))
     link["linkinfo"]["info_data"] |= change
-    monkeypatch.setattr(doctor_can, "_NET", tmp_path)
-    monkeypatch.setattr(doctor_can, "link_of", lambda name: link)
-    found = {each.item: each.level for each in doctor_can.can_findings("can0", load_config(None))}
+    monkeypatch.setattr(machine, "_NET", tmp_path)
+    monkeypatch.setattr(machine, "link_of", lambda name: link)
+    found = {each.item: each.level for each in machine.check_can("can0", load_config(None))}
     assert found[item] == expected
     assert found["can0"] == GOOD
     assert found["can0 drops"] == WARN
 
 
 def test_cpu_lists_and_a_cpu_that_is_not_there() -> None:
-    assert doctor_kernel._cpus("0-2,5") == {0, 1, 2, 5}
-    assert doctor_kernel._cpus("") == set()
-    assert doctor_kernel._cpu(Realtime(80, 4000, True)).level == FAIL
-    assert doctor_kernel._priority(Realtime(0, None, True)).level == WARN
+    assert machine._cpus("0-2,5") == {0, 1, 2, 5}
+    assert machine._cpus("") == set()
+    assert machine._cpu(Realtime(80, 4000, True)).level == FAIL
+    assert machine._priority(Realtime(0, None, True)).level == WARN
 
 
 def test_requirements_are_compared_by_their_numbers() -> None:
@@ -230,10 +229,3 @@ def test_requirements_are_compared_by_their_numbers() -> None:
     assert not fits("5.0", "<", "5")
     assert fits("2.4", "==", "2.4.0")
     assert not fits("1.2.9", ">=", "1.3")
-
-
-def test_exit_status_is_the_worst_level() -> None:
-    items = {level: CheckResult("x", level, "") for level in (GOOD, WARN, FAIL, SKIP)}
-    assert exit_status([items[GOOD], items[SKIP]]) == 0
-    assert exit_status([items[GOOD], items[WARN]]) == 3
-    assert exit_status([items[WARN], items[FAIL]]) == 1

@@ -1,0 +1,77 @@
+"""Results of checks: exit status, report; numbers for people."""
+
+import json
+
+import pytest
+
+from jtqd.daemon.cli.checks import (
+    FAIL,
+    GOOD,
+    SKIP,
+    WARN,
+    CheckResult,
+    duration,
+    exit_status,
+    histogram,
+    number,
+    plural,
+    report,
+    share,
+    size,
+)
+
+NAN = float("nan")
+
+
+def test_exit_status_is_the_worst_level() -> None:
+    items = {level: CheckResult("x", level, "") for level in (GOOD, WARN, FAIL, SKIP)}
+    assert exit_status([items[GOOD], items[SKIP]]) == 0
+    assert exit_status([items[GOOD], items[WARN]]) == 3
+    assert exit_status([items[WARN], items[FAIL]]) == 1
+
+
+def test_the_report_is_a_table_or_json(capsys: pytest.CaptureFixture[str]) -> None:
+    results = [
+        CheckResult("one", GOOD, "fine"),
+        CheckResult("two", WARN, "first", "do this"),
+        CheckResult("three", WARN, "second", "do this"),
+    ]
+    assert report(results, None) == 3
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split() for line in lines[:3]] == [
+        ["GOOD", "one", "fine"],
+        ["WARN", "two", "first"],
+        ["WARN", "three", "second"],
+    ]
+    assert lines[3].strip() == "> do this", "one hint for both"
+    assert lines[4] == "WARN: 1 good, 2 warnings, 0 failures"
+    assert report(results[:1], "jtq.x/1", bus="can0") == 0
+    assert json.loads(capsys.readouterr().out) == {
+        "schema": "jtq.x/1",
+        "result": "GOOD",
+        "bus": "can0",
+        "items": [{"item": "one", "level": "GOOD", "text": "fine", "hint": ""}],
+    }
+
+
+def test_numbers_for_people() -> None:
+    assert [duration(each) for each in (0.0451, 2.34, 59.94, 59.96, 751.2, 11_100.0, 187_300.0, NAN)] == [
+        *("45 ms", "2.3 s", "59.9 s", "1 min 00 s", "12 min 31 s", "3 h 05 min", "2 d 04 h", "-"),
+    ]
+    assert [size(each) for each in (0, 999, 1000, 123_456, 1_230_000_000, None)] == [
+        *("0 B", "999 B", "1 kB", "123 kB", "1.23 GB", "-"),
+    ]
+    assert [plural(count, "slot") for count in (0, 1, 2)] == ["0 slots", "1 slot", "2 slots"]
+    assert (number(-1.005), number(NAN), share(0.8476), share(NAN)) == ("-1.00", "-", "84.8 %", "-")
+
+
+def test_a_histogram_shows_one_cycle_in_a_million() -> None:
+    bins = [0] * 100
+    bins[10], bins[11], bins[30] = 1_000_000, 500, 1
+    line = histogram(bins, 4.0, 60)
+    assert line.startswith("40 █▄")
+    assert line.endswith("▁ 124 us")
+    assert line.count(" ") == 18 + 3, "bins without a cycle are empty"
+    assert len(histogram(bins, 4.0, 10)) <= 10 + len("40  136 us")
+    assert histogram([0] * 9 + [1], 4.0, 10).endswith("us and more")
+    assert histogram([0] * 10, 4.0, 10) == ""
