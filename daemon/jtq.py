@@ -54,7 +54,7 @@ COMMANDS = {
     "completion": ("jtqd.daemon.cli.completion_command", "completion for bash, zsh or fish"),
     "man": ("jtqd.daemon.cli.man_command", "manual page of jtq, made from its help"),
     "measured": (
-        "jtqd.sysid.measured.offline",
+        "jtqd.sysid.measured.command",
         "estimate measured runs before and after fitting the joint file's friction",
     ),
 }
