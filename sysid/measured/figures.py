@@ -10,7 +10,7 @@ import matplotlib as mpl
 from matplotlib import pyplot as plt
 
 from jtqd.estimator.status import STALE, STANDSTILL
-from jtqd.sysid import figures as parts
+from jtqd.sysid.report import figures as parts
 
 if TYPE_CHECKING:
     from jtqd.sysid.measured.bus import BusRun
