@@ -59,7 +59,7 @@ GROUPS = {
         ),
         "reproduce": ("jtqd.sysid.reproduce", "repeat campaigns, fits, training and evaluation from nothing"),
         "measured": (
-            "jtqd.sysid.measured.offline",
+            "jtqd.sysid.measured.command",
             "score the observer on the measured Kinova runs that ship",
         ),
     },

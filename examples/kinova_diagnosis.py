@@ -26,9 +26,9 @@ from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable, RunTableError
 from jtqd.models.files import load_joint, shipped
-from jtqd.sysid import figures as parts
 from jtqd.sysid.diagnosis.command import diagnosed
 from jtqd.sysid.diagnosis.findings import Cause, Findings, Gap, Value, to_mapping
+from jtqd.sysid.report import figures as parts
 from jtqd.sysid.runs.files import ColumnMap, RunError, read_run
 from jtqd.sysid.runs.inputs import InputRun
 

@@ -14,7 +14,7 @@ from jtqd.daemon.logs.errors import LogError
 from jtqd.daemon.logs.reader import read_topic
 from jtqd.daemon.logs.rows import Records
 from jtqd.estimator.status import DEGRADED, NAMES, STANDSTILL, VALID
-from jtqd.sysid.figures import shade
+from jtqd.sysid.report.figures import shade
 
 _SHADES = {STANDSTILL: "#dcecf2", DEGRADED: "#fbe8c8"}
 _OTHER = "#f3d6d6"

@@ -1,1 +1,6 @@
-"""One command over many logs: groups of logs as tasks, here or on a dask cluster, resumable, with one page at the end."""
+"""`jtq batch`: diagnose or replay many logs, here or on a dask cluster, with one summary page.
+
+In: logs and run tables, options of the command. Out: one result per group of logs, kept by content; summary and page.
+Modules: `command` (options), `run` (groups, tasks, results), `summary` (the page). Imports sysid.runs, sysid.report and, in
+tasks, `jtq` as a process.
+"""

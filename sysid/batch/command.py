@@ -6,23 +6,35 @@ import argparse
 import datetime as dt
 import importlib.util
 import json
+import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
 from jtqd.estimator.checked import ConfigError, count, seconds
-from jtqd.sysid.batch.executors import ClusterError, executor
-from jtqd.sysid.batch.figures import DIAGNOSE, REPLAY, REPORT
-from jtqd.sysid.batch.groups import BY_DIRECTORY, BY_RUN, WAYS, Found, GroupError, find_groups
-from jtqd.sysid.batch.options import Passed, passed_to_diagnose, passed_to_replay
-from jtqd.sysid.batch.progress import Progress
-from jtqd.sysid.batch.run import Batch, BatchError, Job, Row
-from jtqd.sysid.batch.store import Store, StoreError, write_whole
-from jtqd.sysid.batch.summary import counts, render, to_mapping
-from jtqd.sysid.batch.tool import tool_version
-from jtqd.sysid.runs.files import RunError
-from jtqd.sysid.runs.sources import LOGS, TABLES, UsageError
+from jtqd.sysid.batch.run import (
+    BY_DIRECTORY,
+    BY_RUN,
+    FAILED,
+    WAYS,
+    BatchError,
+    Group,
+    GroupError,
+    Row,
+    Task,
+    executor,
+    find_groups,
+    run_batch,
+    sha256,
+    tool_version,
+    write_whole,
+)
+from jtqd.sysid.batch.summary import DIAGNOSE, REPLAY, counts, render, to_mapping
+from jtqd.sysid.report.numbers import counted
+from jtqd.sysid.runs.files import ColumnMap, RunError
+from jtqd.sysid.runs.sources import LOGS, TABLES, UsageError, joint_files
 
 BY: Final = "jtq batch"
 PAGE, SUMMARY = "index.html", "summary.json"
@@ -38,97 +50,137 @@ must have the same jtqd and see the logs under the same paths). A finished resul
 the logs, the options, and version and code of jtqd: the same command again does only what is missing. DIR/index.html has
 the summary.
 
-exit status: 0 every group finished (whatever was found), 3 some failed, 1 the batch failed, 2 usage"""
+exit status: 0 every group finished (whatever the result), 3 some failed, 1 the batch failed, 2 usage"""
 
 
 def main(argv: list[str]) -> int:
     """Run a batch; returns the exit status."""
     options = parser().parse_args(argv)
-    needed = [name for name in ("jinja2",) if importlib.util.find_spec(name) is None]
-    if needed:
-        print(f"{BY}: {', '.join(needed)} not installed: pip install 'jtqd[train]'", file=sys.stderr)
-        return 1
-    command = options.command
+    if importlib.util.find_spec("jinja2") is None:
+        return _error("jinja2 is not installed: pip install 'jtqd[train]'")
     try:
-        found = find_groups(options.logs, options.group_by or _GROUP_BY[command], _KINDS[command])
-        passed = passed_to_diagnose(options) if command == DIAGNOSE else passed_to_replay(options)
+        groups, active = find_groups(
+            options.logs, options.group_by or _GROUP_BY[options.command], _KINDS[options.command]
+        )
+        arguments, parameters = _diagnose(options) if options.command == DIAGNOSE else _replay(options)
     except (UsageError, GroupError) as error:
-        print(f"{BY}: {error}", file=sys.stderr)
-        return 2
+        return _error(error, 2)
     except (ConfigError, RunError) as error:
-        print(f"{BY}: {error}", file=sys.stderr)
-        return 1
-    for path in found.active:
-        print(f"{BY}: {path}: left out, it is not ended (`jtq recover` does that)", file=sys.stderr)
-    store = None
+        return _error(error)
+    for path in active:
+        _error(f"{path}: left out, still being written (`jtq recover` ends it)")
+    task = Task(options.command, (), arguments, options.command == DIAGNOSE, options.timeout)
     try:
-        store = Store(options.out)
-        return _run(options, found, passed, store)
-    except (BatchError, ClusterError, StoreError) as error:
-        print(f"{BY}: {error}", file=sys.stderr)
+        return _run(options, groups, task, parameters)
+    except BatchError as error:
+        return _error(error)
     except KeyboardInterrupt:
-        print(f"{BY}: interrupted; the same command goes on from here", file=sys.stderr)
-    finally:
-        if store is not None:
-            store.close()
-    return 1
+        return _error("interrupted; the same command goes on from here")
 
 
-def _run(options: argparse.Namespace, found: Found, passed: Passed, store: Store) -> int:
-    """The batch itself. Raises BatchError, ClusterError, OSError."""
-    job = Job(
-        options.command,
-        passed.arguments,
-        passed.parameters,
-        options.command == DIAGNOSE,
-        tool_version(),
-        options.timeout,
-        options.again,
-    )
-    with (
-        executor(options.scheduler, options.jobs) as (workers, where),
-        Progress(len(found.groups), BY) as progress,
-    ):
-        rows = Batch(job, found.groups, store, workers, progress.finished).run()
-    mapping = to_mapping(job, rows, where)
+def _error(text: object, status: int = 1) -> int:
+    print(f"{BY}: {text}", file=sys.stderr, flush=True)
+    return status
+
+
+def _run(options: argparse.Namespace, groups: Sequence[Group], task: Task, parameters: dict[str, Any]) -> int:
+    """Run the batch and write the summary. Raises BatchError, OSError."""
+    (options.out / "results").mkdir(parents=True, exist_ok=True)
+    with executor(options.scheduler, options.jobs) as (workers, where), _progress(len(groups)) as progress:
+        rows = run_batch(
+            task, parameters, groups, options.out, workers, again=options.again, progress=progress
+        )
+    mapping = to_mapping(task.command, parameters, tool_version(), rows, where)
     text = json.dumps(mapping, indent=1, allow_nan=False)
-    write_whole(options.out / SUMMARY, f"{text}\n".encode())
+    write_whole(options.out / SUMMARY, f"{text}\n")
     made = dt.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
-    page = render(job, rows, where, made, _links(rows, store))
-    write_whole(options.out / PAGE, page.encode())
-    print(text if options.json else _lines(mapping))
-    print(f"{BY}: wrote {options.out / PAGE}", file=sys.stderr)
-    return 3 if counts(rows)["failed"] else 0
+    foot = f"{made} · jtqd {tool_version()}"
+    foot += f" · options: {' '.join(task.arguments)}" if task.arguments else ""
+    write_whole(options.out / PAGE, render(task.command, rows, where, foot))
+    number = counts(rows)
+    if options.json:
+        print(text)
+    else:
+        print(
+            f"{counted(number['groups'], 'group')}: {number['done']} done, {number['kept']} finished before, "
+            f"{number['failed']} failed"
+        )
+        for row in rows:
+            if row.error:
+                print(f"  {row.group.name}: {row.error}")
+    _error(f"wrote {options.out / PAGE}")
+    return 3 if number["failed"] else 0
 
 
-def _links(rows: Sequence[Row], store: Store) -> dict[str, str]:
-    return {
-        row.key: store.link(row.key, REPORT)
-        for row in rows
-        if row.key is not None and row.content is not None and REPORT in row.content["files"]
-    }
+@contextmanager
+def _progress(groups: int) -> Iterator[Callable[[Row], None]]:
+    """Show a bar on a terminal, and a line for each group that failed. Yields what is to be called with each row."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("groups", total=groups)
+
+        def finished(row: Row) -> None:
+            bar.advance(task)
+            if row.state == FAILED:
+                _error(f"{row.group.name}: {row.error}")
+
+        yield finished
 
 
-def _lines(mapping: dict[str, Any]) -> str:
-    """The outcome for people: one line of counts, one per failed group."""
-    number = mapping["counts"]
-    lines = [
-        f"{number['groups']} groups: {number['done']} done, {number['kept']} finished before, {number['failed']} failed"
-    ]
-    lines += [f"  {each['name']}: {each['error']}" for each in mapping["groups"] if each["error"]]
-    return "\n".join(lines)
+def _diagnose(options: argparse.Namespace) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """Return the arguments of `jtq diagnose`, and the same by content. Raises UsageError, ConfigError, RunError."""
+    columns = None if options.columns is None else ColumnMap.load(options.columns)
+    files = joint_files(options.joint, columns)
+    arguments: list[str] = []
+    for text in options.joint:
+        number, equals, path = text.rpartition("=")
+        arguments += ["--joint", f"{number}{equals}{os.path.abspath(path)}"]
+    parameters: dict[str, Any] = {"joint": {str(key): _hash(path) for key, path in files.items()}}
+    if options.columns is not None:
+        arguments += ["--columns", os.path.abspath(options.columns)]
+        parameters["columns"] = _hash(options.columns)
+    return tuple(arguments), parameters
+
+
+def _replay(options: argparse.Namespace) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """Return the arguments of `jtq replay`, and the same by content. Raises ConfigError."""
+    arguments: list[str] = []
+    parameters: dict[str, Any] = {}
+    if options.model is not None:
+        if not options.model.is_dir():
+            raise ConfigError(f"--model {options.model}: found no such directory, expected one with models")
+        arguments += ["--model", os.path.abspath(options.model)]
+        inside = sorted(path for path in options.model.rglob("*") if path.is_file())
+        parameters["model"] = {str(path.relative_to(options.model)): _hash(path) for path in inside}
+    if options.method is not None:
+        arguments += ["--method", options.method]
+        parameters["method"] = options.method
+    if options.exact:
+        arguments.append("--exact")
+        parameters["exact"] = True
+    return tuple(arguments), parameters
+
+
+def _hash(path: Path) -> str:
+    try:
+        return sha256(path)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the arguments of `jtq batch`."""
-    parser = argparse.ArgumentParser(
+    """Arguments of `jtq batch`."""
+    result = argparse.ArgumentParser(
         prog=BY,
-        description="Run one command over many logs, on this machine or on a dask cluster, and sum up.",
+        description="Run one command over many logs, on this machine or on a dask cluster, and summarise the results.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    commands = parser.add_subparsers(dest="command", required=True, metavar="diagnose|replay")
-    diagnose = _common(commands, DIAGNOSE, "what a joint file's simulation gets wrong on each group of runs")
+    commands = result.add_subparsers(dest="command", required=True, metavar="diagnose|replay")
+    diagnose = _common(commands, DIAGNOSE, "errors of a joint file's simulation on each group of runs")
     diagnose.add_argument(
         "--joint",
         action="append",
@@ -143,7 +195,7 @@ def parser() -> argparse.ArgumentParser:
     replay.add_argument("--model", type=Path, metavar="DIR", help="other models; see jtq replay --help")
     replay.add_argument("--method", metavar="NAME", help="another method of the estimator")
     replay.add_argument("--exact", action="store_true", help="cycle by cycle, whatever the length")
-    return parser
+    return result
 
 
 def _common(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
@@ -170,6 +222,6 @@ def _common(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
         "--jobs", type=count, metavar="N", help="tasks at a time on this machine (default: CPUs)"
     )
     made.add_argument("--timeout", type=seconds, metavar="S", help="a group that takes longer has failed")
-    made.add_argument("--again", action="store_true", help="do it again although it is finished")
+    made.add_argument("--again", action="store_true", help="run also what is finished")
     made.add_argument("--json", action="store_true", help="print summary.json")
     return made

@@ -1,4 +1,7 @@
-"""The pictures of the report as SVG texts: the paper's Figs. 14 and 16 with our data, and what the tables cannot show."""
+"""Figures of the evaluation: the paper's Figs. 14 and 16 with our data, errors by run and velocity, calibration.
+
+Each function returns a matplotlib figure in the colours of `sysid.report.page.LIGHT`, None where there is nothing to draw.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +21,13 @@ from jtqd.sysid.evaluate.scores import (
     bin_name,
     common_methods,
 )
-from jtqd.sysid.figures import SENSOR, STANDING, as_svg, plain, shade, thinned
 from jtqd.sysid.fit.fused import GAUSS
-
-# What the pictures of the evaluation have in common: styles of the methods, size, axes, legend.
+from jtqd.sysid.report.figures import SENSOR, STANDING, plain, shade, thinned
+from jtqd.sysid.report.page import LIGHT
 
 
 class Style(NamedTuple):
-    """Of one method in every picture; the first three as in the paper's figures."""
+    """Of one method in every figure; the first three as in the paper's."""
 
     colour: str
     line: str
@@ -33,21 +35,17 @@ class Style(NamedTuple):
 
 
 STYLES: Final = {
-    "tob": Style("#c0392b", "--", "v"),
-    "efficiency": Style("#c98a00", ":", "s"),
-    PAPERS: Style("#7d3c98", "-.", "D"),
-    "physics": Style("#2e9e6b", (0, (5, 1)), "^"),  # type: ignore[arg-type]  # matplotlib's own dash pattern
-    OURS: Style("#1565a7", "-", "o"),
+    "tob": Style(LIGHT["series_1"], "--", "v"),
+    "efficiency": Style(LIGHT["series_2"], ":", "s"),
+    PAPERS: Style(LIGHT["series_3"], "-.", "D"),
+    "physics": Style(LIGHT["series_4"], (0, (5, 1)), "^"),  # type: ignore[arg-type]  # matplotlib's own dash pattern
+    OURS: Style(LIGHT["series_5"], "-", "o"),
 }
 WIDTH_IN: Final = 6.4
 
 
 def new_figure(rows: int, height: float, **options: Any) -> tuple[Any, Any]:
     """Return figure and axes [rows] of the report's width."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")  # no display is needed
-    mpl.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "jtq evaluate", "font.size": 9.5})
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(
@@ -78,7 +76,7 @@ def legend_above(figure: Any, *axes: Any) -> None:
     )
 
 
-def constant_figure(plateaus: Sequence[PlateauScore], drive: str) -> str | None:
+def constant_figure(plateaus: Sequence[PlateauScore], drive: str) -> Any | None:
     """Like Fig. 14, one joint: measured and estimated torque of every plateau, and the error; None without plateaus."""
     own = sorted(
         (each for each in plateaus if each.drive == drive),
@@ -104,7 +102,7 @@ def constant_figure(plateaus: Sequence[PlateauScore], drive: str) -> str | None:
     for axis in (upper, lower):
         plain(axis)
         for k in starts[1:]:
-            axis.axvline(k - 0.5, color="#999999", linewidth=0.8)
+            axis.axvline(k - 0.5, color=LIGHT["soft"], linewidth=0.8)
     for k, end in zip(starts, [*starts[1:], len(own)], strict=True):
         lower.text(
             (k + end - 1) / 2,
@@ -121,10 +119,10 @@ def constant_figure(plateaus: Sequence[PlateauScore], drive: str) -> str | None:
     for axis in (upper, lower):
         axis.set_ylim(bottom=0.0)
     legend_above(figure, upper)
-    return as_svg(figure)
+    return figure
 
 
-def run_figure(samples: Samples) -> str:
+def run_figure(samples: Samples) -> Any:
     """Like Fig. 16: sensor and every method over one run, and their errors with the 90 % interval of ours."""
     figure, (upper, lower) = new_figure(2, 5.2, sharex=True)
     time = samples.time_s
@@ -155,10 +153,10 @@ def run_figure(samples: Samples) -> str:
     lower.set_xlabel("time [s]")
     upper.set_xlim(time[0], time[-1])
     legend_above(figure, upper, lower)
-    return as_svg(figure)
+    return figure
 
 
-def paper_figure(tables: ErrorTables) -> str | None:
+def paper_figure(tables: ErrorTables) -> Any | None:
     """Mean square errors at variable velocity beside the paper's three; None without any."""
     if not tables.both:
         return None
@@ -175,17 +173,22 @@ def paper_figure(tables: ErrorTables) -> str | None:
                     marker,
                     color=colour,
                     markersize=8,
-                    markerfacecolor=colour if filled else "white",
+                    markerfacecolor=colour if filled else LIGHT["paper"],
                 )
         if method in PAPER_MSE_NM2:
             axis.plot(PAPER_MSE_NM2[method], place, "x", color=SENSOR, markersize=8, markeredgewidth=1.8)
     for marker, face, label in (
-        ("o", "#777777", "here, joint in velocity mode"),
-        ("o", "white", "here, all joints"),
+        ("o", LIGHT["soft"], "here, joint in velocity mode"),
+        ("o", LIGHT["paper"], "here, all joints"),
         ("x", SENSOR, "paper"),
     ):
         axis.plot(
-            [], [], marker, color="#777777" if marker == "o" else SENSOR, markerfacecolor=face, label=label
+            [],
+            [],
+            marker,
+            color=LIGHT["soft"] if marker == "o" else SENSOR,
+            markerfacecolor=face,
+            label=label,
         )
     plain_log(axis.xaxis, axis.set_xscale)
     axis.set_yticks(y, [TITLES[method] for method in methods])
@@ -193,10 +196,10 @@ def paper_figure(tables: ErrorTables) -> str | None:
     axis.set_xlabel("mean square error [Nm²]")
     plain(axis)
     legend_above(figure, axis)
-    return as_svg(figure)
+    return figure
 
 
-def runs_figure(tables: ErrorTables, number: int) -> str | None:
+def runs_figure(tables: ErrorTables, number: int) -> Any | None:
     """MSE of every run of one joint, by the MSE of its physics; None without runs."""
     runs = [row for (_, joint), row in tables.runs.items() if joint == number and row]
     if not runs:
@@ -222,10 +225,10 @@ def runs_figure(tables: ErrorTables, number: int) -> str | None:
     axis.set_xticks(np.arange(1, len(runs) + 1) if len(runs) <= 30 else [])
     plain(axis)
     legend_above(figure, axis)
-    return as_svg(figure)
+    return figure
 
 
-def velocities_figure(tables: ErrorTables, number: int) -> str | None:
+def velocities_figure(tables: ErrorTables, number: int) -> Any | None:
     """RMSE of one joint by |velocity|; None without samples."""
     rows = tables.velocities.get(number, {})
     names = [name for k in range(len(VELOCITY_EDGES_RAD_S) - 1) if rows.get(name := bin_name(k))]
@@ -249,17 +252,17 @@ def velocities_figure(tables: ErrorTables, number: int) -> str | None:
     axis.set_xlabel("|velocity| [rad/s]")
     plain(axis)
     legend_above(figure, axis)
-    return as_svg(figure)
+    return figure
 
 
-def calibration_figure(tables: Mapping[str, IntervalTables]) -> str | None:
+def calibration_figure(tables: Mapping[str, IntervalTables]) -> Any | None:
     """How often the interval held the sensor against how often it should have; None without intervals."""
     if not tables:
         return None
     figure, (axis,) = new_figure(1, 3.6)
-    axis.plot([40, 100], [40, 100], color="#999999", linewidth=1.0, label="as it should be")
+    axis.plot([40, 100], [40, 100], color=LIGHT["soft"], linewidth=1.0, label="as it should be")
     looks = {"variable": "-", "constant": ":"}
-    colours = ["#1565a7", "#c0392b", "#2e9e6b", "#7d3c98"]
+    colours = [LIGHT[f"series_{k}"] for k in (5, 1, 4, 3)]
     numbers = sorted({number for table in tables.values() for number in table.joints})
     for kind, line in looks.items():
         for number in numbers:
@@ -283,4 +286,4 @@ def calibration_figure(tables: Mapping[str, IntervalTables]) -> str | None:
     axis.set_ylim(40, 101)
     plain(axis)
     axis.legend(loc="lower right", fontsize=8.5, framealpha=0.9, edgecolor="none")
-    return as_svg(figure)
+    return figure

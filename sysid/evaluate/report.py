@@ -1,9 +1,10 @@
-"""The evaluation as one HTML file that needs nothing else: tables from the mapping, pictures inline."""
+"""The evaluation as plain values (schema jtq.evaluation/1), as text for a terminal, and as one self-contained HTML page."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, Final
 
 from jtqd.estimator.joint import QUADRANTS
@@ -13,9 +14,9 @@ from jtqd.sysid.evaluate.evaluation import Evaluation, RunRecord, Target, mse, w
 from jtqd.sysid.evaluate.methods import OURS, PAPERS, TITLES, JointModels
 from jtqd.sysid.evaluate.scores import PAPER_MSE_NM2, Coverage, ErrorTables, IntervalTables, Row, ratio
 from jtqd.sysid.fit.efficiency_report import TITLES as QUADRANT_TITLES
-
-# The evaluation as plain values, schema jtq.evaluation/1: what is written, and all that the reports show.
-
+from jtqd.sysid.report import page
+from jtqd.sysid.report.figures import page_svg
+from jtqd.sysid.report.numbers import DASH, counted
 
 SCHEMA: Final = "jtq.evaluation/1"
 
@@ -182,9 +183,6 @@ def _plain(value: Any) -> Any:
     return value
 
 
-# The evaluation for a terminal: the same numbers as in the report.
-
-
 _SHORT: Final = {
     "tob": "TOB",
     "efficiency": "efficiency",
@@ -211,10 +209,10 @@ def text_lines(result: Evaluation, mapping: Mapping[str, Any]) -> list[str]:
         "B. variable velocity: mean square error in Nm²",
         *_variable(result),
         "",
-        "C. 90 % interval of ours: how often it held the sensor, in %",
+        "C. 90 % interval of ours: how often it contained the sensor value, in %",
         *_text_intervals(result),
         "",
-        "D. figures to reach",
+        "D. targets",
         *_targets(result.targets),
     ]
     if result.findings:
@@ -236,7 +234,7 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 def _runs(result: Evaluation) -> list[str]:
     kinds = [record.kind for record in result.runs]
     counts = ", ".join(f"{kinds.count(kind)} {text}" for kind, text in _KINDS.items() if kind in kinds)
-    lines = [f"{len(kinds)} runs: {counts}"]
+    lines = [f"{counted(len(kinds), 'run')}: {counts}"]
     for models in result.models:
         lines.append(
             f"{models.joint.name} (j{models.number}): " + ", ".join(TITLES[m] for m in models.methods)
@@ -306,7 +304,7 @@ def _text_intervals(result: Evaluation) -> list[str]:
         held = ", ".join(f"{_SHORT[m]} {100 * c.share:.1f} %" for m, c in one.coverage.items())
         share = f"{100 * one.share:.0f} % of the samples"
         lines.append(
-            f"  standstill j{number}, {share}: the interval held the sensor in {held or 'no sample'}"
+            f"  standstill j{number}, {share}: the interval contained the sensor value in {held or 'no sample'}"
         )
     return lines
 
@@ -323,7 +321,7 @@ def _coverage(one: Coverage | None) -> str:
 def _targets(targets: Sequence[Target]) -> list[str]:
     """The table, and under it the details of what is not reached."""
     rows = [[each.figure, each.paper, each.goal, each.ours, _MARKS[each.reached]] for each in targets]
-    lines = table(["figure", "paper", "to reach", "ours", "reached"], rows)
+    lines = table(["figure", "paper", "target", "ours", "met"], rows)
     for each in targets:
         if each.reached is False and each.details:
             lines += [f"  {each.figure}:", *(f"    {line}" for line in each.details)]
@@ -343,52 +341,62 @@ TEMPLATE: Final = "report.html.j2"
 
 def report_html(result: Evaluation, mapping: Mapping[str, Any], made: str) -> str:
     """Return the page; mapping: `as_mapping(result)`, made: when and by what, one line. Needs jinja2 and matplotlib."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("jtqd.sysid.evaluate", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["number"] = number
-    environment.filters["percent"] = percent
-    environment.filters["quadrant"] = lambda name: QUADRANT_TITLES[name].replace("w", "ω", 1)
-    page = environment.get_template(TEMPLATE).render(
-        e=mapping, made=made, quadrants=QUADRANTS, pictures=pictures(result), verdict=_verdict(mapping)
-    )
-    return f"{page}\n"
+    content = {
+        "e": mapping,
+        "made": made,
+        "quadrants": QUADRANTS,
+        "pictures": pictures(result),
+        "verdict": _verdict(mapping),
+    }
+    filters = {
+        "number": number,
+        "percent": percent,
+        "quadrant": lambda name: QUADRANT_TITLES[name].replace("w", "ω", 1),
+    }
+    return page.render("jtqd.sysid.evaluate", TEMPLATE, content, filters)
 
 
 def pictures(result: Evaluation) -> dict[str, Any]:
-    """Return the figures as SVG texts, None where there is nothing to draw; per joint under its number as text."""
+    """Return the figures as SVG, "" where there is nothing to draw; per joint under its number as text."""
     numbers = [each.number for each in result.models]
     own = {number: [each for each in result.plateaus if each.number == number] for number in numbers}
     return {
         "constant": {
-            str(number): {drive: figures.constant_figure(own[number], drive) for drive in ("forward", "back")}
+            str(number): {
+                drive: _svg(f"constant-{number}-{drive}", figures.constant_figure, own[number], drive)
+                for drive in ("forward", "back")
+            }
             for number in numbers
         },
-        "run": None if result.picture is None else figures.run_figure(result.picture),
-        "paper": figures.paper_figure(result.variable),
-        "runs": {str(number): figures.runs_figure(result.variable, number) for number in numbers},
-        "velocities": {str(number): figures.velocities_figure(result.variable, number) for number in numbers},
-        "calibration": figures.calibration_figure(result.intervals),
+        "run": None if result.picture is None else _svg("run", figures.run_figure, result.picture),
+        "paper": _svg("paper", figures.paper_figure, result.variable),
+        "runs": {
+            str(number): _svg(f"runs-{number}", figures.runs_figure, result.variable, number)
+            for number in numbers
+        },
+        "velocities": {
+            str(number): _svg(f"velocities-{number}", figures.velocities_figure, result.variable, number)
+            for number in numbers
+        },
+        "calibration": _svg("calibration", figures.calibration_figure, result.intervals),
     }
+
+
+def _svg(name: str, draw: Callable[..., Any], *arguments: Any) -> str:
+    return page_svg(partial(draw, *arguments), f"figure-{name}")
 
 
 def number(value: float | None, form: str = ".2f") -> str:
     """Format a number, a dash where there is none."""
-    return "–" if value is None else format(value, form)
+    return DASH if value is None else format(value, form)
 
 
 def percent(share: float | None, form: str = ".1f") -> str:
     """Format a share as percent without the sign, a dash where there is none."""
-    return "–" if share is None else format(100.0 * share, form)
+    return DASH if share is None else format(100.0 * share, form)
 
 
 def _verdict(mapping: Mapping[str, Any]) -> dict[str, int]:
-    """How many of the figures to reach are reached, missed and not known; figures without a goal are not counted."""
+    """Count the targets that are met, missed and not known; figures without a goal are left out."""
     states = [each["reached"] for each in mapping["figures_to_reach"] if each["goal"] != "-"]
     return {"reached": states.count(True), "missed": states.count(False), "unknown": states.count(None)}

@@ -11,7 +11,6 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.joint import CONVENTIONS, QUADRANTS, QuadrantPolynomial
-from jtqd.sysid.figures import plain
 from jtqd.sysid.fit.efficiency import (
     COEFFICIENTS,
     SAME_VELOCITY_RAD_S,
@@ -21,6 +20,7 @@ from jtqd.sysid.fit.efficiency import (
     operating_points,
 )
 from jtqd.sysid.fit.plateaus import Mean, Plateau
+from jtqd.sysid.report.figures import plain
 from jtqd.sysid.runs.checks import RunIssue
 
 SCHEMA: Final = "jtq.efficiency/1"

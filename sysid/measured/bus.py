@@ -1,7 +1,4 @@
-"""Judge jtqd itself on the measured runs: played on a CAN bus, estimated at 1 kHz, scored from what it published.
-
-    python -m jtqd.sysid.measured.bus --bus unix:PATH --out DIR [--json]
-    python -m jtqd.sim_can.bench_kernel run --time-travel --out DIR -- jtq measured --bus vcan0 --out DIR
+"""Score jtqd itself on the measured runs: played on a CAN bus, estimated at 1 kHz, compared from its own log.
 
 For both runs, before and after fitting friction on the other run: the run is played by `jtq sim --play` as the
 PDOs of two drives and a sensor, jtqd runs against it and records, and the log is compared with the sensor
@@ -10,13 +7,11 @@ that came over the bus (filtered like the estimate) and with the estimate made o
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
 import sys
-import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,22 +23,18 @@ from numpy.typing import NDArray
 from jtqd.daemon.logs.errors import LogError
 from jtqd.daemon.logs.reader import read_topic
 from jtqd.daemon.logs.rows import Records
-from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.checked import Section
 from jtqd.estimator.decoder import decode
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.run import RunTable, RunTableError
+from jtqd.estimator.run import RunTable
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import DEGRADED, STALE, STANDSTILL, STARTING, VALID
 from jtqd.estimator.whole_run import estimate_run
 from jtqd.models.files import load_joint, load_yaml, shipped
 from jtqd.sim_can.bench import LONGEST_STEP_NS
-from jtqd.sysid.figures import draw_each_joint
 from jtqd.sysid.fit.friction import low_pass
 from jtqd.sysid.measured.offline import JOINTS, RUNS
-from jtqd.sysid.runs.files import ColumnMap, RunError, read_run
-
-# Score one joint of a played run from jtqd's log: published estimate, sensor, and the offline estimate beside it.
-
+from jtqd.sysid.runs.files import ColumnMap, read_run
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -54,6 +45,13 @@ NO_TORQUE = -0x8000
 TORQUE_UNIT_NM = 0.01
 ALL_INPUTS = 7  # input_flags: both PDOs of the drive and the sensor's
 _NS = 1e-9
+
+AFTER_END_S = 0.3
+"""jtqd runs on for so long without inputs: the status that it then publishes is part of the result."""
+_READY = "bench ready"
+_PLAY_PRIORITY = 70  # real-time, below jtqd's loop
+_START_S = 60.0
+_END_S = 120.0
 
 
 @dataclass(frozen=True)
@@ -181,7 +179,7 @@ def _played_row(time_s: Array, run_s: Array) -> NDArray[np.intp]:
 
 
 def _offline(played: Played) -> Array:
-    """Whole-run estimate from the file, as jtqd.sysid.measured.offline makes it; NaN where none would be published."""
+    """Whole-run estimate from the file, as `offline` makes it; NaN where none would be published."""
     table, joint = played.table, played.joint
     inputs = table.estimator_inputs(played.number, joint.gear_ratio)
     result = estimate_run(joint, played.settings, None, *inputs)
@@ -200,7 +198,7 @@ def reference_torque(state: Records, time_s: Array, bandwidth_rad_s: float) -> A
 
 
 def _replay(state: Records, played: Played) -> float:
-    """Largest difference between what the loop logged and a whole-run estimate of the inputs it logged [Nm]."""
+    """Return the largest difference between the logged torque and a whole-run estimate of the logged inputs [Nm]."""
     fed = np.isfinite(state["dt_s"])
     names = ("dt_s", "current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad")
     again = estimate_run(
@@ -218,15 +216,8 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-AFTER_END_S = 0.3  # jtqd goes on for so long without inputs: what it then says is part of the result
-_READY = "bench ready"
-_PLAY_PRIORITY = 70
-_START_S = 60.0
-_END_S = 120.0
-
-
 class PlayError(RuntimeError):
-    """The play or jtqd failed; one line with what it said."""
+    """The play or jtqd failed; one line with its last message."""
 
 
 def config_file(run: str, after: bool) -> Path:
@@ -238,12 +229,12 @@ def config_file(run: str, after: bool) -> Path:
 
 
 @contextmanager
-def playing(bus: str, run: Path, said: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """`jtq sim --play` on the bus, ready; ended with the context. Its log goes to `said`. Raises PlayError."""
+def playing(bus: str, run: Path, log_path: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """`jtq sim --play` on the bus, ready; ended with the context. Its log goes to `log_path`. Raises PlayError."""
     joints = ",".join(str(number) for number in JOINTS)
     command = [sys.executable, "-m", "jtqd.sim_can", "--bus", bus, "--play", str(run), "--joints", joints]
     read_end, write_end = os.pipe()
-    with said.open("wb") as log, os.fdopen(read_end, "rb") as pipe:
+    with log_path.open("wb") as log, os.fdopen(read_end, "rb") as pipe:
         process = subprocess.Popen(command, stderr=write_end, stdin=subprocess.DEVNULL)
         os.close(write_end)
         try:
@@ -253,7 +244,7 @@ def playing(bus: str, run: Path, said: Path) -> Iterator[subprocess.Popen[bytes]
                     break
             else:
                 raise PlayError(
-                    f"the play ended with exit status {process.wait(_START_S)}: {_tail(said, log)}"
+                    f"the play ended with exit status {process.wait(_START_S)}: {_last_line(log_path, log)}"
                 )
             _prefer(process.pid)
             yield process
@@ -269,12 +260,12 @@ def _prefer(pid: int) -> None:
     try:
         os.sched_setscheduler(pid, os.SCHED_FIFO, os.sched_param(_PLAY_PRIORITY))
     except PermissionError:
-        print("measured: the play has no real-time priority (not permitted)", file=sys.stderr, flush=True)
+        print("jtq measured: the play has no real-time priority (not permitted)", file=sys.stderr, flush=True)
 
 
-def _tail(said: Path, log: Any) -> str:
+def _last_line(path: Path, log: Any) -> str:
     log.flush()
-    return (said.read_text(errors="replace").strip().splitlines() or ["it said nothing"])[-1]
+    return (path.read_text(errors="replace").strip().splitlines() or ["no message"])[-1]
 
 
 def record(bus: str, run: Path, config: Path, length_s: float, out: Path) -> tuple[Path, dict[str, Any]]:
@@ -300,8 +291,8 @@ def record(bus: str, run: Path, config: Path, length_s: float, out: Path) -> tup
             raise PlayError(f"did not end in {error.timeout:.0f} s: {error.cmd}") from None
     (out / "jtqd.log").write_text(done.stderr)
     if done.returncode not in (0, 3):  # 3: done, with cycles missing in the log
-        said = (done.stderr or done.stdout).strip().splitlines() or ["it said nothing"]
-        raise PlayError(f"jtqd ended with exit status {done.returncode}, see {out / 'jtqd.log'}: {said[-1]}")
+        lines = (done.stderr or done.stdout).strip().splitlines() or ["no message"]
+        raise PlayError(f"jtqd ended with exit status {done.returncode}, see {out / 'jtqd.log'}: {lines[-1]}")
     if status:
         raise PlayError(f"the play ended with exit status {status}, see {out / 'play.log'}")
     summary = json.loads(done.stdout)
@@ -312,7 +303,11 @@ def record(bus: str, run: Path, config: Path, length_s: float, out: Path) -> tup
 
 
 def evaluate(bus: str, out: Path) -> list[BusRun]:
-    """All runs, before and after, both joints. Logs stay in `out`."""
+    """Play and score all runs, before and after the fit, both joints. Logs stay in `out`.
+
+    Raises:
+        RunError, RunTableError, ConfigError, LogError, PlayError, OSError: a run or a log cannot be used.
+    """
     columns = ColumnMap.load(shipped("kinova_gen3/columns.yaml"))
     results: list[BusRun] = []
     for run in RUNS:
@@ -321,7 +316,7 @@ def evaluate(bus: str, out: Path) -> list[BusRun]:
         length_s = float(table.time_s[-1] - table.time_s[0])
         for after in (False, True):
             name = "after" if after else "before"
-            print(f"measured: playing {run} on {bus}, {name} the fit", file=sys.stderr, flush=True)
+            print(f"jtq measured: playing {run} on {bus}, {name} the fit", file=sys.stderr, flush=True)
             config = config_file(run, after)
             log, _ = record(bus, path, config, length_s, out / f"{run}.{name}")
             joints, settings = configured(config)
@@ -346,47 +341,3 @@ def table_lines(results: list[BusRun]) -> list[str]:
         for r in results
     )
     return lines
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Command line; results on stdout, log on stderr. Exit status 0 done, 1 failure, 2 usage."""
-    parser = argparse.ArgumentParser(
-        prog="jtq measured --bus",
-        description="Play the Kinova Gen3 runs on a CAN bus, run jtqd against them and score what it published.",
-        epilog="example: jtq measured --bus vcan0 --out /tmp/measured   (exact time: docs/measured_runs.md)",
-    )
-    parser.add_argument("--bus", help="vcan0 or unix:PATH (default: a unix bus of its own)")
-    parser.add_argument("--out", type=Path, required=True, help="folder for the figures and jtqd's logs")
-    parser.add_argument("--json", action="store_true", help="print the results as JSON")
-    options = parser.parse_args(arguments)
-    return run(options.bus, options.out, options.json)
-
-
-def run(bus: str | None, out: Path, as_json: bool) -> int:
-    """Play, score, draw and print; None is a unix bus of its own. Returns the exit status."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix="jtqd-") as folder:
-            results = evaluate(bus or f"unix:{folder}/bus", out)
-        draw_each_joint(JOINTS, results, out / "measured_bus_joint{}.png", _draw_joint)
-    except (RunError, RunTableError, ConfigError, LogError, PlayError, OSError) as error:
-        print(f"measured: {error}", file=sys.stderr)
-        return 1
-    if as_json:
-        print(
-            json.dumps({"schema": "jtq.measured_bus/1", "runs": [as_mapping(r) for r in results]}, indent=1)
-        )
-    else:
-        print("RMSE of the published estimate against the arm's torque sensor; differences in Nm")
-        print("\n".join(table_lines(results)))
-    return 0
-
-
-def _draw_joint() -> Callable[[Sequence[BusRun], Path], None]:
-    from jtqd.sysid.measured.figures import draw_bus_joint
-
-    return draw_bus_joint
-
-
-if __name__ == "__main__":
-    sys.exit(main())

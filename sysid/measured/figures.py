@@ -1,4 +1,4 @@
-"""Figures of jtqd.sysid.measured.bus: what jtqd published beside the sensor, the residual, and bus minus offline."""
+"""Figures of the measured runs: estimate before and after beside the sensor, and the residual; offline and on the bus."""
 
 from __future__ import annotations
 
@@ -10,17 +10,19 @@ import matplotlib as mpl
 from matplotlib import pyplot as plt
 
 from jtqd.estimator.status import STALE, STANDSTILL
-from jtqd.sysid import figures as parts
+from jtqd.sysid.report import figures as parts
 
 if TYPE_CHECKING:
     from jtqd.sysid.measured.bus import BusRun
     from jtqd.sysid.measured.offline import Case
 
-
-# Figures of jtqd.sysid.measured.offline: estimate before and after beside the sensor, the residual of both below.
-
-
 mpl.use("Agg")  # files only; a display is not needed
+
+SILENT = "#d9d9e6"
+LABELS = {
+    "before": (parts.BEFORE, "before: joint file as shipped"),
+    "after": (parts.AFTER, "after: friction fitted on the other run"),
+}
 
 
 def draw_joint(cases: Sequence[Case], path: Path) -> None:
@@ -61,15 +63,6 @@ def draw_joint(cases: Sequence[Case], path: Path) -> None:
     figure.tight_layout()
     figure.savefig(path, dpi=110, metadata={"Software": None})
     plt.close(figure)
-
-
-mpl.use("Agg")  # files only; a display is not needed
-
-SILENT = "#d9d9e6"
-LABELS = {
-    "before": (parts.BEFORE, "before: joint file as shipped"),
-    "after": (parts.AFTER, "after: friction fitted on the other run"),
-}
 
 
 def draw_bus_joint(results: Sequence[BusRun], path: Path) -> None:

@@ -1,20 +1,14 @@
-"""Judge the estimator on measured runs by the arm's own torque sensor, before and after fitting friction.
-
-    python -m jtqd.sysid.measured.offline --out DIR [--json] [--joint-files DIR]
-    python -m jtqd.sysid.measured.offline --bus vcan0|unix:PATH --out DIR [--json]      jtqd itself: see measured.bus
+"""Score the estimator on measured runs by the arm's own torque sensor, before and after fitting friction.
 
 For each joint and each run the estimate is made three times: with the joint file that ships (before), with
 its friction fitted on the OTHER run (after), and with no friction at all, for scale. Nothing but friction
-is fitted, and no run is judged by a fit that has seen it. The reference is the sensor passed through the
+is fitted, and no run is scored by a fit that has seen it. The reference is the sensor passed through the
 observer's own low-pass, so that the known group delay is not counted as error.
 """
 
-import argparse
-import datetime as dt
-import json
+from __future__ import annotations
+
 import math
-import sys
-from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -22,15 +16,13 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Friction, Joint
-from jtqd.estimator.run import RunTable, RunTableError
+from jtqd.estimator.run import RunTable
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import STANDSTILL
 from jtqd.estimator.whole_run import EstimateRun, estimate_run
 from jtqd.models.files import load_joint, shipped
-from jtqd.sysid.figures import draw_each_joint
-from jtqd.sysid.fit.friction import FitError, FrictionFit, fit_friction, low_pass
+from jtqd.sysid.fit.friction import FrictionFit, fit_friction, low_pass
 from jtqd.sysid.runs.files import ColumnMap, RunError, RunFile, read_run
 
 Array = NDArray[np.float64]
@@ -97,7 +89,7 @@ def fitted_joint(joint: Joint, fit: FrictionFit, file: RunFile, *, number: int, 
     friction: dict[str, float] = {key: round(value, 4) for key, value in asdict(fit.friction).items()}
     temperature = file.table.joints[number].temperature_c
     origin: dict[str, object] = {
-        "friction": f"fitted on {run}.csv.gz by jtqd.sysid.measured.offline; nothing else was fitted",
+        "friction": f"fitted on {run}.csv.gz by jtq measured; nothing else was fitted",
         "friction_fit": fit.lines(),
         "log_sha256": file.sha256,
         "date": date,
@@ -107,11 +99,13 @@ def fitted_joint(joint: Joint, fit: FrictionFit, file: RunFile, *, number: int, 
     return replace(joint, friction=Friction(**friction), provenance={**joint.provenance, **origin})
 
 
-def judge(joint: Joint, after: Joint, table: RunTable, *, number: int, run: str, fitted_on: str) -> Case:
+def compare(joint: Joint, after: Joint, table: RunTable, *, number: int, run: str, fitted_on: str) -> Case:
     """Estimate one joint in one run before and after, and score both."""
     sensor = table.joints[number].torque_nm
     if sensor is None:
-        raise RunError(f"{run}: found no usable column j{number}.torque_nm, expected a reference to judge by")
+        raise RunError(
+            f"{run}: found no usable column j{number}.torque_nm, expected a reference to compare with"
+        )
     dt_s = table.dt_s
     estimates = [estimate(j, table, number) for j in (replace(joint, friction=NO_FRICTION), joint, after)]
     none, old, new = (score(e.torque_nm, sensor, dt_s, SETTINGS.bandwidth_rad_s) for e in estimates)
@@ -132,7 +126,15 @@ def judge(joint: Joint, after: Joint, table: RunTable, *, number: int, run: str,
 
 
 def evaluate(joint_files: Path | None, date: str) -> tuple[list[Case], dict[tuple[int, str], FrictionFit]]:
-    """All joints and runs, and the fits by (joint, run). Writes the fitted joint files where told."""
+    """Score all joints in all runs; return the cases, and the fits by (joint, run).
+
+    Args:
+        joint_files: folder for the fitted joint files; None: they are not written.
+        date: for their provenance.
+
+    Raises:
+        RunError, RunTableError, ConfigError, FitError, OSError: a file cannot be used.
+    """
     columns = ColumnMap.load(shipped("kinova_gen3/columns.yaml"))
     files = {run: read_run(shipped(f"kinova_gen3/{run}.csv.gz"), columns) for run in RUNS}
     cases: list[Case] = []
@@ -145,7 +147,7 @@ def evaluate(joint_files: Path | None, date: str) -> tuple[list[Case], dict[tupl
                 table.time_s, table.joints[number], joint, bandwidth_rad_s=SETTINGS.bandwidth_rad_s
             )
             after = fitted_joint(joint, fit, files[other], number=number, run=other, date=date)
-            cases.append(judge(joint, after, files[run].table, number=number, run=run, fitted_on=other))
+            cases.append(compare(joint, after, files[run].table, number=number, run=run, fitted_on=other))
             if joint_files is not None:
                 _save(after, joint_files / f"joint{number}.fitted_on_{other}.yaml")
     return cases, fits
@@ -193,64 +195,4 @@ def as_mapping(cases: list[Case], fits: dict[tuple[int, str], FrictionFit]) -> d
 
 def _save(joint: Joint, path: Path) -> None:
     text = yaml.safe_dump(joint.to_mapping(), sort_keys=False, width=120)
-    path.write_text(
-        f"# Made by python -m jtqd.sysid.measured.offline: the shipped joint file with another friction.\n{text}"
-    )
-
-
-def parser() -> argparse.ArgumentParser:
-    """Return the arguments of `jtq measured`."""
-    parser = argparse.ArgumentParser(
-        prog="jtq measured",
-        description="Score the torque observer on the Kinova Gen3 runs, before and after fitting friction.",
-        epilog="examples:\n  jtq measured --out measured\n  jtq measured --bus unix:/tmp/bus --out measured",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument(
-        "--bus", help="play the runs on this bus (vcan0, unix:PATH) and score what jtqd publishes there"
-    )
-    parser.add_argument(
-        "--out", type=Path, required=True, help="folder for measured_joint2.png and measured_joint4.png"
-    )
-    parser.add_argument("--json", action="store_true", help="print the results as JSON")
-    parser.add_argument(
-        "--joint-files", type=Path, help="folder for the fitted joint files (default: the --out folder)"
-    )
-    return parser
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Command line; results on stdout, log on stderr. Exit status 0 done, 1 failure, 2 usage."""
-    command = parser()
-    options = command.parse_args(arguments)
-    if options.bus is not None:
-        if options.joint_files is not None:
-            command.error("--joint-files: nothing is fitted with --bus")
-        from jtqd.sysid.measured import bus as measured_bus
-
-        return measured_bus.run(options.bus, options.out, options.json)
-    try:
-        options.out.mkdir(parents=True, exist_ok=True)
-        cases, fits = evaluate(options.joint_files or options.out, dt.date.today().isoformat())
-        draw_each_joint(JOINTS, cases, options.out / "measured_joint{}.png", _draw_joint)
-        if options.json:
-            print(json.dumps(as_mapping(cases, fits), indent=1))
-        else:
-            print("RMSE of the estimate against the arm's torque sensor, Nm (percent of rated torque)")
-            print("\n".join(table_lines(cases)))
-            for (joint, run), fit in fits.items():
-                print(f"\njoint {joint}, friction fitted on {run}:", *fit.lines(), sep="\n  ")
-    except (RunError, RunTableError, ConfigError, FitError, OSError) as error:
-        print(f"measured: {error}", file=sys.stderr)
-        return 1
-    return 0
-
-
-def _draw_joint() -> Callable[[Sequence[Case], Path], None]:
-    from jtqd.sysid.measured.figures import draw_joint
-
-    return draw_joint
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    path.write_text(f"# Made by jtq measured: the shipped joint file with another friction.\n{text}")

@@ -1,4 +1,8 @@
-"""The report of a diagnosis: one HTML page from the findings alone, nothing else needed to read it."""
+"""HTML report of a diagnosis: one self-contained page, made from the findings alone.
+
+In: `findings.Findings`. Out: HTML. Modules: `page` (the content), `views` (rows and bars), `words` (sentences), `pictures`.
+Imports sysid.report, the effect library, and sysid.campaign for the length of a plan.
+"""
 
 from jtqd.sysid.diagnosis.report.page import render
 

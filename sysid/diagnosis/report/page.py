@@ -1,4 +1,4 @@
-"""`render`: findings to one self-contained HTML page."""
+"""Render findings as one self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ import yaml
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.effects.effect import Effect
 from jtqd.sysid.diagnosis.findings import AMBIGUOUS, CAUSE, INSUFFICIENT, UNEXPLAINED, Findings
-from jtqd.sysid.diagnosis.report import theme, views
+from jtqd.sysid.diagnosis.report import views
 from jtqd.sysid.diagnosis.report.pictures import pictures, trace_rows
 from jtqd.sysid.diagnosis.report.views import gap_views
-from jtqd.sysid.diagnosis.report.words import BADGES, gain_sentence, listed, number, verdict_sentence
+from jtqd.sysid.diagnosis.report.words import BADGES, gain_sentence, listed, verdict_sentence
+from jtqd.sysid.report import page
+from jtqd.sysid.report.numbers import number
 
-TEMPLATE: Final = "page.html.j2"
+TEMPLATE: Final = "report.html.j2"
 PLAN_FILE: Final = "next_experiment.plan.yaml"
 
 
@@ -29,42 +31,31 @@ def render(findings: Findings, made: str = "", effects: Mapping[str, Effect] | N
 
     Needs jinja2 and matplotlib (ImportError without them).
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("jtqd.sysid.diagnosis.report", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     colour, badge = BADGES[findings.verdict]
     drawn = pictures(findings)
     evidence = views.evidence_views(findings.candidates)
-    page = environment.get_template(TEMPLATE).render(
-        f=findings,
-        made=made,
-        light=theme.variables(theme.LIGHT),
-        dark=theme.variables(theme.DARK),
-        badge=badge,
-        badge_colour=colour,
-        sentence=verdict_sentence(findings),
-        gain_sentence=gain_sentence(findings),
-        scope=_scope(findings),
-        has_gap=findings.verdict in {CAUSE, AMBIGUOUS, UNEXPLAINED},
-        said=findings.verdict in {UNEXPLAINED, INSUFFICIENT},
-        causes=views.cause_views(findings, library() if effects is None else effects),
-        gaps=gap_views(findings.gaps),
-        evidence=evidence,
-        shown=max(views.SHOWN, sum(1 for row in evidence if row.state)),
-        gains=views.gain_views(findings.gain),
-        reasons=[views.reason_in_words(each) for each in findings.reasons],
-        pictures=drawn,
-        closed=sum(1 for each in drawn if not each.opened),
-        traces=trace_rows(findings),
-        next=_next(findings),
-    )
-    return f"{page}\n"
+    content = {
+        "f": findings,
+        "made": made,
+        "badge": badge,
+        "badge_colour": colour,
+        "sentence": verdict_sentence(findings),
+        "gain_sentence": gain_sentence(findings),
+        "scope": _scope(findings),
+        "has_gap": findings.verdict in {CAUSE, AMBIGUOUS, UNEXPLAINED},
+        "said": findings.verdict in {UNEXPLAINED, INSUFFICIENT},
+        "causes": views.cause_views(findings, library() if effects is None else effects),
+        "gaps": gap_views(findings.gaps),
+        "evidence": evidence,
+        "shown": max(views.SHOWN, sum(1 for row in evidence if row.state)),
+        "gains": views.gain_views(findings.gain),
+        "reasons": [views.reason_in_words(each) for each in findings.reasons],
+        "pictures": drawn,
+        "closed": sum(1 for each in drawn if not each.opened),
+        "traces": trace_rows(findings),
+        "next": _next(findings),
+    }
+    return page.render("jtqd.sysid.diagnosis.report", TEMPLATE, content)
 
 
 def library() -> Mapping[str, Effect]:

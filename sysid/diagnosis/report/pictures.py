@@ -1,48 +1,30 @@
-"""The residual in time, before and after, as pictures that follow the page's colours and width."""
+"""Figures of the residual over time, before and after, and which runs are drawn."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
 
 from jtqd.sysid.diagnosis.findings import Findings, Trace
-from jtqd.sysid.diagnosis.report.theme import LIGHT, by_role
-from jtqd.sysid.diagnosis.report.words import balance_title, number
-from jtqd.sysid.figures import as_svg, thinned
+from jtqd.sysid.diagnosis.report.words import balance_title
+from jtqd.sysid.report.figures import page_svg, thinned
+from jtqd.sysid.report.numbers import number
+from jtqd.sysid.report.page import LIGHT
 
 MOST: Final = 6
-"""Pictures on a page; the other runs are in its table."""
+"""Figures on a page; the other runs are in its table."""
 FIRST: Final = 2
-"""Of them, open from the start."""
+"""Of them, shown without a click."""
 WIDE_IN: Final = 9.2
 NARROW_IN: Final = 4.4
 _BUCKETS: Final = {WIDE_IN: 600, NARROW_IN: 260}
-_TELLING: Final = 0.1
-"""A picture that is open from the start shows at least this part of the residual's energy going."""
+_VISIBLE_GAIN: Final = 0.1
+"""Least part of the residual's energy that the causes remove in a figure shown without a click."""
 _FLOOR_SIGMAS: Final = 2.0
-_LOOK: Final[dict[str, Any]] = {
-    "svg.fonttype": "none",
-    "svg.hashsalt": "jtq diagnose",
-    "font.size": 9.5,
-    "text.color": LIGHT["ink"],
-    "axes.labelcolor": LIGHT["soft"],
-    "axes.edgecolor": LIGHT["line"],
-    "xtick.color": LIGHT["soft"],
-    "ytick.color": LIGHT["soft"],
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": LIGHT["line"],
-    "grid.linewidth": 0.5,
-    "figure.facecolor": "none",
-    "axes.facecolor": "none",
-    "savefig.facecolor": "none",
-}
 
 
 @dataclass(frozen=True)
@@ -58,9 +40,7 @@ class TraceRow:
 
 @dataclass(frozen=True)
 class Picture:
-    """One trace, drawn for a laptop and for a phone; text: what it shows, for those who cannot see it; opened: shown from
-    the start.
-    """
+    """One trace as SVG, wide and narrow; text: its alternative text; opened: shown without a click."""
 
     title: str
     text: str
@@ -84,10 +64,10 @@ def trace_rows(findings: Findings) -> list[TraceRow]:
 
 
 def chosen_traces(findings: Findings) -> list[Trace]:
-    """Return the traces to draw: of each balance one run, then of each another, at most MOST.
+    """Return the traces to draw: one run of each balance, then another of each, at most MOST.
 
-    Balances come in the order of the gaps. With causes the first run of a balance is the one in the middle by the part
-    of its energy that they take, not the best and not the worst; without, the one with most energy.
+    Balances come in the order of the gaps. With causes the first run of a balance is the one whose energy they reduce by
+    the median share; without causes it is the one with most energy.
     """
     groups: dict[tuple[int, str], list[Trace]] = {(g.joint, g.balance): [] for g in findings.gaps}
     for trace in findings.traces:
@@ -101,7 +81,7 @@ def chosen_traces(findings: Findings) -> list[Trace]:
 def _ranked(group: Sequence[Trace], both: bool) -> list[Trace]:
     if not both:
         return sorted(group, key=lambda t: -_energy(t.before_nm))
-    ordered = sorted(group, key=lambda t: -_part_taken(t))
+    ordered = sorted(group, key=lambda t: -_removed_share(t))
     middle = (len(ordered) - 1) // 2
     return ordered[middle : middle + 1] + ordered[:middle] + ordered[middle + 1 :]
 
@@ -110,20 +90,20 @@ def _energy(values: Any) -> float:
     return float(np.sum(np.nan_to_num(values) ** 2))
 
 
-def _part_taken(trace: Trace) -> float:
-    """Part of the residual's energy that the causes take away."""
+def _removed_share(trace: Trace) -> float:
+    """Return the part of the residual's energy that the causes remove."""
     there = _energy(trace.before_nm)
     return 1.0 - _energy(trace.after_nm) / there if there > 0.0 else 0.0
 
 
 def pictures(findings: Findings) -> list[Picture]:
-    """Return the pictures; needs matplotlib."""
+    """Return the figures, in the order of `chosen_traces`. Raises ImportError without matplotlib."""
     floors = {(g.joint, g.balance): g.noise_floor_nm for g in findings.gaps}
     both = bool(findings.causes)
     traces = chosen_traces(findings)
     first = {(t.joint, t.balance): k for k, t in reversed(list(enumerate(traces)))}
-    telling = [k for k in sorted(first.values()) if both and _part_taken(traces[k]) > _TELLING]
-    opened = telling[:FIRST] or [0]
+    visible = [k for k in sorted(first.values()) if both and _removed_share(traces[k]) > _VISIBLE_GAIN]
+    opened = visible[:FIRST] or [0]
     return [_picture(trace, k, floors, both, k in opened) for k, trace in enumerate(traces)]
 
 
@@ -139,21 +119,12 @@ def _picture(
         f" before, {number(rms(trace.after_nm))} Nm rms with the causes in the simulation." if both else "."
     )
     wide, narrow = (
-        own_ids(_svg(trace, width, floor, both), f"p{place}{name}")
+        page_svg(partial(_figure, trace, width, floor, both), f"p{place}{name}")
         for width, name in ((WIDE_IN, "w"), (NARROW_IN, "n"))
     )
     return Picture(
         f"{trace.run}, joint {trace.joint}, {balance_title(trace.balance)}", text, wide, narrow, opened
     )
-
-
-def _svg(trace: Trace, width: float, floor: float, both: bool) -> str:
-    """Draw one trace, with settings of its own."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")  # no display is needed
-    with mpl.rc_context(_LOOK):
-        return inherited(by_role(as_svg(_figure(trace, width, floor, both))))
 
 
 def _figure(trace: Trace, width: float, floor: float, both: bool) -> Any:
@@ -211,15 +182,3 @@ def _limit(curves: Sequence[Any], floor: float) -> float:
     if np.isfinite(floor):
         heights.append(1.3 * _FLOOR_SIGMAS * floor)
     return 1.08 * max(heights, default=1.0) or 1.0
-
-
-def own_ids(svg: str, prefix: str) -> str:
-    """Return the picture with ids of its own, so that several fit into one page."""
-    svg = re.sub(r'\bid="', f'id="{prefix}-', svg)
-    return re.sub(r'(url\(#|href="#)', rf"\1{prefix}-", svg)
-
-
-def inherited(svg: str) -> str:
-    """Return the picture with the page's font and coordinates of a tenth of a unit: a third of the size."""
-    svg = re.sub(r"font: (?:[a-z]+ )?([\d.]+px) [^;\"]*", r"font-size: \1", svg)
-    return re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\d+\.\d)\d+", r"\1", path[0]), svg)

@@ -1,4 +1,4 @@
-"""Findings as the page shows them: every number already a text, every bar already a share of its width. Pure."""
+"""Findings as rows of the report: numbers as text, bars as shares of their width."""
 
 from __future__ import annotations
 
@@ -11,26 +11,25 @@ from jtqd.estimator.effects.effect import Effect
 from jtqd.sysid.diagnosis.findings import CandidateEvidence, Cause, Findings, Gain, Gap, Place
 from jtqd.sysid.diagnosis.report.words import (
     AXES,
-    DASH,
-    SPACE,
     balance_title,
     bin_name,
     effect_title,
-    fixed,
     gain_interval,
-    number,
     of_place,
-    parameter,
     parameter_title,
-    percent,
     place,
-    unit_name,
     where,
+)
+from jtqd.sysid.report.numbers import (
+    DASH,
+    SPACE,
+    fixed,
+    number,
+    percent,
+    unit_name,
+    with_interval,
     with_unit,
 )
-
-# Where the gap lives, as the page shows it: the first places in words, every condition as bars on one scale. Pure.
-
 
 _HOT: Final = 2.0
 """A bin with this many times its even share of the gap is marked."""
@@ -231,7 +230,7 @@ def _cause(cause: Cause, effects: Mapping[str, Effect]) -> CauseView:
     effect = effects.get(cause.name)
     rows = []
     for name, value in cause.parameters.items():
-        text, interval = parameter(value)
+        text, interval = with_interval(value.value, value.ci95, value.unit)
         rows.append(ParameterView(parameter_title(name), name, text, interval))
     return CauseView(
         of_place(cause.name, cause.joint),

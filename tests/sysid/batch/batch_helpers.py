@@ -11,7 +11,7 @@ from pathlib import Path
 from tests.paths import ROOT
 from tests.sysid.diagnosis.diagnose_helpers import JOINT_FILE, write_runs
 
-CHILD = b"jtqd.sysid.batch.child"
+CHILD = b"jtqd.daemon.jtq"
 
 
 def fleet(directory, names):

@@ -6,10 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.sysid.batch.figures import figures_of
-from jtqd.sysid.batch.groups import Group
-from jtqd.sysid.batch.run import DONE, FAILED, KEPT, Job, Row
-from jtqd.sysid.batch.summary import counts, render, to_mapping
+from jtqd.sysid.batch.run import DONE, FAILED, KEPT, Group, Row
+from jtqd.sysid.batch.summary import counts, figures_of, render, to_mapping
 
 
 def diagnosis(verdict="cause", rmse=1.25, *causes):
@@ -42,10 +40,6 @@ def row(name, result, state=DONE, error=""):
     return Row(Group(name, (Path("/logs") / name,)), state, key, content, error, 2.0)
 
 
-def job(command="diagnose"):
-    return Job(command, ("--joint", "/j.yaml"), {"joint": {"0": "h"}}, True, "1.2.3")
-
-
 class Page(HTMLParser):
     """Texts, and whether every element is closed."""
 
@@ -70,10 +64,10 @@ class Page(HTMLParser):
 
 def test_figures_of_a_diagnosis():
     ripple, gain = (2, ("torque_ripple",)), ("sensor", ("sensor_gain", "torque_constant"))
-    made = figures_of("diagnose", diagnosis("ambiguous", 1.25, ripple, gain))
+    made = figures_of("diagnose", row("a", diagnosis("ambiguous", 1.25, ripple, gain)))
     assert made.badge == ("warn", "ambiguous")
     assert made.cells[:3] == ("1.25", "0.2", "0.3")
-    assert made.names == ("torque ripple (joint 2)", "sensor gain or torque constant (sensor)")
+    assert made.causes == ("torque ripple (joint 2)", "sensor gain or torque constant (torque sensor)")
     assert made.gap_nm == 1.25
     assert made.values["causes"][1]["class"] == ["sensor_gain", "torque_constant"]
 
@@ -82,13 +76,13 @@ def test_figures_of_a_diagnosis():
     ("identities", "badge"),
     [
         ([identity(5000), identity(5000)], ("good", "identical")),
-        ([identity(5000), identity(4000)], ("good", "identical once known")),
+        ([identity(5000), identity(4000)], ("good", "identical, differences explained")),
         ([identity(5000), identity(4999, explained=False)], ("warn", "differs")),
         ([None], ("after", "other models")),
     ],
 )
 def test_figures_of_a_replay(identities, badge):
-    made = figures_of("replay", {"runs": [run_of(each) for each in identities]})
+    made = figures_of("replay", row("a", {"runs": [run_of(each) for each in identities]}))
     assert made.badge == badge
     assert made.gap_nm == 0.5
     assert made.cells[3] == "0.4 → 0.6"
@@ -96,7 +90,9 @@ def test_figures_of_a_replay(identities, badge):
 
 
 def test_the_largest_difference_of_several_runs_counts():
-    made = figures_of("replay", {"runs": [run_of(None, 0.5, (0.4, 0.9)), run_of(None, 0.7, (0.8, 0.6))]})
+    made = figures_of(
+        "replay", row("a", {"runs": [run_of(None, 0.5, (0.4, 0.9)), run_of(None, 0.7, (0.8, 0.6))]})
+    )
     assert made.gap_nm == 0.7
     assert made.cells[3] == "0.8 → 0.9"
 
@@ -108,28 +104,34 @@ def test_the_page_shows_every_group_failed_ones_first_and_then_by_gap():
         row("old", diagnosis("cause", 1.0, (1, ("torque_ripple",))), KEPT),
         row("<b>&", None, FAILED, "x.csv: <script>"),
     ]
-    text = render(job(), rows, "this machine", "today", {"key-large": "results/large/report.html"})
+    text = render("diagnose", rows, "this machine", "today")
     page = Page(text)
     assert page.open == []
-    assert page.links == ["results/large/report.html"]
+    assert page.links == [
+        "results/key-large/report.html",
+        "results/key-old/report.html",
+        "results/key-small/report.html",
+    ]
     order = [page.texts.index(name) for name in ("<b>&", "large", "old", "small")]
     assert order == sorted(order)
     assert "x.csv: <script>" in page.texts, "escaped"
     assert page.texts[page.texts.index("torque ripple (joint 1)") + 1] == "2", "in two groups"
-    assert "2.0 s, before" in page.texts
+    assert "2.0 s, earlier" in page.texts
     assert 'style="width:50%"' in text, "of the largest gap"
     assert "@import" not in text
     assert "url(" not in text
 
 
 def test_a_page_of_failures_only():
-    page = Page(render(job("replay"), [row("a", None, FAILED, "no")], "here", "today", {}))
+    page = Page(render("replay", [row("a", None, FAILED, "no")], "here", "today"))
     assert "no" in page.texts
 
 
 def test_summary_is_plain():
     rows = [row("a", diagnosis()), row("b", None, FAILED, "why")]
-    mapping = json.loads(json.dumps(to_mapping(job(), rows, "here"), allow_nan=False))
+    mapping = json.loads(
+        json.dumps(to_mapping("diagnose", {"joint": {"0": "h"}}, "1.2.3", rows, "here"), allow_nan=False)
+    )
     assert mapping["counts"] == counts(rows) == {"groups": 2, "done": 1, "kept": 0, "failed": 1}
     assert [group["error"] for group in mapping["groups"]] == [None, "why"]
     assert mapping["groups"][0]["figures"]["verdict"] == "cause"

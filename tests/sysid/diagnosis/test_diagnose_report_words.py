@@ -10,16 +10,8 @@ import pytest
 
 from jtqd.sysid.diagnosis.findings import CandidateEvidence, Findings, Gain, Gap, Place, Value
 from jtqd.sysid.diagnosis.report.views import evidence_views, gain_views, gap_views
-from jtqd.sysid.diagnosis.report.words import (
-    effect_title,
-    gain_sentence,
-    number,
-    parameter,
-    parameter_title,
-    percent,
-    verdict_sentence,
-    with_unit,
-)
+from jtqd.sysid.diagnosis.report.words import effect_title, gain_sentence, parameter_title, verdict_sentence
+from jtqd.sysid.report.numbers import number, percent, with_interval, with_unit
 from tests.sysid.diagnosis import findings_examples as examples
 from tests.sysid.diagnosis.findings_parts import gap
 
@@ -173,7 +165,7 @@ def test_a_gap_without_a_map_still_says_where() -> None:
     ],
 )
 def test_a_parameter_has_the_digits_that_its_interval_allows(value: Value, shown: tuple[str, str]) -> None:
-    text, interval = parameter(value)
+    text, interval = with_interval(value.value, value.ci95, value.unit)
     assert (text.translate(PLAIN_SPACE), interval.translate(PLAIN_SPACE)) == shown
 
 

@@ -36,8 +36,8 @@ from jtqd.sysid.evaluate.scores import (
     standstill,
     velocity_bins,
 )
-from jtqd.sysid.figures import thinned
 from jtqd.sysid.fit.plateaus import Mean, Plateau
+from jtqd.sysid.report.figures import thinned
 from tests.sysid.evaluate.evaluate_helpers import samples
 
 

@@ -1,24 +1,86 @@
-"""What the pictures of sysid have in common: shades, axes, legends, thinning, SVG as text, doing without matplotlib."""
+"""Common parts of the figures of sysid: colours, axes, legends, thinning, and SVG that follows the colours of its page."""
 
 from __future__ import annotations
 
 import io
 import re
-import sys
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.sysid.report.page import LIGHT
 
-SENSOR, BEFORE, AFTER = "#222222", "#c8702a", "#2a78b8"
-STANDING = "#e9e4da"
+SENSOR, BEFORE, AFTER = LIGHT["ink"], LIGHT["before"], LIGHT["after"]
+STANDING, GRID = LIGHT["noise"], LIGHT["line"]
 BUCKETS = 700
 """Of a curve over time: each keeps its lowest and highest sample, so that no spike is lost."""
 STANDING_LABEL = "standstill: the estimate is the middle of an interval"
+STYLE: Final[dict[str, Any]] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "jtqd",
+    "font.size": 9.5,
+    "text.color": LIGHT["ink"],
+    "axes.labelcolor": LIGHT["soft"],
+    "axes.edgecolor": LIGHT["line"],
+    "xtick.color": LIGHT["soft"],
+    "ytick.color": LIGHT["soft"],
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": LIGHT["line"],
+    "grid.linewidth": 0.5,
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+    "savefig.facecolor": "none",
+    "legend.facecolor": LIGHT["paper"],
+}
+"""matplotlib settings of the figures of a page."""
+
+
+def page_svg(draw: Callable[[], Any], name: str) -> str:
+    """Return a figure as SVG for a page: its colours are the page's, its ids begin with `name`; "" without a figure.
+
+    Args:
+        draw: makes the matplotlib figure, in colours of `LIGHT`, or returns None. It runs with the settings `STYLE`; those
+            outside are left alone.
+        name: unique on the page.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+    """
+    import matplotlib as mpl
+
+    mpl.use("Agg")  # no display is needed
+    with mpl.rc_context(STYLE):
+        figure = draw()
+        return "" if figure is None else _compact(_with_roles(_with_prefix(as_svg(figure), name)))
+
+
+def _with_roles(svg: str) -> str:
+    """Replace the light colours by references to their roles, so that the figure follows the page."""
+    roles = {colour: role for role, colour in LIGHT.items()}
+    return re.sub(
+        r"#[0-9a-f]{6}\b",
+        lambda m: f"var(--{roles[m[0].lower()]})" if m[0].lower() in roles else m[0],
+        svg,
+        flags=re.IGNORECASE,
+    )
+
+
+def _with_prefix(svg: str, prefix: str) -> str:
+    """Make the ids of a figure unique on its page."""
+    svg = re.sub(r'\bid="', f'id="{prefix}-', svg)
+    return re.sub(r'(url\(#|href="#)', rf"\1{prefix}-", svg)
+
+
+def _compact(svg: str) -> str:
+    """Use the page's font, and coordinates of a tenth of a unit: a third of the size."""
+    svg = re.sub(r"font: (?:[a-z]+ )?([\d.]+px) [^;\"]*", r"font-size: \1", svg)
+    return re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\d+\.\d)\d+", r"\1", path[0]), svg)
 
 
 def shade(
@@ -53,7 +115,7 @@ def room_for_legend(axis: Any, share: float) -> None:
 
 def plain(axis: Any) -> None:
     """Light grid, no frame above and on the right."""
-    axis.grid(True, color="#dddddd", linewidth=0.6)
+    axis.grid(True, color=GRID, linewidth=0.6)
     axis.set_axisbelow(True)
     for side in ("top", "right"):
         axis.spines[side].set_visible(False)
@@ -102,31 +164,3 @@ def thinned(time_s: FloatArray, values: FloatArray, buckets: int = BUCKETS) -> t
             ends = {int(np.argmin(part)), int(np.argmax(part))}
         kept += [start + k for k in sorted(ends)]
     return time_s[kept], values[kept]
-
-
-def draw_each_joint(
-    joints: Sequence[int],
-    results: Sequence[Any],
-    pattern: Path,
-    load: Callable[[], Callable[[Sequence[Any], Path], None]],
-) -> None:
-    """One picture per joint, said on stderr; without matplotlib only that is said.
-
-    Args:
-        joints: their numbers.
-        results: each with the attribute `joint`.
-        pattern: path of the pictures, "{}" standing for the joint's number.
-        load: imports and returns the function that draws one joint's results.
-    """
-    try:
-        draw_joint = load()
-    except ImportError:
-        print(
-            "measured: no figures: matplotlib is not installed (it is in the extras 'dev' and 'train')",
-            file=sys.stderr,
-        )
-        return
-    for number in joints:
-        path = pattern.with_name(pattern.name.format(number))
-        draw_joint([result for result in results if result.joint == number], path)
-        print(f"measured: wrote {path}", file=sys.stderr)

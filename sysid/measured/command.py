@@ -1,0 +1,111 @@
+"""`jtq measured`: score the torque observer on the shipped runs of a real arm, offline or over a CAN bus.
+
+python -m jtqd.sysid.measured.command --out DIR [--json] [--joint-files DIR]
+python -m jtqd.sysid.measured.command --bus unix:PATH --out DIR [--json]
+python -m jtqd.sim_can.bench_kernel run --time-travel --out DIR -- jtq measured --bus vcan0 --out DIR
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime as dt
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from jtqd.daemon.logs.errors import LogError
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.run import RunTableError
+from jtqd.sysid.fit.friction import FitError
+from jtqd.sysid.measured import bus, offline
+from jtqd.sysid.runs.files import RunError
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line; results on stdout, log on stderr. Exit status 0 done, 1 failure, 2 usage."""
+    options = parser().parse_args(arguments)
+    if options.bus is not None and options.joint_files is not None:
+        parser().error("--joint-files: nothing is fitted with --bus")
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+        if options.bus is None:
+            _offline(options.out, options.joint_files or options.out, options.json)
+        else:
+            _on_bus(options.bus, options.out, options.json)
+    except (RunError, RunTableError, ConfigError, FitError, LogError, bus.PlayError, OSError) as error:
+        print(f"jtq measured: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def parser() -> argparse.ArgumentParser:
+    """Arguments of `jtq measured`."""
+    result = argparse.ArgumentParser(
+        prog="jtq measured",
+        description="Score the torque observer on the Kinova Gen3 runs, before and after fitting friction.",
+        epilog="examples:\n  jtq measured --out measured\n  jtq measured --bus unix:/tmp/bus --out measured",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    result.add_argument(
+        "--bus", help="play the runs on this bus (vcan0, unix:PATH) and score what jtqd publishes there"
+    )
+    result.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder for the figures and jtqd's logs"
+    )
+    result.add_argument("--json", action="store_true", help="print the results as JSON")
+    result.add_argument(
+        "--joint-files",
+        type=Path,
+        metavar="DIR",
+        help="folder for the fitted joint files (default: the --out folder)",
+    )
+    return result
+
+
+def _offline(out: Path, joint_files: Path, as_json: bool) -> None:
+    cases, fits = offline.evaluate(joint_files, dt.date.today().isoformat())
+    _draw(cases, out / "measured_joint{}.png", "draw_joint")
+    if as_json:
+        print(json.dumps(offline.as_mapping(cases, fits), indent=1))
+        return
+    print("RMSE of the estimate against the arm's torque sensor, Nm (percent of rated torque)")
+    print("\n".join(offline.table_lines(cases)))
+    for (joint, run), fit in fits.items():
+        print(f"\njoint {joint}, friction fitted on {run}:", *fit.lines(), sep="\n  ")
+
+
+def _on_bus(address: str, out: Path, as_json: bool) -> None:
+    results = bus.evaluate(address, out)
+    _draw(results, out / "measured_bus_joint{}.png", "draw_bus_joint")
+    if as_json:
+        runs = [bus.as_mapping(each) for each in results]
+        print(json.dumps({"schema": "jtq.measured_bus/1", "runs": runs}, indent=1))
+        return
+    print("RMSE of the published estimate against the arm's torque sensor; differences in Nm")
+    print("\n".join(bus.table_lines(results)))
+
+
+def _draw(results: Sequence[Any], pattern: Path, function: str) -> None:
+    """Draw one figure per joint by a function of `figures`; without matplotlib write that to the log instead.
+
+    Args:
+        results: each with the attribute `joint`.
+        pattern: path of the figures, "{}" in place of the joint's number.
+        function: name of (results of one joint, path) -> None.
+    """
+    try:
+        from jtqd.sysid.measured import figures
+    except ImportError:
+        print("jtq measured: no figures: matplotlib is not installed (extra: train)", file=sys.stderr)
+        return
+    draw: Callable[[Sequence[Any], Path], None] = getattr(figures, function)
+    for number in offline.JOINTS:
+        path = pattern.with_name(pattern.name.format(number))
+        draw([result for result in results if result.joint == number], path)
+        print(f"jtq measured: wrote {path}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
