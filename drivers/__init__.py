@@ -5,7 +5,7 @@ It imports nothing else of jtqd. canopen and python-can are imported by `boot` (
 and canopen's EDS parser by `object_dictionary.read_eds` when it is called. Import the modules themselves:
 
     frame, filters, receive     the 16 bytes, kernel filters, one system call for all frames that have come
-    frame_socket, hub           SocketCAN or a unix socket, alike to use; the hub of a unix bus, `python -m jtqd.drivers.hub`
+    frame_socket, hub, wire     SocketCAN or a unix socket, alike to use; hub of a unix bus, `python -m jtqd.drivers.hub`
     object_dictionary, pdo      objects typed by an EDS, PDO mappings as `struct`, rules for changing them
     sdo, sdo_client, sdo_server the protocol and a queue; blocking clients; the server
     emcy, devices, bus_load     EMCY codes, what drives and sensor must map and scale, load of a configuration

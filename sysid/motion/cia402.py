@@ -1,4 +1,4 @@
-"""CiA 402 from the commanding side: what a statusword says, and which controlword comes next. Pure.
+"""CiA 402 from the commanding side: the state in a statusword, and the controlword that comes next. Pure.
 
 Statusword bits: CiA 402-2, table "statusword bits by state"; commands: its table "command coding". A drive is led one
 state at a time, and each step waits until the statusword has confirmed the one before.
@@ -60,24 +60,24 @@ FAULTED: Final = frozenset({State.FAULT, State.FAULT_REACTION})
 
 
 def state_of(statusword: int) -> State:
-    """State that `statusword` (6041h) tells: bit 5 (quick stop) counts where the coding says so, else mask 4Fh."""
-    found = _BY_SIX_BITS.get(statusword & 0x6F)
-    return found or _BY_FIVE_BITS.get(statusword & 0x4F, State.UNKNOWN)
+    """Decode `statusword` (6041h): bit 5 (quick stop) counts where the coding has it, else mask 4Fh."""
+    state = _BY_SIX_BITS.get(statusword & 0x6F)
+    return state or _BY_FIVE_BITS.get(statusword & 0x4F, State.UNKNOWN)
 
 
 _STATES: Final = tuple(state_of(low) for low in range(0x80))
 
 
 def fast_state(statusword: int) -> State:
-    """`state_of` by table: one index instead of two look-ups, for once per cycle and drive."""
+    """Decode as `state_of` by table: one index instead of two look-ups, for once per cycle and drive."""
     return _STATES[statusword & 0x7F]
 
 
 def enabling_word(state: State) -> int | None:
-    """Next controlword (6040h) on the way to operation enabled; None where none leads there (fault, quick stop)."""
+    """Return the next controlword (6040h) towards operation enabled; None where none leads there (fault, quick stop)."""
     return _ENABLING.get(state)
 
 
 def describe(statusword: int) -> str:
-    """State with its word: "fault (statusword 0218h)"."""
+    """Return the state with its word: "fault (statusword 0218h)"."""
     return f"{state_of(statusword).value} (statusword {statusword:04X}h)"

@@ -1,7 +1,7 @@
 """The commander: a pure state machine, frames and stamps in, frames out. No socket, no clock.
 
     waiting ──> enabling ──> playing ──> ramping ──> braking ──> disabling ──> over
-       │                      │   └─> powerless ──> playing (`power_off`, where the set-points say so)
+       │                      │   └─> powerless ──> playing (where the set-points have no power)
        └── refused: nothing has moved        └── any violation: ramping, or braking at once ──┘
 
 In every cycle one RPDO is sent, to one drive after the other, so that each gets a set-point every second SYNC and the bus
@@ -21,9 +21,6 @@ from jtqd.sysid.motion.setpoints import PERIOD_S, Limits, Monitor, MotionResult,
 from jtqd.sysid.motion.setup import DriveUnits, SensorUnits
 from jtqd.sysid.motion.stopping import Phase, PowerOff, Stopping
 
-# When a set-point is due: SYNC sets the pace, our own clock once SYNC is lost. Pure; times are CLOCK_MONOTONIC in ns.
-
-
 PERIOD_NS: Final = round(PERIOD_S * 1e9)
 UNPACED_NS: Final = 2 * PERIOD_NS
 """Period of our own clock while there is no SYNC."""
@@ -32,7 +29,12 @@ LARGEST_ADVANCE: Final = 4
 
 
 class Pace:
-    """Follows SYNC. `synced`: it runs; `pending`: its newest one has not had its set-point."""
+    """When a set-point is due: SYNC sets the pace, our own clock once SYNC is lost.
+
+    Attributes:
+        synced: SYNC runs.
+        pending: the newest SYNC has not had its set-point.
+    """
 
     def __init__(self, timing: Timing, now_ns: int) -> None:
         self.synced = False
@@ -46,20 +48,20 @@ class Pace:
 
     @property
     def wake_ns(self) -> int:
-        """When the frames of the present cycle, or else of the next one, should all have come; 0: nobody knows."""
+        """When the frames of the present cycle, or else of the next one, should all have come; 0: unknown."""
         if not self.synced:
             return 0
         return self._newest_ns + self._delay_ns + (0 if self.pending else PERIOD_NS)
 
     @property
     def due_ns(self) -> int:
-        """When something must happen although no frame comes."""
+        """When something must be done although no frame comes."""
         if not self.synced:
             return self._newest_ns + UNPACED_NS
         return self._newest_ns + (self._delay_ns if self.pending else self._lost_ns)
 
     def on_sync(self, t_ns: int, now_ns: int) -> Violation | None:
-        """A SYNC received at t_ns is looked at now; says when it comes too late, or we do."""
+        """Take a SYNC received at t_ns; return a violation when it comes too late, or is looked at too late."""
         gap_ns = t_ns - self._newest_ns
         followed = self.synced
         self.synced = self.pending = True
@@ -75,7 +77,7 @@ class Pace:
         return None
 
     def watch(self, now_ns: int) -> Violation | None:
-        """SYNC is not there: told once, from then on our own clock counts."""
+        """Return a violation when SYNC is lost, once; from then on our own clock counts."""
         gap_ns = now_ns - self._newest_ns
         if not self.synced or gap_ns <= self._lost_ns:
             return None
@@ -84,13 +86,13 @@ class Pace:
         return self._lost(gap_ns)
 
     def ready(self, now_ns: int) -> bool:
-        """A set-point is to be sent now: the inputs of the newest SYNC have had their time on the wire."""
+        """Return whether a set-point is to be sent now: the inputs of the newest SYNC have had their time on the wire."""
         if not self.synced:
             return now_ns >= self._newest_ns + UNPACED_NS
         return self.pending and now_ns >= self._newest_ns + self._delay_ns
 
     def served(self, now_ns: int) -> int:
-        """The set-point is on its way; by how many set-points the motion has gone on since the last one."""
+        """Mark the set-point as sent; return by how many set-points the motion has advanced since the last one."""
         advance = min(self._slots, LARGEST_ADVANCE)
         self._slots = 0
         self.pending = False
@@ -110,10 +112,13 @@ Frame = tuple[int, bytes, int]
 
 
 class Commander:
-    """Leads both drives through one motion. `drives` are joints 1 and 2, set up already (`drive_setup`).
+    """One motion of both drives, joints 1 and 2, which are set up already (`jtqd.sysid.motion.setup`).
 
     Call `on_frames` with what has arrived, at best at `wake_ns`, and by `due_ns` at the latest; send what it returns.
-    `refusal` says why nothing was begun; otherwise `result` holds once `over`.
+
+    Attributes:
+        phase: see the module's diagram.
+        refusal: why nothing was begun; None otherwise, and `result` holds once `over`.
     """
 
     def __init__(
@@ -131,7 +136,7 @@ class Commander:
         self.phase = Phase.WAITING
         self.refusal: str | None = None
         self._reason = ""
-        self._takers = self.inputs.takers
+        self._handlers = self.inputs.handlers
         self._pace = Pace(timing, now_ns)
         self._heartbeat = Heartbeat(timing.own_heartbeat_s, now_ns)
         self._monitor = Monitor(limits)
@@ -140,7 +145,7 @@ class Commander:
         self._commands = Commands(setpoints, drives)
         self._turn = 0
         self._index = -1  # of the set-point in force
-        self._stretches = list(setpoints.off)  # without power, still to come
+        self._unpowered = list(setpoints.off)  # without power, still to come
         self._power_off: PowerOff | None = None
         self._stopping: Stopping | None = None
         self._now_ns = self._since_ns = self._still_since_ns = now_ns
@@ -150,7 +155,7 @@ class Commander:
 
     @property
     def over(self) -> bool:
-        """Nothing more will be sent."""
+        """Whether nothing more will be sent."""
         return self.phase is Phase.OVER
 
     @property
@@ -165,7 +170,7 @@ class Commander:
 
     @property
     def result(self) -> MotionResult:
-        """How it ended."""
+        """How the motion ended."""
         return MotionResult("stopped" if self._reason else "done", self._reason, self.played_s)
 
     @property
@@ -180,7 +185,7 @@ class Commander:
 
     @property
     def silent(self) -> bool:
-        """Our heartbeat has ended on purpose: a drive does not obey, and stops when it misses it."""
+        """Whether our heartbeat has ended on purpose: a drive does not obey, and stops when it misses it."""
         return self._stopping is not None and self._stopping.silent
 
     def stop(self, reason: str) -> None:
@@ -188,7 +193,7 @@ class Commander:
         self._stop(Violation(reason, self.phase is Phase.RAMPING))
 
     def frame_refused(self, refused: bool) -> None:
-        """The transmit queue took a frame, or was full; several times in a row means that nobody hears us."""
+        """Count frames that the full transmit queue refused; several in a row: nobody hears us, and the motion stops."""
         self._full = self._full + 1 if refused else 0
         if self._full == FULL_QUEUE_FRAMES:
             self._stop(Violation(f"bus: transmit queue full for {FULL_QUEUE_FRAMES} frames in a row", True))
@@ -196,17 +201,17 @@ class Commander:
     def on_frames(self, frames: Sequence[Frame], now_ns: int) -> list[bytes]:
         """Take what has arrived, in order; return what is to be sent now."""
         self._now_ns = now_ns
-        takers = self._takers
+        handlers = self._handlers
         for can_id, data, t_ns in frames:
-            take = takers.get(can_id)
-            if take is not None:
-                take(data, t_ns)
+            handler = handlers.get(can_id)
+            if handler is not None:
+                handler(data, t_ns)
             elif can_id == SYNC_COB_ID:
                 if self._pace.pending:
                     self._examine()  # several cycles have come at once: none goes unseen
-                self._unpaced(self._pace.on_sync(t_ns, now_ns))
+                self._stop_late(self._pace.on_sync(t_ns, now_ns))
                 self.inputs.cycle += 1
-        self._unpaced(self._pace.watch(now_ns))
+        self._stop_late(self._pace.watch(now_ns))
         if self.phase is Phase.OVER:
             return []
         out = [] if self.silent else self._heartbeat.frames(now_ns)
@@ -219,8 +224,8 @@ class Commander:
 
     # Violations ---------------------------------------------------------------------------------------------
 
-    def _unpaced(self, violation: Violation | None) -> None:
-        """SYNC or we are late: stop, unless nothing has been begun; then the wait begins anew."""
+    def _stop_late(self, violation: Violation | None) -> None:
+        """Stop because SYNC or we are late; before the start the wait begins anew instead."""
         if violation is None:
             return
         if self.phase is Phase.WAITING:
@@ -229,7 +234,7 @@ class Commander:
             self._stop(violation)
 
     def _examine(self) -> None:
-        """Limits and supervision of the newest values. On the stop ramp only what makes it impossible counts."""
+        """Check limits and supervision of the newest values. On the stop ramp only hard violations count."""
         phase = self.phase
         pause = self._power_off
         if phase in (Phase.PLAYING, Phase.ENABLING, Phase.POWERLESS):
@@ -245,7 +250,7 @@ class Commander:
             self._stop(violation)
 
     def _stop(self, violation: Violation) -> None:
-        """Begin to stop, or go on to the harder way. The first reason is the one that is told."""
+        """Begin to stop, or go on to the harder way. The first reason is the one that is reported."""
         if self.over:
             return
         self._reason = self._reason or violation.reason
@@ -278,13 +283,13 @@ class Commander:
         return (self._now_ns - self._since_ns) * 1e-9
 
     def _step(self, advance: int) -> bytes | None:
-        """One cycle of the present phase: the RPDO for the drive whose turn it is."""
+        """Do one cycle of the present phase; return the RPDO for the drive whose turn it is."""
         self._turn = turn = 1 - self._turn
         if self.phase is Phase.POWERLESS:
             return self._powerless(turn, advance)
         if self.phase is Phase.PLAYING:
             self._index += advance
-            if self._stretches and self._index >= self._stretches[0][0]:
+            if self._unpowered and self._index >= self._unpowered[0][0]:
                 return self._without_power(turn)
             if self._index < len(self._setpoints):
                 return self._commands.setpoint(turn, self._index)
@@ -302,8 +307,8 @@ class Commander:
         return frame
 
     def _without_power(self, turn: int) -> bytes | None:
-        """The next stretch without power begins with this set-point, also where cycles were lost just before it."""
-        stretch = self._stretches.pop(0)
+        """Begin the next stretch without power with its first set-point, also where cycles were lost just before it."""
+        stretch = self._unpowered.pop(0)
         self._index = stretch[0]
         self._power_off = PowerOff(
             self.inputs, self._supervision, self._commands, self.timing, stretch, self._now_ns
@@ -325,7 +330,7 @@ class Commander:
         return frame
 
     def _waiting(self) -> None:
-        """Until SYNC, every input and standstill have been there long enough; refused when they do not come in time."""
+        """Wait until SYNC, every input and standstill have been there long enough; refuse when they do not come in time."""
         for drive in self.inputs.drives:
             drive.begin_travel()
         missing: str | None = "no SYNC: is jtqd running on this bus?"
@@ -341,7 +346,7 @@ class Commander:
             self._enter(Phase.ENABLING)
 
     def _enabling(self, turn: int) -> bytes | None:
-        """6040h 6, 7, 15, each after the statusword has confirmed the one before."""
+        """Send 6040h 6, 7, 15, each after the statusword has confirmed the one before."""
         states = [fast_state(drive.statusword) for drive in self.inputs.drives]
         if all(state is State.OPERATION_ENABLED for state in states):
             self._enter(Phase.PLAYING)

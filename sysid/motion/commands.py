@@ -6,6 +6,8 @@ from typing import Final
 
 from jtqd.drivers.devices import COMMANDER_NODE, drive_rpdo1, drive_rpdo2
 from jtqd.drivers.frame import FRAME, pack
+from jtqd.drivers.sdo import Transfer
+from jtqd.drivers.sdo_client import REQUEST_ID
 from jtqd.sysid.motion.cia402 import ENABLE_OPERATION, QUICK_STOP_WORD
 from jtqd.sysid.motion.setpoints import MotionError, Setpoints
 from jtqd.sysid.motion.setup import DriveUnits
@@ -38,31 +40,32 @@ class Commands:
         self._rpdo2 = [drive_rpdo2(drive.node).cob_id for drive in drives]
 
     def control(self, turn: int, word: int) -> bytes:
-        """RPDO1: controlword, no torque."""
+        """Return RPDO1 with a controlword and no torque."""
         return FRAME.pack(self._rpdo1[turn], _COMMAND.size, _COMMAND.pack(word, 0))
 
     def quick_stop_by_sdo(self, turn: int) -> bytes:
-        """Expedited download of 6040h = 2; nobody waits for the answer."""
-        return pack(0x600 + self._nodes[turn], b"\x2b\x40\x60\x00" + QUICK_STOP_WORD.to_bytes(4, "little"))
+        """Return the download of 6040h = 2; its answer is not waited for."""
+        download = Transfer(0x6040, 0, QUICK_STOP_WORD.to_bytes(2, "little"))
+        return pack(REQUEST_ID + self._nodes[turn], download.request)
 
     def setpoint(self, turn: int, index: int) -> bytes:
-        """Set-point number `index`."""
+        """Return the RPDO of set-point number `index`."""
         return self._target(turn, self._velocities[index], self._currents[index])
 
     def target(self, turn: int, velocity_rad_s: float, current_a: float) -> bytes:
-        """Any other set-point."""
+        """Return the RPDO of any other set-point."""
         velocity, current = self._lead.velocity_units(velocity_rad_s), self._follow.current_units(current_a)
         return self._target(turn, velocity, current)
 
     def _target(self, turn: int, velocity: int, current: int) -> bytes:
-        """RPDO2 to the drive in velocity mode, RPDO1 to the other."""
+        """Pack RPDO2 to the drive in velocity mode, RPDO1 to the other."""
         if turn == self._leader:
             return FRAME.pack(self._rpdo2[turn], _VELOCITY.size, _VELOCITY.pack(velocity))
         return FRAME.pack(self._rpdo1[turn], _COMMAND.size, _COMMAND.pack(ENABLE_OPERATION, current))
 
 
 class Heartbeat:
-    """Our heartbeat (node 21h) on its own grid; the first one is the boot-up message. `due_ns`: when the next one is due."""
+    """Heartbeat of the commander (node 21h) on its own grid, next at `due_ns`; the first is the boot-up message."""
 
     def __init__(self, period_s: float, now_ns: int) -> None:
         self.due_ns = now_ns
@@ -70,7 +73,7 @@ class Heartbeat:
         self._state = _BOOT_UP
 
     def frames(self, now_ns: int) -> list[bytes]:
-        """The heartbeat if it is due."""
+        """Return the heartbeat if it is due."""
         if now_ns < self.due_ns:
             return []
         self.due_ns += self._period_ns * (1 + (now_ns - self.due_ns) // self._period_ns)

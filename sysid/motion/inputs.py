@@ -1,4 +1,7 @@
-"""What the bus says about both joints: frames and stamps in, measured values with their age out. Pure.
+"""Measured values of both joints with their age, from frames and stamps, and their supervision. Pure.
+
+    Inputs         decodes TPDOs, heartbeats, EMCY and the answers that matter
+    Supervision    what must hold while the joints move: nodes alive, inputs fresh, drives enabled, sensor valid
 
 All times are CLOCK_MONOTONIC in ns and come as arguments. A frame of another length than its PDO is not taken: the PDO then
 grows stale.
@@ -7,72 +10,75 @@ grows stale.
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from typing import Final
 
-from jtqd.drivers.devices import SYNC_COB_ID, drive_tpdo1, drive_tpdo2, sensor_tpdo1, sensor_tpdo2
+from jtqd.drivers.devices import (
+    NOT_MEASURED,
+    SYNC_COB_ID,
+    TEMPERATURE_C_PER_UNIT,
+    drive_tpdo1,
+    drive_tpdo2,
+    drive_tpdo3,
+    sensor_tpdo1,
+    sensor_tpdo2,
+)
+from jtqd.drivers.emcy import NO_ERROR, Emergency, parse
 from jtqd.sysid.motion.cia402 import FAULTED, POWERED, State, describe, fast_state
 from jtqd.sysid.motion.setpoints import JointSample, Sample, Timing, Violation
-from jtqd.sysid.motion.setup import TEMPERATURE_TPDO, DriveUnits, SensorUnits
+from jtqd.sysid.motion.setup import DriveUnits, SensorUnits
 
 _MOTION: Final = drive_tpdo2(1).layout
 _POSITION: Final = drive_tpdo1(1).layout
 _SENSOR: Final = (sensor_tpdo1(3).layout, sensor_tpdo2(3).layout)
-_TEMPERATURE: Final = struct.Struct("<h")
-_NOT_MEASURED: Final = -0x8000
-_EMERGENCY: Final = struct.Struct("<HB")
-NEVER_NS: Final = -(1 << 62)
-NO_STATUSWORD: Final = 0x7FFF  # decodes to no state
+_TEMPERATURE: Final = drive_tpdo3(1).layout
+_NEVER_NS: Final = -(1 << 62)
+_NO_STATUSWORD: Final = 0x7FFF  # decodes to no state
 
-Take = Callable[[bytes, int], None]
-
-
-class Emergency(NamedTuple):
-    """An EMCY that is present: code and error register (1001h)."""
-
-    code: int
-    register: int
+Handler = Callable[[bytes, int], None]
+"""Takes the data of a frame and its stamp."""
 
 
 class NodeInput:
-    """Heartbeat and EMCY of one node. `who` is "joint 1", "joint 2" or "sensor"."""
+    """Heartbeat and EMCY of one node. `who` is "joint 1", "joint 2" or "sensor"; `emergency` is the EMCY in force."""
 
     def __init__(self, who: str, node: int, heartbeat_ms: int) -> None:
         self.who, self.node = who, node
         self.heartbeat_ns = heartbeat_ms * 1_000_000
-        self.beat_ns = NEVER_NS
+        self.beat_ns = _NEVER_NS
         self.nmt_state = -1
         self.emergency: Emergency | None = None
 
     def on_heartbeat(self, data: bytes, t_ns: int) -> None:
-        """700h+n: NMT state; 0 is the boot-up message."""
+        """Take 700h+n: NMT state; 0 is the boot-up message."""
         if len(data) == 1:
             self.nmt_state = data[0] & 0x7F
             self.beat_ns = t_ns
 
     def on_emergency(self, data: bytes, t_ns: int) -> None:
-        """080h+n: an error code, or 0000h when all errors are over."""
+        """Take 080h+n: an error code, or 0000h when all errors are over."""
         if len(data) == 8:
-            code, register = _EMERGENCY.unpack_from(data)
-            self.emergency = Emergency(code, register) if code else None
+            emergency = parse(data)
+            self.emergency = None if emergency.code == NO_ERROR else emergency
 
 
 class DriveInput(NodeInput):
-    """Values of one drive in SI units, joint side; `cycle_1`, `cycle_2`: SYNCs seen when its TPDOs came last.
+    """Values of one drive in SI units, joint side.
 
-    `told_by_sdo`: it has confirmed an SDO that wrote its controlword.
+    Attributes:
+        cycle_1, cycle_2: SYNCs seen when TPDO1 and TPDO2 came last.
+        sdo_confirmed: it has confirmed an SDO that wrote its controlword.
     """
 
     def __init__(self, number: int, units: DriveUnits, inputs: Inputs) -> None:
         super().__init__(f"joint {number}", units.node, units.heartbeat_ms)
         self.units = units
-        self.statusword = NO_STATUSWORD
+        self.statusword = _NO_STATUSWORD
         self.current_a = self.velocity_rad_s = self.travel_rad = 0.0
         self.temperature_c = math.nan
-        self.temperature_ns = NEVER_NS
+        self.temperature_ns = _NEVER_NS
         self.cycle_1 = self.cycle_2 = 0
-        self.told_by_sdo = False
+        self.sdo_confirmed = False
         self._inputs = inputs
         self._velocity = units.scaling.motor_rad_s_per_unit / units.gear_ratio
         self._motor = units.scaling.motor_rad_per_count / units.gear_ratio
@@ -82,12 +88,12 @@ class DriveInput(NodeInput):
         self._motor_counts = self._link_counts = 0  # since `begin_travel`
 
     def begin_travel(self) -> None:
-        """Travel counts from here."""
+        """Count travel from here."""
         self._motor_counts = self._link_counts = 0
         self.travel_rad = 0.0
 
     def on_position(self, data: bytes, t_ns: int) -> None:
-        """TPDO1. The counters roll over, so differences are taken modulo 2^32; the larger travel of both encoders counts."""
+        """Take TPDO1. The counters roll over: differences are modulo 2^32. The larger travel of both encoders counts."""
         if len(data) != _POSITION.size:
             return
         motor, link = counts = _POSITION.unpack(data)
@@ -100,7 +106,7 @@ class DriveInput(NodeInput):
         self.cycle_1 = self._inputs.cycle
 
     def on_motion(self, data: bytes, t_ns: int) -> None:
-        """TPDO2."""
+        """Take TPDO2."""
         if len(data) == _MOTION.size:
             velocity, current, self.statusword = _MOTION.unpack(data)
             self.velocity_rad_s = velocity * self._velocity
@@ -108,20 +114,20 @@ class DriveInput(NodeInput):
             self.cycle_2 = self._inputs.cycle
 
     def on_temperature(self, data: bytes, t_ns: int) -> None:
-        """TPDO3, 0.1 °C, 8000h: not measured; more may follow behind it."""
+        """Take TPDO3, 0.1 °C, 8000h: not measured; more may follow behind it."""
         if len(data) >= _TEMPERATURE.size:
             units = _TEMPERATURE.unpack_from(data)[0]
-            if units != _NOT_MEASURED:
-                self.temperature_c = units * 0.1
+            if units != NOT_MEASURED:
+                self.temperature_c = units * TEMPERATURE_C_PER_UNIT
                 self.temperature_ns = t_ns
 
     def on_sdo(self, data: bytes, t_ns: int) -> None:
-        """580h+n: the answer to a download of 6040h."""
+        """Take 580h+n: the answer to a download of 6040h."""
         if data[:4] == b"\x60\x40\x60\x00":
-            self.told_by_sdo = True
+            self.sdo_confirmed = True
 
     def sample(self) -> JointSample:
-        """What was measured last."""
+        """Return what was measured last."""
         return JointSample(self.current_a, self.velocity_rad_s, self.travel_rad, self.temperature_c)
 
 
@@ -136,7 +142,7 @@ class ChannelInput:
         self._layout, self._nm, self._inputs = _SENSOR[channel - 1], nm_per_unit, inputs
 
     def on_torque(self, data: bytes, t_ns: int) -> None:
-        """TPDO1 or TPDO2 of the sensor."""
+        """Take TPDO1 or TPDO2 of the sensor."""
         if len(data) == self._layout.size:
             units, self.status = self._layout.unpack(data)
             self.torque_nm = units * self._nm
@@ -144,9 +150,12 @@ class ChannelInput:
 
 
 class Inputs:
-    """Everything that is listened to but SYNC. `cycle` is the number of SYNCs so far, kept by the commander.
+    """All frames that the commander listens to but SYNC.
 
-    `foreign` is True once somebody else has spoken with the heartbeat of `own_node`.
+    Attributes:
+        cycle: number of SYNCs so far, kept by the commander.
+        foreign: another node has sent the heartbeat of `own_node`.
+        handlers: by COB-ID.
     """
 
     def __init__(
@@ -162,31 +171,31 @@ class Inputs:
         self.nodes: tuple[NodeInput, ...] = (
             self.drives if self.sensor is None else (*self.drives, self.sensor)
         )
-        self.takers = self._takers(own_node)
+        self.handlers = self._handlers(own_node)
 
-    def _takers(self, own_node: int) -> dict[int, Take]:
-        takers: dict[int, Take] = {0x700 + own_node: self._on_own_node}
+    def _handlers(self, own_node: int) -> dict[int, Handler]:
+        handlers: dict[int, Handler] = {0x700 + own_node: self._on_own_node}
         for node in self.nodes:
-            takers[0x700 + node.node] = node.on_heartbeat
-            takers[0x080 + node.node] = node.on_emergency
+            handlers[0x700 + node.node] = node.on_heartbeat
+            handlers[0x080 + node.node] = node.on_emergency
         for drive in self.drives:
-            takers[0x180 + drive.node] = drive.on_position
-            takers[0x280 + drive.node] = drive.on_motion
-            takers[0x580 + drive.node] = drive.on_sdo
+            handlers[0x180 + drive.node] = drive.on_position
+            handlers[0x280 + drive.node] = drive.on_motion
+            handlers[0x580 + drive.node] = drive.on_sdo
             if drive.units.temperature:
-                takers[TEMPERATURE_TPDO + drive.node] = drive.on_temperature
+                handlers[drive_tpdo3(drive.node).cob_id] = drive.on_temperature
         if self.sensor is not None:
             for channel in self.channels:
-                takers[0x080 + 0x100 * channel.channel + self.sensor.node] = channel.on_torque
-        return takers
+                handlers[0x080 + 0x100 * channel.channel + self.sensor.node] = channel.on_torque
+        return handlers
 
     @property
     def identifiers(self) -> tuple[int, ...]:
-        """COB-IDs to be received: SYNC and all that `takers` take."""
-        return (SYNC_COB_ID, *self.takers)
+        """COB-IDs to be received: SYNC, and those with a handler."""
+        return (SYNC_COB_ID, *self.handlers)
 
     def sample(self) -> Sample:
-        """What was measured last, of everything."""
+        """Return what was measured last, of everything."""
         one, two = self.drives
         return Sample(one.sample(), two.sample(), tuple([channel.torque_nm for channel in self.channels]))
 
@@ -195,11 +204,8 @@ class Inputs:
 
 
 def _difference(counts: int) -> int:
-    """Difference of two counters of 32 bits, the shorter way round."""
+    """Return the difference of two counters of 32 bits, the shorter way round."""
     return (counts + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000
-
-
-# What must be as it is while the joints move: nodes alive, inputs fresh, drives enabled, sensor valid. Pure.
 
 
 STILL_RAD_S: Final = 0.02
@@ -210,7 +216,7 @@ _MS: Final = 1e-6
 
 
 class Supervision:
-    """Looks at `inputs` once per cycle; keeps no state of its own. What is hard makes each drive brake by itself."""
+    """Checks of `inputs`, once per cycle, without a state of their own. A hard violation: each drive brakes by itself."""
 
     def __init__(self, inputs: Inputs, timing: Timing) -> None:
         self._inputs = inputs
@@ -219,7 +225,7 @@ class Supervision:
         self._temperature_ns = round(timing.temperature_s * 1e9)
 
     def check(self, now_ns: int, *, enabled: bool) -> Violation | None:
-        """First thing that is not as it must be; `enabled`: both drives in operation enabled, else only without fault."""
+        """Return the first violation; `enabled`: both drives must be in operation enabled, else only without fault."""
         inputs = self._inputs
         oldest = inputs.cycle - self._stale
         for drive in inputs.drives:
@@ -248,7 +254,7 @@ class Supervision:
         return None
 
     def missing(self, now_ns: int) -> str | None:
-        """Before the start: what has not been heard yet; None when all is there and in order."""
+        """Return what is missing or wrong before the start; None when all is there and in order."""
         inputs = self._inputs
         for node in inputs.nodes:
             if node.nmt_state < 0:
@@ -265,7 +271,7 @@ class Supervision:
         return None if found is None else found.reason
 
     def moving(self) -> str | None:
-        """Which joint does not stand, or cannot be seen to; None when both do."""
+        """Return which joint does not stand, or cannot be seen to; None when both do."""
         oldest = self._inputs.cycle - self._stale
         for drive in self._inputs.drives:
             if not -STILL_RAD_S <= drive.velocity_rad_s <= STILL_RAD_S or drive.cycle_2 < oldest:
@@ -274,13 +280,13 @@ class Supervision:
         return None
 
     def obeyed(self, turn: int) -> bool:
-        """Drive 0 or 1 says, just now, that it follows no set-point any more, or has taken an SDO that said so."""
+        """Return whether drive 0 or 1 follows no set-point any more, by a fresh statusword or a confirmed SDO."""
         drive = self._inputs.drives[turn]
         fresh = drive.cycle_2 >= self._inputs.cycle - self._stale
-        return drive.told_by_sdo or (fresh and fast_state(drive.statusword) is not State.OPERATION_ENABLED)
+        return drive.sdo_confirmed or (fresh and fast_state(drive.statusword) is not State.OPERATION_ENABLED)
 
     def both_off(self) -> bool:
-        """Both drives say, just now, that their motors are not driven."""
+        """Return whether fresh statuswords of both drives show that their motors are not driven."""
         oldest = self._inputs.cycle - self._stale
         return all(
             fast_state(drive.statusword) not in POWERED and drive.cycle_2 >= oldest
@@ -289,7 +295,7 @@ class Supervision:
 
     def _node(self, node: NodeInput, now_ns: int, *, hard: bool) -> Violation | None:
         if node.emergency is not None:
-            code, register = node.emergency
+            code, register = node.emergency.code, node.emergency.register
             return Violation(f"{node.who}: EMCY {code:04X}h (error register {register:02X}h)", hard)
         if node.nmt_state != _OPERATIONAL:
             name = _NMT_NAMES.get(node.nmt_state, f"state {node.nmt_state}")

@@ -1,4 +1,8 @@
-"""What both joints are told, millisecond by millisecond: one joint follows a velocity, the other a current. Pure."""
+"""Set-points of a motion, millisecond by millisecond, its limits, and how it ends. Pure.
+
+One joint follows a velocity, the other a current. `Limits` hold for what is measured (`Monitor`) and for what is planned
+(`check_setpoints`); every refusal is one line that names joint, quantity, what was found, and the limit.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +13,6 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-
-# What a motion ended with, how it can be refused, and the times it is supervised with.
 
 
 class MotionError(Exception):
@@ -182,11 +184,6 @@ class Setpoints:
         return np.arange(len(self), dtype=np.float64) * PERIOD_S
 
 
-# Limits of a motion: of what is measured (`Monitor`) and of what is planned (`check_setpoints`). Pure.
-#
-# Every refusal is one line that names joint, quantity, what was found, and the limit.
-
-
 STEEPEST_VELOCITY_RAD_S2: Final = 50.0
 """Steepest planned velocity, joint side: 0.05 rad/s from one set-point to the next."""
 STEEPEST_CURRENT_A_S: Final = 500.0
@@ -202,7 +199,7 @@ class Limits:
         velocity_rad_s: joint side (motor encoder through the gear).
         torque_nm: at the sensor between the joints.
         travel_rad: joint side, from where the motion began, by either encoder.
-        temperature_c: of the joint; math.inf where the drives do not tell it.
+        temperature_c: of the joint; math.inf where the drives do not measure it.
     """
 
     current_a: float
@@ -240,7 +237,7 @@ class Sample(NamedTuple):
 
 
 class Monitor:
-    """Compares samples with the limits. It keeps no state: the same sample gives the same answer."""
+    """Comparison of samples with the limits, without a state: the same sample gives the same answer."""
 
     __slots__ = ("_limits",)
 
@@ -248,8 +245,9 @@ class Monitor:
         self._limits = limits
 
     def check(self, sample: Sample) -> str | None:
-        """Return what is beyond its limit, the first found; None when nothing is. A nan is beyond every limit but
-        temperature's, which has its own supervision.
+        """Return the first quantity beyond its limit in words; None when there is none.
+
+        A nan is beyond every limit but temperature's, which has its own supervision.
         """
         limits = self._limits
         current, velocity, travel = limits.current_a, limits.velocity_rad_s, limits.travel_rad

@@ -30,6 +30,7 @@ from jtqd.drivers.devices import (
     SensorScaling,
     drive_rpdo1,
     drive_rpdo2,
+    drive_tpdo3,
 )
 from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import FRAME, FRAME_SIZE, pack
@@ -52,8 +53,6 @@ from jtqd.sysid.motion.setpoints import Limits, MotionError, Setpoints, Timing
 
 INTERPOLATION_MS: Final = 2
 """60C2h: each drive gets every second set-point."""
-TEMPERATURE_TPDO: Final = 0x380
-"""COB-ID of TPDO3, plus the node number: joint temperature, I16, 0.1 °C."""
 _POLL_S, _POLLS = 0.005, 200
 _CONTROLWORD, _STATUSWORD, _MODE_DISPLAY = (0x6040, 0), (0x6041, 0), (0x6061, 0)
 _TARGET_VELOCITY, _TARGET_TORQUE = (0x60FF, 0), (0x6071, 0)
@@ -252,7 +251,7 @@ def _switch_on_temperature(drive: NodeObjects) -> None:
     if cob_id is None or word is None or split_word(word)[2] != 16:
         detail = "no TPDO3 with a temperature of 16 bits (1A02h:1): the limit of temperature cannot be kept"
         raise BootError(drive.node, "1A02h:1", detail=detail)
-    wanted = TEMPERATURE_TPDO + drive.node
+    wanted = drive_tpdo3(drive.node).cob_id
     if cob_id & CAN_ID != wanted:
         raise mismatch(
             drive.node, (0x1802, 1), "COB-ID of TPDO3", expected=f"{wanted:X}h", found=f"0x{cob_id:08X}"

@@ -1,4 +1,4 @@
-"""Plays set-points on a bus: socket, clock and signals around `commander.Commander`.
+"""Play set-points on a bus: socket, clock and signals around `commander.Commander`.
 
 One wake-up per cycle: it sleeps until the frames of the cycle should have crossed the wire, takes them by one system call,
 and sends one frame. It sleeps in select when none came, and never polls a clock.
@@ -76,7 +76,7 @@ def play(
 
 
 def _run(bus: str, commander: Commander, taken: list[str], on_progress: Progress | None) -> str:
-    """Until the commander is over; "" or why the bus could not be used any more. Raises MotionError when it never could."""
+    """Run the commander to its end; return "", or why the bus failed. Raises MotionError when it could not be opened."""
     try:
         socket = open_frame_socket(bus, [exact(can_id) for can_id in commander.inputs.identifiers])
     except BusError as refused:
@@ -114,7 +114,7 @@ def _loop(socket: FrameSocket, commander: Commander, taken: list[str], on_progre
 
 
 def _take(socket: FrameSocket) -> list[Frame]:
-    """All frames that have arrived, their stamps on CLOCK_MONOTONIC.
+    """Return all frames that have arrived, their stamps on CLOCK_MONOTONIC.
 
     The stamps are of CLOCK_REALTIME; a frame waits for a millisecond at most, so only a clock that is stepped within that
     moment makes one wrong, and that looks like lateness.
@@ -134,7 +134,7 @@ def _take(socket: FrameSocket) -> list[Frame]:
 
 @contextmanager
 def _signals() -> Iterator[list[str]]:
-    """SIGINT and SIGTERM only write their names into the list while this lasts (in the main thread)."""
+    """Collect SIGINT and SIGTERM by name in a list while this lasts (in the main thread)."""
     taken: list[str] = []
 
     def take(number: int, frame: FrameType | None) -> None:
@@ -153,7 +153,7 @@ def _signals() -> Iterator[list[str]]:
 
 @contextmanager
 def _on_time() -> Iterator[None]:
-    """No garbage collection, and timers without their usual slack of 50 us, while this lasts."""
+    """Switch garbage collection and the timers' usual slack of 50 us off while this lasts."""
     prctl = ctypes.CDLL(None).prctl
     slack = prctl(_PR_GET_TIMERSLACK, 0, 0, 0, 0)
     collecting = gc.isenabled()

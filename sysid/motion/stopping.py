@@ -1,11 +1,11 @@
-"""How both joints are brought to rest and made powerless, at the end of a motion or before it. Pure.
+"""Both joints brought to rest and made powerless: at the end of a motion (`Stopping`), or within it (`PowerOff`). Pure.
 
     ramping      the velocity along a ramp to zero, the current faster than that; then until both joints stand
     braking      quick stop (6040h 2): each drive brakes by itself
-    disabling    power off (6040h 0), until both statuswords say so
+    disabling    power off (6040h 0), until both statuswords confirm it
 
-A drive that does not obey the RPDO is told by SDO, which a node that is pre-operational still answers. If that does not help
-either, our heartbeat ends: the drives then stop by 1016h:2.
+A drive that does not obey the RPDO gets the quick stop by SDO, which a node that is pre-operational still answers. If that
+does not help either, our heartbeat ends: the drives then stop by 1016h:2.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ SETTLE_S: Final = 0.3
 SETTLED_S: Final = 0.02
 """Both joints must have stood for so long before the next step."""
 OFF_S: Final = 0.01
-"""Each drive is told several times to be off."""
+"""Time for several frames to each drive that switch it off."""
 BY_SDO_S: Final = 0.01
-"""A drive that has not left operation enabled by then is told by SDO."""
+"""A drive that has not left operation enabled by then gets the quick stop by SDO."""
 SILENT_S: Final = 0.2
-"""A drive that has not left operation enabled by then hears no more heartbeat of ours."""
+"""A drive that has not left operation enabled by then gets no more heartbeat of ours."""
 
 
 class Phase(Enum):
@@ -66,7 +66,7 @@ class StopRamp:
         self.duration_s = max(abs(velocity_rad_s) / DECELERATION_RAD_S2, UNLOAD_S if current_a else 0.0)
 
     def at(self, elapsed_s: float) -> tuple[float, float]:
-        """Velocity [rad/s] and current [A], elapsed_s after the beginning of the stop."""
+        """Return velocity [rad/s] and current [A], elapsed_s after the beginning of the stop."""
         velocity = self._velocity_rad_s
         left = max(0.0, abs(velocity) - DECELERATION_RAD_S2 * elapsed_s)
         share = max(0.0, 1.0 - elapsed_s / UNLOAD_S)
@@ -91,7 +91,7 @@ class Stopping:
         self._supervision, self._commands, self._timing = supervision, commands, timing
         self._ramp = StopRamp(*start)
         self._ramp_s = 0.0
-        self._told = [False, False]  # by SDO
+        self._sdo_sent = [False, False]
         self._since_ns = self._moved_ns = now_ns
 
     def brake(self, now_ns: int) -> None:
@@ -100,7 +100,7 @@ class Stopping:
             self._enter(Phase.BRAKING, now_ns)
 
     def step(self, turn: int, advance: int, now_ns: int, *, synced: bool) -> bytes | None:
-        """One cycle: the frame for drive `turn`. Without SYNC nothing is measured, and the time alone counts."""
+        """Do one cycle; return the frame for drive `turn`. Without SYNC nothing is measured, and the time alone counts."""
         if not synced or self._supervision.moving() is not None:
             self._moved_ns = now_ns
         if self.phase is Phase.RAMPING:
@@ -134,29 +134,19 @@ class Stopping:
         obeyed = synced and self._supervision.obeyed(turn)
         if not obeyed and synced and elapsed_s > SILENT_S:
             self.silent = True
-        if not obeyed and elapsed_s > BY_SDO_S and not self._told[turn]:
-            self._told[turn] = True
+        if not obeyed and elapsed_s > BY_SDO_S and not self._sdo_sent[turn]:
+            self._sdo_sent[turn] = True
             return self._commands.quick_stop_by_sdo(turn)
         return self._commands.control(turn, QUICK_STOP_WORD)
 
     def _disabling(self, turn: int, now_ns: int, synced: bool) -> bytes | None:
-        """What SYNC does not bring any more, the shell asks by SDO."""
+        """Switch off. Where SYNC is gone, the shell asks for the statuswords by SDO afterwards."""
         elapsed_s = (now_ns - self._since_ns) * 1e-9
         off = synced and elapsed_s > OFF_S and self._supervision.both_off()
         if off or elapsed_s > self._timing.disable_s:
             self.phase = Phase.OVER
             return None
         return self._commands.control(turn, DISABLE_VOLTAGE)
-
-
-# A stretch of a motion in which both drives have no power: out of operation enabled and back, without a jump. Pure.
-#
-#     standing     set-points of zero, until both joints have stood for Timing.still_s
-#     off          6040h 0 to both, until both statuswords say so; then nothing but time, at least half of the stretch
-#     on           6040h 6, 7, 15 to both as at the start, targets zero, until both are in operation enabled
-#
-# Limits and supervision go on meanwhile, but that both drives are in operation enabled. A joint that turns although nothing
-# drives it ends the motion.
 
 
 ON_S: Final = 0.25
@@ -174,8 +164,19 @@ class _Step(Enum):
 
 
 class PowerOff:
-    """One stretch, from set-point `first` to `end` (not included). `index`: set-point in force, all of them zero;
-    `over`: both drives are in operation enabled again and the stretch has ended; `violation`: why it cannot go on.
+    """One stretch of a motion without power, set-points `stretch` = (first, end): out of operation enabled and back.
+
+        standing     set-points of zero, until both joints have stood for Timing.still_s
+        off          6040h 0 to both, until both statuswords confirm it; then nothing but time, at least half of the stretch
+        on           6040h 6, 7, 15 to both as at the start, targets zero, until both are in operation enabled
+
+    Limits and supervision go on meanwhile, but that both drives must be in operation enabled. A joint that turns although
+    nothing drives it ends the motion.
+
+    Attributes:
+        index: set-point in force; all of them are zero.
+        over: both drives are in operation enabled again, and the stretch has ended.
+        violation: why it cannot go on.
     """
 
     def __init__(  # noqa: PLR0917
@@ -202,7 +203,7 @@ class PowerOff:
         return self._step is _Step.STANDING
 
     def step(self, turn: int, advance: int, now_ns: int) -> bytes | None:
-        """One cycle: the frame for drive `turn`; None where there is nothing to say, or with a `violation`."""
+        """Do one cycle; return the frame for drive `turn`, None where none is due, or with a `violation`."""
         self.index = min(self.index + advance, self._end - 1)
         if self._step is _Step.STANDING:
             return self._standing(turn, now_ns)
@@ -263,7 +264,7 @@ class PowerOff:
         return None if word is None else self._commands.control(turn, word)
 
     def _turning(self) -> Violation | None:
-        """A joint that turns although nothing drives it."""
+        """Return a violation for a joint that turns although nothing drives it."""
         for drive in self._inputs.drives:
             if not -FREE_RAD_S <= drive.velocity_rad_s <= FREE_RAD_S:
                 text = f"velocity {drive.velocity_rad_s:.3f} rad/s without power, limit {FREE_RAD_S:g} rad/s"

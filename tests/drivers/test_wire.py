@@ -5,7 +5,7 @@ import random
 import pytest
 
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_RTR_FLAG, FRAME, arbitration_key, pack, stuffed_bits
-from jtqd.drivers.hub import WireModel
+from jtqd.drivers.wire import WireModel
 
 SEED = 42
 SYNC = pack(0x080)  # 51 bits = 51 us at 1 Mbit/s

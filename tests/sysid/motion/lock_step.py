@@ -12,7 +12,7 @@ import numpy as np
 from jtqd.drivers.boot_procedure import BusSettings, NodeBoot
 from jtqd.drivers.devices import DriveProfile, SensorProfile
 from jtqd.drivers.frame import FRAME
-from jtqd.drivers.sdo import SdoAbort
+from jtqd.drivers.sdo import Transfer
 from jtqd.models.files import shipped
 from jtqd.sim_can.bench import Bench
 from jtqd.sim_can.plant_file import load_plant
@@ -43,29 +43,27 @@ def plateau(
     return Setpoints(joint, velocity * shape, current * shape)
 
 
+Frames = list[tuple[int, bytes, int]]
+"""COB-ID, data and time of each."""
+
+
 class BenchAccess:
-    """SDO to one node of a bench in memory; the bench's clock goes on by what `sleep` is told."""
+    """SDO to one node of a bench in memory; the bench's clock advances by what `sleep` is called with."""
 
     def __init__(self, lock: LockStep, node: int) -> None:
         self.lock, self.node = lock, node
 
     def read(self, index: int, subindex: int) -> bytes:
-        reply = self._ask(bytes([0x40]) + index.to_bytes(2, "little") + bytes([subindex]) + bytes(4))
-        if reply[0] == 0x41:  # segmented: the device name, which nobody needs here
-            return b"?"
-        return reply[4 : 8 - (reply[0] >> 2 & 3)]
+        return self._run(Transfer(index, subindex))
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
-        head = bytes([0x23 | (4 - len(data)) << 2]) + index.to_bytes(2, "little") + bytes([subindex])
-        self._ask(head + data.ljust(4, b"\0"))
+        self._run(Transfer(index, subindex, data))
 
-    def _ask(self, request: bytes) -> bytes:
-        for can_id, data, _ in self.lock.to_bench(0x600 + self.node, request):
-            if can_id == 0x580 + self.node:
-                if data[0] == 0x80:
-                    raise SdoAbort(int.from_bytes(data[4:], "little"))
-                return data
-        raise AssertionError("no answer")
+    def _run(self, transfer: Transfer) -> bytes:
+        while not transfer.done:
+            frames = self.lock.to_bench(0x600 + self.node, transfer.request)
+            assert any(transfer.answer(data) for can_id, data, _ in frames if can_id == 0x580 + self.node)
+        return transfer.value
 
 
 class LockStep:
@@ -80,12 +78,10 @@ class LockStep:
         self.now = 1_000 * MS
         self.counter = 0
         self.sent: list[tuple[int, int, bytes]] = []
-        self.filter: Callable[[list[tuple[int, bytes, int]]], list[tuple[int, bytes, int]]] = lambda frames: (
-            frames
-        )
+        self.filter: Callable[[Frames], Frames] = lambda frames: frames
         self.sync_runs = True
         self.deaf = False
-        self.waiting: list[tuple[int, bytes, int]] = []
+        self.waiting: Frames = []
         self.bench.tick(self.now)
         settings = BusSettings(0x20, counter_overflow=240)
         for node in (1, 2, 3):
@@ -98,14 +94,14 @@ class LockStep:
         self.now += round(duration_s * 1e9)
         self.waiting += self.texts(self.bench.tick(self.now))
 
-    def texts(self, frames: list[bytes]) -> list[tuple[int, bytes, int]]:
+    def texts(self, frames: list[bytes]) -> Frames:
         out = []
         for frame in frames:
             can_id, length, data = FRAME.unpack(frame)
             out.append((can_id, data[:length], self.now))
         return out
 
-    def to_bench(self, can_id: int, data: bytes) -> list[tuple[int, bytes, int]]:
+    def to_bench(self, can_id: int, data: bytes) -> Frames:
         return self.texts(self.bench.on_frame(can_id, data, self.now, self.now))
 
     def access(self, node: int) -> BenchAccess:

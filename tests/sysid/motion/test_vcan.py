@@ -14,7 +14,7 @@ from jtqd.drivers.frame import worst_case_bits
 from jtqd.sysid.motion.setpoints import Limits
 from jtqd.sysid.motion.shell import play
 from tests.paths import ROOT
-from tests.sysid.motion.motion_helpers import plateau
+from tests.sysid.motion.lock_step import plateau
 
 INTERFACE = os.environ.get("JTQD_CAN_INTERFACE", "vcan0")
 LIMITS = Limits(current_a=9.0, velocity_rad_s=3.3, torque_nm=100.0, travel_rad=60.0, temperature_c=70.0)
@@ -105,7 +105,7 @@ def test_a_motion_in_exact_time(tmp_path: Path, jtqd: subprocess.Popen[str]) -> 
 PLAY = """
 from jtqd.sysid.motion.setpoints import Limits
 from jtqd.sysid.motion.shell import play
-from tests.sysid.motion.motion_helpers import plateau
+from tests.sysid.motion.lock_step import plateau
 play({interface!r}, plateau(1.0, 2.0, hold_ms=60_000), Limits(9.0, 3.3, 100.0, 100.0))
 """
 

@@ -9,7 +9,7 @@ import pytest
 from jtqd.sim_can import drive_node as cia402
 from jtqd.sysid.motion.setpoints import MotionError, MotionResult, Setpoints
 from jtqd.sysid.motion.stopping import Phase
-from tests.sysid.motion.motion_helpers import MS, WARM, WIDE, LockStep, plateau
+from tests.sysid.motion.lock_step import MS, WARM, WIDE, LockStep, plateau
 
 OFF = (cia402.SWITCH_ON_DISABLED, cia402.SWITCH_ON_DISABLED)
 RPDOS = {0x201, 0x202, 0x301, 0x302}

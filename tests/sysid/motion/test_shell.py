@@ -23,7 +23,7 @@ from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.models.files import shipped
 from jtqd.sysid.motion.setpoints import Limits, MotionError, Timing
 from jtqd.sysid.motion.shell import play
-from tests.sysid.motion.motion_helpers import plateau
+from tests.sysid.motion.lock_step import plateau
 
 pytestmark = pytest.mark.native
 

@@ -13,8 +13,7 @@ from jtqd.sim_can.plant_file import load_plant
 from jtqd.sysid.campaign.plan import Off, Plateau, Rest, Run, check_run, expand
 from jtqd.sysid.motion.setpoints import Mark, Setpoints
 from jtqd.sysid.motion.stopping import Phase
-from tests.sysid.motion.motion_helpers import MS, PLANT, WIDE, LockStep, plateau
-from tests.sysid.motion.motion_stop_helpers import Frames
+from tests.sysid.motion.lock_step import MS, PLANT, WIDE, Frames, LockStep, plateau
 
 BOTH_OFF = (cia402.SWITCH_ON_DISABLED, cia402.SWITCH_ON_DISABLED)
 BOTH_ON = (cia402.OPERATION_ENABLED, cia402.OPERATION_ENABLED)
