@@ -260,6 +260,17 @@ THE_BUS: Final = Subject("bus", joints=3)
 THE_LOOP, THE_RECORDER, THE_MACHINE = Subject("loop"), Subject("recorder"), Subject("machine")
 
 
+SHOWN_BY_COUNTERS: Final = {
+    "bus_errors": ("bus_down", THE_BUS),
+    "foreign_sync": ("foreign_sync", THE_BUS),
+    "rx_dropped": ("receive_overrun", THE_BUS),
+    "tx_dropped": ("transmit_overrun", THE_BUS),
+    "sync_errors": ("sync_late", THE_BUS),
+    "missed": ("late_loop", THE_LOOP),
+}
+"""Counter of the loop -> condition that its rise shows, subject."""
+
+
 @dataclass(frozen=True)
 class Condition:
     """One that is present; `since_ns` is CLOCK_MONOTONIC."""
