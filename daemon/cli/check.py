@@ -35,8 +35,7 @@ from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.loop import realtime
 from jtqd.daemon.loop.realtime import stolen_s
 from jtqd.daemon.shared.child_process import Child, ChildError
-from jtqd.daemon.shared.reasons import NMT_STATES
-from jtqd.daemon.shared.snapshot import LATE_BIN_NS, SnapshotError, SnapshotReader, View
+from jtqd.daemon.shared.snapshot import LATE_BIN_NS, NMT_STATES, SnapshotError, SnapshotReader, View
 from jtqd.drivers.bus_load import LIMIT
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_SFF_MASK
 from jtqd.drivers.frame_socket import BusError, FrameSocket, open_frame_socket

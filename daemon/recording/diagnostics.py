@@ -16,8 +16,7 @@ from jtqd.daemon.recording.parts import MEGABYTE
 from jtqd.daemon.recording.progress import Account
 from jtqd.daemon.shared import notices
 from jtqd.daemon.shared.conditions import CATALOGUE, SHOWN_BY_COUNTERS, Condition, worst
-from jtqd.daemon.shared.reasons import NMT_STATES, OPERATIONAL
-from jtqd.daemon.shared.snapshot import BUS_COUNTERS, View
+from jtqd.daemon.shared.snapshot import BUS_COUNTERS, NMT_STATES, OPERATIONAL, View
 
 OK, WARN, ERROR, STALE = range(4)
 _OF_THE_BUS = (*BUS_COUNTERS, "bits_worst_case")

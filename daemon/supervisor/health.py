@@ -25,8 +25,6 @@ from jtqd.daemon.shared.conditions import (
 )
 from jtqd.daemon.shared.cycle_record import FLAG_TEMPERATURE, TEMPERATURE_LIFE_S
 from jtqd.daemon.shared.reasons import (
-    NMT_STATES,
-    NOT_OPERATIONAL,
     degraded_reason,
     drive_reason,
     fault_meanings,
@@ -34,7 +32,7 @@ from jtqd.daemon.shared.reasons import (
     stale_reason,
     unready_reason,
 )
-from jtqd.daemon.shared.snapshot import InputView, JointView, View
+from jtqd.daemon.shared.snapshot import NMT_STATES, NOT_OPERATIONAL, InputView, JointView, View
 from jtqd.drivers.emcy import PDO_LONG, PDO_SHORT, PDO_TIMEOUT
 from jtqd.estimator import status as st
 
