@@ -12,8 +12,7 @@ from jtqd.daemon.bus.boot import bus_load_of
 from jtqd.daemon.cli.checks import FAIL, GOOD, SKIP, WARN, CheckResult, plural, share
 from jtqd.daemon.cli.traffic import SYNC, NodeCount, PdoCount, TimeHistogram, Timing, Traffic, described
 from jtqd.daemon.config import Config
-from jtqd.daemon.shared.reasons import NMT_STATES
-from jtqd.daemon.shared.snapshot import LATE_BIN_NS, View
+from jtqd.daemon.shared.snapshot import LATE_BIN_NS, NMT_STATES, View
 from jtqd.drivers.bus_load import LIMIT
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_SFF_MASK
 from jtqd.estimator.status import NAMES, PUBLISHED

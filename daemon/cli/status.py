@@ -34,9 +34,16 @@ from jtqd.daemon.cli.reading import (
     on_bus,
 )
 from jtqd.daemon.shared.notices import ERROR, WARNING, Notice
-from jtqd.daemon.shared.reasons import NMT_STATES, drive_state, joint_reason, silent_s
+from jtqd.daemon.shared.reasons import drive_state, joint_reason, silent_s
 from jtqd.daemon.shared.runtime_dir import About
-from jtqd.daemon.shared.snapshot import BUS_COUNTERS, LATE_BIN_NS, WORK_BIN_NS, SnapshotReader, View
+from jtqd.daemon.shared.snapshot import (
+    BUS_COUNTERS,
+    LATE_BIN_NS,
+    NMT_STATES,
+    WORK_BIN_NS,
+    SnapshotReader,
+    View,
+)
 from jtqd.daemon.supervisor.table import COLOURS, bus_load, plain_line
 from jtqd.estimator.status import NAMES, PUBLISHED
 

@@ -39,6 +39,7 @@ from jtqd.daemon.recording.messages import (
 )
 from jtqd.daemon.shared import cycle_record
 from jtqd.daemon.shared import cycle_record as cycle
+from jtqd.daemon.shared.conditions import Condition, read_conditions
 from jtqd.daemon.shared.notices import Notice, NoticesError, NoticesReader
 from jtqd.daemon.shared.ring import RingError, RingReader
 from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader, View
@@ -168,7 +169,12 @@ class LiveStream:
         ]
 
     def diagnose(
-        self, view: View, work_us: Sequence[float], late_us: Sequence[float], now_ns: int
+        self,
+        view: View,
+        work_us: Sequence[float],
+        late_us: Sequence[float],
+        now_ns: int,
+        conditions: Sequence[Condition] = (),
     ) -> Message:
         """The once-per-second /diagnostics of loop, bus, joints and nodes; what the recorder does is in the log only.
 
@@ -176,8 +182,11 @@ class LiveStream:
             view: of the loop's counters.
             work_us, late_us: p50, p99 and maximum of the work per cycle and of the SYNC's lateness [us].
             now_ns: CLOCK_REALTIME.
+            conditions: that are present.
         """
-        statuses = self._diagnostics.of_the_loop(view, work_us=work_us, late_us=late_us, now_ns=now_ns)
+        statuses = self._diagnostics.of_the_loop(
+            view, work_us=work_us, late_us=late_us, now_ns=now_ns, conditions=conditions
+        )
         return Message(schemas.DIAGNOSTICS.number, now_ns, diagnostics(now_ns, statuses))
 
 
@@ -280,6 +289,7 @@ class Source:
     def __init__(self, request: dict[str, Any]) -> None:
         self._ring = RingReader(Path(request["ring"]), cycle_record.RECORD_SIZE)
         self._snapshot = SnapshotReader(Path(request["snapshot"]))
+        self._directory = Path(request["snapshot"]).parent
         nodes = [Node(int(number), str(name)) for number, name in request["nodes"]]
         self._stream = LiveStream(request["bus"], nodes, _JOINT_NAMES, request["gear_ratios"])
         self._notices: NoticesReader | None = None
@@ -304,7 +314,8 @@ class Source:
         if now - self._diagnosed >= _DIAGNOSIS_S:
             self._diagnosed = now
             work, late = self._snapshot.work_us(*_QUANTILES), self._snapshot.late_us(*_QUANTILES)
-            made.append(self._stream.diagnose(self._snapshot.read(), work, late, time.time_ns()))
+            view, conditions = self._snapshot.read(), read_conditions(self._directory)
+            made.append(self._stream.diagnose(view, work, late, time.time_ns(), conditions))
         return made
 
 

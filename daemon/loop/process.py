@@ -5,7 +5,7 @@ standard output with one JSON line when it is ready, reads the boot report as on
 ends with one JSON line of results. It has no second thread, logs nothing while it runs, and shares only memory with
 other processes.
 
-A request with the key `handover` makes it the successor of a running loop (`daemon/reload/successor.py`).
+The successor of a running loop is a process of its own with the same cycle: `jtqd.daemon.reload.successor`.
 """
 
 from __future__ import annotations
@@ -335,15 +335,10 @@ def read_line(stop: Stop) -> str | None:
     return None
 
 
-def main(argv: list[str]) -> int:
+def main(argv: list[str], go: Callable[[dict[str, Any]], int] = serve) -> int:
     """Entry of the process; every foreseeable failure is one JSON line and exit status 1."""
-    request = json.loads(argv[0])
     try:
-        if "handover" in request:
-            from jtqd.daemon.reload.successor import succeed
-
-            return succeed(request)
-        return serve(request)
+        return go(json.loads(argv[0]))
     except (ConfigError, NetworkError, BusError) as error:
         answer(failed=str(error))
         return 1

@@ -1,6 +1,8 @@
-"""What /diagnostics says once a second: loop, bus, both joints, every node, recorder and disk, one status each. Pure.
+"""Statuses of /diagnostics, once a second: loop, bus, both joints, every node, recorder and disk. Pure.
 
-Levels follow what happened since the last time: a slot that was missed an hour ago is in the count, not in the level.
+A view of the conditions (`jtqd.daemon.shared.conditions`): the worst one of a subject is its level and its text. A condition
+that shows by a counter counts when the counter has risen since the last message: a slot that was missed an hour ago is in
+the count, not in the level.
 """
 
 from __future__ import annotations
@@ -12,12 +14,15 @@ from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.messages import Status
 from jtqd.daemon.recording.parts import MEGABYTE
 from jtqd.daemon.recording.progress import Account
-from jtqd.daemon.shared.snapshot import BUS_COUNTERS, View
+from jtqd.daemon.shared import notices
+from jtqd.daemon.shared.conditions import CATALOGUE, SHOWN_BY_COUNTERS, Condition, worst
+from jtqd.daemon.shared.snapshot import BUS_COUNTERS, NMT_STATES, OPERATIONAL, View
 
 OK, WARN, ERROR, STALE = range(4)
 _OF_THE_BUS = (*BUS_COUNTERS, "bits_worst_case")
 _JOINT_LEVELS = {"VALID": OK, "STANDSTILL": OK, "STALE": STALE, "DRIVE_FAULT": ERROR, "INVALID": ERROR}
-_NMT_STATES = {0: "initialising", 4: "stopped", 5: "operational", 127: "pre-operational"}
+_LEVELS = {notices.INFO: OK, notices.WARNING: WARN, notices.ERROR: ERROR}
+"""Of severities."""
 _SILENT_S = 1.0
 _NEAR = 2.0
 """Times the reserve: less free space than this is a warning."""
@@ -74,6 +79,7 @@ class Diagnostics:
         work_us: Sequence[float],
         late_us: Sequence[float],
         now_ns: int,
+        conditions: Sequence[Condition] = (),
     ) -> list[Status]:
         """All of them; those of the loop only where there is a snapshot.
 
@@ -81,54 +87,67 @@ class Diagnostics:
             view: of the loop.
             work_us, late_us: its p50, p99 and maximum.
             now_ns: CLOCK_REALTIME.
+            conditions: that are present.
         """
         result = []
         if view is not None:
-            result = self.of_the_loop(view, work_us=work_us, late_us=late_us, now_ns=now_ns)
+            result = self.of_the_loop(
+                view, work_us=work_us, late_us=late_us, now_ns=now_ns, conditions=conditions
+            )
         result += [self._recorder(account, recorder), self._disk(recorder)]
         self._lost = account.lost
         return result
 
     def of_the_loop(
-        self, view: View, *, work_us: Sequence[float], late_us: Sequence[float], now_ns: int
+        self,
+        view: View,
+        *,
+        work_us: Sequence[float],
+        late_us: Sequence[float],
+        now_ns: int,
+        conditions: Sequence[Condition] = (),
     ) -> list[Status]:
         """Those of loop, bus, joints and nodes; arguments as of `statuses`."""
-        result = [self._loop(view, work_us, late_us), self._bus_status(view)]
-        result += [self._joint(view, number) for number in (1, 2)]
-        result += [self._node(view, node, now_ns) for node in self._nodes]
+        found = [*conditions, *self._risen(view)]
+        result = [self._loop(view, work_us, late_us, found), self._bus_status(view, found)]
+        result += [self._joint(view, number, found) for number in (1, 2)]
+        result += [self._node(view, node, now_ns, found) for node in self._nodes]
         self._before, self._cycle = dict(view.counters), view.cycle
         return result
 
-    def _grown(self, view: View, *names: str) -> list[str]:
-        return [name for name in names if view.counters.get(name, 0) > self._before.get(name, 0)]
+    def _risen(self, view: View) -> list[Condition]:
+        """Conditions that show by a counter that has risen since the last message."""
+        if not self._before:
+            return []
+        return [
+            Condition(name, subject.name, CATALOGUE[name].severity, CATALOGUE[name].text.format(counter), 0)
+            for counter, (name, subject) in SHOWN_BY_COUNTERS.items()
+            if view.counters.get(counter, 0) > self._before.get(counter, 0)
+        ]
 
-    def _loop(self, view: View, work_us: Sequence[float], late_us: Sequence[float]) -> Status:
-        level, text = OK, "running"
+    def _loop(
+        self, view: View, work_us: Sequence[float], late_us: Sequence[float], found: Sequence[Condition]
+    ) -> Status:
+        level, text = _level(found, "loop", "running")
+        missed = view.counters["missed"] - self._before.get("missed", 0)
+        if self._before and missed:
+            text = f"{missed} {'slot' if missed == 1 else 'slots'} missed since the last message"
         if view.cycle == self._cycle:
             level, text = STALE, "the loop stands still"
-        elif self._before and self._grown(view, "missed"):
-            missed = view.counters["missed"] - self._before["missed"]
-            level, text = WARN, f"{missed} slots missed since the last message"
         values: dict[str, float | str] = {"cycle": view.cycle}
         values |= {name: count for name, count in view.counters.items() if name not in _OF_THE_BUS}
         for name, figures in (("work", work_us), ("late", late_us)):
             values |= dict(zip((f"{name}_p50_us", f"{name}_p99_us", f"{name}_max_us"), figures, strict=True))
         return Status("jtqd: loop", self._bus, level, text, values)
 
-    def _bus_status(self, view: View) -> Status:
-        level, text = OK, "running"
-        if self._before:
-            faults = self._grown(
-                view, "bus_errors", "tx_dropped", "rx_dropped", "foreign_sync", "sync_errors"
-            )
-            if faults:
-                level, text = WARN, "since the last message: " + ", ".join(faults)
+    def _bus_status(self, view: View, found: Sequence[Condition]) -> Status:
+        level, text = _level(found, "bus", "running")
         values: dict[str, float | str] = {
             name: view.counters[name] for name in _OF_THE_BUS if name in view.counters
         }
         return Status("jtqd: bus", self._bus, level, text, values | {"worst_case_load": view.worst_load})
 
-    def _joint(self, view: View, number: int) -> Status:
+    def _joint(self, view: View, number: int, found: Sequence[Condition]) -> Status:
         joint = view.joints[number - 1]
         name = schemas.STATUS_NAMES.get(joint.status, str(joint.status))
         values: dict[str, float | str] = {
@@ -141,17 +160,19 @@ class Diagnostics:
             "sensor_status": joint.sensor_status,
             "input_flags": joint.input_flags,
         }
+        level, text = _level(found, f"joint {number}", "")
         title, hardware = f"jtqd: joint {number}", self._joints[number - 1]
-        return Status(title, hardware, _JOINT_LEVELS.get(name, WARN), name, values)
+        by_status = _JOINT_LEVELS.get(name, WARN)
+        shown = f"{name}: {text}" if text else name
+        return Status(title, hardware, by_status or level, shown, values)
 
-    def _node(self, view: View, node: Node, now_ns: int) -> Status:
+    def _node(self, view: View, node: Node, now_ns: int, found: Sequence[Condition]) -> Status:
         state = view.node_states[node.node_id]
-        name = _NMT_STATES.get(state, f"state {state}")
+        name = NMT_STATES.get(state, f"state {state}")
         heard = view.node_heard_ns[node.node_id]
         age_s = (now_ns - heard) * 1e-9 if heard else float("nan")
-        level, text = OK if state == 5 else WARN, name
-        if node.node_id in view.unconfigured:
-            level, text = WARN, "restarted, waits for its configuration"
+        level, text = _level(found, f"node {node.node_id}", name)
+        level = max(level, OK if state == OPERATIONAL else WARN)
         if not age_s <= _SILENT_S:
             level, text = STALE, "no heartbeat"
         values: dict[str, float | str] = {"nmt_state": name, "heartbeat_age_s": age_s}
@@ -193,3 +214,9 @@ class Diagnostics:
             "reserve_mb": state.reserve / MEGABYTE,
         }
         return Status("jtqd: disk", self._bus, level, text, values)
+
+
+def _level(found: Sequence[Condition], subject: str, otherwise: str) -> tuple[int, str]:
+    """Level and text of the worst condition of a subject; OK and `otherwise` where there is none."""
+    condition = worst(found, subject)
+    return (OK, otherwise) if condition is None else (_LEVELS[condition.severity], condition.text)

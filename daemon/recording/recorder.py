@@ -33,6 +33,7 @@ from jtqd.daemon.recording.request import RecorderRequest, RequestError
 from jtqd.daemon.recording.schemas import definitions
 from jtqd.daemon.shared import cycle_record
 from jtqd.daemon.shared.child_process import Child, ChildError
+from jtqd.daemon.shared.conditions import read_conditions
 from jtqd.daemon.shared.notices import NoticesError, NoticesReader
 from jtqd.daemon.shared.ring import RingError, RingReader
 from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader
@@ -145,8 +146,9 @@ class Session:
         work = nothing if snapshot is None else snapshot.work_us(*_QUANTILES)
         late = nothing if snapshot is None else snapshot.late_us(*_QUANTILES)
         view = None if snapshot is None else snapshot.read()
+        conditions = [] if request.snapshot is None else read_conditions(request.snapshot.parent)
         statuses = self._diagnostics.statuses(
-            view, self.account, state, work_us=work, late_us=late, now_ns=now_ns
+            view, self.account, state, work_us=work, late_us=late, now_ns=now_ns, conditions=conditions
         )
         self.journal.builder.add(schemas.DIAGNOSTICS.number, now_ns, diagnostics(now_ns, statuses))
 

@@ -98,7 +98,7 @@ class Reload:
             "config_sha256": new.files_sha256,
             "handover": str(Path(self._request["ring"]).with_name(SOCKET)),
         }
-        self._child = self._start_child("jtqd.daemon.loop.process", [json.dumps(request)], "the new loop")
+        self._child = self._start_child("jtqd.daemon.reload.successor", [json.dumps(request)], "the new loop")
         self._stage, self._until_s = "to be built", time.monotonic() + READY_S
 
     @property

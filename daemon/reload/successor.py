@@ -4,6 +4,9 @@ build        estimators from the new files; whatever is wrong with them ends her
 shadow       step them through the ring of cycles (`daemon/reload/successor.py`), at a priority below the running loop's
 stand by     `answer(standing_by=...)`; the supervisor then tells the running loop to hand over (SIGUSR2)
 take over    see `daemon/reload/handover.py`; the cycle that follows is ours
+
+Started by the supervisor as `python -m jtqd.daemon.reload.successor` with the request of the loop as its only argument, and
+`handover` in it: the socket of the running loop.
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ from __future__ import annotations
 import json
 import os
 import select
+import sys
 import time
 from collections import deque
 from collections.abc import Sequence
@@ -29,6 +33,7 @@ from jtqd.daemon.loop.process import (
     build_estimators,
     finish,
     loop_filters,
+    main,
     make_duties,
     read_line,
     run,
@@ -228,3 +233,7 @@ class _Overheard:
         if late:
             frames, stamps_ns, own = zip(*late, strict=True)
             self._cycle.between(bytearray(b"".join(frames)), stamps_ns, own, len(late))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:], succeed))

@@ -33,8 +33,6 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from jtqd.daemon.shared.notices import ERROR, INFO, WARNING
-from jtqd.drivers import emcy
-from jtqd.drivers.devices import SYNC_COB_ID
 
 FILE = "conditions.json"
 """Name of the file in the runtime directory of a daemon."""
@@ -49,11 +47,15 @@ DEVIATION_SIGMAS, DEVIATION_S = 3.0, 1.0
 """`deviation`: so many sigmas between estimate and torque sensor, for so long."""
 
 
+_COMMUNICATION, _MANUFACTURER = 0x10, 0x80
+"""Bits of the error register 1001h (CiA 301)."""
+
+
 class Emcy(NamedTuple):
-    """How a condition shows in EMCY messages of jtqd: code, bits of 1001h, and bytes 5 to 7."""
+    """How a condition shows in EMCY messages of jtqd: error code, bits of 1001h, and bytes 5 to 7."""
 
     code: int
-    register: int = emcy.COMMUNICATION
+    register: int = _COMMUNICATION
     detail: int = 0
     """Added to the subject's number."""
     names_joints: bool = True
@@ -102,7 +104,7 @@ _ROWS = (
         "no torque: {}",
         "no fault any more",
         topic="fault",
-        emcy=Emcy(emcy.JOINT_FAULT, emcy.MANUFACTURER),
+        emcy=Emcy(0xFF01, _MANUFACTURER),
     ),
     Definition(
         "fault_latched",
@@ -111,7 +113,7 @@ _ROWS = (
         "latched: {}; `jtq control reset` releases it",
         "latched faults released",
         topic="fault",
-        emcy=Emcy(emcy.FAULT_LATCHED, emcy.MANUFACTURER),
+        emcy=Emcy(0xFF02, _MANUFACTURER),
     ),
     Definition(
         "drive_fault", JOINT, ERROR, "{}", "drive not in fault any more", topic="fault", hold_s=_HOLD_S
@@ -134,7 +136,7 @@ _ROWS = (
         "no heartbeat for {}",
         "heartbeat is back",
         topic="heartbeat",
-        emcy=Emcy(emcy.HEARTBEAT_LOST),
+        emcy=Emcy(0x8130),
     ),
     Definition(
         "node_doubled",
@@ -143,7 +145,7 @@ _ROWS = (
         "{}: are there two nodes with this node-ID?",
         "one producer of heartbeats again",
         topic="heartbeat",
-        emcy=Emcy(emcy.COB_ID_COLLISION, detail=0x700, names_joints=False),
+        emcy=Emcy(0x8150, detail=0x700, names_joints=False),
     ),
     Definition(
         "node_changed",
@@ -151,7 +153,7 @@ _ROWS = (
         WARNING,
         "{}",
         topic="boot",
-        emcy=Emcy(emcy.NODE_CHANGED, emcy.MANUFACTURER),
+        emcy=Emcy(0xFF03, _MANUFACTURER),
     ),
     Definition("node_absent", NODE, WARNING, "optional node, not there", topic="boot", logged=False),
     Definition("node_unconfigured", NODE, WARNING, "{}", topic="boot", logged=False),
@@ -163,26 +165,26 @@ _ROWS = (
         WARNING,
         "no valid frame for {} cycles in a row",
         topic="pdo",
-        emcy=Emcy(emcy.PDO_TIMEOUT),
+        emcy=Emcy(0x8250),
         logged=False,
     ),
     Definition(
         "pdo_short",
         PDO,
         WARNING,
-        f"{emcy.name_of(emcy.PDO_SHORT)} ({emcy.PDO_SHORT:04X}h): it is not used",
+        "PDO not processed, too short (8210h): it is not used",
         "length as mapped again",
         topic="pdo",
-        emcy=Emcy(emcy.PDO_SHORT),
+        emcy=Emcy(0x8210),
     ),
     Definition(
         "pdo_long",
         PDO,
         WARNING,
-        f"{emcy.name_of(emcy.PDO_LONG)} ({emcy.PDO_LONG:04X}h): it is not used",
+        "PDO too long (8220h): it is not used",
         "length as mapped again",
         topic="pdo",
-        emcy=Emcy(emcy.PDO_LONG),
+        emcy=Emcy(0x8220),
     ),
     # Bus
     Definition("bus_warning", BUS, WARNING, "error warning, before: {}", "error active", topic="bus"),
@@ -193,7 +195,7 @@ _ROWS = (
         "error passive, before: {}",
         "error active",
         topic="bus",
-        emcy=Emcy(emcy.CAN_PASSIVE, names_joints=False),
+        emcy=Emcy(0x8120, names_joints=False),
     ),
     Definition("bus_off", BUS, ERROR, "bus-off, before: {}", "error active", topic="bus"),
     Definition("bus_down", BUS, ERROR, "interface down, before: {}", "error active", topic="bus"),
@@ -204,7 +206,7 @@ _ROWS = (
         "another SYNC producer: no input of its cycles is used",
         "no other SYNC producer any more",
         topic="sync",
-        emcy=Emcy(emcy.COB_ID_COLLISION, detail=SYNC_COB_ID),
+        emcy=Emcy(0x8150, detail=0x080),
     ),
     Definition(
         "sync_late", BUS, WARNING, "the own SYNC waits in the transmit queue", topic="sync", logged=False
@@ -216,7 +218,7 @@ _ROWS = (
         "received frames were lost: the loop's socket was read too late",
         "no received frame lost any more",
         topic="bus",
-        emcy=Emcy(emcy.CAN_OVERRUN, detail=1),
+        emcy=Emcy(0x8110, detail=1),
     ),
     Definition(
         "transmit_overrun",
@@ -225,7 +227,7 @@ _ROWS = (
         "frames could not be sent: the transmit queue is full",
         "frames are sent again",
         topic="bus",
-        emcy=Emcy(emcy.CAN_OVERRUN, detail=2),
+        emcy=Emcy(0x8110, detail=2),
     ),
     # Loop, recorder, machine
     Definition("loop_stopped", LOOP, ERROR, "no cycle for {}", "cycles again", topic="loop"),
@@ -258,6 +260,17 @@ class Subject(NamedTuple):
 
 THE_BUS: Final = Subject("bus", joints=3)
 THE_LOOP, THE_RECORDER, THE_MACHINE = Subject("loop"), Subject("recorder"), Subject("machine")
+
+
+SHOWN_BY_COUNTERS: Final = {
+    "bus_errors": ("bus_down", THE_BUS),
+    "foreign_sync": ("foreign_sync", THE_BUS),
+    "rx_dropped": ("receive_overrun", THE_BUS),
+    "tx_dropped": ("transmit_overrun", THE_BUS),
+    "sync_errors": ("sync_late", THE_BUS),
+    "missed": ("late_loop", THE_LOOP),
+}
+"""Counter of the loop -> condition that its rise shows, subject."""
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,9 @@ from jtqd.daemon.shared.cycle_record import (
     NAMES,
 )
 from jtqd.daemon.shared.runtime_dir import About, AboutJoint
-from jtqd.daemon.shared.snapshot import JointView, View
+from jtqd.daemon.shared.snapshot import NMT_STATES, NOT_OPERATIONAL, OPERATIONAL, JointView, View
 from jtqd.estimator import status as st
 
-NMT_STATES = {0: "boot-up", 4: "stopped", 5: "operational", 127: "pre-operational"}
-"""Heartbeat states of CiA 301."""
-OPERATIONAL, NOT_OPERATIONAL = 5, (4, 127)
-"""Heartbeat states in which a node sends its PDOs, and in which it sends none."""
 SILENT_AFTER = 3.0
 """Heartbeat periods without a heartbeat after which a node is silent."""
 _FIRST_CYCLES = 20

@@ -21,6 +21,11 @@ from typing import NamedTuple
 STATUS_CODES = 16
 MAX_NODE = 128
 
+NMT_STATES = {0: "boot-up", 4: "stopped", 5: "operational", 127: "pre-operational"}
+"""Heartbeat states of CiA 301."""
+OPERATIONAL, NOT_OPERATIONAL = 5, (4, 127)
+"""Heartbeat states in which a node sends its PDOs, and in which it sends none."""
+
 COUNTERS = (
     "cycles",
     "missed",

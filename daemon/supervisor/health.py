@@ -17,7 +17,7 @@ from jtqd.daemon.loop.input_pdos import input_pdos, joint_temperatures, sensor_i
 from jtqd.daemon.shared.conditions import (
     DEVIATION_S,
     DEVIATION_SIGMAS,
-    THE_BUS,
+    SHOWN_BY_COUNTERS,
     THE_LOOP,
     THE_RECORDER,
     Conditions,
@@ -25,8 +25,6 @@ from jtqd.daemon.shared.conditions import (
 )
 from jtqd.daemon.shared.cycle_record import FLAG_TEMPERATURE, TEMPERATURE_LIFE_S
 from jtqd.daemon.shared.reasons import (
-    NMT_STATES,
-    NOT_OPERATIONAL,
     degraded_reason,
     drive_reason,
     fault_meanings,
@@ -34,7 +32,7 @@ from jtqd.daemon.shared.reasons import (
     stale_reason,
     unready_reason,
 )
-from jtqd.daemon.shared.snapshot import InputView, JointView, View
+from jtqd.daemon.shared.snapshot import NMT_STATES, NOT_OPERATIONAL, InputView, JointView, View
 from jtqd.drivers.emcy import PDO_LONG, PDO_SHORT, PDO_TIMEOUT
 from jtqd.estimator import status as st
 
@@ -50,14 +48,8 @@ TIMEOUT_CYCLES = 20
 """Cycles in a row without a valid frame of a PDO: timeout (EMCY 8250h)."""
 LENGTH_S = 1.0
 """Errors of the length (EMCY 8210h, 8220h) have ended when no frame of a wrong length came for so long."""
-_COUNTED = (
-    ("foreign_sync", "foreign_sync", THE_BUS),
-    ("rx_dropped", "receive_overrun", THE_BUS),
-    ("tx_dropped", "transmit_overrun", THE_BUS),
-    ("sync_errors", "sync_late", THE_BUS),
-    ("missed", "late_loop", THE_LOOP),
-)
-"""Counter of the loop, condition that is present while it rises, subject."""
+_COUNTED = {counter: row for counter, row in SHOWN_BY_COUNTERS.items() if counter != "bus_errors"}
+"""An interface that is down is observed by `jtqd.daemon.bus.service`, which knows more of it."""
 
 
 def joint_subjects(config: Config) -> tuple[Subject, ...]:
@@ -270,7 +262,7 @@ class Health:
         for change in self._pdos.changes(view.inputs, absent, now_s):
             name = _PDO_CONDITIONS[change.code]
             self._conditions.update(name, change.pdo, change.present, now_s, str(TIMEOUT_CYCLES))
-        for counter, name, subject in _COUNTED:
+        for counter, (name, subject) in _COUNTED.items():
             self._observe_counter(name, subject, view.counters[counter], now_s)
         self._observe_counter("cycles_lost", THE_RECORDER, cycles_lost, now_s)
         for joint, seen, limit_nm in zip(self._joints, view.joints, self._network_limits_nm, strict=True):

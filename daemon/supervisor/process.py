@@ -241,12 +241,18 @@ class Supervisor:
         self._live = None if live is None else LiveKeeper(self._child, live)
         self._say = Say()
         self._tell = Teller(self._say)
-        self._service = Service(
-            config, self._directory, self._instance, self._say, save=self._recorder.save, renew=self._renew
-        )
         self._conditions = Conditions()
         self._conditions_file = ConditionsFile(self._directory)
         self._health = Health(config, self._conditions)
+        self._service = Service(
+            config,
+            self._directory,
+            self._instance,
+            self._say,
+            save=self._recorder.save,
+            renew=self._renew,
+            conditions=self._conditions,
+        )
         signal.signal(signal.SIGHUP, self._on_reload)
 
     def stop(self) -> None:

@@ -8,13 +8,15 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from jtqd.daemon.config import Config
 from jtqd.daemon.reload.files import Reload, ReloadError
 from jtqd.daemon.shared.child_process import Child
+from jtqd.daemon.shared.conditions import CATALOGUE, Condition, Conditions
 from jtqd.daemon.shared.log_lines import ERROR, NOTICE, WARNING, Say
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.daemon.shared.systemd import Notifier
@@ -31,8 +33,14 @@ _GAUGES = frozenset(("work_max_ns", "late_max_ns"))
 _SHARES = (0.5, 0.99, 1.0)
 
 
-def metrics_text(view: View, reader: SnapshotReader, bus: str, recorder_lost: int) -> str:
-    """The whole file; label `bus` tells daemons apart."""
+def metrics_text(
+    view: View,
+    reader: SnapshotReader,
+    bus: str,
+    recorder_lost: int,
+    conditions: Sequence[Condition] = (),
+) -> str:
+    """Text of the whole file; the label `bus` tells daemons apart."""
     label = bus.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ")
     lines: list[str] = []
 
@@ -55,6 +63,13 @@ def metrics_text(view: View, reader: SnapshotReader, bus: str, recorder_lost: in
     )
     metric("sigma_nm", "gauge", "Its standard deviation.", [(at, each.sigma_nm) for at, each in joints])
     metric("status", "gauge", "Status as in the estimate PDO.", [(at, each.status) for at, each in joints])
+    present = Counter(each.name for each in conditions)
+    metric(
+        "condition",
+        "gauge",
+        "Joints, nodes, ... that have this condition now (docs/faults.md).",
+        [(f',name="{name}"', present[name]) for name in CATALOGUE],
+    )
     work = zip(_SHARES, reader.work_us(*_SHARES), strict=True)
     late = zip(_SHARES, reader.late_us(*_SHARES), strict=True)
     metric(
@@ -106,6 +121,7 @@ class Service:
         say: tells the operator.
         save: has the flight recording written; False where there is no recorder.
         renew: called with a new configuration that has come into force.
+        conditions: for the metrics.
     """
 
     def __init__(
@@ -117,8 +133,10 @@ class Service:
         *,
         save: Callable[[], bool],
         renew: Callable[[Config], None],
+        conditions: Conditions,
     ) -> None:
         self._config, self._bus, self._say = config, bus, say
+        self._conditions = conditions
         self._directory, self._save, self._renew = directory, save, renew
         self._notifier = Notifier()
         self._control: ControlServer | None = None
@@ -312,7 +330,8 @@ class Service:
         assert self._reader is not None
         path = self._directory / self._config.metrics_file  # an absolute one stays what it is
         try:
-            write_metrics(path, metrics_text(view, self._reader, self._bus, recorder_lost))
+            present = self._conditions.present()
+            write_metrics(path, metrics_text(view, self._reader, self._bus, recorder_lost, present))
         except OSError as error:
             self._say(f"metrics: {path}: {error.strerror}", WARNING, "metrics")
 

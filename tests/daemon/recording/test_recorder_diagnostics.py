@@ -7,7 +7,8 @@ import pytest
 from jtqd.daemon.recording import messages, schemas
 from jtqd.daemon.recording.diagnostics import Diagnostics, Node, RecorderState
 from jtqd.daemon.recording.progress import Account
-from jtqd.daemon.shared.notices import ERROR, INFO, Notices
+from jtqd.daemon.shared.conditions import Condition
+from jtqd.daemon.shared.notices import ERROR, INFO, WARNING, Notices
 from jtqd.daemon.shared.snapshot import COUNTERS, JointView, Snapshot, SnapshotReader
 from tests.daemon.recording.recorder_bench import DEFINITIONS, messages_of, session_on, statuses_of
 
@@ -34,7 +35,7 @@ class Bench:
     def count(self, name, number):
         self.snapshot.counters[COUNTERS.index(name)] += number
 
-    def look(self, statuses=(2, 6), **recorder):
+    def look(self, statuses=(2, 6), conditions=(), **recorder):
         """One message, a second after the last; {name: (level, text, values)}."""
         self.cycle += 1000
         joint = JointView(*[0] * len(JointView._fields))._replace(torque_nm=1.0, sensor_nm=1.1)
@@ -50,6 +51,7 @@ class Bench:
             work_us=self.reader.work_us(0.5, 0.99, 1.0),
             late_us=self.reader.late_us(0.5, 0.99, 1.0),
             now_ns=NOW,
+            conditions=conditions,
         )
         payload = messages.diagnostics(NOW, found)
         self.sizes.add(len(payload))
@@ -91,7 +93,7 @@ def test_levels_follow_what_happened_since_the_last_message(bench):
     found = bench.look()
     assert levels(found) == {"loop": WARN, "bus": WARN}
     assert found["loop"][1] == "3 slots missed since the last message"
-    assert found["bus"][1] == "since the last message: tx_dropped"
+    assert found["bus"][1] == "frames could not be sent: the transmit queue is full"
     found = bench.look()
     assert levels(found) == {}
     assert found["loop"][2]["missed"] == "3"
@@ -128,8 +130,22 @@ def test_nodes(bench):
     assert found["node 3"][:2] == (STALE, "no heartbeat")
     assert found["node 3"][2]["heartbeat_age_s"] == "1.5"
     bench.heartbeat(3, 5)
-    bench.snapshot.unconfigured[3] = 1
-    assert bench.look()["node 3"][:2] == (WARN, "restarted, waits for its configuration")
+    text = "has restarted and is not configured yet"
+    unready = Condition("node_unconfigured", "node 3", WARNING, text, 0)
+    assert bench.look(conditions=[unready])["node 3"][:2] == (WARN, text)
+
+
+def test_the_worst_condition_of_a_subject_is_its_level_and_text(bench):
+    conditions = [
+        Condition("sensor_lost", "joint 1", WARNING, "torque sensor lost: node 3 is not there", 1),
+        Condition("temperature_lost", "joint 1", WARNING, "temperature lost", 2),
+        Condition("joint_fault", "joint 2", ERROR, "no torque: x", 3),
+        Condition("bus_off", "bus", ERROR, "bus-off, before: error passive", 4),
+    ]
+    found = bench.look(statuses=(2, 15), conditions=conditions)
+    assert found["joint 1"][:2] == (WARN, "VALID: torque sensor lost: node 3 is not there")
+    assert found["joint 2"][:2] == (FAULT, "INVALID: no torque: x")
+    assert found["bus"][:2] == (FAULT, "bus-off, before: error passive")
 
 
 def test_node_that_was_never_heard(bench):

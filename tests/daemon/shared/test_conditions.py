@@ -10,8 +10,12 @@ from jtqd.daemon.shared.conditions import (
     read_conditions,
     worst,
 )
+from jtqd.drivers import emcy
 
 JOINT = Subject("joint 1", 1, 1)
+KNOWN_CODES = {
+    value for name, value in vars(emcy).items() if name.isupper() and isinstance(value, int) and value > 0xFF
+}
 STEP = 1.0 / 16.0  # exact in binary; two of them are longer than what counts as a flicker
 
 
@@ -75,7 +79,9 @@ def test_two_losses_are_two_and_the_next_line_waits_for_its_time():
 
 def test_the_catalogue_is_complete_and_consistent():
     for definition in CATALOGUE.values():
-        assert not (definition.emcy and definition.hold_s), "an EMCY is sent at once"
+        if definition.emcy is not None:
+            assert not definition.hold_s, "an EMCY is sent at once"
+            assert definition.emcy.code in KNOWN_CODES
         assert definition.text.count("{}") <= 1
         assert definition.ended or not definition.logged or definition.name == "node_changed"
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from jtqd.daemon.config import load_config
+from jtqd.daemon.shared.conditions import WARNING, Condition
 from jtqd.daemon.shared.snapshot import COUNTERS, SnapshotReader
 from jtqd.daemon.supervisor.service import metrics_text, write_metrics
 from jtqd.estimator.checked import ConfigError
@@ -19,7 +20,8 @@ def text_of(tmp_path: Path, bus: str = "can0") -> str:
     cycle, _, _ = make(tmp_path, lambda _: inputs())
     turn(cycle, 40)
     reader = SnapshotReader(tmp_path / "snapshot")
-    return metrics_text(reader.read(), reader, bus, 3)
+    present = [Condition("stale_input", f"joint {n}", WARNING, "inputs lost: ...", 0) for n in (1, 2)]
+    return metrics_text(reader.read(), reader, bus, 3, present)
 
 
 def test_every_counter_and_both_joints_in_the_format_of_prometheus(tmp_path: Path) -> None:
@@ -31,6 +33,8 @@ def test_every_counter_and_both_joints_in_the_format_of_prometheus(tmp_path: Pat
     assert 'jtqd_cycles_total{bus="can0"} 40' in lines
     assert 'jtqd_recorder_lost_total{bus="can0"} 3' in lines
     assert 'jtqd_status{bus="can0",joint="2"}' in text
+    assert 'jtqd_condition{bus="can0",name="stale_input"} 2' in lines
+    assert 'jtqd_condition{bus="can0",name="bus_off"} 0' in lines
     named = [line.split()[2] for line in text.splitlines() if line.startswith("# TYPE")]
     assert len(named) == len(set(named))
 
