@@ -1,4 +1,4 @@
-"""`python -m sim_can`: the same as `jtq sim`."""
+"""`python -m jtqd.sim_can`: the same as `jtq sim`."""
 
 from jtqd.sim_can.command import main
 
