@@ -1,5 +1,8 @@
-"""The emulated bench: two drives and a torque sensor around one source. Frames and times in, frames out; no
-socket, no clock.
+"""The emulated bench: two drives and a torque sensor around one source. Frames and times in, frames out.
+
+While no master commands the drives the bench moves them itself. Its built-in motion "demo" fills all four quadrants: joint 1
+follows a velocity trajectory of two smooth bursts with rests between them, joint 2 a torque that varies on its own,
+non-commensurate periods. Everything starts from rest with zero slope. No socket, no clock.
 """
 
 from __future__ import annotations
@@ -13,13 +16,6 @@ from jtqd.sim_can.canopen_node import CanopenNode
 from jtqd.sim_can.drive_node import OPERATION_ENABLED, DriveNode
 from jtqd.sim_can.sensor_node import SENSOR_NODE, SensorNode
 from jtqd.sim_can.source import CURRENT, OFF, VELOCITY, Source
-
-# Built-in motion of the bench: what runs when nobody else commands the drives. Pure functions of time.
-#
-# "demo" fills all four quadrants: joint 1 follows a velocity trajectory of two smooth bursts with rests between
-# them, joint 2 a torque that varies on its own, non-commensurate periods. Everything starts from rest with zero
-# slope.
-
 
 PERIOD_S = 20.0
 # (start, length in s, amplitudes in rad/s of sin(2πk x), k = 1, 2, ..., x = -1/2..1/2 over the burst)
@@ -40,7 +36,7 @@ class Targets(NamedTuple):
 
 
 def demo_velocity(time_s: float) -> float:
-    """Velocity of joint 1 in rad/s, joint side.
+    """Return the velocity of joint 1 in rad/s, joint side.
 
     Each burst is odd about its middle, so the joint comes back to where it began; the window cos² makes
     velocity and acceleration zero at both ends.
@@ -55,13 +51,13 @@ def demo_velocity(time_s: float) -> float:
 
 
 def demo_current(time_s: float) -> float:
-    """Motor current of joint 2 in A: a sum of sines that rises smoothly from zero within LOAD_RISE_S."""
+    """Return the motor current of joint 2 in A: a sum of sines that rises smoothly from zero within LOAD_RISE_S."""
     rise = 1.0 if time_s >= LOAD_RISE_S else 0.5 - 0.5 * math.cos(math.pi * time_s / LOAD_RISE_S)
     return rise * sum(a * math.sin(2.0 * math.pi * time_s / period) for a, period in LOADS)
 
 
 def targets(profile: str, time_s: float) -> tuple[Targets, Targets] | None:
-    """Targets of both joints, or None when the profile leaves the drives alone ("rest")."""
+    """Return the targets of both joints, or None when the profile leaves the drives alone ("rest")."""
     if profile != "demo":
         return None
     return Targets(VELOCITY, demo_velocity(time_s)), Targets(CURRENT, demo_current(time_s))
@@ -69,15 +65,15 @@ def targets(profile: str, time_s: float) -> tuple[Targets, Targets] | None:
 
 CLOCK_STEP_NS = 100_000_000  # stamps and steady clock never differ by this from SYNC to SYNC, unless CLOCK_REALTIME was set
 LONGEST_STEP_NS = 50_000_000  # a source never jumps further than this, however long SYNC was away
-RESOLUTION_NS = (
-    10_000  # a software stamp is no better; the plant then sees an exact grid wherever SYNC keeps one
-)
+# a software stamp is no better; the plant then gets an exact grid wherever SYNC keeps one
+RESOLUTION_NS = 10_000
 IDLE_STEP_NS = 10_000_000  # step of powered drives once SYNC has been away for LONGEST_STEP_NS
 
 
 def bench_filters() -> tuple[CanFilter, ...]:
-    """What the bench listens to: NMT, SYNC, SDO requests, RPDOs 1 and 2 of the drives, heartbeats of jtqd and
-    of the node that commands.
+    """Return filters for what the bench receives.
+
+    NMT, SYNC, SDO requests, RPDOs 1 and 2 of the drives, heartbeats of jtqd and of the node that commands.
     """
     ids = [0x000, SYNC_COB_ID, 0x700 + JTQD_NODE, 0x700 + COMMANDER_NODE]
     ids += [0x600 + node for node in (1, 2, SENSOR_NODE)]
@@ -90,7 +86,7 @@ def _rounded(time_ns: int) -> int:
 
 
 class Bench:
-    """Nodes 1, 2, 3. `over` turns True when a recorded run has ended.
+    """Nodes 1, 2 (drives) and 3 (sensor) of the bench. `over` turns True when a recorded run has ended.
 
     The source's time is the measured time since the first SYNC, in steps of RESOLUTION_NS: equal stamps give
     equal values, and so do stamps that differ by their own inaccuracy.
@@ -99,7 +95,7 @@ class Bench:
     def __init__(self, source: Source, profile: str = "demo") -> None:
         self.source = source
         self.over = False
-        self.drives = tuple(DriveNode(source, number, self._master_came) for number in (0, 1))
+        self.drives = tuple(DriveNode(source, number, self._hand_over) for number in (0, 1))
         self.sensor = SensorNode(source)
         self.nodes: tuple[CanopenNode, ...] = (*self.drives, self.sensor)
         self.sync_count = 0
@@ -114,14 +110,12 @@ class Bench:
 
     @property
     def due_ns(self) -> int:
-        """Steady time of the next thing that `tick` has to do."""
+        """Steady time at which `tick` has something to do next."""
         due = min(node.due_ns for node in self.nodes)
         return min(due, self._idle_due_ns()) if self._moving() else due
 
     def on_frame(self, can_id: int, data: bytes, stamp_ns: int, now_ns: int) -> list[bytes]:
-        """One frame from the bus. stamp_ns: when it was received (kernel); now_ns: steady clock. Frames to
-        send.
-        """
+        """Handle a frame from the bus; return frames to send. stamp_ns: of its reception (kernel); now_ns: steady clock."""
         if can_id == SYNC_COB_ID:
             return self._on_sync(data, stamp_ns, now_ns)
         frames: list[bytes] = []
@@ -130,7 +124,7 @@ class Bench:
         return frames
 
     def tick(self, now_ns: int) -> list[bytes]:
-        """Heartbeats and timers; moves powered drives on when there is no SYNC."""
+        """Serve heartbeats and timers; advance powered drives when there is no SYNC."""
         frames: list[bytes] = []
         for node in self.nodes:
             if now_ns >= node.due_ns:
@@ -177,7 +171,7 @@ class Bench:
         return frames
 
     def _by_itself(self, dt_s: float) -> list[bytes]:
-        """Drives that no master commands: a recorded run says "enabled", or the built-in motion runs."""
+        """Run drives that no master commands: enabled by a recorded run, or by the built-in motion."""
         one, two = self.drives
         signals = self.source.drives
         if signals[0].enabled or signals[1].enabled:
@@ -189,7 +183,7 @@ class Bench:
         if one.machine.state == two.machine.state == OPERATION_ENABLED:
             self._profile_s += dt_s
         else:
-            self._profile_s = 0.0  # begin, or begin again after a stop, from rest
+            self._profile_s = 0.0  # start, or start again after a stop, from rest
         wanted = targets(self._profile, self._profile_s)
         if wanted is None:
             return []
@@ -199,7 +193,7 @@ class Bench:
             frames += drive.run_by_itself(target.mode, value)
         return frames
 
-    def _master_came(self) -> None:
+    def _hand_over(self) -> None:
         for drive in self.drives:
             drive.hand_over()
 
@@ -207,7 +201,7 @@ class Bench:
         return self._last_steady_ns + (IDLE_STEP_NS if self._idle_ns else LONGEST_STEP_NS)
 
     def _moving(self) -> bool:
-        """Powered plant drives go on without SYNC; a recorded run does not: its time is that of the SYNCs."""
+        """Return whether drives go on without SYNC: powered ones of a plant do, a recorded run does not."""
         one, two = self.drives
         if not self.sync_count or self.source.drives[0].enabled or self.source.drives[1].enabled:
             return False

@@ -1,4 +1,6 @@
-"""Shell of the bench: the bus, the clocks and the signals around `jtqd.sim_can.bench.Bench`."""
+"""Event loop of the bench: the bus, the clocks and the signals around `jtqd.sim_can.bench.Bench`."""
+
+from __future__ import annotations
 
 import ctypes
 import gc
@@ -15,7 +17,7 @@ from jtqd.drivers.hub import Hub
 from jtqd.sim_can.bench import Bench, bench_filters
 
 _PR_SET_TIMERSLACK = 29
-_RETRY_S = 0.2  # how often an interface that is down is looked at again
+_RETRY_S = 0.2  # between two looks at an interface that is down
 _NOT_DATA = CAN_EFF_FLAG | CAN_RTR_FLAG | CAN_ERR_FLAG
 _LONGEST_WAIT_S = 1.0
 _LINGER_STEP_S = 0.05
@@ -29,8 +31,12 @@ def _stop(_number: int, _frame: FrameType | None) -> None:
     raise _StopError
 
 
+def _log(text: str) -> None:
+    print(f"bench: {text}", file=sys.stderr, flush=True)
+
+
 class _Bus(Protocol):
-    """What the loop needs of a bus."""
+    """Bus as the loop uses it."""
 
     def send(self, frame16: bytes) -> bool:
         """Send a frame; False: the queue is full and the frame is lost."""
@@ -39,14 +45,14 @@ class _Bus(Protocol):
         """Wait up to timeout_s for frames, give them to the bench, send its answers."""
 
     def linger(self, end_ns: int | None) -> None:
-        """The bench is silent from now on: return when nobody needs the bus from it any more, or at end_ns."""
+        """Stay silent until no other member needs the bus, or until end_ns."""
 
     def close(self) -> None:
         """Leave the bus."""
 
 
 class _EmbeddedHub:
-    """The bench makes the unix bus itself: the hub lives in this process, the bench is a local port of it."""
+    """Unix bus whose hub is in this process; the bench is a local port of it."""
 
     def __init__(self, path: str, bitrate: int | None, bench: Bench) -> None:
         self._hub = Hub(path, bitrate)
@@ -58,10 +64,10 @@ class _EmbeddedHub:
         self.close = self._hub.close
 
     def linger(self, end_ns: int | None) -> None:
-        """The bus is ours: it stays for its other members, as a wire does when a node goes silent."""
+        """Keep the hub for its other members, as a wire stays when a node goes silent."""
         self._port.detach()
         if self._hub.clients:
-            print("bench: silent, the bus stays until its members have left", file=sys.stderr, flush=True)
+            _log("the bus stays up until its other members have left")
         while self._hub.clients and (end_ns is None or time.monotonic_ns() < end_ns):
             self._hub.run_once(_LONGEST_WAIT_S if end_ns is None else _LINGER_STEP_S)
 
@@ -73,7 +79,7 @@ class _EmbeddedHub:
 
 
 class _Socket:
-    """The bench is one of the bus' members: SocketCAN, or a unix bus whose hub runs elsewhere."""
+    """Bus of which the bench is one member: SocketCAN, or a unix bus whose hub runs elsewhere."""
 
     def __init__(self, bus: str, bench: Bench) -> None:
         self._socket = open_frame_socket(bus, bench_filters())
@@ -82,13 +88,13 @@ class _Socket:
         self.close = self._socket.close
 
     def linger(self, end_ns: int | None) -> None:
-        """The bus does not need us."""
+        """Return at once: the bus does not depend on the bench."""
 
     def send(self, frame16: bytes) -> bool:
         try:
             return self._socket.send(frame16)
         except BusDown:
-            self._say_down()
+            self._log_down()
             return False
 
     def serve(self, timeout_s: float) -> None:
@@ -98,12 +104,14 @@ class _Socket:
         try:
             count = socket.receive()
         except BusDown:
-            self._say_down()
-            time.sleep(_RETRY_S)  # the kernel tells it once; the same socket works again when the link is up
+            self._log_down()
+            time.sleep(
+                _RETRY_S
+            )  # the kernel reports it once; the same socket works again when the link is up
             return
         if count and self._down:
             self._down = False
-            print("bench: the interface is up again", file=sys.stderr, flush=True)
+            _log("the interface is up again")
         now_ns = time.monotonic_ns()
         frames, stamps, lengths = bytes(socket.frames[: count * FRAME_SIZE]), socket.stamps_ns, socket.lengths
         for i in range(count):
@@ -115,14 +123,14 @@ class _Socket:
             for frame in self._bench.on_frame(can_id, data[:length], stamps[i], now_ns):
                 self.send(frame)
 
-    def _say_down(self) -> None:
+    def _log_down(self) -> None:
         if not self._down:
             self._down = True
-            print("bench: the interface is down, waiting for it", file=sys.stderr, flush=True)
+            _log("the interface is down, waiting until it is up")
 
 
 def _open(bus: str, bitrate: int | None, bench: Bench) -> _Bus:
-    """The bus as it is; a unix bus without a hub gets one here."""
+    """Open the bus; a unix bus without a hub gets one here."""
     if not bus.startswith(PREFIX):
         return _Socket(bus, bench)
     path = bus[len(PREFIX) :]
@@ -133,7 +141,7 @@ def _open(bus: str, bitrate: int | None, bench: Bench) -> _Bus:
             raise
         return _EmbeddedHub(path, bitrate, bench)
     if bitrate is not None:
-        print(f"bench: {bus} has a hub already, --bitrate is that hub's matter", file=sys.stderr, flush=True)
+        _log(f"{bus} has a hub already, --bitrate is ignored")
     return joined
 
 
@@ -153,7 +161,7 @@ def run(bus: str, bench: Bench, bitrate: int | None = None, duration_s: float | 
         gc.freeze()
         end_ns = None if duration_s is None else time.monotonic_ns() + round(duration_s * 1e9)
         _tick(line, bench)
-        print(f"bench ready on {bus}", file=sys.stderr, flush=True)
+        print(f"bench ready on {bus}", file=sys.stderr, flush=True)  # other processes wait for this line
         _loop(line, bench, end_ns)
     except _StopError:
         pass
@@ -173,7 +181,7 @@ def _tick(line: _Bus, bench: Bench) -> None:
 
 
 def _loop(line: _Bus, bench: Bench, end_ns: int | None) -> None:
-    """Frames as they come, timers when they are due; sleeps in between."""
+    """Serve frames as they come and timers when they are due; sleep in between."""
     while not bench.over:
         now_ns = time.monotonic_ns()
         if end_ns is not None and now_ns >= end_ns:
@@ -184,5 +192,5 @@ def _loop(line: _Bus, bench: Bench, end_ns: int | None) -> None:
             due_ns = bench.due_ns
         wake_ns = due_ns if end_ns is None else min(due_ns, end_ns)
         line.serve(min(max(wake_ns - now_ns, 0) * 1e-9, _LONGEST_WAIT_S))
-    print("bench: the run is over", file=sys.stderr, flush=True)
+    _log("the run is over")
     line.linger(end_ns)

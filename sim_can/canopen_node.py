@@ -1,9 +1,9 @@
-"""One emulated CANopen device: NMT, heartbeat, EMCY, SDO, PDOs (CiA 301). Frames and times in, frames out: no
-socket, no clock.
+"""One emulated CANopen device: NMT, heartbeat, EMCY, SDO, PDOs (CiA 301). Frames and times in, frames out: no socket,
+no clock.
 
-Times are integer nanoseconds of one steady clock. Every method that may say something on the bus returns a
-list of 16-byte frames. What frames arrive is nobody's promise: wrong lengths and foreign identifiers are
-ignored or answered as CiA 301 says, never raised.
+`CanopenNode` is the device; `TransmitPdo`, `HeartbeatConsumer` and `Emergency` are its services. Times are integer
+nanoseconds of one steady clock. Every method that may send returns a list of 16-byte frames. Frames of wrong length and
+foreign identifiers are ignored or answered as CiA 301 requires; nothing is raised for them.
 """
 
 from __future__ import annotations
@@ -19,17 +19,14 @@ from jtqd.drivers.pdo import LAST_SYNC_TYPE, PdoMap, PdoParameters
 from jtqd.drivers.sdo import SdoAbort
 from jtqd.drivers.sdo_server import SdoServer
 
-# One TPDO of an emulated device, compiled once from its mapping: packing it is a few getters and one
-# `struct` call. Pure.
-
-
 NEVER_NS = 1 << 62
+_NS_PER_MS = 1_000_000
 
 Getter = Callable[[], int]
 
 
 class TransmitPdo:
-    """One TPDO with everything that its packing needs."""
+    """One TPDO compiled from its mapping: packing it is a few getters and one `struct` call."""
 
     __slots__ = (
         "cob_id",
@@ -56,7 +53,7 @@ class TransmitPdo:
         self.start = start  # wait for this SYNC counter first (18xxh:6); 0: no waiting
         self.count = 0
         self.last = b""
-        self.period_ns = period_ms * 1_000_000  # event timer, types 254 and 255
+        self.period_ns = period_ms * _NS_PER_MS  # event timer, types 254 and 255
         self.timed_only = timed_only  # no change of its values is an event
         self.due_ns = NEVER_NS
 
@@ -71,7 +68,7 @@ def compile_tpdos(
     getters: Mapping[tuple[int, int], Getter],
     quiet: Set[tuple[int, int]] = frozenset(),
 ) -> list[TransmitPdo]:
-    """All TPDOs that exist and map something; objects without a getter are read from the store.
+    """Return all TPDOs that exist and map something; objects without a getter are read from the store.
 
     quiet: objects whose change is no event; a TPDO that maps nothing else is sent by its event timer alone.
     """
@@ -83,25 +80,22 @@ def compile_tpdos(
     for index in pdos.tpdo_indices:
         pdo = pdos.active_map(index)
         if pdo is not None:
-            found = tuple(getter(mapped.index, mapped.subindex) for mapped in pdo.objects)
+            sources = tuple(getter(mapped.index, mapped.subindex) for mapped in pdo.objects)
             timed_only = all((mapped.index, mapped.subindex) in quiet for mapped in pdo.objects)
             start, period_ms = store.number(index, 6), store.number(index, 5)
-            compiled.append(TransmitPdo(pdo, found, start, period_ms, timed_only))
+            compiled.append(TransmitPdo(pdo, sources, start, period_ms, timed_only))
     return compiled
 
 
-# Heartbeat consumer of an emulated device: 1016h, one entry per watched node (CiA 301, 7.2.8.3.2.2). Pure.
-#
-# An entry holds the node in bits 16..22 and the time in ms in bits 0..15; both must be set. Watching starts
-# with the node's first heartbeat, and anew after the entry was written.
-
-
 _CONSUMER = 0x1016
-_MS = 1_000_000
 
 
 class HeartbeatConsumer:
-    """Which of the watched nodes are missing. `due_ns`: when the next one will be."""
+    """Heartbeat consumer, 1016h: one entry per watched node (CiA 301, 7.2.8.3.2.2).
+
+    An entry holds the node in bits 16..22 and the time in ms in bits 0..15; both must be set. Watching starts with the
+    node's first heartbeat, and again after the entry was written. `due_ns`: when the next node will be missing.
+    """
 
     def __init__(self, store: ObjectStore) -> None:
         self._store = store
@@ -113,11 +107,11 @@ class HeartbeatConsumer:
             store.on_write(_CONSUMER, entry, partial(self._on_write, entry))
 
     def heard(self, node: int, t_ns: int) -> bool:
-        """A heartbeat of `node`; True when that node is watched and none of the watched ones is missing."""
+        """Take a heartbeat of `node`; return True when it is watched and none of the watched nodes is missing."""
         watched = False
         for entry in self._entries:
             word = self._store.number(_CONSUMER, entry)
-            period_ns = (word & 0xFFFF) * _MS
+            period_ns = (word & 0xFFFF) * _NS_PER_MS
             if word >> 16 & 0x7F == node and period_ns:
                 self._due_ns[entry] = t_ns + period_ns
                 self._missing.discard(entry)
@@ -126,7 +120,7 @@ class HeartbeatConsumer:
         return watched and not self._missing
 
     def lost(self, t_ns: int) -> bool:
-        """True when a watched node has become missing since the last call."""
+        """Return True when a watched node has become missing since the last call."""
         late = {entry for entry, due_ns in self._due_ns.items() if t_ns >= due_ns}
         for entry in late:
             del self._due_ns[entry]  # watching starts again with its next heartbeat
@@ -135,7 +129,7 @@ class HeartbeatConsumer:
         return bool(late)
 
     def forget(self) -> None:
-        """NMT reset: nobody was heard, nobody is missing."""
+        """Start again after an NMT reset: no node was heard, none is missing."""
         self._due_ns.clear()
         self._missing.clear()
         self._plan()
@@ -149,10 +143,6 @@ class HeartbeatConsumer:
         self.due_ns = min(self._due_ns.values(), default=NEVER_NS)
 
 
-# EMCY producer of an emulated device: present errors, error register 1001h, error history 1003h, the
-# messages. Pure.
-
-
 _EMCY = struct.Struct("<HB5x")  # error code, error register, manufacturer's field
 ERROR_RESET = 0x0000
 GENERIC = 0x01  # bit 0 of 1001h is set with every error
@@ -160,7 +150,10 @@ CURRENT, COMMUNICATION = 0x02, 0x10
 
 
 class Emergency:
-    """Errors of one device. An error is told when it comes and not again while it lasts (CiA 301, 7.2.7)."""
+    """EMCY producer: present errors, error register 1001h, error history 1003h.
+
+    An error is reported when it comes and not again while it lasts (CiA 301, 7.2.7).
+    """
 
     def __init__(self, store: ObjectStore) -> None:
         self._store = store
@@ -168,11 +161,11 @@ class Emergency:
         self._present: dict[int, int] = {}  # EMCY code -> bits of the error register
 
     def present(self, code: int) -> bool:
-        """The error has come and has not gone."""
+        """Return whether the error is present."""
         return code in self._present
 
     def come(self, code: int, register: int) -> list[bytes]:
-        """A new error: into 1001h and 1003h, and the frame that tells it; nothing when it is known."""
+        """Add an error to 1001h and 1003h; return its EMCY, nothing when it is present already."""
         if code in self._present:
             return []
         self._present[code] = register | GENERIC
@@ -180,12 +173,12 @@ class Emergency:
         return [self._message(code)]
 
     def gone(self, *codes: int) -> list[bytes]:
-        """These errors are over: EMCY 0000h with what is left in the register, if one of them was present."""
+        """Remove errors; return EMCY 0000h with what is left in the register, if one of them was present."""
         over = [code for code in codes if self._present.pop(code, None) is not None]
         return [self._message(ERROR_RESET)] if over else []
 
     def forget(self) -> None:
-        """NMT reset: no error is present; nothing is told."""
+        """Remove all errors after an NMT reset, without an EMCY."""
         self._present.clear()
         self._store.set_number(0x1001, 0, 0)
 
@@ -203,18 +196,16 @@ HEARTBEAT_LOST = 0x8130
 PDO_TOO_SHORT = 0x8210
 SYNC_LENGTH = 0x8240
 _VERIFY, _DOWNLOADED = 0x1020, 0x60
-_CANOPEN_NODE_MS = 1_000_000
 
 Handler = Callable[[int], None]
 
 
 class CanopenNode:
-    """Common part of the bench's devices. A device adds getters of its process objects and handlers of its
-    commands.
+    """Base of the bench's devices, which add getters of their process objects and handlers of their commands.
 
-    `getters[(index, subindex)]` gives the value an object has now; SDO and TPDO read it. `handlers[(index,
-    subindex)]` is told each value that an SDO or an RPDO writes; it may refuse an SDO by raising SdoAbort.
-    A change of a `quiet` object is no event for a TPDO. `due_ns` says when `tick` has something to do.
+    `getters[(index, subindex)]` returns the present value of an object; SDO and TPDO read it. `handlers[(index,
+    subindex)]` is called with each value that an SDO or an RPDO writes; it may refuse an SDO by raising SdoAbort.
+    A change of a `quiet` object is no event for a TPDO. `due_ns`: when `tick` has something to do.
     """
 
     def __init__(self, store: ObjectStore) -> None:
@@ -236,7 +227,7 @@ class CanopenNode:
         self._heartbeat_due_ns = NEVER_NS
         self._heartbeat_ns = 0
         self._consumer = HeartbeatConsumer(store)
-        self._sync_error_told = False
+        self._sync_error_reported = False
 
     # For the devices ----------------------------------------------------------------------------------------
 
@@ -251,9 +242,9 @@ class CanopenNode:
                 raise ValueError(f"{index:04X}h:{subindex} is not a number")
 
             def on_write(
-                data: bytes, unpack: Callable[[bytes], tuple[int]] = layout.unpack, tell: Handler = handler
+                data: bytes, unpack: Callable[[bytes], tuple[int]] = layout.unpack, handle: Handler = handler
             ) -> None:
-                tell(unpack(data)[0])
+                handle(unpack(data)[0])
 
             self.store.on_write(index, subindex, on_write)
 
@@ -261,16 +252,16 @@ class CanopenNode:
         """NMT reset node: the device goes to its power-on state."""
 
     def on_heartbeat_lost(self) -> list[bytes]:
-        """A watched heartbeat stopped; EMCY and 1029h are the base's matter."""
+        """React to the loss of a watched heartbeat; EMCY and 1029h are the base's."""
         return []
 
     def raise_error(self, code: int, register: int) -> list[bytes]:
-        """A new error with its bits of 1001h; the EMCY, unless the node is stopped."""
+        """Add an error with its bits of 1001h; return the EMCY, unless the node is stopped."""
         frames = self._emergency.come(code, register)
         return [] if self.state == STOPPED else frames
 
     def clear_error(self, *codes: int) -> list[bytes]:
-        """These errors are over; EMCY 0000h if one of them was present."""
+        """Remove errors; return EMCY 0000h if one of them was present and the node is not stopped."""
         frames = self._emergency.gone(*codes)
         return [] if self.state == STOPPED else frames
 
@@ -289,7 +280,7 @@ class CanopenNode:
     # From the bus -------------------------------------------------------------------------------------------
 
     def on_frame(self, can_id: int, data: bytes, t_ns: int) -> list[bytes]:
-        """Any frame but SYNC: NMT, SDO request, RPDO, a watched heartbeat; others are ignored."""
+        """Handle any frame but SYNC: NMT, SDO request, RPDO, a watched heartbeat; others are ignored."""
         if can_id == 0x600 + self.node_id:
             if self.state == STOPPED:
                 return []
@@ -306,13 +297,13 @@ class CanopenNode:
         return []
 
     def on_sync(self, data: bytes) -> list[bytes]:
-        """SYNC: apply the synchronous RPDOs received before it, then send the TPDOs that are due."""
+        """Handle a SYNC: apply the synchronous RPDOs received before it, then send the TPDOs that are due."""
         if self.state != OPERATIONAL:
             return []
         frames: list[bytes] = []
         counter = data[0] if len(data) == 1 else 0
-        if len(data) > 1 and not self._sync_error_told:
-            self._sync_error_told = True
+        if len(data) > 1 and not self._sync_error_reported:
+            self._sync_error_reported = True
             frames += self.raise_error(SYNC_LENGTH, COMMUNICATION)
         transmits = self._pdo_maps()
         if self._waiting:
@@ -338,9 +329,7 @@ class CanopenNode:
         return frames
 
     def tick(self, t_ns: int) -> list[bytes]:
-        """Boot-up message, heartbeat, event timers, watched heartbeats; sets `due_ns` to the next time it
-        wants to be called.
-        """
+        """Serve boot-up message, heartbeat, event timers and watched heartbeats; set `due_ns` to the next of them."""
         frames: list[bytes] = []
         if self._bootup_pending:
             self._bootup_pending = False
@@ -373,7 +362,7 @@ class CanopenNode:
         self._forget_signature(data, reply)
         if self.store.number(0x1017) != before:
             self._plan_heartbeat(t_ns)
-        self.due_ns = 0  # whatever was written, let the next tick look at its times again
+        self.due_ns = 0  # whatever was written, the next tick plans again
         frames = [] if reply is None else [pack(0x580 + self.node_id, reply)]
         return frames + self.after_command()
 
@@ -387,7 +376,7 @@ class CanopenNode:
             self.store.set_number(_VERIFY, 2, 0)
 
     def after_command(self) -> list[bytes]:
-        """What a device has to say after an SDO or RPDO wrote to it (EMCY, event-driven TPDOs)."""
+        """Return a device's frames after an SDO or RPDO wrote to it (EMCY, event-driven TPDOs)."""
         return []
 
     def _on_nmt(self, data: bytes, t_ns: int) -> list[bytes]:
@@ -410,9 +399,7 @@ class CanopenNode:
         return []
 
     def _reset(self, whole: bool) -> None:
-        """Power-on values of the communication parameters (mapping too), or of everything; then the boot-up
-        message.
-        """
+        """Restore power-on values of the communication parameters (mapping too), or of everything; plan the boot-up."""
         self.store.restore(0x1000, 0xFFFF if whole else 0x1FFF)
         if whole:
             self.on_reset()
@@ -421,13 +408,13 @@ class CanopenNode:
         self._emergency.forget()
         self._generation = -1
         self._waiting.clear()
-        self._sync_error_told = False
+        self._sync_error_reported = False
         self._bootup_pending = True
         self._heartbeat_due_ns = NEVER_NS
         self._consumer.forget()
 
     def _plan_heartbeat(self, t_ns: int) -> None:
-        self._heartbeat_ns = self.store.number(0x1017) * _CANOPEN_NODE_MS
+        self._heartbeat_ns = self.store.number(0x1017) * _NS_PER_MS
         self._heartbeat_due_ns = t_ns + self._heartbeat_ns if self._heartbeat_ns else NEVER_NS
 
     def _on_heartbeat(self, node: int, data: bytes, t_ns: int) -> list[bytes]:
@@ -472,10 +459,10 @@ class CanopenNode:
                     value.to_bytes(mapped.bits // 8, "little", signed=mapped.signed),
                 )
             except SdoAbort:
-                continue  # a value out of range is not applied; an RPDO has nobody to tell
+                continue  # a value out of range is not applied; an RPDO has no reply
 
     def _pdo_maps(self) -> list[TransmitPdo]:
-        """Active TPDOs; made anew after a change of the PDO parameters. Also refreshes the RPDOs."""
+        """Return the active TPDOs; after a change of the PDO parameters TPDOs and RPDOs are compiled again."""
         if self._generation != self._pdos.generation:
             self._generation = self._pdos.generation
             self._receive = {pdo.cob_id: pdo for pdo in self._pdos.rpdos()}

@@ -5,98 +5,19 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import time
-from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from jtqd.drivers.devices import SYNC_COB_ID, drive_tpdo1, drive_tpdo2, sensor_tpdo1
-from jtqd.drivers.pdo import PdoMap
 from jtqd.estimator.checked import ConfigError, count, natural, seconds
-from jtqd.sim_can.bench import Bench
 from jtqd.sim_can.eds_entries import EdsChild
-from jtqd.sim_can.plant_file import PROFILES, PlantParameters
-from jtqd.sim_can.plant_source import PlantSource
-from jtqd.sim_can.source import Source
 
-# What the bench costs: CPU time of a plant step and of a whole SYNC, measured in this process.
+if TYPE_CHECKING:
+    from jtqd.sim_can.plant_file import PlantParameters
+    from jtqd.sim_can.source import Source
 
+# what needs numpy is imported in functions: the EDS child reads meanwhile, and --help is quick
 
-CYCLE_NS = 1_000_000
-BLOCK = 50
-
-
-@dataclass(frozen=True)
-class Cost:
-    """CPU time in microseconds per 1 ms cycle, medians over blocks of 50 cycles."""
-
-    plant_step_us: float  # both joints with their drives' control loops
-    source_us: float  # plant step with encoders, noise and sensor
-    sync_us: float  # everything a SYNC does: source, state machines, five TPDOs packed
-    substeps: int
-    cycles: int
-
-    def as_json(self) -> dict[str, float | int]:
-        """Plain mapping for `--json`."""
-        return asdict(self)
-
-
-def map_pdos(bench: Bench) -> None:
-    """Give the nodes the mapping that jtqd writes at boot, by SDO, and start them."""
-    maps = [(node, pdo) for node in (1, 2) for pdo in (drive_tpdo1(node), drive_tpdo2(node))]
-    for node, pdo in [*maps, (3, sensor_tpdo1(3))]:
-        number = (pdo.cob_id - 0x80) // 0x100 - 1
-        for index, subindex, value, size in _mapping_writes(0x1800 + number, pdo):
-            request = bytes([0x23 | (4 - size) << 2]) + index.to_bytes(2, "little") + bytes([subindex])
-            bench.on_frame(0x600 + node, request + value.to_bytes(4, "little"), 0, 0)
-    bench.on_frame(0x000, b"\x01\x00", 0, 0)
-
-
-def _mapping_writes(index: int, pdo: PdoMap) -> list[tuple[int, int, int, int]]:
-    entries = [(index + 0x200, entry, word, 4) for entry, word in enumerate(pdo.words, 1)]
-    return [
-        (index, 1, 0xC000_0000 | pdo.cob_id, 4),
-        (index + 0x200, 0, 0, 1),
-        *entries,
-        (index + 0x200, 0, len(pdo.words), 1),
-        (index, 2, pdo.transmission_type, 1),
-        (index, 1, 0x4000_0000 | pdo.cob_id, 4),
-    ]
-
-
-def measure(parameters: PlantParameters, cycles: int = 4000) -> Cost:
-    """Run the demo motion for `cycles` SYNCs and measure; three benches, so that no part is a difference of
-    two others.
-    """
-    full = Bench(PlantSource(parameters))
-    map_pdos(full)
-    stamps = [0]
-
-    def sync() -> None:
-        stamps[0] += CYCLE_NS
-        full.on_frame(SYNC_COB_ID, b"\x01", stamps[0], stamps[0])
-
-    whole = _median_us(sync, cycles)
-    source = PlantSource(parameters)
-    for drive, moving in enumerate(full.drives):
-        source.command(drive, *moving._command())
-    reading = _median_us(lambda: source.advance(0.001), cycles)
-    plant = source.plant
-    stepping = _median_us(lambda: plant.step(0.001), cycles)
-    substeps = round(0.001 / plant.substep_s)
-    return Cost(stepping, reading, whole, substeps, cycles)
-
-
-def _median_us(call: object, cycles: int) -> float:
-    assert callable(call)
-    blocks = []
-    for _ in range(max(1, cycles // BLOCK)):
-        start = time.process_time_ns()
-        for _ in range(BLOCK):
-            call()
-        blocks.append((time.process_time_ns() - start) / (BLOCK * 1000.0))
-    return sorted(blocks)[len(blocks) // 2]
-
-
+PROFILES = ("demo", "rest")  # those of `plant_file`, which would import numpy
 PLANT = "campaign_plant.yaml"
 """The bench that the shipped models were identified on."""
 
@@ -117,7 +38,7 @@ def _joints(text: str) -> tuple[int, int]:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Options of `jtq sim`."""
+    """Return the options of `jtq sim`."""
     made = argparse.ArgumentParser(
         prog="jtq sim",
         description="Emulated bench: two drives (nodes 1, 2) and a torque sensor (node 3) on a CAN bus.",
@@ -125,17 +46,21 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     made.add_argument(
-        "--bus", help="SocketCAN interface (vcan0) or unix:PATH; a unix bus without a hub gets one"
+        "--bus", help="SocketCAN interface (vcan0) or unix:PATH; without a hub on PATH the bench starts one"
     )
     made.add_argument(
         "--plant",
         type=Path,
         metavar="FILE",
-        help=f"plant file (default: {PLANT}), or a joint.yaml for two ideal joints",
+        help=f"plant file (default: {PLANT}), or a joint file for two ideal joints",
     )
-    made.add_argument("--seed", type=natural, default=0, metavar="N", help="seed of the noise (default 0)")
     made.add_argument(
-        "--profile", choices=PROFILES, help="motion while no master commands (default: the plant file's)"
+        "--seed", type=natural, default=0, metavar="N", help="seed of noise and days (default 0)"
+    )
+    made.add_argument(
+        "--profile",
+        choices=PROFILES,
+        help="motion while no master commands (default: the plant file's)",
     )
     made.add_argument("--play", type=Path, metavar="RUN", help="play a measured run instead of the plant")
     made.add_argument(
@@ -147,10 +72,15 @@ def parser() -> argparse.ArgumentParser:
         metavar="A,B",
         help="joints of the run for drives 1, 2 (default: those with a joint file in the column map, else 1,2)",
     )
-    made.add_argument("--bitrate", type=count, metavar="B", help="model the wire of an own hub, bit/s")
-    made.add_argument("--duration", type=seconds, metavar="S", help="end after so many seconds")
-    made.add_argument("--cost", action="store_true", help="measure the CPU time of one cycle and leave")
-    made.add_argument("--json", action="store_true", help="with --cost: result as JSON")
+    made.add_argument(
+        "--bitrate",
+        type=count,
+        metavar="B",
+        help="bit rate of the wire that the bench's own hub models, bit/s",
+    )
+    made.add_argument("--duration", type=seconds, metavar="S", help="end after S seconds")
+    made.add_argument("--cost", action="store_true", help="print the CPU time of one cycle and exit")
+    made.add_argument("--json", action="store_true", help="with --cost: print JSON")
     return made
 
 
@@ -177,7 +107,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _usage(options: argparse.Namespace) -> str:
-    """What is wrong with the combination of options; empty when nothing is."""
+    """Return what is wrong with the combination of options; empty when nothing is."""
     if options.cost:
         return ""
     if options.bus is None:
@@ -196,7 +126,7 @@ def _run(options: argparse.Namespace) -> int:
 
     if options.cost:
         return _print_cost(options, load_plant(options.plant or shipped(PLANT)))
-    child = EdsChild()  # reads while this process loads numpy and makes the plant
+    child = EdsChild()  # it reads while this process loads numpy and makes the plant
     try:
         if options.play is not None:
             source: Source = _played(options)
@@ -234,10 +164,9 @@ def _serve(options: argparse.Namespace, source: Source, profile: str) -> int:
     return run(options.bus, Bench(source, profile), options.bitrate, options.duration)
 
 
-def _print_cost(options: argparse.Namespace, parameters: object) -> int:
-    from jtqd.sim_can.plant_file import PlantParameters
+def _print_cost(options: argparse.Namespace, parameters: PlantParameters) -> int:
+    from jtqd.sim_can.cost import measure
 
-    assert isinstance(parameters, PlantParameters)
     cost = measure(parameters)
     if options.json:
         print(json.dumps(cost.as_json()))

@@ -1,6 +1,4 @@
-"""Current and velocity loop of one drive: first-order current loop, PI velocity loop with feedforward. Pure,
-plain floats.
-"""
+"""Current and velocity loop of one drive: first-order current loop, PI velocity loop with feedforward. Pure."""
 
 import math
 
@@ -46,10 +44,8 @@ class DriveControl:
 
     def __init__(self, side: JointPlant) -> None:
         joint, drive = side.joint, side.drive
-        kt, inertia = (
-            joint.torque_constant_nm_per_a,
-            joint.rotor_inertia_kgm2,
-        )  # what the drive believes: nominal values
+        # nominal values: a drive knows no others
+        kt, inertia = joint.torque_constant_nm_per_a, joint.rotor_inertia_kgm2
         self._bandwidth = 2.0 * math.pi * drive.current_bandwidth_hz
         self._kp = drive.velocity_bandwidth_rad_s * inertia / kt
         self._integral_rate = self._kp / drive.velocity_integral_time_s
@@ -74,9 +70,7 @@ class DriveControl:
         self._decay = 0.0
 
     def command(self, mode: int, target: float, motor_velocity_rad_s: float) -> None:
-        """Set mode (OFF, VELOCITY, CURRENT) and target. Entering velocity mode starts from the present
-        velocity and current.
-        """
+        """Set mode (OFF, VELOCITY, CURRENT) and target. Velocity mode starts from the present velocity and current."""
         if mode != self.mode:
             self.mode = mode
             self.reference_rad_s = motor_velocity_rad_s
@@ -85,7 +79,7 @@ class DriveControl:
         self._to_go_s = self.interpolation_s
 
     def plan(self, dt_s: float) -> None:
-        """Reference and feedforward of the next control cycle of length dt_s > 0."""
+        """Plan reference and feedforward of the next control cycle of length dt_s > 0."""
         if self.mode == VELOCITY:
             limit = self._slope_limit
             # whole cycles, at least one: SYNCs jitter, the line must end where a cycle ends

@@ -1,9 +1,14 @@
-"""Emulated CiA 402 drive: object dictionary, state machine and PDOs around one drive of a `Source`. Pure."""
+"""Emulated CiA 402 drive: state machine, object dictionary and PDOs around one drive of a `Source`. Pure.
+
+`StateMachine` follows CiA 402-2, table "statusword bits by state": controlword in, state and statusword out; numbers in its
+comments are the transitions. `DriveNode` is the device.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from fractions import Fraction
 from typing import Final
 
 from jtqd.drivers.object_dictionary import ObjectStore
@@ -12,12 +17,6 @@ from jtqd.sim_can.canopen_node import CURRENT as CURRENT_ERROR
 from jtqd.sim_can.canopen_node import HEARTBEAT_LOST, CanopenNode
 from jtqd.sim_can.eds_entries import entries_of
 from jtqd.sim_can.source import CURRENT, OFF, VELOCITY, DriveRatings, DriveSignals, Source
-
-# State machine of a CiA 402 drive: controlword in, state and statusword out. Pure.
-#
-# States and statuswords after CiA 402-2, table "statusword bits by state"; numbers in comments below are its
-# transitions.
-
 
 NOT_READY: Final = 0
 SWITCH_ON_DISABLED: Final = 1
@@ -40,7 +39,7 @@ NAMES: Final = (
 )
 
 VOLTAGE: Final = 0x0010  # bit 4, voltage enabled
-REMOTE: Final = 0x0200  # bit 9, the controlword is obeyed
+REMOTE: Final = 0x0200  # bit 9, the controlword is followed
 FOLLOWS: Final = 0x1000  # bit 12 in csv and cst: the drive follows the target
 _BITS: Final = (0x00, 0x40, 0x21, 0x23, 0x27, 0x07, 0x0F, 0x08)
 STATUSWORDS: Final = tuple(
@@ -57,7 +56,7 @@ _SHUTDOWN: Final = (0x87, 0x06)
 _SWITCH_ON: Final = (0x8F, 0x07)
 _ENABLE: Final = (0x8F, 0x0F)
 
-# what each command does in which state
+# command -> state before -> state after
 _TRANSITIONS: Final = (
     (
         _DISABLE_VOLTAGE,
@@ -95,11 +94,11 @@ class StateMachine:
 
     @property
     def powered(self) -> bool:
-        """The power stage drives the motor."""
+        """Whether the power stage drives the motor."""
         return self.state in (OPERATION_ENABLED, QUICK_STOP, FAULT_REACTION)
 
     def controlword(self, word: int) -> bool:
-        """Obey 6040h. True when a fault was reset by this word (rising edge of bit 7, transition 15)."""
+        """Follow 6040h. Return True when this word reset a fault (rising edge of bit 7, transition 15)."""
         rising = word & FAULT_RESET and not self._last & FAULT_RESET
         self._last = word
         if self.state == FAULT:
@@ -114,27 +113,23 @@ class StateMachine:
         return False
 
     def fault(self) -> None:
-        """Transition 13: a fault was detected. A powered drive reacts first; the others are in "fault" at
-        once.
-        """
+        """Detect a fault, transition 13. A powered drive reacts first; the others are in "fault" at once."""
         if self.state != FAULT:
             self.state = FAULT_REACTION if self.powered else FAULT
 
     def stopped(self) -> None:
-        """The quick stop or the fault reaction has come to its end: transition 12 or 14."""
+        """End the quick stop or the fault reaction: transition 12 or 14."""
         if self.state == QUICK_STOP:
             self.state = SWITCH_ON_DISABLED
         elif self.state == FAULT_REACTION:
             self.state = FAULT
 
     def enable_by_itself(self) -> None:
-        """Operation enabled without a controlword: demo motion and play-back, where no controller is on the
-        bus.
-        """
+        """Enable operation without a controlword: demo motion and play-back, where no controller is on the bus."""
         self.state = OPERATION_ENABLED
 
     def release(self) -> None:
-        """Power stage off without a fault, as after power-on."""
+        """Switch the power stage off without a fault, as after power-on."""
         self.state = SWITCH_ON_DISABLED
         self._last = 0
 
@@ -150,12 +145,12 @@ _I32 = 0x7FFF_FFFF
 
 
 def wrapped(value: int) -> int:
-    """A position counter of 32 bits runs over at its ends."""
+    """Return a position as a counter of 32 bits, which wraps around."""
     return (value + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000
 
 
 def limited(value: int, limit: int) -> int:
-    """Anything but a position stays at the end of its range."""
+    """Return the value held within its range: anything but a position saturates."""
     return -limit if value < -limit else limit if value > limit else value
 
 
@@ -183,7 +178,7 @@ class DriveNode(CanopenNode):
         self._link_units = ratings.link_counts_per_rev / (2.0 * math.pi)
         self._still_rad_s = STANDSTILL_RAD_S * ratings.gear_ratio
         self._current_units = 0.0
-        self._rate()
+        self._store_ratings()
         self.getters = {
             (0x3001, 0): self._temperature,
             (0x603F, 0): lambda: self._error_code,
@@ -191,14 +186,12 @@ class DriveNode(CanopenNode):
             (0x6061, 0): lambda: self._mode,
             (0x6064, 0): self._motor_position,
             (0x606C, 0): self._motor_velocity,
-            (
-                0x6077,
-                0,
-            ): self._current,  # torque in 1/1000 of rated torque = current in 1/1000 of rated current
+            # torque in 1/1000 of rated torque = current in 1/1000 of rated current
+            (0x6077, 0): self._current,
             (0x6078, 0): self._current,
             (0x60E4, 1): self._link_position,
         }
-        self.quiet = frozenset({(0x3001, 0)})  # told every 500 ms, that is soon enough
+        self.quiet = frozenset({(0x3001, 0)})  # sent every 500 ms
         self.handlers = {
             (0x6040, 0): self._controlword,
             (0x6060, 0): self._mode_of_operation,
@@ -209,7 +202,7 @@ class DriveNode(CanopenNode):
         self._messages: list[bytes] = []
         self.connect()
 
-    def _rate(self) -> None:
+    def _store_ratings(self) -> None:
         """Put the source's ratings into the object dictionary, as power-on values."""
         ratings = self._ratings
         numerator, denominator = _ratio(ratings.gear_ratio)
@@ -226,7 +219,7 @@ class DriveNode(CanopenNode):
         for key, value in values.items():
             self.store.set_number(*key, value)
             self.store.keep_as_default(*key)
-        # what 6075h says is what 6078h is scaled by, to the mA
+        # 6078h is scaled by 6075h as it reads, to the mA
         self._current_units = 1000.0 / (self.store.number(0x6075) * 1e-3)
 
     # Process objects ----------------------------------------------------------------------------------------
@@ -275,26 +268,26 @@ class DriveNode(CanopenNode):
         self._interpolate(self.store.number(0x60C2, 1), index)
 
     def _interpolate(self, value: int, index: int) -> None:
-        """60C2h: value * 10^index seconds from one target velocity to the next."""
+        """Apply 60C2h: value * 10^index seconds from one target velocity to the next."""
         period_s = value / 10**-index
         if period_s != self._interpolation_s:
             self._interpolation_s = period_s
             self._source.interpolate(self._number, period_s)
 
     def _take_over(self) -> None:
-        """A master is there: from now on only it commands, and both drives, as the demo motion needs both."""
+        """Give the command to the master for good, of both drives: the demo motion needs both."""
         if not self.commanded:
             self._on_master()
 
     def hand_over(self) -> None:
-        """The built-in motion ends for this drive."""
+        """End the built-in motion of this drive."""
         if not self.commanded:
             self.commanded = True
             self.machine.release()
             self._mode = 0
 
     def run_by_itself(self, mode: int, target: float) -> list[bytes]:
-        """Built-in motion or play-back: operation enabled, with a target in the units of `Source.command`."""
+        """Enable operation for built-in motion or play-back, with a target in the units of `Source.command`."""
         machine = self.machine
         if self.commanded or machine.state in (FAULT, FAULT_REACTION):
             return []
@@ -308,15 +301,15 @@ class DriveNode(CanopenNode):
         return self.event()
 
     def after_command(self) -> list[bytes]:
-        """EMCY of a fault reset, statusword as an event-driven TPDO."""
+        """Return the EMCY of a fault reset, and the statusword as an event-driven TPDO."""
         self._send_command()
         frames = self._messages + self.event()
         self._messages = []
         return frames
 
     def _send_command(self) -> None:
-        """Tell the source what this drive's power stage does now."""
-        command = self._command()
+        """Command the source if the power stage's mode or target has changed."""
+        command = self.source_command()
         if command != self._sent:
             if command[0] != OFF:
                 if self._ran and self._sent[0] == OFF:
@@ -325,7 +318,8 @@ class DriveNode(CanopenNode):
             self._sent = command
             self._source.command(self._number, *command)
 
-    def _command(self) -> tuple[int, float]:
+    def source_command(self) -> tuple[int, float]:
+        """Return mode and target of this drive's power stage, as `Source.command` takes them."""
         state = self.machine.state
         if state in (QUICK_STOP, FAULT_REACTION):
             return VELOCITY, 0.0
@@ -345,7 +339,7 @@ class DriveNode(CanopenNode):
     # Once per SYNC ------------------------------------------------------------------------------------------
 
     def watch(self) -> list[bytes]:
-        """After the source went on: overcurrent, end of a quick stop or of a fault reaction."""
+        """Check for overcurrent and the end of a quick stop or fault reaction, after the source has advanced."""
         current = self._signals.current_a
         trip = self._ratings.trip_current_a
         machine = self.machine
@@ -363,7 +357,7 @@ class DriveNode(CanopenNode):
         return []
 
     def on_heartbeat_lost(self) -> list[bytes]:
-        """A commanded drive stops and keeps the fault until reset; one that runs by itself is released."""
+        """Stop a commanded drive with a fault until reset; release one that runs by itself."""
         if self.commanded:
             self.machine.fault()
             self._error_code = HEARTBEAT_LOST
@@ -374,7 +368,7 @@ class DriveNode(CanopenNode):
         return self.event()
 
     def on_reset(self) -> None:
-        """Power-on state: power stage off, no mode, no fault."""
+        """Return to the power-on state: power stage off, no mode, no fault."""
         self.machine.release()
         self._ran = False
         self._mode = 0
@@ -384,7 +378,6 @@ class DriveNode(CanopenNode):
 
 
 def _ratio(gear_ratio: float) -> tuple[int, int]:
-    from fractions import Fraction
-
-    found = Fraction(gear_ratio).limit_denominator(10_000)
-    return found.numerator, found.denominator
+    """Return numerator and denominator of 6091h."""
+    ratio = Fraction(gear_ratio).limit_denominator(10_000)
+    return ratio.numerator, ratio.denominator

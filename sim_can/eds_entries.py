@@ -1,7 +1,7 @@
-"""Object dictionary entries of the bench's nodes from their EDS files, read in a process of their own.
+"""Object dictionary entries of the bench's nodes from their EDS files, read in a child process.
 
-canopen's EDS parser takes 20 MB that the bench would then carry for good; a child reads the files and hands
-the entries over as JSON, while this process loads everything else.
+canopen's EDS parser takes 20 MB, which the bench would keep for good. A child (`python -m jtqd.sim_can.eds_entries`) reads
+the files and prints the entries as JSON while this process loads everything else.
 """
 
 import json
@@ -19,14 +19,14 @@ _cache: dict[int, list[Entry]] = {}
 
 
 def entries_of(node: int) -> list[Entry]:
-    """Entries of node 1, 2 or 3: those a child has read, else read here and kept."""
+    """Return the entries of node 1, 2 or 3: those a child has read, else read here and kept."""
     if node not in _cache:
         _cache[node] = read_eds(FOLDER / FILES[node], node)
     return _cache[node]
 
 
 class EdsChild:
-    """The child that reads; begin it early, `take` its result before the nodes are made."""
+    """Child process that reads the EDS files; start it early, `take` its result before the nodes are made."""
 
     def __init__(self) -> None:
         self._process = subprocess.Popen(
@@ -37,9 +37,7 @@ class EdsChild:
         )
 
     def take(self) -> None:
-        """Put the child's entries where `entries_of` finds them; where it failed they are read in this
-        process.
-        """
+        """Give the child's entries to `entries_of`; if the child failed they are read in this process."""
         try:
             output, _ = self._process.communicate(timeout=_CHILD_S)
         except subprocess.TimeoutExpired:

@@ -1,21 +1,23 @@
-"""The plant of `jtqd.sim_can.plant` for joints whose files have effects: the same equations with the effects in them.
+"""Plant of joints whose files have effects: the equations of `jtqd.sim_can.plant` with the effects in them.
 
-Per joint, with the sums of the hooks of estimator/effects/effect.py (b: twist by position alone, u: other twist):
+Per joint, with the sums of the hooks of `jtqd.estimator.effects.effect` (b: twist by position alone, u: other twist):
 
     δ = θm/G + e(θm) + b(θm) - θl         τ = K (δ + u) + D dδ/dt + H z
     Jm dwm/dt = Kt i - τ (1/G + e') - (A cos(n θm + φ) + loss_nm + friction) / G
     (Jl1 + Jl2) dwl1/dt = (τ1 - load1) - (τ2 - load2)      sensor = τ1 - load1 - Jl1 dwl1/dt
 
 A kinematic error brings its virtual work τ b' along as its loss. Dissipative losses are part of the implicit
-friction, so a joint sticks with them as without. A class of its own, because asking hooks costs time that a plant
+friction, so a joint sticks with them as without. A class of its own, because evaluating hooks costs time that a plant
 without effects must not pay; with effects of size zero both give the same numbers bit by bit. Pure.
 """
+
+from __future__ import annotations
 
 import math
 
 from jtqd.estimator.checked import ConfigError
-from jtqd.sim_can.losses import EffectFriction, JointEffects, total
-from jtqd.sim_can.plant import Plant, _Constants
+from jtqd.sim_can.joint_effects import EffectFriction, JointEffects, total
+from jtqd.sim_can.plant import JointConstants, Plant, relaxed_angle
 from jtqd.sim_can.plant_file import STEEPEST_KINEMATIC_ERROR, PlantParameters, substep_limit
 
 
@@ -37,7 +39,7 @@ class _Side:
         "velocity",
     )
 
-    def __init__(self, constants: _Constants, effects: JointEffects, sign: float) -> None:
+    def __init__(self, constants: JointConstants, effects: JointEffects, sign: float) -> None:
         self.constants = constants
         self.sign = sign  # of joint 1's link position in this joint's frame
         self.effects = effects
@@ -48,7 +50,7 @@ class _Side:
         self.load = 0.0  # Nm taken between gear and sensor
 
     def place(self, angle: float, velocity: float, slip: float, link: float, h: float) -> None:
-        """Take over a state; the bend's rate is that of the last step of h seconds."""
+        """Set the state; the bend's rate is that of the last step of h seconds."""
         self.angle, self.velocity, self.slip, self.link = angle, velocity, slip, link
         if self.effects.bend:
             before = self.effects.bend_rad(angle - h * velocity, link)
@@ -66,7 +68,7 @@ class _Side:
         return x - self.link
 
     def torque(self, link_velocity: float) -> float:
-        """τ at the present state; the hooks' state then holds it, and `load` is up to date."""
+        """Return τ at the present state; sets the hooks' state and `load`."""
         c, effects = self.constants, self.effects
         state = effects.state
         joint_velocity = self.velocity * (1.0 / c.gear_ratio)
@@ -93,7 +95,7 @@ class _Side:
         return torque
 
     def push(self, current_a: float, torque_nm: float, h: float) -> float:
-        """Motor velocity after h seconds without friction, from the state at which `torque` was asked."""
+        """Return the motor velocity after h seconds without friction, from the state that `torque` set."""
         c, effects = self.constants, self.effects
         angle = self.angle
         load = torque_nm * self.slope + c.ripple_nm * math.cos(c.ripple_order * angle + c.ripple_phase)
@@ -106,7 +108,7 @@ class _Side:
         )
 
     def turn(self, velocity: float, link: float, h: float) -> None:
-        """Go on to this motor velocity for h seconds, and to this link position."""
+        """Advance by h seconds at this motor velocity, to this link position."""
         effects, c = self.effects, self.constants
         effects.state.motor_acceleration_rad_s2 = (velocity - self.velocity) / h
         self.velocity = velocity
@@ -149,11 +151,14 @@ class EffectPlant(Plant):
             EffectFriction(file, effects) if effects.friction else file
             for file, effects in zip(files, self.effects, strict=True)
         )
-        self.motor_position = [_relaxed(side) for side in self._sides]
+        self.motor_position = [
+            relaxed_angle(side.constants, side.effects.bend_rad if side.effects.bend else None)
+            for side in self._sides
+        ]
         self.time_s = 0.0
 
     def begin_run(self) -> None:
-        """The time that effects may depend on begins here."""
+        """Start the time that effects may depend on."""
         self.time_s = 0.0
 
     def _integrate(self, steps: int, h: float) -> None:
@@ -193,7 +198,7 @@ class EffectPlant(Plant):
         self.time_s += steps * h
 
     def _place(self, h: float) -> None:
-        """The plant's public state into both sides, temperature and time into their effects' states."""
+        """Copy the plant's public state to both sides, temperature and time to their effects' states."""
         for k, side in enumerate(self._sides):
             state = side.effects.state
             state.temperature_c = self.temperatures[k].celsius
@@ -207,25 +212,14 @@ class EffectPlant(Plant):
             )
 
     def joint_torques(self) -> tuple[float, float]:
-        """(τ1, τ2): torque of each flexible spline in Nm, own frames."""
+        """Return (τ1, τ2): torque of each flexible spline in Nm, own frames."""
         self._place(self.substep_s)
         one, two = self._sides
         return one.torque(self.link_velocity), two.torque(-self.link_velocity)
 
     def sensor_torque(self) -> float:
-        """True torque in the sensor, Nm: τ1 - load1 - Jl1 dwl1/dt."""
+        """Return the true torque in the sensor, Nm: τ1 - load1 - Jl1 dwl1/dt."""
         tau_1, tau_2 = self.joint_torques()
         one, two = tau_1 - self._sides[0].load, tau_2 - self._sides[1].load
         share = self._link_inertia[0] / (self._link_inertia[0] + self._link_inertia[1])
         return one - share * (one - two)
-
-
-def _relaxed(side: _Side) -> float:
-    """Motor angle without torsion at link angle zero, as `jtqd.sim_can.plant._relaxed`."""
-    c = side.constants
-    angle = 0.0
-    for _ in range(60):
-        bend = side.effects.bend_rad(angle)
-        angle = -c.gear_ratio * c.error_rad * math.sin(c.error_order * angle + c.error_phase)
-        angle -= c.gear_ratio * bend
-    return angle if c.error_rad or side.effects.bend else 0.0

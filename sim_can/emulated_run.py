@@ -1,17 +1,18 @@
-"""Emulated runs without a bus, for training and tests: plant, drives and quantised measurement at 1 kHz.
-Pure.
+"""Emulated runs without a bus, for training and tests: plant, drives and quantised measurement at 1 kHz. Pure.
 
-A run holds exactly what a controller would have read from the PDOs, in SI units: the same `PlantSource`,
-rounded to the drives' and the sensor's units as the nodes round it.
+A run holds exactly what a controller would have read from the PDOs, in SI units: the same `PlantSource`, rounded to the
+drives' and the sensor's units as the nodes round it.
 """
+
+from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sim_can.days import NOMINAL_DAY, Day
 from jtqd.sim_can.days import day as day_of
@@ -27,26 +28,24 @@ TimeFunction = Callable[[float], float]
 
 
 class JointCommand(NamedTuple):
-    """What one drive does: mode OFF, VELOCITY (rad/s, joint side) or CURRENT (A), and its target over time in
-    seconds.
-    """
+    """Command of one drive: mode OFF, VELOCITY (rad/s, joint side) or CURRENT (A), and its target over time in seconds."""
 
     mode: int
     target: TimeFunction
 
     @classmethod
-    def velocity(cls, target: TimeFunction) -> "JointCommand":
-        """Velocity mode; target(t) in rad/s of the joint side."""
+    def velocity(cls, target: TimeFunction) -> JointCommand:
+        """Return a command in velocity mode; target(t) in rad/s of the joint side."""
         return cls(VELOCITY, target)
 
     @classmethod
-    def current(cls, target: TimeFunction) -> "JointCommand":
-        """Current mode; target(t) in A."""
+    def current(cls, target: TimeFunction) -> JointCommand:
+        """Return a command in current mode; target(t) in A."""
         return cls(CURRENT, target)
 
     @classmethod
-    def off(cls) -> "JointCommand":
-        """Power stage off."""
+    def off(cls) -> JointCommand:
+        """Return a command that leaves the power stage off."""
         return cls(OFF, _zero)
 
 
@@ -66,7 +65,7 @@ def emulate_run(
     """Run both joints from rest for duration_s and return what was measured every period_s.
 
     Args:
-        plant: the bench. commands: of joint 1 and joint 2; targets are asked once per period, at its
+        plant: the bench. commands: of joint 1 and joint 2; targets are evaluated once per period, at its
         beginning.
         seed: of the measurement noise and of the days; the same arguments give the same table bit by bit.
         day: number of the day of this seed (0, 1, 2, ...; each has noise of its own), whose values lie within
@@ -123,14 +122,12 @@ def emulate_run(
         )
         for number in (1, 2)
     }
-    time: NDArray[np.float64] = np.arange(count, dtype=np.float64) * period_s
+    time: FloatArray = np.arange(count, dtype=np.float64) * period_s
     return RunTable(time_s=time, joints=joints)
 
 
-def _columns(
-    signals: NDArray[np.float64], torque: NDArray[np.float64], ratings: DriveRatings
-) -> JointColumns:
-    """Rounded to the units of 6078h, 6064h, 606Ch, 60E4h and 3001h."""
+def _columns(signals: FloatArray, torque: FloatArray, ratings: DriveRatings) -> JointColumns:
+    """Return the signals [n, 5] rounded to the units of 6078h, 6064h, 606Ch, 60E4h and 3001h, and the torque [n]."""
     motor = 2.0 * math.pi / ratings.motor_counts_per_rev
     link = 2.0 * math.pi / ratings.link_counts_per_rev
     current = ratings.rated_current_a / 1000.0

@@ -21,7 +21,10 @@ joint sticks at exactly zero velocity, does not creep, and no step size makes fr
 clock.
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -34,8 +37,8 @@ from jtqd.sim_can.plant_file import JointPlant, PlantParameters, substep_limit
 CONTROL_CYCLE_S = 0.001
 
 
-class _Constants(NamedTuple):
-    """Numbers of one joint that the inner loop uses."""
+class JointConstants(NamedTuple):
+    """Constants of one joint for the inner loop, SI units."""
 
     gear_ratio: float
     torque_constant: float
@@ -53,9 +56,9 @@ class _Constants(NamedTuple):
     per_travel: float
 
 
-def _constants(side: JointPlant) -> _Constants:
+def _constants(side: JointPlant) -> JointConstants:
     d = side.deviations
-    return _Constants(
+    return JointConstants(
         side.joint.gear_ratio,
         side.torque_constant,
         side.rotor_inertia,
@@ -73,19 +76,21 @@ def _constants(side: JointPlant) -> _Constants:
     )
 
 
-def _relaxed(c: _Constants) -> float:
-    """Motor angle without torsion at link angle zero, θ = -G e(θ): a bench is bolted together without stress.
+def relaxed_angle(c: JointConstants, bend_rad: Callable[[float], float] | None = None) -> float:
+    """Return the motor angle without torsion at link angle zero, θ = -G (e(θ) + b(θ)): a bench is assembled without stress.
 
-    The iteration contracts: G |e'| < 1/2 (`plant_parameters`). 0 without kinematic error.
+    bend_rad: b(θ), twist by position alone. The iteration contracts: G |e' + b'| < 1/2 (`plant_file`). 0 without either.
     """
     angle = 0.0
     for _ in range(60):
+        bend = 0.0 if bend_rad is None else bend_rad(angle)
         angle = -c.gear_ratio * c.error_rad * math.sin(c.error_order * angle + c.error_phase)
-    return angle if c.error_rad else 0.0
+        angle -= c.gear_ratio * bend
+    return angle if c.error_rad or bend_rad is not None else 0.0
 
 
 def loss_table(side: JointPlant) -> LossTable:
-    """Losses of the joint's file over what the gear transmits, without a Stribeck peak: that is a deviation."""
+    """Return the losses of the joint's file over what the gear transmits, without a Stribeck peak: that is a deviation."""
     joint = side.joint
     if joint.efficiency is None:
         joint = replace(joint, friction=replace(joint.friction, stribeck_nm=0.0))
@@ -98,7 +103,7 @@ def loss_table(side: JointPlant) -> LossTable:
 
 
 def joint_friction(side: JointPlant, table: LossTable | None = None) -> JointFriction:
-    """Friction law of a true joint from its file's losses (`table`, else made here) and its deviations."""
+    """Return the friction law of a true joint from its file's losses (`table`, else made here) and its deviations."""
     joint, d = side.joint, side.deviations
     viscous = (d.viscous_scale - 1.0) * joint.friction.viscous_nms_per_rad
     table = loss_table(side) if table is None else table
@@ -130,7 +135,7 @@ class Plant:
         self._warming = any(side.thermal.kelvin_per_w > 0.0 for side in parameters.joints)
         self._day = NOMINAL_DAY
         self.substep_s = substep_limit(parameters)
-        self.motor_position = [_relaxed(c) for c in self._joints]
+        self.motor_position = [relaxed_angle(c) for c in self._joints]
         self.motor_velocity = [0.0, 0.0]
         self.link_position = 0.0
         self.link_velocity = 0.0
@@ -138,17 +143,17 @@ class Plant:
         self._loss_w = [0.0, 0.0]  # power of the friction in the last integration step
 
     def begin_run(self) -> None:
-        """The drives are about to be enabled: the time that effects may depend on begins here."""
+        """Start a run: the drives are about to be enabled; the time that effects may depend on counts from here."""
 
     def begin_day(self, day: Day) -> None:
-        """Friction and temperature of another day; both joints are as warm as their surroundings."""
+        """Set friction and temperature of another day; both joints are as warm as their surroundings."""
         self._day = day
         for k, temperature in enumerate(self.temperatures):
             temperature.start(day.temperature_k[k])
             self._set_friction(k)
 
     def _set_friction(self, k: int) -> None:
-        """Shares of Coulomb and viscous friction by the present day and temperature, against the file's."""
+        """Set the Coulomb and viscous friction of the present day and temperature, as differences to the file's."""
         side, temperature = self.parameters.joints[k], self.temperatures[k]
         file = side.joint.friction
         viscous = side.deviations.viscous_scale * (1.0 + self._day.viscous[k]) * temperature.viscous
@@ -157,7 +162,7 @@ class Plant:
         )
 
     def command(self, drive: int, mode: int, target: float) -> None:
-        """Mode and target of drive 0 or 1 from now on; see `jtqd.sim_can.source`."""
+        """Set mode and target of drive 0 or 1; see `jtqd.sim_can.source`."""
         self.drives[drive].command(mode, target, self.motor_velocity[drive])
 
     def step(self, dt_s: float) -> None:
@@ -179,13 +184,13 @@ class Plant:
                 self._warm(cycle)
 
     def _warm(self, dt_s: float) -> None:
-        """The losses of dt_s seconds go into the joints' temperatures."""
+        """Add the losses of dt_s seconds to the joints' temperatures."""
         for k, temperature in enumerate(self.temperatures):
             if temperature.add(self._loss_w[k], dt_s):
                 self._set_friction(k)
 
     def _integrate(self, steps: int, h: float) -> None:  # noqa: PLR0915 - both joints written out for speed
-        """`steps` integration steps of h seconds."""
+        """Integrate `steps` steps of h seconds."""
         G1, Kt1, Jm1, K1, D1, A1, n1, p1, E1, k1, q1, S1, H1, c1 = self._joints[0]
         G2, Kt2, Jm2, K2, D2, A2, n2, p2, E2, k2, q2, S2, H2, c2 = self._joints[1]
         control1, control2 = self.drives[0].step, self.drives[1].step
@@ -250,7 +255,7 @@ class Plant:
         self._loss_w[0], self._loss_w[1] = stop1 * abs(w1) / h1, stop2 * abs(w2) / h2
 
     def _torsions(self) -> tuple[float, float]:
-        """(δ1, δ2) in rad, own frames."""
+        """Return (δ1, δ2) in rad, own frames."""
         one, two = self._joints
         th1, th2 = self.motor_position
         x1 = th1 / one.gear_ratio
@@ -262,7 +267,7 @@ class Plant:
         return x1 - self.link_position, x2 + self.link_position
 
     def joint_torques(self) -> tuple[float, float]:
-        """(τ1, τ2): torque of each flexible spline in Nm, Eq. (3), own frames."""
+        """Return (τ1, τ2): torque of each flexible spline in Nm, Eq. (3), own frames."""
         G1, _, _, K1, D1, _, _, _, E1, k1, q1, S1, H1, _ = self._joints[0]
         G2, _, _, K2, D2, _, _, _, E2, k2, q2, S2, H2, _ = self._joints[1]
         d1, d2 = self._torsions()
@@ -276,13 +281,13 @@ class Plant:
         return K1 * d1 + D1 * (v1 - wl) + H1 * z1, K2 * d2 + D2 * (v2 + wl) + H2 * z2
 
     def sensor_torque(self) -> float:
-        """True torque in the sensor, Nm: τ1 - Jl1 dwl1/dt."""
+        """Return the true torque in the sensor, Nm: τ1 - Jl1 dwl1/dt."""
         one, two = self.joint_torques()
         share = self._link_inertia[0] / (self._link_inertia[0] + self._link_inertia[1])
         return one - share * (one - two)
 
     def energy(self) -> float:
-        """Kinetic and elastic energy and the ripple's potential, J. Without motor current it can only fall."""
+        """Return kinetic and elastic energy and the ripple's potential, J. Without motor current it can only fall."""
         total = 0.5 * (self._link_inertia[0] + self._link_inertia[1]) * self.link_velocity**2
         for k, (c, torsion) in enumerate(zip(self._joints, self._torsions(), strict=True)):
             total += 0.5 * c.rotor_inertia * self.motor_velocity[k] ** 2 + 0.5 * c.stiffness * torsion**2

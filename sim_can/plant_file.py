@@ -16,7 +16,7 @@ from typing import Any
 from jtqd.estimator.checked import Section
 from jtqd.estimator.joint import Joint
 from jtqd.sim_can.days import RunToRun, Thermal
-from jtqd.sim_can.losses import changed_joint, uses_temperature
+from jtqd.sim_can.joint_effects import changed_joint, uses_temperature
 
 # How a true joint differs from its file: `deviations` of a plant file. Unknown keys are errors.
 

@@ -1,5 +1,8 @@
-"""The plant seen through its encoders, current measurement and torque sensor: the default
-`jtqd.sim_can.source.Source`. Pure.
+"""The plant measured by its encoders, current measurement and torque sensor: the default `source.Source`. Pure.
+
+Encoders round and add noise, the sensor has gain, offset and noise; a bench whose joint files have effects also has errors
+by the hooks current_a, link_rad and sensor_nm (`Readings`). Encoders and current measurement belong to their joint's file.
+There is one sensor: its effects are those of joint 1's file, and joint 2's only where joint 1's has none.
 """
 
 from __future__ import annotations
@@ -15,27 +18,19 @@ from jtqd.estimator.effects.functions import Scalar
 from jtqd.estimator.joint import Joint
 from jtqd.sim_can.days import NOMINAL_DAY, Day, day
 from jtqd.sim_can.effect_plant import EffectPlant
-from jtqd.sim_can.losses import effects_of
+from jtqd.sim_can.joint_effects import effects_of
 from jtqd.sim_can.plant import Plant
 from jtqd.sim_can.plant_file import JointPlant, PlantParameters
 from jtqd.sim_can.source import OFF, ChannelSignal, DriveRatings, DriveSignals
 
-# What the instruments of a bench with effects read beside the truth: hooks current_a, link_rad, sensor_nm. Pure.
-#
-# Encoders and current measurement belong to their joint's file. There is one sensor: its effects are those of joint
-# 1's file, and joint 2's only where joint 1's has none.
-#
-# What reads late reads the past: the rates that a delay is multiplied with are means over the delay itself, so that
-# truth - d * rate is the truth d ago, between samples by a straight line. An error of the motor's encoder, which
-# the library expresses as one of the link's (motor_side=1), goes to the motor's.
-
-
 Errors = tuple[float, float, float]
 """What motor encoder [rad, motor side], link encoder [rad] and current [A] read above the truth."""
 
+_TWO_PI = 2.0 * math.pi
+
 
 class _Truth(NamedTuple):
-    """What reads late, at one time."""
+    """True values of the quantities that a channel delay acts on, at one time."""
 
     time_s: float
     currents: tuple[float, float]
@@ -73,7 +68,7 @@ class _Past:
             samples.popleft()
 
     def ago(self, delay_s: float) -> _Truth:
-        """The truth of delay_s ago; 0: of the last sample before this one."""
+        """Return the truth of delay_s ago, between samples by a straight line; 0: of the last sample before this one."""
         samples = self._samples
         if delay_s <= 0.0:
             return samples[-2] if len(samples) > 1 else samples[-1]
@@ -87,7 +82,10 @@ class _Past:
 
 
 class _Reading:
-    """One hook of one effect, with a state of its own: its rates are over its own delay."""
+    """One hook of one effect, with a state of its own.
+
+    Its rates are means over its own delay d, so that truth - d * rate is the truth d ago.
+    """
 
     def __init__(self, effect: Effect, name: str, values: Values, joint: Joint, number: int) -> None:
         self._call: Callable[..., Any] = getattr(effect, name)
@@ -99,16 +97,16 @@ class _Reading:
         self.delay_s = abs(values.get("delay_s", 0.0))
         self.at_motor = name == "link_rad" and effect.at_motor_of(values)
 
-    def see(self, plant: EffectPlant, truth: _Truth, past: _Past) -> None:
-        """The truth as this joint sees it, in its own frame."""
+    def update(self, plant: EffectPlant, truth: _Truth, past: _Past) -> None:
+        """Set the hook's state to the truth in this joint's own frame."""
         number, state = self._number, self.state
         sign = -1.0 if number else 1.0
-        seen = plant.effects[number].state
+        inner = plant.effects[number].state
         for name in ("direction", "velocity_rad_s", "motor_position_rad", "torsion_rad", "torque_nm"):
-            setattr(state, name, getattr(seen, name))
-        state.motor_acceleration_rad_s2 = seen.motor_acceleration_rad_s2
-        state.link_acceleration_rad_s2 = seen.link_acceleration_rad_s2
-        state.temperature_c, state.time_s = seen.temperature_c, seen.time_s
+            setattr(state, name, getattr(inner, name))
+        state.motor_acceleration_rad_s2 = inner.motor_acceleration_rad_s2
+        state.link_acceleration_rad_s2 = inner.link_acceleration_rad_s2
+        state.temperature_c, state.time_s = inner.temperature_c, inner.time_s
         state.current_a = truth.currents[number]
         state.link_position_rad, state.coupling_position_rad = sign * truth.link_rad, truth.link_rad
         before = past.ago(self.delay_s)
@@ -122,22 +120,25 @@ class _Reading:
             state.link_velocity_rad_s = sign * plant.link_velocity
 
     def error(self) -> float:
-        """The hook at the state."""
+        """Return the hook's value at the state."""
         return float(self._call(self._values, self.state, self.joint, self._functions))
 
 
 class Readings:
-    """Errors of all instruments of one bench; `read` once per sample, after the plant's step."""
+    """Errors by effects of all instruments of one bench; `read` once per sample, after the plant's step.
+
+    An error of the motor's encoder, which the library expresses as one of the link's (motor_side=1), is the motor's here.
+    """
 
     def __init__(self, plant: EffectPlant) -> None:
         self._plant = plant
         sides = [side.true_joint for side in plant.parameters.joints]
-        found = [(k, *entry) for k, joint in enumerate(sides) for entry in effects_of(joint)]
-        first = next((k for k, effect, values in found if effect.at_sensor_of(values)), 0)
+        entries = [(k, *entry) for k, joint in enumerate(sides) for entry in effects_of(joint)]
+        first = next((k for k, effect, values in entries if effect.at_sensor_of(values)), 0)
         self._current: list[list[_Reading]] = [[], []]
         self._position: list[list[_Reading]] = [[], []]
         self._sensor: list[_Reading] = []
-        for k, effect, values in found:
+        for k, effect, values in entries:
             for name, readings in (
                 ("current_a", self._current[k]),
                 ("link_rad", self._position[k]),
@@ -156,7 +157,7 @@ class Readings:
         self._time_s = 0.0
 
     def read(self, torque_nm: float, dt_s: float) -> tuple[tuple[Errors, Errors], float]:
-        """Errors of both joints' instruments, and what the sensor reads where torque_nm is the truth.
+        """Return the errors of both joints' instruments, and what the sensor reads where torque_nm is the truth.
 
         dt_s: time since the last call.
         """
@@ -166,7 +167,7 @@ class Readings:
         truth = _Truth(self._time_s, (one.current_a, two.current_a), plant.link_position, torque_nm)
         self._past.add(truth)
         for reading in self._all:
-            reading.see(plant, truth, self._past)
+            reading.update(plant, truth, self._past)
         return (self._of_joint(0), self._of_joint(1)), self._of_sensor(torque_nm)
 
     def _of_joint(self, k: int) -> Errors:
@@ -181,7 +182,7 @@ class Readings:
         return motor, link, current
 
     def _of_sensor(self, truth_nm: float) -> float:
-        """The hooks use what the sensor reads, which is what is wanted; they are linear in it: a secant is exact."""
+        """Return what the sensor reads. Its hooks depend on just that, linearly: a secant is exact."""
         if not self._sensor:
             return truth_nm
         low, high = (self._sensor_errors(truth_nm + more) for more in (0.0, 1.0))
@@ -195,11 +196,8 @@ class Readings:
         return error
 
 
-_TWO_PI = 2.0 * math.pi
-
-
 def ratings_of(side: JointPlant) -> DriveRatings:
-    """What the drive of this joint says about itself: nominal values, as a drive knows no others."""
+    """Return the ratings in the drive's own objects: nominal values, as a drive knows no others."""
     return DriveRatings(
         gear_ratio=side.joint.gear_ratio,
         rated_current_a=side.drive.rated_current_a,
@@ -250,9 +248,9 @@ class _Encoders:
 
 
 def _plant_of(parameters: PlantParameters) -> tuple[Plant, Readings | None]:
-    """The plant for these joints, and what its instruments read beside the truth.
+    """Return the plant of these joints and, with effects, the errors of its instruments.
 
-    Raises ConfigError for effects that cannot be.
+    Raises ConfigError for effects with which no joint could work.
     """
     if not parameters.has_effects:
         return Plant(parameters), None
@@ -263,9 +261,8 @@ def _plant_of(parameters: PlantParameters) -> tuple[Plant, Readings | None]:
 class PlantSource:
     """`Source` of the emulated bench; the same seed and the same calls give the same signals bit by bit.
 
-    Where the plant file has `run_to_run`, the source begins in day 0 of its seed, and each time a drive is
-    enabled after both were off again it is another day, unless the run goes on (`resume`). `noise_seed`: of
-    the noise, where it is not `seed`.
+    Where the plant file has `run_to_run`, the source starts in day 0 of its seed, and each time a drive is enabled after
+    both were off it is the next day, unless the run goes on (`resume`). `noise_seed`: of the noise, where it is not `seed`.
     """
 
     def __init__(self, parameters: PlantParameters, seed: int = 0, noise_seed: str | None = None) -> None:
@@ -288,7 +285,7 @@ class PlantSource:
         self.begin_day(day(self._widths, seed, 0))
 
     def begin_day(self, values: Day = NOMINAL_DAY) -> None:
-        """Another day: friction, temperature and zeros as given. The joints stay where they are."""
+        """Set friction, temperature and zeros of another day. The joints stay where they are."""
         self.plant.begin_day(values)
         for encoders, zero in zip(self._encoders, values.link_zero_rad, strict=True):
             encoders.link_zero_rad = zero
@@ -320,7 +317,7 @@ class PlantSource:
         return True
 
     def command(self, drive: int, mode: int, target: float) -> None:
-        """Mode and target for the control loops of drive 0 or 1."""
+        """Set mode and target of the control loops of drive 0 or 1."""
         modes = self._modes
         if mode != modes[drive]:
             if modes == [OFF, OFF] and not self._resumed:
@@ -333,9 +330,9 @@ class PlantSource:
         self.plant.command(drive, mode, target)
 
     def resume(self) -> None:
-        """What is enabled next goes on with the run, also after both drives were off."""
+        """Continue the run with what is enabled next, also after both drives were off."""
         self._resumed = True
 
     def interpolate(self, drive: int, period_s: float) -> None:
-        """Time between two velocity targets of drive 0 or 1 [s]."""
+        """Set the time between two velocity targets of drive 0 or 1 [s]."""
         self.plant.drives[drive].interpolation_s = period_s

@@ -1,4 +1,4 @@
-"""A measured run as the source of the bench's nodes: plays its rows as PDO values, faithfully in time.
+"""Playback of a measured run: a `Source` whose rows the bench's nodes send as PDO values, faithfully in time.
 
 Run time advances by the measured step from SYNC to SYNC. The value of a SYNC is the row nearest to its
 time, never an interpolation, so that what is on the bus is what was measured. Nearest, not previous: rows
@@ -10,13 +10,15 @@ When the run is over `advance` returns False for good. The nodes then stop answe
 never sent as a measured one.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTableError
 from jtqd.models.files import load_joint, shipped
@@ -27,7 +29,10 @@ COLUMN_MAP_NAME = "columns.yaml"
 
 
 class PlaySource:
-    """Source (sim_can/source.py) of two recorded joints, each with a torque sensor channel of its own."""
+    """`Source` of two recorded joints, each with a torque sensor channel of its own.
+
+    `notes`: remarks of the run's reader on the joints that are played.
+    """
 
     def __init__(
         self, run: RunFile, joints: tuple[int, int], ratings: tuple[DriveRatings, DriveRatings]
@@ -95,6 +100,7 @@ class PlaySource:
         """Ignored, as `command`."""
 
     def _show(self, row: int) -> None:
+        """Set the signals to a row of the run."""
         self._row = row
         first, second = self._drives
         (
@@ -112,7 +118,7 @@ class PlaySource:
 
 
 def columns_beside(run_path: Path | str) -> Path | None:
-    """The run's own column map: columns.yaml in its folder, where there is one."""
+    """Return the run's own column map, columns.yaml in its folder; None where there is none."""
     path = Path(run_path).parent / COLUMN_MAP_NAME
     return path if path.is_file() else None
 
@@ -155,7 +161,7 @@ def _files_of(columns: ColumnMap | None, joints: tuple[int, int]) -> tuple[Path,
 
 
 def _ratings(joint: Joint) -> DriveRatings:
-    """Ratings whose rated current gives the joint's rated torque: i_rated = tau_rated/(G Kt). Never trips."""
+    """Return ratings whose rated current gives the joint's rated torque: i_rated = tau_rated/(G Kt). Never trips."""
     rated_current_a = joint.rated_torque_nm / (joint.gear_ratio * joint.torque_constant_nm_per_a)
     return DriveRatings(
         gear_ratio=joint.gear_ratio,
@@ -166,8 +172,8 @@ def _ratings(joint: Joint) -> DriveRatings:
 
 
 def _rows(run: RunFile, joints: Sequence[int], ratings: Sequence[DriveRatings]) -> list[tuple[float, ...]]:
-    """One tuple of floats per row, ready to be assigned: four quantities and the torque of each joint."""
-    columns: list[NDArray[np.float64]] = []
+    """Return one tuple of floats per row, ready to be assigned: four quantities and the torque of each joint."""
+    columns: list[FloatArray] = []
     for joint, rating in zip(joints, ratings, strict=True):
         try:
             _, *inputs = run.table.estimator_inputs(joint, rating.gear_ratio)

@@ -25,43 +25,41 @@ class _Channel:
         self.set_decimals(decimals)
 
     def set_decimals(self, decimals: int) -> None:
-        """6132h."""
+        """Set the decimal digits: 6132h."""
         self.scale = 10.0**decimals
 
     def autozero(self) -> None:
-        """6125h: what is measured now is zero from now on."""
+        """Make the present torque zero: 6125h."""
         if self.signal is not None:
             self.zero_nm = self.signal.torque_nm
 
     def value(self, limit: int = _I32) -> int:
-        """9130h; with limit 7FFFh: 7130h. A value that does not fit stands at the end of the range."""
+        """Return 9130h, or 7130h with limit 7FFFh; a value that does not fit saturates."""
         if self.signal is None:
             return 0
         value = round((self.signal.torque_nm - self.zero_nm) * self.scale)
         return -limit - 1 if value < -limit - 1 else limit if value > limit else value
 
     def value_16(self) -> int:
-        """7130h."""
+        """Return 7130h."""
         return self.value(_I16)
 
     def status(self) -> int:
-        """6150h: not valid without a signal; overload where even 32 bits do not hold the value."""
+        """Return 6150h: not valid without a signal; overload where even 32 bits do not hold the value."""
         if self.signal is None or not self.signal.valid:
             return NOT_VALID
         value = self.value()
         return POSITIVE_OVERLOAD if value == _I32 else NEGATIVE_OVERLOAD if value == -_I32 - 1 else 0
 
     def status_16(self) -> int:
-        """6150h where the 16-bit value is what is read: overload at its own range."""
+        """Return 6150h for a channel that is read in 16 bits: overload at that range."""
         value = self.value_16()
         overload = POSITIVE_OVERLOAD if value == _I16 else NEGATIVE_OVERLOAD if value == -_I16 - 1 else 0
         return self.status() | overload
 
 
 class SensorNode(CanopenNode):
-    """Node 3. Channel 1 is the source's first torque channel; channel 2 is valid only where the source has a
-    second.
-    """
+    """Sensor as node 3. Channel 1 is the source's first torque channel; channel 2 is valid only where there is a second."""
 
     def __init__(self, source: Source) -> None:
         super().__init__(ObjectStore(entries_of(SENSOR_NODE), SENSOR_NODE))
@@ -81,7 +79,7 @@ class SensorNode(CanopenNode):
         self.connect()
 
     def on_reset(self) -> None:
-        """Power-on state: zero and decimals as delivered."""
+        """Return to the power-on state: zero and decimals as delivered."""
         for number, channel in enumerate(self._channels, 1):
             channel.zero_nm = 0.0
             channel.set_decimals(self.store.number(0x6132, number))

@@ -1,4 +1,4 @@
-"""Where the bench's nodes get their measurements from: the plant, or a recorded run.
+"""Source of the bench's measurements: what the plant (`plant_source`) and a recorded run (`play`) give to the nodes.
 
 The bench calls `advance(dt_s)` once per SYNC (dt_s = 0.0 at the first one: that is time zero of the source)
 and then reads `drives` and `channels`, which the source updates in place. All quantities are SI, already with
@@ -10,6 +10,8 @@ the own positive current of both joints. Sensor channel 0 is the bench's sensor.
 where each joint has a sensor of its own (measured runs): then channel 0 belongs to drive 0 and channel 1 to
 drive 1.
 """
+
+from __future__ import annotations
 
 import math
 from collections.abc import Sequence
@@ -24,7 +26,7 @@ CURRENT = 10  # cyclic synchronous torque; target: motor current in A
 
 @dataclass(frozen=True)
 class DriveRatings:
-    """What a drive tells about itself by SDO, and the rounding of its PDOs."""
+    """Ratings of a drive, readable by SDO, and the rounding of its PDOs."""
 
     gear_ratio: float
     rated_current_a: float  # 6075h; 6078h is 1/1000 of it
@@ -37,9 +39,9 @@ class DriveRatings:
 class DriveSignals:
     """Measured quantities of one drive; mutable, read once per SYNC.
 
-    `enabled` says that the source itself has the drive in operation (a recorded run). The node then reports
-    "operation enabled" although no master sent a controlword. The plant leaves it False: its drives are
-    enabled by a master or by the demo profile.
+    `enabled`: the source itself has the drive in operation (a recorded run); the node then reports "operation enabled"
+    although no master sent a controlword. The plant leaves it False: its drives are enabled by a master or by the demo
+    profile.
     """
 
     __slots__ = (
@@ -88,21 +90,20 @@ class Source(Protocol):
         """One or two entries; the same objects every time, updated by `advance`."""
 
     def advance(self, dt_s: float) -> bool:
-        """Go on by dt_s >= 0 and sample. False: the run is over (signals keep their last value); the bench
-        then ends.
-        """
+        """Advance by dt_s >= 0 and sample. False: the run is over (signals keep their last value); the bench then ends."""
 
     def command(self, drive: int, mode: int, target: float) -> None:
-        """Command for drive 0 or 1 from now on: OFF, VELOCITY (rad/s, motor side) or CURRENT (A). A recorded
-        run ignores it.
-        """
+        """Command drive 0 or 1: OFF, VELOCITY (rad/s, motor side) or CURRENT (A). A recorded run ignores it."""
 
     def resume(self) -> None:
-        """A drive is about to be enabled again that was switched off and has not been set up anew: the run goes on. A
-        recorded run ignores it.
+        """Continue the run: a drive that was switched off, but not set up anew, is about to be enabled again.
+
+        A recorded run ignores it.
         """
 
     def interpolate(self, drive: int, period_s: float) -> None:
-        """Time between two targets of drive 0 or 1 [s] (60C2h): VELOCITY targets are approached in a straight
-        line of that length. Not called: one control cycle. A recorded run ignores it.
+        """Set the time between two targets of drive 0 or 1 [s] (60C2h).
+
+        VELOCITY targets are approached in a straight line of that length. Not called: one control cycle. A recorded run
+        ignores it.
         """

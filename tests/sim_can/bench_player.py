@@ -5,7 +5,7 @@ import struct
 
 from jtqd.drivers.frame import FRAME
 from jtqd.sim_can.bench import Bench
-from jtqd.sim_can.command import map_pdos
+from jtqd.sim_can.cost import map_pdos
 from jtqd.sim_can.source import VELOCITY, ChannelSignal, DriveRatings, DriveSignals
 
 MS = 1_000_000

@@ -16,7 +16,8 @@ from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import FRAME, pack
 from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.drivers.hub import Hub
-from jtqd.sim_can.command import main, map_pdos
+from jtqd.sim_can.command import main
+from jtqd.sim_can.cost import map_pdos
 
 pytestmark = pytest.mark.native
 

@@ -10,7 +10,7 @@ import yaml
 from jtqd.estimator.checked import ConfigError
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.bench import PERIOD_S, demo_current, demo_velocity, targets
-from jtqd.sim_can.command import measure
+from jtqd.sim_can.cost import measure
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant, plant_from_mapping
 from jtqd.sim_can.plant_source import PlantSource
