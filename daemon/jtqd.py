@@ -1,4 +1,4 @@
-"""Command line of the daemon."""
+"""`jtqd`, the daemon: command line and exit status."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-# What is heavy to load is loaded in `_run`: Ctrl-C must find its handler there, also in the first second.
+# What is heavy to load is loaded in `_run`: Ctrl-C must find its handler installed, also in the first second.
 from jtqd import __version__
 from jtqd.daemon.live.address import NEEDED, Address, address, installed
 from jtqd.estimator.checked import seconds
@@ -28,7 +28,7 @@ exit status: 0 done, 1 failure, 2 usage, 3 done, but cycles are missing in the l
 
 
 def parser() -> argparse.ArgumentParser:
-    """Arguments of `jtqd`."""
+    """Return the arguments of `jtqd`."""
     result = argparse.ArgumentParser(
         prog="jtqd",
         description="Estimate the torque of two harmonic-drive joints at 1 kHz, as a CANopen master, without torque sensor.",
@@ -58,27 +58,29 @@ def parser() -> argparse.ArgumentParser:
         help="serve Foxglove or Lichtblick, read-only, 50 Hz (default: 127.0.0.1:8765; extra: live)",
     )
     result.add_argument("--json", action="store_true", help="print the final summary as JSON")
-    result.add_argument("--version", action="version", version=f"jtqd {__version__}")
+    result.add_argument(
+        "--version", action="version", help="print the version", version=f"jtqd {__version__}"
+    )
     return result
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the daemon; returns the exit status."""
     arguments = parser().parse_args(argv)
-    with _early_signals() as told_to_end:
-        return _run(arguments, told_to_end)
+    with _early_signals() as stop_requests:
+        return _run(arguments, stop_requests)
 
 
 @contextmanager
 def _early_signals() -> Iterator[list[int]]:
-    """Until the supervisor takes the signals: an order to end is kept for it, SIGHUP comes before any file is read.
+    """Collect orders to end until the supervisor takes the signals; SIGHUP is ignored, as no file has been read yet.
 
-    An exception instead would come out of the libraries that are being loaded as errors of theirs.
+    An exception (KeyboardInterrupt) would surface as errors of the libraries that are being loaded.
     """
-    told_to_end: list[int] = []
+    stop_requests: list[int] = []
 
     def note(number: int, frame: FrameType | None) -> None:
-        told_to_end.append(number)
+        stop_requests.append(number)
 
     handlers: dict[int, Callable[[int, FrameType | None], Any] | int] = {
         signal.SIGINT: note,
@@ -87,13 +89,13 @@ def _early_signals() -> Iterator[list[int]]:
     }
     before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
-        yield told_to_end
+        yield stop_requests
     finally:
         for number, old in before.items():
             signal.signal(number, old)
 
 
-def _run(arguments: argparse.Namespace, told_to_end: list[int]) -> int:
+def _run(arguments: argparse.Namespace, stop_requests: list[int]) -> int:
     if not arguments.bus:
         parser().error("argument --bus: found '', expected an interface, unix:PATH or sim")
     if arguments.live is not None and not installed():
@@ -109,7 +111,7 @@ def _run(arguments: argparse.Namespace, told_to_end: list[int]) -> int:
         supervisor = Supervisor(
             config, arguments.bus, arguments.config, arguments.record, arguments.duration, arguments.live
         )
-        if told_to_end:
+        if stop_requests:
             supervisor.stop()
         summary = supervisor.run()
     except (ConfigError, BusError, SupervisorError) as error:

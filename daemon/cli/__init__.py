@@ -1,5 +1,5 @@
 """Commands of `jtq` about a bus, a running daemon and this machine: status, control, check, doctor, bus-load, completion.
 
 In: command-line arguments, a bus, runtime directories of daemons. Out: text or JSON on standard output, an exit status.
-May import all of daemon, drivers, estimator and models. `checks` holds the result of a check and its report.
+May import daemon, drivers, estimator and models. `checks` holds the result of a check and its report, for all of them.
 """

@@ -342,11 +342,11 @@ def check_loop_timing(
 
 def check_stolen_time(stolen_s: float, seconds: float) -> CheckResult:
     """Judge the processor time that a hypervisor took in `seconds` (`daemon/loop/realtime.py`)."""
-    share = stolen_s / max(seconds, 1e-3)
-    text = f"{share:.1%} of a processor taken away by a hypervisor (stolen time)"
+    stolen = stolen_s / max(seconds, 1e-3)
+    text = f"{share(stolen)} of a processor taken away by a hypervisor (stolen time)"
     return (
         CheckResult("processors", WARN, text, _STOLEN_HINT)
-        if share >= STOLEN_WARN
+        if stolen >= STOLEN_WARN
         else CheckResult("processors", GOOD, text)
     )
 

@@ -1,4 +1,4 @@
-"""`jtq bus-load`: what a configuration costs on the wire, before it is run."""
+"""`jtq bus-load`: the worst-case load of the bus by a configuration, before it is run."""
 
 from __future__ import annotations
 
@@ -17,27 +17,28 @@ _EXAMPLES = """examples:
   jtq bus-load --config /etc/jtqd/can0.yaml     before it is run: jtqd refuses one above 95 %
   jtq bus-load --json | jq '.rows[] | [.cob_id, .share]'
 
-What really is on a bus is measured by `jtq check`.
+The load that a bus really has is measured by `jtq check`.
+
 exit status: 0 it fits, 1 it does not or cannot be read, 2 usage"""
 
 
 def parser() -> argparse.ArgumentParser:
-    """Arguments of `jtq bus-load`."""
-    made = argparse.ArgumentParser(
+    """Return the arguments of `jtq bus-load`."""
+    result = argparse.ArgumentParser(
         prog="jtq bus-load",
-        description="Worst-case load of the bus by a configuration; jtqd refuses one above 95 %.",
+        description="Compute the worst-case bus load of a configuration: every possible stuff bit, every PDO in its turn.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    made.add_argument(
+    result.add_argument(
         "--config", type=Path, metavar="FILE", help="configuration (default: the bench that ships)"
     )
-    made.add_argument("--json", action="store_true", help="print as JSON")
-    return made
+    result.add_argument("--json", action="store_true", help="print as JSON")
+    return result
 
 
 def main(argv: list[str]) -> int:
-    """Print the table; exit status 0 it fits, 1 it does not or cannot be read, 2 usage."""
+    """Print the table; returns the exit status."""
     arguments = parser().parse_args(argv)
     try:
         config = load_config(arguments.config)

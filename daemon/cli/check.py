@@ -51,19 +51,21 @@ def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq check`."""
     result = argparse.ArgumentParser(
         prog="jtq check",
-        description="Self-test of a bus and of this machine's timing: GOOD, WARN or FAIL for each item, and what to do.",
+        description="Measure a bus and the timing of this machine: GOOD, WARN or FAIL for each item, and what to do.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     result.add_argument(
-        "seconds", type=seconds, nargs="?", default=10.0, metavar="S", help="how long (default 10)"
+        "seconds", type=seconds, nargs="?", default=10.0, metavar="S", help="seconds to measure (default: 10)"
     )
-    result.add_argument("--bus", default="can0", help="SocketCAN interface, unix:PATH, or sim (default can0)")
+    result.add_argument(
+        "--bus", default="can0", help="SocketCAN interface, unix:PATH, or sim (default: can0)"
+    )
     result.add_argument(
         "--config",
         type=Path,
         metavar="FILE",
-        help="what should be on the bus (default: the running jtqd's configuration, else the bench that ships)",
+        help="configuration of the bus (default: that of the running jtqd, else the bench that ships)",
     )
     result.add_argument("--drive-sync", action="store_true", help="boot the nodes and send SYNC")
     result.add_argument("--json", action="store_true", help="print as JSON")

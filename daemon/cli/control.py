@@ -23,7 +23,7 @@ _EXAMPLES = """examples:
 exit status: 0 done, 1 refused or no daemon (the line on standard error says why), 2 usage"""
 _DONE = {
     "ping": "jtqd on {bus} answers, process {pid}, cycle {cycle}",
-    "reload": "jtqd on {bus} has taken over the new files at cycle {cycle}, {missed} missed",
+    "reload": "jtqd on {bus} has taken over the new files at cycle {cycle}, {cycles} missed",
     "reset": "jtqd on {bus} has released its latched faults: {released}",
     "save": "jtqd on {bus} writes the flight recording",
 }
@@ -61,7 +61,8 @@ def main(argv: list[str]) -> int:
     if arguments.json:
         print(json.dumps(reply))
     elif reply["ok"] and daemon is not None:
-        print(_DONE[arguments.verb].format(**{"bus": daemon.about.bus} | reply))
+        cycles = "1 cycle" if reply.get("missed") == 1 else f"{reply.get('missed')} cycles"
+        print(_DONE[arguments.verb].format(**{"bus": daemon.about.bus, "cycles": cycles} | reply))
     if not reply["ok"]:
         print(f"jtq control: {arguments.verb}: {reply['error']}", file=sys.stderr)
     return 0 if reply["ok"] else 1

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 
+from jtqd import __version__
 from jtqd.daemon.bus.boot import bus_load_of
 from jtqd.daemon.cli.checks import FAIL, GOOD, SKIP, WARN, CheckResult, report, share, size
 from jtqd.daemon.cli.machine import check_can, check_kernel
@@ -115,7 +116,7 @@ def check_packages() -> Iterator[CheckResult]:
             wrong.append(f"{name} is missing")
         elif not all(fits(version, *limit) for limit in limits):
             wrong.append(f"{name} {version}, expected {line.removeprefix(name)}")
-    text = f"jtqd {installed('jtqd')}, " + ", ".join(versions)
+    text = f"jtqd {__version__}, " + ", ".join(versions)
     if wrong:
         yield CheckResult(
             "packages", FAIL, "; ".join(wrong), "pip install --upgrade jtqd, in its own environment"

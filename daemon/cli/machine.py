@@ -249,7 +249,7 @@ def check_can(bus: str | None, config: Config) -> Iterator[CheckResult]:
                 "CAN interface",
                 WARN,
                 "none on this machine",
-                "plug it in; `ip link add dev vcan0 type vcan` for a test",
+                "connect one; `ip link add dev vcan0 type vcan` for a test",
             )
         for name in names:
             yield from _interface(name, config)

@@ -381,7 +381,7 @@ def _log(log: CurrentLog | None) -> Iterator[RenderableType]:
         yield _line("recorder", "no recording")
         return
     lost = Text(f"{log.account.lost} lost", style="bold red" if log.account.lost else "")
-    held = f", {log.account.let_go} dropped (flight recorder)" if log.account.let_go else ""
+    held = f", {log.account.let_go} discarded (flight recorder)" if log.account.let_go else ""
     yield _line(
         "recorder",
         Text.assemble(
@@ -428,7 +428,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq status`."""
     result = argparse.ArgumentParser(
         prog="jtq status",
-        description="How a running jtqd is doing: torque, status with its reason, inputs, timing, bus, nodes, log.",
+        description="Show how a running jtqd is doing: torque, status with its reason, inputs, timing, bus, nodes, log.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

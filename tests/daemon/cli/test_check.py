@@ -233,7 +233,7 @@ def test_stolen_time_is_judged_by_its_share_of_one_processor() -> None:
     found = [check_stolen_time(stolen, 10.0) for stolen in (0.0, 0.009, 0.01, 3.0)]
     assert [each.level for each in found] == [GOOD, GOOD, WARN, WARN]
     assert [bool(each.hint) for each in found] == [False, False, True, True]
-    assert found[-1].text.startswith("30.0% of a processor")
+    assert found[-1].text.startswith("30.0 % of a processor")
 
 
 def test_stolen_time_is_the_eighth_field_in_ticks(tmp_path: Path) -> None:

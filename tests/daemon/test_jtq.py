@@ -1,4 +1,4 @@
-"""How `jtq` ends when somebody does not want more of it: a closed pipe, Ctrl-C; and options before a log."""
+"""`jtq`: version, unknown commands, and how it ends: a closed pipe, Ctrl-C; options before a log."""
 
 import itertools
 import os
@@ -8,9 +8,32 @@ import subprocess
 import sys
 import time
 
+import pytest
+
+import jtqd
+from jtqd.daemon import jtq
+from jtqd.daemon import jtqd as daemon
 from tests.paths import GOLDEN
 
 LOG = GOLDEN / "fused.mcap"
+
+
+@pytest.mark.parametrize("main", [jtq.main, daemon.main], ids=["jtq", "jtqd"])
+def test_both_programs_print_one_version(main, capsys):
+    try:
+        status = main(["--version"])
+    except SystemExit as ended:
+        status = ended.code
+    assert (status, capsys.readouterr().out) == (0, f"jtqd {jtqd.__version__}\n")
+
+
+def test_an_unknown_command_is_answered_with_its_neighbour(capsys):
+    assert jtq.main(["stauts"]) == 2
+    assert (
+        capsys.readouterr().err
+        == "jtq: no command 'stauts'; did you mean 'status'? (jtq --help lists them)\n"
+    )
+    assert jtq.main([]) == 2
 
 
 def started(*arguments):
@@ -22,7 +45,7 @@ def started(*arguments):
     )
 
 
-def test_a_closed_pipe_is_no_word():
+def test_a_closed_pipe_ends_it_silently():
     with started("export", "candump", LOG) as process:
         lines = list(itertools.islice(process.stdout, 2))
         process.stdout.close()
@@ -31,7 +54,7 @@ def test_a_closed_pipe_is_no_word():
         assert process.wait(30) == 1
 
 
-def test_ctrl_c_is_no_word(tmp_path):
+def test_ctrl_c_ends_it_silently(tmp_path):
     """While it waits for a pipe that nobody empties."""
     pipe = tmp_path / "pipe.csv"
     os.mkfifo(pipe)
