@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import doctest
 import importlib
 import re
 import textwrap
@@ -65,3 +66,19 @@ def test_the_examples_of_the_api_run(
     )
     expected = re.findall(r"#> (.*)", code)
     assert capsys.readouterr().out.splitlines() == expected
+
+
+PACKAGES = ("daemon", "drivers", "estimator", "models", "sim_can", "sysid")
+WITH_EXAMPLES = [
+    "jtqd." + ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+    for package in PACKAGES
+    for path in sorted((ROOT / package).rglob("*.py"))
+    if ">>> " in path.read_text()
+]
+
+
+@pytest.mark.parametrize("name", WITH_EXAMPLES)
+def test_the_examples_of_docstrings_run(name: str) -> None:
+    result = doctest.testmod(importlib.import_module(name))
+    assert result.attempted
+    assert not result.failed

@@ -1,4 +1,4 @@
-"""Command line: `python -m tests.faults [--case N ...] [--json | --markdown]`."""
+"""Command line: `python -m tests.slow.faults [--case N ...] [--json | --markdown]`."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from tests.slow.faults.table import HEAD, as_json, cells, line, row
 
 CASES = (*BUS, *PDOS, *NODES, *VALUES)
 _EXAMPLES = """examples:
-  python -m tests.faults                 every case that is played on the bus, as a table
-  python -m tests.faults --case 16 12    only these (16: all its parts; 16a: this part)
-  python -m tests.faults --markdown      the table of docs/faults.md
+  python -m tests.slow.faults                 every case that is played on the bus, as a table
+  python -m tests.slow.faults --case 16 12    only these (16: all its parts; 16a: this part)
+  python -m tests.slow.faults --markdown      the table of docs/faults.md
 
 Where this machine has no SocketCAN, it runs in the bench kernel, with exact time. Exit status 1: a case does not hold.
 """
@@ -28,7 +28,7 @@ Where this machine has no SocketCAN, it runs in the bench kernel, with exact tim
 def main(arguments: list[str] | None = None) -> int:
     """Returns the exit status."""
     parser = argparse.ArgumentParser(
-        prog="python -m tests.faults", epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="python -m tests.slow.faults", epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
         "--case", nargs="+", metavar="N", help="numbers of cases, with or without their letter"

@@ -1,4 +1,4 @@
-"""Command line: `python -m tests.fuzz frames|service|files|storm`."""
+"""Command line: `python -m tests.slow.fuzz frames|service|files|storm`."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import tempfile
 from pathlib import Path
 
 _EXAMPLES = """examples:
-  python -m tests.fuzz frames --count 1000000 --seed 1    frames through the loop's path
-  python -m tests.fuzz service --count 1000000            frames through the supervisor's path
-  python -m tests.fuzz files --count 300                  damaged files, 300 of each kind
-  python -m tests.fuzz storm                              one run, quiet and in a storm of 120 000 frames by turns
+  python -m tests.slow.fuzz frames --count 1000000 --seed 1    frames through the loop's path
+  python -m tests.slow.fuzz service --count 1000000            frames through the supervisor's path
+  python -m tests.slow.fuzz files --count 300                  damaged files, 300 of each kind
+  python -m tests.slow.fuzz storm                              one run, quiet and in a storm of 120 000 frames by turns
 
 Exit status 0: nothing found; 3: findings."""
 
@@ -20,7 +20,7 @@ Exit status 0: nothing found; 3: findings."""
 def main(arguments: list[str] | None = None) -> int:
     """Run one fuzzer and print what it counted; returns the exit status."""
     parser = argparse.ArgumentParser(
-        prog="python -m tests.fuzz", epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="python -m tests.slow.fuzz", epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("what", choices=("frames", "service", "files", "storm"))
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="of all that is random (default 1)")

@@ -1,4 +1,4 @@
-"""Command line: `python -m tests.soak [--minutes 30] [--seed N] [--native | --exact [--wall S]]`."""
+"""Command line: `python -m tests.slow.soak [--minutes 30] [--seed N] [--native | --exact [--wall S]]`."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import time
 from pathlib import Path
 
 _EXAMPLES = """examples:
-  python -m tests.soak                            30 minutes on a unix bus
-  python -m tests.soak --minutes 5 --seed 7
-  python -m tests.soak --exact --minutes 5        in the bench kernel, guest time: on vcan0, with the link taken down
-  python -m tests.soak --exact --minutes 1440 --wall 3600    as much guest time as an hour of this machine gives
+  python -m tests.slow.soak                            30 minutes on a unix bus
+  python -m tests.slow.soak --minutes 5 --seed 7
+  python -m tests.slow.soak --exact --minutes 5        in the bench kernel, guest time: on vcan0, with the link taken down
+  python -m tests.slow.soak --exact --minutes 1440 --wall 3600    as much guest time as an hour of this machine gives
 
 Exit status 0: all is well; 3: findings."""
 _STOP = "stop"
@@ -26,7 +26,7 @@ _ENDS_WITHIN_S = 1800.0
 def main(arguments: list[str] | None = None) -> int:
     """Run; returns the exit status."""
     parser = argparse.ArgumentParser(
-        prog="python -m tests.soak", epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="python -m tests.slow.soak", epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--minutes", type=float, default=30.0, help="how long (default 30)")
     parser.add_argument("--seed", type=int, default=1, help="of the faults (default 1)")
