@@ -21,8 +21,8 @@ from jtqd.sysid.batch.run import Batch, BatchError, Job, Row
 from jtqd.sysid.batch.store import Store, StoreError, write_whole
 from jtqd.sysid.batch.summary import counts, render, to_mapping
 from jtqd.sysid.batch.tool import tool_version
-from jtqd.sysid.runs.files import RunError
-from jtqd.sysid.runs.sources import LOGS, TABLES, UsageError
+from jtqd.sysid.runs.files import LOGS, TABLES, RunError
+from jtqd.sysid.runs.joints import UsageError
 
 BY: Final = "jtq batch"
 PAGE, SUMMARY = "index.html", "summary.json"

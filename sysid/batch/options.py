@@ -11,7 +11,7 @@ from typing import Any
 
 from jtqd.estimator.checked import ConfigError
 from jtqd.sysid.runs.files import ColumnMap
-from jtqd.sysid.runs.sources import joint_files
+from jtqd.sysid.runs.joints import joint_files
 
 
 @dataclass(frozen=True)
