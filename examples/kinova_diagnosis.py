@@ -29,8 +29,7 @@ from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.command import diagnosed
 from jtqd.sysid.diagnosis.findings import Cause, Findings, Gap, Value, to_mapping
 from jtqd.sysid.report import figures as parts
-from jtqd.sysid.runs.files import ColumnMap, RunError, read_run
-from jtqd.sysid.runs.inputs import InputRun
+from jtqd.sysid.runs.files import ColumnMap, RunError, RunFile, read_run
 
 RUNS: Final = ("opti_traj_testing1", "RunTrajectory1")
 JOINTS: Final = range(1, 8)
@@ -46,13 +45,13 @@ class Diagnosed:
     findings: Findings
 
 
-def measured_runs() -> list[InputRun]:
+def measured_runs() -> list[RunFile]:
     """Return both runs as shipped, with the encoder counted once. Raises RunError, ConfigError."""
     columns = ColumnMap.load(shipped("kinova_gen3/columns.yaml"))
     runs = []
     for name in RUNS:
         file = read_run(shipped(f"kinova_gen3/{name}.csv.gz"), columns)
-        runs.append(InputRun(name, one_encoder(file.table), file.notes, file.sha256))
+        runs.append(replace(file, name=name, table=one_encoder(file.table)))
     return runs
 
 
@@ -65,10 +64,10 @@ def one_encoder(table: RunTable) -> RunTable:
     return RunTable(table.time_s, joints)
 
 
-def only(run: InputRun, number: int) -> InputRun:
+def only(run: RunFile, number: int) -> RunFile:
     """Return the run with one joint's columns and notes."""
     notes = tuple(note for note in run.notes if note.startswith(f"j{number}.") or not note.startswith("j"))
-    return run._replace(table=RunTable(run.table.time_s, {number: run.table.joints[number]}), notes=notes)
+    return replace(run, table=RunTable(run.table.time_s, {number: run.table.joints[number]}), notes=notes)
 
 
 def diagnose_all(numbers: Sequence[int] = JOINTS) -> list[Diagnosed]:
@@ -171,9 +170,9 @@ def write(directory: Path, results: Sequence[Diagnosed], sha256: Mapping[str, st
 def main(arguments: list[str] | None = None) -> int:
     """Command line; results on stdout, log on stderr. Exit status 0 done, 1 failure, 2 usage."""
     parser = argparse.ArgumentParser(
-        prog=f"python -m examples.{BY}",
+        prog=f"python -m sysid.{BY}",
         description="Diagnose the seven joints of the measured Kinova Gen3 arm and draw the figures of the docs page.",
-        epilog=f"example:\n  python -m examples.{BY} --out measured_diagnosis",
+        epilog=f"example:\n  python -m sysid.{BY} --out measured_diagnosis",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where reports and figures go")

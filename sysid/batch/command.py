@@ -32,9 +32,9 @@ from jtqd.sysid.batch.run import (
     write_whole,
 )
 from jtqd.sysid.batch.summary import DIAGNOSE, REPLAY, counts, render, to_mapping
-from jtqd.sysid.report.numbers import counted
-from jtqd.sysid.runs.files import ColumnMap, RunError
-from jtqd.sysid.runs.sources import LOGS, TABLES, UsageError, joint_files
+from jtqd.sysid.runs.files import LOGS, TABLES, ColumnMap, RunError
+from jtqd.sysid.runs.joints import UsageError, joint_files
+from jtqd.sysid.text import counted
 
 BY: Final = "jtq batch"
 PAGE, SUMMARY = "index.html", "summary.json"

@@ -1,4 +1,4 @@
-"""`jtq campaign`: plans, checks and runs a campaign; docs/campaign.md."""
+"""`jtq campaign`: options, the plan that they ask for, dry run, and the campaign itself (docs/campaign.md)."""
 
 from __future__ import annotations
 
@@ -24,23 +24,15 @@ from jtqd.drivers.bus_load import LIMIT, BusLoad
 from jtqd.estimator.checked import ConfigError, count, natural, seconds
 from jtqd.estimator.joint import Joint
 from jtqd.models.files import shipped
+from jtqd.sysid.campaign.bench import Bench, BenchConfig
 from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Plan, check_plan, load_plan, travel_rad
-from jtqd.sysid.campaign.plans import KINDS, Scale, Tried, make_plan, seed_of
+from jtqd.sysid.campaign.plans import KINDS, OnTried, Scale, make_plan, seed_of
 from jtqd.sysid.campaign.processes import EmulatedBench, ProcessError, StopAsked, unix_bus
-from jtqd.sysid.campaign.runner import Bench, BenchConfig, Outcome, attempt, go_through
-from jtqd.sysid.campaign.state import (
-    BETWEEN_RUNS_S,
-    DONE,
-    CampaignDirectory,
-    Designing,
-    Reporter,
-    StateError,
-    clock_text,
-)
+from jtqd.sysid.campaign.reporter import BETWEEN_RUNS_S, Designing, Reporter, clock_text
+from jtqd.sysid.campaign.runner import Outcome, attempt, go_through
+from jtqd.sysid.campaign.state import DONE, CampaignDirectory, StateError
 from jtqd.sysid.motion.setpoints import Limits, Setpoints
-
-# Options of `jtq campaign`, and the plan that they ask for.
-
+from jtqd.sysid.text import counted
 
 EMULATED: Final = "sim"
 PLANT: Final = "campaign_plant.yaml"
@@ -54,7 +46,7 @@ _EXAMPLES: Final = """examples:
 
 
 def parser() -> argparse.ArgumentParser:
-    """All options; what goes together with what is the matter of `misuse`."""
+    """All options; `usage_error` checks their combination."""
     made = argparse.ArgumentParser(
         prog="jtq campaign",
         description="Drive both joints through a campaign of runs, record and check each; go on where it was interrupted.",
@@ -96,7 +88,7 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def misuse(options: argparse.Namespace) -> str:
+def usage_error(options: argparse.Namespace) -> str:
     """What is wrong with the combination of options; empty when nothing is."""
     if options.plan not in KINDS:
         if not options.plan.endswith((".yaml", ".yml")):
@@ -137,7 +129,7 @@ def scale_of(options: argparse.Namespace, joints: tuple[Joint, Joint]) -> Scale:
 
 
 def wanted_plan(
-    options: argparse.Namespace, joints: tuple[Joint, Joint], on_progress: Tried | None = None
+    options: argparse.Namespace, joints: tuple[Joint, Joint], on_progress: OnTried | None = None
 ) -> Plan:
     """Read or make the plan; `joints` are those of the bench. Raises ConfigError."""
     if options.plan not in KINDS:
@@ -160,9 +152,6 @@ def _limit(text: str) -> tuple[str, float]:
     if not 0.0 < number < math.inf:
         raise argparse.ArgumentTypeError(f"found {name}={value}, expected a number > 0")
     return name, number
-
-
-# What a campaign would do: its runs, how long they take, and what the bus would carry. Pure.
 
 
 def rows(plan: Plan, setpoints: Mapping[str, Setpoints]) -> list[dict[str, Any]]:
@@ -189,8 +178,8 @@ def total_s(setpoints: Mapping[str, Setpoints]) -> float:
     return sum(points.duration_s + BETWEEN_RUNS_S for points in setpoints.values())
 
 
-def content(plan: Plan, setpoints: Mapping[str, Setpoints], load: BusLoad) -> dict[str, Any]:
-    """For a program."""
+def dry_run_mapping(plan: Plan, setpoints: Mapping[str, Setpoints], load: BusLoad) -> dict[str, Any]:
+    """What a campaign would do, for a program: its runs, how long they take, the bus load."""
     return {
         "schema": "jtq.campaign_plan/1",
         "name": plan.name,
@@ -203,8 +192,8 @@ def content(plan: Plan, setpoints: Mapping[str, Setpoints], load: BusLoad) -> di
     }
 
 
-def text(plan: Plan, setpoints: Mapping[str, Setpoints], load: BusLoad) -> str:
-    """For people."""
+def dry_run_text(plan: Plan, setpoints: Mapping[str, Setpoints], load: BusLoad) -> str:
+    """The same for people."""
     table = rows(plan, setpoints)
     width = max(len("run"), *(len(row["run"]) for row in table))
     lines = [
@@ -219,7 +208,7 @@ def text(plan: Plan, setpoints: Mapping[str, Setpoints], load: BusLoad) -> str:
     motion_s = sum(points.duration_s for points in setpoints.values())
     limits = plan.limits
     lines += [
-        f"{len(table)} runs, {clock_text(motion_s)} of motion, about {clock_text(total_s(setpoints))} in all",
+        f"{counted(len(table), 'run')}, {clock_text(motion_s)} of motion, about {clock_text(total_s(setpoints))} in all",
         f"limits: {limits.current_a:g} A, {limits.velocity_rad_s:g} rad/s, {limits.torque_nm:g} Nm, "
         f"{limits.travel_rad:g} rad, "
         + (
@@ -240,12 +229,12 @@ _MASTER_GONE: Final = "fault 8130h"
 def main(argv: list[str]) -> int:
     """Plan and run; exit status 0 done, 1 failure or ended early, 2 usage, 3 done with findings."""
     options = parser().parse_args(argv)
-    problem = misuse(options)
+    problem = usage_error(options)
     if problem:
         print(f"jtq campaign: {problem}", file=sys.stderr)
         return 2
     try:
-        return _dry(options) if options.dry_run else _campaign(options)
+        return _dry_run(options) if options.dry_run else _campaign(options)
     except (ConfigError, StateError, ProcessError) as error:
         print(f"jtq campaign: {error}", file=sys.stderr)
         return 1
@@ -254,7 +243,7 @@ def main(argv: list[str]) -> int:
         return 1
 
 
-def _made(options: argparse.Namespace, config: BenchConfig) -> Plan:
+def _make_plan(options: argparse.Namespace, config: BenchConfig) -> Plan:
     """The plan, with a bar or a line where making it takes its time."""
     if options.plan != "excitation":
         return wanted_plan(options, config.joints)
@@ -262,22 +251,22 @@ def _made(options: argparse.Namespace, config: BenchConfig) -> Plan:
         return wanted_plan(options, config.joints, designing.advance)
 
 
-def _checked(plan: Plan, options: argparse.Namespace) -> dict[str, Setpoints]:
+def _check_plan(plan: Plan, options: argparse.Namespace) -> dict[str, Setpoints]:
     try:
         return check_plan(plan)
     except ConfigError as error:
         raise ConfigError(f"{options.plan}: {error}") from None
 
 
-def _dry(options: argparse.Namespace) -> int:
+def _dry_run(options: argparse.Namespace) -> int:
     config = BenchConfig.load(options.config)
     load = config.load_with_commander()
-    plan = _made(options, config)
-    setpoints = _checked(plan, options)
+    plan = _make_plan(options, config)
+    setpoints = _check_plan(plan, options)
     if options.json:
-        print(json.dumps(content(plan, setpoints, load)))
+        print(json.dumps(dry_run_mapping(plan, setpoints, load)))
     else:
-        print(text(plan, setpoints, load))
+        print(dry_run_text(plan, setpoints, load))
     return 0
 
 
@@ -287,8 +276,8 @@ def _campaign(options: argparse.Namespace) -> int:
     made_from = recipe(options, config.joints)
     directory = CampaignDirectory(options.out)
     try:
-        plan = directory.same_recipe(made_from) or _made(options, config)
-        setpoints = _checked(plan, options)
+        plan = directory.same_recipe(made_from) or _make_plan(options, config)
+        setpoints = _check_plan(plan, options)
         directory.begin(plan, made_from)
         outcome = _run(options, config, plan, setpoints, directory)
     finally:
@@ -315,7 +304,7 @@ def _run(
             process = EmulatedBench(
                 bus, folder, options.plant or shipped(PLANT), _bench_seed(plan, options, done)
             )
-        with process, Reporter(to_do, len(plan.runs), done) as reporter, _commander_says(reporter):
+        with process, Reporter(to_do, len(plan.runs), done) as reporter, _commander_log(reporter):
             bench = Bench(bus, options.config, config)
             motion = bench.play(plan.limits, reporter.on_progress)
             return go_through(
@@ -338,7 +327,7 @@ def _bench_seed(plan: Plan, options: argparse.Namespace, done: int) -> int:
     return seed_of(f"bench/{plan.name}", float(done), options.seed)
 
 
-class _Said(logging.Handler):
+class _ReporterHandler(logging.Handler):
     """What the commander logs, to the reporter; but not what jtqd's own end leaves behind in every run."""
 
     def __init__(self, reporter: Reporter) -> None:
@@ -348,12 +337,12 @@ class _Said(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         text = record.getMessage()
         if _MASTER_GONE not in text:
-            self._reporter.say(text)
+            self._reporter.write_line(text)
 
 
 @contextmanager
-def _commander_says(reporter: Reporter) -> Iterator[None]:
-    logger, handler = logging.getLogger("jtqd.sysid.motion"), _Said(reporter)
+def _commander_log(reporter: Reporter) -> Iterator[None]:
+    logger, handler = logging.getLogger("jtqd.sysid.motion"), _ReporterHandler(reporter)
     logger.addHandler(handler)
     propagate, logger.propagate = logger.propagate, False
     try:

@@ -23,11 +23,11 @@ from jtqd.estimator.run import RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, TimeFunction, emulate_run
 from jtqd.sim_can.plant_file import PlantParameters, load_plant
-from jtqd.sysid.campaign.plan import Plan, Run, expand
+from jtqd.sysid.campaign.plan import Plan, Run, expand, marks_of
 from jtqd.sysid.campaign.plans import Scale, make_plan
-from jtqd.sysid.campaign.runner import marks_of
+from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.files import write_run
-from jtqd.sysid.runs.inputs import progress
+from jtqd.sysid.text import counted
 
 PLANT: Final = "campaign_plant.yaml"
 _RECIPE: Final = "emulated_runs.json"
@@ -47,15 +47,15 @@ def emulated_run(bench: PlantParameters, seed: int, day: int, run: Run) -> RunTa
     """Return the table of one run on this day of the seed."""
     points = expand(run)
     commands = (
-        JointCommand.velocity(_told(points.velocity_rad_s)),
-        JointCommand.current(_told(points.current_a)),
+        JointCommand.velocity(_sampled(points.velocity_rad_s)),
+        JointCommand.current(_sampled(points.current_a)),
     )
     one, two = commands if points.velocity_joint == 1 else (commands[1], commands[0])
     return emulate_run(bench, (one, two), len(points) / _HZ, seed, day=day)
 
 
-def _told(values: FloatArray) -> TimeFunction:
-    """What a drive is told, one value per millisecond."""
+def _sampled(values: FloatArray) -> TimeFunction:
+    """The command of a drive as a function of time, one value per millisecond."""
     each = values.tolist()
 
     def at(time_s: float) -> float:
@@ -64,7 +64,7 @@ def _told(values: FloatArray) -> TimeFunction:
     return at
 
 
-def _written(out: Path, plant: Path, seed: int, numbered: tuple[int, Run]) -> str:
+def _write_run_files(out: Path, plant: Path, seed: int, numbered: tuple[int, Run]) -> str:
     day, run = numbered
     write_run(out / f"{run.name}.csv.gz", emulated_run(load_plant(plant), seed, day, run))
     (out / f"{run.name}.json").write_text(json.dumps(marks_of(run, expand(run)), indent=1) + "\n")
@@ -93,7 +93,7 @@ def main(arguments: list[str] | None = None) -> int:
     except (ConfigError, OSError) as error:
         print(f"emulated_runs: {error}", file=sys.stderr)
         return 1
-    print(f"{len(plan.runs)} runs in {options.out}")
+    print(f"{counted(len(plan.runs), 'run')} in {options.out}")
     return 0
 
 
@@ -101,7 +101,7 @@ def _emulate(out: Path, plan: Plan, plant: Path, seed: int) -> None:
     """Write what is not there yet, on all processors."""
     left = [(day, run) for day, run in enumerate(plan.runs) if not (out / f"{run.name}.json").exists()]
     with ProcessPoolExecutor() as pool:
-        made: Iterable[str] = pool.map(partial(_written, out, plant, seed), left)
+        made: Iterable[str] = pool.map(partial(_write_run_files, out, plant, seed), left)
         for _ in zip(progress(left, "runs"), made, strict=True):
             pass
 

@@ -1,7 +1,7 @@
-"""Plans of a campaign (schema jtq.plan/1): frozen, checked, to and from YAML. Pure but for `load_plan`.
+"""Plans of a campaign (schema jtq.plan/1): frozen, checked, to and from YAML, and as set-points at 1 kHz.
 
-A plan says what both joints are told in every run. What that is millisecond by millisecond, and whether it keeps
-the plan's own limits, is the matter of `jtqd.sysid.campaign.plan`.
+A plan gives the commands of both joints in every run, segment by segment. `expand` makes set-points of a run, millisecond
+by millisecond; `check_run` and `check_plan` hold them against the plan's own limits. All but `load_plan` is pure.
 """
 
 from __future__ import annotations
@@ -286,9 +286,6 @@ def _fourier(section: Section) -> Fourier:
         raise ConfigError(f"{section.where}: key '{section.path}': {error}") from None
 
 
-# From the segments of a run to set-points at 1 kHz, and whether they keep the plan's limits. Pure.
-
-
 def smooth_step(x: FloatArray) -> FloatArray:
     """10 x^3 - 15 x^4 + 6 x^5: from 0 to 1 over x in 0..1 with first and second derivative zero at both ends."""
     result: FloatArray = x * x * x * (10.0 + x * (-15.0 + 6.0 * x))
@@ -380,3 +377,22 @@ def check_run(run: Run, limits: Limits) -> Setpoints:
 def check_plan(plan: Plan) -> dict[str, Setpoints]:
     """Set-points of every run by its name. Raises ConfigError as check_run."""
     return {run.name: check_run(run, plan.limits) for run in plan.runs}
+
+
+def marks_of(run: Run, setpoints: Setpoints) -> dict[str, Any]:
+    """Content of NAME.json: which segment was when, in seconds of the run table (to about a cycle)."""
+    return {
+        "run": run.name,
+        "velocity_joint": run.velocity_joint,
+        "segments": [
+            {
+                "kind": mark.kind,
+                "start_s": mark.start_s,
+                "end_s": mark.end_s,
+                "velocity_joint": run.velocity_joint,
+                "velocity_rad_s": mark.velocity_rad_s,
+                "current_a": mark.current_a,
+            }
+            for mark in setpoints.marks
+        ],
+    }

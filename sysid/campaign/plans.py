@@ -1,4 +1,16 @@
-"""The campaigns that come with the toolbox: efficiency, excitation, validate; whole or scaled down. Pure."""
+"""The campaigns that come with the toolbox: efficiency, excitation, validate; whole or scaled down.
+
+Runs at constant velocity and load are those of section II of the paper (efficiency) and of its section IV.A (validation).
+Runs at varying velocity and load are Fourier trajectories (`jtqd.sysid.excitation.design`): those of `excitation_runs` are
+optimised for the information that they give about the losses; those of `variable_runs` are drawn, because runs to judge
+by must not be chosen by what they are to judge.
+
+Signs. Each joint has its own frame; the links turn oppositely, and a positive current of either joint gives a positive
+torque in the sensor. So with equal signs of the velocity joint's velocity and the other joint's current, the velocity
+joint drives forward (its own current and velocity have the same sign) and the other joint is driven back. "forward_1"
+means that joint 1 is the velocity joint, "back_1" that joint 2 is: for joint 2 the names read the other way round, and
+every run serves both.
+"""
 
 from __future__ import annotations
 
@@ -14,15 +26,6 @@ from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Fourier, Plan, Plateau, Res
 from jtqd.sysid.excitation.design import POPULATION, STARTS, Design, design, draw
 from jtqd.sysid.excitation.model import ExcitationLimits
 from jtqd.sysid.motion.setpoints import Limits
-
-# Runs at constant velocity and load: section II of the paper (efficiency) and its section IV.A (validation). Pure.
-#
-# Signs. Each joint has its own frame; the links turn oppositely, and a positive current of either joint gives a positive
-# torque in the sensor. So with equal signs of the velocity joint's velocity and the other joint's current, the velocity
-# joint drives forward (its own current and velocity have the same sign) and the other joint is driven back. "forward_1"
-# means that joint 1 is the velocity joint, "back_1" that joint 2 is: for joint 2 the names read the other way round, and
-# every run serves both.
-
 
 VELOCITIES_RAD_S: Final = (0.2, 0.6, 1.0, 1.4, 1.8, 2.2, 2.6, 3.0)
 """Section II of the paper."""
@@ -127,16 +130,10 @@ def _ramp_s(step_rad_s: float) -> float:
     return max(RAMP_S, round(_RAMP_PER_RAD_S * abs(step_rad_s), 3))
 
 
-# Runs at varying velocity and load: Fourier trajectories to train on, and others to judge by. Pure.
-#
-# The trajectories come from `jtqd.sysid.excitation.design`. Those of `excitation_runs` are optimised for what they tell
-# about the losses; those of `variable_runs` are drawn, because a judge must not be chosen by what it is to judge.
-
-
 Joints = tuple[Joint, Joint] | None
 """Velocity joint and driving joint of the design; None: those that ship. Either order serves, the joints being alike."""
-Tried = Callable[[int], None]
-"""Told the number of motions that have been tried since the last call."""
+OnTried = Callable[[int], None]
+"""Called with the number of motions that have been tried since the last call."""
 
 FULL_RAD_S: Final = 3.0
 MEDIUM_RAD_S: Final = 1.2
@@ -166,7 +163,7 @@ def excitation_runs(
     seed: int,
     evaluations: int,
     joints: Joints = None,
-    on_progress: Tried | None = None,
+    on_progress: OnTried | None = None,
 ) -> tuple[Run, ...]:
     """Section III: `count` runs of two trajectories each with 2 s of rest between; run_s [s] is a run's length.
 
@@ -341,8 +338,8 @@ class Scale:
         return 2 * runs * starts * evaluations
 
 
-def make_plan(kind: str, scale: Scale, on_progress: Tried | None = None) -> Plan:
-    """The plan of one of KINDS; on_progress is told how many motions were tried, `scale.motions_tried` in all.
+def make_plan(kind: str, scale: Scale, on_progress: OnTried | None = None) -> Plan:
+    """The plan of one of KINDS; on_progress is called with how many motions were tried, `scale.motions_tried` in all.
 
     Raises:
         ConfigError: a scale that leaves nothing to be driven.
@@ -363,7 +360,7 @@ def _efficiency(scale: Scale) -> tuple[Run, ...]:
     return efficiency_runs(hold_s=hold_s, travel_rad=scale.limits.travel_rad)
 
 
-def _excitation(scale: Scale, on_progress: Tried | None) -> tuple[Run, ...]:
+def _excitation(scale: Scale, on_progress: OnTried | None) -> tuple[Run, ...]:
     return excitation_runs(
         scale.limits,
         scale.or_else("runs", RUNS, QUICK_RUNS),

@@ -30,7 +30,7 @@ _LIBC: Final = ctypes.CDLL(None)
 
 
 class ProcessError(Exception):
-    """A process did not start, or ended by a failure; one line with what it said last."""
+    """A process did not start, or ended by a failure; one line with its last message."""
 
 
 class Interrupted(Exception):  # noqa: N818 - an order, not an error
@@ -44,13 +44,13 @@ def _die_with_parent() -> None:
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
 
 
-def _start(module: str, arguments: Sequence[str], said: Path, **streams: Any) -> subprocess.Popen[bytes]:
-    """A Python module as a process; what it says goes to the file `said`.
+def _start(module: str, arguments: Sequence[str], messages: Path, **streams: Any) -> subprocess.Popen[bytes]:
+    """A Python module as a process; its standard error goes to the file `messages`.
 
     It has a session of its own: Ctrl-C on a terminal must reach the commander alone, which needs the SYNC of jtqd to
     bring both joints to rest. It gets SIGTERM when we die, however we die.
     """
-    with said.open("wb") as log:
+    with messages.open("wb") as log:
         return subprocess.Popen(
             [sys.executable, "-P", "-m", module, *arguments],
             stdin=subprocess.DEVNULL,
@@ -73,12 +73,12 @@ def _end(process: subprocess.Popen[bytes]) -> int:
 
 
 def last_line(path: Path) -> str:
-    """What a process said last, for a message of one line."""
+    """Last line of what a process wrote, for a message of one line."""
     try:
         lines = path.read_text(errors="replace").strip().splitlines()
     except OSError:
         lines = []
-    return lines[-1] if lines else "it said nothing"
+    return lines[-1] if lines else "no message"
 
 
 class EmulatedBench:
@@ -86,19 +86,19 @@ class EmulatedBench:
 
     Args:
         bus: where it is put; a unix bus is made if there is none.
-        folder: for what it says. plant: plant file, None for the one of campaigns. seed: of its noise and its days.
+        folder: for its messages. plant: plant file, None for the one of campaigns. seed: of its noise and its days.
     """
 
     def __init__(self, bus: str, folder: Path, plant: Path | None, seed: int) -> None:
         arguments = ["--bus", bus, "--profile", "rest", "--seed", str(seed)]
         arguments += [] if plant is None else ["--plant", str(plant)]
-        self._said = folder / "bench.log"
-        self._process = _start("jtqd.sim_can", arguments, self._said, stdout=subprocess.DEVNULL)
+        self._messages = folder / "bench.log"
+        self._process = _start("jtqd.sim_can", arguments, self._messages, stdout=subprocess.DEVNULL)
 
     def __enter__(self) -> EmulatedBench:
         """Wait until it is ready. Raises ProcessError."""
         deadline = time.monotonic() + READY_S
-        while b"bench ready" not in self._said.read_bytes():
+        while b"bench ready" not in self._messages.read_bytes():
             self.check()
             if time.monotonic() > deadline:
                 self.__exit__()
@@ -114,7 +114,7 @@ class EmulatedBench:
         """Raises ProcessError when it is no longer there."""
         if self._process.poll() is not None:
             raise ProcessError(
-                f"the emulated bench ended with exit status {self._process.returncode}: {last_line(self._said)}"
+                f"the emulated bench ended with exit status {self._process.returncode}: {last_line(self._messages)}"
             )
 
 
@@ -141,9 +141,9 @@ class Jtqd:
     """jtqd during one run; a context manager that is entered when it publishes, and ends it in order.
 
     Args:
-        bus, config: as for jtqd. folder: of the run; its log goes to folder/log, what it says to folder/jtqd.log.
+        bus, config: as for jtqd. folder: of the run; its log goes to folder/log, its messages to folder/jtqd.log.
         duration_s: of the motion.
-        estimate_cob_id: seen on the bus, it says that jtqd publishes.
+        estimate_cob_id: seen on the bus, jtqd is publishing.
         stop_asked: asked while waiting.
     """
 
@@ -157,7 +157,7 @@ class Jtqd:
         estimate_cob_id: int,
         stop_asked: StopAsked,
     ) -> None:
-        self.said: Final = folder / "jtqd.log"
+        self.messages: Final = folder / "jtqd.log"
         self._bus, self._cob_id, self._stop_asked = bus, estimate_cob_id, stop_asked
         self._arguments = ["--bus", bus, "--record", str(folder / "log"), "--json"]
         self._arguments += ["--duration", f"{duration_s + _MARGIN_S:.1f}"]
@@ -172,7 +172,7 @@ class Jtqd:
         except BusError as error:
             raise ProcessError(str(error)) from None
         with self._output.open("wb") as output:
-            self._process = _start("jtqd.daemon.jtqd", self._arguments, self.said, stdout=output)
+            self._process = _start("jtqd.daemon.jtqd", self._arguments, self.messages, stdout=output)
         try:
             self._wait(socket.wait)
         except BaseException:
@@ -197,11 +197,11 @@ class Jtqd:
             ProcessError: it ended by a failure, or recorded nothing.
         """
         if self._status not in (0, 3):  # 3: done, with cycles missing in the log
-            raise ProcessError(f"jtqd ended with exit status {self._status}: {last_line(self.said)}")
+            raise ProcessError(f"jtqd ended with exit status {self._status}: {last_line(self.messages)}")
         try:
             summary = json.loads(self._output.read_text())
         except ValueError:
-            raise ProcessError(f"jtqd ended without a summary: {last_line(self.said)}") from None
+            raise ProcessError(f"jtqd ended without a summary: {last_line(self.messages)}") from None
         recording = summary.get("recording") or {}
         if not recording.get("path"):
             raise ProcessError(f"jtqd recorded nothing: {recording.get('error') or 'no reason given'}")
@@ -214,7 +214,7 @@ class Jtqd:
                 raise Interrupted
             if self._process.poll() is not None:
                 raise ProcessError(
-                    f"jtqd ended with exit status {self._process.returncode}: {last_line(self.said)}"
+                    f"jtqd ended with exit status {self._process.returncode}: {last_line(self.messages)}"
                 )
             if time.monotonic() > deadline:
                 raise ProcessError(f"jtqd published nothing within {READY_S:g} s")

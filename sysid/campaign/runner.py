@@ -1,4 +1,8 @@
-"""Goes through the runs of a campaign that are not done, and says what became of them."""
+"""Runs of a campaign: play what is not done, record, check, keep the files, report the outcome.
+
+One attempt: jtqd is started, the motion played, jtqd ended, its log turned into the run's table and checked (`findings`).
+`go_through` does so for every run that is not done; a run against which was nothing but time is tried again.
+"""
 
 from __future__ import annotations
 
@@ -14,149 +18,23 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from jtqd.daemon.logs.errors import LogError
-from jtqd.drivers.boot_request import RequestError, parse_request
-from jtqd.drivers.bus_load import BusLoad, BusLoadError, Row, check_bus_load, configured_load, heartbeat_row
-from jtqd.drivers.devices import COMMANDER_NODE, DriveProfile, SensorProfile
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError, Section
 from jtqd.estimator.joint import Joint
-from jtqd.models.files import load_joint, load_yaml, shipped
-from jtqd.sysid.campaign.plan import Plan, Run
-from jtqd.sysid.campaign.processes import Interrupted, Jtqd, ProcessError, StopAsked, on_time
-from jtqd.sysid.campaign.state import (
-    DONE,
-    FAILED,
-    PARTS,
-    PENDING,
-    STOPPED,
-    CampaignDirectory,
-    Reporter,
-    RunState,
-)
-from jtqd.sysid.motion.setpoints import PERIOD_S, Limits, MotionError, MotionResult, Setpoints, Timing
-from jtqd.sysid.motion.shell import Progress, play
-from jtqd.sysid.runs.checks import check_channels
+from jtqd.sysid.campaign.bench import Bench, BenchConfig, Play
+from jtqd.sysid.campaign.plan import Plan, Run, marks_of
+from jtqd.sysid.campaign.processes import Interrupted, Jtqd, ProcessError, StopAsked
+from jtqd.sysid.campaign.reporter import Reporter
+from jtqd.sysid.campaign.state import DONE, FAILED, PARTS, PENDING, STOPPED, CampaignDirectory, RunState
+from jtqd.sysid.motion.setpoints import PERIOD_S, MotionError, MotionResult, Setpoints
+from jtqd.sysid.runs.checks import check_run
 from jtqd.sysid.runs.files import write_run
 from jtqd.sysid.runs.logs import LoggedRun, log_to_run
+from jtqd.sysid.text import counted
 
-# What a campaign needs to know of jtqd's configuration, and the load of the bus with the commander on it.
-
-
-DEFAULT_CONFIG: Final = "bench.yaml"
-PERIOD_US: Final = 1000
-_SETPOINT_RPDO: Final = 0x200  # or 300h+n: either way four bytes
-_RPDO_BYTES: Final = 4
-"""RPDO1: 6040h and 6071h; RPDO2: 60FFh."""
-
-
-@dataclass(frozen=True)
-class BenchConfig:
-    """The part of jtqd's configuration that concerns the bench.
-
-    Attributes:
-        path: the file. drives: of joint 1 and 2. joints: their joint files.
-        sensor: None without one. master: jtqd's own node-ID.
-    """
-
-    path: Path
-    drives: tuple[DriveProfile, DriveProfile]
-    joints: tuple[Joint, Joint]
-    sensor: SensorProfile | None
-    master: int
-    heartbeat_ms: int
-    bitrate: int
-
-    @classmethod
-    def load(cls, path: Path | None) -> BenchConfig:
-        """Read a configuration of jtqd (None: the one that ships); what is not asked for here jtqd checks itself.
-
-        Raises:
-            ConfigError: naming file, key, found and expected; also for a period of SYNC other than 1 ms.
-        """
-        path = path if path is not None else shipped(DEFAULT_CONFIG)
-        mapping, _ = load_yaml(path)
-        top = Section(mapping, str(path))
-        sync = top.section("sync", optional=True)
-        if sync is not None:
-            sync.integer("period_us", low=PERIOD_US, high=PERIOD_US, default=PERIOD_US)
-        sections = [top.required(f"joint_{number}") for number in (1, 2)]
-        files = [load_joint(path.parent / joint.text("file")) for joint in sections]
-        nodes = [_node(joint, "drive") for joint in sections]
-        sensor = top.section("sensor", optional=True)
-        if sensor is not None:
-            nodes.append(_node(sensor, "sensor"))
-        master = top.integer("node_id", low=1, high=127)
-        try:
-            request = parse_request({"bus": "-", "nodes": nodes, "master_node": master})
-        except RequestError as error:
-            raise ConfigError(f"{path}: {error}") from None
-        one, two = (each for each in request.profiles if isinstance(each, DriveProfile))
-        timing = top.section("nodes", optional=True)
-        return cls(
-            path=path,
-            drives=(one, two),
-            joints=(files[0], files[1]),
-            sensor=next((each for each in request.profiles if isinstance(each, SensorProfile)), None),
-            master=master,
-            heartbeat_ms=100 if timing is None else timing.integer("heartbeat_ms", low=10, default=100),
-            bitrate=top.integer("bitrate", low=10_000, high=1_000_000, default=1_000_000),
-        )
-
-    @property
-    def nodes(self) -> tuple[int, int]:
-        """Node-IDs of drive 1 and 2."""
-        return self.drives[0].node_id, self.drives[1].node_id
-
-    @property
-    def estimate_cob_id(self) -> int:
-        """COB-ID of jtqd's estimate: it is publishing when this is on the bus."""
-        return 0x180 + self.master
-
-    def load_with_commander(self) -> BusLoad:
-        """Load of the bus during a campaign: jtqd's configuration, and what the commander and its drives add.
-
-        Set-points go to the two drives in turn, so that a cycle holds one RPDO.
-
-        Raises:
-            ConfigError: above 95 % in the worst case, or two users of one COB-ID.
-        """
-        extra = [heartbeat_row("commander", COMMANDER_NODE, round(Timing().own_heartbeat_s * 1e3))]
-        # either drive may be the velocity joint: both RPDOs have four bytes, so one row stands for both
-        extra += [
-            Row(_SETPOINT_RPDO + node, f"set-points of drive {node}", _RPDO_BYTES, 0.5) for node in self.nodes
-        ]
-        try:
-            return check_bus_load(
-                configured_load(
-                    self.nodes,
-                    {} if self.sensor is None else {self.sensor.node_id: self.sensor.channels},
-                    temperatures=self.nodes,  # the commander switches TPDO3 on where jtqd does not
-                    heartbeat_ms=self.heartbeat_ms,
-                    master=self.master,
-                    extra=extra,
-                    bitrate=self.bitrate,
-                    period_s=1e-6 * PERIOD_US,
-                )
-            )
-        except BusLoadError as error:
-            raise ConfigError(f"{self.path}: with the commander's set-points: {error}") from None
-
-
-def _node(section: Section, kind: str) -> dict[str, Any]:
-    """A node of the configuration as the boot takes it: the commander asks of it what jtqd's boot asks."""
-    node = {"node": section.integer("node", low=1, high=127), "kind": kind}
-    node |= {key: section.raw(key) for key in ("identity", "given", "unit_words") if section.has(key)}
-    if kind == "sensor":
-        node["channels"] = list(range(1, section.integer("channels", low=1, high=2, default=1) + 1))
-    return node
-
-
-# Is this run what it was meant to be? Looks at a run table beside its set-points and names what is wrong. Pure.
-#
-# Nothing here judges a model. What is found are missing cycles, broken channels, wrong wiring, and motions that did not
-# take place.
-
-
+_BUS_WAS_LATE: Final = re.compile(
+    r"SYNC missing|missing for \d+ cycles|no heartbeat for|no temperature for|late by|transmit queue"
+)
+_SIGNALLED: Final = re.compile(r"SIGINT|SIGTERM")
 LONGEST_GAP_S: Final = 0.0095
 """A longer step, of 10 cycles or more: the table would be refused by whoever reads it (jtqd.sysid.runs.files)."""
 LOST_SHARE: Final = 0.01
@@ -168,7 +46,121 @@ MOVED_RAD: Final = 1.0
 """Least motion of a link from which the other one's says anything."""
 
 
-def unusable(logged: LoggedRun) -> str | None:
+class Attempt(NamedTuple):
+    """How an attempt at a run ended.
+
+    Attributes:
+        state: to be kept. again: another attempt may fare better, because nothing but time was against this one.
+        begun: the joints were moved; otherwise the bench itself is not ready. signalled: the operator ended it.
+    """
+
+    state: RunState
+    again: bool = False
+    begun: bool = True
+    signalled: bool = False
+
+
+class Recorded(NamedTuple):
+    """What jtqd left of a run: parts of the log, summary; and where the run's files go."""
+
+    log: tuple[Path, ...]
+    summary: dict[str, Any]
+    out: Path
+
+
+def attempt(
+    run: Run, setpoints: Setpoints, bench: Bench, out: Path, *, motion: Play, stop_asked: StopAsked
+) -> Attempt:
+    """Play a run and leave its files in `out`: all of a run that is done, the log of one that is not.
+
+    Raises:
+        Interrupted: a signal came before the motion had begun.
+        OSError: the files cannot be written.
+    """
+    if stop_asked():
+        raise Interrupted
+    folder = out / (run.name + PARTS)
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    jtqd = Jtqd(
+        bench.bus,
+        bench.config_path,
+        folder,
+        setpoints.duration_s,
+        estimate_cob_id=bench.config.estimate_cob_id,
+        stop_asked=stop_asked,
+    )
+    try:
+        try:
+            with jtqd:
+                result = motion(setpoints)
+            log, summary = jtqd.log()
+        except (ProcessError, MotionError) as error:
+            _keep([jtqd.messages], out, run.name, ".jtqd.log")
+            return Attempt(RunState(FAILED, str(error)), again=isinstance(error, MotionError), begun=False)
+        if result.status == "stopped":
+            _keep(log, out, run.name, ".stopped.mcap")
+            return _stopped(result)
+        state = RunState(played_s=result.played_s)
+        return _kept(run, setpoints, bench.config, Recorded(log, summary, out), state)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _stopped(result: MotionResult) -> Attempt:
+    signalled = bool(_SIGNALLED.search(result.reason))
+    return Attempt(
+        RunState(STOPPED, result.reason, played_s=result.played_s),
+        again=not signalled and bool(_BUS_WAS_LATE.search(result.reason)),
+        signalled=signalled,
+    )
+
+
+def _kept(
+    run: Run, setpoints: Setpoints, config: BenchConfig, recorded: Recorded, state: RunState
+) -> Attempt:
+    """Run table, marks and log of a motion that was played to its end."""
+    log, out = recorded.log, recorded.out
+    state = replace(state, status=FAILED)
+    lost = int((recorded.summary.get("recording") or {}).get("lost", 0))
+    try:
+        logged = log_to_run(log, nodes=config.nodes, sensor=config.sensor is not None)
+    except LogError as error:
+        _keep(log, out, run.name, ".failed.mcap")
+        return Attempt(replace(state, reason=str(error)), again=True)
+    state = replace(
+        state,
+        rows=len(logged.table.time_s),
+        missed=logged.missed,
+        incomplete=logged.incomplete,
+        incomplete_by=dict(logged.incomplete_by),
+        findings=findings(logged, setpoints, config.joints, sensor=config.sensor is not None),
+    )
+    if lost:
+        state = replace(
+            state, findings=(f"log: found {counted(lost, 'cycle')} lost by the recorder", *state.findings)
+        )
+    why = gap_too_long(logged)
+    if why is not None:
+        _keep(log, out, run.name, ".failed.mcap")
+        return Attempt(replace(state, reason=why), again=True)
+    sha256 = write_run(out / f"{run.name}.csv.gz", logged.table)
+    (out / f"{run.name}.json").write_text(json.dumps(marks_of(run, setpoints), indent=1) + "\n")
+    _keep(log, out, run.name, ".mcap")
+    return Attempt(replace(state, status=DONE, sha256=sha256))
+
+
+def _keep(paths: Sequence[Path], out: Path, run: str, ending: str) -> None:
+    """Move files out of the run's own directory, as far as they are there; both lie in the same file system.
+
+    The first becomes RUN.ENDING, the second RUN@2.ENDING and so on (no name has a @): a long run's log has several parts.
+    """
+    for number, path in enumerate(paths, start=1):
+        if path.exists():
+            os.replace(path, out / (run + ("" if number == 1 else f"@{number}") + ending))
+
+
+def gap_too_long(logged: LoggedRun) -> str | None:
     """Why a table cannot be kept at all, or None."""
     if logged.longest_gap_s > LONGEST_GAP_S:
         time_s = logged.table.time_s
@@ -183,18 +175,17 @@ def unusable(logged: LoggedRun) -> str | None:
 def findings(
     logged: LoggedRun, setpoints: Setpoints, joints: tuple[Joint, Joint], *, sensor: bool
 ) -> tuple[str, ...]:
-    """What is wrong with a run, a line each; empty when nothing is.
+    """What is wrong with a run beside its set-points, a line each; empty when nothing is.
+
+    Nothing here judges a model: looked for are missing cycles, broken channels, wrong wiring, and motions that did not
+    take place.
 
     Args:
         logged: whose first row belongs to the first set-point.
-        joints: as jtqd was told. sensor: the bench has a torque sensor.
+        joints: as in jtqd's configuration. sensor: the bench has a torque sensor.
     """
-    table = logged.table
-    channels = [
-        item.text
-        for number, joint in zip((1, 2), joints, strict=True)
-        for item in check_channels(table.time_s, table.joints[number], joint, f"j{number}")
-    ]
+    by_number = dict(zip((1, 2), joints, strict=True))
+    channels = [issue.text for issue in check_run(logged.table, by_number).refused]
     return (
         *_lost(logged),
         *(_no_sensor(logged) if sensor else ()),
@@ -267,174 +258,6 @@ def _opposite(logged: LoggedRun) -> Iterator[str]:
         yield f"j2.link_position_rad: found it turning {slope:.4g} times as far as j1's, expected -1"
 
 
-# One run of a campaign: jtqd started, the motion played, jtqd ended, its log turned into the run's files.
-
-
-_BUS_WAS_LATE: Final = re.compile(
-    r"SYNC missing|missing for \d+ cycles|no heartbeat for|no temperature for|late by|transmit queue"
-)
-_SIGNALLED: Final = re.compile(r"SIGINT|SIGTERM")
-
-Play = Callable[[Setpoints], MotionResult]
-"""The motion itself: `jtqd.sysid.motion.shell.play` on the bench, or what a test puts in its place. Raises MotionError."""
-
-
-@dataclass(frozen=True)
-class Bench:
-    """Where the runs take place: bus, jtqd's configuration (None: the one that ships) and what is in it."""
-
-    bus: str
-    config_path: Path | None
-    config: BenchConfig
-
-    def play(self, limits: Limits, on_progress: Progress) -> Play:
-        """The commander on this bench."""
-
-        def motion(setpoints: Setpoints) -> MotionResult:
-            with on_time():
-                return play(
-                    self.bus,
-                    setpoints,
-                    limits,
-                    on_progress=on_progress,
-                    drives=self.config.drives,
-                    sensor=self.config.sensor,
-                )
-
-        return motion
-
-
-class Attempt(NamedTuple):
-    """How an attempt at a run ended.
-
-    Attributes:
-        state: to be kept. again: another attempt may fare better, because nothing but time was against this one.
-        begun: the joints were moved; otherwise the bench itself is not ready. signalled: the operator ended it.
-    """
-
-    state: RunState
-    again: bool = False
-    begun: bool = True
-    signalled: bool = False
-
-
-class Recorded(NamedTuple):
-    """What jtqd left of a run: parts of the log, summary; and where the run's files go."""
-
-    log: tuple[Path, ...]
-    summary: dict[str, Any]
-    out: Path
-
-
-def attempt(
-    run: Run, setpoints: Setpoints, bench: Bench, out: Path, *, motion: Play, stop_asked: StopAsked
-) -> Attempt:
-    """Play a run and leave its files in `out`: all of a run that is done, the log of one that is not.
-
-    Raises:
-        Interrupted: a signal came before the motion had begun.
-        OSError: the files cannot be written.
-    """
-    if stop_asked():
-        raise Interrupted
-    folder = out / (run.name + PARTS)
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
-    jtqd = Jtqd(
-        bench.bus,
-        bench.config_path,
-        folder,
-        setpoints.duration_s,
-        estimate_cob_id=bench.config.estimate_cob_id,
-        stop_asked=stop_asked,
-    )
-    try:
-        try:
-            with jtqd:
-                result = motion(setpoints)
-            log, summary = jtqd.log()
-        except (ProcessError, MotionError) as error:
-            _keep([jtqd.said], out, run.name, ".jtqd.log")
-            return Attempt(RunState(FAILED, str(error)), again=isinstance(error, MotionError), begun=False)
-        if result.status == "stopped":
-            _keep(log, out, run.name, ".stopped.mcap")
-            return _stopped(result)
-        state = RunState(played_s=result.played_s)
-        return _kept(run, setpoints, bench.config, Recorded(log, summary, out), state)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def _stopped(result: MotionResult) -> Attempt:
-    signalled = bool(_SIGNALLED.search(result.reason))
-    return Attempt(
-        RunState(STOPPED, result.reason, played_s=result.played_s),
-        again=not signalled and bool(_BUS_WAS_LATE.search(result.reason)),
-        signalled=signalled,
-    )
-
-
-def _kept(
-    run: Run, setpoints: Setpoints, config: BenchConfig, recorded: Recorded, state: RunState
-) -> Attempt:
-    """Run table, marks and log of a motion that was played to its end."""
-    log, out = recorded.log, recorded.out
-    state = replace(state, status=FAILED)
-    lost = int((recorded.summary.get("recording") or {}).get("lost", 0))
-    try:
-        logged = log_to_run(log, nodes=config.nodes, sensor=config.sensor is not None)
-    except LogError as error:
-        _keep(log, out, run.name, ".failed.mcap")
-        return Attempt(replace(state, reason=str(error)), again=True)
-    state = replace(
-        state,
-        rows=len(logged.table.time_s),
-        missed=logged.missed,
-        incomplete=logged.incomplete,
-        incomplete_by=dict(logged.incomplete_by),
-        findings=findings(logged, setpoints, config.joints, sensor=config.sensor is not None),
-    )
-    if lost:
-        state = replace(state, findings=(f"log: found {lost} cycles lost by the recorder", *state.findings))
-    why = unusable(logged)
-    if why is not None:
-        _keep(log, out, run.name, ".failed.mcap")
-        return Attempt(replace(state, reason=why), again=True)
-    sha256 = write_run(out / f"{run.name}.csv.gz", logged.table)
-    (out / f"{run.name}.json").write_text(json.dumps(marks_of(run, setpoints), indent=1) + "\n")
-    _keep(log, out, run.name, ".mcap")
-    return Attempt(replace(state, status=DONE, sha256=sha256))
-
-
-def marks_of(run: Run, setpoints: Setpoints) -> dict[str, Any]:
-    """Content of NAME.json: which segment was when, in seconds of the run table (to about a cycle)."""
-    return {
-        "run": run.name,
-        "velocity_joint": run.velocity_joint,
-        "segments": [
-            {
-                "kind": mark.kind,
-                "start_s": mark.start_s,
-                "end_s": mark.end_s,
-                "velocity_joint": run.velocity_joint,
-                "velocity_rad_s": mark.velocity_rad_s,
-                "current_a": mark.current_a,
-            }
-            for mark in setpoints.marks
-        ],
-    }
-
-
-def _keep(paths: Sequence[Path], out: Path, run: str, ending: str) -> None:
-    """Move files out of the run's own directory, as far as they are there; both lie in the same file system.
-
-    The first becomes RUN.ENDING, the second RUN@2.ENDING and so on (no name has a @): a long run's log has several parts.
-    """
-    for number, path in enumerate(paths, start=1):
-        if path.exists():
-            os.replace(path, out / (run + ("" if number == 1 else f"@{number}") + ending))
-
-
 ATTEMPTS: Final = 3
 
 AttemptRun = Callable[[Run, Setpoints], Attempt]
@@ -482,7 +305,7 @@ class Outcome:
         lines = [f"runs      {', '.join(text for text in counts if not text.startswith('0 '))}"]
         rows = sum(state.rows for state in self.runs.values())
         lines.append(
-            f"cycles    {rows} rows, {_where(self.runs, 'missed')}, {_where(self.runs, 'incomplete')}"
+            f"cycles    {counted(rows, 'row')}, {_where(self.runs, 'missed')}, {_where(self.runs, 'incomplete')}"
         )
         for name, state in self.runs.items():
             if state.status in (STOPPED, FAILED):

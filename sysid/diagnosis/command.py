@@ -10,7 +10,6 @@ import os
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -21,10 +20,10 @@ from jtqd.estimator.run import RunTableError
 from jtqd.sysid.campaign.plan import Plan
 from jtqd.sysid.diagnosis.extended_joint import FILE, write_extended
 from jtqd.sysid.diagnosis.findings import INSUFFICIENT, NO_GAP, Findings, summary_lines, to_mapping
-from jtqd.sysid.runs.channels import Checked, check_runs
-from jtqd.sysid.runs.files import ColumnMap, RunError
-from jtqd.sysid.runs.inputs import InputRun
-from jtqd.sysid.runs.sources import UsageError, joint_files, joints_of, read_all
+from jtqd.sysid.progress import waiting
+from jtqd.sysid.runs.checks import CheckedRuns, check_runs
+from jtqd.sysid.runs.files import ColumnMap, RunError, RunFile, read_runs
+from jtqd.sysid.runs.joints import UsageError, joint_files, joints_of
 
 BY: Final = "jtq diagnose"
 _NEEDED: Final = ("matplotlib", "jinja2")
@@ -46,7 +45,7 @@ def main(argv: list[str]) -> int:
         columns = None if options.columns is None else ColumnMap.load(options.columns)
         files = joint_files(options.joint, columns)
         _check_out(options.out, options.force)
-        runs = read_all(options.runs, columns)
+        runs = read_runs(options.runs, columns)
         joints = joints_of(files, runs)
         for run in runs:
             for note in run.notes:
@@ -69,7 +68,7 @@ def main(argv: list[str]) -> int:
     return 0 if findings.verdict == NO_GAP else 3
 
 
-def diagnosed(runs: Sequence[InputRun], joints: Mapping[int, Joint]) -> Findings:
+def diagnosed(runs: Sequence[RunFile], joints: Mapping[int, Joint]) -> Findings:
     """Check the channels, diagnose what may be used, and say in the findings what may not."""
     checked = check_runs([(run.name, run.table) for run in runs], joints)
     for line in (*checked.refused, *checked.notes):
@@ -84,7 +83,7 @@ def diagnosed(runs: Sequence[InputRun], joints: Mapping[int, Joint]) -> Findings
             joints=tuple(joints),
             channel_notes=notes,
         )
-    with _waiting(f"diagnosing {len(checked.runs)} runs"):
+    with waiting(f"diagnosing {len(checked.runs)} runs"):
         from jtqd.sysid.diagnosis.diagnose import diagnose
 
         left = {number: joint for number, joint in joints.items() if number not in checked.lost}
@@ -92,7 +91,7 @@ def diagnosed(runs: Sequence[InputRun], joints: Mapping[int, Joint]) -> Findings
     return _with_channels(findings, checked, notes)
 
 
-def _with_channels(findings: Findings, checked: Checked, notes: tuple[str, ...]) -> Findings:
+def _with_channels(findings: Findings, checked: CheckedRuns, notes: tuple[str, ...]) -> Findings:
     """Findings that tell of the channels; without a gap they are no proof for a joint that could not be judged."""
     findings = replace(findings, channel_notes=notes + findings.channel_notes)
     if findings.verdict == NO_GAP and checked.lost:
@@ -194,12 +193,3 @@ def _write(
         for name in (*names, FINDINGS):
             os.replace(fresh / name, directory / name)
     return mapping
-
-
-def _waiting(text: str) -> Any:
-    """A spinner on standard error where that is a terminal."""
-    if not sys.stderr.isatty():
-        return nullcontext()
-    from rich.console import Console
-
-    return Console(stderr=True).status(text)

@@ -1,57 +1,22 @@
-"""Moments at which a channel does what its noise never does, and seconds that are off for no reason that shows. Pure.
+"""Moments at which a channel does what its noise never does, and seconds that are off for no reason that shows.
 
 Events are no effect of the library, and a least-squares fit gives them more weight than anything else. So they are found
-first in what the causes leave; where there are some, the search is made again without them (`without_events`).
+first in what the causes leave; where there are some, the search is made again without them (`Dataset.without_events`).
 Everything in Nm^2 unless a name says otherwise.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
-from jtqd.estimator.joint import Joint
-from jtqd.sysid.diagnosis.noise import past_valid, saturated_residuals, whiten
-from jtqd.sysid.diagnosis.powerless import Readings
-from jtqd.sysid.diagnosis.regressors import EffectCandidate, Family, RunData, gain_columns
-from jtqd.sysid.diagnosis.signals import Channel, JointSignals, Line
-
-# Runs as the statistics see them.
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """signals [run][joint]; runs: the same binned, `samples` to a bin of step_s seconds; the library's candidates;
-    unexplained: what none of them explains, per channel and run [n]; groups: nuisances; lines: those among them that are
-    lines at orders or frequencies of no effect; readings: per run what the current reads without power; events: what is not
-    valid in `runs` only because it is an event, per channel and run [n].
-    """
-
-    signals: list[list[JointSignals]]
-    runs: list[RunData]
-    candidates: list[EffectCandidate]
-    samples: int
-    step_s: float
-    unexplained: dict[Channel, list[FloatArray]]
-    groups: list[Family]
-    lines: list[Line]
-    readings: Sequence[Readings] = ()
-    events: Mapping[Channel, Sequence[BoolArray]] = field(default_factory=dict)
-
-    @property
-    def joints(self) -> dict[int, Joint]:
-        """The joint files by number, their own effects taken off the residuals already."""
-        return {s.number: s.joint for s in self.signals[0]}
-
-    def seen(self, run: int, channel: Channel) -> BoolArray:
-        """Return where a channel of a run is valid or in an event [n]."""
-        valid = self.runs[run].channels[channel].valid
-        return valid | self.events[channel][run] if channel in self.events else valid
-
+from jtqd.sysid.diagnosis.noise import past_valid, whiten
+from jtqd.sysid.diagnosis.regressors import RunData
+from jtqd.sysid.diagnosis.signals import Channel
 
 BLOCK_S: Final = 1.0
 _BURST_S: Final = 0.05
@@ -84,6 +49,18 @@ class Burst:
     def name(self) -> str:
         """Text of its place: what, and the first moments."""
         return f"{self.what}: " + ", ".join(f"{run} {t:.1f} s" for run, t in self.times[:6])
+
+
+@dataclass(frozen=True)
+class EventLimits:
+    """From where on one channel has events: ar: autoregression of its noise; step_s: seconds to a bin; jump_nm,
+    wander_nm: by how much an event moves, and means over seconds wander, at least [Nm].
+    """
+
+    ar: FloatArray
+    step_s: float
+    jump_nm: float
+    wander_nm: float
 
 
 @dataclass(frozen=True)
@@ -211,18 +188,3 @@ def block_means(x: FloatArray, block: int) -> tuple[FloatArray, BoolArray]:
     seen = np.isfinite(cut).sum(axis=1)
     mean: FloatArray = np.nansum(cut, axis=1) / np.maximum(seen, 1)
     return mean, np.asarray(seen > block // 2, np.bool_)
-
-
-def without_events(prepared: Prepared, found: Mapping[Channel, Events]) -> Prepared:
-    """Return the runs with these events taken for not valid, and what is then unexplained."""
-    runs, hidden = [], {c: list(e.masks) for c, e in found.items()}
-    for r, run in enumerate(prepared.runs):
-        channels = dict(run.channels)
-        for channel, masks in hidden.items():
-            d = channels[channel]
-            masks[r] = masks[r] & d.valid
-            channels[channel] = replace(d, valid=d.valid & ~masks[r])
-        runs.append(replace(run, channels=channels))
-    leave = gain_columns(prepared.candidates)
-    unexplained = {c: saturated_residuals(runs, c, leave) for c in runs[0].channels}
-    return replace(prepared, runs=runs, unexplained=unexplained, events=hidden)

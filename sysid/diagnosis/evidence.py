@@ -1,4 +1,10 @@
-"""Evidence of every effect of the library, for the table of the report: alone against the baseline. Pure."""
+"""Evidence of every effect of the library: alone against the baseline, smallest size detectable, equivalence classes.
+
+An effect of coefficients b lowers the deviance by about b' I b, I being the information of its columns that the causes
+found and the changes from run to run leave. It is detected when that exceeds its cost in BIC plus ENTER: the minimum
+detectable effect. Where the runs' own changes are what limits it, their variance is itself estimated from few runs, and
+the same evidence needs a larger ratio: t^2 = n (exp(d/n) - 1) instead of d.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +20,6 @@ from jtqd.sysid.diagnosis.mixed_model import Mixed, explained
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.search import ENTER, HELD_OUT, Hypothesis, Search
 
-# Smallest size of every effect that these runs would show: the minimum detectable effect. Pure.
-#
-# An effect of coefficients b lowers the deviance by about b' I b, I being the information of its columns that the causes
-# found and the changes from run to run leave. It is detected when that exceeds its cost in BIC plus ENTER. Where the
-# runs' own changes are what limits it, their variance is itself estimated from few runs, and the same evidence needs a
-# larger ratio: t^2 = n (exp(d/n) - 1) instead of d.
-
-
 RELEVANT: Final = 1e-3
 """Part of the rated torque below which a contribution (rms over the runs) is not called an effect, however certain."""
 
@@ -29,7 +27,7 @@ RELEVANT: Final = 1e-3
 _LARGEST: Final = 0.2
 """Part of the rated torque: a torque that would have to be larger to show is invisible."""
 _COLLINEAR: Final = 1e-4
-"""Below this part of its information nothing is left beside a rival: no size would tell the two apart."""
+"""Below this part of its information nothing is left beside a rival: no size would distinguish the two."""
 
 
 def _order(candidate: EffectCandidate) -> float:
@@ -42,7 +40,7 @@ def information(
     """Return (information of its leading coefficient, share of the uncertainty that is the runs' own changes).
 
     For waves the worst phase. Columns already chosen for the same effect count as known. rival: another candidate that it
-    must be told from.
+    must be distinguished from.
     """
     base = [k for c in best.chosen if c.key != candidate.key for k in c.columns]
     if rival is not None:
@@ -94,9 +92,9 @@ def minimum_size(search: Search, best: Hypothesis, candidate: EffectCandidate) -
             and rival.term.basis[0].keys() == candidate.term.basis[0].keys()
         )
         if same and rival.joint != candidate.joint and _order(rival) == _order(candidate):
-            told, told_share = information(search.mixed, best, candidate, rival)
-            if _COLLINEAR * known < told < known:
-                known, share = told, told_share
+            beside, beside_share = information(search.mixed, best, candidate, rival)
+            if _COLLINEAR * known < beside < known:
+                known, share = beside, beside_share
     one = candidate.term.combine([1.0, *([0.0] * (candidate.size - 1))])
     none = candidate.term.combine([0.0] * candidate.size)
     moved = [p for p in candidate.effect.parameters if not p.fixed and one.get(p.name) != none.get(p.name)]
@@ -118,9 +116,6 @@ def minimum_size(search: Search, best: Hypothesis, candidate: EffectCandidate) -
     if lead.unit == "Nm" and found > _LARGEST * search.least_nm / RELEVANT:
         return nothing
     return {lead.name: Value(found, (found, found), lead.unit)}
-
-
-# Equivalence classes: which other effects would explain the same runs as well as the one chosen. Pure.
 
 
 WITHIN: Final = 6.0
@@ -155,7 +150,7 @@ def equivalence_class(
         # the runs' own changes may be bought by a rival, but not at a discount
         price = rival.bic - best.bic - max(worse, 0.0)
         # what a drive reads without power is no matter of the model's imperfections
-        refuted = search.unread(rival) - search.unread(best) > WITHIN
+        refuted = search.reading_misfit(rival) - search.reading_misfit(best) > WITHIN
         if worse < room and price < WITHIN and not refuted and search.plausible(rival):
             key = candidate.key
             if key not in found or rival.bic < found[key].bic:

@@ -1,8 +1,8 @@
 """From a joint and the causes found to the extended joint file: effects with their values, intervals in its provenance.
 
 An effect that the joint file has already is replaced by the cause of the same name, so that diagnosing with the extended
-file again does not add the same thing twice. Effects of the torque sensor go into every joint's file. Pure but for
-`write_extended`.
+file again does not add the same thing twice. Effects of the torque sensor go into every joint's file. All of it is
+pure but `write_extended`.
 """
 
 from __future__ import annotations
@@ -13,39 +13,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.sysid.diagnosis.findings import Cause, Findings, Value
 from jtqd.sysid.fit.joint_writer import write_joint
-
-# A joint whose effects that replace a value of its file are put into that value: the same joint in other words. Pure.
-#
-# With an efficiency in the file the losses are the table's: there another friction or torque constant in the file is not
-# the effect that bears its name, which is what is lost beside the table. Such an effect stays an effect.
-
-
-def fold(joint: Joint) -> Joint:
-    """Return the joint with every effect put into the file's values where all its given parameters have a key for it."""
-    kept = []
-    for item in joint.effects:
-        effect = EFFECTS[item.name]
-        keys = {p.name: p.key for p in effect.parameters}
-        beside_table = joint.efficiency is not None and "loss_nm" in effect.hooks and not effect.changes_joint
-        if beside_table or not all(keys[name] for name in item.parameters):
-            kept.append(item)
-            continue
-        for name, value in item.parameters.items():
-            joint = _with(joint, keys[name].split("."), value)
-    return replace(joint, effects=tuple(kept))
-
-
-def _with(joint: Joint, path: list[str], value: float) -> Joint:
-    if len(path) == 1:
-        changed: dict[str, Any] = {path[0]: value}
-        return replace(joint, **changed)
-    inner: dict[str, Any] = {path[1]: value}
-    return replace(joint, friction=replace(joint.friction, **inner))
-
 
 SENSOR: Final = "sensor"
 FILE: Final = "extended.joint.yaml"

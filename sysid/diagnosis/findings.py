@@ -1,4 +1,4 @@
-"""What a diagnosis says, as frozen values: the source of findings.json (schema jtq.findings/1), report and exit status."""
+"""Result of a diagnosis as frozen values: the source of findings.json (schema jtq.findings/1), report and exit status."""
 
 from __future__ import annotations
 
@@ -143,13 +143,6 @@ class Findings:
     traces: tuple[Trace, ...] = field(default=(), repr=False)
 
 
-# Findings as plain values for findings.json, schema jtq.findings/1. Pure.
-#
-# The keys of the schema are always there, whatever the verdict: a program that reads `gap.rmse_nm` need not ask first. What
-# has no value is null; NaN and infinity, which JSON does not have, are null as well (an unlimited interval, an effect that
-# no size would make visible). Keys beside those of the schema say more and may be ignored.
-
-
 _NO_GAP_MEASURED: Final[dict[str, Any]] = {
     "joint": None,
     "rmse_nm": None,
@@ -162,7 +155,11 @@ _NO_GAIN_MEASURED: Final = {"rmse_before_nm": None, "rmse_after_nm": None, "spli
 def to_mapping(
     findings: Findings, *, sha256: Mapping[str, str] | None = None, files: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Return dicts, lists, texts and finite numbers only.
+    """Return the findings as findings.json has them: dicts, lists, texts and finite numbers only.
+
+    The keys of the schema are always there, whatever the verdict: a program that reads `gap.rmse_nm` need not ask first.
+    What has no value is null; NaN and infinity, which JSON does not have, are null as well (an unlimited interval, an
+    effect that no size would make visible). Keys beside those of the schema say more and may be ignored.
 
     sha256: hash of each run's file by the run's name; files: names of what was written beside findings.json.
     """
@@ -269,10 +266,7 @@ def _gain(gain: Gain) -> dict[str, Any]:
     }
 
 
-# Findings in a few lines for a terminal. Pure.
-
-
-_SAID: Final = {
+_VERDICTS_IN_WORDS: Final = {
     NO_GAP: "the simulation explains these runs down to their noise",
     CAUSE: "the gap has a cause that these runs name",
     AMBIGUOUS: "the gap has a cause, but these runs cannot tell which of a class",
@@ -282,8 +276,8 @@ _SAID: Final = {
 
 
 def summary_lines(findings: Findings) -> list[str]:
-    """Return verdict, gap, causes with intervals, gain, next experiment: one line each."""
-    lines = [f"{findings.verdict}: {_SAID.get(findings.verdict, '')}"]
+    """Return verdict, gap, causes with intervals, gain, next experiment for a terminal: one line each."""
+    lines = [f"{findings.verdict}: {_VERDICTS_IN_WORDS.get(findings.verdict, '')}"]
     lines += [f"  {reason}" for reason in findings.reasons]
     for gap in findings.gaps[:1]:
         lines.append(

@@ -1,4 +1,4 @@
-"""What the extended model gains on runs left out. Pure."""
+"""Gain of the extended model on runs left out: error of its torque, and of a free run of the motor."""
 
 from __future__ import annotations
 
@@ -15,23 +15,94 @@ from jtqd.estimator.effects.functions import Whole
 from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.joint import Effect as Effect_parameters
 from jtqd.estimator.joint import Joint
-from jtqd.sysid.diagnosis.events import Prepared
+from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.findings import Gain, RunGain
 from jtqd.sysid.diagnosis.mixed_model import solve
 from jtqd.sysid.diagnosis.refine import Refined
 from jtqd.sysid.diagnosis.signals import BaseLoss, Channel, JointSignals
 
-# Free run of one joint's motor: what the model makes of the measured current and torque, without looking. Pure.
-#
-#     (G^2 Jm + Jl) dv/dt = G Kt I - TAU_S - load_nm - loss0 - loss_nm          v = omega_m/G
-#
-# with I = i - current_a and TAU_S = tau_s - sensor_nm: the measured inputs less what the effects of the joint say about
-# them. The run is cut into windows of half a second; each begins in the measured state and is then left alone, all of
-# them stepped at once. The error of the velocity counts every newton metre that the model has wrong over the whole
-# window, where a residual of the torque balance sees one sample at a time.
-#
-# The spring is on the other side of the measured torque, so twist_rad and link_rad have no part in this. Friction is
-# implicit: its impulse within a step can stop the motor and not turn it round, so a joint sticks.
+_BOOTSTRAPS: Final = 2000
+
+
+def held_out_gain(dataset: Dataset, refined: Refined, seed: int = 0) -> Gain:
+    """Return the error of the simulation's torque before and after, each run with the parameters of all others.
+
+    In the balance where most goes away; the run's own zero and friction of the day stay in, as in service. ci95: of
+    rmse_before - rmse_after [Nm], bootstrap over runs.
+    """
+    steps = left_out_steps(refined)
+    squares: dict[Channel, list[tuple[float, float, int]]] = {}
+    for run, left, step in zip(dataset.runs, refined.runs, steps, strict=True):
+        for channel, d in left.channels.items():
+            before = run.channels[channel].residual[d.valid]
+            after = (d.residual - d.regressors @ step[d.index])[d.valid]
+            if channel.balance == "torsion" and len(before):
+                before, after = before - before.mean(), after - after.mean()
+            squares.setdefault(channel, []).append(
+                (float(before @ before), float(after @ after), len(before))
+            )
+    drops = {c: _rms(np.array(s), 0) - _rms(np.array(s), 1) for c, s in squares.items()}
+    channel = max(drops, key=lambda c: drops[c])
+    table = np.array(squares[channel])
+    rng = np.random.default_rng(seed)
+    picks = rng.integers(0, len(table), size=(_BOOTSTRAPS, len(table)))
+    sums = table[picks].sum(axis=1)
+    drawn = np.sqrt(sums[:, 0] / sums[:, 2]) - np.sqrt(sums[:, 1] / sums[:, 2])
+    low, high = np.percentile(drawn, (2.5, 97.5))
+    free = _free_runs(dataset, refined, steps)
+    return Gain(
+        _rms(table, 0),
+        _rms(table, 1),
+        f"each of {len(table)} runs left out once; {channel.balance} balance of joint {channel.joint}",
+        (float(low), float(high)),
+        *free,
+        tuple(
+            RunGain(run.name, _rms(row, 0), _rms(row, 1))
+            for run, row in zip(dataset.runs, table[:, None, :], strict=True)
+            if row[0, 2] > 0.0
+        ),
+    )
+
+
+def _free_runs(dataset: Dataset, refined: Refined, steps: Sequence[FloatArray]) -> tuple[float, float]:
+    """Return the rms error of the simulation running free, before and after [rad/s, joint side], over all joints and runs;
+    each run with the parameters of all others.
+    """
+    squares = np.zeros(2)
+    count = 0
+    for run, step in zip(dataset.signals, steps, strict=True):
+        place, causes = 0, []
+        for p in refined.present:
+            causes.append(p.moved([float(x) for x in step[place : place + len(p.free)]]))
+            place += len(p.free)
+        for s in run:
+            mine = [p for p in causes if p.joint in ("sensor", s.number)]
+            if not mine:
+                continue
+            effects = [*s.joint.effects, *(Effect_parameters(p.effect.name, dict(p.values)) for p in mine)]
+            try:
+                after = free_run(s, replace(s.joint, effects=tuple(effects))).rmse_rad_s
+            except ConfigError:
+                continue  # a run left out can take a parameter out of its range
+            before = free_run(s, s.joint).rmse_rad_s
+            squares += (before**2, after**2)
+            count += 1
+    if not count:
+        return float("nan"), float("nan")
+    root = np.sqrt(squares / count)
+    return float(root[0]), float(root[1])
+
+
+def _rms(table: FloatArray, column: int) -> float:
+    return float(np.sqrt(table[:, column].sum() / max(table[:, 2].sum(), 1.0)))
+
+
+def left_out_steps(refined: Refined) -> list[FloatArray]:
+    """Return per run the change of the free parameters when this run is left out."""
+    marginals, _ = refined.mixed.marginal_runs(refined.variances)
+    total = marginals.sum(axis=0)
+    k = refined.mixed.columns
+    return [solve(total - m, k)[0] for m in marginals]
 
 
 WINDOW_S: Final = 0.5
@@ -72,6 +143,15 @@ def free_run(
     signals: JointSignals, joint: Joint, base: BaseLoss | None = None, *, window_s: float = WINDOW_S
 ) -> FreeRun:
     """Simulate one joint of one run in windows and compare its velocity with the measured one.
+
+        (G^2 Jm + Jl) dv/dt = G Kt I - TAU_S - load_nm - loss0 - loss_nm          v = omega_m/G
+
+    with I = i - current_a and TAU_S = tau_s - sensor_nm: the measured inputs less what the effects of the joint say about
+    them. Each window begins in the measured state and is then left alone, all of them stepped at once. The error of the
+    velocity counts every newton metre that the model has wrong over the whole window, where a residual of the torque balance
+    sees one sample at a time. The spring is on the other side of the measured torque, so twist_rad and link_rad have no
+    part in this. Friction is implicit: its impulse within a step can stop the motor and not turn it round, so a joint
+    sticks.
 
     joint: the model, its `effects` included; signals.joint itself for the run before anything is extended. base: losses of
     the joint file (effects do not change them), made here if not given. A run shorter than one window is one window.
@@ -242,87 +322,3 @@ class _Stepwise(Whole):
         moved = np.zeros_like(d) if self._last is None else (d - self._last) / travel
         self._last, self._z = d, np.clip(self._z + moved, -1.0, 1.0)
         return self._z
-
-
-_BOOTSTRAPS: Final = 2000
-
-
-def held_out_gain(prepared: Prepared, refined: Refined, seed: int = 0) -> Gain:
-    """Return the error of the simulation's torque before and after, each run with the parameters of all others.
-
-    In the balance where most goes away; the run's own zero and friction of the day stay in, as in service. ci95: of
-    rmse_before - rmse_after [Nm], bootstrap over runs.
-    """
-    steps = left_out_steps(refined)
-    squares: dict[Channel, list[tuple[float, float, int]]] = {}
-    for run, left, step in zip(prepared.runs, refined.runs, steps, strict=True):
-        for channel, d in left.channels.items():
-            before = run.channels[channel].residual[d.valid]
-            after = (d.residual - d.regressors @ step[d.index])[d.valid]
-            if channel.balance == "torsion" and len(before):
-                before, after = before - before.mean(), after - after.mean()
-            squares.setdefault(channel, []).append(
-                (float(before @ before), float(after @ after), len(before))
-            )
-    drops = {c: _rms(np.array(s), 0) - _rms(np.array(s), 1) for c, s in squares.items()}
-    channel = max(drops, key=lambda c: drops[c])
-    table = np.array(squares[channel])
-    rng = np.random.default_rng(seed)
-    picks = rng.integers(0, len(table), size=(_BOOTSTRAPS, len(table)))
-    sums = table[picks].sum(axis=1)
-    drawn = np.sqrt(sums[:, 0] / sums[:, 2]) - np.sqrt(sums[:, 1] / sums[:, 2])
-    low, high = np.percentile(drawn, (2.5, 97.5))
-    free = _free_runs(prepared, refined, steps)
-    return Gain(
-        _rms(table, 0),
-        _rms(table, 1),
-        f"each of {len(table)} runs left out once; {channel.balance} balance of joint {channel.joint}",
-        (float(low), float(high)),
-        *free,
-        tuple(
-            RunGain(run.name, _rms(row, 0), _rms(row, 1))
-            for run, row in zip(prepared.runs, table[:, None, :], strict=True)
-            if row[0, 2] > 0.0
-        ),
-    )
-
-
-def _free_runs(prepared: Prepared, refined: Refined, steps: Sequence[FloatArray]) -> tuple[float, float]:
-    """Return the rms error of the simulation running free, before and after [rad/s, joint side], over all joints and runs;
-    each run with the parameters of all others.
-    """
-    squares = np.zeros(2)
-    count = 0
-    for run, step in zip(prepared.signals, steps, strict=True):
-        place, causes = 0, []
-        for p in refined.present:
-            causes.append(p.moved([float(x) for x in step[place : place + len(p.free)]]))
-            place += len(p.free)
-        for s in run:
-            mine = [p for p in causes if p.joint in ("sensor", s.number)]
-            if not mine:
-                continue
-            effects = [*s.joint.effects, *(Effect_parameters(p.effect.name, dict(p.values)) for p in mine)]
-            try:
-                after = free_run(s, replace(s.joint, effects=tuple(effects))).rmse_rad_s
-            except ConfigError:
-                continue  # a run left out can take a parameter out of its range
-            before = free_run(s, s.joint).rmse_rad_s
-            squares += (before**2, after**2)
-            count += 1
-    if not count:
-        return float("nan"), float("nan")
-    root = np.sqrt(squares / count)
-    return float(root[0]), float(root[1])
-
-
-def _rms(table: FloatArray, column: int) -> float:
-    return float(np.sqrt(table[:, column].sum() / max(table[:, 2].sum(), 1.0)))
-
-
-def left_out_steps(refined: Refined) -> list[FloatArray]:
-    """Return per run the change of the free parameters when this run is left out."""
-    marginals, _ = refined.mixed.marginal_runs(refined.variances)
-    total = marginals.sum(axis=0)
-    k = refined.mixed.columns
-    return [solve(total - m, k)[0] for m in marginals]

@@ -1,20 +1,40 @@
-"""How large the gap is in each balance, against the noise floor of the data, and where it lives. Pure."""
+"""How large the gap is in each balance, against the noise floor of the data, and where it lies.
+
+Where: which condition explains most of what is left over, and which the rest. An axis (velocity, load, an angle, ...)
+explains a residual when the mean of a bin over the *other* runs predicts it in this run: the square error that goes
+away, summed over the runs left out one by one (`explained_by_bins`). Noise of another run is independent however coloured
+it is, so bins that only follow the noise explain nothing or less, and more bins are no advantage; nor is a condition that
+merely goes with the run (temperature, time), because other runs do not confirm it. Events and seconds that are off
+explain only what the best axis does not predict: a bump that makes a step on every pass is the angle's, not the moments'.
+The condition that explains most is the first location; what it explains is taken out, and the search is made again
+(`locate`). Energies in Nm^2.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.sysid.diagnosis.events import Burst, Prepared
+from jtqd.sysid.diagnosis.dataset import Dataset
+from jtqd.sysid.diagnosis.events import BLOCK_S, Burst, EventLimits, block_means, events, wandering
 from jtqd.sysid.diagnosis.findings import Gap, Place, Trace
-from jtqd.sysid.diagnosis.leftover import MOST, Leftover, Told, less_nuisances, places_told
+from jtqd.sysid.diagnosis.leftover import Leftover, less_nuisances
 from jtqd.sysid.diagnosis.refine import Refined
-from jtqd.sysid.diagnosis.regressors import LINE
+from jtqd.sysid.diagnosis.regressors import LINE, RunData
 from jtqd.sysid.diagnosis.signals import Channel, Line
-from jtqd.sysid.diagnosis.structure import SIGNIFICANT, AxisMap, axis_maps
+from jtqd.sysid.diagnosis.structure import (
+    SIGNIFICANT,
+    AxisMap,
+    axis_map,
+    axis_maps,
+    axis_values,
+    directions,
+    signed,
+)
 
 _SAME: Final = 0.02
 """Two runs whose velocities and loads differ by less than this part of their rms are repetitions."""
@@ -23,31 +43,186 @@ _LEAST_SHARE: Final = 0.02
 """Of the gap, from which a further bin is worth a line."""
 _TRACE_POINTS: Final = 4000
 QUADRANT_NAMES: Final = ("v+ load+", "v+ load-", "v- load+", "v- load-")
+MOST: Final = 3
+"""Locations that are looked for."""
+LEAST: Final = 0.01
+"""Part of the energy that a location must explain."""
+_BEYOND: Final = 0.01
+"""Largest p of an axis that explains what others before it do not."""
+_FEWEST_RUNS: Final = 2
+"""An axis is confirmed by this many runs at least."""
+_PRIOR_S: Final = 1.0
+"""A bin's mean over the other runs counts as if it had been zero for so long before."""
 
 
-def channel_gaps(prepared: Prepared, refined: Refined, left: Leftover | None) -> tuple[Gap, ...]:
+@dataclass(frozen=True)
+class Location:
+    """Part of a gap: the energy [Nm^2] that an axis explains beyond those before it, with its bins, the largest first; or
+    that events, seconds or a line hold.
+    """
+
+    energy_nm2: float
+    axis: str = ""
+    bins: tuple[int, ...] = ()
+    burst: Burst | None = None
+    line: Line | None = None
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """An axis in one direction: energy explained; prediction [run][n] of the residual; energy explained per bin."""
+
+    axis: str
+    energy_nm2: float
+    prediction: list[FloatArray]
+    bins: FloatArray
+
+
+def explained_by_bins(
+    places: Sequence[np.ndarray[tuple[int], np.dtype[np.intp]]],
+    parts: Sequence[FloatArray],
+    bins: int,
+    step_s: float,
+) -> tuple[FloatArray, list[FloatArray]]:
+    """Return the energy that the bins' means over the other runs take off each run, and bin [runs, bins] (sum of squares
+    over samples, Nm^2), and those means at every sample [run][n]. places: bin of every sample.
+    """
+    sums, counts = np.zeros((len(parts), bins)), np.zeros((len(parts), bins))
+    for r, (place, x) in enumerate(zip(places, parts, strict=True)):
+        good = np.isfinite(x)
+        sums[r] = np.bincount(place[good], x[good], minlength=bins)
+        counts[r] = np.bincount(place[good], minlength=bins)
+    others = (sums.sum(axis=0) - sums) / (counts.sum(axis=0) - counts + _PRIOR_S / step_s)
+    # sum of x^2 - (x - m)^2 over a bin
+    explained: FloatArray = 2.0 * others * sums - others**2 * counts
+    return explained, [others[r][place] for r, place in enumerate(places)]
+
+
+def locate(  # noqa: PLR0917
+    runs: Sequence[RunData],
+    channel: Channel,
+    parts: Sequence[FloatArray],
+    limits: EventLimits | None,
+    lines: Sequence[Line],
+    maps: Mapping[str, AxisMap],
+) -> list[Location]:
+    """Return the locations of a channel's residual [run][n], first the one that explains most, at most MOST.
+
+    limits: None for a gap that has causes or none: events and wandering are left out, and an axis need not be certain;
+    maps: of this residual. Of a gap that is not explained an axis whose map could be chance is no location.
+    """
+    now = list(parts)
+    whole = float(np.nanmean(np.concatenate(now) ** 2))
+    out: list[Location] = []
+    while len(out) < MOST:
+        used = [t.axis for t in out]  # empty names: events, seconds, lines
+        axis = _best_axis(runs, channel, now, used, maps, LEAST * whole, certain=limits is not None)
+        rest = now if axis is None else [x - y for x, y in zip(now, axis.prediction, strict=True)]
+        found = [] if axis is None else [Location(axis.energy_nm2, axis.axis, _descending(axis.bins))]
+        found += [
+            Location(0.5 * x.amplitude_nm**2, line=x) for x in lines if all(t.line is not x for t in out)
+        ]
+        masked = now
+        if limits is not None and not any(t.burst is not None and t.burst.what == "events" for t in out):
+            seen = events(runs, channel, rest, limits.ar, limits.step_s, limits.jump_nm)
+            if seen is not None:
+                found.append(Location(seen.burst.excess_nm2, burst=seen.burst))
+                masked = [np.where(m, np.nan, x) for m, x in zip(seen.masks, now, strict=True)]
+                rest = [np.where(m, np.nan, x) for m, x in zip(seen.masks, rest, strict=True)]
+        if limits is not None and not any(t.burst is not None and t.burst.what == "seconds" for t in out):
+            off = wandering(runs, {channel: rest}, limits.step_s, {channel: limits.wander_nm})
+            found += [Location(b.excess_nm2, burst=b) for b in off]
+        best = max(found, key=lambda t: t.energy_nm2, default=None)
+        if best is None or best.energy_nm2 < LEAST * whole:
+            break
+        out.append(best)
+        if best.axis and axis is not None:
+            now = [x - y for x, y in zip(now, axis.prediction, strict=True)]
+        elif best.burst is not None and limits is not None:
+            now = masked if best.burst.what == "events" else _less_seconds(now, limits.step_s)
+    return out
+
+
+def _descending(explained: FloatArray) -> tuple[int, ...]:
+    """Return the bins that explain something, the largest first."""
+    return tuple(int(k) for k in np.argsort(-explained) if explained[k] > 0.0)
+
+
+def _less_seconds(parts: Sequence[FloatArray], step_s: float) -> list[FloatArray]:
+    """Return the residual less its mean over every second [run][n]."""
+    block = max(2, round(BLOCK_S / step_s))
+    out = []
+    for x in parts:
+        mean, use = block_means(x, block)
+        level = np.zeros(len(x))
+        level[: len(mean) * block] = np.repeat(np.where(use, mean, 0.0), block)
+        out.append(x - level)
+    return out
+
+
+def _best_axis(  # noqa: PLR0917
+    runs: Sequence[RunData],
+    channel: Channel,
+    parts: Sequence[FloatArray],
+    used: Sequence[str],
+    maps: Mapping[str, AxisMap],
+    least_nm2: float,
+    *,
+    certain: bool,
+) -> _Axis | None:
+    """Return the axis that explains most of what is left; certain: none that could be chance, by its map while nothing is
+    taken out (`used` is empty), else by a map of what is left.
+    """
+    step_s = float(np.median(np.diff(runs[0].time_s)))
+    count = max(sum(int(np.isfinite(x).sum()) for x in parts), 1)
+    ranked: list[tuple[float, str, FloatArray, list[FloatArray], list[FloatArray] | None, FloatArray]] = []
+    for axis, drawn in maps.items():
+        if axis in used or (certain and not used and drawn.p >= SIGNIFICANT):
+            continue
+        edges, bins = drawn.edges, len(drawn.edges) - 1
+        values = [axis_values(run.axes[channel.joint], axis) for run in runs]
+        places = [np.clip(np.searchsorted(edges, v, side="right") - 1, 0, bins - 1) for v in values]
+        for side in directions(runs, channel):
+            explained, means = explained_by_bins(places, signed(parts, side), bins, step_s)
+            explained /= count
+            if explained.sum() > least_nm2 and (explained.sum(axis=1) > 0.0).sum() >= _FEWEST_RUNS:
+                ranked.append((float(explained.sum()), axis, explained, signed(means, side), side, edges))
+    ranked.sort(key=lambda item: -item[0])
+    for energy, axis, explained, prediction, side, edges in ranked:
+        p = 0.0
+        if certain and used:
+            values = [axis_values(run.axes[channel.joint], axis) for run in runs]
+            block = max(2, round(BLOCK_S / step_s))
+            rng = np.random.default_rng(0)
+            p = axis_map(channel, axis, edges, values, signed(parts, side), block, rng).p
+        if p < _BEYOND:
+            return _Axis(axis, energy, prediction, explained.sum(axis=0))
+    return None
+
+
+def channel_gaps(dataset: Dataset, refined: Refined, left: Leftover | None) -> tuple[Gap, ...]:
     """Return the gaps of all channels, largest excess over the floor first; places of what is left over where `left`
     is given (nothing named), else of the whole gap.
     """
-    residuals = _raw(prepared)
+    residuals = _raw(dataset)
     # where the gap lives: without what each run has of its own, which would hide a small effect
-    shown = _calm(prepared, refined) if left is None else less_nuisances(prepared, refined)
-    maps = axis_maps(prepared.runs, shown, prepared.step_s) if left is None else left.maps
+    shown = _calm(dataset, refined) if left is None else less_nuisances(dataset, refined)
+    maps = axis_maps(dataset.runs, shown, dataset.step_s) if left is None else left.maps
     out = []
     for channel, parts in residuals.items():
         everything = np.concatenate(parts)
         rmse = float(np.sqrt(np.nanmean(everything**2)))
-        floor, origin = _floor(prepared, refined, channel)
+        floor, origin = _floor(dataset, refined, channel)
         floor = min(floor, rmse)  # changes from run to run that work against each other are not noise
         mine = [m for m in maps if m.channel == channel]
-        noise = float(np.sqrt(np.nanmean(np.concatenate(prepared.unexplained[channel]) ** 2)))
+        noise = float(np.sqrt(np.nanmean(np.concatenate(dataset.unexplained[channel]) ** 2)))
         every = [p for m in mine for p in _bins(m, noise)]
-        judge = None if left is None else left.judges[channel]
+        limits = None if left is None else left.limits[channel]
         lines = [] if left is None else [x for x in left.lines if x.channel == channel]
         by_axis = {m.axis: m for m in mine}
-        told = places_told(prepared.runs, channel, shown[channel], judge, lines, by_axis)
+        locations = locate(dataset.runs, channel, shown[channel], limits, lines, by_axis)
         excess = max(rmse**2 - noise**2, 1e-30)
-        places = _places(told, by_axis, noise, excess, left is not None)
+        places = _places(locations, by_axis, noise, excess, left is not None)
         out.append(Gap(channel.joint, channel.balance, rmse, floor, origin, tuple(places), tuple(every)))
     if left is not None:  # what is not explained comes first, wherever the gap is largest
         energy = left.by_channel()
@@ -55,27 +230,27 @@ def channel_gaps(prepared: Prepared, refined: Refined, left: Leftover | None) ->
     return tuple(sorted(out, key=lambda g: g.noise_floor_nm**2 - g.rmse_nm**2))
 
 
-def _raw(prepared: Prepared) -> dict[Channel, list[FloatArray]]:
+def _raw(dataset: Dataset) -> dict[Channel, list[FloatArray]]:
     """Residuals of the simulation with the joint file [run][n]; torsion without each run's zero; NaN where invalid."""
     out: dict[Channel, list[FloatArray]] = {}
-    for r, run in enumerate(prepared.runs):
+    for r, run in enumerate(dataset.runs):
         for channel, d in run.channels.items():
-            x = np.where(prepared.seen(r, channel), d.residual, np.nan)
+            x = np.where(dataset.valid_or_event(r, channel), d.residual, np.nan)
             if channel.balance == "torsion":
                 x = x - np.nanmean(x)
             out.setdefault(channel, []).append(x)
     return out
 
 
-def _floor(prepared: Prepared, refined: Refined, channel: Channel) -> tuple[float, str]:
+def _floor(dataset: Dataset, refined: Refined, channel: Channel) -> tuple[float, str]:
     """Return the noise floor [Nm] and where it was taken from."""
-    repeats = _repeats(prepared, channel)
+    repeats = _repeats(dataset, channel)
     if repeats is not None:
         return repeats, "repeated runs"
-    noise = np.concatenate(prepared.unexplained[channel])
+    noise = np.concatenate(dataset.unexplained[channel])
     square = float(np.nanmean(noise**2))
     drift, count = 0.0, 0
-    usual = np.array([g.name != LINE for g in prepared.groups])
+    usual = np.array([g.name != LINE for g in dataset.groups])
     for run, u in zip(refined.runs, refined.nuisances, strict=True):
         d = run.channels[channel]
         part = (d.nuisances @ (u * usual)[d.families])[d.valid]
@@ -88,10 +263,10 @@ def _floor(prepared: Prepared, refined: Refined, channel: Channel) -> tuple[floa
     ), "what no effect explains, and changes from run to run"
 
 
-def _repeats(prepared: Prepared, channel: Channel) -> float | None:
+def _repeats(dataset: Dataset, channel: Channel) -> float | None:
     """Return rms of half the difference of repeated runs times sqrt 2 [Nm]; None without repetitions."""
     differences = []
-    runs = prepared.runs
+    runs = dataset.runs
     for a in range(len(runs)):
         for b in range(a):
             one, two = runs[a], runs[b]
@@ -141,13 +316,17 @@ def _every_bin(m: AxisMap, floor: float) -> list[Place]:
 
 
 def _places(
-    told: Sequence[Told], maps: Mapping[str, AxisMap], floor: float, excess_nm2: float, significant: bool
+    locations: Sequence[Location],
+    maps: Mapping[str, AxisMap],
+    floor: float,
+    excess_nm2: float,
+    significant: bool,
 ) -> list[Place]:
-    """Return the places, first one of each that tells (`places`), then more bins of their axes, then the other axes by
-    their structure; significant: leave out axes that could be chance, and what others tell already.
+    """Return the places of the findings: the first of each location (`locate`), then more bins of their axes, then the other
+    axes by their structure; significant: leave out axes that could be chance, and what others explain already.
     """
     ranked: list[list[Place]] = []
-    for t in told:
+    for t in locations:
         if t.burst is not None:
             ranked.append([_moments(t.burst, excess_nm2)])
         elif t.line is not None:
@@ -156,7 +335,7 @@ def _places(
             bins = _every_bin(maps[t.axis], floor)
             ranked.append([bins[k] for k in t.bins[:_PLACES_PER_AXIS]])
     if not significant:
-        others = [m for m in maps.values() if all(t.axis != m.axis for t in told)]
+        others = [m for m in maps.values() if all(t.axis != m.axis for t in locations)]
         others.sort(key=lambda m: (m.p >= SIGNIFICANT, -m.energy_nm2))
         ranked += [sorted(_bins(m, floor), key=lambda p: -p.share)[:_PLACES_PER_AXIS] for m in others]
     first = [places[0] for places in ranked[:MOST] if places]
@@ -184,39 +363,39 @@ def _bin_name(m: AxisMap, k: int) -> str:
     return f"{m.edges[k]:.3g} to {m.edges[k + 1]:.3g} {m.unit}".strip()
 
 
-def _causes(prepared: Prepared, refined: Refined, channel: Channel) -> list[FloatArray]:
+def _causes(dataset: Dataset, refined: Refined, channel: Channel) -> list[FloatArray]:
     """Return what the causes explain, per run [n]: before less after, the runs' own changes in neither."""
     return [
         run.channels[channel].residual - left.channels[channel].residual
-        for run, left in zip(prepared.runs, refined.runs, strict=True)
+        for run, left in zip(dataset.runs, refined.runs, strict=True)
     ]
 
 
-def _after(prepared: Prepared, refined: Refined) -> dict[Channel, list[FloatArray]]:
+def _after(dataset: Dataset, refined: Refined) -> dict[Channel, list[FloatArray]]:
     """Return what the causes leave, less what each run has of its own where that makes it smaller [run][n]: fitted to the
     whitened residual of few seconds it need not.
     """
-    out = less_nuisances(prepared, refined)
+    out = less_nuisances(dataset, refined)
     for channel, parts in out.items():
         for r, run in enumerate(refined.runs):
-            plain = np.where(prepared.seen(r, channel), run.channels[channel].residual, np.nan)
+            plain = np.where(dataset.valid_or_event(r, channel), run.channels[channel].residual, np.nan)
             if np.nansum(plain**2) < np.nansum(parts[r] ** 2):
                 parts[r] = plain
     return out
 
 
-def _calm(prepared: Prepared, refined: Refined) -> dict[Channel, list[FloatArray]]:
+def _calm(dataset: Dataset, refined: Refined) -> dict[Channel, list[FloatArray]]:
     """Return the residual with the joint files, less what each run has of its own [run][n]."""
-    after = _after(prepared, refined)
-    return {c: [a + b for a, b in zip(after[c], _causes(prepared, refined, c), strict=True)] for c in after}
+    after = _after(dataset, refined)
+    return {c: [a + b for a, b in zip(after[c], _causes(dataset, refined, c), strict=True)] for c in after}
 
 
-def traces(prepared: Prepared, refined: Refined) -> tuple[Trace, ...]:
+def traces(dataset: Dataset, refined: Refined) -> tuple[Trace, ...]:
     """Return the residual before and after for plots, thinned, one per run and channel."""
     out = []
-    after = _after(prepared, refined)
-    raw = _calm(prepared, refined)
-    for r, run in enumerate(prepared.runs):
+    after = _after(dataset, refined)
+    raw = _calm(dataset, refined)
+    for r, run in enumerate(dataset.runs):
         for channel in run.channels:
             every = max(1, len(run.time_s) // _TRACE_POINTS)
             axes = run.axes[channel.joint]

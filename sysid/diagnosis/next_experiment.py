@@ -1,4 +1,4 @@
-"""The next experiment: which kind of motion separates what these runs cannot, as a plan that `jtq campaign` drives. Pure.
+"""The next experiment: which kind of motion separates what these runs cannot, as a plan that `jtq campaign` drives.
 
 What an effect needs to be seen at all is its `Effect.experiment`. For two effects that look alike the kind that separates
 them is in PAIRS where it is another one. Of all kinds that a diagnosis would like, at most MOST_KINDS are planned, those
@@ -26,13 +26,6 @@ from jtqd.sysid.excitation.model import Bench as StaticBench
 from jtqd.sysid.excitation.model import ExcitationLimits
 from jtqd.sysid.motion.setpoints import Limits
 
-# What a next experiment may ask of two coupled joints: limits from the joint files, and the loads that keep them. Pure.
-#
-# A joint file gives the rated torque and no rated current. The current limit is what the joint needs to give its rated
-# torque against its own losses; the planned motion stays well below both, because the file may be wrong in the very
-# thing that the experiment is to settle.
-
-
 VELOCITY_RAD_S: Final = 2.0
 """Fastest motion where nothing else is said; joint files have no rated velocity."""
 TEMPERATURE_C: Final = 70.0
@@ -48,7 +41,11 @@ _OVER: Final = 3.0
 
 @dataclass(frozen=True)
 class Reach:
-    """What the runs of an experiment may use.
+    """What the runs of an experiment may use of two coupled joints.
+
+    A joint file gives the rated torque and no rated current. The current limit is what the joint needs to give its rated
+    torque against its own losses; the planned motion stays well below both, because the file may be wrong in the very
+    thing that the experiment is to settle.
 
     joints: of the bench; limits: of the plan but for travel, which each plan adds; velocity_rad_s: fastest plateau;
     acceleration_rad_s2: steepest change of it; own_current_a: largest planned current of joint 1 and of joint 2.
@@ -133,13 +130,6 @@ def _down(value: float) -> float:
     return float(round(math.floor(value / place + 1e-9) * place, 6))
 
 
-# The runs of each kind of experiment, within a `Reach`. Pure.
-#
-# Signs as in `jtqd.sysid.campaign.plans`: with equal signs of the velocity joint's velocity and the other joint's
-# current, the velocity joint drives and the other one is driven back. Every kind is done with either joint as the velocity
-# joint, so that both joints drive and are driven, and there are always runs to leave out.
-
-
 _RAMP_S: Final = 0.4
 _STEEPEST: Final = 1.875
 """Peak slope of the smooth step of `jtqd.sysid.campaign.plan`, in steps per ramp."""
@@ -159,8 +149,12 @@ Make = Callable[[Reach, int, str], Sequence[Run]]
 
 @dataclass(frozen=True)
 class Kind:
-    """One kind of experiment. what: what is done and what that tells, for people; make: runs of one velocity joint,
+    """One kind of experiment. what: what is done and what that shows, for people; make: runs of one velocity joint,
     named after the prefix given.
+
+    Signs as in `jtqd.sysid.campaign.plans`: with equal signs of the velocity joint's velocity and the other joint's
+    current, the velocity joint drives and the other one is driven back. Every kind is done with either joint as the
+    velocity joint, so that both joints drive and are driven, and there are always runs to leave out.
     """
 
     name: str

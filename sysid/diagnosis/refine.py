@@ -1,4 +1,4 @@
-"""Parameters of the causes with intervals: Gauss-Newton on the mixed model, all causes and all runs at once. Pure.
+"""Parameters of the causes with intervals: Gauss-Newton on the mixed model, all causes and all runs at once.
 
 The search is linear in its columns; velocities, travels and reference temperatures come from grids there. Here every
 free parameter of every cause moves: the residual is taken at the present parameters, its derivatives by finite
@@ -17,11 +17,11 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import MOTOR, TORSION, Effect, Parameter
 from jtqd.estimator.joint import Joint
-from jtqd.sysid.diagnosis.events import Prepared
+from jtqd.sysid.diagnosis.current_zero import UnpoweredColumn, unpowered, with_readings
+from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.findings import JointName
 from jtqd.sysid.diagnosis.mixed_model import Mixed, Model
 from jtqd.sysid.diagnosis.noise import Noise, run_sums
-from jtqd.sysid.diagnosis.powerless import Row, unpowered, with_readings
 from jtqd.sysid.diagnosis.regressors import ChannelData, RunData, binned, contribution
 from jtqd.sysid.diagnosis.search import Hypothesis
 from jtqd.sysid.diagnosis.signals import Channel, JointSignals
@@ -37,7 +37,7 @@ _LARGEST_STEP: Final = 0.5
 
 
 @dataclass(frozen=True)
-class Present:
+class PresentEffect:
     """An effect that is there: parameters by name and which of them are free."""
 
     effect: Effect
@@ -45,7 +45,7 @@ class Present:
     values: Mapping[str, float]
     free: tuple[str, ...]
 
-    def moved(self, step: Sequence[float]) -> Present:
+    def moved(self, step: Sequence[float]) -> PresentEffect:
         """Return it with its free parameters changed."""
         new = dict(self.values)
         for name, d in zip(self.free, step, strict=True):
@@ -64,7 +64,7 @@ class Refined:
     the derivatives.
     """
 
-    present: tuple[Present, ...]
+    present: tuple[PresentEffect, ...]
     covariance: FloatArray
     random_share: FloatArray
     mixed: Mixed
@@ -94,37 +94,37 @@ def free_names(effect: Effect, values: Mapping[str, float]) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True)
-class _Look:
+class _Iterate:
     """Causes at some parameters: what is left there, and the step from there; left: the deviance that they leave."""
 
-    present: tuple[Present, ...]
+    present: tuple[PresentEffect, ...]
     mixed: Mixed
     model: Model
     data: list[RunData]
     left: float
 
 
-def refine(prepared: Prepared, present: Sequence[Present], noise: Noise) -> Refined:
-    """Return the refined causes of the prepared runs (their residuals are those at the joint files' values).
+def refine(dataset: Dataset, present: Sequence[PresentEffect], noise: Noise) -> Refined:
+    """Return the refined causes of the dataset runs (their residuals are those at the joint files' values).
 
     Where steps do not come to rest, the parameters that left the least are taken, not the last ones.
     """
-    look = best = _look_at(prepared, present, noise)
+    look = best = _linearised(dataset, present, noise)
     least = look.left
     for step in range(1, _MOST_STEPS + 1):
         if not present:
             break
         now, settled = _stepped(look)
-        look = _look_at(prepared, now, noise)
+        look = _linearised(dataset, now, noise)
         least = min(least, look.left)
         if look.left <= least + _AS_GOOD:
             best = look
         if step >= _STEPS and settled:
             break
     model = best.model
-    for run_signals in prepared.signals:
+    for run_signals in dataset.signals:
         for s in run_signals:
-            _see_torsion(s, best.present)
+            _set_torsion(s, best.present)
     certain = best.mixed.marginal(np.full_like(model.variances, 1e-12))[0]
     count = len(model.columns)
     share = np.zeros(count)
@@ -142,20 +142,20 @@ def refine(prepared: Prepared, present: Sequence[Present], noise: Noise) -> Refi
     )
 
 
-def _look_at(prepared: Prepared, present: Sequence[Present], noise: Noise) -> _Look:
-    signals, runs, samples, groups = prepared.signals, prepared.runs, prepared.samples, prepared.groups
+def _linearised(dataset: Dataset, present: Sequence[PresentEffect], noise: Noise) -> _Iterate:
+    signals, runs, samples, groups = dataset.signals, dataset.runs, dataset.samples, dataset.groups
     for run_signals in signals:
         for s in run_signals:
-            _see_torsion(s, present)
+            _set_torsion(s, present)
     data = [_at(s, run, present, samples) for s, run in zip(signals, runs, strict=True)]
     count = sum(len(p.free) for p in present)
     sums = [run_sums(d, noise, count, len(groups)) for d in data]
-    sums = with_readings(sums, prepared.readings, _unpowered(present, prepared.joints))
+    sums = with_readings(sums, dataset.readings, _unpowered(present, dataset.joints))
     mixed = Mixed(sums, count, np.array([g.sigma for g in groups]))
-    return _Look(tuple(present), mixed, mixed.fit(range(count)), data, mixed.fit(()).deviance)
+    return _Iterate(tuple(present), mixed, mixed.fit(range(count)), data, mixed.fit(()).deviance)
 
 
-def _stepped(look: _Look) -> tuple[list[Present], bool]:
+def _stepped(look: _Iterate) -> tuple[list[PresentEffect], bool]:
     """Return the causes one step further, and whether that step was none."""
     now, settled, first = [], True, 0
     for p in look.present:
@@ -169,7 +169,7 @@ def _stepped(look: _Look) -> tuple[list[Present], bool]:
     return now, settled
 
 
-def _see_torsion(s: JointSignals, present: Sequence[Present]) -> None:
+def _set_torsion(s: JointSignals, present: Sequence[PresentEffect]) -> None:
     """Set the torsion that effects see to what it is: that of the encoders for what follows it with memory or play, else
     what the spring does with the causes, K d = tau + their contributions.
     """
@@ -183,7 +183,9 @@ def _see_torsion(s: JointSignals, present: Sequence[Present]) -> None:
     s.state.torsion_rad = total / s.joint.stiffness_nm_per_rad
 
 
-def _at(run: Sequence[JointSignals], base: RunData, present: Sequence[Present], samples: int) -> RunData:
+def _at(
+    run: Sequence[JointSignals], base: RunData, present: Sequence[PresentEffect], samples: int
+) -> RunData:
     """Return the run with what is left at these parameters, and derivatives by each free one, as regressors."""
     left = {c: d.residual.copy() for c, d in base.channels.items()}
     columns: dict[Channel, list[tuple[int, FloatArray]]] = {c: [] for c in base.channels}
@@ -213,9 +215,9 @@ def _at(run: Sequence[JointSignals], base: RunData, present: Sequence[Present], 
     return RunData(base.name, base.time_s, channels, base.axes)
 
 
-def _unpowered(present: Sequence[Present], joints: Mapping[int, Joint]) -> list[Row]:
+def _unpowered(present: Sequence[PresentEffect], joints: Mapping[int, Joint]) -> list[UnpoweredColumn]:
     """Return what the causes read without power: the derivatives by the free parameters, and off the residual."""
-    out: list[Row] = []
+    out: list[UnpoweredColumn] = []
     place = 0
     for p in present:
         if "current_a" in p.effect.hooks and isinstance(p.joint, int):
@@ -229,11 +231,11 @@ def _unpowered(present: Sequence[Present], joints: Mapping[int, Joint]) -> list[
     return out
 
 
-def _of(p: Present, s: JointSignals, values: Mapping[str, float]) -> dict[str, FloatArray]:
+def _of(p: PresentEffect, s: JointSignals, values: Mapping[str, float]) -> dict[str, FloatArray]:
     return contribution(p.effect, values, s)
 
 
-def _difference(p: Present, name: str) -> float:
+def _difference(p: PresentEffect, name: str) -> float:
     q = parameter(p.effect, name)
     if name == "phase_rad":
         return 1e-4
@@ -241,7 +243,7 @@ def _difference(p: Present, name: str) -> float:
     return max(1e-4 * abs(p.values[name]), 1e-6 * width)
 
 
-def present_causes(best: Hypothesis) -> list[Present]:
+def present_causes(best: Hypothesis) -> list[PresentEffect]:
     """Return the chosen candidates as effects with parameters."""
     out = []
     for c in best.chosen:
@@ -249,5 +251,5 @@ def present_causes(best: Hypothesis) -> list[Present]:
         for p in c.effect.parameters:
             if p.default is not None and not math.isnan(p.default):
                 values.setdefault(p.name, p.default)
-        out.append(Present(c.effect, c.joint, values, free_names(c.effect, values)))
+        out.append(PresentEffect(c.effect, c.joint, values, free_names(c.effect, values)))
     return out

@@ -1,4 +1,4 @@
-"""Regressors of all effects, averaged over bins: what each hidden effect would leave in the residuals of the balances. Pure.
+"""Regressors of all effects, averaged over bins: what each hidden effect would leave in the residuals of the balances.
 
 A channel is one balance of one joint: up to four with two joints. An effect of joint j shows in the motor balance, the
 torsion balance or both of that joint; an effect of the sensor in all channels at once. That pattern is what tells many
@@ -66,7 +66,8 @@ def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatA
         order = p.get("order_per_motor_rev", 0.0)
         add(
             MOTOR,
-            effect.loss_nm(p, state, joint, x) * s.seen(order * joint.gear_ratio * state.velocity_rad_s),
+            effect.loss_nm(p, state, joint, x)
+            * s.visible_share(order * joint.gear_ratio * state.velocity_rad_s),
         )
     if "current_a" in hooks:
         scale = joint.gear_ratio * joint.torque_constant_nm_per_a

@@ -1,4 +1,4 @@
-"""Which effects are there: beam search over the library by BIC, one after another, all refitted jointly. Pure.
+"""Which effects are there: beam search over the library by BIC, one after another, all refitted jointly.
 
 BIC = deviance of the mixed model + ln(n_eff) per parameter. An effect enters when it lowers BIC by ENTER and when its
 parameters are physically plausible; it stays when nothing that came later replaces it. Held out: the coefficients
@@ -15,8 +15,8 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.sysid.diagnosis.current_zero import Readings, UnpoweredColumn, reading_misfit
 from jtqd.sysid.diagnosis.mixed_model import Mixed, Model, explained, solve
-from jtqd.sysid.diagnosis.powerless import Readings, Row, misfit
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
 
 ENTER: Final = 10.0
@@ -57,7 +57,7 @@ class Search:
     moments [channels, P, P]: mean products of a unit of every column, Nm^2; column_rms [P]: by them the rms in the
     channel where it is largest, Nm; least_nm: contributions below
     are not called effects, however certain; readings, unpowered: what the currents read without power, per run, and which
-    columns make them read that (`powerless`).
+    columns make them read that (`current_zero`).
     """
 
     def __init__(  # noqa: PLR0917
@@ -68,7 +68,7 @@ class Search:
         moments: FloatArray,
         least_nm: float,
         readings: Sequence[Readings] = (),
-        unpowered: Sequence[Row] = (),
+        unpowered: Sequence[UnpoweredColumn] = (),
     ) -> None:
         self.mixed = mixed
         self._moments = moments
@@ -126,14 +126,14 @@ class Search:
         squares = np.einsum("i,cij,j->c", beta, self._moments[:, own, own], beta)
         return float(np.sqrt(max(squares.max(), 0.0)))
 
-    def unread(self, hypothesis: Hypothesis) -> float:
+    def reading_misfit(self, hypothesis: Hypothesis) -> float:
         """Return the sum of squares that what the currents read without power leaves; 0 without such a reading."""
         beta = dict(zip(hypothesis.model.columns, hypothesis.model.beta, strict=True))
         read: dict[int, float] = {}
         for where, column, amperes in self._unpowered:
             if isinstance(where, int):
                 read[where] = read.get(where, 0.0) + amperes * float(beta.get(column, 0.0))
-        return misfit(self._readings, read)
+        return reading_misfit(self._readings, read)
 
     def fits_beside(self, candidate: EffectCandidate, chosen: Sequence[EffectCandidate]) -> bool:
         """Return whether a candidate may be added: an effect is there once, waves once per order."""

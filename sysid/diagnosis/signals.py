@@ -1,4 +1,4 @@
-"""What a diagnosis sees of one joint in one run: state for the effects, residuals of both balances, masks. Pure.
+"""What a diagnosis sees of one joint in one run: state for the effects, residuals of both balances, masks.
 
 The residuals are those of `jtqd.estimator.effects.effect`: what the simulation with the joint file leaves over. Derivatives
 are central differences of positions, which look one sample ahead: this is for recorded runs. All arrays are later
@@ -27,8 +27,6 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sim_can.losses import TORQUE_STEPS, LossTable
 from jtqd.sim_can.plant_file import plant_of_joint
 
-# A channel of the diagnosis, and a line found in its residual.
-
 
 class Channel(NamedTuple):
     """One balance ("motor" or "torsion") of one joint."""
@@ -50,18 +48,16 @@ class Line:
     unit: str = "1/rev"
 
 
-# Losses of the joint file as the simulation has them: a function of transmitted torque and velocity, whole runs at once.
-#
-# The law of the emulated plant for this file (`jtqd.sim_can.plant_file.plant_of_joint`): with an efficiency the table of
-# `jtqd.sim_can.losses` and the file's Stribeck peak, else the file's friction. The direction of friction is known: samples
-# near rest, where a simulation's smoothing would matter, are not used by the diagnosis. Pure.
-
-
 _SLOPE_NM: Final = 0.3
 
 
 class BaseLoss:
-    """loss0(tau, v) of one joint file, signed like the velocity [Nm, joint side]."""
+    """Losses of one joint file as the simulation has them, loss0(tau, v), signed like the velocity [Nm, joint side].
+
+    The law of the emulated plant for this file (`jtqd.sim_can.plant_file.plant_of_joint`): with an efficiency the table of
+    `jtqd.sim_can.losses` and the file's Stribeck peak, else the file's friction. The direction of friction is known: samples
+    near rest, where a simulation's smoothing would matter, are not used by the diagnosis.
+    """
 
     def __init__(self, joint: Joint) -> None:
         self._friction: Final = joint.friction
@@ -135,7 +131,7 @@ class JointSignals:
 
     number: joint; state: what hooks use; motor_nm, torsion_nm: residuals of the two balances [Nm] (torsion None: one
     encoder only); moving: samples at which friction has a direction; per_torque: by how much the motor residual falls per Nm
-    that the sensor reads too high, 1 where the losses know no load (`sensor_zero`); off: samples at which the power stage is
+    that the sensor reads too high, 1 where the losses know no load (`about_zero`); off: samples at which the power stage is
     off (None: the run does not tell).
     """
 
@@ -165,7 +161,7 @@ class JointSignals:
         fields = {name: getattr(self.state, name) for name in State.__slots__}
         return State(**{**fields, "temperature_c": self.sensor_temperature_c})
 
-    def seen(self, rate_rad_s: FloatArray) -> FloatArray:
+    def visible_share(self, rate_rad_s: FloatArray) -> FloatArray:
         """Return how much of a torque that swings at this rate [n] the motor balance holds [n].
 
         A quick torque moves the rotor and nothing else, and samples show less of that acceleration than there is: nothing at
@@ -332,24 +328,23 @@ def smooth(x: FloatArray, samples: int) -> FloatArray:
     return result
 
 
-# Motor residuals where the losses depend on the load: expanded about the sensor's zero of the run. Pure.
-#
-# The simulation takes its losses at the measured torque, so a zero z of the sensor is in the residual twice: as -z, and
-# as the losses' error. Driving with an efficiency of a half that doubles it, driven back it takes part of it away:
-#
-#     motor = .. - loss0(tau) - tau = .. - z - (loss0(tau) - loss0(tau - z))  ~  .. - z (1 + loss0')
-#
-# A zero of 0.3 Nm is not small where the efficiency turns from driving to driven back, within 2 Nm. So loss0 is expanded
-# about a first guess z0 of each run's zero and not about 0; the residual still holds the whole of z, now linearly. A bad
-# guess does no harm but that of none.
-
-
 _LARGEST_NM: Final = 2.0
 _TURNS: Final = 2
 
 
 def about_zero(run: Sequence[JointSignals], bases: Mapping[int, BaseLoss]) -> list[JointSignals]:
-    """Return the signals of one run's joints with motor residual and `per_torque` expanded about the run's zero."""
+    """Return the signals of one run's joints with motor residual and `per_torque` expanded about the sensor's zero of the
+    run, where the losses depend on the load.
+
+    The simulation takes its losses at the measured torque, so a zero z of the sensor is in the residual twice: as -z, and
+    as the losses' error. Driving with an efficiency of a half that doubles it, driven back it takes part of it away:
+
+        motor = .. - loss0(tau) - tau = .. - z - (loss0(tau) - loss0(tau - z))  ~  .. - z (1 + loss0')
+
+    A zero of 0.3 Nm is not small where the efficiency turns from driving to driven back, within 2 Nm. So loss0 is expanded
+    about a first guess z0 of each run's zero and not about 0; the residual still holds the whole of z, now linearly. A bad
+    guess does no harm but that of none.
+    """
     if not any(bases[s.number].depends_on_load for s in run):
         return list(run)
     out = [_expanded(s, bases[s.number], 0.0) for s in run]

@@ -1,4 +1,4 @@
-"""What is left over, and where: maps of the residual with tests that need no noise model. Pure.
+"""What is left over, and where: maps of the residual with tests that need no noise model.
 
 A residual that has nothing to do with the conditions changes its sign at random from second to second, run to run.
 So its sums over the bins of an axis (velocity, load, angles, ...) are compared with those after flipping the sign of whole
@@ -19,9 +19,6 @@ from jtqd.estimator.effects.effect import MOTOR
 from jtqd.sysid.diagnosis.events import BLOCK_S
 from jtqd.sysid.diagnosis.regressors import RunData
 from jtqd.sysid.diagnosis.signals import Channel, Line
-
-# Lines of a residual: at orders of the motor, whatever the speed, and at fixed frequencies, whatever the motion. Pure.
-
 
 ORDERS: Final = np.arange(0.3, 10.0, 0.04)
 """Per motor revolution, where lines of what is left over are looked for."""
@@ -258,7 +255,7 @@ def axis_maps(
             edges = axis_edges(axis, np.concatenate(there))
             if edges is not None:
                 maps = [
-                    axis_map(channel, axis, edges, values, turned(plain, side), block, rng)
+                    axis_map(channel, axis, edges, values, signed(plain, side), block, rng)
                     for side in directions(runs, channel)
                 ]
                 out.append(max(maps, key=lambda m: (m.p < SIGNIFICANT, m.energy_nm2)))
@@ -276,7 +273,7 @@ def directions(runs: Sequence[RunData], channel: Channel) -> list[list[FloatArra
     return [None, [np.sign(a["velocity"]) for a in axes], [np.sign(a["current"]) for a in axes]]
 
 
-def turned(parts: Sequence[FloatArray], side: Sequence[FloatArray] | None) -> list[FloatArray]:
+def signed(parts: Sequence[FloatArray], side: Sequence[FloatArray] | None) -> list[FloatArray]:
     """Return the residual in these signs [run][n]."""
     return list(parts) if side is None else [x * d for x, d in zip(parts, side, strict=True)]
 

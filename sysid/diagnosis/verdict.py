@@ -1,15 +1,16 @@
-"""From the statistics to findings: gaps, causes with classes and intervals, evidence, gain, what is left over. Pure."""
+"""From the statistics to findings: gaps, causes with classes and intervals, evidence, gain, what is left over."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
 from jtqd.estimator.joint import Joint
+from jtqd.sysid.diagnosis.current_zero import offset_at_rest, rest_current
+from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.evidence import RELEVANT, candidate_table, equivalence_class
-from jtqd.sysid.diagnosis.few_runs import ENOUGH_RUNS, FewRuns
 from jtqd.sysid.diagnosis.findings import (
     AMBIGUOUS,
     CAUSE,
@@ -24,18 +25,15 @@ from jtqd.sysid.diagnosis.findings import (
 )
 from jtqd.sysid.diagnosis.gain import held_out_gain, left_out_steps
 from jtqd.sysid.diagnosis.gaps import channel_gaps, traces
+from jtqd.sysid.diagnosis.leave_one_out import ENOUGH_RUNS, LeaveOneOut
 from jtqd.sysid.diagnosis.leftover import Leftover, leftover
 from jtqd.sysid.diagnosis.next_experiment import MOST_KINDS, next_experiment
 from jtqd.sysid.diagnosis.noise import Noise
-from jtqd.sysid.diagnosis.powerless import offset_at_rest, rest_current
-from jtqd.sysid.diagnosis.refine import Present, Refined, parameter, present_causes, refine
+from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, parameter, present_causes, refine
 from jtqd.sysid.diagnosis.regressors import EffectCandidate, binned, contribution
 from jtqd.sysid.diagnosis.search import Hypothesis, Search
 from jtqd.sysid.diagnosis.signals import Channel
 from jtqd.sysid.fit.friction import student_975
-
-if TYPE_CHECKING:
-    from jtqd.sysid.diagnosis.events import Prepared
 
 UNEXPLAINED_SHARE: Final = 0.2
 """When what is left over holds more than this part of the structured gap, the causes found do not name it."""
@@ -49,7 +47,7 @@ BESIDE: Final = 0.02
 
 
 def conclude(  # noqa: PLR0917
-    prepared: Prepared,
+    dataset: Dataset,
     search: Search,
     best: Hypothesis,
     refined: Refined,
@@ -59,21 +57,21 @@ def conclude(  # noqa: PLR0917
     numbers: tuple[int, ...],
 ) -> Findings:
     """Return the findings of one diagnosis."""
-    best, refined, explained = _relevant(prepared, search, best, refined, noise, joints)
-    left = leftover(prepared, refined, noise, joints)
+    best, refined, explained = _without_negligible(dataset, search, best, refined, noise, joints)
+    left = leftover(dataset, refined, noise, joints)
     whole, squares = best, sum(r * r for e in explained for r in e.values())
-    few = FewRuns(prepared, search) if search.mixed.runs < ENOUGH_RUNS else None
+    few = LeaveOneOut(dataset, search) if search.mixed.runs < ENOUGH_RUNS else None
     if few is not None:  # what is left over is judged with all that was found, names need more
         best = few.confirmed(whole)
-        refined = refine(prepared, present_causes(best), noise)
-        best, refined, explained = _relevant(prepared, search, best, refined, noise, joints)
-    gain = held_out_gain(prepared, refined)
+        refined = refine(dataset, present_causes(best), noise)
+        best, refined, explained = _without_negligible(dataset, search, best, refined, noise, joints)
+    gain = held_out_gain(dataset, refined)
     classes = [
         few.rivals(best, candidate) if few is not None else equivalence_class(search, best, candidate)
         for candidate in best.chosen
     ]
-    best, refined, classes = _settled(prepared, search, best, refined, noise, classes)
-    explained = [_rms_at(prepared, p) for p in refined.present]
+    best, refined, classes = _without_asymmetry_at_rest(dataset, search, best, refined, noise, classes)
+    explained = [_rms_at(dataset, p) for p in refined.present]
     rivals = {r.key: c.effect.name for c, found in zip(best.chosen, classes, strict=True) for r in found}
     causes = [
         _cause(search, best, refined, k, classes[k], *_largest(explained[k])) for k in range(len(classes))
@@ -93,7 +91,7 @@ def conclude(  # noqa: PLR0917
                 + "), so they are not named as its cause"
             )
         causes = []
-        left, refined = _least_left(prepared, left, refined, noise, joints)
+        left, refined = _least_left(dataset, left, refined, noise, joints)
     elif not causes:
         verdict = INSUFFICIENT if doubt else NO_GAP
         reasons += [doubt] if doubt else []
@@ -101,7 +99,7 @@ def conclude(  # noqa: PLR0917
         verdict = CAUSE if all(len(c.names) == 1 for c in causes) and not doubt else AMBIGUOUS
     reasons += left.reasons if verdict == UNEXPLAINED else []
     causes.sort(key=lambda c: -c.rms_nm)
-    gaps = channel_gaps(prepared, refined, left if verdict == UNEXPLAINED else None)
+    gaps = channel_gaps(dataset, refined, left if verdict == UNEXPLAINED else None)
     return Findings(
         verdict,
         tuple(reasons or [s for s in (_sentence(verdict, causes, gaps), doubt) if s]),
@@ -111,26 +109,26 @@ def conclude(  # noqa: PLR0917
         tuple(causes),
         candidate_table(search, best, rivals),
         gain if causes else None,
-        next_experiment=_next(verdict, causes, unsure, joints, prepared),
-        traces=traces(prepared, refined),
+        next_experiment=_next(verdict, causes, unsure, joints, dataset),
+        traces=traces(dataset, refined),
     )
 
 
 def _least_left(
-    prepared: Prepared, left: Leftover, refined: Refined, noise: Noise, joints: Mapping[int, Joint]
+    dataset: Dataset, left: Leftover, refined: Refined, noise: Noise, joints: Mapping[int, Joint]
 ) -> tuple[Leftover, Refined]:
     """Return what is left over without any cause where that is less: a fit that is bent leaves more than there was, and in
     other places.
     """
     if not refined.present:
         return left, refined
-    bare = refine(prepared, (), noise)
-    without = leftover(prepared, bare, noise, joints)
+    bare = refine(dataset, (), noise)
+    without = leftover(dataset, bare, noise, joints)
     return (without, bare) if without.energy_nm2() <= left.energy_nm2() else (left, refined)
 
 
-def _settled(  # noqa: PLR0917
-    prepared: Prepared,
+def _without_asymmetry_at_rest(  # noqa: PLR0917
+    dataset: Dataset,
     search: Search,
     best: Hypothesis,
     refined: Refined,
@@ -150,12 +148,12 @@ def _settled(  # noqa: PLR0917
         others = [c for c in best.chosen if c is not cause]
         as_offset = search.hypothesis((*others, offset), best.model)
         size = offset.term.combine(as_offset.coefficients(offset))["offset_a"]
-        if not offset_at_rest(rest_current(prepared.signals, cause.joint), size):
+        if not offset_at_rest(rest_current(dataset.signals, cause.joint), size):
             continue
         rest = tuple(c for c in classes[k] if c is not twin)
         if cause is not offset:
             best = search.hypothesis((*others, twin), best.model)
-            refined = refine(prepared, present_causes(best), noise)
+            refined = refine(dataset, present_causes(best), noise)
             by_key = {
                 c.key: found for c, found in zip((*others, twin), (*_without(classes, k), rest), strict=True)
             }
@@ -173,7 +171,7 @@ def _next(
     causes: Sequence[Cause],
     unsure: Sequence[tuple[str, JointName]],
     joints: Mapping[int, Joint],
-    prepared: Prepared,
+    dataset: Dataset,
 ) -> dict[str, Any] | None:
     """Return the experiment that would settle an ambiguous verdict, or one of too few runs; unsure: what does not hold on
     every run left out.
@@ -181,8 +179,8 @@ def _next(
     if verdict not in (AMBIGUOUS, INSUFFICIENT):
         return None
     classes = [tuple(dict.fromkeys(n.split(" of ")[0] for n in c.names)) for c in causes if len(c.names) > 1]
-    known = {s.number: joints[s.number] for s in prepared.signals[0]}
-    warm = bool(np.isfinite(prepared.signals[0][0].state.temperature_c).any())
+    known = {s.number: joints[s.number] for s in dataset.signals[0]}
+    warm = bool(np.isfinite(dataset.signals[0][0].state.temperature_c).any())
     said = [f"{' and '.join(names)} fit these runs equally well" for names in classes]
     alone = tuple(dict.fromkeys(name for name, _ in unsure))[:MOST_KINDS]
     if alone:
@@ -192,8 +190,8 @@ def _next(
     return next_experiment(classes, known, text, temperature=warm)
 
 
-def _relevant(  # noqa: PLR0917
-    prepared: Prepared,
+def _without_negligible(  # noqa: PLR0917
+    dataset: Dataset,
     search: Search,
     best: Hypothesis,
     refined: Refined,
@@ -203,26 +201,26 @@ def _relevant(  # noqa: PLR0917
     """Return hypothesis and refinement without causes that are too small to matter, and the rms of each in each channel."""
     rated = max(j.rated_torque_nm for j in joints.values())
     while True:
-        rms = [_rms_at(prepared, p) for p in refined.present]
+        rms = [_rms_at(dataset, p) for p in refined.present]
         sizes = [max(r.values(), default=0.0) for r in rms]
         least = max(RELEVANT * rated, BESIDE * max(sizes, default=0.0))
         large = [c for c, size in zip(best.chosen, sizes, strict=True) if size >= least]
         if len(large) == len(best.chosen):
             return best, refined, rms
         best = search.hypothesis(large, best.model)
-        refined = refine(prepared, present_causes(best), noise)
+        refined = refine(dataset, present_causes(best), noise)
 
 
-def _rms_at(prepared: Prepared, present: Present) -> dict[Channel, float]:
+def _rms_at(dataset: Dataset, present: PresentEffect) -> dict[Channel, float]:
     """Return the rms of one cause's contribution in each channel, Nm, over valid bins; a constant in torsion is none."""
     sums: dict[Channel, list[float]] = {}
-    for run, data in zip(prepared.signals, prepared.runs, strict=True):
+    for run, data in zip(dataset.signals, dataset.runs, strict=True):
         for s in run:
             if present.joint not in ("sensor", s.number):
                 continue
             for balance, value in contribution(present.effect, present.values, s).items():
                 channel = Channel(s.number, balance)
-                part = binned(value, prepared.samples)[data.channels[channel].valid]
+                part = binned(value, dataset.samples)[data.channels[channel].valid]
                 if balance == "torsion" and len(part):
                     part = part - part.mean()
                 total = sums.setdefault(channel, [0.0, 0.0])

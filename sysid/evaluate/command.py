@@ -19,9 +19,9 @@ from jtqd.sysid.evaluate.inputs import Inputs, read_inputs
 from jtqd.sysid.evaluate.loop_time import loop_time
 from jtqd.sysid.evaluate.methods import JointModels, load_models
 from jtqd.sysid.evaluate.report import as_mapping, text_lines
+from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.checks import RunIssue
 from jtqd.sysid.runs.files import RunError
-from jtqd.sysid.runs.inputs import progress
 
 BY: Final = "jtq evaluate"
 _NEEDED: Final = ("matplotlib", "jinja2", "onnx")

@@ -14,9 +14,9 @@ from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.evaluate.methods import JointModels, run_hashes
+from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.checks import RunIssue, check_channels
-from jtqd.sysid.runs.files import ColumnMap, RunError, RunFile, read_run
-from jtqd.sysid.runs.inputs import progress, run_paths
+from jtqd.sysid.runs.files import ColumnMap, RunError, RunFile, read_run, run_paths
 
 # Which joint of a run was in velocity mode, the paper's tested joint: by the campaign's marks, else by the data. Pure.
 #

@@ -16,7 +16,8 @@ from jtqd.sysid.evaluate.scores import PAPER_MSE_NM2, Coverage, ErrorTables, Int
 from jtqd.sysid.fit.efficiency_report import TITLES as QUADRANT_TITLES
 from jtqd.sysid.report import page
 from jtqd.sysid.report.figures import page_svg
-from jtqd.sysid.report.numbers import DASH, counted
+from jtqd.sysid.report.numbers import DASH
+from jtqd.sysid.text import counted
 
 SCHEMA: Final = "jtq.evaluation/1"
 

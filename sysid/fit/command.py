@@ -35,11 +35,13 @@ from jtqd.sysid.fit.fused import FusedFit, fit_fused
 from jtqd.sysid.fit.joint_writer import with_fit, write_joint
 from jtqd.sysid.fit.losses import LossFitError
 from jtqd.sysid.fit.no_load import NoLoadFit, fit_no_load, no_load
-from jtqd.sysid.fit.plateaus import Plateau, PlateauError, PlateauRules
+from jtqd.sysid.fit.plateaus import Plateau, PlateauError, PlateauRules, plateaus_of
 from jtqd.sysid.fit.signals import RunSignals, run_signals
 from jtqd.sysid.fit.torsion import TorsionError
-from jtqd.sysid.runs.files import RunError
-from jtqd.sysid.runs.inputs import InputRun, channel_findings, joint_number, plateaus_of, progress, read_runs
+from jtqd.sysid.progress import progress
+from jtqd.sysid.runs.checks import channel_findings
+from jtqd.sysid.runs.files import RunError, RunFile, read_runs
+from jtqd.sysid.runs.joints import joint_number
 
 # What all kinds of `jtq fit` ask for on the command line.
 
@@ -53,7 +55,11 @@ def fit_parser(kind: str, description: str, examples: str) -> argparse.ArgumentP
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "runs", nargs="+", type=Path, metavar="RUNS", help="run files (.csv, .csv.gz) or directories of them"
+        "runs",
+        nargs="+",
+        type=Path,
+        metavar="RUNS",
+        help="run files (.csv, .csv.gz, .parquet, .mcap) or directories of them",
     )
     parser.add_argument("--joint", type=Path, required=True, metavar="FILE", help="joint file to start from")
     parser.add_argument(
@@ -149,7 +155,7 @@ def efficiency_main(argv: list[str]) -> int:
     return 0
 
 
-def analyse(joint: Joint, runs: list[InputRun], number: int, options: argparse.Namespace) -> EfficiencyResult:
+def analyse(joint: Joint, runs: list[RunFile], number: int, options: argparse.Namespace) -> EfficiencyResult:
     """Everything but files: channels, plateaus, points, fits.
 
     A run whose channels contradict each other ends it there: what follows from them is not worth a look. Raises
@@ -363,7 +369,7 @@ def losses_main(argv: list[str]) -> int:
     return 0
 
 
-def signals_of(runs: list[InputRun], number: int, joint: Joint) -> list[RunSignals]:
+def signals_of(runs: list[RunFile], number: int, joint: Joint) -> list[RunSignals]:
     """Return what fits of the fused estimator see of one joint in all runs, with a progress bar on a terminal."""
     settings = EstimatorSettings(method="fused")
     return [
@@ -372,7 +378,7 @@ def signals_of(runs: list[InputRun], number: int, joint: Joint) -> list[RunSigna
     ]
 
 
-def _with_fused(joint: Joint, fit: FusedFit, runs: list[InputRun]) -> Joint:
+def _with_fused(joint: Joint, fit: FusedFit, runs: list[RunFile]) -> Joint:
     return with_fit(
         replace(joint, fused=fit.fused),
         "fused",

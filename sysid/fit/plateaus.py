@@ -14,6 +14,8 @@ the level. A channel that moves by less than its own resolution is known to reso
 from __future__ import annotations
 
 import math
+import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -24,7 +26,10 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns
 from jtqd.sysid.fit.friction import effective_samples
-from jtqd.sysid.runs.checks import Cells, cut_cells, integral, means_between
+from jtqd.sysid.fit.ripple_cells import Cells, cut_cells, means_between
+from jtqd.sysid.progress import progress
+from jtqd.sysid.runs.channels import integral
+from jtqd.sysid.runs.files import RunFile
 
 RIPPLE_ORDERS: Final = (1.0, 2.0, 4.0)
 """Orders per motor revolution that are taken out of the samples before their noise is judged."""
@@ -255,3 +260,26 @@ def _trimmed(means: FloatArray, first: int, last: int, rated_nm: float) -> tuple
             break
         first, last = first + int(far[0]), last - int(far[-1])
     return first, last
+
+
+def plateaus_of(
+    runs: Sequence[RunFile], number: int, joint: Joint, rules: PlateauRules | None = None
+) -> list[Plateau]:
+    """Return the plateaus of one joint in all runs; a run without any is named on standard error.
+
+    Raises:
+        PlateauError: of the first run, when no run has a plateau. RunTableError: a run does not have the joint.
+    """
+    plateaus: list[Plateau] = []
+    unsettled = []
+    for run in progress(runs, "finding plateaus"):
+        columns = run.table.joint(number, joint.gear_ratio)
+        try:
+            plateaus += find_plateaus(run.table.time_s, columns, joint, run.name, rules)
+        except PlateauError as error:
+            unsettled.append(error)
+    if not plateaus:
+        raise unsettled[0]
+    for reason in unsettled:
+        print(f"jtq fit: {reason}", file=sys.stderr)
+    return plateaus

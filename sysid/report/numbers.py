@@ -43,11 +43,6 @@ def percent(share: float, decimals: int = 0) -> str:
     return f"{fixed(100.0 * share, decimals)}{SPACE}%" if math.isfinite(share) else DASH
 
 
-def counted(count: int, noun: str) -> str:
-    """Return a number of things, e.g. "1 run", "2 runs"."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
 def with_unit(value: float, unit: str, digits: int = 3) -> str:
     """Return a quantity, e.g. "40 µrad"."""
     if not math.isfinite(value):

@@ -1,35 +1,59 @@
-"""Channels of the runs before a diagnosis: what cannot be right is left out and named, what is odd is noted. Pure.
+"""Channels of one joint against each other: dead, stuck, clipped, of the wrong sign or scale; and the gear ratio.
 
-A diagnosis takes every column at its word. So a joint of a run whose columns contradict each other (unit, sign, dead,
-another joint's file) is left out with one line; a channel that is only not needed (temperature, link encoder) is left out
-alone; what is usable but odd (short stuck stretches, clipping, spikes, uneven time) is a note.
+Nothing here is a fit. Every check asks a question that physics answers whatever the friction may be:
+
+- A torque or current that is the same number for a while although its partner moves is stuck; where the number is the
+  channel's largest or smallest, saturated. Only a moving joint is asked: in a standing one stiction can hold the torque.
+- The motor's velocity is the derivative of its position; motor and link turn by the gear ratio.
+- A motor that carries far more than its friction has a torque of its current's sign. Where it has not, the energy
+  lost on the way, the integral of (G Kt i - tau) v dt, shows which of the two is swapped: losses are positive.
+
+`check_channels` holds for every use of a run. The others (`check_energy`, `check_held`, `check_spikes`) are for a
+diagnosis, which takes every column at its word.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.losses import FrictionModel
-from jtqd.estimator.run import JointColumns, RunTable
-from jtqd.sysid.runs.checks import MOVING_RAD_S, STUCK_S, RunIssue, check_channels
-from jtqd.sysid.runs.time_base import SKEW_NOTED_S, SKEW_REFUSED_S, evened, rate_problem, skew_s, unwrapped
-from jtqd.sysid.runs.units import temperature_finding, unit_findings
+from jtqd.estimator.losses import FrictionModel, static_friction
+from jtqd.estimator.run import JointColumns
+from jtqd.sysid.text import counted
 
-HELD_SHARE: Final = 0.02
+
+class RunIssue(NamedTuple):
+    """What a check noticed about runs or joint file.
+
+    kind: a fixed name for programs, e.g. "torque_nm_stuck"; text: one line with what was found and what was expected.
+    """
+
+    kind: str
+    text: str
+
+
+MOVING_RAD_S: Final = 0.02
+"""Joint side; slower joints are not asked."""
+STUCK_S: Final = 0.2
+"""A moving joint's torque or current does not stay one number for so long, unless all else stands as well."""
+PARTNER_MOVED: Final = 0.1
+"""Share of rated torque by which the motor torque must have moved before a constant sensor is called stuck."""
+SENSOR_MOVED: Final = 0.5
+"""The same for the sensor beside a constant current: a commanded current is constant, and friction may vary."""
+RATIO_TOLERANCE: Final = 0.01
+"""Gear ratio from the positions against the joint file."""
+VELOCITY_TOLERANCE: Final = 0.05
+"""Motor velocity against the derivative of the motor's position."""
+TURNED_RAD: Final = 0.5
+"""Joint side; positions that moved less say nothing about ratio and signs."""
+_BLOCK_S: Final = 0.05
+LONGEST_HELD: Final = 0.02
 """Of the moving time: a channel that is stuck or clipped for longer spoils what is fitted to the rest."""
-_REFUSING: Final = ("_dead", "_sign", "_scale", "_unit")
-_SPARE: Final = {
-    "link_position_rad_stuck": ("link_position_rad", "link_velocity_rad_s"),
-    "motor_position_rad_stuck": ("motor_position_rad",),
-}
 _CLIPPED_ROWS: Final = 5
 _SPIKE: Final = 12.0
 """Times the usual step of the channel from row to row, and more than _SPIKE_RATED of rated torque."""
@@ -38,118 +62,240 @@ _ENERGY: Final = -0.3
 """Losses below this part of the file's friction power mean that motion and torque have not the same sign."""
 
 
-@dataclass(frozen=True)
-class Checked:
-    """runs: (name, table) with what may be used; notes: one line each; refused: why joints of runs were left out;
-    lost: joints of which nothing is left.
+def check_channels(time_s: FloatArray, run: JointColumns, joint: Joint, where: str) -> list[RunIssue]:
+    """Return what is wrong with the measured columns of one joint in one run; an empty list is good.
+
+    time_s [n]; run: columns as read, not derived (a derived position agrees with itself); `where` names run and joint
+    in the texts, e.g. "forward_1.csv.gz: j1". Columns that are not there are not checked.
     """
-
-    runs: tuple[tuple[str, RunTable], ...]
-    notes: tuple[str, ...]
-    refused: tuple[str, ...]
-    lost: tuple[int, ...]
-
-
-def check_runs(runs: Sequence[tuple[str, RunTable]], joints: Mapping[int, Joint]) -> Checked:
-    """Return what of the runs can be used for a diagnosis of `joints` (joint file by number)."""
-    usable, notes, refused = [], [], []
-    for name, original in runs:
-        problem = rate_problem(original.time_s, name)
-        if problem is not None:
-            refused.append(problem)
-            continue
-        table, rolled = unwrapped(original, name)
-        table, stretched = evened(table, name)
-        notes += rolled + stretched
-        good: dict[int, JointColumns] = {}
-        for number in sorted(set(joints) & set(table.joints)):
-            kept, why, odd = _judged(table, number, joints[number], f"{name}: j{number}")
-            notes += odd
-            refused += why
-            if kept is not None:
-                good[number] = kept
-        opposite = _opposite_sensors(good, name)
-        if opposite is not None:
-            refused.append(opposite)
-            del good[2]
-        if good:
-            usable.append((name, RunTable(table.time_s, good)))
-    left = {number for _, table in usable for number in table.joints}
-    recorded = {number for _, table in runs for number in table.joints}
-    lost = tuple(sorted(number for number in joints if number in recorded - left))
-    return Checked(tuple(usable), tuple(notes), tuple(refused), lost)
-
-
-def _judged(
-    table: RunTable, number: int, joint: Joint, where: str
-) -> tuple[JointColumns | None, list[str], list[str]]:
-    """Columns that may be used (None: the joint is left out of this run), why not, and notes."""
-    columns = table.joints[number]
-    missing = _missing(columns, where)
-    if missing is not None:
-        return None, [missing], []
-    notes = []
-    hot = temperature_finding(table.time_s, columns, where)
-    if hot is not None:
-        notes.append(hot.text)
-        columns = replace(columns, temperature_c=None)
-    units = unit_findings(table.time_s, columns, joint, where)
-    found = units or check_channels(table.time_s, columns, joint, where)
-    found = found or _energy(table.time_s, columns, joint, where)
-    refusing = [item.text for item in found if item.kind.endswith(_REFUSING) or item.kind in _WHOLE]
-    if refusing:
-        return None, refusing, notes
-    columns, spared = _spared(columns, found)
-    notes += spared
-    why, odd = _held_and_clipped(table.time_s, columns, joint, where)
-    notes += odd + _spikes(columns, joint, where)
-    if why:
-        return None, why, notes
-    late = skew_s(replace_joint(table, number, columns), number, joint)
-    if late is not None and abs(late) >= SKEW_NOTED_S:
-        text = (
-            f"{where}.torque_nm: found it {abs(late):.3g} s {'behind' if late > 0.0 else 'ahead of'} current and motion, "
-            "expected channels in step: skew"
+    speed = _speed(time_s, run, joint)
+    issues = _dead(run, joint, where)
+    if any(item.kind == "motor_velocity_rad_s_dead" for item in issues):
+        return issues
+    issues += _positions(time_s, run, joint, where)
+    if speed is not None and run.current_a is not None and run.torque_nm is not None:
+        moving = np.abs(speed) > MOVING_RAD_S
+        motor_nm = joint.gear_ratio * joint.torque_constant_nm_per_a * run.current_a
+        rated = joint.rated_torque_nm
+        torque, current = (run.torque_nm, f"{where}.torque_nm"), (run.current_a, f"{where}.current_a")
+        issues += _held(time_s, *torque, partner_nm=motor_nm, moved_nm=PARTNER_MOVED * rated, moving=moving)
+        issues += _held(
+            time_s, *current, partner_nm=run.torque_nm, moved_nm=SENSOR_MOVED * rated, moving=moving
         )
-        if abs(late) >= SKEW_REFUSED_S:
-            return None, [text], notes
-        notes.append(text)
-    return columns, [], notes
+        if not issues:
+            issues += _signs(time_s, motor_nm, run.torque_nm, speed, joint=joint, where=where)
+    return issues
 
 
-_WHOLE: Final = ("gear_ratio", "joint_file")
+def gear_ratio_of(time_s: FloatArray, run: JointColumns) -> float | None:
+    """Return motor turns per link turn by the two positions, signed; None where they do not say.
+
+    The median over blocks of 0.2 s in which the link turned: a position that rolls over spoils single blocks only.
+    """
+    if run.motor_position_rad is None or run.link_position_rad is None:
+        return None
+    step = max(1, round(0.2 / float(np.median(np.diff(time_s)))))
+    motor, link = np.diff(run.motor_position_rad[::step]), np.diff(run.link_position_rad[::step])
+    turned = np.abs(link) > 2e-3
+    if float(np.sum(np.abs(link[turned]))) < TURNED_RAD:
+        return None
+    return float(np.median(motor[turned] / link[turned]))
 
 
-def replace_joint(table: RunTable, number: int, columns: JointColumns) -> RunTable:
-    """The run with other columns of one joint."""
-    return RunTable(table.time_s, {**table.joints, number: columns})
+def integral(time_s: FloatArray, signal: FloatArray) -> FloatArray:
+    """Return the integral [n] of a signal from the first sample on (trapezoids)."""
+    steps = 0.5 * (signal[1:] + signal[:-1]) * np.diff(time_s)
+    return np.concatenate(([0.0], np.cumsum(steps)))
 
 
-def _missing(columns: JointColumns, where: str) -> str | None:
-    """What a joint cannot be judged without."""
-    if columns.torque_nm is None or not np.any(columns.torque_nm):
-        return f"{where}.torque_nm: found no torque sensor channel (or a dead one), expected the reference of a diagnosis"
-    if columns.current_a is None:
-        return f"{where}.current_a: found no such column, expected the motor current"
-    motion = ("motor_position_rad", "motor_velocity_rad_s", "link_position_rad", "link_velocity_rad_s")
-    if all(getattr(columns, name) is None for name in motion):
-        return f"{where}: found no position and no velocity, expected at least one of them"
-    return None
+def _speed(time_s: FloatArray, run: JointColumns, joint: Joint) -> FloatArray | None:
+    velocity = run.derived(time_s, joint.gear_ratio).motor_velocity_rad_s
+    return None if velocity is None else velocity / joint.gear_ratio
 
 
-def _spared(columns: JointColumns, found: Sequence[RunIssue]) -> tuple[JointColumns, list[str]]:
-    """Columns without the stuck ones that a diagnosis can do without."""
-    notes = []
-    for item in found:
-        gone = _SPARE.get(item.kind)
-        if gone is not None:
-            empty: dict[str, Any] = dict.fromkeys(gone)
-            columns = replace(columns, **empty)
-            notes.append(f"{item.text}; not used")
-    return columns, notes
+def _dead(run: JointColumns, joint: Joint, where: str) -> list[RunIssue]:
+    """Channels that are exactly zero although something else shows that they should not be."""
+    issues = []
+    torque, current, velocity = run.torque_nm, run.current_a, run.motor_velocity_rad_s
+    if torque is not None and not np.any(torque):
+        issues.append(
+            _exactly_zero("torque_nm", where, len(torque), "the torque that the motor's current makes")
+        )
+    loaded = torque is not None and float(np.max(np.abs(torque))) > 0.5 * joint.rated_torque_nm
+    if current is not None and not np.any(current) and loaded:
+        issues.append(
+            _exactly_zero("current_a", where, len(current), "a current beside more than half rated torque")
+        )
+    for name in ("motor_position_rad", "link_position_rad"):
+        position = getattr(run, name)
+        turned = position is not None and float(np.ptp(position)) / (
+            joint.gear_ratio if name.startswith("motor") else 1.0
+        )
+        if velocity is not None and not np.any(velocity) and turned and turned > TURNED_RAD:
+            issues.append(
+                _exactly_zero("motor_velocity_rad_s", where, len(velocity), f"the derivative of {name}")
+            )
+            break
+    return issues
 
 
-def _energy(time_s: FloatArray, run: JointColumns, joint: Joint, where: str) -> list[RunIssue]:
+def _exactly_zero(channel: str, where: str, rows: int, expected: str) -> RunIssue:
+    return RunIssue(
+        f"{channel}_dead",
+        f"{where}.{channel}: found exactly zero in all {rows} rows, expected {expected}: dead channel",
+    )
+
+
+def _positions(time_s: FloatArray, run: JointColumns, joint: Joint, where: str) -> list[RunIssue]:
+    """Motor velocity against motor position, motor against link position."""
+    issues = []
+    motor, link, velocity = run.motor_position_rad, run.link_position_rad, run.motor_velocity_rad_s
+    if motor is not None and velocity is not None:
+        step = max(1, round(_BLOCK_S / float(np.median(np.diff(time_s)))))
+        by_velocity = np.diff(integral(time_s, velocity)[::step])
+        by_position = np.diff(motor[::step])
+        if float(np.sum(np.abs(by_velocity))) > TURNED_RAD * joint.gear_ratio:
+            # a median: blocks in which a position rolls over are few
+            turning = np.abs(by_velocity) > 0.2 * float(np.max(np.abs(by_velocity)))
+            slope = float(np.median(by_position[turning] / by_velocity[turning]))
+            issues += _slope_issue(slope, where)
+        elif float(np.ptp(motor)) > TURNED_RAD * joint.gear_ratio:
+            issues.append(
+                RunIssue(
+                    "motor_velocity_rad_s_scale",
+                    f"{where}.motor_velocity_rad_s: found next to no motion while motor_position_rad turned by "
+                    f"{float(np.ptp(motor)):.3g} rad, expected its derivative: stuck, or of the joint side",
+                )
+            )
+    ratio = gear_ratio_of(time_s, run)
+    if ratio is None and link is not None and motor is not None:
+        turned = float(np.ptp(motor)) / joint.gear_ratio
+        if turned > TURNED_RAD and float(np.ptp(link)) < 0.05 * turned:
+            issues.append(
+                RunIssue(
+                    "link_position_rad_stuck",
+                    f"{where}.link_position_rad: found {float(np.ptp(link)):.3g} rad of motion while the motor "
+                    f"turned the joint by {turned:.3g} rad: stuck channel",
+                )
+            )
+    elif ratio is not None and ratio < 0.0:
+        issues.append(
+            RunIssue(
+                "link_position_rad_sign",
+                f"{where}.link_position_rad: found it turning against motor_position_rad "
+                f"({ratio:.5g} motor turns per turn), expected the same direction: swapped sign",
+            )
+        )
+    if ratio is not None and abs(abs(ratio) / joint.gear_ratio - 1.0) > RATIO_TOLERANCE:
+        issues.append(
+            RunIssue(
+                "gear_ratio",
+                f"{where}: found {abs(ratio):.5g} motor turns per turn of the link, expected gear_ratio "
+                f"{joint.gear_ratio:g} of {joint.name}: wrong gear ratio, or a position scaled wrongly",
+            )
+        )
+    return issues
+
+
+def _slope_issue(slope: float, where: str) -> list[RunIssue]:
+    channel = f"{where}.motor_velocity_rad_s"
+    if abs(slope + 1.0) < VELOCITY_TOLERANCE:
+        return [
+            RunIssue(
+                "motor_velocity_rad_s_sign",
+                f"{channel}: found the opposite of the derivative of motor_position_rad: one of them has a swapped sign",
+            )
+        ]
+    if abs(slope) < 1e-3:
+        return [
+            RunIssue(
+                "motor_position_rad_stuck",
+                f"{where}.motor_position_rad: found it standing while motor_velocity_rad_s is not zero: stuck channel",
+            )
+        ]
+    if abs(slope - 1.0) > VELOCITY_TOLERANCE:
+        return [
+            RunIssue(
+                "motor_velocity_rad_s_scale",
+                f"{channel}: found {1.0 / slope:.4g} times the derivative of motor_position_rad, expected the same: "
+                "a wrong scale, or one of them stuck for a part of the run",
+            )
+        ]
+    return []
+
+
+def _held(
+    time_s: FloatArray,
+    channel: FloatArray,
+    name: str,
+    *,
+    partner_nm: FloatArray,
+    moved_nm: float,
+    moving: NDArray[np.bool_],
+) -> list[RunIssue]:
+    """At most one issue per channel: stretches of one number, of a moving joint, in which the partner moved by moved_nm."""
+    # Runs of equal values: a new one begins where the value changes or the joint starts or stops moving.
+    new = np.diff(channel, prepend=math.nan) != 0.0
+    starts = np.flatnonzero(new | np.diff(moving, prepend=not moving[0]))
+    ends = np.append(starts[1:], len(channel))
+    seconds = time_s[ends - 1] - time_s[starts]
+    block = max(1, round(_BLOCK_S / float(np.median(np.diff(time_s)))))
+    held: dict[float, float] = {}
+    first: dict[float, int] = {}
+    for start, end, length in zip(starts, ends, seconds, strict=True):
+        if length < STUCK_S or not moving[start]:
+            continue
+        whole = (end - start) // block * block
+        blocks = partner_nm[start : start + whole].reshape(-1, block).mean(axis=1)
+        if float(np.ptp(blocks)) > moved_nm:
+            value = float(channel[start])
+            held[value] = held.get(value, 0.0) + float(length)
+            first.setdefault(value, int(start))
+    if not held:
+        return []
+    value = max(held, key=lambda v: held[v])
+    extreme = value in (float(np.min(channel)), float(np.max(channel)))
+    comes_back = bool(
+        np.any(channel[first[value] :] != value)
+    )  # what never moves again has not reached a limit
+    saturated = extreme and comes_back
+    quantity = name.rsplit(".", 1)[-1]
+    unit = "Nm" if quantity == "torque_nm" else "A"
+    return [
+        RunIssue(
+            f"{quantity}_{'saturated' if saturated else 'stuck'}",
+            f"{name}: found exactly {value:g} {unit} for {sum(held.values()):.2g} s of motion in which "
+            f"{'the motor torque' if quantity == 'torque_nm' else 'the measured torque'} moved by more than "
+            f"{moved_nm:g} Nm: {'saturated' if saturated else 'stuck'} channel",
+        )
+    ]
+
+
+def _signs(
+    time_s: FloatArray,
+    motor_nm: FloatArray,
+    torque: FloatArray,
+    speed: FloatArray,
+    *,
+    joint: Joint,
+    where: str,
+) -> list[RunIssue]:
+    """Torque against current where the motor carries more than twice its friction; the energy says which is swapped."""
+    loaded = (np.abs(motor_nm) > 2.0 * static_friction(joint.friction)) & (np.abs(speed) > MOVING_RAD_S)
+    if np.count_nonzero(loaded) < 20 or float(np.mean(motor_nm[loaded] * torque[loaded] > 0.0)) > 0.2:
+        return []
+    if_torque_is_swapped = float(integral(time_s, np.where(loaded, (motor_nm + torque) * speed, 0.0))[-1])
+    swapped, other = ("torque_nm", "current_a") if if_torque_is_swapped > 0.0 else ("current_a", "torque_nm")
+    return [
+        RunIssue(
+            f"{swapped}_sign",
+            f"{where}.{swapped}: found the opposite sign of {other} while the motor carries more than its friction, "
+            f"expected the same: swapped sign of {swapped} (with the other sign the joint loses energy, as it must)",
+        )
+    ]
+
+
+def check_energy(time_s: FloatArray, run: JointColumns, joint: Joint, where: str) -> list[RunIssue]:
     """Friction takes energy out of motion; where motion gains it, velocity and torque are of opposite signs."""
     velocity = run.derived(time_s, joint.gear_ratio).motor_velocity_rad_s
     if velocity is None or run.current_a is None or run.torque_nm is None:
@@ -172,17 +318,20 @@ def _energy(time_s: FloatArray, run: JointColumns, joint: Joint, where: str) -> 
     ]
 
 
-def _held_and_clipped(
+def check_held(
     time_s: FloatArray, run: JointColumns, joint: Joint, where: str
-) -> tuple[list[str], list[str]]:
-    """Stretches of one number while the joint moves and the partner changes: refused when long, else noted."""
+) -> tuple[list[RunIssue], list[RunIssue]]:
+    """Return stretches of one number while the joint moves and the partner changes: (long ones, short ones).
+
+    Long: more than LONGEST_HELD of the moving time.
+    """
     velocity = run.derived(time_s, joint.gear_ratio).motor_velocity_rad_s
     if velocity is None or run.current_a is None or run.torque_nm is None:
         return [], []
     moving = np.abs(velocity) / joint.gear_ratio > MOVING_RAD_S
     motor = joint.gear_ratio * joint.torque_constant_nm_per_a * run.current_a
-    refused: list[str] = []
-    notes: list[str] = []
+    long: list[RunIssue] = []
+    short: list[RunIssue] = []
     # A commanded current is constant for good reasons, and friction may vary beside it: only much counts there.
     for name, values, partner, moved in (
         ("torque_nm", run.torque_nm, motor, 0.1 * joint.rated_torque_nm),
@@ -200,8 +349,9 @@ def _held_and_clipped(
             f"moving time from {time_s[int(np.argmax(rows))]:.4g} s on while "
             f"{'the motor torque' if name == 'torque_nm' else 'the measured torque'} changed: {word} channel"
         )
-        (refused if share > HELD_SHARE else notes).append(text)
-    return refused, notes
+        issue = RunIssue(f"{name}_{word.split(maxsplit=1)[0]}", text)
+        (long if share > LONGEST_HELD else short).append(issue)
+    return long, short
 
 
 def _held_rows(
@@ -244,7 +394,7 @@ def _moved(partner: FloatArray) -> float:
     return float(np.ptp(partner[:whole].reshape(-1, width).mean(axis=1)))
 
 
-def _spikes(run: JointColumns, joint: Joint, where: str) -> list[str]:
+def check_spikes(run: JointColumns, joint: Joint, where: str) -> list[RunIssue]:
     """Jumps of the sensor from one row to the next: a spike or a drop-out is two of them."""
     torque = run.torque_nm
     if torque is None:
@@ -255,21 +405,9 @@ def _spikes(run: JointColumns, joint: Joint, where: str) -> list[str]:
     if not count:
         return []
     return [
-        f"{where}.torque_nm: found {count} jumps of more than {limit:.3g} Nm from one row to the next: spikes or drop-outs"
+        RunIssue(
+            "torque_nm_spikes",
+            f"{where}.torque_nm: found {counted(count, 'jump')} of more than {limit:.3g} Nm from one row to the next: "
+            "spikes or drop-outs",
+        )
     ]
-
-
-def _opposite_sensors(good: Mapping[int, JointColumns], name: str) -> str | None:
-    """On the bench both joints carry the one sensor, each positive along its own current: the same column twice."""
-    if 1 not in good or 2 not in good:
-        return None
-    one, two = good[1].torque_nm, good[2].torque_nm
-    assert one is not None
-    assert two is not None
-    size = float(np.std(one))
-    if size == 0.0 or float(np.std(one + two)) > 0.2 * size:
-        return None
-    return (
-        f"{name}: j2.torque_nm: found the opposite of j1.torque_nm, expected the same (positive along each joint's own "
-        "positive current): one joint's columns are in the other's frame"
-    )

@@ -1,352 +1,229 @@
-"""Channels of a run against each other: dead, stuck, saturated, of the wrong sign or scale; and the gear ratio.
+"""What of a run may be used: `check_run`, one set of checks for fits, campaigns, evaluation and diagnosis.
 
-Nothing here is a fit. Every check asks a question that physics answers whatever the friction may be:
-
-- A torque or current that is the same number for a while although its partner moves is stuck; where the number is the
-  channel's largest or smallest, saturated. Only a moving joint is asked: in a standing one stiction can hold the torque.
-- The motor's velocity is the derivative of its position; motor and link turn by the gear ratio.
-- A motor that carries far more than its friction has a torque of its current's sign. Where it has not, the energy
-  lost on the way, the integral of (G Kt i - tau) v dt, tells which of the two is swapped: losses are positive.
+Every check of a joint's channels against each other holds for every use (`channels`). A diagnosis takes every column at
+its word, so a thorough check asks more: time base (`time_base`), units (`units`), energy, held and clipped stretches,
+spikes, skew. A joint of a run whose columns contradict each other (unit, sign, dead, another joint's file) is left out
+with one line; a channel that is only not needed (temperature, link encoder) is left out alone; what is usable but odd
+(short stuck stretches, clipping, spikes, uneven time) is a note.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.losses import static_friction
-from jtqd.estimator.run import JointColumns
+from jtqd.estimator.run import JointColumns, RunTable
+from jtqd.sysid.runs.channels import RunIssue, check_channels, check_energy, check_held, check_spikes
+from jtqd.sysid.runs.files import RunFile
+from jtqd.sysid.runs.time_base import (
+    SKEW_NOTED_S,
+    SKEW_REFUSED_S,
+    check_rate,
+    on_even_steps,
+    skew_s,
+    unwrapped,
+)
+from jtqd.sysid.runs.units import temperature_issue, unit_issues
 
-# What a fit noticed about runs or joint file: a name for programs, one line for people.
+__all__ = [
+    "CheckedRun",
+    "CheckedRuns",
+    "RunIssue",
+    "channel_findings",
+    "check_channels",
+    "check_run",
+    "check_runs",
+]
+
+_REFUSING: Final = ("_dead", "_sign", "_scale", "_unit")
+_REFUSING_KINDS: Final = ("gear_ratio", "joint_file")
+_SPARE: Final = {
+    "link_position_rad_stuck": ("link_position_rad", "link_velocity_rad_s"),
+    "motor_position_rad_stuck": ("motor_position_rad",),
+}
+"""Columns that a diagnosis can do without when they are stuck."""
 
 
-class RunIssue(NamedTuple):
-    """kind: a fixed name, e.g. "torque_stuck"; text: one line with what was found and what was expected."""
+@dataclass(frozen=True)
+class CheckedRun:
+    """Result of `check_run`.
 
-    kind: str
-    text: str
-
-
-# A run cut into cells of whole ripple periods, and the means over them: what is left when the ripple is averaged out.
-#
-# A harmonic drive's ripple has 2 periods per motor revolution. A mean over whole periods does not contain it, however
-# long or short they are; a mean over a fixed time does, by an amount that depends on where it began.
-
-
-class Cells(NamedTuple):
-    """Consecutive cells: means [n, m] of m signals, edges [n] in s, and whether a cell may be used [n].
-
-    Not usable: cells of a joint so slow that a ripple period takes longer than it may; they are cut by time instead.
+    Attributes:
+        table: what may be used; None: nothing.
+        refused: why joints (or the whole run) are left out. notes: what is odd about the rest.
     """
 
-    means: FloatArray
-    start_s: FloatArray
-    end_s: FloatArray
-    usable: NDArray[np.bool_]
+    table: RunTable | None
+    refused: tuple[RunIssue, ...] = ()
+    notes: tuple[RunIssue, ...] = ()
 
 
-def cut_cells(
-    time_s: FloatArray,
-    signals: Sequence[FloatArray],
-    motor_velocity_rad_s: FloatArray,
-    *,
-    shortest_s: float,
-    longest_s: float,
-    periods_per_motor_rev: float,
-) -> Cells:
-    """Cut a run [n] into cells of as many whole ripple periods as take at least `shortest_s`.
+@dataclass(frozen=True)
+class CheckedRuns:
+    """Result of `check_runs`.
 
-    time_s rising, steps may be uneven; the angle is the motor velocity's integral, so that positions that roll over or
-    are not measured do not matter.
+    Attributes:
+        runs: (name, table) with what may be used.
+        notes, refused: as those of `CheckedRun`, one line each. lost: joints of which nothing is left.
     """
-    distance = integral(time_s, np.abs(motor_velocity_rad_s))
-    periods = distance * periods_per_motor_rev / math.tau
-    starts, ends, usable = [], [], []
-    start, last = float(time_s[0]), float(time_s[-1])
-    while start + shortest_s <= last:
-        at, ahead = np.interp((start, start + shortest_s), time_s, periods).tolist()
-        end = _time_of(at + max(1, math.ceil(ahead - at - 1e-9)), time_s, periods)
-        good = end - start <= longest_s
-        if not good:
-            end = start + shortest_s
-        starts.append(start)
-        ends.append(end)
-        usable.append(good)
-        start = end
-    edges = np.array(starts), np.array(ends)
-    means = np.array([means_between(time_s, signal, *edges) for signal in signals])
-    return Cells(means.T, *edges, np.array(usable, np.bool_))
+
+    runs: tuple[tuple[str, RunTable], ...]
+    notes: tuple[str, ...]
+    refused: tuple[str, ...]
+    lost: tuple[int, ...]
 
 
-def means_between(
-    time_s: FloatArray, signal: FloatArray, start_s: FloatArray, end_s: FloatArray
-) -> FloatArray:
-    """Return the means [m] of a signal [n] over [start, end] (each [m]), samples at the ends taken in part."""
-    area = integral(time_s, signal)
-    result: FloatArray = np.interp(end_s, time_s, area) - np.interp(start_s, time_s, area)
-    return result / (end_s - start_s)
+def check_run(
+    table: RunTable, joints: Mapping[int, Joint], name: str = "", *, thorough: bool = False
+) -> CheckedRun:
+    """Check the joints of one run that have a joint file; `name` begins every line.
 
-
-def integral(time_s: FloatArray, signal: FloatArray) -> FloatArray:
-    """Return the integral [n] of a signal from the first sample on (trapezoids)."""
-    steps = 0.5 * (signal[1:] + signal[:-1]) * np.diff(time_s)
-    return np.concatenate(([0.0], np.cumsum(steps)))
-
-
-def _time_of(period: float, time_s: FloatArray, periods: FloatArray) -> float:
-    """When the given number of ripple periods has passed; infinity if it never does."""
-    index = int(np.searchsorted(periods, period))
-    if index >= len(periods):
-        return math.inf
-    share = (period - periods[index - 1]) / (periods[index] - periods[index - 1])
-    return float(time_s[index - 1] + share * (time_s[index] - time_s[index - 1]))
-
-
-MOVING_RAD_S = 0.02
-"""Joint side; slower joints are not asked."""
-STUCK_S = 0.2
-"""A moving joint's torque or current does not stay one number for so long, unless all else stands as well."""
-PARTNER_MOVED = 0.1
-"""Share of rated torque by which the motor torque must have moved before a constant sensor is called stuck."""
-SENSOR_MOVED = 0.5
-"""The same for the sensor beside a constant current: a commanded current is constant, and friction may vary."""
-RATIO_TOLERANCE = 0.01
-"""Gear ratio from the positions against the joint file."""
-VELOCITY_TOLERANCE = 0.05
-"""Motor velocity against the derivative of the motor's position."""
-TURNED_RAD = 0.5
-"""Joint side; positions that moved less say nothing about ratio and signs."""
-_BLOCK_S = 0.05
-
-
-def check_channels(time_s: FloatArray, run: JointColumns, joint: Joint, where: str) -> list[RunIssue]:
-    """Return what is wrong with the measured columns of one joint in one run; an empty list is good.
-
-    time_s [n]; run: columns as read, not derived (a derived position agrees with itself); `where` names run and joint
-    in the texts, e.g. "forward_1.csv.gz: j1". Columns that are not there are not checked.
+    thorough: as a diagnosis needs it; only then are columns changed (positions that roll over made continuous, uneven
+    steps made even, channels that are not needed left out when they are wrong).
     """
-    speed = _speed(time_s, run, joint)
-    found = _dead(run, joint, where)
-    if any(item.kind == "motor_velocity_rad_s_dead" for item in found):
-        return found
-    found += _positions(time_s, run, joint, where)
-    if speed is not None and run.current_a is not None and run.torque_nm is not None:
-        moving = np.abs(speed) > MOVING_RAD_S
-        motor_nm = joint.gear_ratio * joint.torque_constant_nm_per_a * run.current_a
-        rated = joint.rated_torque_nm
-        torque, current = (run.torque_nm, f"{where}.torque_nm"), (run.current_a, f"{where}.current_a")
-        found += _held(time_s, *torque, partner_nm=motor_nm, moved_nm=PARTNER_MOVED * rated, moving=moving)
-        found += _held(
-            time_s, *current, partner_nm=run.torque_nm, moved_nm=SENSOR_MOVED * rated, moving=moving
-        )
-        if not found:
-            found += _signs(time_s, motor_nm, run.torque_nm, speed, joint=joint, where=where)
-    return found
+    notes: list[RunIssue] = []
+    if thorough:
+        slow = check_rate(table.time_s, name)
+        if slow:
+            return CheckedRun(None, tuple(slow))
+        table, rolled = unwrapped(table, name)
+        table, uneven = on_even_steps(table, name)
+        notes += rolled + uneven
+    refused: list[RunIssue] = []
+    usable: dict[int, JointColumns] = {}
+    for number in sorted(set(joints) & set(table.joints)):
+        where = f"{name}: j{number}" if name else f"j{number}"
+        if thorough:
+            columns, why, odd = _checked_joint(table, number, joints[number], where)
+            notes += odd
+        else:
+            columns = table.joints[number]
+            why = check_channels(table.time_s, columns, joints[number], where)
+        refused += why
+        if columns is not None and not why:
+            usable[number] = columns
+    if thorough:
+        opposite = _opposite_sensors(usable, name)
+        if opposite:
+            refused += opposite
+            del usable[2]
+    return CheckedRun(RunTable(table.time_s, usable) if usable else None, tuple(refused), tuple(notes))
 
 
-def gear_ratio_of(time_s: FloatArray, run: JointColumns) -> float | None:
-    """Return motor turns per link turn by the two positions, signed; None where they do not say.
-
-    The median over blocks of 0.2 s in which the link turned: a position that rolls over spoils single blocks only.
-    """
-    if run.motor_position_rad is None or run.link_position_rad is None:
-        return None
-    step = max(1, round(0.2 / float(np.median(np.diff(time_s)))))
-    motor, link = np.diff(run.motor_position_rad[::step]), np.diff(run.link_position_rad[::step])
-    turned = np.abs(link) > 2e-3
-    if float(np.sum(np.abs(link[turned]))) < TURNED_RAD:
-        return None
-    return float(np.median(motor[turned] / link[turned]))
-
-
-def _speed(time_s: FloatArray, run: JointColumns, joint: Joint) -> FloatArray | None:
-    velocity = run.derived(time_s, joint.gear_ratio).motor_velocity_rad_s
-    return None if velocity is None else velocity / joint.gear_ratio
-
-
-def _dead(run: JointColumns, joint: Joint, where: str) -> list[RunIssue]:
-    """Channels that are exactly zero although something else shows that they should not be."""
-    found = []
-    torque, current, velocity = run.torque_nm, run.current_a, run.motor_velocity_rad_s
-    if torque is not None and not np.any(torque):
-        found.append(
-            _exactly_zero("torque_nm", where, len(torque), "the torque that the motor's current makes")
-        )
-    loaded = torque is not None and float(np.max(np.abs(torque))) > 0.5 * joint.rated_torque_nm
-    if current is not None and not np.any(current) and loaded:
-        found.append(
-            _exactly_zero("current_a", where, len(current), "a current beside more than half rated torque")
-        )
-    for name in ("motor_position_rad", "link_position_rad"):
-        position = getattr(run, name)
-        turned = position is not None and float(np.ptp(position)) / (
-            joint.gear_ratio if name.startswith("motor") else 1.0
-        )
-        if velocity is not None and not np.any(velocity) and turned and turned > TURNED_RAD:
-            found.append(
-                _exactly_zero("motor_velocity_rad_s", where, len(velocity), f"the derivative of {name}")
-            )
-            break
-    return found
-
-
-def _exactly_zero(channel: str, where: str, rows: int, expected: str) -> RunIssue:
-    return RunIssue(
-        f"{channel}_dead",
-        f"{where}.{channel}: found exactly zero in all {rows} rows, expected {expected}: dead channel",
+def check_runs(runs: Sequence[tuple[str, RunTable]], joints: Mapping[int, Joint]) -> CheckedRuns:
+    """Return what of the runs can be used for a diagnosis of `joints` (joint file by number)."""
+    each = [(name, check_run(table, joints, name, thorough=True)) for name, table in runs]
+    usable = tuple((name, run.table) for name, run in each if run.table is not None)
+    left = {number for _, table in usable for number in table.joints}
+    recorded = {number for _, table in runs for number in table.joints}
+    return CheckedRuns(
+        usable,
+        tuple(issue.text for _, run in each for issue in run.notes),
+        tuple(issue.text for _, run in each for issue in run.refused),
+        tuple(sorted(number for number in joints if number in recorded - left)),
     )
 
 
-def _positions(time_s: FloatArray, run: JointColumns, joint: Joint, where: str) -> list[RunIssue]:
-    """Motor velocity against motor position, motor against link position."""
-    found = []
-    motor, link, velocity = run.motor_position_rad, run.link_position_rad, run.motor_velocity_rad_s
-    if motor is not None and velocity is not None:
-        step = max(1, round(_BLOCK_S / float(np.median(np.diff(time_s)))))
-        by_velocity = np.diff(integral(time_s, velocity)[::step])
-        by_position = np.diff(motor[::step])
-        if float(np.sum(np.abs(by_velocity))) > TURNED_RAD * joint.gear_ratio:
-            # a median: blocks in which a position rolls over are few
-            turning = np.abs(by_velocity) > 0.2 * float(np.max(np.abs(by_velocity)))
-            slope = float(np.median(by_position[turning] / by_velocity[turning]))
-            found += _slope_finding(slope, where)
-        elif float(np.ptp(motor)) > TURNED_RAD * joint.gear_ratio:
-            found.append(
-                RunIssue(
-                    "motor_velocity_rad_s_scale",
-                    f"{where}.motor_velocity_rad_s: found next to no motion while motor_position_rad turned by "
-                    f"{float(np.ptp(motor)):.3g} rad, expected its derivative: stuck, or of the joint side",
-                )
-            )
-    ratio = gear_ratio_of(time_s, run)
-    if ratio is None and link is not None and motor is not None:
-        turned = float(np.ptp(motor)) / joint.gear_ratio
-        if turned > TURNED_RAD and float(np.ptp(link)) < 0.05 * turned:
-            found.append(
-                RunIssue(
-                    "link_position_rad_stuck",
-                    f"{where}.link_position_rad: found {float(np.ptp(link)):.3g} rad of motion while the motor "
-                    f"turned the joint by {turned:.3g} rad: stuck channel",
-                )
-            )
-    elif ratio is not None and ratio < 0.0:
-        found.append(
-            RunIssue(
-                "link_position_rad_sign",
-                f"{where}.link_position_rad: found it turning against motor_position_rad "
-                f"({ratio:.5g} motor turns per turn), expected the same direction: swapped sign",
-            )
-        )
-    if ratio is not None and abs(abs(ratio) / joint.gear_ratio - 1.0) > RATIO_TOLERANCE:
-        found.append(
-            RunIssue(
-                "gear_ratio",
-                f"{where}: found {abs(ratio):.5g} motor turns per turn of the link, expected gear_ratio "
-                f"{joint.gear_ratio:g} of {joint.name}: wrong gear ratio, or a position scaled wrongly",
-            )
-        )
-    return found
+def channel_findings(runs: Sequence[RunFile], number: int, joint: Joint) -> list[RunIssue]:
+    """Return what is wrong with one joint's channels in any run, those included that the reader has called dead."""
+    issues: list[RunIssue] = []
+    for run in runs:
+        issues += [
+            RunIssue("dead_channel", f"{run.name}: {note}") for note in run.notes if f"j{number}." in note
+        ]
+        issues += check_run(run.table, {number: joint}, run.name).refused
+    return issues
 
 
-def _slope_finding(slope: float, where: str) -> list[RunIssue]:
-    channel = f"{where}.motor_velocity_rad_s"
-    if abs(slope + 1.0) < VELOCITY_TOLERANCE:
+def _checked_joint(
+    table: RunTable, number: int, joint: Joint, where: str
+) -> tuple[JointColumns | None, list[RunIssue], list[RunIssue]]:
+    """Columns that may be used (None: the joint is left out of this run), why not, and notes."""
+    columns = table.joints[number]
+    missing = _missing(columns, where)
+    if missing:
+        return None, missing, []
+    notes: list[RunIssue] = []
+    hot = temperature_issue(table.time_s, columns, where)
+    if hot is not None:
+        notes.append(hot)
+        columns = replace(columns, temperature_c=None)
+    issues = (
+        unit_issues(table.time_s, columns, joint, where)
+        or check_channels(table.time_s, columns, joint, where)
+        or check_energy(table.time_s, columns, joint, where)
+    )
+    refusing = [i for i in issues if i.kind.endswith(_REFUSING) or i.kind in _REFUSING_KINDS]
+    if refusing:
+        return None, refusing, notes
+    columns, spared = _spared(columns, issues)
+    notes += spared
+    refusing, short = check_held(table.time_s, columns, joint, where)
+    notes += short + check_spikes(columns, joint, where)
+    if refusing:
+        return None, refusing, notes
+    late = skew_s(RunTable(table.time_s, {**table.joints, number: columns}), number, joint)
+    if late is not None and abs(late) >= SKEW_NOTED_S:
+        skew = RunIssue(
+            "torque_nm_skew",
+            f"{where}.torque_nm: found it {abs(late):.3g} s {'behind' if late > 0.0 else 'ahead of'} current and motion, "
+            "expected channels in step: skew",
+        )
+        if abs(late) >= SKEW_REFUSED_S:
+            return None, [skew], notes
+        notes.append(skew)
+    return columns, [], notes
+
+
+def _missing(columns: JointColumns, where: str) -> list[RunIssue]:
+    """The first column that is missing and without which a joint cannot be diagnosed."""
+    if columns.torque_nm is None or not np.any(columns.torque_nm):
         return [
             RunIssue(
-                "motor_velocity_rad_s_sign",
-                f"{channel}: found the opposite of the derivative of motor_position_rad: one of them has a swapped sign",
+                "torque_nm_missing",
+                f"{where}.torque_nm: found no torque sensor channel (or a dead one), expected the reference of a diagnosis",
             )
         ]
-    if abs(slope) < 1e-3:
-        return [
-            RunIssue(
-                "motor_position_rad_stuck",
-                f"{where}.motor_position_rad: found it standing while motor_velocity_rad_s is not zero: stuck channel",
-            )
-        ]
-    if abs(slope - 1.0) > VELOCITY_TOLERANCE:
-        return [
-            RunIssue(
-                "motor_velocity_rad_s_scale",
-                f"{channel}: found {1.0 / slope:.4g} times the derivative of motor_position_rad, expected the same: "
-                "a wrong scale, or one of them stuck for a part of the run",
-            )
-        ]
+    if columns.current_a is None:
+        text = f"{where}.current_a: found no such column, expected the motor current"
+        return [RunIssue("current_a_missing", text)]
+    motion = ("motor_position_rad", "motor_velocity_rad_s", "link_position_rad", "link_velocity_rad_s")
+    if all(getattr(columns, name) is None for name in motion):
+        text = f"{where}: found no position and no velocity, expected at least one of them"
+        return [RunIssue("motion_missing", text)]
     return []
 
 
-def _held(
-    time_s: FloatArray,
-    channel: FloatArray,
-    name: str,
-    *,
-    partner_nm: FloatArray,
-    moved_nm: float,
-    moving: NDArray[np.bool_],
-) -> list[RunIssue]:
-    """One finding per channel: stretches of one number, of a moving joint, in which the partner moved by moved_nm."""
-    # Runs of equal values: a new one begins where the value changes or the joint starts or stops moving.
-    new = np.diff(channel, prepend=math.nan) != 0.0
-    starts = np.flatnonzero(new | np.diff(moving, prepend=not moving[0]))
-    ends = np.append(starts[1:], len(channel))
-    seconds = time_s[ends - 1] - time_s[starts]
-    block = max(1, round(_BLOCK_S / float(np.median(np.diff(time_s)))))
-    held: dict[float, float] = {}
-    first: dict[float, int] = {}
-    for start, end, length in zip(starts, ends, seconds, strict=True):
-        if length < STUCK_S or not moving[start]:
-            continue
-        whole = (end - start) // block * block
-        blocks = partner_nm[start : start + whole].reshape(-1, block).mean(axis=1)
-        if float(np.ptp(blocks)) > moved_nm:
-            value = float(channel[start])
-            held[value] = held.get(value, 0.0) + float(length)
-            first.setdefault(value, int(start))
-    if not held:
-        return []
-    value = max(held, key=lambda v: held[v])
-    extreme = value in (float(np.min(channel)), float(np.max(channel)))
-    comes_back = bool(
-        np.any(channel[first[value] :] != value)
-    )  # what never moves again has not reached a limit
-    saturated = extreme and comes_back
-    quantity = name.rsplit(".", 1)[-1]
-    unit = "Nm" if quantity == "torque_nm" else "A"
-    return [
-        RunIssue(
-            f"{quantity}_{'saturated' if saturated else 'stuck'}",
-            f"{name}: found exactly {value:g} {unit} for {sum(held.values()):.2g} s of motion in which "
-            f"{'the motor torque' if quantity == 'torque_nm' else 'the measured torque'} moved by more than "
-            f"{moved_nm:g} Nm: {'saturated' if saturated else 'stuck'} channel",
-        )
-    ]
+def _spared(columns: JointColumns, issues: Sequence[RunIssue]) -> tuple[JointColumns, list[RunIssue]]:
+    """Columns without the stuck ones that a diagnosis can do without."""
+    notes = []
+    for item in issues:
+        unused = _SPARE.get(item.kind)
+        if unused is not None:
+            empty: dict[str, Any] = dict.fromkeys(unused)
+            columns = replace(columns, **empty)
+            notes.append(RunIssue(item.kind, f"{item.text}; not used"))
+    return columns, notes
 
 
-def _signs(
-    time_s: FloatArray,
-    motor_nm: FloatArray,
-    torque: FloatArray,
-    speed: FloatArray,
-    *,
-    joint: Joint,
-    where: str,
-) -> list[RunIssue]:
-    """Torque against current where the motor carries more than twice its friction; the energy says which is swapped."""
-    loaded = (np.abs(motor_nm) > 2.0 * static_friction(joint.friction)) & (np.abs(speed) > MOVING_RAD_S)
-    if np.count_nonzero(loaded) < 20 or float(np.mean(motor_nm[loaded] * torque[loaded] > 0.0)) > 0.2:
+def _opposite_sensors(usable: Mapping[int, JointColumns], name: str) -> list[RunIssue]:
+    """On the bench both joints carry the one sensor, each positive along its own current: the same column twice."""
+    if 1 not in usable or 2 not in usable:
         return []
-    if_torque_is_swapped = float(integral(time_s, np.where(loaded, (motor_nm + torque) * speed, 0.0))[-1])
-    swapped, other = ("torque_nm", "current_a") if if_torque_is_swapped > 0.0 else ("current_a", "torque_nm")
+    one, two = usable[1].torque_nm, usable[2].torque_nm
+    assert one is not None
+    assert two is not None
+    size = float(np.std(one))
+    if size == 0.0 or float(np.std(one + two)) > 0.2 * size:
+        return []
     return [
         RunIssue(
-            f"{swapped}_sign",
-            f"{where}.{swapped}: found the opposite sign of {other} while the motor carries more than its friction, "
-            f"expected the same: swapped sign of {swapped} (with the other sign the joint loses energy, as it must)",
+            "torque_nm_frame",
+            f"{name}: j2.torque_nm: found the opposite of j1.torque_nm, expected the same (positive along each joint's own "
+            "positive current): one joint's columns are in the other's frame",
         )
     ]

@@ -1,4 +1,4 @@
-"""From jtqd's log of a run to its run table: what the estimator was given, cycle by cycle, and what is missing of it."""
+"""jtqd's log of a run as a run table: what the estimator was given, cycle by cycle, and what is missing of it."""
 
 from __future__ import annotations
 
@@ -16,16 +16,14 @@ from jtqd.daemon.logs.rows import Records
 from jtqd.drivers.devices import NOT_MEASURED, TEMPERATURE_C_PER_UNIT, drive_tpdo3
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.run import JointColumns, RunTable
+from jtqd.sysid.text import counted
 
 ALL_INPUTS: Final = 7
 """input_flags of the log: both PDOs of the drive and the sensor's are of this cycle."""
 DRIVE_INPUTS: Final = 3
 _ENABLED_MASK, _ENABLED = 0x6F, 0x27  # 6041h: "operation enabled" of CiA 402
-_NO_POWER: Final = (
-    (0x4F, 0x40),
-    (0x6F, 0x21),
-    (0x6F, 0x23),
-)  # switch on disabled, ready to switch on, switched on
+_NO_POWER: Final = ((0x4F, 0x40), (0x6F, 0x21), (0x6F, 0x23))
+"""Mask and value of 6041h: switch on disabled, ready to switch on, switched on."""
 _INPUTS: Final = ("current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad")
 _TOPICS: Final = ("/joint/1/state", "/joint/2/state", "/can/frames")
 _NS: Final = 1e-9
@@ -39,7 +37,7 @@ class LoggedRun:
 
     Attributes:
         table: joints 1 and 2; torque_nm is None where the log has no value of the sensor at all, temperature_c where
-            the drive told none.
+            the drive sent none.
         missed: slots without a cycle (missed by the loop, or left silent on purpose).
         incomplete: cycles left out because an input was not fresh.
         incomplete_by: the same by input, e.g. {"joint 2": 3, "sensor": 1}; a cycle may miss several.
@@ -84,15 +82,17 @@ def log_to_run(
     span = _span(states, log)
     temperatures = [_temperature(frames, node, span) for node in nodes]
     one, two = (state[span] for state in states)
-    there = {f"joint {n}": _complete(state, n, log) for n, state in ((1, one), (2, two))}
+    present = {f"joint {n}": _complete(state, n, log) for n, state in ((1, one), (2, two))}
     if sensor:
-        there["sensor"] = _sensor_there(one, two)
-    if not there.get("sensor", np.ones(1)).any():
-        del there["sensor"]  # a dead sensor must not take the drives' columns with it
+        present["sensor"] = _with_sensor(one, two)
+    if not present.get("sensor", np.ones(1)).any():
+        del present["sensor"]  # a dead sensor must not take the drives' columns with it
         sensor = False
-    used: Flags = np.logical_and.reduce(list(there.values()))
+    used: Flags = np.logical_and.reduce(list(present.values()))
     if np.count_nonzero(used) < 2:
-        raise LogError(f"{log}: found {np.count_nonzero(used)} complete cycles, expected at least 2")
+        raise LogError(
+            f"{log}: found {counted(int(np.count_nonzero(used)), 'complete cycle')}, expected at least 2"
+        )
     stamps = one["sync_monotonic_ns"][used].astype(np.int64)
     cycles = one["cycle"].astype(np.int64)
     table = RunTable(
@@ -106,7 +106,7 @@ def log_to_run(
         table=table,
         missed=int(cycles[-1] - cycles[0]) + 1 - len(cycles),
         incomplete=int(np.count_nonzero(~used)),
-        incomplete_by={name: int(np.count_nonzero(~flags)) for name, flags in there.items()},
+        incomplete_by={name: int(np.count_nonzero(~flags)) for name, flags in present.items()},
         longest_gap_s=float(np.diff(table.time_s).max()),
     )
 
@@ -117,12 +117,13 @@ def _span(states: list[Records], log: Path) -> slice:
     for state in states:
         counts &= (state["statusword"] & _ENABLED_MASK) == _ENABLED
         counts &= (state["input_flags"] & DRIVE_INPUTS) == DRIVE_INPUTS
-    found = np.flatnonzero(counts)
-    if len(found) < 2:
+    rows = np.flatnonzero(counts)
+    if len(rows) < 2:
         raise LogError(
-            f"{log}: found {len(found)} cycles of the motion with both drives in 'operation enabled', expected more"
+            f"{log}: found {counted(len(rows), 'cycle')} of the motion with both drives in 'operation enabled', "
+            "expected at least 2"
         )
-    return slice(int(found[0]), int(found[-1]) + 1)
+    return slice(int(rows[0]), int(rows[-1]) + 1)
 
 
 def _complete(state: Records, number: int, log: Path) -> Flags:
@@ -132,13 +133,13 @@ def _complete(state: Records, number: int, log: Path) -> Flags:
         finite = np.isfinite(state[name])
         if not finite.any():
             raise LogError(
-                f"{log}: j{number}.{name}: found no value in {len(state)} cycles, expected one in each"
+                f"{log}: j{number}.{name}: found no value in {counted(len(state), 'cycle')}, expected one in each"
             )
         there = there & finite
     return there
 
 
-def _sensor_there(one: Records, two: Records) -> Flags:
+def _with_sensor(one: Records, two: Records) -> Flags:
     """Cycles [n] in which every joint that has the sensor at all has it."""
     flags = [np.isfinite(state["sensor_torque_nm"]) for state in (one, two)]
     have = [each for each in flags if each.any()] or flags
@@ -168,7 +169,7 @@ def _powered(statusword: NDArray[Any]) -> FloatArray | None:
 def _temperature(frames: Records, node: int, span: slice) -> FloatArray | None:
     """Temperature [n] of a drive's joint over the cycles of `span` [degC] by its TPDO3, held between two; None without any.
 
-    Before the first frame of the span that frame's value holds: the one before it was told while the drive was off, and an
+    Before the first frame of the span that frame's value holds: the one before it was sent while the drive was off, and an
     emulated day begins when the drives are enabled. Where the span has no frame, the last one before it counts.
     """
     raw = frames["frames"]

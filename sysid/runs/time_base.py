@@ -1,4 +1,4 @@
-"""Time base of a run for a diagnosis: rate, unevenness, positions that roll over, skew between channels. Pure."""
+"""Time base of a run for a diagnosis: rate, unevenness, positions that roll over, skew between channels."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
-from jtqd.sysid.runs.checks import MOVING_RAD_S
+from jtqd.sysid.runs.channels import MOVING_RAD_S, RunIssue
+from jtqd.sysid.text import counted
 
 SLOWEST_HZ: Final = 50.0
 """Below it accelerations and reversals are not in the data; ripple of slow motion folds."""
@@ -27,19 +28,22 @@ _SKEW_GAIN: Final = 0.3
 _POSITIONS: Final = ("motor_position_rad", "link_position_rad")
 
 
-def rate_problem(time_s: FloatArray, where: str) -> str | None:
-    """One line when the run is sampled too slowly for a diagnosis."""
+def check_rate(time_s: FloatArray, where: str) -> list[RunIssue]:
+    """Return an issue when the run is sampled too slowly for a diagnosis."""
     step = float(np.median(np.diff(time_s)))
     if 1.0 / step >= SLOWEST_HZ:
-        return None
+        return []
     guess = ", or time in milliseconds" if step >= 0.5 else ""
-    return (
-        f"{where}: time_s: found {1.0 / step:.4g} Hz (steps of {step:.4g} s), expected at least {SLOWEST_HZ:g} Hz: "
-        f"recorded too slowly for friction and ripple{guess}"
-    )
+    return [
+        RunIssue(
+            "sample_rate",
+            f"{where}: time_s: found {1.0 / step:.4g} Hz (steps of {step:.4g} s), expected at least {SLOWEST_HZ:g} Hz: "
+            f"recorded too slowly for friction and ripple{guess}",
+        )
+    ]
 
 
-def evened(table: RunTable, where: str) -> tuple[RunTable, list[str]]:
+def on_even_steps(table: RunTable, where: str) -> tuple[RunTable, list[RunIssue]]:
     """Return the run on equal steps (the median's) where its own are uneven, and a note of it.
 
     Values between two rows lie on a cubic through both with the slopes of a parabola through three rows: on straight lines
@@ -64,7 +68,7 @@ def evened(table: RunTable, where: str) -> tuple[RunTable, list[str]]:
         f"{where}: time_s: found {uneven} of {len(steps)} steps off the median of {median:.4g} s by more than "
         f"{UNEVEN:.0%} (up to {float(np.max(steps)):.4g} s): brought to equal steps"
     )
-    return RunTable(grid, joints), [note]
+    return RunTable(grid, joints), [RunIssue("time_uneven", note)]
 
 
 def _cubic(at: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
@@ -79,9 +83,10 @@ def _cubic(at: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
     return result
 
 
-def unwrapped(table: RunTable, where: str) -> tuple[RunTable, list[str]]:
+def unwrapped(table: RunTable, where: str) -> tuple[RunTable, list[RunIssue]]:
     """Return the run with positions that roll over made continuous, and a note for each."""
-    joints, notes = {}, []
+    joints: dict[int, JointColumns] = {}
+    notes: list[RunIssue] = []
     for number, columns in table.joints.items():
         changed: dict[str, Any] = {}
         for name in _POSITIONS:
@@ -91,9 +96,11 @@ def unwrapped(table: RunTable, where: str) -> tuple[RunTable, list[str]]:
                 continue
             changed[name] = np.unwrap(position, period=turn)
             rolls = int(np.count_nonzero(np.abs(np.diff(position)) > 0.5 * turn))
-            notes.append(
-                f"{where}: j{number}.{name}: found it rolling over by {turn:.4g} rad {rolls} times: made continuous"
+            text = (
+                f"{where}: j{number}.{name}: found it rolling over by {turn:.4g} rad {counted(rolls, 'time')}: "
+                "made continuous"
             )
+            notes.append(RunIssue("position_rollover", text))
         joints[number] = replace(columns, **changed) if changed else columns
     return (RunTable(table.time_s, joints) if notes else table), notes
 
@@ -112,7 +119,7 @@ def _turn(position: FloatArray) -> float | None:
 
 
 def skew_s(table: RunTable, number: int, joint: Joint) -> float | None:
-    """Seconds by which the sensor's torque comes late (early: negative) against current and motion; None: not to be told.
+    """Seconds by which the sensor's torque comes late (early: negative) against current and motion; None: not measurable.
 
     The torque is shifted over the regression on motor torque, acceleration, friction's sign, velocity and a constant;
     where the residual is smallest, the channels are in step. Friction would bias a plain cross-correlation.

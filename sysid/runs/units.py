@@ -1,4 +1,4 @@
-"""Columns in other units than the run table's, found by their size and named: degrees, rpm, counts, mNm, mA, ms. Pure.
+"""Columns in other units than the run table's, found by their size and named: degrees, rpm, counts, mNm, mA, ms.
 
 Nothing is converted: a factor that is only suspected belongs into the column map, by the hand of who knows the file. What
 is compared holds whatever the friction may be, to a factor of two or so; the units looked for are further apart.
@@ -18,7 +18,7 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns
-from jtqd.sysid.runs.checks import MOVING_RAD_S, TURNED_RAD, RunIssue, gear_ratio_of, integral
+from jtqd.sysid.runs.channels import MOVING_RAD_S, TURNED_RAD, RunIssue, gear_ratio_of, integral
 
 DEGREES: Final = 180.0 / math.pi
 RPM: Final = 60.0 / (2.0 * math.pi)
@@ -63,7 +63,7 @@ _SPEEDS: Final = (
 )
 
 
-def unit_findings(time_s: FloatArray, run: JointColumns, joint: Joint, where: str) -> list[RunIssue]:
+def unit_issues(time_s: FloatArray, run: JointColumns, joint: Joint, where: str) -> list[RunIssue]:
     """Return what looks like another unit in the measured columns of one joint; an empty list is good.
 
     time_s [n]; run: columns as read; `where` names run and joint. The first column that is off is named; what follows
@@ -78,7 +78,7 @@ def unit_findings(time_s: FloatArray, run: JointColumns, joint: Joint, where: st
     )
 
 
-def temperature_finding(time_s: FloatArray, run: JointColumns, where: str) -> RunIssue | None:
+def temperature_issue(time_s: FloatArray, run: JointColumns, where: str) -> RunIssue | None:
     """A temperature that no joint has, or a step that none makes: it would be a moment of the run, not its warmth."""
     if run.temperature_c is None:
         return None
@@ -116,20 +116,22 @@ def _speed(time_s: FloatArray, run: JointColumns, joint: Joint, where: str) -> l
     if abs(ratio - 1.0) < _CLOSE or ratio == 0.0:
         return []
     at = f"{where}.motor_velocity_rad_s"
-    said = f"found {ratio:.4g} times the derivative of motor_position_rad"
+    ratio_is = f"found {ratio:.4g} times the derivative of motor_position_rad"
     if (name := _named(ratio, _SPEEDS)) is not None:
-        text = f"{at}: {said}, expected the same: {name} suspected, expected rad/s"
+        text = f"{at}: {ratio_is}, expected the same: {name} suspected, expected rad/s"
     elif (name := _named(1.0 / ratio, _ANGLES)) is not None:
-        text = f"{where}.motor_position_rad: {said}, expected the same: {name} suspected, expected rad"
+        text = f"{where}.motor_position_rad: {ratio_is}, expected the same: {name} suspected, expected rad"
     elif _near(ratio, 1000.0) or _near(ratio, 1e6):
         unit = "milliseconds" if ratio < 1e5 else "microseconds"
-        text = f"{where}: time_s: {said}, expected the same: {unit} suspected, expected seconds"
+        text = f"{where}: time_s: {ratio_is}, expected the same: {unit} suspected, expected seconds"
     elif _near(ratio, 1.0 / joint.gear_ratio):
-        text = f"{at}: {said}, expected the same: the joint side's velocity suspected, expected the motor's"
+        text = (
+            f"{at}: {ratio_is}, expected the same: the joint side's velocity suspected, expected the motor's"
+        )
     elif _near(ratio, 1.0 / 6.0):
-        text = f"{at}: {said}, expected the same: rpm beside degrees suspected, expected rad/s and rad"
+        text = f"{at}: {ratio_is}, expected the same: rpm beside degrees suspected, expected rad/s and rad"
     else:
-        return []  # a scale without a name: `check_channels` says it
+        return []  # a scale without a name: `check_channels` reports it
     return [RunIssue("motor_velocity_rad_s_unit", text)]
 
 
@@ -139,15 +141,15 @@ def _angles(time_s: FloatArray, run: JointColumns, joint: Joint, where: str) -> 
     if ratio is None:
         return []
     off = abs(ratio) / joint.gear_ratio
-    said = f"found {abs(ratio):.5g} motor turns per turn of the link, gear_ratio of {joint.name} is {joint.gear_ratio:g}"
+    ratio_is = f"found {abs(ratio):.5g} motor turns per turn of the link, gear_ratio of {joint.name} is {joint.gear_ratio:g}"
     for channel, factor in (("motor_position_rad", off), ("link_position_rad", 1.0 / off)):
         name = _named(factor, _ANGLES)
         if name is not None:
-            return [RunIssue(f"{channel}_unit", f"{where}.{channel}: {said}: {name} suspected, expected rad")]
+            return [
+                RunIssue(f"{channel}_unit", f"{where}.{channel}: {ratio_is}: {name} suspected, expected rad")
+            ]
     if _near(off, 1.0 / joint.gear_ratio):
-        text = (
-            f"{where}.motor_position_rad: {said}: an angle of the joint side suspected, expected the motor's"
-        )
+        text = f"{where}.motor_position_rad: {ratio_is}: an angle of the joint side suspected, expected the motor's"
         return [RunIssue("motor_position_rad_unit", text)]
     return []
 
@@ -194,7 +196,7 @@ def _torque_and_current(time_s: FloatArray, run: JointColumns, joint: Joint, whe
             )
         ]
     assert slope is not None
-    said = f"found {abs(slope):.3g} Nm at the sensor per Nm of the motor (G Kt i), friction aside, expected about 1"
+    ratio_is = f"found {abs(slope):.3g} Nm at the sensor per Nm of the motor (G Kt i), friction aside, expected about 1"
     large = max(sizes, key=lambda name: sizes[name])
     if abs(slope) > 1.0:
         channel, name = "torque_nm", _torque_name(abs(slope))
@@ -208,9 +210,7 @@ def _torque_and_current(time_s: FloatArray, run: JointColumns, joint: Joint, whe
     else:
         channel, name = "torque_nm", "kNm or a signal in volts"
     expected = "A" if channel == "current_a" else "Nm"
-    text = (
-        f"{where}.{channel}: {said}: {name} suspected, expected {expected}, or a joint file of another joint"
-    )
+    text = f"{where}.{channel}: {ratio_is}: {name} suspected, expected {expected}, or a joint file of another joint"
     return [RunIssue(f"{channel}_unit", text)]
 
 

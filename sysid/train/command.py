@@ -21,8 +21,10 @@ from jtqd.models.files import load_joint
 from jtqd.sysid.fit.command import signals_of
 from jtqd.sysid.fit.losses import LossFitError
 from jtqd.sysid.fit.torsion import TorsionError
-from jtqd.sysid.runs.files import RunError
-from jtqd.sysid.runs.inputs import InputRun, channel_findings, joint_number, progress, read_runs
+from jtqd.sysid.progress import progress
+from jtqd.sysid.runs.checks import channel_findings
+from jtqd.sysid.runs.files import RunError, RunFile, read_runs
+from jtqd.sysid.runs.joints import joint_number
 from jtqd.sysid.train.ours import train_fused
 from jtqd.sysid.train.paper import TrainedNetwork, paper_block, split_by_sample, train_paper
 
@@ -244,7 +246,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _train_joint(
-    joint: Joint, number: int, runs: list[InputRun], options: argparse.Namespace
+    joint: Joint, number: int, runs: list[RunFile], options: argparse.Namespace
 ) -> dict[str, Any]:
     iterations = options.iterations or _ITERATIONS[options.network]
     claimed = None

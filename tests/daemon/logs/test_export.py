@@ -89,12 +89,12 @@ def joints(n):
 def test_run_table_is_what_the_diagnosis_reads(tmp_path, name):
     if name.endswith("parquet"):
         pytest.importorskip("pyarrow")
-    from jtqd.sysid.runs.sources import read_any
+    from jtqd.sysid.runs.files import read_run
 
     log = write_log(tmp_path / "a.mcap", regular(50, joints))
     out = tmp_path / name
     assert main([name.split(".")[1], str(log), "--out", str(out)]) == 0
-    table = read_any(out).table
+    table = read_run(out).table
     assert table.time_s.tolist() == pytest.approx([n * 1e-3 for n in range(50)], abs=1e-12)
     for number in (1, 2):
         wanted = [joints(n)[number - 1] for n in range(50)]

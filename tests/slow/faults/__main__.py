@@ -28,7 +28,9 @@ Where this machine has no SocketCAN, it runs in the bench kernel, with exact tim
 def main(arguments: list[str] | None = None) -> int:
     """Returns the exit status."""
     parser = argparse.ArgumentParser(
-        prog="python -m tests.slow.faults", epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="python -m tests.slow.faults",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
         "--case", nargs="+", metavar="N", help="numbers of cases, with or without their letter"

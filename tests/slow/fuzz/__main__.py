@@ -20,7 +20,9 @@ Exit status 0: nothing found; 3: findings."""
 def main(arguments: list[str] | None = None) -> int:
     """Run one fuzzer and print what it counted; returns the exit status."""
     parser = argparse.ArgumentParser(
-        prog="python -m tests.slow.fuzz", epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="python -m tests.slow.fuzz",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("what", choices=("frames", "service", "files", "storm"))
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="of all that is random (default 1)")

@@ -14,7 +14,7 @@ from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sysid.campaign.plan import expand
 from jtqd.sysid.campaign.plans import ladder
-from jtqd.sysid.campaign.runner import findings, unusable
+from jtqd.sysid.campaign.runner import findings, gap_too_long
 from jtqd.sysid.motion.setpoints import Setpoints
 from jtqd.sysid.runs.logs import LoggedRun
 
@@ -136,13 +136,13 @@ def test_lost_cycles_do_not_make_a_motion_look_wrong() -> None:
     assert findings(logged(RunTable(table.time_s[keep], columns)), points, joints, sensor=True) == ()
 
 
-def test_a_gap_that_readers_refuse_makes_a_run_unusable() -> None:
+def test_a_gap_that_readers_refuse_makes_a_run_gap_too_long() -> None:
     table, _, _ = good_run()
-    assert unusable(logged(table)) is None
-    assert unusable(replace(logged(table), longest_gap_s=0.009)) is None
+    assert gap_too_long(logged(table)) is None
+    assert gap_too_long(replace(logged(table), longest_gap_s=0.009)) is None
     shifted = np.array(table.time_s)
     shifted[1000:] += 0.024
-    why = unusable(logged(RunTable(shifted, table.joints)))
+    why = gap_too_long(logged(RunTable(shifted, table.joints)))
     assert why is not None
     assert "25.0 ms" in why
     assert "at 0.999 s" in why

@@ -11,8 +11,8 @@ import pytest
 import yaml
 
 from jtqd.models.files import shipped
+from jtqd.sysid.campaign.bench import BenchConfig
 from jtqd.sysid.campaign.command import main, parser, recipe, wanted_plan
-from jtqd.sysid.campaign.runner import BenchConfig
 from jtqd.sysid.campaign.state import DONE, CampaignDirectory, RunState
 from tests.drivers.hub_helpers import until_it_listens
 

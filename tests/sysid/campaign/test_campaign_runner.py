@@ -8,20 +8,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Plan, Plateau, Rest, Run, check_plan
+from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Plan, Plateau, Rest, Run, check_plan, marks_of
 from jtqd.sysid.campaign.processes import Interrupted
-from jtqd.sysid.campaign.runner import ATTEMPTS, Attempt, Outcome, _stopped, go_through, marks_of
-from jtqd.sysid.campaign.state import (
-    BETWEEN_RUNS_S,
-    DONE,
-    FAILED,
-    STOPPED,
-    CampaignDirectory,
-    Remaining,
-    Reporter,
-    RunState,
-    clock_text,
-)
+from jtqd.sysid.campaign.reporter import BETWEEN_RUNS_S, Remaining, Reporter, clock_text
+from jtqd.sysid.campaign.runner import ATTEMPTS, Attempt, Outcome, _stopped, go_through
+from jtqd.sysid.campaign.state import DONE, FAILED, STOPPED, CampaignDirectory, RunState
 from jtqd.sysid.motion.commander import Pace
 from jtqd.sysid.motion.setpoints import JointSample, Limits, Monitor, MotionResult, Sample, Setpoints, Timing
 

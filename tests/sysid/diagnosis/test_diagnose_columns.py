@@ -10,7 +10,7 @@ import pytest
 from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
-from jtqd.sysid.diagnosis import diagnose as module
+from jtqd.sysid.diagnosis.dataset import usable_signals
 from jtqd.sysid.diagnosis.regressors import (
     BIN_S,
     LONG_S,
@@ -58,7 +58,9 @@ def test_columns_are_the_hooks_in_the_balances_of_the_contract(name: str) -> Non
                 continue  # its acceleration is below
             motor, torsion = balances(effect, p, s.state, BARE)
             if "loss_nm" in effect.hooks and "order_per_motor_rev" in p:
-                motor = motor * s.seen(p["order_per_motor_rev"] * BARE.gear_ratio * s.state.velocity_rad_s)
+                motor = motor * s.visible_share(
+                    p["order_per_motor_rev"] * BARE.gear_ratio * s.state.velocity_rad_s
+                )
             found = contribution(effect, p, s)
             for balance, expected in (("motor", motor), ("torsion", torsion)):
                 there = found.get(balance, np.zeros(len(s.time_s)))
@@ -124,10 +126,10 @@ def test_a_quick_torque_is_in_the_balance_as_far_as_samples_show_it(of_position:
             found = second_difference(-true / w**2, s.time_s)
         else:
             found = np.gradient(np.sin(w * s.time_s + 0.3) / w, s.time_s)
-        share = s.seen(np.full(fine, w))
+        share = s.visible_share(np.full(fine, w))
         assert found[5:-5] == pytest.approx((share * true)[5:-5], abs=1e-5), hz
-    assert s.seen(np.zeros(1)) == pytest.approx([1.0], abs=1e-6)
-    assert s.seen(np.array([2e3 * np.pi])) == pytest.approx([0.0], abs=1e-6)
+    assert s.visible_share(np.zeros(1)) == pytest.approx([1.0], abs=1e-6)
+    assert s.visible_share(np.array([2e3 * np.pi])) == pytest.approx([0.0], abs=1e-6)
 
 
 def test_without_a_second_encoder_there_is_no_torsion_to_explain() -> None:
@@ -225,7 +227,7 @@ def test_a_diagnosis_gives_the_sensor_the_temperature_of_the_first_joint() -> No
     columns = rigid_run(PLAIN).joints[1]
     warm = [replace(columns, temperature_c=np.full(len(rigid_run(PLAIN).time_s), t)) for t in (31.0, 20.0)]
     table = RunTable(rigid_run(PLAIN).time_s, dict(zip((1, 2), warm, strict=True)))
-    usable, why = module._usable([("a", table), ("b", table)], {1: PLAIN, 2: PLAIN}, (1, 2))
+    usable, why = usable_signals([("a", table), ("b", table)], {1: PLAIN, 2: PLAIN}, (1, 2))
     assert len(usable) == 2, why
     for run in usable:
         at_sensor = [s.state_of(EFFECTS["sensor_drift"], {}).temperature_c[0] for s in run]

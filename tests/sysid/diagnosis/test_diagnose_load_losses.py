@@ -13,9 +13,9 @@ from jtqd.estimator.losses import LossModel
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.losses import JointFriction, LossTable
 from jtqd.sim_can.plant_file import plant_of_joint
-from jtqd.sysid.diagnosis.extended_joint import fold
+from jtqd.sysid.diagnosis.diagnose import with_effects_applied
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, about_zero
-from jtqd.sysid.runs.time_base import evened
+from jtqd.sysid.runs.time_base import on_even_steps
 from tests.sysid.diagnosis.diagnose_helpers import bench_run
 
 JOINT = load_joint(shipped("joint1.yaml"))
@@ -84,11 +84,11 @@ def test_losses_without_load_leave_the_residual_alone() -> None:
 def test_a_torque_constant_beside_a_table_stays_an_effect() -> None:
     constant = Effect("torque_constant", {"torque_constant_nm_per_a": 0.058})
     inertia = Effect("rotor_inertia", {"rotor_inertia_kgm2": 8.0e-5})
-    table = fold(replace(JOINT, effects=(constant, inertia)))
+    table = with_effects_applied(replace(JOINT, effects=(constant, inertia)))
     assert table.effects == (constant,)
     assert table.torque_constant_nm_per_a == JOINT.torque_constant_nm_per_a
     assert table.rotor_inertia_kgm2 == 8.0e-5
-    plain = fold(replace(JOINT, efficiency=None, effects=(constant,)))
+    plain = with_effects_applied(replace(JOINT, efficiency=None, effects=(constant,)))
     assert plain.effects == ()
     assert plain.torque_constant_nm_per_a == 0.058
 
@@ -107,7 +107,7 @@ def test_missing_cycles_leave_no_blow_in_the_acceleration() -> None:
         )
         for n, c in whole.joints.items()
     }
-    table, notes = evened(replace(whole, time_s=whole.time_s[keep], joints=joints), "run")
+    table, notes = on_even_steps(replace(whole, time_s=whole.time_s[keep], joints=joints), "run")
     assert notes
     position = table.joints[1].motor_position_rad
     assert position is not None

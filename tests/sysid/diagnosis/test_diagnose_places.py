@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.sysid.diagnosis.leftover import Judge, Told, places_told, told_by
+from jtqd.sysid.diagnosis.events import EventLimits
+from jtqd.sysid.diagnosis.gaps import Location, explained_by_bins, locate
 from jtqd.sysid.diagnosis.regressors import RunData
 from jtqd.sysid.diagnosis.signals import Channel, Line
 from jtqd.sysid.diagnosis.structure import AxisMap, axis_maps
@@ -48,7 +49,7 @@ def noise(seed: int) -> FloatArray:
 
 def told(
     residual: Residual, channel: Channel = MOTOR1, lines: tuple[Line, ...] = (), seed: int = 0
-) -> tuple[list[Told], dict[str, AxisMap]]:
+) -> tuple[list[Location], dict[str, AxisMap]]:
     """Places of six runs."""
     axes = [motion(seed + k) for k in range(6)]
     parts = [residual(a, k) + noise(seed + k) for k, a in enumerate(axes)]
@@ -56,7 +57,7 @@ def told(
         run_data(f"run{k}", {channel: x}, a) for k, (x, a) in enumerate(zip(parts, axes, strict=True))
     ]
     maps = {m.axis: m for m in axis_maps(runs, {channel: parts}, STEP_S)}
-    return places_told(runs, channel, parts, Judge(AR, STEP_S, 0.5, 0.3), lines, maps), maps
+    return locate(runs, channel, parts, EventLimits(AR, STEP_S, 0.5, 0.3), lines, maps), maps
 
 
 @pytest.mark.parametrize(
@@ -145,7 +146,7 @@ def test_other_runs_predict_this_one() -> None:
     places = [rng.integers(0, 3, 400) for _ in range(4)]
     parts = [np.array([0.5, 0.0, -1.0])[p] + rng.normal(0.0, 0.3, 400) for p in places]
     parts[1][50:90] = np.nan
-    energy, means = told_by(places, parts, 3, STEP_S)
+    energy, means = explained_by_bins(places, parts, 3, STEP_S)
     for r in range(4):
         others = [k for k in range(4) if k != r]
         x = np.concatenate([parts[k] for k in others])

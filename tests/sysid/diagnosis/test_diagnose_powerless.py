@@ -8,10 +8,17 @@ import pytest
 from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.run import RunTable
+from jtqd.sysid.diagnosis.current_zero import (
+    DRIFT,
+    Reading,
+    reading,
+    reading_misfit,
+    unpowered_columns,
+    with_readings,
+)
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import Cause
 from jtqd.sysid.diagnosis.noise import Sums
-from jtqd.sysid.diagnosis.powerless import DRIFT, Reading, columns_of, misfit, reading, with_readings
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
 from tests.estimator.effects.effect_signals import PLAIN
 from tests.sysid.diagnosis.diagnose_core_helpers import candidates, rigid_run
@@ -107,7 +114,7 @@ def one_reading(current_a: float, noise_a: float = 0.001, drift_a: float = 0.002
 def test_many_readings_are_no_more_certain_than_the_drift() -> None:
     """The information of n readings of sigma^2 = noise^2 + n drift^2 is n / sigma^2, below 1 / drift^2."""
     chosen = candidates(PLAIN, ("friction_asymmetry", 1, 0), ("current_offset", 1, 0))
-    rows = columns_of(chosen, {1: PLAIN})
+    rows = unpowered_columns(chosen, {1: PLAIN})
     assert [(where, column) for where, column, _ in rows] == [(1, 1)]
     amperes = rows[0][2]
     assert amperes == pytest.approx(EFFECTS["current_offset"].terms(PLAIN)[0].basis[0]["offset_a"])
@@ -119,7 +126,7 @@ def test_many_readings_are_no_more_certain_than_the_drift() -> None:
         assert gram == pytest.approx(weight * np.outer([0.0, amperes, 0.05], [0.0, amperes, 0.05]), rel=1e-9)
         assert weight < 1.0 / 0.002**2
         assert out[0].rows == 101
-        assert misfit([{1: one_reading(0.05)}] * n, {1: 0.03}) == pytest.approx(weight * 0.02**2)
+        assert reading_misfit([{1: one_reading(0.05)}] * n, {1: 0.03}) == pytest.approx(weight * 0.02**2)
 
 
 def test_runs_without_a_reading_stay_as_they_are() -> None:
@@ -128,4 +135,4 @@ def test_runs_without_a_reading_stay_as_they_are() -> None:
     assert out[0] is sums[0]
     assert out[1].gram[2, 2] > 1.0
     assert with_readings(sums, (), []) == sums
-    assert misfit([{}, {}], {1: 1.0}) == 0.0
+    assert reading_misfit([{}, {}], {1: 1.0}) == 0.0

@@ -14,15 +14,14 @@ from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
 from jtqd.sysid.diagnosis import refine as refine_module
 from jtqd.sysid.diagnosis import regressors as columns_module
-from jtqd.sysid.diagnosis.diagnose import one_sensor, together
-from jtqd.sysid.diagnosis.events import Prepared
-from jtqd.sysid.diagnosis.extended_joint import fold
+from jtqd.sysid.diagnosis.current_zero import RestCurrent, offset_at_rest, rest_current
+from jtqd.sysid.diagnosis.dataset import Dataset
+from jtqd.sysid.diagnosis.diagnose import combined, one_sensor, with_effects_applied
 from jtqd.sysid.diagnosis.findings import AMBIGUOUS, CAUSE, INSUFFICIENT, NO_GAP, UNEXPLAINED, Findings, Gap
 from jtqd.sysid.diagnosis.gain import held_out_gain
 from jtqd.sysid.diagnosis.gaps import _repeats
 from jtqd.sysid.diagnosis.noise import ORDER, Noise
-from jtqd.sysid.diagnosis.powerless import RestCurrent, offset_at_rest, rest_current
-from jtqd.sysid.diagnosis.refine import Present, Refined, free_names, parameter, refine
+from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, free_names, parameter, refine
 from jtqd.sysid.diagnosis.regressors import contribution, families
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
 from jtqd.sysid.diagnosis.verdict import _normal_phase
@@ -41,7 +40,7 @@ def signals(table: RunTable, joint: Joint = PLAIN, name: str = "run") -> JointSi
     return joint_signals(name, table, 1, joint, BaseLoss(joint))
 
 
-def peaked(runs: int, seed: float, noise: float = NOISE_NM) -> Prepared:
+def peaked(runs: int, seed: float, noise: float = NOISE_NM) -> Dataset:
     """Runs of a joint with a Stribeck peak that its file knows nothing of."""
     tables = [
         rigid_run(
@@ -57,7 +56,7 @@ def peaked(runs: int, seed: float, noise: float = NOISE_NM) -> Prepared:
     groups = families([1])
     binned = [columns_module.run_data(s, [], SAMPLES, groups) for s in made]
     unexplained = {c: [np.zeros(len(r.time_s)) for r in binned] for c in binned[0].channels}
-    return Prepared(made, binned, [], SAMPLES, SAMPLES * 1e-3, unexplained, groups, [])
+    return Dataset(made, binned, [], SAMPLES, SAMPLES * 1e-3, unexplained, groups, [])
 
 
 WHITE = Noise(
@@ -69,17 +68,17 @@ WHITE = Noise(
 )
 
 
-def start(**values: float) -> Present:
-    return Present(STRIBECK, 1, values, free_names(STRIBECK, values))
+def start(**values: float) -> PresentEffect:
+    return PresentEffect(STRIBECK, 1, values, free_names(STRIBECK, values))
 
 
 @pytest.fixture(scope="module")
-def refined() -> tuple[Prepared, Refined]:
-    prepared = peaked(4, 0.2)
-    return prepared, refine(prepared, [start(stribeck_nm=0.6, stribeck_velocity_rad_s=0.12)], WHITE)
+def refined() -> tuple[Dataset, Refined]:
+    dataset = peaked(4, 0.2)
+    return dataset, refine(dataset, [start(stribeck_nm=0.6, stribeck_velocity_rad_s=0.12)], WHITE)
 
 
-def test_a_parameter_in_an_exponent_is_found_from_a_wrong_start(refined: tuple[Prepared, Refined]) -> None:
+def test_a_parameter_in_an_exponent_is_found_from_a_wrong_start(refined: tuple[Dataset, Refined]) -> None:
     """From half the size and the nearest velocity of the grid of the search; the equation is not linear in it."""
     _, result = refined
     found, spread = result.present[0].values, np.sqrt(np.diag(result.covariance))
@@ -106,7 +105,7 @@ def test_where_steps_do_not_come_to_rest_the_best_ones_count(monkeypatch: pytest
     """Steps that reach the truth and then go on, to and fro."""
     values = iter([{"stribeck_nm": 0.8}, {}, *({"stribeck_nm": 2.0 + 0.1 * (n % 2)} for n in range(40))])
 
-    def stepped(look: Any) -> tuple[list[Present], bool]:
+    def stepped(look: Any) -> tuple[list[PresentEffect], bool]:
         return [replace(p, values={**TRUTH, **next(values)}) for p in look.present], False
 
     monkeypatch.setattr(refine_module, "_stepped", stepped)
@@ -116,27 +115,27 @@ def test_where_steps_do_not_come_to_rest_the_best_ones_count(monkeypatch: pytest
     assert float(np.std(left)) < 1e-3
 
 
-def test_what_is_left_is_the_noise(refined: tuple[Prepared, Refined]) -> None:
+def test_what_is_left_is_the_noise(refined: tuple[Dataset, Refined]) -> None:
     _, result = refined
     left = np.concatenate([r.channels[MOTOR1].residual[r.channels[MOTOR1].valid] for r in result.runs])
     assert float(np.std(left)) == pytest.approx(WHITE.sigma[0], rel=0.05)
 
 
-def test_the_gain_is_that_of_the_truth(refined: tuple[Prepared, Refined]) -> None:
+def test_the_gain_is_that_of_the_truth(refined: tuple[Dataset, Refined]) -> None:
     """Before: the peak and the noise; after: the noise alone, on runs whose parameters came from the others."""
-    prepared, result = refined
-    gain = held_out_gain(prepared, result)
+    dataset, result = refined
+    gain = held_out_gain(dataset, result)
     assert gain.rmse_after_nm == pytest.approx(WHITE.sigma[0], rel=0.05)
     peak: list[FloatArray] = []
-    for run in prepared.signals:
+    for run in dataset.signals:
         whole = contribution(STRIBECK, TRUTH, run[0])["motor"]
-        peak.append(columns_module.binned(whole, SAMPLES)[prepared.runs[len(peak)].channels[MOTOR1].valid])
+        peak.append(columns_module.binned(whole, SAMPLES)[dataset.runs[len(peak)].channels[MOTOR1].valid])
     truth = float(np.sqrt(np.mean(np.concatenate(peak) ** 2) + WHITE.sigma[0] ** 2))
     assert gain.rmse_before_nm == pytest.approx(truth, rel=0.05)
     low, high = gain.ci95
     assert low <= gain.rmse_before_nm - gain.rmse_after_nm <= high
     assert "motor balance of joint 1" in gain.split
-    assert [each.run for each in gain.runs] == [run.name for run in prepared.runs]
+    assert [each.run for each in gain.runs] == [run.name for run in dataset.runs]
     squares = np.mean([(r.rmse_before_nm**2, r.rmse_after_nm**2) for r in gain.runs], axis=0)
     assert np.sqrt(squares) == pytest.approx((gain.rmse_before_nm, gain.rmse_after_nm), rel=0.01), (
         "equal runs"
@@ -176,14 +175,14 @@ def test_the_floor_of_repeated_runs_is_their_noise() -> None:
         return run_data(name, parts, conditions)
 
     other = {"velocity": np.cos(1.3 * t), "load": 20.0 * np.sin(1.7 * t)}
-    prepared = peaked(2, 0.0)
-    repeated = replace(prepared, runs=[run("a", 0.0, axes), run("b", 0.0, axes), run("c", 5.0, other)])
+    dataset = peaked(2, 0.0)
+    repeated = replace(dataset, runs=[run("a", 0.0, axes), run("b", 0.0, axes), run("c", 5.0, other)])
     for channel in (MOTOR1, TORSION1):
         assert _repeats(repeated, channel) == pytest.approx(0.25, rel=0.05)
-    moved = replace(prepared, runs=[run("a", 0.0, axes), run("b", 0.4, axes)])
+    moved = replace(dataset, runs=[run("a", 0.0, axes), run("b", 0.4, axes)])
     assert _repeats(moved, TORSION1) == pytest.approx(0.25, rel=0.05), "each run has its zero there"
     assert _repeats(moved, MOTOR1) == pytest.approx((0.25**2 + 0.5 * 0.4**2) ** 0.5, rel=0.05)
-    assert _repeats(replace(prepared, runs=[run("a", 0.0, axes), run("c", 0.0, other)]), MOTOR1) is None
+    assert _repeats(replace(dataset, runs=[run("a", 0.0, axes), run("c", 0.0, other)]), MOTOR1) is None
 
 
 FOLDED = (
@@ -197,7 +196,7 @@ def test_an_effect_for_a_value_of_the_file_is_that_value() -> None:
     """Residuals of the joint with the value are those of the file less what the effect leaves."""
     s = signals(rigid_run(PLAIN, noise=0.1))
     joint = extended(PLAIN, *FOLDED)
-    other = fold(joint)
+    other = with_effects_applied(joint)
     assert other.effects == ()
     assert (other.friction.viscous_nms_per_rad, other.friction.coulomb_nm) == (4.5, 3.1)
     assert other.rotor_inertia_kgm2 == 8e-5
@@ -208,11 +207,11 @@ def test_an_effect_for_a_value_of_the_file_is_that_value() -> None:
 def test_effects_that_are_more_than_a_value_stay() -> None:
     ripple = ("torque_ripple", {"amplitude_nm": 0.3})
     cubic = ("nonlinear_stiffness", {"cubic_nm_per_rad3": 1e9, "stiffness_nm_per_rad": 11000.0})
-    found = fold(extended(PLAIN, ripple, FOLDED[0], cubic))
+    found = with_effects_applied(extended(PLAIN, ripple, FOLDED[0], cubic))
     assert [e.name for e in found.effects] == ["torque_ripple", "nonlinear_stiffness"]
     assert found.friction.viscous_nms_per_rad == 4.5
-    assert fold(found) == found
-    assert fold(PLAIN) == PLAIN
+    assert with_effects_applied(found) == found
+    assert with_effects_applied(PLAIN) == PLAIN
 
 
 def resting(current_a: list[float], number: int = 1) -> JointSignals:
@@ -278,7 +277,7 @@ def test_joints_together_have_the_verdict_that_asks_for_most(verdicts: tuple[str
         replace(findings(v, (), gain=None), joints=(n,), reasons=("why",), gaps=())
         for n, v in enumerate(verdicts, 1)
     ]
-    found = together(parts)
+    found = combined(parts)
     assert found.verdict == whole
     assert found.joints == (1, 2)
     assert found.reasons == ("joint 1: why", "joint 2: why")
@@ -295,7 +294,7 @@ def test_joints_together_put_the_largest_first() -> None:
         assert base.gain is not None
         return replace(base, gain=replace(base.gain, split=f"joint {n}"), next_experiment={"why": plan})
 
-    found = together([part(1, small, 0.3, "first"), part(2, large, 0.8, "second")])
+    found = combined([part(1, small, 0.3, "first"), part(2, large, 0.8, "second")])
     assert [c.joint for c in found.causes] == [2, 1]
     assert [g.joint for g in found.gaps] == [2, 1]
     assert found.gain is not None

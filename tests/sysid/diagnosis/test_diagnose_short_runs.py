@@ -49,7 +49,7 @@ def test_with_four_runs_nothing_of_this_applies(monkeypatch: pytest.MonkeyPatch)
     def refuse(*_: object) -> None:
         raise AssertionError("asked for with four runs")
 
-    monkeypatch.setattr(verdict, "FewRuns", refuse)
+    monkeypatch.setattr(verdict, "LeaveOneOut", refuse)
     assert found(206, runs=4).verdict == NO_GAP
 
 

@@ -1,4 +1,4 @@
-"""What the current reads while the power stage is off: a measurement of its zero, a row of the regression. Pure.
+"""Zero of the current sensor, as read while the power stage is off or the joint rests: an extra row of the regression.
 
 While a joint turns, an offset of the current and an asymmetric friction are the same torque in every sample. With the power
 stage off no current flows, whatever friction does: what is read then is the current sensor's own error, which only effects
@@ -27,14 +27,6 @@ from jtqd.sysid.diagnosis.noise import Sums
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.signals import JointSignals
 
-# What the current reads at rest: the one thing that tells an offset of the current from an asymmetric friction. Pure.
-#
-# In motion the two are the same torque in every sample. At rest friction takes up anything, so nothing follows from the
-# balance; but a drive that is off, or told zero, carries no current, and what is read then is the offset. That it is so is
-# inferred only where the reading is the same at every rest: a loop that holds a joint still rests at another current each
-# time.
-
-
 _STILL_RAD_S: Final = 0.003
 _REST_S: Final = 0.3
 _FEWEST: Final = 4
@@ -54,7 +46,13 @@ class RestCurrent:
 
 
 def rest_current(signals: Sequence[Sequence[JointSignals]], number: int) -> RestCurrent | None:
-    """Return what the current of a joint reads at rest; None with too few rests."""
+    """Return what the current of a joint reads at rest; None with too few rests.
+
+    In motion an offset of the current and an asymmetric friction are the same torque in every sample. At rest friction takes
+    up anything, so nothing follows from the balance; but a drive that is off, or commanded to zero, carries no current, and
+    what is read then is the offset. That it is so is inferred only where the reading is the same at every rest: a loop that
+    holds a joint still rests at another current each time.
+    """
     means = []
     for run in signals:
         for s in run:
@@ -156,8 +154,10 @@ def unpowered(effect: Effect, p: Values, joint: Joint) -> float:
     return float(effect.current_a(p, rest, joint, Scalar()))
 
 
-def with_readings(sums: Sequence[Sums], found: Sequence[Readings], rows: Iterable[Row]) -> list[Sums]:
-    """Return the runs' normal equations with a row for every reading; rows: what the columns read (`columns_of`,
+def with_readings(
+    sums: Sequence[Sums], found: Sequence[Readings], rows: Iterable[UnpoweredColumn]
+) -> list[Sums]:
+    """Return the runs' normal equations with a row for every reading; rows: what the columns read (`unpowered_columns`,
     or of refined parameters), in the order of the columns. Runs without a reading are returned as they are.
     """
     if not any(found):
@@ -183,13 +183,15 @@ def with_readings(sums: Sequence[Sums], found: Sequence[Readings], rows: Iterabl
     return out
 
 
-Row = tuple[JointName, int, float]
+UnpoweredColumn = tuple[JointName, int, float]
 """Joint, column (-1: the residual), what it reads without power [A]."""
 
 
-def columns_of(candidates: Sequence[EffectCandidate], joints: Mapping[int, Joint]) -> list[Row]:
+def unpowered_columns(
+    candidates: Sequence[EffectCandidate], joints: Mapping[int, Joint]
+) -> list[UnpoweredColumn]:
     """Return what the search's columns read without power, those that read something."""
-    out: list[Row] = []
+    out: list[UnpoweredColumn] = []
     for c in candidates:
         if "current_a" in c.effect.hooks and isinstance(c.joint, int):
             for column, p in zip(c.columns, c.term.basis, strict=True):
@@ -199,7 +201,7 @@ def columns_of(candidates: Sequence[EffectCandidate], joints: Mapping[int, Joint
     return out
 
 
-def misfit(found: Sequence[Readings], read: Mapping[int, float]) -> float:
+def reading_misfit(found: Sequence[Readings], read: Mapping[int, float]) -> float:
     """Return the sum of squares that the readings leave where the current of a joint reads `read` [A] (0 if absent)."""
     counts = {n: sum(n in run for run in found) for run in found for n in run}
     return sum(

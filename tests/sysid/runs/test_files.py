@@ -1,6 +1,7 @@
 """Run files: what is read is what was written, and everything wrong is one clear line."""
 
 import gzip
+import os
 import random
 from pathlib import Path
 
@@ -8,8 +9,9 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
 from jtqd.models.files import shipped
-from jtqd.sysid.runs.files import ColumnMap, RunError, read_run
+from jtqd.sysid.runs.files import ColumnMap, RunError, read_run, read_runs, write_run
 
 KINOVA = shipped("kinova_gen3/columns.yaml").parent
 GOOD = "time_s,j1.current_a,j1.torque_nm\n0.000,1.5,-2\n0.001,2.5,-3\n0.002,3.5,-4\n"
@@ -95,14 +97,14 @@ def test_wrong_maps_are_named(mapping: dict[str, object], said: str) -> None:
         ("", "empty file"),
         (" \n\n", "empty file"),
         ("time_s,j1.current_a\n", "0 samples"),
-        ("time_s,j1.current_a\n0,1\n", "1 samples"),
+        ("time_s,j1.current_a\n0,1\n", "1 sample below"),
         ("t,j1.current_a\n0,1\n1,2\n", "no column 'time_s'"),
         ("time_s,speed\n0,1\n1,2\n", "no joint's columns"),
         ("time_s,j1.current_a\n0,1\n1,fast\n", "line 3, column 'j1.current_a': found 'fast'"),
         ("time_s,j1.current_a\n0,1\n\n1,nan\n", "line 4, column 'j1.current_a': found 'nan'"),
         ("time_s,j1.current_a\n0,1\n1,inf\n", "line 3, column 'j1.current_a': found 'inf'"),
         ("time_s,j1.current_a\n0,\n1,2\n", "line 2, column 'j1.current_a': found ''"),
-        ("time_s,j1.current_a\n0,1\n1\n", "line 3: found 1 cells, expected 2"),
+        ("time_s,j1.current_a\n0,1\n1\n", "line 3: found 1 cell, expected 2"),
         ("time_s,j1.current_a\n0,1\n1,2,3\n", "line 3: found 3 cells, expected 2"),
         ("time_s,time_s\n0,1\n1,2\n", "'time_s' twice"),
         ("time_s,j1.current_a\n0,1\n1,2\n1,3\n", "line 4: found time 1 s after 1 s"),
@@ -132,7 +134,9 @@ def test_broken_gzip_is_named(tmp_path: Path, keep: int) -> None:
 
 
 def test_other_formats_missing_files_and_missing_columns_are_named(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match=r"'\.mcap', expected \.csv or \.csv\.gz"):
+    with pytest.raises(RunError, match=r"'\.xlsx', expected \.csv, \.csv\.gz, \.parquet, \.mcap"):
+        read_run(_file(tmp_path, GOOD, "run.xlsx"))
+    with pytest.raises(RunError, match="not a readable MCAP file"):
         read_run(_file(tmp_path, b"\x89MCAP", "run.mcap"))
     with pytest.raises(RunError, match="No such file"):
         read_run(tmp_path / "none.csv")
@@ -207,3 +211,103 @@ def test_damaged_files_never_raise_anything_else(tmp_path: Path) -> None:
         except RunError as error:
             said = str(error)
         assert "\n" not in said
+
+
+def random_table(rng: np.random.Generator, rows: int) -> RunTable:
+    """Any columns of any joints, of very different sizes; time with jitter."""
+    scales = {"motor_position_rad": 6000.0, "motor_velocity_rad_s": 300.0, "temperature_c": 40.0}
+    joints = {}
+    for number in rng.permutation([1, 2, 3])[: rng.integers(1, 4)]:
+        names = [name for name in COLUMN_NAMES if rng.random() < 0.7] or ["current_a"]
+        joints[int(number)] = JointColumns(
+            **{name: scales.get(name, 10.0) * rng.normal(size=rows) for name in names}
+        )
+    return RunTable(np.cumsum(rng.uniform(0.0009, 0.0011, rows)), joints)
+
+
+@pytest.mark.parametrize("name", ["run.csv", "run.csv.gz"])
+def test_any_table_comes_back_to_1e_9(tmp_path: Path, name: str) -> None:
+    for seed in range(15):
+        table = random_table(np.random.default_rng(seed), 60)
+        sha256 = write_run(tmp_path / name, table)
+        read = read_run(tmp_path / name)
+        assert read.sha256 == sha256
+        assert read.notes == ()
+        assert set(read.table.joints) == set(table.joints), f"seed {seed}"
+        assert np.abs(read.table.time_s - table.time_s).max() < 1e-10
+        for number, columns in table.joints.items():
+            for column in COLUMN_NAMES:
+                wanted, found = getattr(columns, column), getattr(read.table.joints[number], column)
+                assert (wanted is None) == (found is None), f"seed {seed}, {column}"
+                if wanted is not None:
+                    assert np.abs(found - wanted).max() < 1e-9, f"seed {seed}, {column}"
+
+
+def test_the_same_table_is_the_same_file(tmp_path: Path) -> None:
+    table = random_table(np.random.default_rng(7), 100)
+    one, two = (write_run(tmp_path / name, table) for name in ("a.csv.gz", "b.csv.gz"))
+    assert one == two
+    assert (tmp_path / "a.csv.gz").read_bytes() == (tmp_path / "b.csv.gz").read_bytes()
+    assert (tmp_path / "a.csv.gz").read_bytes()[4:8] == bytes(4), "no time of writing in the gzip header"
+    header = gzip.decompress((tmp_path / "a.csv.gz").read_bytes()).decode().splitlines()[0].split(",")
+    assert header[0] == "time_s"
+    assert [name.split(".")[0] for name in header[1:]] == sorted(name.split(".")[0] for name in header[1:])
+
+
+def test_a_disk_that_is_full_leaves_the_earlier_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    table = random_table(np.random.default_rng(1), 50)
+    write_run(tmp_path / "run.csv", table)
+    before = (tmp_path / "run.csv").read_bytes()
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        write_run(tmp_path / "run.csv", random_table(np.random.default_rng(2), 50))
+    assert (tmp_path / "run.csv").read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["run.csv"]
+
+
+def test_other_endings_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"expected \.csv or \.csv\.gz"):
+        write_run(tmp_path / "run.parquet", random_table(np.random.default_rng(1), 10))
+
+
+def test_numbers_a_text_could_get_wrong_survive(tmp_path: Path) -> None:
+    rng = random.Random(3)
+    hard = [1e-10, -1e-10, 123456.7890123456, -0.0, 1e15, -2.5e-9, 0.1 + 0.2, 5e-324]
+    values = np.array([*hard, *(rng.uniform(-1, 1) * 10 ** rng.randint(-9, 6) for _ in range(200))])
+    table = RunTable(np.arange(len(values)) * 1e-3, {1: JointColumns(current_a=values)})
+    write_run(tmp_path / "run.csv", table)
+    found = read_run(tmp_path / "run.csv").table.joints[1].current_a
+    assert found is not None
+    assert np.all(np.abs(found - values) <= 1e-9 + 1e-15 * np.abs(values))
+
+
+def test_a_directory_is_its_tables_and_names_are_unique(tmp_path: Path) -> None:
+    """A campaign's directory holds the log of every run beside its table: read once, not twice."""
+    one, other = tmp_path / "one", tmp_path / "other"
+    for folder, seed in ((one, 1), (other, 2)):
+        folder.mkdir()
+        write_run(folder / "a.csv.gz", random_table(np.random.default_rng(seed), 20))
+    _file(one, b"not looked at", "a.mcap")
+    _file(one, GOOD, ".hidden.csv")
+    runs = read_runs([one, other / "a.csv.gz"])
+    assert [run.name for run in runs] == ["a.csv.gz", str(other / "a.csv.gz")]
+    assert [(run.path, run.source) for run in runs] == [(d / "a.csv.gz", "csv") for d in (one, other)]
+    with pytest.raises(RunError, match=r"same data as in a\.csv\.gz, expected every run once"):
+        read_runs([one, one / "a.csv.gz"])
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(RunError, match=r"no run file in it, expected names ending in \.csv, "):
+        read_runs([empty])
+
+
+def test_a_column_map_may_be_given_as_its_file(tmp_path: Path) -> None:
+    path = _file(tmp_path, GOOD.replace("j1.current_a", "I"))
+    columns = _file(tmp_path, "time_s: time_s\nj1.current_a: {column: I, scale: 2.0}\n", "columns.yaml")
+    [run] = read_runs([path], columns)
+    current = run.table.joints[1].current_a
+    assert current is not None
+    assert current.tolist() == [3.0, 5.0, 7.0]

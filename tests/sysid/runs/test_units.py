@@ -11,7 +11,7 @@ from jtqd.estimator.run import RunTable
 from jtqd.models.files import shipped
 from jtqd.sim_can.emulated_run import emulate_run
 from jtqd.sim_can.plant_file import load_plant
-from tests.sysid.runs.diagnose_channel_helpers import (
+from tests.sysid.runs.spoiled_runs import (
     ANGLES,
     DEGREES,
     Change,

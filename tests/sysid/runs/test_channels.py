@@ -13,7 +13,7 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant, plant_of_joint
-from jtqd.sysid.runs.checks import check_channels, gear_ratio_of
+from jtqd.sysid.runs.channels import check_channels, gear_ratio_of
 from jtqd.sysid.runs.files import ColumnMap, read_run
 from tests.estimator.estimator_helpers import joint1
 from tests.sysid.campaign_helpers import plateau_run

@@ -13,9 +13,9 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import shipped
 from jtqd.sim_can.emulated_run import emulate_run
 from jtqd.sim_can.plant_file import load_plant, plant_of_joint
-from jtqd.sysid.runs.channels import check_runs
-from jtqd.sysid.runs.time_base import evened, skew_s, unwrapped
-from tests.sysid.runs.diagnose_channel_helpers import (
+from jtqd.sysid.runs.checks import check_runs
+from jtqd.sysid.runs.time_base import on_even_steps, skew_s, unwrapped
+from tests.sysid.runs.spoiled_runs import (
     ANGLES,
     JOINTS,
     Change,
@@ -188,9 +188,9 @@ def test_uneven_time_is_brought_to_equal_steps(run: RunTable, seed: int) -> None
         table.time_s,
         {1: JointColumns(current_a=3.0 * table.time_s - 1.0, torque_nm=np.sin(2.0 * table.time_s))},
     )
-    even, notes = evened(line, "r")
+    even, notes = on_even_steps(line, "r")
     assert np.ptp(np.diff(even.time_s)) < 1e-9
-    assert "equal steps" in notes[0]
+    assert "equal steps" in notes[0].text
     current, torque = even.joints[1].current_a, even.joints[1].torque_nm
     assert current is not None
     assert torque is not None
@@ -204,7 +204,7 @@ def test_uneven_time_is_brought_to_equal_steps(run: RunTable, seed: int) -> None
 def test_jitter_of_stamps_is_left_alone(run: RunTable) -> None:
     jitter = run.time_s + 1e-4 * np.sin(np.arange(len(run.time_s)))
     table = RunTable(jitter, run.joints)
-    assert evened(table, "r") == (table, [])
+    assert on_even_steps(table, "r") == (table, [])
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""With fewer than four runs: what is named must hold on each run left out, not on all of them together. Pure.
+"""With fewer than four runs: what is named must hold on each run left out, not on all of them together.
 
 With many runs the sum over runs left out says whether an effect is there. With two or three, one run can carry that sum,
 the runs' own changes are hardly known (their variance is little more than its prior), and what the models get wrong
@@ -11,19 +11,17 @@ each run left out, not by their sum.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
+from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.evidence import WITHIN
 from jtqd.sysid.diagnosis.findings import Cause, JointName
 from jtqd.sysid.diagnosis.mixed_model import explained
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.search import DEEPEST, Hypothesis, Search
 from jtqd.sysid.diagnosis.signals import Channel
-
-if TYPE_CHECKING:
-    from jtqd.sysid.diagnosis.events import Prepared
 
 ENOUGH_RUNS: Final = 4
 """From here on the sum over runs left out decides, as everywhere else."""
@@ -36,11 +34,11 @@ _SCALES: Final = frozenset({"torque_constant", "sensor_gain"})
 Squares = Mapping[Channel, float]
 
 
-class FewRuns:
+class LeaveOneOut:
     """What sets of candidates do to each run left out."""
 
-    def __init__(self, prepared: Prepared, search: Search) -> None:
-        self.prepared = prepared
+    def __init__(self, dataset: Dataset, search: Search) -> None:
+        self.dataset = dataset
         self.search = search
         self._squares: dict[tuple[int, ...], list[Squares]] = {}
 
@@ -87,7 +85,7 @@ class FewRuns:
                 continue
             helps = self._helps(rival, base, (new,), least=0.0)
             worse = all(fall < -FALL for fall in self._falls(rival, best, (new, cause)))
-            worse = worse or self.search.unread(rival) - self.search.unread(best) > WITHIN
+            worse = worse or self.search.reading_misfit(rival) - self.search.reading_misfit(best) > WITHIN
             if helps and not worse:
                 score = self._score(rival)
                 if score < found.get(new.key, (np.inf, new))[0]:
@@ -128,7 +126,7 @@ class FewRuns:
 
     def left_share(self, best: Hypothesis) -> float:
         """Return which part of the squared error that effects could explain at all is left on runs left out, 0 to 1."""
-        floors = self.prepared.unexplained
+        floors = self.dataset.unexplained
         before, after = 0.0, 0.0
         pairs = zip(self.squares(self.search.hypothesis(())), self.squares(best), strict=True)
         for r, (raw, left) in enumerate(pairs):
@@ -186,7 +184,7 @@ class FewRuns:
         """
         columns = np.array([k for c in where for k in c.columns], np.intp)
         out = []
-        for run, a, b in zip(self.prepared.runs, self.squares(one), self.squares(other), strict=True):
+        for run, a, b in zip(self.dataset.runs, self.squares(one), self.squares(other), strict=True):
             there = [c for c, d in run.channels.items() if np.isin(columns, d.index).any()]
             out.append(sum(1.0 - a[c] / max(b[c], 1e-30) for c in there))
         return out
@@ -207,7 +205,7 @@ class FewRuns:
     def _measured(self, hypothesis: Hypothesis) -> list[Squares]:
         out: list[Squares] = []
         columns = list(hypothesis.model.columns)
-        for run, beta in zip(self.prepared.runs, self.search.held_out_beta(hypothesis), strict=True):
+        for run, beta in zip(self.dataset.runs, self.search.held_out_beta(hypothesis), strict=True):
             weight = dict(zip(columns, (float(b) for b in beta), strict=True))
             squares = {}
             for channel, d in run.channels.items():

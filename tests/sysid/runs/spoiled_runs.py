@@ -12,7 +12,7 @@ from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant
-from jtqd.sysid.runs.channels import Checked, check_runs
+from jtqd.sysid.runs.checks import CheckedRuns, check_runs
 
 JOINTS = {number: load_joint(shipped(f"joint{number}.yaml")) for number in (1, 2)}
 DEGREES = 180.0 / math.pi
@@ -51,7 +51,7 @@ def each_column(table: RunTable, change: Callable[[FloatArray], FloatArray]) -> 
     return RunTable(change(table.time_s), {number: of(columns) for number, columns in table.joints.items()})
 
 
-def checked(table: RunTable, joints: dict[int, Joint] | None = None) -> Checked:
+def checked(table: RunTable, joints: dict[int, Joint] | None = None) -> CheckedRuns:
     result = check_runs([("r.csv", table)], joints or JOINTS)
     for line in (*result.refused, *result.notes):
         assert line.startswith("r.csv: ")

@@ -1,0 +1,286 @@
+"""The runs as the statistics see them: signals, binned residuals, regressors of the library's candidates, nuisances.
+
+`usable_signals` takes what can serve from the run tables and refuses the rest with reasons; `build_dataset` makes
+everything of it that the search, the refinement and the maps share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+
+from jtqd.estimator.arrays import BoolArray, FloatArray
+from jtqd.estimator.effects.effect import Effect
+from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.run import RunTable
+from jtqd.sysid.diagnosis.current_zero import Readings, readings
+from jtqd.sysid.diagnosis.events import Events
+from jtqd.sysid.diagnosis.findings import JointName
+from jtqd.sysid.diagnosis.noise import saturated_residuals
+from jtqd.sysid.diagnosis.regressors import (
+    EffectCandidate,
+    Family,
+    RunData,
+    bin_samples,
+    contribution,
+    families,
+    gain_columns,
+    run_data,
+)
+from jtqd.sysid.diagnosis.signals import (
+    BaseLoss,
+    Channel,
+    JointSignals,
+    Line,
+    SignalsError,
+    about_zero,
+    joint_signals,
+    with_one_sensor,
+)
+from jtqd.sysid.diagnosis.structure import frequency_lines, order_lines, sharpened
+from jtqd.sysid.text import counted
+
+FEWEST_RUNS: Final = 2
+SHORTEST_MOVING_S: Final = 5.0
+SLOWEST_HZ: Final = 50.0
+SAME_RATE: Final = 0.05
+COGGING_ORDERS: Final = np.arange(5.0, 101.0)
+"""Per motor revolution, where cogging is looked for."""
+ORDER_STEP_S: Final = 0.002
+STRONG_LINE: Final = 25.0
+_SIDELOBES: Final = 0.25
+_LOWEST_ORDER: Final = 0.7
+_MOST_LINES: Final = 4
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """signals [run][joint]; runs: the same binned, `samples` to a bin of step_s seconds; the library's candidates;
+    unexplained: what none of them explains, per channel and run [n]; groups: nuisances; lines: those among them that are
+    lines at orders or frequencies of no effect; readings: per run what the current reads without power; events: what is not
+    valid in `runs` only because it is an event, per channel and run [n].
+    """
+
+    signals: list[list[JointSignals]]
+    runs: list[RunData]
+    candidates: list[EffectCandidate]
+    samples: int
+    step_s: float
+    unexplained: dict[Channel, list[FloatArray]]
+    groups: list[Family]
+    lines: list[Line]
+    readings: Sequence[Readings] = ()
+    events: Mapping[Channel, Sequence[BoolArray]] = field(default_factory=dict)
+
+    @property
+    def joints(self) -> dict[int, Joint]:
+        """The joint files by number, their own effects taken off the residuals already."""
+        return {s.number: s.joint for s in self.signals[0]}
+
+    def valid_or_event(self, run: int, channel: Channel) -> BoolArray:
+        """Return where a channel of a run is valid or in an event [n]."""
+        valid = self.runs[run].channels[channel].valid
+        return valid | self.events[channel][run] if channel in self.events else valid
+
+    def without_events(self, events: Mapping[Channel, Events]) -> Dataset:
+        """Return the runs with these events taken for not valid, and what is then unexplained."""
+        runs, hidden = [], {c: list(e.masks) for c, e in events.items()}
+        for r, run in enumerate(self.runs):
+            channels = dict(run.channels)
+            for channel, masks in hidden.items():
+                d = channels[channel]
+                masks[r] = masks[r] & d.valid
+                channels[channel] = replace(d, valid=d.valid & ~masks[r])
+            runs.append(replace(run, channels=channels))
+        leave = gain_columns(self.candidates)
+        unexplained = {c: saturated_residuals(runs, c, leave) for c in runs[0].channels}
+        return replace(self, runs=runs, unexplained=unexplained, events=hidden)
+
+
+def usable_signals(
+    runs: Sequence[tuple[str, RunTable]], joints: Mapping[int, Joint], numbers: Sequence[int]
+) -> tuple[list[list[JointSignals]], list[str]]:
+    """Return the signals of the runs that can serve, none if too few do, and why others cannot."""
+    if not numbers:
+        return [], ["found no joint that both the runs and the joint files have"]
+    out: list[list[JointSignals]] = []
+    reasons: list[str] = []
+    bases = {n: BaseLoss(joints[n]) for n in numbers}
+    rates = [1.0 / float(np.median(np.diff(table.time_s))) for _, table in runs]
+    usual = float(np.median(rates))
+    for (name, table), rate in zip(runs, rates, strict=True):
+        if rate < SLOWEST_HZ:
+            reasons.append(f"{name}: found {rate:.3g} samples per second, expected at least {SLOWEST_HZ:.0f}")
+            continue
+        if abs(rate / usual - 1.0) > SAME_RATE:  # bins of another length have another noise
+            reasons.append(
+                f"{name}: found {rate:.0f} samples per second, expected {usual:.0f} as in the others"
+            )
+            continue
+        mine = []
+        for n in numbers:
+            if n not in table.joints:
+                continue
+            try:
+                mine.append(joint_signals(name, table, n, joints[n], bases[n]))
+            except SignalsError as error:
+                reasons.append(str(error))
+        if mine:
+            out.append([_without_known_effects(s) for s in about_zero(mine, bases)])
+    common = {tuple(s.number for s in run) for run in out}
+    if len(common) > 1:  # only what every run has can be stacked
+        keep = set.intersection(*(set(c) for c in common))
+        out = [[s for s in run if s.number in keep] for run in out]
+        out = [run for run in out if run]
+    _same_balances(out)
+    out = [with_one_sensor(run) for run in out]
+    if not out:
+        return [], reasons or ["found no run that can serve"]
+    if len(out) < FEWEST_RUNS:
+        return [], [
+            *reasons,
+            f"found {counted(len(out), 'run')} that can serve, expected at least {FEWEST_RUNS}: a gain is measured on runs "
+            "left out",
+        ]
+    moving = sum(float(s.moving.sum()) * float(np.median(np.diff(s.time_s))) for run in out for s in run)
+    if moving < SHORTEST_MOVING_S:
+        return [], [
+            *reasons,
+            f"found {moving:.1f} s in motion in all runs, expected at least {SHORTEST_MOVING_S:.0f} s",
+        ]
+    return out, reasons
+
+
+def _same_balances(runs: list[list[JointSignals]]) -> None:
+    """Leave out the torsion balance of a joint that not every run has: what is stacked must be there in all."""
+    lacking = {s.number for run in runs for s in run if s.torsion_nm is None}
+    for run in runs:
+        run[:] = [replace(s, torsion_nm=None, twist_rad=None) if s.number in lacking else s for s in run]
+
+
+def _without_known_effects(s: JointSignals) -> JointSignals:
+    """Return the signals less what the joint file's own effects explain, at the torsion that the encoders saw."""
+    motor, torsion, usual = s.motor_nm, s.torsion_nm, s.state.torsion_rad
+    if s.twist_rad is not None:
+        s.state.torsion_rad = s.twist_rad
+    for item in s.joint.effects:
+        found = contribution(EFFECTS[item.name], item.parameters, s)
+        motor = motor - found.get("motor", 0.0)
+        if torsion is not None and "torsion" in found:
+            torsion = torsion - found["torsion"]
+    s.state.torsion_rad = usual
+    return replace(s, motor_nm=motor, torsion_nm=torsion)
+
+
+def build_dataset(signals: list[list[JointSignals]], joints: Mapping[int, Joint]) -> Dataset:
+    """Return binned residuals, candidates, unknown lines and zero readings of these runs [run][joint]."""
+    samples = bin_samples(s for run in signals for s in run)
+    step = samples * float(np.median(np.diff(signals[0][0].time_s)))
+    candidates = library_candidates(signals, joints)
+    candidates += _cogging_orders(signals, joints, candidates)
+    lines = unknown_lines(signals, candidates, samples, step)
+    groups = families([s.number for s in signals[0]], lines)
+    runs = [run_data(run, candidates, samples, groups) for run in signals]
+    leave = gain_columns(candidates)
+    unexplained = {c: saturated_residuals(runs, c, leave) for c in runs[0].channels}
+    return Dataset(signals, runs, candidates, samples, step, unexplained, groups, lines, readings(signals))
+
+
+def library_candidates(
+    signals: Sequence[Sequence[JointSignals]], joints: Mapping[int, Joint]
+) -> list[EffectCandidate]:
+    """Return every term of every effect that these runs have the channels for, columns numbered."""
+    out: list[EffectCandidate] = []
+    first = 0
+    numbers = [s.number for s in signals[0]]
+    for effect in EFFECTS.values():
+        for n in numbers:
+            for term in effect.terms(joints[n]):
+                at_sensor = effect.at_sensor_of(term.basis[0])
+                if at_sensor and n != numbers[0]:
+                    continue
+                where: JointName = "sensor" if at_sensor else n
+                if not _has_channels(effect, signals, n):
+                    continue
+                shown = [contribution(effect, term.basis[0], s) for s in signals[0] if s.number == n]
+                size = max((float(np.abs(v).max()) for found in shown for v in found.values()), default=0.0)
+                if size > 0.0 and np.isfinite(size):
+                    out.append(
+                        EffectCandidate(effect, where, term, first, effect.largest(joints[n], term.basis[-1]))
+                    )
+                    first += len(term.basis)
+    return out
+
+
+def _has_channels(effect: Effect, signals: Sequence[Sequence[JointSignals]], number: int) -> bool:
+    """Return whether the runs have what the effect needs."""
+    for run in signals:
+        for s in run:
+            if s.number == number:
+                for name in effect.needs:
+                    if not np.isfinite(np.asarray(getattr(s.state, name), np.float64)).any():
+                        return False
+    return True
+
+
+def _cogging_orders(
+    signals: Sequence[Sequence[JointSignals]],
+    joints: Mapping[int, Joint],
+    candidates: Sequence[EffectCandidate],
+) -> list[EffectCandidate]:
+    """Return cogging at integer orders that stand out of the residual's order spectrum."""
+    first = candidates[-1].columns.stop if candidates else 0
+    out: list[EffectCandidate] = []
+    step = float(np.median(np.diff(signals[0][0].time_s)))
+    every = max(1, round(ORDER_STEP_S / step))
+    step *= every
+    bare = [run_data(run, [], every) for run in signals]
+    for s in signals[0]:
+        channel = Channel(s.number, "motor")
+        parts = [np.where(r.channels[channel].valid, r.channels[channel].residual, np.nan) for r in bare]
+        there = {
+            round(c.term.basis[0]["order_per_motor_rev"])
+            for c in candidates
+            if c.effect.name == "cogging" and c.joint == s.number
+        }
+        for line in order_lines(bare, {channel: parts}, step, COGGING_ORDERS)[:4]:
+            order = round(line.order)
+            if order >= 5 and abs(line.order - order) < 0.06 and order not in there:
+                term = EFFECTS["cogging"].term_of_order(float(order))
+                if term is None:
+                    continue
+                out.append(EffectCandidate(EFFECTS["cogging"], s.number, term, first))
+                first += len(term.basis)
+                there.add(order)
+    return out
+
+
+def unknown_lines(
+    signals: Sequence[Sequence[JointSignals]],
+    candidates: Sequence[EffectCandidate],
+    samples: int,
+    step_s: float,
+) -> list[Line]:
+    """Return strong lines of the residuals at orders and frequencies that no candidate has; no sidelobes of others."""
+    bare = [run_data(run, [], samples) for run in signals]
+    residuals = {c: saturated_residuals(bare, c) for c in bare[0].channels}
+    known = {
+        (c.joint, float(c.term.basis[0]["order_per_motor_rev"]))
+        for c in candidates
+        if "order_per_motor_rev" in c.term.basis[0]
+    }
+    out: list[Line] = []
+    for line in order_lines(bare, residuals, step_s):
+        stronger = any(
+            o.channel == line.channel and o.unit == line.unit and abs(o.order - line.order) < _SIDELOBES
+            for o in out
+        )
+        near = any(j == line.channel.joint and abs(o - line.order) < _SIDELOBES for j, o in known)
+        if line.ratio > STRONG_LINE and line.order > _LOWEST_ORDER and not stronger and not near:
+            out.append(sharpened(line, bare, residuals[line.channel], step_s))
+    out += [line for line in frequency_lines(bare, residuals, step_s) if line.ratio > STRONG_LINE][:1]
+    return out[:_MOST_LINES]

@@ -1,0 +1,82 @@
+"""Which joint file belongs to which joint of the runs: options --joint and --number."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.joint import Joint
+from jtqd.models.files import load_joint
+from jtqd.sysid.runs.files import ColumnMap, RunFile
+
+ALL_JOINTS: Final = 0
+"""Key of the joint file that serves every joint of the runs."""
+_JOINT: Final = re.compile(r"([1-7])=(.+)")
+
+
+class UsageError(ValueError):
+    """A command line that cannot be meant; one line."""
+
+
+def joint_files(arguments: Sequence[str], columns: ColumnMap | None) -> dict[int, Path]:
+    """Return the joint files by number, or {ALL_JOINTS: file}; without arguments those that the column map names.
+
+    Raises UsageError.
+    """
+    if not arguments:
+        if columns is not None and columns.joint_files:
+            return dict(columns.joint_files)
+        raise UsageError("--joint: missing, expected FILE for both joints, or 1=FILE and 2=FILE")
+    files: dict[int, Path] = {}
+    for text in arguments:
+        match = _JOINT.fullmatch(text)
+        number = int(match.group(1)) if match else ALL_JOINTS
+        if number in files:
+            which = "for all joints" if number == ALL_JOINTS else f"of joint {number}"
+            raise UsageError(f"--joint: found two files {which}, expected one")
+        files[number] = Path(match.group(2) if match else text)
+    if ALL_JOINTS in files and len(files) > 1:
+        raise UsageError(
+            "--joint: found a file for all joints beside one for a single joint, expected either"
+        )
+    return files
+
+
+def joints_of(files: Mapping[int, Path], runs: Sequence[RunFile]) -> dict[int, Joint]:
+    """Load the joint files of the joints that the runs have.
+
+    Raises ConfigError for a file that cannot be used, or a joint that no run has.
+    """
+    there = sorted({number for run in runs for number in run.table.joints})
+    if ALL_JOINTS in files:
+        joint = load_joint(files[ALL_JOINTS])
+        return dict.fromkeys(there, joint)
+    have = ", ".join(f"j{number}" for number in there)
+    for number, path in files.items():
+        if number not in there:
+            raise ConfigError(
+                f"--joint {number}={path}: found no columns of j{number} in the runs, which have {have}"
+            )
+    return {number: load_joint(path) for number, path in sorted(files.items())}
+
+
+def joint_number(option: int | None, joint: Joint, runs: Sequence[RunFile]) -> int:
+    """Return the number of the joint meant: the option, else the number its name ends in, else the only one there is.
+
+    Raises ConfigError where none of these decides.
+    """
+    if option is not None:
+        return option
+    ending = re.search(r"(\d+)$", joint.name)
+    there = {number for run in runs for number in run.table.joints}
+    if ending and int(ending.group(1)) in there:
+        return int(ending.group(1))
+    if len(there) == 1:
+        return there.pop()
+    have = ", ".join(f"j{number}" for number in sorted(there))
+    raise ConfigError(
+        f"--number: missing, expected the joint that {joint.name} is in the runs, which have {have}"
+    )
