@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from jtqd.daemon.logs.errors import LogError
+from jtqd.daemon.logs import LogError
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Joint
