@@ -31,11 +31,11 @@ GROUPS = {
     },
     "log: recorded cycles": {
         "export": (
-            "jtqd.daemon.logs.export_command",
+            "jtqd.daemon.logs.export",
             "write a log as CSV, Parquet or candump lines, or the bus as a DBC",
         ),
         "recover": (
-            "jtqd.daemon.logs.recover_command",
+            "jtqd.daemon.logs.recover",
             "repair logs that a crash has left, or that are damaged",
         ),
         "replay": ("jtqd.daemon.replay.command", "run the estimator over a log again, and compare"),

@@ -19,8 +19,7 @@ from typing import Any, Final
 import numpy as np
 import yaml
 
-from jtqd.daemon.logs.errors import LogError
-from jtqd.daemon.logs.reader import read_topics
+from jtqd.daemon.logs import LogError, read_topics
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError, count, natural, seconds
 from jtqd.estimator.joint import Effect, Joint

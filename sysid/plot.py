@@ -10,9 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jtqd.daemon.logs.errors import LogError
-from jtqd.daemon.logs.reader import read_topic
-from jtqd.daemon.logs.rows import Records
+from jtqd.daemon.logs import LogError, Records, read_topic
 from jtqd.estimator.status import DEGRADED, NAMES, STANDSTILL, VALID
 from jtqd.sysid.report.figures import shade
 

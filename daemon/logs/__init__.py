@@ -1,1 +1,35 @@
-"""Recorded logs: reading, repair and export."""
+"""Logs read back: messages as arrays, attachments, tables and frames for other programs, recovery after a crash.
+
+In come MCAP files of jtqd, its python-can writer and others; out go numpy arrays, CSV, Parquet, candump lines, whole files.
+May import numpy, mcap and the file format of `daemon.recording`; import `recover`, `export`, `can_frames`, `can_io` by name.
+"""
+
+from jtqd.daemon.logs.container import LogError
+from jtqd.daemon.logs.log_file import LogFile
+from jtqd.daemon.logs.read import (
+    Messages,
+    Records,
+    iter_messages,
+    iter_topics,
+    log_parts,
+    read_attachments,
+    read_messages,
+    read_topic,
+    read_topics,
+    topics_of,
+)
+
+__all__ = [
+    "LogError",
+    "LogFile",
+    "Messages",
+    "Records",
+    "iter_messages",
+    "iter_topics",
+    "log_parts",
+    "read_attachments",
+    "read_messages",
+    "read_topic",
+    "read_topics",
+    "topics_of",
+]

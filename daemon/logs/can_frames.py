@@ -9,9 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jtqd.daemon.logs.errors import LogError
-from jtqd.daemon.logs.reader import Messages, iter_messages, topics_of
-from jtqd.daemon.logs.rows import Records
+from jtqd.daemon.logs.container import LogError
+from jtqd.daemon.logs.read import Messages, Records, iter_messages, topics_of
 
 EXTENDED, REMOTE, ERROR = 0x8000_0000, 0x4000_0000, 0x2000_0000
 """Bits of `can_id` as in Linux: 29-bit identifier, remote frame, error frame."""

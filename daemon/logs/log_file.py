@@ -9,31 +9,63 @@ from __future__ import annotations
 import os
 from array import array
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
+from typing import NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, Header, Metadata, Schema
+from numpy.typing import NDArray
 
-from jtqd.daemon.logs.batch import Batch, ChunkPlace, believed, between, read_index
-from jtqd.daemon.logs.chunks import HEAD_SIZE, MAX_CHUNK, ChunkError, chunk_head, heads_at, unpack, walk
-from jtqd.daemon.logs.errors import LogError
-from jtqd.daemon.logs.records import (
+from jtqd.daemon.logs.container import (
     HEAD,
+    HEAD_SIZE,
+    MAX_CHUNK,
     MAX_SMALL,
     MESSAGE_BODY,
+    ChunkError,
+    LogError,
     Source,
     attachment_data,
     attachment_index,
+    chunk_head,
+    footer_of,
+    heads_at,
+    message_index,
     parse,
+    read_summary,
+    unpack,
+    walk,
 )
-from jtqd.daemon.logs.tail import footer_of, read_summary
 from jtqd.daemon.recording.mcap_file import MAGIC
 from jtqd.daemon.recording.parts import ACTIVE
 
 _FLAT_PIECE = 8 << 20
 """[byte] messages outside chunks are read in pieces of this size."""
+
+
+class Batch(NamedTuple):
+    """Messages of one channel out of one chunk: `data` holds them, `offsets` is where each record begins [n]."""
+
+    channel: int
+    data: bytes
+    offsets: NDArray[np.int64]
+    log_times: NDArray[np.uint64]
+    lengths: NDArray[np.uint64]
+    """Of the payloads, which begin 31 bytes behind the offsets."""
+
+
+@dataclass
+class _ChunkPlace:
+    """A chunk of a file."""
+
+    offset: int
+    start_ns: int
+    end_ns: int
+    index: dict[int, int] = field(default_factory=dict)
+    """Channel -> offset of its message index; empty: unknown."""
 
 
 class LogFile:
@@ -56,7 +88,7 @@ class LogFile:
         self.metadata: list[Metadata] = []
         self.counts: dict[int, int] = {}
         """Channel -> messages, where the summary says it."""
-        self._chunks: list[ChunkPlace] = []
+        self._chunks: list[_ChunkPlace] = []
         self._flat = array("q")
         self._descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
         try:
@@ -95,7 +127,7 @@ class LogFile:
             self.attachments = summary.attachments
             self.counts = {} if summary.statistics is None else summary.statistics.channel_message_counts
             self._chunks = [
-                ChunkPlace(
+                _ChunkPlace(
                     c.chunk_start_offset, c.message_start_time, c.message_end_time, c.message_index_offsets
                 )
                 for c in sorted(summary.chunks, key=lambda c: c.chunk_start_offset)
@@ -128,7 +160,7 @@ class LogFile:
                 head = chunk_head(source.read(at, HEAD_SIZE))
                 if head is None:
                     return
-                self._chunks.append(ChunkPlace(at, head.start_ns, head.end_ns))
+                self._chunks.append(_ChunkPlace(at, head.start_ns, head.end_ns))
             elif opcode == Opcode.MESSAGE_INDEX and self._chunks:
                 self._chunks[-1].index[int.from_bytes(source.read(at + HEAD.size, 2), "little")] = at
             elif opcode == Opcode.MESSAGE:
@@ -207,7 +239,7 @@ class LogFile:
                 yield from self._of_chunk(chunk, data, wanted, first, last)
         yield from self._of_flat(wanted, first, last)
 
-    def _unpacked(self, chunk: ChunkPlace) -> bytes | None:
+    def _unpacked(self, chunk: _ChunkPlace) -> bytes | None:
         """Content of a chunk; None for the torn last one of a file that is being written."""
         source = self._source
         found = source.head(chunk.offset)
@@ -227,19 +259,19 @@ class LogFile:
             ) from None
 
     def _of_chunk(
-        self, chunk: ChunkPlace, data: bytes, wanted: set[int] | None, first: int, last: int
+        self, chunk: _ChunkPlace, data: bytes, wanted: set[int] | None, first: int, last: int
     ) -> Iterator[Batch]:
         batches = []
         for channel in sorted(chunk.index.keys() if wanted is None else wanted & chunk.index.keys()):
-            entries = read_index(self._source, chunk.index[channel], channel)
-            batch = None if entries is None else believed(data, channel, entries)
+            entries = message_index(self._source, chunk.index[channel], channel)
+            batch = None if entries is None else _indexed(data, channel, entries)
             if batch is None:  # nothing of this chunk's indexes is believed then
                 break
             batches.append(batch)
         else:
             if chunk.index:
                 whole = chunk.start_ns >= first and chunk.end_ns <= last
-                yield from batches if whole else (between(batch, first, last) for batch in batches)
+                yield from batches if whole else (_within(batch, first, last) for batch in batches)
                 return
         yield from self._of_walk(data, wanted, first, last)
 
@@ -260,7 +292,7 @@ class LogFile:
                 batch = Batch(
                     channel, data, records.offsets[mine], times, heads["length"][mine] - MESSAGE_BODY
                 )
-                yield between(batch, first, last)
+                yield _within(batch, first, last)
 
     def _of_flat(self, wanted: set[int] | None, first: int, last: int) -> Iterator[Batch]:
         """Messages outside chunks, piece by piece."""
@@ -286,7 +318,7 @@ class LogFile:
                     if (lengths < MESSAGE_BODY).any():
                         raise LogError(f"{self.path}: not a readable MCAP file: a message is too short")
                     batch = Batch(channel, data, here[mine], heads["log_time"][mine], lengths - MESSAGE_BODY)
-                    yield between(batch, first, last)
+                    yield _within(batch, first, last)
 
     # ---- attachments ----
 
@@ -296,3 +328,35 @@ class LogFile:
         if data is None:
             raise LogError(f"{self.path}: attachment {index.name!r} is damaged")
         return data
+
+
+def _indexed(data: bytes, channel: int, entries: NDArray[np.uint64]) -> Batch | None:
+    """Messages where an index says; None where at one of these places there is none."""
+    offsets = entries[:, 1].astype(np.int64)
+    if not len(offsets):
+        return Batch(channel, data, offsets, entries[:, 0], entries[:, 0])
+    if offsets.min() < 0 or offsets.max() > len(data) - HEAD.size - MESSAGE_BODY:
+        return None
+    if len(offsets) > 1 and (np.diff(offsets) <= 0).any():  # by time, in some writers' files
+        order = np.argsort(offsets)
+        offsets, entries = offsets[order], entries[order]
+    heads = heads_at(data, offsets)
+    lengths = heads["length"]
+    good = (
+        (heads["opcode"] == Opcode.MESSAGE)
+        & (heads["channel"] == channel)
+        & (heads["log_time"] == entries[:, 0])
+    )
+    good &= (lengths >= MESSAGE_BODY) & (lengths <= len(data))
+    ends = offsets + HEAD.size + lengths.astype(np.int64)
+    if not good.all() or ends[-1] > len(data) or (ends[:-1] > offsets[1:]).any():
+        return None
+    return Batch(channel, data, offsets, entries[:, 0], lengths - MESSAGE_BODY)
+
+
+def _within(batch: Batch, first: int, last: int) -> Batch:
+    """Those with a log time from `first` to `last`."""
+    inside = (batch.log_times >= first) & (batch.log_times <= last)
+    return Batch(
+        batch.channel, batch.data, batch.offsets[inside], batch.log_times[inside], batch.lengths[inside]
+    )

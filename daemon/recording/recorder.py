@@ -215,8 +215,9 @@ class Session:
             files = own_files(request.directory, request.prefix)
             current = self.parts.part if self.parts.is_open else 0
             if any(each.active and (each.run, each.part) != (self.run, current) for each in files):
-                arguments = [str(request.directory), request.prefix]
-                self._repair = Child("jtqd.daemon.logs.leftovers", arguments, name="the repair")
+                reserve = round(request.reserve_mb * MEGABYTE)
+                arguments = [str(request.directory), request.prefix, str(reserve)]
+                self._repair = Child("jtqd.daemon.logs.recover", arguments, name="the repair")
         if self._repair is None:
             return
         ended = not self._repair.alive()

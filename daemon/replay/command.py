@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from mcap.records import Channel, Schema
 
-from jtqd.daemon.logs.errors import LogError
-from jtqd.daemon.logs.reader import read_attachments
+from jtqd.daemon.logs import LogError, read_attachments
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData
 from jtqd.daemon.recording.messages import CDR_HEADER, JOINT_ESTIMATE_SIZE
 from jtqd.daemon.recording.parts import ACTIVE

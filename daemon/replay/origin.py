@@ -18,7 +18,7 @@ import numpy.typing as npt
 import yaml
 
 from jtqd.daemon.config import Config, load_config
-from jtqd.daemon.logs.errors import LogError
+from jtqd.daemon.logs import LogError
 from jtqd.daemon.loop.joint import JointInputs
 from jtqd.daemon.loop.process import joint_inputs
 from jtqd.daemon.shared import cycle_record as cr

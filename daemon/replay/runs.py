@@ -17,9 +17,15 @@ import numpy.typing as npt
 from numpy.lib.recfunctions import repack_fields
 
 from jtqd.daemon.config import Config
-from jtqd.daemon.logs.errors import LogError
-from jtqd.daemon.logs.log_file import LogFile
-from jtqd.daemon.logs.reader import iter_messages, iter_topics, read_attachments, read_topic, read_topics
+from jtqd.daemon.logs import (
+    LogError,
+    LogFile,
+    iter_messages,
+    iter_topics,
+    read_attachments,
+    read_topic,
+    read_topics,
+)
 from jtqd.daemon.replay.origin import FRAMES, JOINT, Origin, check_fields, open_origin
 from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_POSITION
 from jtqd.estimator.arrays import RecordArray

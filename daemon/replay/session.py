@@ -16,8 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from jtqd.daemon.config import Config
-from jtqd.daemon.logs.errors import LogError
-from jtqd.daemon.logs.reader import log_parts
+from jtqd.daemon.logs import LogError, log_parts
 from jtqd.daemon.loop.joint_status import JointSafety
 from jtqd.daemon.replay.compare import Comparison, Identity, compare, identity
 from jtqd.daemon.replay.estimates import ExactReplay, Model, replay_whole

@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from jtqd.daemon.logs.errors import LogError
+from jtqd.daemon.logs import LogError
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.campaign.bench import Bench, BenchConfig, Play

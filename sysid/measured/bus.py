@@ -20,9 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jtqd.daemon.logs.errors import LogError
-from jtqd.daemon.logs.reader import read_topic
-from jtqd.daemon.logs.rows import Records
+from jtqd.daemon.logs import LogError, Records, read_topic
 from jtqd.estimator.checked import Section
 from jtqd.estimator.decoder import decode
 from jtqd.estimator.joint import Joint

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from jtqd.daemon.logs.errors import LogError
+from jtqd.daemon.logs import LogError
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.run import RunTableError
 from jtqd.sysid.fit.friction import FitError

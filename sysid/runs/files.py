@@ -431,7 +431,7 @@ def _is_number(value: object) -> bool:
 
 
 def _read_log(path: Path) -> RunFile:
-    from jtqd.daemon.logs.errors import LogError
+    from jtqd.daemon.logs import LogError
     from jtqd.sysid.runs.logs import log_to_run
 
     _, sha256 = _bytes(path)

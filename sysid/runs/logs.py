@@ -10,9 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from jtqd.daemon.logs.errors import LogError
-from jtqd.daemon.logs.reader import read_topics
-from jtqd.daemon.logs.rows import Records
+from jtqd.daemon.logs import LogError, Records, read_topics
 from jtqd.drivers.devices import NOT_MEASURED, TEMPERATURE_C_PER_UNIT, drive_tpdo3
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.run import JointColumns, RunTable

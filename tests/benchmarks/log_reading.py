@@ -1,4 +1,4 @@
-"""`logs`: one joint of a log into arrays, by `jtqd.daemon.logs.reader` and by the mcap library with its ROS 2 decoder.
+"""`logs`: one joint of a log into arrays, by `jtqd.daemon.logs` and by the mcap library with its ROS 2 decoder.
 
 The file is written by the recorder's own code, with noise in every measured quantity and seven frames a cycle. Both read it
 in turns in one process; the figures are CPU times of this process, extrapolated to an hour.
@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from jtqd.daemon.logs.reader import read_topic
+from jtqd.daemon.logs import read_topic
 from tests.benchmarks.table import mark, table
 from tests.daemon.logs.campaign_log import Cycle, Joint, write_log
 
@@ -104,7 +104,7 @@ def text(result: dict[str, Any]) -> str:
     """As a table."""
     rows = [
         [name, f"{result['us_per_message'][key]:.2f}", f"{result['hour_s'][key]:.1f}"]
-        for name, key in (("jtqd.daemon.logs.reader", "ours"), ("mcap + mcap-ros2-support", "library"))
+        for name, key in (("jtqd.daemon.logs", "ours"), ("mcap + mcap-ros2-support", "library"))
     ]
     head = ["one joint into arrays", "us a message", "s for an hour"]
     size = result["bytes"] * 3600.0 * _RATE_HZ / result["cycles"] * 1e-9

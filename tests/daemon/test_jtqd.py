@@ -16,7 +16,7 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 
-from jtqd.daemon.logs.reader import read_topic
+from jtqd.daemon.logs import read_topic
 from jtqd.daemon.loop.estimate_pdo import decode
 from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_NETWORK_SKIPPED, FLAG_POSITION
 from jtqd.daemon.shared.snapshot import SnapshotReader

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jtqd.daemon.logs.reader import read_topic
+from jtqd.daemon.logs import read_topic
 from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_POSITION
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.estimator.status import PUBLISHED

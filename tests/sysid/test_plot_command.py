@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jtqd.daemon.logs.errors import LogError
+from jtqd.daemon.logs import LogError
 from jtqd.estimator.status import DEGRADED, STALE, STANDSTILL, VALID
 from jtqd.sysid import plot as plot_command
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from jtqd.daemon.logs.reader import read_attachments
+from jtqd.daemon.logs import read_attachments
 from tests.daemon.bus.master_daemon import INTERFACE, Daemon, LateSensor, a_daemon, frame
 
 pytestmark = pytest.mark.socketcan

@@ -6,8 +6,11 @@ import json
 import math
 import os
 import re
+import struct
 import subprocess
 import sys
+import tracemalloc
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import can
@@ -15,10 +18,9 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
+from jtqd.daemon.logs import LogError, read_topic
 from jtqd.daemon.logs.can_io import McapCanReader, McapCanWriter
-from jtqd.daemon.logs.errors import LogError
-from jtqd.daemon.logs.export_command import main
-from jtqd.daemon.logs.reader import read_topic
+from jtqd.daemon.logs.export import RunTable, main
 from jtqd.daemon.logs.recover import recover
 from tests.daemon.logs.campaign_log import Cycle, Joint, regular, write_log
 from tests.daemon.logs.log_files import ATTACHMENTS, ours
@@ -206,7 +208,7 @@ def test_reader_of_a_topic_without_frames_is_refused(log):
 def test_can_logconvert_there_and_back(log, tmp_path, suffix):
     there, back = tmp_path / f"a.{suffix}", tmp_path / "b.mcap"
     for source, target in ((log, there), (there, back)):
-        done = run(BIN / "can_logconvert", source, target)
+        done = run(sys.executable, "-m", "can.logconvert", source, target)
         assert done.returncode == 0, done.stderr
     found, expected = frames_of(back), expected_frames()
     assert [frame[1:] for frame in found] == [frame[1:] for frame in expected]
@@ -253,12 +255,15 @@ def test_can_player_and_can_logger_on_a_bus(log, tmp_path):
     except (can.CanError, ImportError, OSError) as error:
         pytest.skip(f"no multicast: {error}")
     logger = subprocess.Popen(
-        [BIN / "can_logger", *bus, "-f", out], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", "can.logger", *bus, "-f", out],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     try:
         logger.stdout.readline()
         logger.stdout.readline()
-        player = run(BIN / "can_player", *bus, "--ignore-timestamps", log)
+        player = run(sys.executable, "-m", "can.player", *bus, "--ignore-timestamps", log)
         assert player.returncode == 0, player.stderr
         import time
 
@@ -303,3 +308,96 @@ def test_nothing_is_left_of_a_table_that_could_not_be_written(log, tmp_path, mon
     assert main(["csv", str(log), "--out", str(tmp_path / "a.csv")]) == 1
     assert list(tmp_path.iterdir()) == []
     assert np.isfinite(1.0)
+
+
+# ---- chunk by chunk ----
+
+
+def test_a_topic_whose_columns_change_on_the_way(tmp_path):
+    """Sequences of one length in each chunk, of another in the next: one column of text, as in one piece."""
+    path, out = tmp_path / "a.mcap", tmp_path / "a.csv"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=100)
+        writer.start("x", "lib")
+        schema = writer.register_schema("a/B", "ros2msg", b"int32[] a\n")
+        channel = writer.register_channel("/t", "cdr", schema)
+        for n in range(12):
+            numbers = range(n, n + 1 + n // 6)
+            data = b"\0\1\0\0" + struct.pack(f"<I{len(numbers)}i", len(numbers), *numbers)
+            writer.add_message(channel, n, data, n, n)
+        writer.finish()
+    assert main(["csv", str(path), "--topic", "/t", "--out", str(out)]) == 0
+    rows = list(csv.DictReader(out.open()))
+    assert [row["a"] for row in rows] == [*map(str, range(6)), *(f"{n} {n + 1}" for n in range(6, 12))]
+
+
+def test_a_table_takes_no_more_memory_than_some_chunks(tmp_path):
+    """Ten times the log, the same memory (bytes that Python and numpy hold at most while it is written)."""
+    peaks = []
+    for count in (4_000, 40_000):
+        log = write_log(tmp_path / f"{count}.mcap", regular(count, joints))
+        tracemalloc.start()
+        assert main(["csv", str(log), "--out", str(tmp_path / "a.csv"), "--all-cycles"]) == 0
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    print(peaks)
+    assert peaks[1] < 1.5 * peaks[0]
+
+
+def test_what_is_no_file_is_written_to_and_never_replaced(log, tmp_path, capsys):
+    """A pipe, as /dev/stdout may be; a link; the log itself."""
+    pipe, link, target = tmp_path / "pipe", tmp_path / "link", tmp_path / "target.csv"
+    os.mkfifo(pipe)
+    with ThreadPoolExecutor(1) as pool:
+        read = pool.submit(pipe.read_bytes)
+        assert main(["csv", str(log), "--out", str(pipe), "--all-cycles"]) == 0
+        lines = read.result(20).count(b"\n")
+    assert lines == 121
+    assert pipe.is_fifo()
+    link.symlink_to(target)
+    assert main(["csv", str(log), "--out", str(link), "--all-cycles"]) == 0
+    assert link.is_symlink()
+    assert target.read_bytes().count(b"\n") == lines
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["link", "pipe", "target.csv"]
+    capsys.readouterr()
+    assert main(["csv", str(log), "--out", str(tmp_path)]) == 1
+    assert capsys.readouterr().err == f"jtq export: {tmp_path}: Is a directory\n"
+    assert main(["csv", str(log), "--out", str(tmp_path / "no" / "a.csv")]) == 1
+    assert capsys.readouterr().err == f"jtq export: {tmp_path}/no/a.csv: No such file or directory\n"
+    before = log.read_bytes()
+    for wrong in (["--out", str(log)], ["--out", "a", "--start", "nan"], ["--out", "a", "--end", "1e300"]):
+        with pytest.raises(SystemExit) as stop:
+            main(["csv", str(log), *wrong])
+        assert stop.value.code == 2
+    assert log.read_bytes() == before
+
+
+def test_a_run_table_needs_two_cycles(tmp_path):
+    for count in (1, 2):
+        write_log(tmp_path / "a.mcap", regular(count, lambda n: (Joint(), Joint())))
+        table = RunTable(tmp_path / "a.mcap")
+        if count == 2:
+            assert [len(block["time_s"]) for block in table.blocks()] == [2]
+            continue
+        with pytest.raises(LogError, match="found 1 cycles with every column, expected at least 2"):
+            list(table.blocks())
+        (tmp_path / "a.mcap").unlink()
+
+
+def test_export_never_writes_over_its_log(tmp_path):
+    data = ours(tmp_path / "a.mcap", 10)
+    (tmp_path / "link.mcap").symlink_to(tmp_path / "a.mcap")
+    for out in ("a.mcap", "link.mcap"):
+        with pytest.raises(SystemExit, match="2"):
+            main(["candump", str(tmp_path / "a.mcap"), "--out", str(tmp_path / out)])
+    assert (tmp_path / "a.mcap").read_bytes() == data
+
+
+def test_frames_of_half_a_second_ago_are_in_the_file_of_the_logger(tmp_path):
+    writer = McapCanWriter(tmp_path / "a.mcap.active")
+    for n in range(1200):
+        writer.on_message_received(can.Message(timestamp=1.7e9 + n * 1e-3, arbitration_id=1, data=b"x"))
+    kept = (tmp_path / "a.mcap.active").read_bytes()  # as a crash would leave it
+    writer.stop()
+    (tmp_path / "b.mcap.active").write_bytes(kept)
+    assert len(list(McapCanReader(tmp_path / "b.mcap.active"))) >= 1000

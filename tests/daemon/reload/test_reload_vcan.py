@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from jtqd.daemon.logs.reader import read_topic
+from jtqd.daemon.logs import read_topic
 from jtqd.models.files import shipped
 
 INTERFACE = os.environ.get("JTQD_CAN_INTERFACE", "vcan0")

@@ -9,7 +9,7 @@ from pathlib import Path
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from jtqd.daemon.logs.reader import read_topic
+from jtqd.daemon.logs import read_topic
 
 
 def cut(

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jtqd.daemon.logs.reader import read_attachments, read_topic
+from jtqd.daemon.logs import read_attachments, read_topic
 from jtqd.daemon.replay.command import main
 from jtqd.daemon.replay.session import Wishes, replay
 from tests.daemon.replay.replay_helpers import cut, cycles, provenance

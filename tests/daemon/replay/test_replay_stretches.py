@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jtqd.daemon.logs.errors import LogError
-from jtqd.daemon.logs.reader import read_topic
+from jtqd.daemon.logs import LogError, read_topic
 from jtqd.daemon.replay import command, session
 from jtqd.daemon.replay.runs import Run, in_order, read_part, stretches
 from jtqd.daemon.replay.session import Result, Wishes, replay, replay_each

@@ -139,7 +139,7 @@ ELSEWHERE = (
         (
             "tests/daemon/test_vcan.py::test_a_recorder_that_dies_or_stalls_costs_the_loop_nothing",
             "tests/daemon/logs/test_recover.py::test_killed_between_two_chunks_loses_nothing",
-            "tests/daemon/logs/test_recover_fuzz.py::test_random_damage",
+            "tests/daemon/logs/test_recover.py::test_random_damage",
             "tests/slow/test_fuzz_files.py::test_every_kind_of_file",
         ),
     ),

@@ -69,7 +69,7 @@ def _network(method: str) -> Callable[[Path], None]:
 
 
 def _read_log(path: Path) -> None:
-    from jtqd.daemon.logs.reader import read_attachments, read_topics, topics_of
+    from jtqd.daemon.logs import read_attachments, read_topics, topics_of
 
     read_attachments(path)
     read_topics(path, [each for each in topics_of(path) if not each.startswith(("/diag", "/events", "/log"))])
@@ -96,8 +96,7 @@ def targets(directory: Path) -> list[Target]:
     """All of them; good files are put into `directory`."""
     from jtqd.daemon.bus.boot import boot_request
     from jtqd.daemon.config import load_config
-    from jtqd.daemon.logs import export_command, recover_command
-    from jtqd.daemon.logs.errors import LogError
+    from jtqd.daemon.logs import LogError, export, recover
     from jtqd.daemon.replay import command as replay_command
     from jtqd.drivers.boot_request import RequestError
     from jtqd.drivers.object_dictionary import EdsError, read_eds
@@ -159,8 +158,8 @@ def targets(directory: Path) -> list[Target]:
             (NetworkError, ConfigError),
         ),
         Target("log, read", log, ".mcap", damage_bytes, _read_log, logs),
-        Target("log, recover", log, ".mcap", damage_bytes, _command(recover_command.main), ()),
-        Target("log, export", log, ".mcap", damage_bytes, _command(export_command.main, "candump"), ()),
+        Target("log, recover", log, ".mcap", damage_bytes, _command(recover.main), ()),
+        Target("log, export", log, ".mcap", damage_bytes, _command(export.main, "candump"), ()),
         Target("log, replay", log, ".mcap", damage_bytes, _command(replay_command.main, "--json"), ()),
     ]
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from jtqd.daemon.logs.reader import iter_messages
+from jtqd.daemon.logs import iter_messages
 from jtqd.daemon.shared.cycle_record import FLAG_SYNC_CONFIRMED
 from tests.slow.faults.ears import Heard
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from jtqd.daemon.logs.reader import read_topic
+from jtqd.daemon.logs import read_topic
 from jtqd.drivers.frame import FRAME, pack
 from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.estimator.status import STALE, STARTING

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jtqd.daemon.logs.errors import LogError
+from jtqd.daemon.logs import LogError
 from jtqd.estimator.run import COLUMN_NAMES
 from jtqd.sysid.runs.logs import log_to_run
 from tests.daemon.logs.campaign_log import OFF, Cycle, Joint, regular, temperature, write_log

@@ -1,31 +1,49 @@
-"""Reading logs: the fast way against the library's decoder, the generic decoder, time, parts, unfinished and lying files."""
+"""Reading logs: fixed rows against the library's decoder, messages of other writers, parts, unfinished and lying files."""
 
+import json
 import os
 import resource
+import shutil
 import struct
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+import zstandard
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from mcap_ros2.decoder import DecoderFactory
+from numpy.lib.recfunctions import repack_fields
 
-from jtqd.daemon.logs import rows
-from jtqd.daemon.logs.errors import LogError
-from jtqd.daemon.logs.reader import (
+from jtqd.daemon.logs import (
+    LogError,
+    iter_messages,
     log_parts,
+    read,
     read_attachments,
     read_messages,
     read_topic,
     read_topics,
     topics_of,
 )
+from jtqd.daemon.logs.can_frames import iter_frames
+from jtqd.daemon.logs.container import ChunkError, Source, message_index, unpack_data
+from jtqd.daemon.logs.export import main as export
+from jtqd.daemon.logs.log_file import _indexed
 from jtqd.daemon.recording.schemas import SCHEMAS
+from jtqd.daemon.replay.command import main as replay
+from jtqd.daemon.replay.session import Wishes
+from jtqd.daemon.replay.session import replay as replayed
 from tests.daemon.logs.log_files import ATTACHMENTS, cycles, foreign, ours, record_starts
-from tests.paths import ROOT
+from tests.daemon.recording.recorder_bench import record_of as cycle_record
+from tests.daemon.recording.recorder_bench import session_on
+from tests.daemon.replay import replay_helpers
+from tests.daemon.replay.replay_helpers import cycles as cycle_numbers
+from tests.paths import GOLDEN, ROOT
 
+INDEXED = ("/joint/1/state", "/joint/2/state", "/can/frames")
 JOINT, FRAMES = "/joint/1/state", "/can/frames"
 START_NS = 1_700_000_007_000_000_000
 
@@ -68,7 +86,7 @@ def test_fixed_messages_are_never_decoded_one_by_one(log, monkeypatch):
     def refuse(*_):
         raise AssertionError("decoded one by one")
 
-    monkeypatch.setattr(rows.Decoder, "rows", refuse)
+    monkeypatch.setattr(read._Decoder, "rows", refuse)
     found = read_topics(log, (JOINT, FRAMES))
     assert len(found[JOINT]) == len(found[FRAMES]) == 130
     assert found[JOINT]["header"]["stamp"]["sec"].tolist() == [1_700_000_007] * 130
@@ -302,8 +320,6 @@ def test_schemas_and_messages_that_lie(tmp_path, schema, payload, words):
 
 def test_decompression_bomb_takes_no_memory(tmp_path):
     """64 kB that unpack to 4 GB, within 700 MB of address space: one line."""
-    import zstandard
-
     whole = foreign("zstd", count=3)
     starts = record_starts(whole)
     chunk = next(at for at in starts if whole[at] == 6)
@@ -312,7 +328,7 @@ def test_decompression_bomb_takes_no_memory(tmp_path):
     path = tmp_path / "a.mcap.active"
     path.write_bytes(whole[:chunk] + struct.pack("<BQ", 6, len(body)) + body + whole[chunk : starts[-3]])
     code = (
-        "from pathlib import Path; from jtqd.daemon.logs.reader import *\n"
+        "from pathlib import Path; from jtqd.daemon.logs import *\n"
         f"try: read_topic(Path({str(path)!r}), '/t0')\nexcept LogError as e: print(e)"
     )
     done = subprocess.run(
@@ -345,3 +361,190 @@ def test_all_of_our_definitions_have_a_layout_or_a_decoder(log):
     assert set(SCHEMAS) >= {"jtqd_msgs/msg/JointEstimate"}
     assert sum(1 for _ in cycles(3)) == 3
     assert read_topic(log, "/joint_states")["position"][0].shape == (2,)
+
+
+def test_without_the_decoder_one_line_names_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mcap_ros2.decoder", None)
+    path = tmp_path / "a.mcap"
+    path.write_bytes(foreign())
+    with pytest.raises(LogError, match=r"pip install 'jtqd\[ros2\]'") as error:
+        read_topic(path, "/t0")
+    assert "\n" not in str(error.value)
+
+
+def test_a_sequence_that_says_it_is_longer_than_its_message(tmp_path):
+    path = tmp_path / "a.mcap"
+    good = b"\0\1\0\0" + struct.pack("<II4s", 1, 4, b"abc\0")
+    for count in (1, 4_000_000_000):
+        with open(path, "wb") as file:
+            writer = Writer(file)
+            writer.start("ros2", "x")
+            channel = writer.register_channel(
+                "/a", "cdr", writer.register_schema("a/A", "ros2msg", b"string[] a\n")
+            )
+            writer.add_message(channel, 1, good, 1)
+            writer.add_message(channel, 2, good[:4] + struct.pack("<I", count) + good[8:], 2)
+            writer.finish()
+        if count == 1:
+            assert [row["a"].tolist() for row in read_topic(path, "/a")] == [[b"abc"], [b"abc"]]
+    with pytest.raises(LogError, match="/a: found a message that cannot be decoded"):
+        read_topic(path, "/a")
+
+
+# ---- indexes and chunks that lie ----
+
+
+def message(channel, time_ns, payload):
+    return struct.pack("<BQHIQQ", Opcode.MESSAGE, 22 + len(payload), channel, 0, time_ns, time_ns) + payload
+
+
+@pytest.mark.parametrize("cut", range(4))
+def test_the_last_chunk_is_read_whole_whatever_of_its_indexes_is_there(tmp_path, cut):
+    """The writer was killed between the message indexes of its last chunk: some channels have one, others none."""
+    data = ours(tmp_path / "a.mcap")
+    starts = record_starts(data)
+    last = max(n for n, at in enumerate(starts[:-1]) if data[at] == Opcode.CHUNK)
+    end = starts[last + 1 + cut]
+    assert data[starts[last + cut]] == (Opcode.MESSAGE_INDEX if cut else Opcode.CHUNK)
+    active = tmp_path / "b.mcap.active"
+    active.write_bytes(data[:end])
+    for topic in INDEXED:
+        assert len(read_topic(active, topic)) == 120, topic
+
+
+def test_an_index_of_another_channel_is_none(tmp_path):
+    path = tmp_path / "index"
+    entries = struct.pack("<2Q", 5, 0)
+    head = struct.pack("<BQHI", Opcode.MESSAGE_INDEX, 6 + len(entries), 3, len(entries))
+    path.write_bytes(head + entries)
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        source = Source(descriptor)
+        assert message_index(source, 0, 3).tolist() == [[5, 0]]
+        assert message_index(source, 0, 4) is None
+    finally:
+        os.close(descriptor)
+
+
+def test_an_index_into_the_inside_of_a_message_is_not_believed():
+    """A payload that looks like a message: an index that names both would give its bytes twice."""
+    inner = message(1, 7, b"inner")
+    data = message(1, 5, inner + bytes(8)) + message(1, 9, b"next")
+    outer, second = 0, 31 + len(inner) + 8
+    good = _indexed(data, 1, np.array([[5, outer], [9, second]], np.uint64))
+    assert good is not None
+    assert good.lengths.tolist() == [len(inner) + 8, 4]
+    assert _indexed(data, 1, np.array([[5, outer], [7, 31], [9, second]], np.uint64)) is None
+
+
+def test_a_packed_chunk_that_says_it_is_larger_is_not_unpacked():
+    """What the frame of zstd says is looked at before a byte is made."""
+    packed = zstandard.ZstdCompressor().compress(bytes(100_000))
+    assert unpack_data("zstd", packed, 100_000) == bytes(100_000)
+    with pytest.raises(ChunkError, match="says 100000 bytes unpacked, expected at most 99999"):
+        unpack_data("zstd", packed, 99_999)
+
+
+def test_parts_beyond_9999_come_in_the_order_of_their_numbers(tmp_path):
+    names = [f"r-20260101T000000Z-{n}.mcap" for n in ("9998", "9999", "10000")]
+    for name in names:
+        (tmp_path / name).touch()
+    assert [path.name for path in log_parts(tmp_path)] == names
+    assert [path.name for path in log_parts([tmp_path / name for name in names[::-1]])] == names
+
+
+def test_a_summary_that_fails_its_crc_is_not_believed(tmp_path):
+    """One letter of a topic's name in the summary: everything parses."""
+    data = bytearray(ours(tmp_path / "a.mcap"))
+    at = data.rindex(b"/joint_states")
+    data[at + 1] ^= 0x20
+    (tmp_path / "b.mcap").write_bytes(data)
+    with pytest.raises(LogError, match="its summary is damaged"):
+        read_topic(tmp_path / "b.mcap", INDEXED[0])
+
+
+# ---- parts of a run: what two of them have comes once ----
+
+
+GOLDEN_LOG = GOLDEN / "fused.mcap"
+NAME = "jtqd-can0-20261121T173111Z-{:04d}.mcap"
+IN_PARTS = ("/joint/1/state", "/joint/2/state", "/can/frames", "/diagnostics", "/events")
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory):
+    """A run in three parts: 100 cycles are in the first two, one is in the last two; what has no cycle is in all."""
+    directory = tmp_path_factory.mktemp("parts")
+    first = cycle_numbers(GOLDEN_LOG)[0]
+    for n, (begin, end) in enumerate(((0, 700), (600, 1001), (1000, 1 << 30)), start=1):
+        replay_helpers.cut(
+            GOLDEN_LOG, directory / NAME.format(n), lambda c, b=begin, e=end: b <= c - first < e
+        )
+    return directory
+
+
+@pytest.mark.parametrize("topic", IN_PARTS)
+def test_every_message_comes_once(parts, topic):
+    whole = packed(read_topic(GOLDEN_LOG, topic))
+    assert packed(read_topic(parts, topic)) == whole
+    pieces = [each.records for each in iter_messages(parts, topic)]
+    assert b"".join(map(packed, pieces)) == whole
+
+
+def packed(records):
+    if records.dtype.hasobject:  # texts of changing length: their times
+        records = records["header"]["stamp"]
+    return repack_fields(records, recurse=True).tobytes()
+
+
+def test_frames_and_tables(parts, tmp_path):
+    frames = [sum(len(each.ids) for each in iter_frames(path, "/can/frames")) for path in (GOLDEN_LOG, parts)]
+    assert frames[0] == frames[1] > 1000
+    tables = []
+    for path in (GOLDEN_LOG, parts):
+        out = tmp_path / f"{path.name}.csv"
+        assert export(["csv", str(path), "--out", str(out), "--all-cycles"]) == 0
+        tables.append(out.read_bytes())
+    assert tables[0] == tables[1]
+
+
+def test_what_only_looks_alike_is_kept(parts, tmp_path):
+    """Another byte in a message of the same cycle and time: nobody knows which one is right."""
+    shutil.copytree(parts, tmp_path, dirs_exist_ok=True)
+    cycle = cycle_numbers(GOLDEN_LOG)[0] + 650
+    second = tmp_path / NAME.format(2)
+
+    def spoil(topic, at, data):
+        return data[:-9] + bytes((data[-9] ^ 1,)) + data[-8:] if at == cycle and "/1/" in topic else data
+
+    replay_helpers.cut(parts / NAME.format(2), second, payload=spoil)
+    found = read_topic(tmp_path, "/joint/1/state")["cycle"]
+    assert len(found) == len(read_topic(GOLDEN_LOG, "/joint/1/state")) + 1
+    assert np.count_nonzero(found == cycle) == 2
+    with pytest.raises(LogError, match="given twice"):
+        replayed([tmp_path], Wishes())
+
+
+def test_replay_of_a_directory(parts, capsys):
+    assert replay([str(parts), "--exact", "--json"]) == 0
+    (run,) = json.loads(capsys.readouterr().out)["runs"]
+    assert (len(run["logs"]), run["cycles"], run["lost_cycles"]) == (3, len(cycle_numbers(GOLDEN_LOG)), 0)
+    assert replay([str(GOLDEN_LOG), "--exact", "--json"]) == 0
+    (alone,) = json.loads(capsys.readouterr().out)["runs"]
+    assert run["identity"] == alone["identity"]
+    assert run["joints"] == alone["joints"]
+
+
+def test_a_recorder_that_did_not_report_its_last_chunks(tmp_path):
+    """By the recorder's own code: what was written and not settled is written again, in other chunks."""
+    for part, numbers in ((1, range(2600)), (2, range(1300, 4000))):
+        directory = tmp_path / str(part)
+        directory.mkdir()
+        session = session_on(directory, run="20250102T030405Z")
+        for n in numbers:
+            session.recording.add(cycle_record(n))
+        session.finish()
+        (written,) = (directory / "logs").glob("*.mcap")
+        (tmp_path / "both").mkdir(exist_ok=True)
+        written.rename(tmp_path / "both" / f"test-20250102T030405Z-{part:04d}.mcap")
+    assert read_topic(tmp_path / "both", "/joint/2/state")["cycle"].tolist() == list(range(4000))
