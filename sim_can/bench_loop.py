@@ -61,7 +61,11 @@ class _EmbeddedHub:
         """The bus is ours: it stays for its other members, as a wire does when a node goes silent."""
         self._port.detach()
         if self._hub.clients:
-            print("bench: silent, the bus stays until its members have left", file=sys.stderr, flush=True)
+            print(
+                "bench: the nodes are silent; the bus closes when its last client has disconnected",
+                file=sys.stderr,
+                flush=True,
+            )
         while self._hub.clients and (end_ns is None or time.monotonic_ns() < end_ns):
             self._hub.run_once(_LONGEST_WAIT_S if end_ns is None else _LINGER_STEP_S)
 
