@@ -67,7 +67,7 @@ class _EmbeddedHub:
         """Keep the hub for its other members, as a wire stays when a node goes silent."""
         self._port.detach()
         if self._hub.clients:
-            _log("the bus stays up until its other members have left")
+            _log("the nodes are silent; the bus closes when its last client has disconnected")
         while self._hub.clients and (end_ns is None or time.monotonic_ns() < end_ns):
             self._hub.run_once(_LONGEST_WAIT_S if end_ns is None else _LINGER_STEP_S)
 

@@ -221,6 +221,9 @@ class Check:
         return str(value) if self.index >= _PROFILE and self.index != _UNIT else f"0x{value:X}"
 
 
+CHANGED = "its configuration was changed "
+
+
 class ConfigurationMismatch(NamedTuple):
     """What a reading has shown: with `changed`, the node is not to be used before a new boot; else it is only told."""
 
@@ -287,7 +290,7 @@ class ConfigurationWatch:
         assert check.expected is not None
         text = f"{check.index:04X}h:{check.subindex}: expected {check.text(check.expected)}, found {found}"
         if check is not self._signature:
-            return ConfigurationMismatch(True, f"its configuration was changed ({text})")
+            return ConfigurationMismatch(True, f"{CHANGED}({text})")
         self._signature, self._position = None, 0
         return ConfigurationMismatch(False, f"its configuration was written to by somebody else ({text})")
 
@@ -465,7 +468,7 @@ class NodeCare:
             self._say("boot", node, f"node {node}: {finding.text}")
             return
         del self._checks[node]
-        self.changed[node] = finding.text
+        self.changed[node] = finding.text.removeprefix(CHANGED)
         self._reader.note_doubt(node)
         self._returning.request(node, finding.text)
 

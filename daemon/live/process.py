@@ -136,7 +136,12 @@ class LiveStream:
         slots = missed - (missed if self._missed is None else self._missed)
         self._missed = missed
         if slots > 0:
-            made += self.note(schemas.SLOTS_MISSED, f"the loop missed {slots} slots", _WARN, count=slots)
+            made += self.note(
+                schemas.SLOTS_MISSED,
+                f"the loop missed {slots} {'slot' if slots == 1 else 'slots'}",
+                _WARN,
+                count=slots,
+            )
         return made
 
     def notices(self, news: Iterable[Notice]) -> list[Message]:

@@ -249,7 +249,7 @@ class Recording:
         before, self.missed = self.missed, missed
         if before is not None and missed > before:
             count = missed - before
-            text = f"the loop missed {count} slots"
+            text = f"the loop missed {count} {'slot' if count == 1 else 'slots'}"
             self.journal.note(schemas.SLOTS_MISSED, text, level=WARN, count=count)
 
     def lose(self, count: int, time_ns: int) -> None:

@@ -116,10 +116,16 @@ _ROWS = (
         emcy=Emcy(0xFF02, _MANUFACTURER),
     ),
     Definition(
-        "drive_fault", JOINT, ERROR, "{}", "drive not in fault any more", topic="fault", hold_s=_HOLD_S
+        "drive_fault",
+        JOINT,
+        ERROR,
+        "the drive reports {}",
+        "drive not in fault any more",
+        topic="fault",
+        hold_s=_HOLD_S,
     ),
-    Definition("drive_off", JOINT, INFO, "{}", logged=False),
-    Definition("degraded", JOINT, INFO, "{}", logged=False),
+    Definition("drive_off", JOINT, INFO, "the drive carries no current: {}", logged=False),
+    Definition("degraded", JOINT, INFO, "the network is not alone in charge: {}", logged=False),
     Definition(
         "deviation",
         JOINT,
@@ -151,13 +157,13 @@ _ROWS = (
         "node_changed",
         NODE,
         WARNING,
-        "{}",
+        "its configuration was changed {}",
         topic="boot",
         emcy=Emcy(0xFF03, _MANUFACTURER),
     ),
     Definition("node_absent", NODE, WARNING, "optional node, not there", topic="boot", logged=False),
-    Definition("node_unconfigured", NODE, WARNING, "{}", topic="boot", logged=False),
-    Definition("node_not_operational", NODE, WARNING, "{}", topic="heartbeat", logged=False),
+    Definition("node_unconfigured", NODE, WARNING, "not used: {}", topic="boot", logged=False),
+    Definition("node_not_operational", NODE, WARNING, "its state is {}", topic="heartbeat", logged=False),
     Definition("node_error", NODE, WARNING, "reports {}", topic="emcy", logged=False),
     Definition(
         "pdo_timeout",
@@ -240,7 +246,7 @@ _ROWS = (
     Definition(
         "stolen_time", MACHINE, INFO, "a hypervisor takes processor time away", topic="machine", logged=False
     ),
-    Definition("not_granted", MACHINE, WARNING, "{}", topic="machine", logged=False),
+    Definition("not_granted", MACHINE, WARNING, "not granted: {}", topic="machine", logged=False),
 )
 CATALOGUE: Final = {row.name: row for row in _ROWS}
 

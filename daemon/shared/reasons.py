@@ -64,7 +64,7 @@ def joint_reason(about: About, number: int, view: View, earlier: View) -> str:
         case st.STALE:
             reason = _stale(about, joint, seen, view, earlier)
         case st.OFF | st.DRIVE_FAULT:
-            reason = drive_reason(joint.node, seen)
+            reason = f"drive {joint.node}: {drive_reason(seen)}"
         case st.STARTING if view.cycle <= _FIRST_CYCLES:
             reason = "the first cycles"
         case st.STARTING:
@@ -94,10 +94,10 @@ def drive_state(statusword: int) -> str:
     return _DRIVE_STATES.get(_state_bits(statusword), f"statusword {statusword:04X}h")
 
 
-def drive_reason(node: int, seen: JointView) -> str:
+def drive_reason(seen: JointView) -> str:
     """Explain status 0 (off) or 5 (drive fault) by the drive's state."""
     word = seen.statusword
-    state = f"drive {node}: {drive_state(word)} (6041h {word:04X}h)"
+    state = f"{drive_state(word)} (6041h {word:04X}h)"
     now = _STATUS_OF_STATE.get(_state_bits(word), st.OFF)
     return state if now == seen.status else f"{state}; {_HELD}"
 

@@ -304,7 +304,7 @@ class Health:
         joins = bool(seen.latched & ~joint.latched)
         conditions.update("fault_latched", subject, seen.latched != 0, now_s, latched, log_again=joins)
         joint.faults, joint.latched = present, seen.latched
-        drive = partial(drive_reason, joint.node, seen)
+        drive = partial(drive_reason, seen)
         conditions.update("drive_fault", subject, seen.status == st.DRIVE_FAULT, now_s, drive)
         conditions.update("drive_off", subject, seen.status == st.OFF, now_s, drive)
         why = partial(degraded_reason, seen, limit_nm)

@@ -305,7 +305,7 @@ class Supervisor:
         for line in running["refused"]:
             self._say(f"not granted: {line}", WARNING)
         if running["refused"]:
-            text = "not granted: " + "; ".join(running["refused"])
+            text = "; ".join(running["refused"])
             self._conditions.update("not_granted", THE_MACHINE, True, time.monotonic(), text)
         reader = SnapshotReader(self._snapshot, supervisor=True)
         self._tell.notices = Notices(self._directory / NOTICES)

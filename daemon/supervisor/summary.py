@@ -12,8 +12,8 @@ from jtqd.daemon.shared.notices import INFO
 from jtqd.daemon.shared.snapshot import SnapshotReader
 
 _AGES = (
-    "              (estimate and sensor of the same cycle: a fused estimate is about 5 ms old by then, and the RMSE\n"
-    "              includes what that delay costs)"
+    "              (estimate and sensor reading of the same cycle; the estimate is filtered and about 5 ms old by then,\n"
+    "              which this RMSE includes)"
 )
 _REFUSED = ("overruns", "latches", "latch_resets")
 """Counters beside those of the faults (docs/safety.md)."""

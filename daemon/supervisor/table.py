@@ -109,11 +109,15 @@ def loop_line(reader: SnapshotReader, previous: View, view: View, bitrate: int) 
 
 def plain_line(reader: SnapshotReader, previous: View, view: View, bitrate: int) -> str:
     """The same for a log: one line without control characters."""
-    joints = "  ".join(
-        f"joint {n} {_number(joint.torque_nm)} Nm +- {_number(joint.sigma_nm)} {NAMES.get(joint.status, joint.status)}"
-        for n, joint in enumerate(view.joints, start=1)
-    )
+    joints = "  ".join(f"joint {n} {_plain(joint)}" for n, joint in enumerate(view.joints, start=1))
     return f"{joints}  {loop_line(reader, previous, view, bitrate)}"
+
+
+def _plain(joint: JointView) -> str:
+    name = NAMES.get(joint.status, str(joint.status))
+    if joint.status not in PUBLISHED:
+        return name
+    return f"{name} {_number(joint.torque_nm)} +- {_number(joint.sigma_nm)} Nm"
 
 
 def _number(value: float) -> str:

@@ -154,7 +154,7 @@ def test_lines_where_there_is_no_terminal(tmp_path: Path) -> None:
     lines = [process.stdout.readline() for _ in range(2)]
     process.terminate()
     process.communicate()
-    assert all(line.startswith("joint 1 -117.94 Nm +- 0.48 valid") for line in lines)
+    assert all(line.startswith("joint 1 valid -117.94 +- 0.48 Nm") for line in lines)
     assert not any("\x1b" in line for line in lines)
 
 

@@ -1,9 +1,11 @@
 """The set of conditions: few lines however much happens, the file, and the catalogue."""
 
+import re
 from itertools import pairwise
 
 from jtqd.daemon.shared.conditions import (
     CATALOGUE,
+    SEVERITIES,
     Conditions,
     ConditionsFile,
     Subject,
@@ -11,8 +13,10 @@ from jtqd.daemon.shared.conditions import (
     worst,
 )
 from jtqd.drivers import emcy
+from tests.paths import ROOT
 
 JOINT = Subject("joint 1", 1, 1)
+FAULTS = ROOT / "docs" / "faults.md"
 KNOWN_CODES = {
     value for name, value in vars(emcy).items() if name.isupper() and isinstance(value, int) and value > 0xFF
 }
@@ -131,3 +135,18 @@ def test_the_file_shows_what_is_present_the_worst_first(tmp_path):
     assert worst(found, "joint 2") is None
     (tmp_path / "conditions.json").write_text('{"schema": "jtqd.conditions/1", "conditions": [{}]}')
     assert read_conditions(tmp_path) == []
+
+
+def test_every_condition_is_in_the_table_of_the_docs():
+    rows = re.findall(
+        r"^\| `(\w+)` \| (\w+) \| (\w+) \| (.*) \| (\w*) \| (yes)? ?\|$", FAULTS.read_text(), re.M
+    )
+    assert {row[0]: (row[1], row[2], row[4], bool(row[5])) for row in rows} == {
+        each.name: (
+            each.about,
+            SEVERITIES[each.severity],
+            f"{each.emcy.code:04X}h" if each.emcy else "",
+            each.logged,
+        )
+        for each in CATALOGUE.values()
+    }
