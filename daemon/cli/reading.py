@@ -27,6 +27,34 @@ from jtqd.daemon.supervisor.health import stale_cause
 from jtqd.estimator import status as st
 
 _SHARED = ("/dev/shm", "/run/jtqd/*", "/run/user/*")
+NMT_STATES = {0: "boot-up", 4: "stopped", 5: "operational", 127: "pre-operational"}
+"""Heartbeat states of CiA 301."""
+SILENT_AFTER = 3.0
+"""Heartbeat periods without a heartbeat after which a node is silent."""
+_FIRST_CYCLES = 20
+_HELD = "held until enough cycles in a row were good"
+"""Hysteresis of `daemon/loop/joint_status.py`."""
+_STATE_WORD = {
+    0x00: "not ready to switch on",
+    0x40: "switch on disabled",
+    0x21: "ready to switch on",
+    0x23: "switched on, not enabled",
+    0x27: "operation enabled",
+    0x07: "quick stop active",
+    0x0F: "fault reaction active",
+    0x08: "fault",
+}
+STILL_S = 0.25
+"""A loop whose SYNC is older stands still; the snapshot is written every 8th cycle."""
+STARTING, RUNNING, STILL = "starting", "running", "still"
+_NOTICES = 20
+_PROCESS = {
+    "T": "stopped (SIGSTOP)",
+    "t": "stopped by a debugger",
+    "D": "waiting for the kernel",
+    "R": "busy",
+    "S": "asleep",
+}
 
 
 class Daemon(NamedTuple):
@@ -121,25 +149,6 @@ def _subdirectories(root: Path) -> list[Path]:
         return []
 
 
-NMT_STATES = {0: "boot-up", 4: "stopped", 5: "operational", 127: "pre-operational"}
-"""Heartbeat states of CiA 301."""
-SILENT_AFTER = 3.0
-"""Heartbeat periods without a heartbeat after which a node is silent."""
-_FIRST_CYCLES = 20
-_HELD = "held until enough cycles in a row were good"
-"""Hysteresis of `daemon/loop/joint_status.py`."""
-_STATE_WORD = {
-    0x00: "not ready to switch on",
-    0x40: "switch on disabled",
-    0x21: "ready to switch on",
-    0x23: "switched on, not enabled",
-    0x27: "operation enabled",
-    0x07: "quick stop active",
-    0x0F: "fault reaction active",
-    0x08: "fault",
-}
-
-
 def drive_state(statusword: int) -> str:
     """State of a CiA 402 drive by its statusword (6041h)."""
     if statusword & 0x4F in (0x00, 0x40, 0x0F, 0x08):  # bit 5 does not count in these
@@ -213,19 +222,6 @@ def _degraded(joint: AboutJoint, seen: JointView) -> str:
     return "outside what the network was trained on: physics, with less or nothing of the network"
 
 
-STILL_S = 0.25
-"""A loop whose SYNC is older stands still; the snapshot is written every 8th cycle."""
-STARTING, RUNNING, STILL = "starting", "running", "still"
-_NOTICES = 20
-_PROCESS = {
-    "T": "stopped (SIGSTOP)",
-    "t": "stopped by a debugger",
-    "D": "waiting for the kernel",
-    "R": "busy",
-    "S": "asleep",
-}
-
-
 @dataclass(frozen=True)
 class CurrentLog:
     """What the recorder has left so far."""
@@ -257,21 +253,21 @@ class Reading:
     """Quantiles 0.5, 0.99 and 1."""
     log: CurrentLog | None = None
     notices: tuple[Notice, ...] = ()
-    """The last lines that the daemon had to say about the bus."""
+    """The daemon's last notices about the bus."""
 
 
 class Watch:
-    """Looks at one daemon again and again."""
+    """Reads one daemon again and again."""
 
     def __init__(self, daemon: Daemon) -> None:
         self.daemon = daemon
         self._reader: SnapshotReader | None = None
         self._earlier: View | None = None
-        self._said: NoticesReader | None = None
+        self._notices_reader: NoticesReader | None = None
         self._notices: deque[Notice] = deque(maxlen=_NOTICES)
 
     def read(self) -> Reading:
-        """How it is now."""
+        """Read its state now."""
         view = self._view()
         if view is None:
             return Reading(self.daemon, STARTING, "its nodes are being booted", None, None)
@@ -289,16 +285,16 @@ class Watch:
             _three(self._reader.work_us(0.5, 0.99, 1.0)),
             _three(self._reader.late_us(0.5, 0.99, 1.0)),
             _log(self.daemon),
-            self._news(),
+            self._read_notices(),
         )
 
-    def _news(self) -> tuple[Notice, ...]:
-        if self._said is None:
+    def _read_notices(self) -> tuple[Notice, ...]:
+        if self._notices_reader is None:
             try:
-                self._said = NoticesReader(self.daemon.directory / NOTICES)
+                self._notices_reader = NoticesReader(self.daemon.directory / NOTICES)
             except NoticesError:
                 return ()
-        self._notices.extend(self._said.read()[0])
+        self._notices.extend(self._notices_reader.read()[0])
         return tuple(self._notices)
 
     def _view(self) -> View | None:
