@@ -36,6 +36,15 @@ _LOG_FREE = 10 << 30
 """A working day of recording."""
 _SHM_FREE = 64 << 20
 _BYTES_AN_HOUR = 1.1e9
+SCHEMA = "jtq.doctor/1"
+_EXAMPLES = """examples:
+  jtq doctor                                          this machine, all its CAN interfaces, the shipped configuration
+  jtq doctor --bus can0 --config /etc/jtqd/can0.yaml
+  sudo -u jtqd jtq doctor --bus can0                  as the user that jtqd runs as: rights are those of the caller
+  jtq doctor --json | jq '.items[] | select(.level == "FAIL")'
+
+exit status: 0 all good, 3 warnings, 1 failures, 2 usage"""
+_USUAL_LOGS = Path("/var/log/jtqd")
 
 
 def check_files(config: Config) -> Iterator[CheckResult]:
@@ -188,17 +197,6 @@ def check_leftovers(log: Path | None, search: DaemonSearch) -> Iterator[CheckRes
             ", ".join(map(str, search.left_over)),
             "of daemons that were killed; the next start on the same bus takes it over, or remove it",
         )
-
-
-SCHEMA = "jtq.doctor/1"
-_EXAMPLES = """examples:
-  jtq doctor                                          this machine, all its CAN interfaces, the shipped configuration
-  jtq doctor --bus can0 --config /etc/jtqd/can0.yaml
-  sudo -u jtqd jtq doctor --bus can0                  as the user that jtqd runs as: rights are those of the caller
-  jtq doctor --json | jq '.items[] | select(.level == "FAIL")'
-
-exit status: 0 all good, 3 warnings, 1 failures, 2 usage"""
-_USUAL_LOGS = Path("/var/log/jtqd")
 
 
 def parser() -> argparse.ArgumentParser:

@@ -30,6 +30,11 @@ _LOCKED_BYTES = 256 << 20
 _SLOW_CLOCK_NS = 1_000
 _GOOD_CLOCKS = ("tsc", "arch_sys_counter", "kvm-clock", "hyperv_clocksource_tsc_page")
 _SYS = Path("/sys/devices/system")
+_NET = Path("/sys/class/net")
+_ARPHRD_CAN = "280"
+_QUEUE = 100
+"""Frames; the default of 10 overflows when one cycle meets SDO traffic."""
+_COUNTED = ("error_warning", "error_passive", "bus_off")
 
 
 def check_kernel(wanted: Realtime, *, can: bool) -> Iterator[CheckResult]:
@@ -226,13 +231,6 @@ def _governor() -> CheckResult:
     return CheckResult(
         "cpufreq", WARN, text, "cpupower frequency-set -g performance: a slow clock makes a cycle long"
     )
-
-
-_NET = Path("/sys/class/net")
-_ARPHRD_CAN = "280"
-_QUEUE = 100
-"""Frames; the default of 10 overflows when one cycle meets SDO traffic."""
-_COUNTED = ("error_warning", "error_passive", "bus_off")
 
 
 def interfaces() -> list[str]:

@@ -21,6 +21,17 @@ from jtqd.daemon.shared.runtime_dir import FILE, About, AboutError, read_about
 from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader, View
 
 _SHARED = ("/dev/shm", "/run/jtqd/*", "/run/user/*")
+STILL_S = 0.25
+"""A loop whose SYNC is older stands still; the snapshot is written every 8th cycle."""
+STARTING, RUNNING, STILL = "starting", "running", "still"
+_NOTICES = 20
+_PROCESS = {
+    "T": "stopped (SIGSTOP)",
+    "t": "stopped by a debugger",
+    "D": "waiting for the kernel",
+    "R": "busy",
+    "S": "asleep",
+}
 
 
 class Daemon(NamedTuple):
@@ -115,19 +126,6 @@ def _subdirectories(root: Path) -> list[Path]:
         return []
 
 
-STILL_S = 0.25
-"""A loop whose SYNC is older stands still; the snapshot is written every 8th cycle."""
-STARTING, RUNNING, STILL = "starting", "running", "still"
-_NOTICES = 20
-_PROCESS = {
-    "T": "stopped (SIGSTOP)",
-    "t": "stopped by a debugger",
-    "D": "waiting for the kernel",
-    "R": "busy",
-    "S": "asleep",
-}
-
-
 @dataclass(frozen=True)
 class CurrentLog:
     """What the recorder has left so far."""
@@ -159,21 +157,21 @@ class Reading:
     """Quantiles 0.5, 0.99 and 1."""
     log: CurrentLog | None = None
     notices: tuple[Notice, ...] = ()
-    """The last lines that the daemon had to say about the bus."""
+    """The daemon's last notices about the bus."""
 
 
 class Watch:
-    """Looks at one daemon again and again."""
+    """Reads one daemon again and again."""
 
     def __init__(self, daemon: Daemon) -> None:
         self.daemon = daemon
         self._reader: SnapshotReader | None = None
         self._earlier: View | None = None
-        self._said: NoticesReader | None = None
+        self._notices_reader: NoticesReader | None = None
         self._notices: deque[Notice] = deque(maxlen=_NOTICES)
 
     def read(self) -> Reading:
-        """How it is now."""
+        """Read its state now."""
         view = self._view()
         if view is None:
             return Reading(self.daemon, STARTING, "its nodes are being booted", None, None)
@@ -191,16 +189,16 @@ class Watch:
             _three(self._reader.work_us(0.5, 0.99, 1.0)),
             _three(self._reader.late_us(0.5, 0.99, 1.0)),
             _log(self.daemon),
-            self._news(),
+            self._read_notices(),
         )
 
-    def _news(self) -> tuple[Notice, ...]:
-        if self._said is None:
+    def _read_notices(self) -> tuple[Notice, ...]:
+        if self._notices_reader is None:
             try:
-                self._said = NoticesReader(self.daemon.directory / NOTICES)
+                self._notices_reader = NoticesReader(self.daemon.directory / NOTICES)
             except NoticesError:
                 return ()
-        self._notices.extend(self._said.read()[0])
+        self._notices.extend(self._notices_reader.read()[0])
         return tuple(self._notices)
 
     def _view(self) -> View | None:

@@ -48,6 +48,32 @@ from jtqd.daemon.supervisor.table import COLOURS, bus_load, plain_line
 from jtqd.estimator.status import NAMES, PUBLISHED
 
 SCHEMA = "jtq.status/1"
+_HEAD = "bold"
+_HEADING = 9
+"""Width of the headings of lines."""
+_FAULTS = (
+    "stale_inputs",
+    "published_late",
+    *BUS_COUNTERS,
+    "network_fallbacks",
+    "overruns",
+    "latches",
+)
+"""Counters shown when they are not zero."""
+_OPERATIONAL = 5
+_LAST_NOTICES = 4
+_EXAMPLES = """examples:
+  jtq status                     live view of the daemon that runs here; Ctrl-C ends the view
+  jtq status --bus can0          of the one on can0, where there are several
+  jtq status --once              one picture, also into a file or a mail
+  jtq status --json | jq '.joints[].torque_nm'
+
+exit status: 0 it runs, 1 no daemon runs (or none that you may look at), 2 usage, 3 it does not advance, or is still starting
+what you may look at: your own daemons, and those whose group you are in (usermod -a -G jtqd YOU)"""
+_PERIOD_S = 0.2
+_PLAIN_PERIOD_S = 1.0
+_BETWEEN_S = 0.3
+"""Between the two readings of one picture: bus load and causes need what has changed."""
 
 
 def content(reading: Reading) -> dict[str, Any]:
@@ -162,22 +188,6 @@ def _quantiles(values: tuple[float, float, float]) -> dict[str, float | None]:
 
 def _number(value: float) -> float | None:
     return value if isfinite(value) else None
-
-
-_HEAD = "bold"
-_HEADING = 9
-"""Width of the headings of lines."""
-_FAULTS = (
-    "stale_inputs",
-    "published_late",
-    *BUS_COUNTERS,
-    "network_fallbacks",
-    "overruns",
-    "latches",
-)
-"""Counters shown when they are not zero."""
-_OPERATIONAL = 5
-_LAST_NOTICES = 4
 
 
 class StatusView:
@@ -408,20 +418,6 @@ def clock() -> RenderableType:
     return Padding(
         Text(time.strftime("%H:%M:%S  Ctrl-C ends this view; jtqd goes on"), style="dim"), (1, 0, 0, 0)
     )
-
-
-_EXAMPLES = """examples:
-  jtq status                     live view of the daemon that runs here; Ctrl-C ends the view
-  jtq status --bus can0          of the one on can0, where there are several
-  jtq status --once              one picture, also into a file or a mail
-  jtq status --json | jq '.joints[].torque_nm'
-
-exit status: 0 it runs, 1 no daemon runs (or none that you may look at), 2 usage, 3 it does not advance, or is still starting
-what you may look at: your own daemons, and those whose group you are in (usermod -a -G jtqd YOU)"""
-_PERIOD_S = 0.2
-_PLAIN_PERIOD_S = 1.0
-_BETWEEN_S = 0.3
-"""Between the two readings of one picture: bus load and causes need what has changed."""
 
 
 def parser() -> argparse.ArgumentParser:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from jtqd import __version__
 from jtqd.daemon.config import load_config
 from tests.paths import ROOT
 from tests.systemd.systemd_wheels import runtime_distributions
@@ -96,6 +97,18 @@ def test_the_installer_installs_every_file_of_the_folder() -> None:
     )
     assert wrong.returncode == 2
     assert "unknown argument --frobnicate" in wrong.stderr
+
+
+def test_the_installer_asks_the_installed_package() -> None:
+    """The lines of Python in the script, run as they stand there."""
+    script = (UNITS / "install.sh").read_text()
+    answers = [
+        subprocess.run(
+            [sys.executable, "-c", line], cwd="/", capture_output=True, text=True, check=True
+        ).stdout.strip()
+        for line in re.findall(r"-c '(import jtqd[^']*)'", script)
+    ]
+    assert [Path(answers[0]).resolve(), answers[1]] == [ROOT / "models", __version__]
 
 
 def test_the_installer_gives_a_service_a_budget_for_its_logs(tmp_path: Path) -> None:
