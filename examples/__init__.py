@@ -1,1 +1,6 @@
-"""TODO."""
+"""Examples: run each as `python -m examples.NAME --help`.
+
+hidden_effect     an effect is hidden in the emulated bench, found by a campaign and a diagnosis, and jtqd's gain is measured
+kinova_diagnosis  the diagnosis of the seven joints of a measured arm, with the figures of docs/measured_diagnosis.md
+receive_estimate  receive the estimate PDO with python-can; receive_estimate.c does the same in C on SocketCAN
+"""

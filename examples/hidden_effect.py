@@ -1,4 +1,13 @@
-"""Files of the hidden-effect run: the secret bench, jtqd's configurations, the plans. docs/diagnosis.md says what it is for.
+"""Hide an effect in the emulated bench, find it over the bus, and measure what the extended model gains in jtqd.
+
+    python -m examples.hidden_effect --effect torque_constant --out DIR
+    python -m jtqd.sim_can.bench_kernel run --time-travel --out DIR -- \\
+        python -m examples.hidden_effect --effect torque_constant --bus sim:vcan0 --out DIR
+
+A secret plant file -> `jtq campaign` on the bench that it makes -> `jtq diagnose` with the nominal joint files -> jtqd
+with the nominal and with the extended joint files on fresh motions of the same bench -> `jtq diagnose` once more, with
+the extended files. Every step is a command of its own, printed before it runs; docs/diagnosis.md, "End to end over the
+bus".
 
 The secret bench differs from the nominal joint files by one effect of joint 1 alone; noise, drives and the days
 (`run_to_run`) are those of the campaign's bench. Its joints are otherwise what `jtq sim --plant` makes of their files.
@@ -39,10 +48,23 @@ from jtqd.sysid.runs.files import RunError, read_run, write_run
 
 NUMBERS: Final = (1, 2)
 SECRET_JOINT: Final = 1
+NAMES: Final = ("torque_constant", "torque_ripple", "kinematic_error")
 _PLANT: Final = "campaign_plant.yaml"
 _KT_LOW: Final = 0.94
 _FRESH_SEED: Final = 1000
 """Added to the seed: no motion of the fresh runs is one of the diagnosed runs."""
+_DRIVE_ON: Final = 0x27
+_DRIVE_MASK: Final = 0x6F
+NO_BUS: Final = "none"
+_FINDINGS: Final = 3
+_STDERR: Final = 2
+_METHODS: Final = ("efficiency", "tob")
+Row = tuple[str, float, float]
+"""Label of an error, and its value before and after [Nm]."""
+
+
+class StepError(RuntimeError):
+    """A command of the toolbox failed; the reason is in its log."""
 
 
 def nominal_file(number: int) -> Path:
@@ -60,9 +82,6 @@ def secrets(joint: Joint) -> Mapping[str, Effect]:
         Effect("kinematic_error", {"amplitude_rad": 1.0e-4, "order_per_motor_rev": 2.0, "phase_rad": 0.9}),
     )
     return {effect.name: effect for effect in made}
-
-
-NAMES: Final = ("torque_constant", "torque_ripple", "kinematic_error")
 
 
 def write_secret(directory: Path, name: str) -> Path:
@@ -114,24 +133,17 @@ def plans(runs: int, fresh: int, seconds: float, seed: int) -> tuple[Plan, Plan]
     )
 
 
-# Error of the estimate against the torque sensor: as jtqd published it, from its logs, or offline from run tables.
-
-
-_DRIVE_ON: Final = 0x27
-_DRIVE_MASK: Final = 0x6F
-
-
 def log_rmse(logs: Sequence[Path], number: int, settings: EstimatorSettings) -> float:
     """Return the RMSE [Nm] of what joint `number` published in all logs while its drive was on and the joint moved.
 
-    The sensor is filtered like the estimate. A joint that stands has an interval and no value, so it is not judged.
+    The sensor is filtered like the estimate. Standstill, where the estimate is an interval, does not count.
     Raises LogError.
     """
     return _rms([_log_errors(log, number, settings.bandwidth_rad_s) for log in logs], f"{number}")
 
 
 def table_rmse(tables: Sequence[RunTable], number: int, joint: Joint, settings: EstimatorSettings) -> float:
-    """Return the same of the whole-run estimate of run tables. Raises LogError."""
+    """Return the RMSE [Nm] of the whole-run estimate of run tables, in motion. Raises LogError."""
     errors = []
     for table in tables:
         columns = table.joint(number, joint.gear_ratio)
@@ -160,30 +172,6 @@ def _log_errors(log: Path, number: int, bandwidth_rad_s: float) -> FloatArray:
     return np.asarray(error[on & (state["status"] == VALID) & np.isfinite(error)], np.float64)
 
 
-# An effect hidden in the emulated bench, found over the bus, and what the extended model is then worth in jtqd.
-#
-#     python -m examples.hidden_effect --effect torque_constant --out DIR
-#     python -m jtqd.sim_can.bench_kernel run --time-travel --out DIR -- python -m examples.hidden_effect         --effect
-# torque_constant --bus sim:vcan0 --out DIR
-#
-# A secret plant file -> `jtq campaign` on the bench that it makes -> `jtq diagnose` with the nominal joint files -> jtqd
-# with the nominal and with the extended joint files on fresh motions of the same bench -> `jtq diagnose` once more, with
-# the extended files. Every step is a command of its own, printed before it runs. docs/diagnosis.md, "End to end over the
-# bus".
-
-
-NO_BUS: Final = "none"
-_FINDINGS: Final = 3
-_STDERR: Final = 2
-_METHODS: Final = ("efficiency", "tob")
-Row = tuple[str, float, float]
-"""What is judged, and its error before and after [Nm]."""
-
-
-class StepError(RuntimeError):
-    """A command of the toolbox failed; it has said why."""
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Run all steps and print the table; exit status 0 done, 1 failure, 2 usage."""
     options = _parser().parse_args(arguments)
@@ -191,19 +179,17 @@ def main(arguments: list[str] | None = None) -> int:
         options.out.mkdir(parents=True, exist_ok=True)
         result = run(options)
     except (StepError, ConfigError, RunError, LogError) as error:
-        print(f"hidden_effect_demo: {error}", file=sys.stderr)
+        print(f"hidden_effect: {error}", file=sys.stderr)
         return 1
     except OSError as error:
-        print(
-            f"hidden_effect_demo: {error.filename or options.out}: {error.strerror or error}", file=sys.stderr
-        )
+        print(f"hidden_effect: {error.filename or options.out}: {error.strerror or error}", file=sys.stderr)
         return 1
     print(json.dumps(result, indent=1) if options.json else "\n".join(lines(result)))
     return 0
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
-    """All steps; what they showed. Raises StepError, ConfigError, RunError, LogError, OSError."""
+    """Run all steps and return their results. Raises StepError, ConfigError, RunError, LogError, OSError."""
     out: Path = options.out
     nominal = {number: nominal_file(number) for number in NUMBERS}
     plant = write_secret(out / "secret", options.effect)
@@ -233,13 +219,13 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         "jtqd": {number: (before[number], after[number]) for number in NUMBERS},
         "method": options.method,
         "bus": options.bus,
-        "extended_on_the_same_runs": _said(again),
-        "extended_on_fresh_runs": _said(fresh_after),
+        "extended_on_the_same_runs": _verdict(again),
+        "extended_on_fresh_runs": _verdict(fresh_after),
     }
 
 
 def lines(result: Mapping[str, Any]) -> list[str]:
-    """The result as text: hidden, found, and errors before and after."""
+    """Return the result as text: hidden effect, diagnosis, and errors before and after."""
     hidden, gain = result["hidden"], result["gain"]
     values = ", ".join(f"{name} {value:.4g}" for name, value in hidden["parameters"].items())
     out = [
@@ -247,29 +233,29 @@ def lines(result: Mapping[str, Any]) -> list[str]:
         f"found   verdict {result['verdict']}",
     ]
     for cause in result["causes"]:
-        told = ", ".join(
+        parameters = ", ".join(
             f"{name} {each['value']:.4g}{_interval(each)}" for name, each in cause["parameters"].items()
         )
-        out.append(f"        {' or '.join(cause['class'])} of joint {cause['joint']}: {told}")
+        out.append(f"        {' or '.join(cause['class'])} of joint {cause['joint']}: {parameters}")
     where = "jtqd on fresh runs" if result["bus"] != NO_BUS else "estimator on fresh runs"
     rows: list[Row] = []
     if gain["rmse_before_nm"] is not None:
-        rows.append((f"promised: {gain['split']}", gain["rmse_before_nm"], gain["rmse_after_nm"]))
+        rows.append((f"diagnosis: {gain['split']}", gain["rmse_before_nm"], gain["rmse_after_nm"]))
     for number, balances in result["simulation"].items():
         rows += [
             (f"simulation on fresh runs: joint {number}, {b} balance", *both) for b, both in balances.items()
         ]
     rows += [(f"{where}: joint {n}, method {result['method']}", *both) for n, both in result["jtqd"].items()]
     wide = max(len(row[0]) for row in rows)
-    out += ["", f"{'error against the sensor, Nm rms':<{wide}}  before   after  taken away"]
-    out += [f"{what:<{wide}}  {b:6.3f}  {a:6.3f}  {_taken(b, a):10.3f}" for what, b, a in rows]
+    out += ["", f"{'error against the sensor, Nm rms':<{wide}}  before   after  reduced by"]
+    out += [f"{what:<{wide}}  {b:6.3f}  {a:6.3f}  {_reduction(b, a):>10}" for what, b, a in rows]
     out += ["", f"extended files, same runs:  {result['extended_on_the_same_runs']}"]
     out += [f"extended files, fresh runs: {result['extended_on_fresh_runs']}"]
     return out
 
 
 class _Bench:
-    """Where the motions take place: the secret bench on a bus, with jtqd; or without a bus, with the estimator alone."""
+    """The secret bench on a bus, with jtqd; or without a bus, with the estimator alone."""
 
     def __init__(self, options: argparse.Namespace, plant: Path) -> None:
         self._options = options
@@ -277,7 +263,7 @@ class _Bench:
         self._settings = EstimatorSettings(method=options.method)
 
     def play(self, plan: Plan, name: str, joints: Mapping[int, Path]) -> dict[int, float]:
-        """Play a plan into out/name while jtqd estimates with these joint files; its error per joint [Nm rms]."""
+        """Play a plan into out/name while jtqd estimates with these joint files; return its error per joint [Nm rms]."""
         out: Path = self._options.out / name
         if self._options.bus == NO_BUS:
             out.mkdir(exist_ok=True)
@@ -318,7 +304,7 @@ def _gap(findings: Mapping[str, Any], joint: int, balance: str) -> float:
     return math.nan
 
 
-def _said(findings: Mapping[str, Any]) -> str:
+def _verdict(findings: Mapping[str, Any]) -> str:
     names = ", ".join(f"{each['name']} of {each['joint']}" for each in findings["causes"])
     return f"{findings['verdict']}{f' ({names})' if names else ''}"
 
@@ -328,9 +314,8 @@ def _interval(value: Mapping[str, Any]) -> str:
     return "" if low is None or high is None or low == high else f" [{low:.4g}, {high:.4g}]"
 
 
-def _taken(before: float, after: float) -> float:
-    """Rms of what is gone: independent errors add in squares, so this can be compared where what is left differs."""
-    return math.copysign(math.sqrt(abs(before**2 - after**2)), before - after)
+def _reduction(before: float, after: float) -> str:
+    return f"{100.0 * (1.0 - after / before):.0f} %" if before > 0.0 else "-"
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -31,9 +31,15 @@ from jtqd.sysid.diagnosis.findings import Cause, Findings, Gap, Value, to_mappin
 from jtqd.sysid.report import figures as parts
 from jtqd.sysid.runs.files import ColumnMap, RunError, RunFile, read_run
 
+mpl.use("Agg")  # files only; a display is not needed
+
 RUNS: Final = ("opti_traj_testing1", "RunTrajectory1")
 JOINTS: Final = range(1, 8)
-BY: Final = "measured_diagnosis"
+BY: Final = "kinova_diagnosis"
+_RUN_COLOURS: Final = ("#7a4fa3", "#2a8a5a")
+_COLUMNS: Final = 3
+_SLOW_RAD_S: Final = 0.03
+"""Below it the direction of friction is not known, and the residual is not the model's fault."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +64,7 @@ def measured_runs() -> list[RunFile]:
 def one_encoder(table: RunTable) -> RunTable:
     """Return the run without motor positions, which the column map makes from the joint's: there is one encoder.
 
-    As a second encoder they would say that no joint ever twists under its load.
+    As a second encoder they would mean that no joint ever twists under its load.
     """
     joints = {number: replace(columns, motor_position_rad=None) for number, columns in table.joints.items()}
     return RunTable(table.time_s, joints)
@@ -84,8 +90,8 @@ def diagnose_all(numbers: Sequence[int] = JOINTS) -> list[Diagnosed]:
 def table_lines(results: Sequence[Diagnosed]) -> list[str]:
     """Return the results as the rows of a Markdown table."""
     lines = [
-        "| joint | verdict | gap: RMSE, noise floor [Nm] | causes (and what they cannot be told from) | "
-        "held-out RMSE before, after [Nm] |",
+        "| joint | verdict | gap: RMSE, noise floor [Nm] | causes (and effects indistinguishable from them) | "
+        "RMSE on runs left out before, after [Nm] |",
         "|---|---|---|---|---|",
     ]
     for one in results:
@@ -95,8 +101,8 @@ def table_lines(results: Sequence[Diagnosed]) -> list[str]:
 
 
 def run_lines(results: Sequence[Diagnosed]) -> list[str]:
-    """Return what is named as worth on each run left out, the rows of a Markdown table."""
-    lines = ["| joint | left out | joint file [Nm rms] | with what is named |", "|---|---|---|---|"]
+    """Return the error on each run left out, with and without the causes, as rows of a Markdown table."""
+    lines = ["| joint | left out | joint file [Nm rms] | with the causes |", "|---|---|---|---|"]
     for one in results:
         lines += [
             f"| {one.number} | {run.run} | {run.rmse_before_nm:.2f} | {run.rmse_after_nm:.2f} |"
@@ -152,7 +158,7 @@ def as_mapping(results: Sequence[Diagnosed], sha256: Mapping[str, str]) -> dict[
 
 
 def write(directory: Path, results: Sequence[Diagnosed], sha256: Mapping[str, str]) -> None:
-    """Write findings.json and report.html of each joint and the figures; says on standard error what. Raises OSError."""
+    """Write findings.json and report.html of each joint and the figures. Raises OSError."""
     from jtqd.sysid.diagnosis.report.page import render
 
     for one in results:
@@ -170,9 +176,9 @@ def write(directory: Path, results: Sequence[Diagnosed], sha256: Mapping[str, st
 def main(arguments: list[str] | None = None) -> int:
     """Command line; results on stdout, log on stderr. Exit status 0 done, 1 failure, 2 usage."""
     parser = argparse.ArgumentParser(
-        prog=f"python -m sysid.{BY}",
+        prog=f"python -m examples.{BY}",
         description="Diagnose the seven joints of the measured Kinova Gen3 arm and draw the figures of the docs page.",
-        epilog=f"example:\n  python -m sysid.{BY} --out measured_diagnosis",
+        epilog=f"example:\n  python -m examples.{BY} --out kinova_diagnosis",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where reports and figures go")
@@ -194,17 +200,6 @@ def main(arguments: list[str] | None = None) -> int:
     else:
         print("\n".join((*table_lines(results), "", *run_lines(results))))
     return 0
-
-
-# Figures of examples.kinova_diagnosis: what the simulation leaves over in time, and over the load.
-
-
-mpl.use("Agg")  # files only; a display is not needed
-
-_RUN_COLOURS: Final = ("#7a4fa3", "#2a8a5a")
-_COLUMNS: Final = 3
-_SLOW_RAD_S: Final = 0.03
-"""Below it the direction of friction is not known, and the residual is not the model's fault."""
 
 
 def draw_residuals(results: Sequence[Diagnosed], path: Path) -> None:

@@ -1,4 +1,4 @@
-"""`jtq excitation`: designs excitation runs and writes them as a plan, or compares the ways to get them."""
+"""`jtq excitation`: design excitation runs and write them as a plan for `jtq campaign`."""
 
 from __future__ import annotations
 
@@ -10,24 +10,18 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from jtqd.estimator.checked import ConfigError, count, natural, seconds
 from jtqd.estimator.joint import Joint
 from jtqd.models.files import load_joint, shipped
-from jtqd.sim_can.plant_file import load_plant
 from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Fourier, Plan, Rest, Run, check_plan
-from jtqd.sysid.excitation.compare import HEADING, JUDGES, Row, compare, deviation_ratio, table_lines, trial
 from jtqd.sysid.excitation.design import FINAL_RATE_HZ, STARTS, Design, design
 from jtqd.sysid.excitation.model import Bench, ExcitationLimits
 
-# Options of `jtq excitation`.
-
-
 EVALUATIONS: Final = 2000
-COMPARED_EVALUATIONS: Final = 4000
 LIMIT_OPTIONS: Final = {
     "velocity_rad_s": ("--velocity", "rad/s", "peak velocity, joint side"),
     "acceleration_rad_s2": ("--acceleration", "rad/s2", "peak acceleration, joint side"),
@@ -38,9 +32,7 @@ LIMIT_OPTIONS: Final = {
 }
 _EXAMPLES: Final = """examples:
   jtq excitation --out excitation.plan.yaml     then: jtq campaign excitation.plan.yaml --bus sim --out DIR
-  jtq excitation --count 4 --velocity 0.3 --seed 1 --json
-  jtq excitation --compare
-  jtq excitation --trial"""
+  jtq excitation --count 4 --velocity 0.3 --seed 1 --json"""
 
 
 def _positive(text: str) -> float:
@@ -57,12 +49,12 @@ def parser() -> argparse.ArgumentParser:
     """Options of `jtq excitation`."""
     made = argparse.ArgumentParser(
         prog="jtq excitation",
-        description="Design Fourier trajectories of velocity and driving current that tell the losses of a joint best "
-        "(genetic algorithm, D-optimality); --compare sets it beside other ways to find them.",
+        description="Design Fourier trajectories of velocity and driving current that determine the losses of a joint best "
+        "(differential evolution, D-optimality).",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    made.add_argument("--count", type=count, metavar="N", help="runs (default 8; --compare 1; --trial 4)")
+    made.add_argument("--count", type=count, metavar="N", help="runs (default 8)")
     made.add_argument(
         "--duration", type=seconds, default=20.0, metavar="S", help="length of a run (default 20)"
     )
@@ -72,7 +64,8 @@ def parser() -> argparse.ArgumentParser:
         "--evaluations",
         type=count,
         metavar="N",
-        help=f"motions a search tries (default {EVALUATIONS}; --compare {COMPARED_EVALUATIONS})",
+        default=EVALUATIONS,
+        help=f"motions a search tries (default {EVALUATIONS})",
     )
     made.add_argument(
         "--starts", type=count, metavar="N", help=f"searches per run, the best counts (default {STARTS})"
@@ -86,17 +79,6 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument(
         "--velocity-joint", type=int, choices=(1, 2), default=1, help="joint in velocity mode (default 1)"
-    )
-    made.add_argument(
-        "--compare", action="store_true", help="table of genetic algorithm, scipy's DE and random"
-    )
-    made.add_argument(
-        "--trial",
-        action="store_true",
-        help="fit designed and drawn runs on the emulated bench, and judge them",
-    )
-    made.add_argument(
-        "--seeds", type=count, metavar="N", help="with --compare and --trial: seeds to try (default 5)"
     )
     made.add_argument(
         "--out", type=Path, metavar="FILE", help="write the runs as a plan (jtq.plan/1) to this file"
@@ -116,46 +98,20 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def problem_of(options: argparse.Namespace) -> str:
-    """What is wrong with the combination of options; empty when nothing is."""
-    if options.compare and options.trial:
-        return "--trial does not go with --compare"
-    kind = "--compare" if options.compare else "--trial" if options.trial else ""
-    for name in ("out", "starts"):
-        if kind and getattr(options, name) is not None:
-            return f"--{name} does not go with {kind}"
-    if options.trial and options.velocity_joint != 1:
-        return "--velocity-joint 2 does not go with --trial, where joint 1 is in velocity mode"
-    if options.seeds is not None and not kind:
-        return "--seeds belongs to --compare and --trial"
-    return ""
-
-
 REST_S: Final = 1.0
-"""Before and after each motion; two in a row make the 2 s at rest of the paper's section III."""
+"""Rest before and after each motion; two in a row make the 2 s of the paper's section III."""
 
 
 def main(argv: list[str]) -> int:
-    """Design or compare; exit status 0 done, 1 failure, 2 usage."""
+    """Design the runs; exit status 0 done, 1 failure, 2 usage."""
     options = parser().parse_args(argv)
-    problem = problem_of(options)
-    if problem:
-        print(f"jtq excitation: {problem}", file=sys.stderr)
-        return 2
     try:
         limits = ExcitationLimits(
             **{one.name: getattr(options, one.name) for one in fields(ExcitationLimits)}
         )
-        joints = _joints(options)
-        if options.compare:
-            return _compare(options, limits, joints)
-        if options.trial:
-            return _trial(options, limits, joints)
-        return _design(options, limits, joints)
+        return _design(options, limits, _joints(options))
     except ConfigError as error:
         print(f"jtq excitation: {error}", file=sys.stderr)
-    except ImportError:
-        print("jtq excitation: scipy is not installed: pip install 'jtqd[train]'", file=sys.stderr)
     except OSError as error:
         print(f"jtq excitation: {error.filename or options.out}: {error.strerror or error}", file=sys.stderr)
     return 1
@@ -171,78 +127,8 @@ def _joints(options: argparse.Namespace) -> tuple[Joint, Joint]:
     return load_joint(one), load_joint(two)
 
 
-def _compare(options: argparse.Namespace, limits: ExcitationLimits, joints: tuple[Joint, Joint]) -> int:
-    number, seeds = options.count or 1, options.seeds or 5
-    evaluations = options.evaluations or COMPARED_EVALUATIONS
-    with _progress("comparing", number * seeds * (3 * evaluations + 1)) as advance:
-        rows = compare(
-            limits,
-            count=number,
-            duration_s=options.duration,
-            harmonics=options.harmonics,
-            seed=options.seed,
-            seeds=seeds,
-            evaluations=evaluations,
-            joints=joints,
-            on_progress=advance,
-        )
-    if options.json:
-        print(json.dumps(_rows_mapping(rows, options, limits)))
-        return 0
-    runs = "one run" if number == 1 else f"{number} runs together"
-    print(
-        f"-log det of the scaled information of {runs} of {options.duration:g} s: median, best, worst of {seeds} "
-        "seeds; lower is better.\nCondition of the scaled regressor; standard deviation of the coefficients "
-        "against the first row; processor seconds per design."
-    )
-    print("\n".join(table_lines(rows)))
-    return 0
-
-
-def _rows_mapping(
-    rows: tuple[Row, ...], options: argparse.Namespace, limits: ExcitationLimits
-) -> dict[str, Any]:
-    return {
-        "schema": "jtq.excitation_comparison/1",
-        "limits": asdict(limits),
-        "duration_s": options.duration,
-        "harmonics": options.harmonics,
-        "rows": [
-            {**asdict(row), "median": row.median, "deviation_ratio": deviation_ratio(row, rows[0])}
-            for row in rows
-        ],
-    }
-
-
-def _trial(options: argparse.Namespace, limits: ExcitationLimits, joints: tuple[Joint, Joint]) -> int:
-    number, seeds = options.count or 4, options.seeds or 5
-    with _progress("emulated runs", JUDGES + 2 * seeds * number) as advance:
-        trials, floor_nm = trial(
-            limits,
-            load_plant(shipped("plant.yaml")),
-            joints,
-            count=number,
-            duration_s=options.duration,
-            harmonics=options.harmonics,
-            seed=options.seed,
-            seeds=seeds,
-            evaluations=options.evaluations or EVALUATIONS,
-            on_progress=advance,
-        )
-    if options.json:
-        content = {"schema": "jtq.excitation_trial/1", "floor_nm": floor_nm}
-        print(json.dumps({**content, "trials": [asdict(one) for one in trials]}))
-        return 0
-    print(
-        f"error [Nm] of the loss on {JUDGES} drawn runs after a fit to so many others; median and worst of {seeds} "
-        f"seeds\n(fitted to the judging runs themselves: {floor_nm:.2f})"
-    )
-    print("\n".join([HEADING, *(one.line() for one in trials)]))
-    return 0
-
-
 def _design(options: argparse.Namespace, limits: ExcitationLimits, joints: tuple[Joint, Joint]) -> int:
-    number, evaluations = options.count or 8, options.evaluations or EVALUATIONS
+    number, evaluations = options.count or 8, options.evaluations
     if options.out is not None:
         _require_within_campaign(limits)
         options.out.parent.mkdir(parents=True, exist_ok=True)

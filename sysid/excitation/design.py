@@ -1,4 +1,4 @@
-"""Excitation trajectories for identification: Fourier coefficients chosen so that the runs tell the losses best.
+"""Design excitation runs: Fourier coefficients chosen so that the runs determine the losses best (D-optimality).
 
     designs = design(ExcitationLimits(), count=8, duration_s=20.0, seed=1)
     segment = designs[0].to_mapping()          # the `fourier` segment of a plan (schema jtq.plan/1)
@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
@@ -25,23 +24,15 @@ from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.excitation.fourier import MAX_HARMONICS, FourierSeries, FourierTrajectory
 from jtqd.sysid.excitation.model import Bench, Candidates, ExcitationLimits
 
-# A small genetic algorithm: (mu + lambda), tournaments, blend crossover, mutation that fades. Pure.
-#
-# Genomes are rows in the box [-1, 1]^d. Written for criteria that evaluate a whole generation at once and forgive nothing:
-# there are no penalties, the criterion makes its own genomes feasible.
-
-
 Criterion = Callable[[FloatArray], FloatArray]
-"""Values [m], lower is better, of genomes [m, d]; may be infinite, never NaN."""
+"""Values [m], lower is better, of genomes [m, d] in [-1, 1]; may be infinite, never NaN."""
 
 POPULATION: Final = 40
-TOURNAMENT: Final = 2
-BLEND: Final = 0.3
-"""How far beyond its parents a child may lie, in parts of their distance (BLX-alpha)."""
-MUTATION_START: Final = 0.3
-MUTATION_END: Final = 0.01
-MUTATION_RATE: Final = 0.3
-"""Standard deviation at the first and at the last generation, and the chance of each gene to be touched."""
+STRATEGY: Final = "randtobest1bin"
+MUTATION: Final = (0.3, 0.7)
+RECOMBINATION: Final = 0.9
+"""Of the differential evolution (docs/excitation.md has the comparison). scipy's own settings take four times as many
+evaluations for a design as good."""
 
 
 class Found(NamedTuple):
@@ -51,63 +42,43 @@ class Found(NamedTuple):
     value: float
 
 
-def random_genomes(count: int, dimension: int, rng: np.random.Generator) -> FloatArray:
-    """Return `count` genomes, uniform in the box."""
-    return rng.uniform(-1.0, 1.0, (count, dimension))
-
-
 def minimise(criterion: Criterion, dimension: int, *, evaluations: int, rng: np.random.Generator) -> Found:
-    """Return the best of exactly `evaluations` genomes (>= 1); the same generator state gives the same result.
+    """Return the best genome of a search of at most `evaluations` (>= 1); the same generator state gives the same result.
 
-    Every generation makes as many children as there are parents; the best of both survive. A child is a random point of
-    the box that its two parents span, widened by BLEND on each side, then mutated.
+    Up to POPULATION evaluations the genomes are drawn uniformly, beyond it they evolve (scipy's differential evolution,
+    whole generations of POPULATION).
 
     Raises:
         ValueError: evaluations below 1.
+        ConfigError: scipy is needed and not installed.
     """
     if evaluations < 1:
-        raise ValueError(f"{evaluations} evaluations")
-    size = min(POPULATION, evaluations)
-    parents = random_genomes(size, dimension, rng)
-    values = criterion(parents)
-    done = size
-    while done < evaluations:
-        number = min(size, evaluations - done)
-        progress = done / evaluations
-        sigma = MUTATION_START * (MUTATION_END / MUTATION_START) ** progress
-        one, two = parents[_winners(values, number, rng)], parents[_winners(values, number, rng)]
-        share = rng.uniform(-BLEND, 1.0 + BLEND, (number, dimension))
-        touched = rng.random((number, dimension)) < MUTATION_RATE
-        noise = np.where(touched, rng.normal(0.0, sigma, (number, dimension)), 0.0)
-        children = np.clip(one + share * (two - one) + noise, -1.0, 1.0)
-        everyone = np.concatenate([parents, children])
-        all_values = np.concatenate([values, criterion(children)])
-        keep = np.argsort(all_values, kind="stable")[:size]
-        parents, values = everyone[keep], all_values[keep]
-        done += number
-    return Found(parents[0] if done > size else parents[int(np.argmin(values))], float(values.min()))
-
-
-def _winners(values: FloatArray, number: int, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Index of the best of TOURNAMENT random parents, `number` times."""
-    players = rng.integers(0, len(values), (number, TOURNAMENT))
-    best = np.argmin(values[players], axis=1)
-    winners: NDArray[np.intp] = players[np.arange(number), best]
-    return winners
-
-
-# How much runs tell about the losses of a joint: D-optimality of the loss as a linear model in (v, tau). Pure.
-#
-# The loss that is to be told apart, per direction of motion d and, in it, per quadrant (driving or back-driven):
-#
-#     loss = s (c_d + f_d |v| + q_d v^2 + p_d exp(-(v/0.05)^2))                            s = tanh(v/0.02)
-#          + s (k_dq |tau| + m_dq tau^2 + n_dq |tau| |v|)
-#
-# 20 columns. The estimator's own loss (estimator/losses.py) is finer in the load: lines between nodes. For a design the
-# few coefficients of a polynomial do better: they want the ends and the middle of every range, not a node's surroundings.
-#
-# Both joints are served by one and the same number: at the same instant the other joint has (-v, tau), which only changes
-# places and signs of the columns, and no determinant.
+        raise ValueError(f"found {evaluations} evaluations, expected at least 1")
+    first = rng.uniform(-1.0, 1.0, (min(POPULATION, evaluations), dimension))
+    generations = evaluations // POPULATION - 1
+    if generations < 1:
+        values = criterion(first)
+        best = int(np.argmin(values))
+        return Found(first[best], float(values[best]))
+    try:
+        from scipy.optimize import differential_evolution
+    except ImportError:
+        raise ConfigError("excitation design: scipy is not installed: pip install 'jtqd[train]'") from None
+    result = differential_evolution(
+        lambda genomes: criterion(genomes.T),
+        [(-1.0, 1.0)] * dimension,
+        strategy=STRATEGY,
+        mutation=MUTATION,
+        recombination=RECOMBINATION,
+        init=first,
+        maxiter=generations,
+        tol=0.0,  # no early end
+        polish=False,
+        updating="deferred",
+        vectorized=True,
+        rng=rng,
+    )
+    return Found(np.asarray(result.x), float(result.fun))
 
 
 STRIBECK_VELOCITY_RAD_S: Final = 0.05
@@ -119,6 +90,14 @@ gets a bad log det in place of an infinite one; that of a useful run changes by 
 
 def loss_regressor(velocity_rad_s: FloatArray, torque_nm: FloatArray) -> FloatArray:
     """Return the 20 columns of the loss model [..., 20] at velocities [rad/s] and joint torques [Nm] of one shape [...].
+
+    Per direction of motion d and, in it, per quadrant q (driving or back-driven), with s = tanh(v/0.02):
+
+        loss = s (c_d + f_d |v| + q_d v^2 + p_d exp(-(v/0.05)^2)) + s (k_dq |tau| + m_dq tau^2 + n_dq |tau| |v|)
+
+    The estimator's own loss (estimator/losses.py) is finer in the load: lines between nodes. For a design the few
+    coefficients of a polynomial do better: they ask for the ends and the middle of every range. At the same instant the
+    other joint has (-v, tau), which only changes places and signs of the columns: one determinant serves both joints.
 
     Order: direction positive, then negative; in each 4 columns of speed, 3 of load driving (tau v >= 0), 3 back-driven.
     """
@@ -221,25 +200,24 @@ def design(
         limits: what no run may exceed at any set-point of 1 kHz.
         count: number of runs, >= 1. duration_s: length of each, 1 to 600 s. harmonics: of velocity and of current.
         seed: the same arguments give the same runs.
-        evaluations: motions that each search tries, >= 1.
+        evaluations: most motions that each search tries, >= 1.
         starts: independent searches for each run, of which the best counts. None: 3, or 1 where there are so few
             evaluations that nothing would be searched but only drawn.
-        joints: velocity joint and driving joint; None: the two that ship. They tell which torque a current gives and
-            which current a motion takes.
+        joints: velocity joint and driving joint; None: the two that ship. They give the torque of a current and the
+            current of a motion.
         on_progress: called after each batch with the number of motions tried since the last call.
 
     Raises:
-        ConfigError: an argument is out of range.
+        ConfigError: an argument is out of range, or scipy is needed (more than one generation) and not installed.
     """
     if starts is None:
         starts = STARTS if evaluations > POPULATION else 1
     _check_range("count", count, 1, 1000)
     _check_range("evaluations", evaluations, 1, 10_000_000)
     _check_range("starts", starts, 1, 1000)
-    number = starts
 
     def search(criterion: Criterion, dimension: int, evaluations: int, rng: np.random.Generator) -> Found:
-        generators = rng.spawn(number)
+        generators = rng.spawn(starts or 1)
         found = [minimise(criterion, dimension, evaluations=evaluations, rng=each) for each in generators]
         return min(found, key=lambda one: one.value)
 

@@ -1,17 +1,15 @@
-"""Comparison of searches, trial on the emulated bench, and the command `jtq excitation`."""
+"""The command `jtq excitation`, and its runs as segments of a plan."""
 
 import json
-import math
+import sys
 
 import numpy as np
 import pytest
 import yaml
 
-from jtqd.estimator.checked import ConfigError
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.campaign.plan import Plan, expand, load_plan
 from jtqd.sysid.excitation import command as excitation_command
-from jtqd.sysid.excitation.compare import compare, deviation_ratio, table_lines
 from jtqd.sysid.excitation.design import draw
 from jtqd.sysid.excitation.fourier import FourierSeries, FourierTrajectory
 from jtqd.sysid.excitation.model import ExcitationLimits
@@ -23,29 +21,6 @@ LIMITS = ExcitationLimits()
 def setpoints(one):
     time_s = np.arange(round(one.velocity.duration_s * 1000) + 1) * 1e-3
     return (time_s, *one.velocity.motion(time_s), one.current.value(time_s))
-
-
-def test_comparison_gives_every_method_the_same_evaluations():
-    seen = []
-    rows = compare(
-        LIMITS, count=1, duration_s=10.0, harmonics=3, seeds=2, evaluations=640, on_progress=seen.append
-    )
-    assert [row.evaluations for row in rows] == [640, 640, 640, 1]
-    spent = sum(seen) / 2
-    generation = 4 * 13
-    assert 3 * 640 + 1 - generation < spent <= 3 * 640 + 1
-    genetic, _, best, drawn = rows
-    assert genetic.median < best.median < drawn.median
-    assert deviation_ratio(genetic, genetic) == 1.0
-    assert deviation_ratio(best, genetic) == pytest.approx(math.exp((best.median - genetic.median) / 40.0))
-    lines = table_lines(rows)
-    assert len(lines) == 5
-    assert len({len(line) for line in lines}) == 1
-
-
-def test_comparison_refuses_a_budget_without_generations():
-    with pytest.raises(ConfigError, match="--evaluations: found 100, expected >= 252"):
-        compare(LIMITS, count=1, duration_s=10.0, evaluations=100)
 
 
 def test_segment_mapping_is_what_a_plan_reads(tmp_path):
@@ -87,38 +62,6 @@ def test_command_writes_a_plan_of_what_it_prints(tmp_path, capsys):
     assert len(capsys.readouterr().out.splitlines()) == 4
 
 
-def test_command_compares(capsys):
-    arguments = ["--compare", "--duration", "8", "--harmonics", "2", "--evaluations", "150", "--seeds", "2"]
-    assert excitation_command.main([*arguments, "--json"]) == 0
-    rows = json.loads(capsys.readouterr().out)["rows"]
-    assert [len(row["negative_log_det"]) for row in rows] == [2, 2, 2, 2]
-    assert excitation_command.main(arguments) == 0
-    assert "genetic algorithm" in capsys.readouterr().out
-
-
-def test_trial_judges_both_kinds_on_other_runs(capsys):
-    arguments = [
-        "--trial",
-        "--count",
-        "2",
-        "--duration",
-        "3",
-        "--evaluations",
-        "40",
-        "--seeds",
-        "1",
-        "--json",
-    ]
-    assert excitation_command.main(arguments) == 0
-    result = json.loads(capsys.readouterr().out)
-    assert [one["runs"] for one in result["trials"]] == [1, 2]
-    one, two = result["trials"]
-    assert one["drawn_nm"] != two["drawn_nm"]
-    assert one["designed_nm"] != one["drawn_nm"]
-    for one in result["trials"]:  # nothing fits the judging runs better than a fit to them
-        assert min(one["designed_nm"] + one["drawn_nm"]) > result["floor_nm"] > 0.1
-
-
 @pytest.mark.parametrize(
     ("arguments", "status", "message"),
     [
@@ -126,12 +69,6 @@ def test_trial_judges_both_kinds_on_other_runs(capsys):
         (["--velocity", "99", "--out", "plan.yaml"], 1, "--velocity: found 99, expected at most"),
         (["--joint-current", "99", "--out", "plan.yaml"], 1, "--joint-current: found 99, expected at most"),
         (["--joints", "none1.yaml", "none2.yaml"], 1, "none1.yaml: cannot be read"),
-        (["--compare", "--out", "plan.yaml"], 2, "--out does not go with --compare"),
-        (["--compare", "--starts", "2"], 2, "--starts does not go with --compare"),
-        (["--compare", "--trial"], 2, "--trial does not go with --compare"),
-        (["--trial", "--out", "plan.yaml"], 2, "--out does not go with --trial"),
-        (["--seeds", "2"], 2, "--seeds belongs to --compare and --trial"),
-        (["--compare", "--evaluations", "20"], 1, "--evaluations: found 20, expected >= 252"),
     ],
 )
 def test_command_refuses_in_one_line(arguments, status, message, capsys, tmp_path):
@@ -144,10 +81,11 @@ def test_command_refuses_in_one_line(arguments, status, message, capsys, tmp_pat
     assert not list(tmp_path.iterdir())
 
 
-def test_command_without_scipy_says_so(capsys, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "scipy.optimize", None)
-    assert excitation_command.main(["--compare"]) == 1
-    assert capsys.readouterr().err == ("jtq excitation: scipy is not installed: pip install 'jtqd[train]'\n")
+def test_command_without_scipy_refuses_in_one_line(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "scipy.optimize", None)
+    assert excitation_command.main(["--count", "1", "--evaluations", "100"]) == 1
+    said = capsys.readouterr().err
+    assert said == "jtq excitation: excitation design: scipy is not installed: pip install 'jtqd[train]'\n"
 
 
 @pytest.mark.parametrize("value", ["nan", "0", "-1", "many"])

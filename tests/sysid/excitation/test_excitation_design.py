@@ -1,6 +1,7 @@
 """Designed excitation: limits at every set-point, information by closed forms, and searches with equal budgets."""
 
 import math
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,6 @@ from jtqd.estimator.losses import LossModel
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant
-from jtqd.sysid.excitation import design as genetic
 from jtqd.sysid.excitation.design import (
     COLUMNS,
     POPULATION,
@@ -247,7 +247,7 @@ def test_condition_is_that_of_the_regressor():
 
 
 @pytest.mark.parametrize("evaluations", [1, 2, POPULATION - 1, POPULATION, POPULATION + 1, 1000])
-def test_search_uses_its_evaluations_and_returns_the_best_of_them(evaluations):
+def test_search_stays_within_its_evaluations_and_returns_the_best_of_them(evaluations):
     seen = []
 
     def criterion(genomes):
@@ -257,23 +257,34 @@ def test_search_uses_its_evaluations_and_returns_the_best_of_them(evaluations):
         return values
 
     found = minimise(criterion, 6, evaluations=evaluations, rng=np.random.default_rng(0))
-    assert len(seen) == evaluations
+    assert evaluations - POPULATION < len(seen) <= evaluations
     assert found.value == min(seen)
-    assert np.sum((found.genome - 0.3) ** 2) == found.value
+    assert np.sum((found.genome - 0.3) ** 2) == pytest.approx(found.value)
 
 
 def test_search_closes_in_on_a_minimum():
-    """Without mutation it freezes at 1e-2, without its fading at 2e-2; of random points 2000 come to 1."""
+    """Of random points 2000 come to 1."""
     for seed in range(5):
         rng = np.random.default_rng(seed)
         found = minimise(lambda g: np.sum((g - 0.3) ** 2, axis=1), 12, evaluations=2000, rng=rng)
-        assert found.value < 5e-4, f"seed {seed}"
+        assert found.value < 5e-3, f"seed {seed}"
 
 
-def test_better_parents_win_tournaments():
-    """The best of k out of values 0..999 has the mean 1000/(k + 1)."""
-    winners = genetic._winners(np.arange(1000.0), 20000, np.random.default_rng(0))
-    assert np.mean(winners) == pytest.approx(1000.0 / (genetic.TOURNAMENT + 1), rel=0.03)
+def test_a_search_needs_scipy_and_a_draw_does_not(monkeypatch):
+    monkeypatch.setitem(sys.modules, "scipy.optimize", None)
+    assert len(draw(LIMITS, count=1, duration_s=10.0)) == 1
+    with pytest.raises(ConfigError, match="scipy is not installed: pip install"):
+        design(LIMITS, **small())
+
+
+def test_a_design_is_better_than_the_best_of_as_many_draws():
+    """One run of 20 s, 2000 evaluations: about 57 against 65 in -log det."""
+    problem = Problem(LIMITS, duration_s=20.0, harmonics=5)
+    criterion = problem.criterion(np.zeros((1, 1)))
+    rng = np.random.default_rng(0)
+    drawn = min(criterion(rng.uniform(-1.0, 1.0, (200, problem.dimension))).min() for _ in range(10))
+    found = minimise(criterion, problem.dimension, evaluations=2000, rng=np.random.default_rng(0))
+    assert found.value < drawn - 4.0
 
 
 def test_search_without_evaluations_is_refused():

@@ -1,0 +1,104 @@
+"""Receive the torque estimate of jtqd with python-can and print it (docs/bus.md: estimate PDO of node 20h).
+
+    jtqd --bus unix:/tmp/bus ...     python -m examples.receive_estimate --bus unix:/tmp/bus
+    jtqd --bus vcan0 ...             python -m examples.receive_estimate --bus vcan0 --count 10
+
+On SocketCAN nothing of jtqd is needed; the unix bus needs it installed, for its python-can interface. A controller that
+acts on the torque must read docs/safety.md first: check status and sequence of every PDO, and time out without one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import struct
+import sys
+from typing import NamedTuple
+
+import can
+
+COB_ID = 0x1A0
+LAYOUT = struct.Struct("<hhBBBB")  # torque 1, torque 2, sigma 1, sigma 2, status of both, SYNC counter
+NO_TORQUE = -0x8000
+UNKNOWN_SIGMA = 255
+STATUS = {
+    0: "off",
+    1: "starting",
+    2: "valid",
+    3: "degraded",
+    4: "stale",
+    5: "drive_fault",
+    6: "standstill",
+    15: "invalid",
+}
+
+
+class JointEstimate(NamedTuple):
+    """One joint: torque and its standard deviation [Nm], None where the PDO has none; name of the status."""
+
+    torque_nm: float | None
+    sigma_nm: float | None
+    status: str
+
+
+def decode(data: bytes) -> tuple[JointEstimate, JointEstimate, int]:
+    """Decode the eight bytes: both joints, and the SYNC counter of their inputs. Raises struct.error on another length."""
+    torque_1, torque_2, sigma_1, sigma_2, status, sequence = LAYOUT.unpack(data)
+
+    def joint(torque: int, sigma: int, code: int) -> JointEstimate:
+        return JointEstimate(
+            None if torque == NO_TORQUE else 0.01 * torque,
+            None if sigma == UNKNOWN_SIGMA else 0.05 * sigma,
+            STATUS.get(code, f"unknown ({code})"),
+        )
+
+    return joint(torque_1, sigma_1, status & 0x0F), joint(torque_2, sigma_2, status >> 4), sequence
+
+
+def open_bus(name: str) -> can.BusABC:
+    """Open a SocketCAN interface, or the unix bus unix:PATH. Raises can.CanError, OSError."""
+    filters = [{"can_id": COB_ID, "can_mask": 0x7FF, "extended": False}]
+    if name.startswith("unix:"):
+        return can.Bus(interface="jtq_unix", channel=name.removeprefix("unix:"), can_filters=filters)
+    return can.Bus(interface="socketcan", channel=name, can_filters=filters)
+
+
+def line(joint: JointEstimate) -> str:
+    """Return one joint as text, e.g. "-7.75 Nm +- 0.20 valid"."""
+    torque = "   no torque" if joint.torque_nm is None else f"{joint.torque_nm:9.2f} Nm"
+    sigma = "?" if joint.sigma_nm is None else f"{joint.sigma_nm:.2f}"
+    return f"{torque} +- {sigma:>5}  {joint.status:<11}"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Print every estimate; exit status 0 after --count or Ctrl-C, 1 without bus or estimate."""
+    parser = argparse.ArgumentParser(
+        prog="python -m examples.receive_estimate",
+        description="Print the torque estimate that jtqd publishes.",
+    )
+    parser.add_argument("--bus", required=True, help="can0, vcan0 or unix:PATH")
+    parser.add_argument("--count", type=int, default=0, metavar="N", help="end after N estimates")
+    parser.add_argument("--timeout", type=float, default=1.0, metavar="S", help="longest pause (default 1)")
+    options = parser.parse_args(arguments)
+    received = 0
+    try:
+        with open_bus(options.bus) as bus:
+            while not options.count or received < options.count:
+                message = bus.recv(options.timeout)
+                if message is None:
+                    print(f"no estimate on {options.bus} for {options.timeout:g} s", file=sys.stderr)
+                    return 1
+                if message.arbitration_id != COB_ID or message.dlc != LAYOUT.size:
+                    continue
+                one, two, sequence = decode(bytes(message.data))
+                print(f"{sequence:3}  1: {line(one)}  2: {line(two)}".rstrip(), flush=True)
+                received += 1
+    except KeyboardInterrupt:
+        return 0
+    except (can.CanError, OSError) as error:
+        print(f"{options.bus}: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
