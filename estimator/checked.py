@@ -114,7 +114,7 @@ class Section:
         above: float | None = None,
     ) -> float:
         """Return a finite float in [low, high], and > `above`; bool, text, NaN and infinity are refused."""
-        expected = range_text("a number" + (f" in {unit}" if unit else ""), low, high, above)
+        expected = range_text("a number" + in_unit(unit), low, high, above)
         value = self._take(key, default, expected)
         if key not in self._mapping:
             return value  # type: ignore[no-any-return]  # the caller's own default, None included
@@ -137,7 +137,7 @@ class Section:
         default: Any = REQUIRED,
     ) -> int:
         """Return a whole number in [low, high]; 3.0, bool and text are refused."""
-        expected = range_text("a whole number" + (f" in {unit}" if unit else ""), low, high, None)
+        expected = range_text("a whole number" + in_unit(unit), low, high, None)
         value = self._take(key, default, expected)
         if key not in self._mapping:
             return value  # type: ignore[no-any-return]
@@ -218,6 +218,11 @@ def range_text(kind: str, low: float | None, high: float | None, above: float | 
     if above is not None:
         return f"{kind} > {_bound(above)}" + (f" and <= {_bound(high)}" if high is not None else "")
     return f"{kind} <= {_bound(high)}" if high is not None else kind
+
+
+def in_unit(unit: str) -> str:
+    """Return " in UNIT", nothing for a number without one."""
+    return f" in {unit}" if unit not in {"", "1"} else ""
 
 
 def _bound(value: float) -> str:

@@ -39,6 +39,7 @@ from jtqd.estimator.checked import (
     ConfigError,
     Section,
     Verbatim,
+    in_unit,
     number_as_text,
     range_text,
 )
@@ -250,12 +251,11 @@ def _field(name: str, hint: Any, optional: bool) -> _Field:
 
 def _expected(node: Any, unit: str) -> str:
     """Return what a message calls the values of a type."""
-    of_unit = f" in {unit}" if unit else ""
     if isinstance(node, inspect.FloatType | inspect.IntType):
         kind = "a number" if isinstance(node, inspect.FloatType) else "a whole number"
-        return range_text(kind + of_unit, node.ge, node.le, node.gt)
+        return range_text(kind + in_unit(unit), node.ge, node.le, node.gt)
     if isinstance(node, inspect.VarTupleType | inspect.TupleType):
         lengths = _lengths(node)
         count = f"{lengths[0]} " if len(lengths) == 1 else f"{lengths[0]} to {lengths[-1]} "
-        return f"a list of {count if len(lengths) < sys.maxsize else ''}finite numbers{of_unit}"
+        return f"a list of {count if len(lengths) < sys.maxsize else ''}finite numbers{in_unit(unit)}"
     return "true or false" if isinstance(node, inspect.BoolType) else "a text"

@@ -161,11 +161,11 @@ class FusedSigma:
 
     current_nm: Annotated[float, limits("Nm", gt=0.0)]
     viscous_nms_per_rad: Annotated[float, limits("Nms/rad", ge=0.0)]
-    load: Annotated[float, limits("1", ge=0.0)]
+    load: Annotated[float, limits(ge=0.0)]
     torsion_nm: Annotated[float, limits("Nm", gt=0.0)]
-    torsion_load: Annotated[float, limits("1", ge=0.0)]
+    torsion_load: Annotated[float, limits(ge=0.0)]
     reference_nm: Annotated[float, limits("Nm", ge=0.0)]
-    scale: Annotated[tuple[float, float, float, float], limits("1")]
+    scale: Annotated[tuple[float, float, float, float], limits()]
 
     def __post_init__(self) -> None:
         check(self, "fused.sigma")

@@ -1,4 +1,4 @@
-"""What differs from one day to the next: friction, temperature and the zeros of link encoders and sensor. Pure.
+"""Temperature of the emulated joints, and what differs from one day to the next: friction, temperature, zeros. Pure.
 
 A fit that is tested on the day it was made on looks better than it is. So the emulated bench has days: the
 values of day n come from a Kronecker sequence, frac(s_j + n α_j), which is uniform and spreads evenly even
@@ -10,54 +10,48 @@ from __future__ import annotations
 
 import math
 import random
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Annotated, Final, NamedTuple
 
 from jtqd.estimator.checked import Section
+from jtqd.estimator.decoder import decode, limits
 
-# Temperature of a joint: warmed by its own losses, cooled by its surroundings, felt by its friction. Pure.
-#
-#     T' = (T_ambient + R P - T) / τ          P: power of the losses [W]
-#     viscous share of the losses times exp(-b (T - T_ref)), Coulomb share times exp(-c (T - T_ref))
-#
-# One thermal mass, as the grease that carries the viscous friction has no thermometer of its own either. The
-# measured temperature is this one.
+REFERENCE_C: Final = 25.0
+UPDATE_S: Final = 0.1
+"""Of the temperature; with time constants of at least 10 s a step is below 1 % of any change."""
 
 
-REFERENCE_C = 25.0
-UPDATE_S = 0.1  # of the temperature; with time constants of at least 10 s a step is below 1 % of any change
+@dataclass(frozen=True, slots=True)
+class Thermal:
+    """Thermal behaviour of a joint (`thermal` of a plant file); the defaults are one that stays as it is.
 
+    reference_c: where the joint file's friction holds; ambient_c: surroundings of the nominal day.
+    """
 
-class Thermal(NamedTuple):
-    """Thermal behaviour of a joint (`thermal` of a plant file); the defaults are one that stays as it is."""
-
-    reference_c: float = REFERENCE_C  # where the joint file's friction holds
-    viscous_per_k: float = 0.0
-    coulomb_per_k: float = 0.0
-    kelvin_per_w: float = 0.0
-    time_constant_s: float = 600.0
-    ambient_c: float = REFERENCE_C  # surroundings of the nominal day
+    reference_c: Annotated[float, limits("degC", ge=-40.0, le=100.0)] = REFERENCE_C
+    viscous_per_k: Annotated[float, limits("1/K", ge=0.0, le=0.1)] = 0.0
+    coulomb_per_k: Annotated[float, limits("1/K", ge=0.0, le=0.1)] = 0.0
+    kelvin_per_w: Annotated[float, limits("K/W", ge=0.0, le=20.0)] = 0.0
+    time_constant_s: Annotated[float, limits("s", ge=10.0, le=1.0e5)] = 600.0
+    ambient_c: Annotated[float, limits("degC", ge=-40.0, le=100.0)] = REFERENCE_C
 
     @classmethod
-    def from_section(cls, section: Section | None) -> Thermal:
-        """Checked values; a joint without this section keeps its temperature. Raises ConfigError."""
-        if section is None:
-            return cls()
-        reference_c = section.number("reference_c", unit="degC", low=-40.0, high=100.0, default=REFERENCE_C)
-        thermal = cls(
-            reference_c=reference_c,
-            ambient_c=section.number("ambient_c", unit="degC", low=-40.0, high=100.0, default=reference_c),
-            viscous_per_k=section.number("viscous_per_k", unit="1/K", low=0.0, high=0.1, default=0.0),
-            coulomb_per_k=section.number("coulomb_per_k", unit="1/K", low=0.0, high=0.1, default=0.0),
-            kelvin_per_w=section.number("kelvin_per_w", unit="K/W", low=0.0, high=20.0, default=0.0),
-            time_constant_s=section.number("time_constant_s", unit="s", low=10.0, high=1.0e5, default=600.0),
-        )
-        section.finish()
-        return thermal
+    def from_section(cls, section: Section) -> Thermal:
+        """Read `thermal` of a plant file; surroundings left out are at the reference. Raises ConfigError."""
+        thermal = decode(cls, section)
+        if section.has("ambient_c"):
+            return thermal
+        return replace(thermal, ambient_c=thermal.reference_c)
 
 
 class JointTemperature:
-    """State of one joint. `viscous` and `coulomb` are the factors of the two shares at the present
-    temperature.
+    """Temperature T of one joint: warmed by its own losses, cooled by its surroundings, felt by its friction.
+
+        T' = (T_ambient + R P - T) / tau          P: power of the losses [W]
+        viscous share of the losses times exp(-b (T - T_ref)), Coulomb share times exp(-c (T - T_ref))
+
+    One thermal mass, as the grease that carries the viscous friction has no thermometer of its own either: the measured
+    temperature is this one. `viscous` and `coulomb` are the factors of the two shares at the present temperature.
     """
 
     __slots__ = ("_ambient", "_heat_j", "_thermal", "_time_s", "celsius", "coulomb", "viscous")
@@ -101,31 +95,24 @@ class JointTemperature:
 _PRIMES = (5, 17, 37, 97, 11, 53, 23)
 _STEPS = tuple(math.sqrt(prime) % 1.0 for prime in _PRIMES)
 
-# Day-to-day viscous changes must leave friction dissipative.
-_MOST_VISCOUS = 0.9
 
+@dataclass(frozen=True, slots=True)
+class RunToRun:
+    """Half widths of the uniform spread of each value over the days (`run_to_run` of a plant file).
 
-class RunToRun(NamedTuple):
-    """Half widths of the uniform spread of each value over the days (`run_to_run` of a plant file)."""
+    viscous: share of the file's viscous friction, below 1 so that friction stays dissipative; temperature_k: ambient
+    and start of the day against the joint's reference.
+    """
 
-    viscous: float = 0.0  # share of the file's viscous friction
-    sensor_zero_nm: float = 0.0
-    temperature_k: float = 0.0  # ambient and start of the day against the joint's reference
-    link_zero_rad: float = 0.0
+    viscous: Annotated[float, limits(ge=0.0, le=0.9)] = 0.0
+    sensor_zero_nm: Annotated[float, limits("Nm", ge=0.0)] = 0.0
+    temperature_k: Annotated[float, limits("K", ge=0.0, le=100.0)] = 0.0
+    link_zero_rad: Annotated[float, limits("rad", ge=0.0, le=0.1)] = 0.0
 
-    @classmethod
-    def from_section(cls, section: Section | None) -> RunToRun:
-        """Checked widths; all zero where the file has no such section. Raises ConfigError."""
-        if section is None:
-            return cls()
-        widths = cls(
-            viscous=section.number("viscous", unit="1", low=0.0, high=_MOST_VISCOUS, default=0.0),
-            sensor_zero_nm=section.number("sensor_zero_nm", unit="Nm", low=0.0, default=0.0),
-            temperature_k=section.number("temperature_k", unit="K", low=0.0, high=100.0, default=0.0),
-            link_zero_rad=section.number("link_zero_rad", unit="rad", low=0.0, high=0.1, default=0.0),
-        )
-        section.finish()
-        return widths
+    @property
+    def varies(self) -> bool:
+        """Whether one day differs from another."""
+        return self != RunToRun()
 
 
 class Day(NamedTuple):
@@ -142,7 +129,7 @@ NOMINAL_DAY = Day()
 
 def day(widths: RunToRun, seed: int, n: int) -> Day:
     """Day n = 0, 1, 2, ... of a bench with this seed; every value lies within its half width."""
-    if not any(widths):
+    if not widths.varies:
         return NOMINAL_DAY
     # a text as seed: the noise generator of the same seed must not give the same numbers
     start = random.Random(f"run to run {seed}")

@@ -322,7 +322,7 @@ class PlantSource:
         if mode != modes[drive]:
             if modes == [OFF, OFF] and not self._resumed:
                 self.plant.begin_run()
-                if self._ran and any(self._widths):
+                if self._ran and self._widths.varies:
                     self.day_number += 1
                     self.begin_day(day(self._widths, self._seed, self.day_number))
             modes[drive] = mode

@@ -220,7 +220,7 @@ def test_a_joint_in_a_warm_room_is_the_same_by_effect_and_by_thermal_behaviour()
     rates = {"viscous_per_k": 0.03, "coulomb_per_k": 0.01, "reference_c": 25.0}
     thermal = Thermal(ambient_c=40.0, kelvin_per_w=5.0, time_constant_s=10.0, **rates)
     warm = with_effects(JOINT, {"temperature_dependent_friction": rates})
-    only = thermal._replace(viscous_per_k=0.0, coulomb_per_k=0.0)
+    only = replace(thermal, viscous_per_k=0.0, coulomb_per_k=0.0)
     one = Plant(PlantParameters((JointPlant(JOINT, thermal=thermal), JointPlant(JOINT))))
     two = EffectPlant(PlantParameters((JointPlant(warm, thermal=only), JointPlant(JOINT))))
     for plant in (one, two):

@@ -57,7 +57,7 @@ def test_new_sections_may_be_left_out():
         (
             ("run_to_run", "viscous"),
             1.5,
-            "'run_to_run.viscous': found 1.5, expected a number in 1 from 0 to 0.9",
+            "'run_to_run.viscous': found 1.5, expected a number from 0 to 0.9",
         ),
         (("run_to_run", "sensor_zero"), 0.3, "'run_to_run.sensor_zero': unknown key, did you mean"),
         (("run_to_run", "temperature_k"), -4.0, "'run_to_run.temperature_k': found -4.0"),

@@ -205,7 +205,7 @@ def test_shipped_plant_deviates_as_documented():
     [
         (("joint_1", "deviation"), {}, "'joint_1.deviation': unknown key, did you mean 'deviations'"),
         (("joint_1", "deviations", "friction_scale"), "x", "'joint_1.deviations.friction_scale': found 'x'"),
-        (("joint_1", "deviations", "stiffness_scale"), 0.0, "expected a number >= 0.05"),
+        (("joint_1", "deviations", "stiffness_scale"), 0.0, "expected a number from 0.05 to 10"),
         (("joint_2", "measurement", "motor_counts_per_rev"), 1.5, "motor_counts_per_rev': found 1.5"),
         (("joint_2", "deviations", "ripple", "amplitude"), 1.0, "ripple.amplitude': unknown key"),
         (("joint_1", "deviations", "stribeck", "velocity_rad_s"), 0.2, "from 0.002 to 0.06"),
