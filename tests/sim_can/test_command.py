@@ -23,7 +23,7 @@ pytestmark = pytest.mark.native
 
 
 def start(bus, *arguments):
-    command = [sys.executable, "-m", "sim_can", "--bus", bus, *arguments]
+    command = [sys.executable, "-m", "jtqd.sim_can", "--bus", bus, *arguments]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     assert process.stderr.readline() == f"bench ready on {bus}\n"
     return process
@@ -116,7 +116,7 @@ def test_bench_answers_sdo_and_sync_on_a_unix_bus_and_leaves_in_order(running):
 def test_second_bench_joins_the_hub_of_another_process(running, tmp_path):
     bus, _ = running
     second = subprocess.run(
-        [sys.executable, "-m", "sim_can", "--bus", bus, "--duration", "0.2", "--bitrate", "1000000"],
+        [sys.executable, "-m", "jtqd.sim_can", "--bus", bus, "--duration", "0.2", "--bitrate", "1000000"],
         stderr=subprocess.PIPE,
         text=True,
         timeout=20,
@@ -130,7 +130,7 @@ def test_bench_says_that_its_hub_has_gone(tmp_path):
     bus = f"unix:{tmp_path}/bench"
     hub = Hub(str(tmp_path / "bench"))
     process = subprocess.Popen(
-        [sys.executable, "-m", "sim_can", "--bus", bus], stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", "jtqd.sim_can", "--bus", bus], stderr=subprocess.PIPE, text=True
     )
     deadline = time.monotonic() + 10.0
     while hub.counters.frames < 3 and time.monotonic() < deadline:  # three boot-up messages
