@@ -32,7 +32,7 @@ COMMANDS = {
         "what the simulation gets wrong on measured runs, its cause by name, the extended joint file",
     ),
     "export": ("jtqd.daemon.logs.export", "a log as CSV, Parquet or candump lines; the bus as a DBC"),
-    "recover": ("jtqd.daemon.logs.recover", "repair logs left by a crash, or damaged"),
+    "recover": ("jtqd.daemon.logs.recover_command", "repair logs left by a crash, or damaged"),
     "replay": (
         "jtqd.daemon.replay.command",
         "run the estimator over a log again: is it what was published, and what would another model say",
