@@ -35,7 +35,7 @@ GROUPS = {
             "write a log as CSV, Parquet or candump lines, or the bus as a DBC",
         ),
         "recover": (
-            "jtqd.daemon.logs.recover",
+            "jtqd.daemon.logs.recover_command",
             "repair logs that a crash has left, or that are damaged",
         ),
         "replay": ("jtqd.daemon.replay.command", "run the estimator over a log again, and compare"),

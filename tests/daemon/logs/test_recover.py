@@ -15,7 +15,8 @@ from collections import Counter
 import pytest
 from mcap.reader import make_reader
 
-from jtqd.daemon.logs.recover import RecoverError, main, recover
+from jtqd.daemon.logs.recover import RecoverError, recover
+from jtqd.daemon.logs.recover_command import main
 from tests.daemon.logs.log_files import ATTACHMENTS, by_index, foreign, in_order, ours, record_starts
 from tests.paths import ROOT
 

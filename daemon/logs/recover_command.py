@@ -1,0 +1,111 @@
+"""`jtq recover`: recover logs that a crash left unfinished, or that were damaged later."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from jtqd.daemon.logs.container import LogError, Source, footer_of
+from jtqd.daemon.logs.recover import Recovery, counted, recover
+from jtqd.daemon.recording.parts import ACTIVE
+
+_ENDINGS = (".mcap", ".mcap" + ACTIVE)
+_EXAMPLES = """examples:
+  jtq recover /var/log/jtqd                       every file there that a crash has left
+  jtq recover run.mcap.active                     becomes run.mcap
+  jtq recover --dry-run --json run.mcap           check every byte, change nothing
+
+In a directory: every *.mcap.active, and every *.mcap that has no proper end. A file named on the command line is
+checked from its first byte to its last. Files that a recorder is writing are refused (in a directory: left out).
+The recovered file is written beside the old one, which it then replaces: as much room as the file has must be free.
+
+exit status: 0 nothing lost, 3 recovered with loss, 1 failure, 2 usage"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the arguments of `jtq recover`."""
+    result = argparse.ArgumentParser(
+        prog="jtq recover",
+        description="Recover logs of jtqd that were torn by a crash, cut short or damaged: every whole chunk is kept.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    result.add_argument("logs", nargs="+", type=Path, metavar="FILE|DIR")
+    result.add_argument("--json", action="store_true", help="results as JSON on standard output")
+    result.add_argument("--dry-run", action="store_true", help="report what would be done, change nothing")
+    return result
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run `jtq recover`; returns its exit status."""
+    options = parser().parse_args(argv)
+    for path in options.logs:
+        if not path.is_dir() and not path.name.endswith(_ENDINGS):
+            parser().error(f"found {path}, expected a directory or a file named *.mcap or *.mcap{ACTIVE}")
+    results: list[Recovery] = []
+    failures: list[dict[str, str]] = []
+    for path in _files(options.logs):
+        try:
+            results.append(recover(path, dry_run=options.dry_run))
+        except (LogError, OSError) as error:
+            text = f"{path}: {error.strerror}" if isinstance(error, OSError) else str(error)
+            failures.append({"path": str(path), "error": text})
+            print(f"jtq recover: {text}", file=sys.stderr)
+            continue
+        if not options.json:
+            print(_text(results[-1], options.dry_run), flush=True)
+    if options.json:
+        print(json.dumps({"files": [each.as_json() for each in results], "failures": failures}))
+    elif not results and not failures:
+        print("nothing to recover")
+    if failures:
+        return 1
+    return 3 if any(each.lossy for each in results) else 0
+
+
+def _files(paths: list[Path]) -> Iterator[Path]:
+    for path in paths:
+        if not path.is_dir():
+            yield path
+            continue
+        for each in sorted(path.iterdir()):
+            if each.is_file() and (
+                each.name.endswith(_ENDINGS[1]) or (each.suffix == ".mcap" and not _has_footer(each))
+            ):
+                yield each
+
+
+def _has_footer(path: Path) -> bool:
+    """The file ends properly; also True for one that cannot be opened."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:
+        return True
+    try:
+        return footer_of(Source(descriptor)) is not None
+    finally:
+        os.close(descriptor)
+
+
+def _text(result: Recovery, dry_run: bool) -> str:
+    would = "would be " if dry_run else ""
+    state = f"{would}repaired" if result.changed else f"{would}renamed" if result.renamed else "whole"
+    lines = [
+        f"{result.path}: {state}: {counted(result.messages, 'message')}, {counted(result.chunks, 'chunk')}, "
+        f"{counted(result.attachments, 'attachment')}, {result.seconds:.1f} s"
+    ]
+    lines += [f"  {finding}" for finding in result.findings]
+    if result.lossy:
+        lines.append(
+            f"  lost: {counted(result.lost_bytes, 'byte')}, {counted(result.lost_chunks, 'chunk')}, "
+            f"about {result.lost_s:.2f} s"
+        )
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
