@@ -93,7 +93,7 @@ class EmulatedBench:
         arguments = ["--bus", bus, "--profile", "rest", "--seed", str(seed)]
         arguments += [] if plant is None else ["--plant", str(plant)]
         self._messages = folder / "bench.log"
-        self._process = _start("sim_can", arguments, self._messages, stdout=subprocess.DEVNULL)
+        self._process = _start("jtqd.sim_can", arguments, self._messages, stdout=subprocess.DEVNULL)
 
     def __enter__(self) -> EmulatedBench:
         """Wait until it is ready. Raises ProcessError."""

@@ -139,11 +139,11 @@ def usable_signals(
     _same_balances(out)
     out = [with_one_sensor(run) for run in out]
     if not out:
-        return [], reasons or ["found no run that can serve"]
+        return [], reasons or ["found no usable run"]
     if len(out) < FEWEST_RUNS:
         return [], [
             *reasons,
-            f"found {counted(len(out), 'run')} that can serve, expected at least {FEWEST_RUNS}: a gain is measured on runs "
+            f"found {counted(len(out), 'usable run')}, expected at least {FEWEST_RUNS}: a gain is measured on runs "
             "left out",
         ]
     moving = sum(float(s.moving.sum()) * float(np.median(np.diff(s.time_s))) for run in out for s in run)

@@ -1,4 +1,4 @@
-"""From the statistics to findings: gaps, causes with classes and intervals, evidence, gain, what is left over."""
+"""Verdict of a diagnosis: gaps, causes with classes and intervals, evidence, gain, what is left over, as findings."""
 
 from __future__ import annotations
 
@@ -85,10 +85,11 @@ def conclude(  # noqa: PLR0917
     if left.significant and (share > UNEXPLAINED_SHARE or not whole.chosen):
         verdict = UNEXPLAINED
         if whole.chosen:
+            closest = ", ".join(f"{c.effect.name} of {_of(c.joint)}" for c in whole.chosen)
+            effects, are = ("effect", "it is") if len(whole.chosen) == 1 else ("effects", "they are")
             reasons.append(
-                f"{share:.0%} of the structured gap is left over by the closest effects of the library ("
-                + ", ".join(f"{c.effect.name} of {_of(c.joint)}" for c in whole.chosen)
-                + "), so they are not named as its cause"
+                f"the closest {effects} of the library ({closest}) would leave {share:.0%} of the structured gap, "
+                f"so {are} not named as its cause"
             )
         causes = []
         left, refined = _least_left(dataset, left, refined, noise, joints)
@@ -135,7 +136,7 @@ def _without_asymmetry_at_rest(  # noqa: PLR0917
     noise: Noise,
     classes: list[tuple[EffectCandidate, ...]],
 ) -> tuple[Hypothesis, Refined, list[tuple[EffectCandidate, ...]]]:
-    """Return the same without friction asymmetry where the current at rest shows that it is an offset (`rests`)."""
+    """Return the same without friction asymmetry where the current at rest shows that it is an offset (`current_zero`)."""
     pair = {"current_offset", "friction_asymmetry"}
     for k, cause in enumerate(best.chosen):
         twin = next(
@@ -181,11 +182,13 @@ def _next(
     classes = [tuple(dict.fromkeys(n.split(" of ")[0] for n in c.names)) for c in causes if len(c.names) > 1]
     known = {s.number: joints[s.number] for s in dataset.signals[0]}
     warm = bool(np.isfinite(dataset.signals[0][0].state.temperature_c).any())
-    said = [f"{' and '.join(names)} fit these runs equally well" for names in classes]
+    reasons = [f"{' and '.join(names)} fit these runs equally well" for names in classes]
     alone = tuple(dict.fromkeys(name for name, _ in unsure))[:MOST_KINDS]
     if alone:
-        said.append(f"{', '.join(alone)}: seen on all runs together, but not settled by so few")
-    text = "; ".join(said)
+        reasons.append(
+            f"{', '.join(alone)}: indicated by all runs together, but not confirmed on every run left out"
+        )
+    text = "; ".join(reasons)
     classes += [(name,) for name in alone]
     return next_experiment(classes, known, text, temperature=warm)
 

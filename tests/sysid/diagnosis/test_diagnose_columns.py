@@ -58,7 +58,9 @@ def test_columns_are_the_hooks_in_the_balances_of_the_contract(name: str) -> Non
                 continue  # its acceleration is below
             motor, torsion = balances(effect, p, s.state, BARE)
             if "loss_nm" in effect.hooks and "order_per_motor_rev" in p:
-                motor = motor * s.visible_share(p["order_per_motor_rev"] * BARE.gear_ratio * s.state.velocity_rad_s)
+                motor = motor * s.visible_share(
+                    p["order_per_motor_rev"] * BARE.gear_ratio * s.state.velocity_rad_s
+                )
             found = contribution(effect, p, s)
             for balance, expected in (("motor", motor), ("torsion", torsion)):
                 there = found.get(balance, np.zeros(len(s.time_s)))
