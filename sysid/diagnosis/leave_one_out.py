@@ -73,7 +73,7 @@ class LeaveOneOut:
     def rivals(self, best: Hypothesis, cause: EffectCandidate) -> tuple[EffectCandidate, ...]:
         """Return the candidates (one per effect and joint) that in the place of `cause` help on every run left out and on
         at least one of them leave no more than FALL more than it, best first; with one joint, torque constant and
-        sensor gain are never told apart, whose difference is a factor on friction and inertia.
+        sensor gain are never separated, whose difference is a factor on friction and inertia.
         """
         others = [c for c in best.chosen if c is not cause]
         base = self._without(best, cause)

@@ -116,7 +116,7 @@ class Leftover:
 
 def less_nuisances(dataset: Dataset, refined: Refined) -> dict[Channel, list[FloatArray]]:
     """Return what the causes leave, less the runs' own changes but not less strange lines, events with it [run][n]."""
-    use = np.array([g.name != LINE for g in dataset.groups])
+    use = np.array([g.name != LINE for g in dataset.families])
     out: dict[Channel, list[FloatArray]] = {}
     for r, (run, u) in enumerate(zip(refined.runs, refined.nuisances, strict=True)):
         for channel, d in run.channels.items():

@@ -28,7 +28,7 @@ from jtqd.sysid.motion.setpoints import Limits
 from jtqd.sysid.text import counted
 
 VELOCITY_RAD_S: Final = 2.0
-"""Fastest motion where nothing else is said; joint files have no rated velocity."""
+"""Fastest motion where nothing else is given; joint files have no rated velocity."""
 TEMPERATURE_C: Final = 70.0
 _TORQUE_SHARE: Final = 0.7
 """Planned torque as a part of the rated one: it rings at a reversal under load (docs/excitation.md)."""
@@ -90,7 +90,7 @@ def reach_of(
 ) -> Reach:
     """Return what two coupled joints can do; one joint alone is taken to face one like itself.
 
-    joints: by number, at least one; the first two count. temperature: whether the drives tell theirs (a plan with a
+    joints: by number, at least one; the first two count. temperature: whether the drives measure theirs (a plan with a
     limit for it is refused otherwise).
 
     Raises ValueError without a joint.
@@ -232,7 +232,7 @@ def _speed_ladder(reach: Reach, role: int, prefix: str) -> list[Run]:
 
 
 def _slow_reversals(reach: Reach, role: int, prefix: str) -> list[Run]:
-    # the last ones tell what Coulomb friction is by itself
+    # the last ones show what Coulomb friction is by itself
     speeds = (0.04, 0.055, 0.075, 0.1, 0.14, 0.2, 0.35, 0.5 * reach.velocity_rad_s)
     middle = 0.6 * reach.load_of(role, speeds[-1])
     return [
