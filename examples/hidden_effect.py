@@ -182,7 +182,7 @@ Row = tuple[str, float, float]
 
 
 class StepError(RuntimeError):
-    """A command of the toolbox failed; its own message says why."""
+    """A command of the toolbox failed; it has said why."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -234,8 +234,8 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         "jtqd": {number: (before[number], after[number]) for number in NUMBERS},
         "method": options.method,
         "bus": options.bus,
-        "extended_on_the_same_runs": _verdict(again),
-        "extended_on_fresh_runs": _verdict(fresh_after),
+        "extended_on_the_same_runs": _said(again),
+        "extended_on_fresh_runs": _said(fresh_after),
     }
 
 
@@ -248,23 +248,22 @@ def lines(result: Mapping[str, Any]) -> list[str]:
         f"found   verdict {result['verdict']}",
     ]
     for cause in result["causes"]:
-        estimates = ", ".join(
+        told = ", ".join(
             f"{name} {each['value']:.4g}{_interval(each)}" for name, each in cause["parameters"].items()
         )
-        out.append(f"        {' or '.join(cause['class'])} of joint {cause['joint']}: {estimates}")
+        out.append(f"        {' or '.join(cause['class'])} of joint {cause['joint']}: {told}")
     where = "jtqd on fresh runs" if result["bus"] != NO_BUS else "estimator on fresh runs"
     rows: list[Row] = []
     if gain["rmse_before_nm"] is not None:
-        rows.append((f"diagnosis: {gain['split']}", gain["rmse_before_nm"], gain["rmse_after_nm"]))
+        rows.append((f"promised: {gain['split']}", gain["rmse_before_nm"], gain["rmse_after_nm"]))
     for number, balances in result["simulation"].items():
         rows += [
             (f"simulation on fresh runs: joint {number}, {b} balance", *both) for b, both in balances.items()
         ]
     rows += [(f"{where}: joint {n}, method {result['method']}", *both) for n, both in result["jtqd"].items()]
     wide = max(len(row[0]) for row in rows)
-    out += ["", f"{'error against the sensor, Nm rms':<{wide}}  before   after  rms removed"]
-    out += [f"{what:<{wide}}  {b:6.3f}  {a:6.3f}  {_rms_removed(b, a):11.3f}" for what, b, a in rows]
-    out += ["rms removed: sqrt(before^2 - after^2); independent errors add in squares"]
+    out += ["", f"{'error against the sensor, Nm rms':<{wide}}  before   after  taken away"]
+    out += [f"{what:<{wide}}  {b:6.3f}  {a:6.3f}  {_taken(b, a):10.3f}" for what, b, a in rows]
     out += ["", f"extended files, same runs:  {result['extended_on_the_same_runs']}"]
     out += [f"extended files, fresh runs: {result['extended_on_fresh_runs']}"]
     return out
@@ -320,7 +319,7 @@ def _gap(findings: Mapping[str, Any], joint: int, balance: str) -> float:
     return math.nan
 
 
-def _verdict(findings: Mapping[str, Any]) -> str:
+def _said(findings: Mapping[str, Any]) -> str:
     names = ", ".join(f"{each['name']} of {each['joint']}" for each in findings["causes"])
     return f"{findings['verdict']}{f' ({names})' if names else ''}"
 
@@ -330,8 +329,8 @@ def _interval(value: Mapping[str, Any]) -> str:
     return "" if low is None or high is None or low == high else f" [{low:.4g}, {high:.4g}]"
 
 
-def _rms_removed(before: float, after: float) -> float:
-    """Rms of the removed part: independent errors add in squares, so this can be compared where what is left differs."""
+def _taken(before: float, after: float) -> float:
+    """Rms of what is gone: independent errors add in squares, so this can be compared where what is left differs."""
     return math.copysign(math.sqrt(abs(before**2 - after**2)), before - after)
 
 
