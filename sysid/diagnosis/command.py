@@ -24,6 +24,7 @@ from jtqd.sysid.progress import waiting
 from jtqd.sysid.runs.checks import CheckedRuns, check_runs
 from jtqd.sysid.runs.files import ColumnMap, RunError, RunFile, read_runs
 from jtqd.sysid.runs.joints import UsageError, joint_files, joints_of
+from jtqd.sysid.text import counted
 
 BY: Final = "jtq diagnose"
 _NEEDED: Final = ("matplotlib", "jinja2")
@@ -69,7 +70,7 @@ def main(argv: list[str]) -> int:
 
 
 def diagnosed(runs: Sequence[RunFile], joints: Mapping[int, Joint]) -> Findings:
-    """Check the channels, diagnose what may be used, and say in the findings what may not."""
+    """Check the channels and diagnose what may be used; the findings list what may not."""
     checked = check_runs([(run.name, run.table) for run in runs], joints)
     for line in (*checked.refused, *checked.notes):
         print(f"{BY}: {line}", file=sys.stderr)
@@ -83,7 +84,7 @@ def diagnosed(runs: Sequence[RunFile], joints: Mapping[int, Joint]) -> Findings:
             joints=tuple(joints),
             channel_notes=notes,
         )
-    with waiting(f"diagnosing {len(checked.runs)} runs"):
+    with waiting(f"diagnosing {counted(len(checked.runs), 'run')}"):
         from jtqd.sysid.diagnosis.diagnose import diagnose
 
         left = {number: joint for number, joint in joints.items() if number not in checked.lost}
@@ -92,14 +93,18 @@ def diagnosed(runs: Sequence[RunFile], joints: Mapping[int, Joint]) -> Findings:
 
 
 def _with_channels(findings: Findings, checked: CheckedRuns, notes: tuple[str, ...]) -> Findings:
-    """Findings that tell of the channels; without a gap they are no proof for a joint that could not be judged."""
+    """Findings with the notes of the channels; without a gap they are no proof for a joint that could not be judged."""
     findings = replace(findings, channel_notes=notes + findings.channel_notes)
     if findings.verdict == NO_GAP and checked.lost:
-        lost = ", ".join(str(number) for number in checked.lost)
+        one = len(checked.lost) == 1
+        lost = f"joint{'' if one else 's'} {', '.join(map(str, checked.lost))}"
         return replace(
             findings,
             verdict=INSUFFICIENT,
-            reasons=(f"joint {lost}: no run of it can be used, the rest has no gap", *checked.refused),
+            reasons=(
+                f"{lost}: no run of {'it' if one else 'them'} can be used, the rest has no gap",
+                *checked.refused,
+            ),
         )
     if findings.verdict == INSUFFICIENT and checked.refused:
         return replace(findings, reasons=(*findings.reasons, *checked.refused))
@@ -111,7 +116,7 @@ def parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=BY,
         description="Measure what a joint file's simulation gets wrong on recorded runs and name the cause, "
-        "or the causes that these runs cannot tell apart and the experiment that would.",
+        "or the causes that these runs cannot distinguish and the experiment that would.",
         epilog=(
             "examples:\n"
             "  jtq diagnose campaigns/validate --joint models/joint1.yaml --out diagnosis\n"

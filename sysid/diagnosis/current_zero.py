@@ -89,7 +89,7 @@ SHORTEST_S: Final = 0.3
 """Of what is left of a rest without power: less is no reading."""
 DRIFT: Final = 5e-4
 """Of the rated torque over G Kt: what the zero of a current sensor may change by between the reading and the motion, half of
-what is called an effect at all (`minimum.RELEVANT`). All readings of a joint together are no more certain than this.
+what is called an effect at all (`evidence.RELEVANT`). All readings of a joint together are no more certain than this.
 """
 _BLOCK_S: Final = 0.1
 

@@ -1,6 +1,6 @@
 """The runs as the statistics see them: signals, binned residuals, regressors of the library's candidates, nuisances.
 
-`usable_signals` takes what can serve from the run tables and refuses the rest with reasons; `build_dataset` makes
+`usable_signals` takes what is usable from the run tables and refuses the rest with reasons; `build_dataset` makes
 everything of it that the search, the refinement and the maps share.
 """
 
@@ -59,10 +59,14 @@ _MOST_LINES: Final = 4
 
 @dataclass(frozen=True)
 class Dataset:
-    """signals [run][joint]; runs: the same binned, `samples` to a bin of step_s seconds; the library's candidates;
-    unexplained: what none of them explains, per channel and run [n]; groups: nuisances; lines: those among them that are
-    lines at orders or frequencies of no effect; readings: per run what the current reads without power; events: what is not
-    valid in `runs` only because it is an event, per channel and run [n].
+    """All runs of one diagnosis.
+
+    Attributes:
+        signals: [run][joint]. runs: the same binned, `samples` to a bin of step_s seconds.
+        candidates: of the library, columns numbered. unexplained: what none of them explains, per channel and run [n].
+        families: of nuisances. unknown_lines: those among them at orders or frequencies of no effect.
+        readings: per run what the current reads without power.
+        events: what is not valid in `runs` only because it is an event, per channel and run [n].
     """
 
     signals: list[list[JointSignals]]
@@ -71,8 +75,8 @@ class Dataset:
     samples: int
     step_s: float
     unexplained: dict[Channel, list[FloatArray]]
-    groups: list[Family]
-    lines: list[Line]
+    families: list[Family]
+    unknown_lines: list[Line]
     readings: Sequence[Readings] = ()
     events: Mapping[Channel, Sequence[BoolArray]] = field(default_factory=dict)
 
@@ -104,7 +108,7 @@ class Dataset:
 def usable_signals(
     runs: Sequence[tuple[str, RunTable]], joints: Mapping[int, Joint], numbers: Sequence[int]
 ) -> tuple[list[list[JointSignals]], list[str]]:
-    """Return the signals of the runs that can serve, none if too few do, and why others cannot."""
+    """Return the signals [run][joint] of the usable runs, none if they are too few, and why others cannot be used."""
     if not numbers:
         return [], ["found no joint that both the runs and the joint files have"]
     out: list[list[JointSignals]] = []
@@ -139,11 +143,11 @@ def usable_signals(
     _same_balances(out)
     out = [with_one_sensor(run) for run in out]
     if not out:
-        return [], reasons or ["found no run that can serve"]
+        return [], reasons or ["found no usable run"]
     if len(out) < FEWEST_RUNS:
         return [], [
             *reasons,
-            f"found {counted(len(out), 'run')} that can serve, expected at least {FEWEST_RUNS}: a gain is measured on runs "
+            f"found {counted(len(out), 'usable run')}, expected at least {FEWEST_RUNS}: a gain is measured on runs "
             "left out",
         ]
     moving = sum(float(s.moving.sum()) * float(np.median(np.diff(s.time_s))) for run in out for s in run)

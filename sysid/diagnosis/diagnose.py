@@ -30,7 +30,7 @@ from jtqd.sysid.diagnosis.leftover import events_left
 from jtqd.sysid.diagnosis.mixed_model import Mixed
 from jtqd.sysid.diagnosis.next_experiment import next_experiment
 from jtqd.sysid.diagnosis.noise import Noise, noise_model, run_sums
-from jtqd.sysid.diagnosis.refine import present_causes, refine
+from jtqd.sysid.diagnosis.refine import present_effects, refine
 from jtqd.sysid.diagnosis.regressors import RunData, column_moments
 from jtqd.sysid.diagnosis.search import HELD_OUT, Hypothesis, Search
 from jtqd.sysid.diagnosis.signals import Channel
@@ -76,12 +76,12 @@ def _diagnosed(
     dataset = build_dataset(usable, joints)
     least = RELEVANT * max(joints[n].rated_torque_nm for n in numbers)
     noise, search, best = _searched(dataset, least)
-    refined = refine(dataset, present_causes(best), noise)
+    refined = refine(dataset, present_effects(best), noise)
     events = events_left(dataset, refined, noise, joints)
     if events:  # no effect makes them: they shall bend none
         dataset = dataset.without_events(events)
         noise, search, best = _searched(dataset, least)
-        refined = refine(dataset, present_causes(best), noise)
+        refined = refine(dataset, present_effects(best), noise)
     findings = conclude(dataset, search, best, refined, noise, joints, names, numbers)
     return replace(findings, channel_notes=tuple(reasons))
 
@@ -153,7 +153,7 @@ def _searched(dataset: Dataset, least_nm: float) -> tuple[Noise, Search, Hypothe
     """
     runs, candidates = dataset.runs, dataset.candidates
     columns = candidates[-1].columns.stop if candidates else 0
-    groups = dataset.groups
+    groups = dataset.families
     sigma = np.array([g.sigma for g in groups])
     moments = column_moments(runs, columns)
     unpowered = unpowered_columns(candidates, dataset.joints)

@@ -1,4 +1,4 @@
-"""From a joint and the causes found to the extended joint file: effects with their values, intervals in its provenance.
+"""The extended joint file: a joint with the effects found and their values, intervals in its provenance.
 
 An effect that the joint file has already is replaced by the cause of the same name, so that diagnosing with the extended
 file again does not add the same thing twice. Effects of the torque sensor go into every joint's file. All of it is
@@ -16,6 +16,7 @@ from typing import Any, Final
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.sysid.diagnosis.findings import Cause, Findings, Value
 from jtqd.sysid.fit.joint_writer import write_joint
+from jtqd.sysid.text import counted
 
 SENSOR: Final = "sensor"
 FILE: Final = "extended.joint.yaml"
@@ -77,7 +78,7 @@ def files(joints: Mapping[int, Joint], findings: Findings) -> dict[str, int]:
 def title(number: int, findings: Findings) -> str:
     """First line of an extended joint file."""
     names = [cause.name for cause in findings.causes if cause.joint in (number, SENSOR)]
-    runs = f"{len(findings.runs)} run" + ("s" if len(findings.runs) != 1 else "")
+    runs = counted(len(findings.runs), "run")
     what = f"found {', '.join(names)}" if names else "found no effect of this joint to add"
     return f"Written by jtq diagnose from {runs}: {what} (verdict {findings.verdict})."
 
@@ -97,8 +98,8 @@ def write_extended(
 
 
 def _first(numbers: Sequence[int], findings: Findings) -> int:
-    said = [cause.joint for cause in findings.causes] + [gap.joint for gap in findings.gaps]
-    return next((int(number) for number in said if number in numbers), numbers[0])
+    named = [cause.joint for cause in findings.causes] + [gap.joint for gap in findings.gaps]
+    return next((int(number) for number in named if number in numbers), numbers[0])
 
 
 def _record(cause: Cause) -> dict[str, Any]:

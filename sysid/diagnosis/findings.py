@@ -34,7 +34,7 @@ class Value:
 
 @dataclass(frozen=True)
 class Cause:
-    """One effect present. names: its class, itself first: what it cannot be told from on these runs."""
+    """One effect present. names: its class, itself first: what these runs cannot distinguish it from."""
 
     name: str
     joint: JointName
@@ -269,7 +269,7 @@ def _gain(gain: Gain) -> dict[str, Any]:
 _VERDICTS_IN_WORDS: Final = {
     NO_GAP: "the simulation explains these runs down to their noise",
     CAUSE: "the gap has a cause that these runs name",
-    AMBIGUOUS: "the gap has a cause, but these runs cannot tell which of a class",
+    AMBIGUOUS: "the gap has a cause, but these runs do not settle which",
     UNEXPLAINED: "there is a gap that no effect of the library explains",
     INSUFFICIENT: "these runs cannot be judged",
 }
@@ -285,25 +285,34 @@ def summary_lines(findings: Findings) -> list[str]:
             f"noise {gap.noise_floor_nm:.3g} Nm ({gap.floor_from})"
         )
         if findings.verdict != NO_GAP:
-            lines += [f"  {each.share:4.0%} of it at {each.axis} {each.bin}" for each in gap.localisation[:3]]
+            lines += [f"  {each.share:4.0%} of it {_where(each)}" for each in gap.localisation[:3]]
     lines += [_summary_cause(each) for each in findings.causes]
     gain = findings.gain
     if gain is not None and math.isfinite(gain.rmse_before_nm):
         low, high = gain.ci95
         lines.append(
             f"gain on runs left out: {gain.rmse_before_nm:.3g} -> {gain.rmse_after_nm:.3g} Nm rms "
-            f"(less by {low:.3g} to {high:.3g} Nm)"
+            f"(reduced by {low:.3g} to {high:.3g} Nm, 95 % interval)"
         )
     if findings.next_experiment:
         lines.append(f"next experiment: {findings.next_experiment['why']}")
     return lines
 
 
+def _where(place: Place) -> str:
+    """Return where a place is: "at load 2 to 3 Nm", "in events: run1 3.2 s, ...", "at order 2.47 per motor revolution"."""
+    if place.axis == "time" and ":" in place.bin:
+        return f"in {place.bin}"
+    if place.axis == "frequency":
+        return f"at {place.bin}"
+    return f"at {place.axis.replace('_', ' ')} {place.bin}"
+
+
 def _summary_cause(cause: Cause) -> str:
-    at = "sensor" if cause.joint == "sensor" else f"joint {cause.joint}"
+    at = "the sensor" if cause.joint == "sensor" else f"joint {cause.joint}"
     values = ", ".join(_value(name, each) for name, each in cause.parameters.items())
     others = [name for name in cause.names if name != cause.name]
-    either = f"; cannot be told from {', '.join(others)}" if others else ""
+    either = f"; these runs cannot distinguish it from {', '.join(others)}" if others else ""
     return f"cause: {cause.name} of {at}: {values} ({cause.rms_nm:.3g} Nm rms){either}"
 
 

@@ -250,7 +250,7 @@ def _floor(dataset: Dataset, refined: Refined, channel: Channel) -> tuple[float,
     noise = np.concatenate(dataset.unexplained[channel])
     square = float(np.nanmean(noise**2))
     drift, count = 0.0, 0
-    usual = np.array([g.name != LINE for g in dataset.groups])
+    usual = np.array([g.name != LINE for g in dataset.families])
     for run, u in zip(refined.runs, refined.nuisances, strict=True):
         d = run.channels[channel]
         part = (d.nuisances @ (u * usual)[d.families])[d.valid]

@@ -1,4 +1,4 @@
-"""With fewer than four runs: what is named must hold on each run left out, not on all of them together.
+"""Leave-one-run-out confirmation: with fewer than four runs what is named must hold on each run left out.
 
 With many runs the sum over runs left out says whether an effect is there. With two or three, one run can carry that sum,
 the runs' own changes are hardly known (their variance is little more than its prior), and what the models get wrong
@@ -35,7 +35,7 @@ Squares = Mapping[Channel, float]
 
 
 class LeaveOneOut:
-    """What sets of candidates do to each run left out."""
+    """Sets of candidates, judged on each run left out."""
 
     def __init__(self, dataset: Dataset, search: Search) -> None:
         self.dataset = dataset
@@ -73,7 +73,7 @@ class LeaveOneOut:
     def rivals(self, best: Hypothesis, cause: EffectCandidate) -> tuple[EffectCandidate, ...]:
         """Return the candidates (one per effect and joint) that in the place of `cause` help on every run left out and on
         at least one of them leave no more than FALL more than it, best first; with one joint, torque constant and
-        sensor gain are never told apart, whose difference is a factor on friction and inertia.
+        sensor gain are never separated, whose difference is a factor on friction and inertia.
         """
         others = [c for c in best.chosen if c is not cause]
         base = self._without(best, cause)
@@ -120,7 +120,7 @@ class LeaveOneOut:
         """Return a sentence about what is unsure."""
         names = ", ".join(f"{n} of {'the sensor' if j == 'sensor' else f'joint {j}'}" for n, j in unsure)
         return (
-            f"seen on all {self.search.mixed.runs} runs together, but not settled by so few: {names}; "
+            f"indicated by all {self.search.mixed.runs} runs together, but not confirmed on every run left out: {names}; "
             f"expected {ENOUGH_RUNS} runs or more"
         )
 

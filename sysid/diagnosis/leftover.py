@@ -1,4 +1,4 @@
-"""What the causes leave over: is it structure, and where."""
+"""What the causes leave over, and whether it is structure: maps, events, lines that are not noise."""
 
 from __future__ import annotations
 
@@ -31,6 +31,7 @@ from jtqd.sysid.diagnosis.structure import (
     order_lines,
     sharpened,
 )
+from jtqd.sysid.text import counted
 
 _RELEVANT: Final = 6e-4
 """Part of the rated torque (rms) from which structure counts as a gap."""
@@ -87,21 +88,25 @@ class Leftover:
         for m in sorted(self.found, key=lambda m: -m.energy_nm2)[:3]:
             size, axis = np.sqrt(m.energy_nm2), m.axis.replace("_", " ")
             out.append(
-                f"joint {m.channel.joint}, {m.channel.balance} balance: {size:.3g} Nm rms follow the {axis}"
-                " in a way that no effect of the library does"
+                f"joint {m.channel.joint}, {m.channel.balance} balance: {size:.3g} Nm rms depend on the {axis}"
+                " in a way that no effect of the library explains"
             )
         for b in self.bursts:
             run, t = b.times[0]
             many = len(b.times)
-            seen = f"{many} events that noise does not make" if b.what == "events" else "seconds that are off"
+            what = (
+                f"{counted(many, 'event')} that cannot be noise"
+                if b.what == "events"
+                else "means over a second that cannot be noise"
+            )
             out.append(
-                f"joint {b.channel.joint}, {b.channel.balance} balance: {seen}, the strongest in {run} at {t:.1f} s"
+                f"joint {b.channel.joint}, {b.channel.balance} balance: {what}, the strongest in {run} at {t:.1f} s"
             )
         for line in self.lines[:2]:
             where = (
                 f"at {line.order:.3g} Hz, whatever the motion"
                 if line.unit == "Hz"
-                else f"at order {line.order:.2f} per motor revolution, which is none of gear or motor"
+                else f"at order {line.order:.2f} per motor revolution, an order of neither gear nor motor"
             )
             out.append(
                 f"joint {line.channel.joint}, {line.channel.balance} balance: {line.amplitude_nm:.3g} Nm {where}"
@@ -111,7 +116,7 @@ class Leftover:
 
 def less_nuisances(dataset: Dataset, refined: Refined) -> dict[Channel, list[FloatArray]]:
     """Return what the causes leave, less the runs' own changes but not less strange lines, events with it [run][n]."""
-    use = np.array([g.name != LINE for g in dataset.groups])
+    use = np.array([g.name != LINE for g in dataset.families])
     out: dict[Channel, list[FloatArray]] = {}
     for r, (run, u) in enumerate(zip(refined.runs, refined.nuisances, strict=True)):
         for channel, d in run.channels.items():

@@ -25,9 +25,10 @@ from jtqd.sysid.excitation.design import draw
 from jtqd.sysid.excitation.model import Bench as StaticBench
 from jtqd.sysid.excitation.model import ExcitationLimits
 from jtqd.sysid.motion.setpoints import Limits
+from jtqd.sysid.text import counted
 
 VELOCITY_RAD_S: Final = 2.0
-"""Fastest motion where nothing else is said; joint files have no rated velocity."""
+"""Fastest motion where nothing else is given; joint files have no rated velocity."""
 TEMPERATURE_C: Final = 70.0
 _TORQUE_SHARE: Final = 0.7
 """Planned torque as a part of the rated one: it rings at a reversal under load (docs/excitation.md)."""
@@ -89,7 +90,7 @@ def reach_of(
 ) -> Reach:
     """Return what two coupled joints can do; one joint alone is taken to face one like itself.
 
-    joints: by number, at least one; the first two count. temperature: whether the drives tell theirs (a plan with a
+    joints: by number, at least one; the first two count. temperature: whether the drives measure theirs (a plan with a
     limit for it is refused otherwise).
 
     Raises ValueError without a joint.
@@ -231,7 +232,7 @@ def _speed_ladder(reach: Reach, role: int, prefix: str) -> list[Run]:
 
 
 def _slow_reversals(reach: Reach, role: int, prefix: str) -> list[Run]:
-    # the last ones tell what Coulomb friction is by itself
+    # the last ones show what Coulomb friction is by itself
     speeds = (0.04, 0.055, 0.075, 0.1, 0.14, 0.2, 0.35, 0.5 * reach.velocity_rad_s)
     middle = 0.6 * reach.load_of(role, speeds[-1])
     return [
@@ -515,9 +516,9 @@ def next_experiment(
 ) -> dict[str, Any]:
     """Return {"why": text, "plan": mapping of jtq.plan/1} of the campaign that would settle it.
 
-    classes: names of effects that the runs cannot tell apart, one sequence per class; a sequence of one name asks to make
+    classes: names of effects that the runs cannot distinguish, one sequence per class; a sequence of one name asks to make
     that effect visible. joints: files of the joints in the runs, one or two, whose ratings the plan keeps. why: what the
-    diagnosis has to say before. velocity_rad_s: the fastest motion allowed. temperature: whether the runs have one; without
+    diagnosis says before it. velocity_rad_s: the fastest motion allowed. temperature: whether the runs have one; without
     it the plan does not supervise it. Raises ValueError without a joint.
     """
     classes = [tuple(names) for names in classes]
@@ -536,7 +537,7 @@ def _text(
 ) -> str:
     """Reason, what is to be separated, what is done, what it takes, what is left to do by hand."""
     parts = [why.strip().rstrip(".") + "."] if why.strip() else []
-    aims = [f"to tell {', '.join(names[:-1])} from {names[-1]}" for names in classes if len(names) > 1]
+    aims = [f"to distinguish {', '.join(names[:-1])} from {names[-1]}" for names in classes if len(names) > 1]
     aims += [f"to make {names[0]} visible" for names in classes if len(names) == 1]
     parts.append(f"Proposed{' ' if aims else ''}{' and '.join(aims)}:")
     parts += [f"{kind}: {EXPERIMENTS[kind].what}." for kind in kinds]
@@ -546,7 +547,7 @@ def _text(
         )
     parts += [note for pair, note in _BY_HAND.items() if any(pair <= set(names) for names in classes)]
     parts.append(
-        f"{len(plan.runs)} runs, {plan.duration_s / 60.0:.0f} min, at most {plan.limits.torque_nm:g} Nm and "
+        f"{counted(len(plan.runs), 'run')}, {plan.duration_s / 60.0:.0f} min, at most {plan.limits.torque_nm:g} Nm and "
         f"{plan.limits.current_a:g} A."
     )
     return " ".join(parts)

@@ -109,16 +109,16 @@ def refine(dataset: Dataset, present: Sequence[PresentEffect], noise: Noise) -> 
 
     Where steps do not come to rest, the parameters that left the least are taken, not the last ones.
     """
-    look = best = _linearised(dataset, present, noise)
-    least = look.left
+    iterate = best = _linearised(dataset, present, noise)
+    least = iterate.left
     for step in range(1, _MOST_STEPS + 1):
         if not present:
             break
-        now, settled = _stepped(look)
-        look = _linearised(dataset, now, noise)
-        least = min(least, look.left)
-        if look.left <= least + _AS_GOOD:
-            best = look
+        now, settled = _stepped(iterate)
+        iterate = _linearised(dataset, now, noise)
+        least = min(least, iterate.left)
+        if iterate.left <= least + _AS_GOOD:
+            best = iterate
         if step >= _STEPS and settled:
             break
     model = best.model
@@ -143,11 +143,11 @@ def refine(dataset: Dataset, present: Sequence[PresentEffect], noise: Noise) -> 
 
 
 def _linearised(dataset: Dataset, present: Sequence[PresentEffect], noise: Noise) -> _Iterate:
-    signals, runs, samples, groups = dataset.signals, dataset.runs, dataset.samples, dataset.groups
+    signals, runs, samples, groups = dataset.signals, dataset.runs, dataset.samples, dataset.families
     for run_signals in signals:
         for s in run_signals:
             _set_torsion(s, present)
-    data = [_at(s, run, present, samples) for s, run in zip(signals, runs, strict=True)]
+    data = [_run_at(s, run, present, samples) for s, run in zip(signals, runs, strict=True)]
     count = sum(len(p.free) for p in present)
     sums = [run_sums(d, noise, count, len(groups)) for d in data]
     sums = with_readings(sums, dataset.readings, _unpowered(present, dataset.joints))
@@ -155,13 +155,13 @@ def _linearised(dataset: Dataset, present: Sequence[PresentEffect], noise: Noise
     return _Iterate(tuple(present), mixed, mixed.fit(range(count)), data, mixed.fit(()).deviance)
 
 
-def _stepped(look: _Iterate) -> tuple[list[PresentEffect], bool]:
+def _stepped(iterate: _Iterate) -> tuple[list[PresentEffect], bool]:
     """Return the causes one step further, and whether that step was none."""
     now, settled, first = [], True, 0
-    for p in look.present:
+    for p in iterate.present:
         mine = slice(first, first + len(p.free))
-        moved = p.moved([float(b) for b in look.model.beta[mine]])
-        deviation = np.sqrt(np.maximum(np.diag(look.model.covariance)[mine], 0.0))
+        moved = p.moved([float(b) for b in iterate.model.beta[mine]])
+        deviation = np.sqrt(np.maximum(np.diag(iterate.model.covariance)[mine], 0.0))
         change = np.array([moved.values[name] - p.values[name] for name in p.free])
         settled = settled and bool(np.all(np.abs(change) <= _SETTLED * deviation))
         now.append(moved)
@@ -179,11 +179,11 @@ def _set_torsion(s: JointSignals, present: Sequence[PresentEffect]) -> None:
         return
     total = s.state.torque_nm
     for p in mine:
-        total = total + _of(p, s, p.values).get(TORSION, 0.0)
+        total = total + _contribution(p, s, p.values).get(TORSION, 0.0)
     s.state.torsion_rad = total / s.joint.stiffness_nm_per_rad
 
 
-def _at(
+def _run_at(
     run: Sequence[JointSignals], base: RunData, present: Sequence[PresentEffect], samples: int
 ) -> RunData:
     """Return the run with what is left at these parameters, and derivatives by each free one, as regressors."""
@@ -194,14 +194,14 @@ def _at(
         for s in run:
             if p.joint not in ("sensor", s.number):
                 continue
-            here = _of(p, s, p.values)
+            here = _contribution(p, s, p.values)
             for balance in (MOTOR, TORSION):
                 channel = Channel(s.number, balance)
                 if channel in left and balance in here:
                     left[channel] = left[channel] - binned(here[balance], samples)
             for k, name in enumerate(p.free):
-                size = _difference(p, name)
-                there = _of(p, s, {**p.values, name: p.values[name] + size})
+                size = _step_size(p, name)
+                there = _contribution(p, s, {**p.values, name: p.values[name] + size})
                 for balance, value in there.items():
                     slope = (value - here[balance]) / size
                     columns[Channel(s.number, balance)].append((place + k, binned(slope, samples)))
@@ -224,18 +224,18 @@ def _unpowered(present: Sequence[PresentEffect], joints: Mapping[int, Joint]) ->
             here = unpowered(p.effect, p.values, joints[p.joint])
             out.append((p.joint, -1, -here))
             for k, name in enumerate(p.free):
-                size = _difference(p, name)
+                size = _step_size(p, name)
                 there = unpowered(p.effect, {**p.values, name: p.values[name] + size}, joints[p.joint])
                 out.append((p.joint, place + k, (there - here) / size))
         place += len(p.free)
     return out
 
 
-def _of(p: PresentEffect, s: JointSignals, values: Mapping[str, float]) -> dict[str, FloatArray]:
+def _contribution(p: PresentEffect, s: JointSignals, values: Mapping[str, float]) -> dict[str, FloatArray]:
     return contribution(p.effect, values, s)
 
 
-def _difference(p: PresentEffect, name: str) -> float:
+def _step_size(p: PresentEffect, name: str) -> float:
     q = parameter(p.effect, name)
     if name == "phase_rad":
         return 1e-4
@@ -243,7 +243,7 @@ def _difference(p: PresentEffect, name: str) -> float:
     return max(1e-4 * abs(p.values[name]), 1e-6 * width)
 
 
-def present_causes(best: Hypothesis) -> list[PresentEffect]:
+def present_effects(best: Hypothesis) -> list[PresentEffect]:
     """Return the chosen candidates as effects with parameters."""
     out = []
     for c in best.chosen:

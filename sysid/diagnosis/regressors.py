@@ -1,8 +1,8 @@
 """Regressors of all effects, averaged over bins: what each hidden effect would leave in the residuals of the balances.
 
 A channel is one balance of one joint: up to four with two joints. An effect of joint j shows in the motor balance, the
-torsion balance or both of that joint; an effect of the sensor in all channels at once. That pattern is what tells many
-of them apart (the isolability matrix of fault diagnosis).
+torsion balance or both of that joint; an effect of the sensor in all channels at once. That pattern is what separates
+many of them (the isolability matrix of fault diagnosis).
 """
 
 from __future__ import annotations

@@ -132,7 +132,7 @@ class JointSignals:
     number: joint; state: what hooks use; motor_nm, torsion_nm: residuals of the two balances [Nm] (torsion None: one
     encoder only); moving: samples at which friction has a direction; per_torque: by how much the motor residual falls per Nm
     that the sensor reads too high, 1 where the losses know no load (`about_zero`); off: samples at which the power stage is
-    off (None: the run does not tell).
+    off (None: not recorded).
     """
 
     run: str

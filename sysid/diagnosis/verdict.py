@@ -1,4 +1,4 @@
-"""From the statistics to findings: gaps, causes with classes and intervals, evidence, gain, what is left over."""
+"""Verdict of a diagnosis: gaps, causes with classes and intervals, evidence, gain, what is left over, as findings."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from jtqd.sysid.diagnosis.leave_one_out import ENOUGH_RUNS, LeaveOneOut
 from jtqd.sysid.diagnosis.leftover import Leftover, leftover
 from jtqd.sysid.diagnosis.next_experiment import MOST_KINDS, next_experiment
 from jtqd.sysid.diagnosis.noise import Noise
-from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, parameter, present_causes, refine
+from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, parameter, present_effects, refine
 from jtqd.sysid.diagnosis.regressors import EffectCandidate, binned, contribution
 from jtqd.sysid.diagnosis.search import Hypothesis, Search
 from jtqd.sysid.diagnosis.signals import Channel
@@ -63,7 +63,7 @@ def conclude(  # noqa: PLR0917
     few = LeaveOneOut(dataset, search) if search.mixed.runs < ENOUGH_RUNS else None
     if few is not None:  # what is left over is judged with all that was found, names need more
         best = few.confirmed(whole)
-        refined = refine(dataset, present_causes(best), noise)
+        refined = refine(dataset, present_effects(best), noise)
         best, refined, explained = _without_negligible(dataset, search, best, refined, noise, joints)
     gain = held_out_gain(dataset, refined)
     classes = [
@@ -85,10 +85,11 @@ def conclude(  # noqa: PLR0917
     if left.significant and (share > UNEXPLAINED_SHARE or not whole.chosen):
         verdict = UNEXPLAINED
         if whole.chosen:
+            closest = ", ".join(f"{c.effect.name} of {_owner(c.joint)}" for c in whole.chosen)
+            effects, are = ("effect", "it is") if len(whole.chosen) == 1 else ("effects", "they are")
             reasons.append(
-                f"{share:.0%} of the structured gap is left over by the closest effects of the library ("
-                + ", ".join(f"{c.effect.name} of {_of(c.joint)}" for c in whole.chosen)
-                + "), so they are not named as its cause"
+                f"the closest {effects} of the library ({closest}) would leave {share:.0%} of the structured gap, "
+                f"so {are} not named as its cause"
             )
         causes = []
         left, refined = _least_left(dataset, left, refined, noise, joints)
@@ -102,14 +103,14 @@ def conclude(  # noqa: PLR0917
     gaps = channel_gaps(dataset, refined, left if verdict == UNEXPLAINED else None)
     return Findings(
         verdict,
-        tuple(reasons or [s for s in (_sentence(verdict, causes, gaps), doubt) if s]),
+        tuple(reasons or [s for s in (_reason(verdict, causes, gaps), doubt) if s]),
         names,
         numbers,
         gaps,
         tuple(causes),
         candidate_table(search, best, rivals),
         gain if causes else None,
-        next_experiment=_next(verdict, causes, unsure, joints, dataset),
+        next_experiment=_settling_experiment(verdict, causes, unsure, joints, dataset),
         traces=traces(dataset, refined),
     )
 
@@ -135,7 +136,7 @@ def _without_asymmetry_at_rest(  # noqa: PLR0917
     noise: Noise,
     classes: list[tuple[EffectCandidate, ...]],
 ) -> tuple[Hypothesis, Refined, list[tuple[EffectCandidate, ...]]]:
-    """Return the same without friction asymmetry where the current at rest shows that it is an offset (`rests`)."""
+    """Return the same without friction asymmetry where the current at rest shows that it is an offset (`current_zero`)."""
     pair = {"current_offset", "friction_asymmetry"}
     for k, cause in enumerate(best.chosen):
         twin = next(
@@ -153,20 +154,20 @@ def _without_asymmetry_at_rest(  # noqa: PLR0917
         rest = tuple(c for c in classes[k] if c is not twin)
         if cause is not offset:
             best = search.hypothesis((*others, twin), best.model)
-            refined = refine(dataset, present_causes(best), noise)
+            refined = refine(dataset, present_effects(best), noise)
             by_key = {
-                c.key: found for c, found in zip((*others, twin), (*_without(classes, k), rest), strict=True)
+                c.key: found for c, found in zip((*others, twin), (*_others(classes, k), rest), strict=True)
             }
             return best, refined, [by_key[c.key] for c in best.chosen]
         classes = [*classes[:k], rest, *classes[k + 1 :]]
     return best, refined, classes
 
 
-def _without(classes: Sequence[tuple[EffectCandidate, ...]], k: int) -> list[tuple[EffectCandidate, ...]]:
+def _others(classes: Sequence[tuple[EffectCandidate, ...]], k: int) -> list[tuple[EffectCandidate, ...]]:
     return [c for j, c in enumerate(classes) if j != k]
 
 
-def _next(
+def _settling_experiment(
     verdict: str,
     causes: Sequence[Cause],
     unsure: Sequence[tuple[str, JointName]],
@@ -181,11 +182,13 @@ def _next(
     classes = [tuple(dict.fromkeys(n.split(" of ")[0] for n in c.names)) for c in causes if len(c.names) > 1]
     known = {s.number: joints[s.number] for s in dataset.signals[0]}
     warm = bool(np.isfinite(dataset.signals[0][0].state.temperature_c).any())
-    said = [f"{' and '.join(names)} fit these runs equally well" for names in classes]
+    reasons = [f"{' and '.join(names)} fit these runs equally well" for names in classes]
     alone = tuple(dict.fromkeys(name for name, _ in unsure))[:MOST_KINDS]
     if alone:
-        said.append(f"{', '.join(alone)}: seen on all runs together, but not settled by so few")
-    text = "; ".join(said)
+        reasons.append(
+            f"{', '.join(alone)}: indicated by all runs together, but not confirmed on every run left out"
+        )
+    text = "; ".join(reasons)
     classes += [(name,) for name in alone]
     return next_experiment(classes, known, text, temperature=warm)
 
@@ -208,7 +211,7 @@ def _without_negligible(  # noqa: PLR0917
         if len(large) == len(best.chosen):
             return best, refined, rms
         best = search.hypothesis(large, best.model)
-        refined = refine(dataset, present_causes(best), noise)
+        refined = refine(dataset, present_effects(best), noise)
 
 
 def _rms_at(dataset: Dataset, present: PresentEffect) -> dict[Channel, float]:
@@ -234,7 +237,7 @@ def _largest(rms: Mapping[Channel, float]) -> tuple[float, str]:
     return rms[channel], channel.balance
 
 
-def _of(joint: JointName) -> str:
+def _owner(joint: JointName) -> str:
     return "the sensor" if joint == "sensor" else f"joint {joint}"
 
 
@@ -277,7 +280,7 @@ def _cause(  # noqa: PLR0917
     for rival in rivals:
         label = rival.effect.name
         if rival.joint != candidate.joint:
-            label += f" of {_of(rival.joint)}"
+            label += f" of {_owner(rival.joint)}"
         if label not in names:
             names.append(label)
     evidence = max(without.model.deviance - best.model.deviance, 1e-9)
@@ -312,7 +315,7 @@ def _normal_phase(values: dict[str, Value]) -> dict[str, Value]:
     return out
 
 
-def _sentence(verdict: str, causes: Sequence[Cause], gaps: Sequence[Gap]) -> str:
+def _reason(verdict: str, causes: Sequence[Cause], gaps: Sequence[Gap]) -> str:
     if verdict == NO_GAP:
         worst = gaps[0]
         return (
@@ -324,5 +327,5 @@ def _sentence(verdict: str, causes: Sequence[Cause], gaps: Sequence[Gap]) -> str
         text = c.name.replace("_", " ")
         if len(c.names) > 1:
             text += " (or " + ", ".join(n.replace("_", " ") for n in c.names[1:]) + ")"
-        parts.append(f"{text} of {_of(c.joint)}, {c.rms_nm:.3g} Nm rms")
+        parts.append(f"{text} of {_owner(c.joint)}, {c.rms_nm:.3g} Nm rms")
     return "the simulation lacks " + "; ".join(parts)

@@ -71,7 +71,11 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "runs", nargs="+", type=Path, metavar="RUNS", help="run files (.csv, .csv.gz) or directories of them"
+        "runs",
+        nargs="+",
+        type=Path,
+        metavar="RUNS",
+        help="run files (.csv, .csv.gz, .parquet, .mcap) or directories of them",
     )
     parser.add_argument(
         "--models",

@@ -88,7 +88,7 @@ def check_channels(time_s: FloatArray, run: JointColumns, joint: Joint, where: s
 
 
 def gear_ratio_of(time_s: FloatArray, run: JointColumns) -> float | None:
-    """Return motor turns per link turn by the two positions, signed; None where they do not say.
+    """Return motor turns per link turn by the two positions, signed; None where they moved too little.
 
     The median over blocks of 0.2 s in which the link turned: a position that rolls over spoils single blocks only.
     """
@@ -280,7 +280,7 @@ def _signs(
     joint: Joint,
     where: str,
 ) -> list[RunIssue]:
-    """Torque against current where the motor carries more than twice its friction; the energy says which is swapped."""
+    """Torque against current where the motor carries more than twice its friction; the energy shows which is swapped."""
     loaded = (np.abs(motor_nm) > 2.0 * static_friction(joint.friction)) & (np.abs(speed) > MOVING_RAD_S)
     if np.count_nonzero(loaded) < 20 or float(np.mean(motor_nm[loaded] * torque[loaded] > 0.0)) > 0.2:
         return []

@@ -1,5 +1,6 @@
 """Run files: what is read is what was written, and everything wrong is one clear line."""
 
+import doctest
 import gzip
 import os
 import random
@@ -11,6 +12,7 @@ import pytest
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
 from jtqd.models.files import shipped
+from jtqd.sysid import runs, text
 from jtqd.sysid.runs.files import ColumnMap, RunError, read_run, read_runs, write_run
 
 KINOVA = shipped("kinova_gen3/columns.yaml").parent
@@ -293,9 +295,9 @@ def test_a_directory_is_its_tables_and_names_are_unique(tmp_path: Path) -> None:
         write_run(folder / "a.csv.gz", random_table(np.random.default_rng(seed), 20))
     _file(one, b"not looked at", "a.mcap")
     _file(one, GOOD, ".hidden.csv")
-    runs = read_runs([one, other / "a.csv.gz"])
-    assert [run.name for run in runs] == ["a.csv.gz", str(other / "a.csv.gz")]
-    assert [(run.path, run.source) for run in runs] == [(d / "a.csv.gz", "csv") for d in (one, other)]
+    read = read_runs([one, other / "a.csv.gz"])
+    assert [run.name for run in read] == ["a.csv.gz", str(other / "a.csv.gz")]
+    assert [(run.path, run.source) for run in read] == [(d / "a.csv.gz", "csv") for d in (one, other)]
     with pytest.raises(RunError, match=r"same data as in a\.csv\.gz, expected every run once"):
         read_runs([one, one / "a.csv.gz"])
     empty = tmp_path / "empty"
@@ -311,3 +313,10 @@ def test_a_column_map_may_be_given_as_its_file(tmp_path: Path) -> None:
     current = run.table.joints[1].current_a
     assert current is not None
     assert current.tolist() == [3.0, 5.0, 7.0]
+
+
+def test_the_examples_in_the_docstrings_hold() -> None:
+    for module in (runs, text):
+        result = doctest.testmod(module)
+        assert result.attempted
+        assert not result.failed

@@ -42,7 +42,7 @@ def test_a_parameter_whose_interval_holds_the_files_value_is_no_settled_cause() 
     assert [c.name for c in findings.causes] == ["viscous_friction"]
     assert findings.verdict == AMBIGUOUS
     assert findings.next_experiment is not None
-    assert "not settled by so few: viscous_friction of joint 1" in findings.reasons[-1]
+    assert "not confirmed on every run left out: viscous_friction of joint 1" in findings.reasons[-1]
 
 
 def test_with_four_runs_nothing_of_this_applies(monkeypatch: pytest.MonkeyPatch) -> None:
