@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 import jtqd
+from jtqd.daemon import jtq
 from tests.paths import ROOT
 from tests.systemd.systemd_wheels import build_wheel, copy_sources, make_wheels
 
@@ -194,6 +195,11 @@ def test_the_wheel_alone_runs_the_bench_from_an_empty_folder(wheels: Path, tmp_p
     for program in ("jtqd", "jtq"):
         done = run([python.parent / program, "--version"], empty)
         assert done.stdout == f"jtqd {jtqd.__version__}\n"
+    for name in jtq.COMMANDS:
+        done = run([python.parent / "jtq", name, "--help"], empty)
+        assert done.returncode == 0 or "is not installed: pip install 'jtqd[train]'" in done.stderr, (
+            done.stderr
+        )
     done = run([python.parent / "jtqd", "--bus", "sim", "--duration", "5"], empty)
     assert done.returncode == 0, done.stderr
     assert "RMSE joint 2" in done.stdout
