@@ -8,7 +8,9 @@ import os
 import subprocess
 import sys
 import tarfile
+import tomllib
 import zipfile
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
@@ -58,6 +60,14 @@ def content(wheel: Path) -> set[str]:
 def test_every_package_has_its_link() -> None:
     links = {path.name: path.resolve() for path in (ROOT / "src" / "jtqd").iterdir() if path.is_symlink()}
     assert links == {name: ROOT / name for name in PACKAGES}
+
+
+def test_every_entry_point_exists() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    groups = {"console_scripts": project["scripts"], **project["entry-points"]}
+    for group, entries in groups.items():
+        for name, value in entries.items():
+            assert callable(EntryPoint(name, value, group).load()), f"{group}: {name} = {value}"
 
 
 def test_the_wheel_holds_jtqd_alone_with_all_its_data(wheel: Path) -> None:
