@@ -147,6 +147,7 @@ def test_the_sdist_makes_the_same_wheel(source: Path, tmp_path: Path) -> None:
     (sdist,) = tmp_path.glob("*.tar.gz")
     with tarfile.open(sdist) as archive:
         assert not [member.name for member in archive if member.issym() or "/tests/" in member.name]
+        assert f"jtqd-{jtqd.__version__}/systemd/install.sh" in archive.getnames()
     assert content(build_wheel(sdist, tmp_path)) == expected()
 
 
