@@ -23,7 +23,6 @@ GROUPS = {
             "examine kernel, rights, CAN interface and files of this machine",
         ),
         "bus-load": ("jtqd.daemon.cli.bus_load", "compute the worst-case bus load of a configuration"),
-        "completion": ("jtqd.daemon.cli.completion", "print a completion script for bash, zsh, tcsh or fish"),
     },
     "look: pictures of the estimate": {
         "plot": ("jtqd.sysid.plot", "draw the estimate of a log beside the torque sensor"),
@@ -63,6 +62,9 @@ GROUPS = {
             "score the observer on the measured Kinova runs that ship",
         ),
     },
+    "shell: this terminal": {
+        "completion": ("jtqd.daemon.cli.completion", "print a completion script for bash, zsh, tcsh or fish"),
+    },
 }
 """Heading -> subcommand -> (module, one line of help)."""
 
@@ -100,11 +102,22 @@ def main(argv: list[str] | None = None) -> int:
         hint = f"; did you mean {near[0]!r}?" if near else ""
         print(f"jtq: no command {name!r}{hint} (jtq --help lists them)", file=sys.stderr)
         return 2
+    return _run(name, command[0], arguments[1:])
+
+
+def _run(name: str, module: str, arguments: list[str]) -> int:
+    """Run the command of a module; returns its exit status."""
     try:
-        status = importlib.import_module(command[0]).main(arguments[1:])
+        status = importlib.import_module(module).main(arguments)
         sys.stdout.flush()
     except KeyboardInterrupt:
         return 130
+    except ModuleNotFoundError as error:  # the packages of an extra; what belongs to jtqd is always there
+        package = (error.name or "jtqd").partition(".")[0]
+        if package == "jtqd":
+            raise
+        print(f"jtq {name}: {package} is not installed: pip install 'jtqd[train]'", file=sys.stderr)
+        return 1
     except OSError as error:  # a full disk, a missing directory, a closed pipe
         if not isinstance(error, BrokenPipeError):  # `| head` has what it wanted
             print(f"jtq {name}: {error.filename or 'output'}: {error.strerror}", file=sys.stderr)

@@ -8,12 +8,15 @@ import os
 import subprocess
 import sys
 import tarfile
+import tomllib
 import zipfile
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 
 import jtqd
+from jtqd.daemon import jtq
 from tests.paths import ROOT
 from tests.systemd.systemd_wheels import build_wheel, copy_sources, make_wheels
 
@@ -57,6 +60,14 @@ def content(wheel: Path) -> set[str]:
 def test_every_package_has_its_link() -> None:
     links = {path.name: path.resolve() for path in (ROOT / "src" / "jtqd").iterdir() if path.is_symlink()}
     assert links == {name: ROOT / name for name in PACKAGES}
+
+
+def test_every_entry_point_exists() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    groups = {"console_scripts": project["scripts"], **project["entry-points"]}
+    for group, entries in groups.items():
+        for name, value in entries.items():
+            assert callable(EntryPoint(name, value, group).load()), f"{group}: {name} = {value}"
 
 
 def test_the_wheel_holds_jtqd_alone_with_all_its_data(wheel: Path) -> None:
@@ -136,6 +147,7 @@ def test_the_sdist_makes_the_same_wheel(source: Path, tmp_path: Path) -> None:
     (sdist,) = tmp_path.glob("*.tar.gz")
     with tarfile.open(sdist) as archive:
         assert not [member.name for member in archive if member.issym() or "/tests/" in member.name]
+        assert f"jtqd-{jtqd.__version__}/systemd/install.sh" in archive.getnames()
     assert content(build_wheel(sdist, tmp_path)) == expected()
 
 
@@ -194,6 +206,11 @@ def test_the_wheel_alone_runs_the_bench_from_an_empty_folder(wheels: Path, tmp_p
     for program in ("jtqd", "jtq"):
         done = run([python.parent / program, "--version"], empty)
         assert done.stdout == f"jtqd {jtqd.__version__}\n"
+    for name in jtq.COMMANDS:
+        done = run([python.parent / "jtq", name, "--help"], empty)
+        assert done.returncode == 0 or "is not installed: pip install 'jtqd[train]'" in done.stderr, (
+            done.stderr
+        )
     done = run([python.parent / "jtqd", "--bus", "sim", "--duration", "5"], empty)
     assert done.returncode == 0, done.stderr
     assert "RMSE joint 2" in done.stdout

@@ -36,6 +36,15 @@ def test_an_unknown_command_is_answered_with_its_neighbour(capsys):
     assert jtq.main([]) == 2
 
 
+def test_a_missing_extra_is_one_line_and_a_missing_module_of_ours_is_not(monkeypatch, capsys):
+    monkeypatch.setitem(jtq.COMMANDS, "fit", ("no_such_package.command", ""))
+    assert jtq.main(["fit"]) == 1
+    assert capsys.readouterr().err == "jtq fit: no_such_package is not installed: pip install 'jtqd[train]'\n"
+    monkeypatch.setitem(jtq.COMMANDS, "fit", ("jtqd.no_such_module", ""))
+    with pytest.raises(ModuleNotFoundError):
+        jtq.main(["fit"])
+
+
 def started(*arguments):
     return subprocess.Popen(
         [sys.executable, "-m", "jtqd.daemon.jtq", *map(str, arguments)],

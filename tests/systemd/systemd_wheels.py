@@ -79,9 +79,9 @@ def copy_sources(copy: Path) -> Path:
         shutil.copy2(ROOT / item, copy / item)
     unwanted = shutil.ignore_patterns("__pycache__", "*.egg-info")
     shutil.copytree(ROOT / "src", copy / "src", symlinks=True, ignore=unwanted)
-    for link in (ROOT / "src" / "jtqd").iterdir():
-        if link.is_symlink():
-            shutil.copytree(ROOT / link.name, copy / link.name, ignore=unwanted)
+    packages = [link.name for link in (ROOT / "src" / "jtqd").iterdir() if link.is_symlink()]
+    for folder in (*packages, "systemd"):
+        shutil.copytree(ROOT / folder, copy / folder, ignore=unwanted)
     return copy
 
 
