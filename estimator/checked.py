@@ -1,4 +1,8 @@
-"""Checked reading of plain mappings (from YAML or JSON): every error names file, key, found and expected."""
+"""Errors of what an operator wrote: sections of a file read key by key, and numbers of a command line.
+
+Every message names the file, the key, what was found and what was expected. Whole dataclasses are read by
+`jtqd.estimator.decoder`.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +39,8 @@ class Verbatim(str):
     __slots__ = ()
 
 
-def _shown(value: object) -> str:
+def shown(value: object) -> str:
+    """Return a value as messages show it: its repr, shortened; what is `Verbatim` as it is."""
     if isinstance(value, Verbatim):
         return value
     text = _SHORT.repr(value)
@@ -43,7 +48,7 @@ def _shown(value: object) -> str:
 
 
 def number_as_text(value: object) -> str:
-    """Explain a number that arrived as text: YAML 1.1 needs a point and a signed exponent."""
+    """Return an explanation for a number that arrived as text: YAML 1.1 needs a point and a signed exponent."""
     if isinstance(value, str):
         try:
             float(value)
@@ -65,7 +70,7 @@ class Section:
         self.path: Final = path
         if not isinstance(mapping, Mapping):
             at = f"key '{path}': " if path else ""
-            raise ConfigError(f"{where}: {at}found {_shown(mapping)}, expected {SECTION}")
+            raise ConfigError(f"{where}: {at}found {shown(mapping)}, expected {SECTION}")
         for key in mapping:
             if not isinstance(key, str):
                 raise ConfigError(
@@ -79,7 +84,7 @@ class Section:
 
     def error(self, key: str, found: object, expected: str) -> ConfigError:
         """Return (not raise) the error of one key, for checks that this class does not know."""
-        return ConfigError(f"{self.where}: {self._at(key)}: found {_shown(found)}, expected {expected}")
+        return ConfigError(f"{self.where}: {self._at(key)}: found {shown(found)}, expected {expected}")
 
     def _take(self, key: str, default: object, expected: str) -> Any:
         self._known[key] = None
@@ -93,11 +98,9 @@ class Section:
         """Whether the key is present (does not count as reading it)."""
         return key in self._mapping
 
-    def keys(self) -> tuple[str, ...]:
+    def names(self) -> tuple[str, ...]:
         """All keys that are present, in file order."""
         return tuple(self._mapping)
-
-    names = keys  # for loops: linters take `.keys()` for a dict's
 
     def raw(self, key: str, default: Any = REQUIRED, expected: str = "a value") -> Any:
         """Return the value as parsed, marking the key as known; `expected` is for the message when it is missing."""
@@ -161,15 +164,6 @@ class Section:
             raise self.error(key, value, expected)
         return value
 
-    def boolean(self, key: str, default: Any = REQUIRED) -> bool:
-        """Return true or false; 0, 1 and texts are refused."""
-        value = self._take(key, default, "true or false")
-        if key not in self._mapping:
-            return value  # type: ignore[no-any-return]
-        if not isinstance(value, bool):
-            raise self.error(key, value, "true or false")
-        return value
-
     def section(self, key: str, optional: bool = False) -> Section | None:
         """Return the mapping under `key`; None when it is optional and missing (or empty in the file)."""
         value = self._take(key, None if optional else REQUIRED, SECTION)
@@ -194,7 +188,7 @@ class Section:
         return f"{self.path}.{key}" if self.path else key
 
     def finish(self, known: Iterable[str] = ()) -> None:
-        """Refuse keys that are not `known` and were not read yet, naming the nearest known one."""
+        """Refuse keys that were not read yet and are not `known`, naming the nearest one."""
         self._known.update(dict.fromkeys(known))
         for key in self._mapping:
             if key not in self._known:
@@ -230,7 +224,7 @@ def _bound(value: float) -> str:
     return str(value) if isinstance(value, int) else f"{value:g}"
 
 
-# Numbers of a command line: argparse types whose refusals say what was found and what was expected.
+# Numbers of a command line: types for argparse's `type=`.
 
 
 def seconds(text: str) -> float:

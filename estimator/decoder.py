@@ -10,12 +10,13 @@
 
     friction = decode(Friction, Section(mapping, "joint.yaml", "friction"))
 
-A range stands once, beside its field. Types and ranges are those of msgspec, which converts every value; an error of
-its own has neither the value nor the unit, it takes NaN and keys that no field has, so the messages are written here.
+A range stands once, beside its field. msgspec holds the ranges and converts the values. Its errors have neither the
+value nor the unit, and it takes NaN, infinity and keys that no field has: keys, finiteness and messages are ours.
 
-A field is a value (float, int, bool, str, Literal, a tuple of numbers, or one of these or None), another dataclass (a
-section; optional where it has a default), a tuple of dataclasses (a list of sections) or a dict of values (a section
-with free keys). A dataclass whose file has another shape than itself has a class method `from_section(section)`.
+A field is a value (float, int, bool, str or a tuple of numbers), a dataclass (a section), a tuple of dataclasses (a list
+of sections) or a Mapping from str to values (a section with free keys). A key may be left out where its field has a
+default or may be None; a section or list that is empty in the file counts as left out. A dataclass that differs in
+shape from its section has a class method `from_section(section)`.
 """
 
 from __future__ import annotations
@@ -23,8 +24,7 @@ from __future__ import annotations
 import math
 import re
 import sys
-from collections import abc
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cache
 from types import NoneType, UnionType
@@ -42,6 +42,7 @@ from jtqd.estimator.checked import (
     in_unit,
     number_as_text,
     range_text,
+    shown,
 )
 
 T = TypeVar("T")
@@ -74,6 +75,11 @@ Text = Annotated[str, msgspec.Meta(pattern=r"\S")]
 """A text that is not empty."""
 
 
+def numbers_text(count: int) -> Verbatim:
+    """Return how a message shows a list of a wrong length."""
+    return Verbatim("1 number" if count == 1 else f"{count} numbers")
+
+
 class FieldError(ConfigError):
     """A value of a dataclass cannot be used: key (dotted below the dataclass), what was found, what was expected.
 
@@ -81,9 +87,12 @@ class FieldError(ConfigError):
     """
 
     def __init__(self, where: str, key: str, found: object, expected: str) -> None:
-        shown = found if isinstance(found, Verbatim) else repr(found)
-        super().__init__(f"{where}.{key}: found {shown}, expected {expected}")
+        super().__init__(f"{where}.{key}: found {shown(found)}, expected {expected}")
         self.key, self.found, self.expected = key, found, expected
+
+    def __reduce__(self) -> tuple[type[ConfigError], tuple[str]]:
+        """Reach another process as a plain ConfigError."""
+        return ConfigError, (str(self),)
 
 
 def decode(kind: type[T], section: Section, **given: Any) -> T:
@@ -161,10 +170,12 @@ class _Field:
             else:
                 if _finite(converted):
                     return converted
-        found = value
+        found, expected = value, self.expected
         if many and isinstance(value, list) and len(value) not in _lengths(self.node):
-            found = Verbatim(f"{len(value)} number{'' if len(value) == 1 else 's'}")
-        raise section.error(key, found, self.expected + ("" if many else number_as_text(value)))
+            found = numbers_text(len(value))
+        if isinstance(self.node, inspect.FloatType):
+            expected += number_as_text(value)
+        raise section.error(key, found, expected)
 
     def holds(self, value: Any) -> bool:
         """Whether a number or choice keeps the annotation."""
@@ -185,15 +196,16 @@ class _Field:
 
 
 def _nested(kind: Any, section: Section) -> Any:
+    """Return the dataclass of a section, by its own `from_section` where it has one."""
     own = getattr(kind, "from_section", None)
     return decode(kind, section) if own is None else own(section)
 
 
 def _plain(value: object) -> object:
-    """Return numpy's floats as Python's: msgspec takes no subclasses."""
-    if isinstance(value, float):
-        return float(value)
-    return [_plain(each) for each in value] if isinstance(value, list) else value
+    """Return numpy's floats, bare or in a list, as Python's: msgspec takes no subclasses."""
+    if isinstance(value, list | tuple):
+        return [float(each) if isinstance(each, float) else each for each in value]
+    return float(value) if isinstance(value, float) else value
 
 
 def _finite(value: object) -> bool:
@@ -230,6 +242,7 @@ def _checked_fields(kind: Any) -> tuple[_Field, ...]:
 
 
 def _field(name: str, hint: Any, optional: bool) -> _Field:
+    """Return how a field of this annotation is read; optional: it has a default."""
     options = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     nullable = NoneType in options
     (core,) = (each for each in options if each is not NoneType)
@@ -238,7 +251,7 @@ def _field(name: str, hint: Any, optional: bool) -> _Field:
         return _Field(name, hint, "section", core, SECTION, nullable, optional)
     if get_origin(core) is tuple and is_dataclass(arguments[0]):
         return _Field(name, hint, "list", arguments[0], "a list of mappings", nullable, optional)
-    if get_origin(core) is abc.Mapping:
+    if get_origin(core) is Mapping:
         inner = None if arguments[1] is Any else _field("", arguments[1], False)
         return _Field(name, hint, "mapping", inner, SECTION, nullable, optional)
     node: Any = inspect.type_info(core)

@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import Annotated, Any, Final
 
 from jtqd.estimator.checked import Section, Verbatim
-from jtqd.estimator.decoder import FieldError, Text, check, choice, decode, limits
+from jtqd.estimator.decoder import FieldError, Text, check, choice, decode, limits, numbers_text
 from jtqd.estimator.effects.library import EFFECTS, checked_parameters, read_parameters
 
 CONVENTIONS: Final = ("joint_over_motor", "motor_over_joint")
@@ -80,8 +80,8 @@ class Efficiency:
 
 def _check_length(where: str, key: str, values: tuple[float, ...], count: int, other: str) -> None:
     if len(values) != count:
-        found = Verbatim(f"{len(values)} number{'' if len(values) == 1 else 's'}")
-        raise FieldError(where, key, found, f"a list of {count} finite numbers, as many as {other}")
+        expected = f"a list of {count} finite numbers, as many as {other}"
+        raise FieldError(where, key, numbers_text(len(values)), expected)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,13 +12,14 @@ import math
 import re
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 import yaml
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.decoder import decode, limits
 from jtqd.models.files import load_yaml
 from jtqd.sysid.excitation.fourier import FourierSeries, FourierTrajectory
 from jtqd.sysid.motion.setpoints import PERIOD_S, Limits, Mark, MotionError, Setpoints, check_setpoints
@@ -54,10 +55,10 @@ class Plateau:
         hold_s, ramp_s: seconds.
     """
 
-    velocity_rad_s: float
-    current_a: float
-    hold_s: float
-    ramp_s: float = DEFAULT_RAMP_S
+    velocity_rad_s: Annotated[float, limits("rad/s")]
+    current_a: Annotated[float, limits("A")]
+    hold_s: Annotated[float, limits("s", ge=0.0, le=LONGEST_S)]
+    ramp_s: Annotated[float, limits("s", ge=0.0, le=LONGEST_S)] = DEFAULT_RAMP_S
 
     @property
     def duration_s(self) -> float:
@@ -78,8 +79,8 @@ class Plateau:
 class Rest:
     """Both targets are taken to zero within ramp_s and stay there for hold_s [s]."""
 
-    hold_s: float
-    ramp_s: float = DEFAULT_RAMP_S
+    hold_s: Annotated[float, limits("s", ge=0.0, le=LONGEST_S)]
+    ramp_s: Annotated[float, limits("s", ge=0.0, le=LONGEST_S)] = DEFAULT_RAMP_S
 
     @property
     def duration_s(self) -> float:
@@ -97,7 +98,7 @@ class Off:
     then is its sensor's own error. Must begin at rest.
     """
 
-    hold_s: float
+    hold_s: Annotated[float, limits("s", ge=SHORTEST_OFF_S, le=LONGEST_S)]
 
     @property
     def duration_s(self) -> float:
@@ -255,30 +256,21 @@ def _run(section: Section) -> Run:
 
 def _segment(section: Section) -> Segment:
     kind = section.text("kind", ("plateau", "rest", "power_off", "fourier"))
-    result: Segment
     if kind == "fourier":
-        result = _fourier(section)
-    elif kind == "power_off":
-        result = Off(section.number("hold_s", "s", low=SHORTEST_OFF_S, high=LONGEST_S))
-    else:
-        hold_s = section.number("hold_s", "s", low=0.0, high=LONGEST_S)
-        ramp_s = section.number("ramp_s", "s", low=0.0, high=LONGEST_S, default=DEFAULT_RAMP_S)
-        if kind == "rest":
-            result = Rest(hold_s, ramp_s)
-        else:
-            result = Plateau(
-                section.number("velocity_rad_s", "rad/s"), section.number("current_a", "A"), hold_s, ramp_s
-            )
-    section.finish()
-    return result
+        return _fourier(section)
+    if kind == "power_off":
+        return decode(Off, section)
+    return decode(Rest, section) if kind == "rest" else decode(Plateau, section)
 
 
 def _fourier(section: Section) -> Fourier:
     duration_s = section.number("duration_s", "s", low=0.1, high=LONGEST_S)
+    velocity, current = section.required("velocity"), section.required("current")
+    section.finish()
     try:
         return Fourier(
-            FourierTrajectory.from_section(section.required("velocity"), duration_s),
-            FourierSeries.from_section(section.required("current"), duration_s),
+            FourierTrajectory.from_section(velocity, duration_s),
+            FourierSeries.from_section(current, duration_s),
         )
     except ConfigError as error:
         if str(error).startswith(section.where):
