@@ -27,16 +27,17 @@ from jtqd.drivers.pdo import PdoParameters
 from tests.drivers.canopen_nodes import HubResponder, Responder, TestNode, drive_store, sensor_store
 from tests.paths import ROOT
 
+NODES = [
+    {"node": 1, "kind": "drive", "identity": {"vendor": 0x7A1, "product": 0x402}},
+    {"node": 2, "kind": "drive", "identity": {"serial": 22}},
+    {"node": 3, "kind": "sensor", "channels": [1]},
+]
 REQUEST = {
     "bus": "virtual",
     "answer_timeout_s": 0.2,
     "heartbeat_ms": 30,
     "sync": {"counter_overflow": 240},
-    "nodes": [
-        {"node": 1, "kind": "drive", "identity": {"vendor": 0x7A1, "product": 0x402}},
-        {"node": 2, "kind": "drive", "identity": {"serial": 22}},
-        {"node": 3, "kind": "sensor", "channels": [1]},
-    ],
+    "nodes": NODES,
 }
 
 
@@ -297,6 +298,15 @@ def test_sensor_channel_that_is_off(bench):
     assert str(error) == "node 3: 6112h:1 channel operating mode: expected 1 (normal operation), found 0"
 
 
+def test_a_sensor_without_operating_mode_and_a_drive_without_serial_number(bench):
+    for subindex in (0, 1, 2):
+        del bench.sensor.store.entries[0x6112, subindex]
+    del bench.drive1.store.entries[0x1018, 4]
+    report = bench.boot(nodes=[{"node": 1, "kind": "drive", "identity": {"revision": 0x10000}}, *NODES[2:]])
+    assert report.nodes[1].serial == 0
+    assert sorted(report.nodes) == [1, 3]
+
+
 def test_another_sync_identifier(bench):
     bench.drive1.store.set_number(0x1005, 0, 0x90)
     assert "node 1: 1005h:0 COB-ID SYNC: expected 080h, found 0x00000090" in str(bench.fails())
@@ -408,6 +418,14 @@ def test_request_becomes_profiles():
         SensorProfile(3),
     )
     assert request.settings == BusSettings(0x20, heartbeat_ms=30, counter_overflow=240)
+
+
+def test_an_optional_node_is_waited_for_half_a_second_at_most():
+    nodes = [{"node": 1, "kind": "drive"}, {"node": 3, "kind": "sensor", "mandatory": False}]
+    patient = parse_request({"bus": "can0", "answer_timeout_s": 2.0, "nodes": nodes})
+    assert (patient.timeout_s(1), patient.timeout_s(3)) == (2.0, 0.5)
+    hasty = parse_request({"bus": "can0", "answer_timeout_s": 0.2, "nodes": nodes})
+    assert (hasty.timeout_s(1), hasty.timeout_s(3)) == (0.2, 0.2)
 
 
 def run_boot(request):

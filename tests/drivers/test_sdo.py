@@ -81,6 +81,14 @@ def test_segmented_download():
     assert write.done
 
 
+def test_a_segmented_download_whose_toggle_does_not_alternate_is_broken():
+    write = Transfer(0x2000, 1, b"ABCDEFGHI")
+    write.answer(frame("60 00 20 01 00 00 00 00"))
+    with pytest.raises(TransferError) as caught:
+        write.answer(frame("30 00 00 00 00 00 00 00"))  # toggle 1 where 0 is due
+    assert caught.value.code == TOGGLE_NOT_ALTERNATED
+
+
 def test_a_refusal_is_the_servers():
     with pytest.raises(SdoAbort, match="object does not exist"):
         Transfer(0x5000, 0).answer(frame("80 00 50 00 00 00 02 06"))

@@ -79,7 +79,11 @@ def test_a_refusal_is_an_abort_and_a_long_object_comes_in_segments() -> None:
 
 def test_a_lost_answer_is_asked_for_again_and_answers_to_others_are_ignored() -> None:
     """The first reply is lost; the second comes behind one of another node, a short one and one to another object."""
-    others = [(0x586, bytes(8)), (0x585, b"\x43\x00\x10"), (0x585, b"\x43\x18\x10\x01\x99\x00\x00\x00")]
+    others = [
+        (0x586, bytes.fromhex("43 00 10 00 FF FF FF FF")),
+        (0x585, b"\x43\x00\x10"),
+        (0x585, b"\x43\x18\x10\x01\x99\x00\x00\x00"),
+    ]
     socket = FakeSocket(lambda n, reply: [] if n == 1 else [*others, (0x585, reply)])
     assert client(socket).read(0x1000, 0) == (0x0002_0192).to_bytes(4, "little")
     assert len(socket.requests) == 2

@@ -42,8 +42,12 @@ def configure(
 
 
 def test_a_drive_is_configured_and_says_how_it_counts(lock: LockStep) -> None:
-    units = set_up(lock.access(2), DriveProfile(2), CST, 300, lock.sleep, temperature=True)
+    access = lock.access(2)
+    access.write(0x6071, 0, b"\x10\x00")
+    access.write(0x60FF, 0, b"\x10\x00\x00\x00")
+    units = set_up(access, DriveProfile(2), CST, 300, lock.sleep, temperature=True)
     store = lock.bench.drives[1].store
+    assert (store.number(0x6071), store.number(0x60FF)) == (0, 0), "targets of zero before the mode"
     assert store.number(0x1016, 2) == 0x0021_012C, "node 21h, 300 ms"
     assert (store.number(0x60C2, 1), store.number(0x60C2, 2)) == (2, -3)
     assert store.number(0x1802, 1) == 0x4000_0382, "TPDO3 is on, although jtqd's boot had switched it off"
