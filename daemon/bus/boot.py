@@ -239,7 +239,7 @@ class ReturningNodes:
 
 
 def gear_ratio_error(config: Config, node: int, found: float | None) -> str | None:
-    """Compare the gear ratio that a drive reports (6091h) with the joint file; returns what is wrong in one line, or None."""
+    """Compare the gear ratio that a drive reports (6091h) with the joint file; returns what is wrong, or None."""
     for joint in config.joints:
         expected = joint.joint.gear_ratio
         if joint.node_id == node and found and abs(found - expected) > 0.005 * expected:

@@ -45,9 +45,6 @@ from jtqd.drivers.frame import pack
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
 from jtqd.drivers.object_dictionary import ObjectStore, entries_from_json
 
-# Steps of the start and of the end: bench, boot of the nodes, answers of children; all end early when the operator says.
-
-
 _WARM_UP_TIMEOUT_S = 60.0
 """Generous: a controller that loads its libraries from a slow card may take its time; nothing is published meanwhile."""
 _BENCH_PRIORITY = 40
@@ -72,7 +69,7 @@ def checked_load(config: Config) -> BusLoad:
 def log_directory(record: str | None) -> Path | None:
     """Where logs go, from the option `--record`, made where it is missing; None: nowhere.
 
-    A disk that is full, read-only or closed to us now may not be so later: that is the recorder's to say and to wait for.
+    A disk that is full, read-only or closed to us now may not be so later: the recorder reports it and waits for it.
 
     Raises:
         SupervisorError: the path can be no directory, whatever becomes of the disk.
@@ -439,7 +436,7 @@ class Supervisor:
         self._conditions_file.write(self._conditions.present())
 
     def _serve(self, view: View, now: float) -> None:
-        """The own node's duties, for as long as there is a bus; what became of it the loop says."""
+        """The own node's duties, for as long as there is a bus; the loop reports its end."""
         if self._bus_gone:
             return
         known = len(self._report["nodes"])
@@ -474,7 +471,7 @@ class Supervisor:
             raise ReloadError(wrong)
 
     def _renew(self, config: Config) -> None:
-        """Another configuration is in force: say so wherever it shows."""
+        """Show another configuration, which has come into force, wherever it shows."""
         self._config = config
         self._health.use(config)
         self._node.set_parameters(config)

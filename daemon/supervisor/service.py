@@ -1,6 +1,8 @@
-"""What the supervisor does for those who look after a daemon: systemd, the control socket, reloads, the metrics file.
+"""Service to those who look after a daemon: systemd, the control socket, reloads, the metrics file.
 
-Nothing here touches the loop but through shared memory and signals.
+Nothing here touches the loop but through shared memory and signals. The metrics are a Prometheus text file for a node
+exporter's textfile collector: off unless the configuration has `metrics: {file: PATH}`; a name without a directory lies in
+the runtime directory.
 """
 
 from __future__ import annotations
@@ -22,12 +24,6 @@ from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.daemon.shared.systemd import Notifier
 from jtqd.daemon.supervisor.control import FILE, Answer, ControlError, ControlServer, Reply
 from jtqd.estimator import status as st
-
-# The daemon's counters as a Prometheus text file, for a node exporter's textfile collector.
-#
-# Written by the supervisor under another name and then renamed: a reader never sees half of it. Off unless the configuration
-# has `metrics: {file: PATH}`; a name without a directory lies in the runtime directory.
-
 
 _GAUGES = frozenset(("work_max_ns", "late_max_ns"))
 _SHARES = (0.5, 0.99, 1.0)
@@ -85,7 +81,7 @@ def metrics_text(
 
 
 def write_metrics(path: Path, text: str) -> None:
-    """Replace the file at once. Raises OSError."""
+    """Replace the file at once: a reader never sees half of it. Raises OSError."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         temporary.write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""How the loop is doing, for whoever looks: a live table on a terminal, a line every few seconds elsewhere."""
+"""Live table of the running loop on a terminal; a line every few seconds elsewhere."""
 
 from __future__ import annotations
 
@@ -16,9 +16,6 @@ from rich.text import Text
 from jtqd.daemon.shared.log_lines import INFO, OperatorLog
 from jtqd.daemon.shared.snapshot import JointView, SnapshotReader, View
 from jtqd.estimator.status import NAMES, PUBLISHED
-
-# The table that `jtqd` shows while it runs: torque, sigma and status of both joints, and how the loop is doing.
-
 
 COLOURS = {"valid": "green", "degraded": "yellow", "standstill": "cyan", "starting": "blue", "off": "dim"}
 """Style of a status; what is not here is bad news."""
