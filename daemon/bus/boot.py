@@ -1,7 +1,7 @@
-"""Nodes that restart, stop, appear or lose their configuration in service: configured before their data is used.
+"""Boot of the nodes: the request, and nodes that restart, stop, appear or lose their configuration in service.
 
-One after the other, each by a boot process of its own beside the running loop; a node that fails is tried again later and
-keeps no other one waiting.
+They are configured before their data is used: one after the other, each by a boot process of its own beside the running
+loop; a node that fails is tried again later and keeps no other one waiting.
 """
 
 from __future__ import annotations
@@ -17,14 +17,11 @@ from jtqd.daemon.shared.log_lines import RateLimit
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.drivers.bus_load import BusLoad, configured_load
 
-# What the boot process is asked to do: `python -m jtqd.drivers.boot` gets this as JSON.
-
-
 _OWN_EDS = Path(__file__).resolve().parents[2] / "drivers" / "eds" / "jtqd.eds"
 
 
 def boot_request(config: Config, bus: str, only: int | None = None) -> dict[str, Any]:
-    """Request for all nodes, or for the one that came back while our own SYNC is running."""
+    """Request to the boot process (`python -m jtqd.drivers.boot`, as JSON) for all nodes, or for `only` one in service."""
     nodes: list[dict[str, Any]] = [
         {
             "node": joint.node_id,
@@ -64,11 +61,8 @@ def boot_request(config: Config, bus: str, only: int | None = None) -> dict[str,
     }
 
 
-# Bus load of a configuration.
-
-
 def bus_load_of(config: Config) -> BusLoad:
-    """Load of everything that the configuration puts on the bus; nothing is checked here."""
+    """Compute the load of everything that the configuration puts on the bus; nothing is checked here."""
     return configured_load(
         [joint.node_id for joint in config.joints],
         {config.sensor.node_id: config.sensor.channels} if config.sensor else {},
@@ -88,8 +82,8 @@ _SAY_AGAIN_S = 60.0
 _SETTLED_S = 0.3
 """After its boot a node's last heartbeat may still say pre-operational."""
 
-Say = Callable[[str, int, str], None]
-"""Takes topic, node and a line for the operator."""
+LogEvent = Callable[[str, int, str], None]
+"""Takes topic, node and a line of an event."""
 
 
 class ReturningNodes:
@@ -102,7 +96,7 @@ class ReturningNodes:
         config, bus: as for the first boot.
         report: report of the first boot; nodes that are booted later are added.
         start_child: makes a child process from (module, arguments, name).
-        say: what the operator is told.
+        log: takes topic, node and line of an event.
 
     Attributes:
         busy: node that is being booted; 0: none.
@@ -115,10 +109,10 @@ class ReturningNodes:
         bus: str,
         report: dict[str, Any],
         start_child: Callable[[str, list[str], str], Child],
-        say: Say,
+        log: LogEvent,
     ) -> None:
         self._config, self._bus, self._report = config, bus, report
-        self._start_child, self._say = start_child, say
+        self._start_child, self._log = start_child, log
         self._child: Child | None = None
         self._restarts = 0
         """`View.restarts` of the node that is being booted, before that began."""
@@ -130,7 +124,7 @@ class ReturningNodes:
         self._limit = RateLimit(_SAY_AGAIN_S)
 
     def request(self, node: int, why: str) -> None:
-        """Boot this node again; `why` goes into the line that tells it."""
+        """Boot this node again; `why` goes into the line about it."""
         self._requested[node] = why
 
     def waiting(self, view: View, now_s: float) -> list[int]:
@@ -161,7 +155,11 @@ class ReturningNodes:
             node, self._child, self.busy = self.busy, None, 0
             # One that has restarted meanwhile may have lost what was written to it.
             if view.restarts[node] != self._restarts:
-                self._refuse(node, f"node {node} restarted while it was being configured: once more", now_s)
+                self._refuse(
+                    node,
+                    f"node {node} restarted while it was being configured: it is configured once more",
+                    now_s,
+                )
                 booted = None
             else:
                 booted = self._accepted(node, answer, now_s)
@@ -198,17 +196,19 @@ class ReturningNodes:
         why = self._requested.pop(node, None)
         if node in self.absent:
             self.absent.discard(node)
-            self._say("boot", node, f"node {node} has appeared and is configured")
+            self._log("boot", node, f"node {node} has appeared and is configured")
         else:
             text = f"node {node} was away and is configured again"
-            self._say("boot", node, text if why is None else f"node {node} is configured again: {why}")
+            self._log("boot", node, text if why is None else f"node {node} is configured again: {why}")
         for note in booted.get("notes", ()):
-            self._say("boot", node, f"node {node}: {note}")
+            self._log("boot", node, f"node {node}: {note}")
 
     def _accepted(self, node: int, answer: dict[str, Any] | None, now_s: float) -> dict[str, Any] | None:
         """The node's part of the report, if it may be used."""
         if answer is None or not answer["ok"]:
-            reason = "its boot ended without a word" if answer is None else answer["error"]["message"]
+            reason = (
+                "the boot process ended without an answer" if answer is None else answer["error"]["message"]
+            )
             self._refuse(node, f"boot in service: {reason}", now_s)
             return None
         now: dict[str, Any] = answer["nodes"][str(node)]
@@ -222,7 +222,7 @@ class ReturningNodes:
                 return None
         if now["serial"] != then["serial"]:
             text = f"another device: serial number {now['serial']:08X}h, before {then['serial']:08X}h"
-            self._say("boot", node, f"node {node}: {text}")
+            self._log("boot", node, f"node {node}: {text}")
         return now
 
     def _accepted_first(self, node: int, now: dict[str, Any], now_s: float) -> dict[str, Any] | None:
@@ -234,12 +234,12 @@ class ReturningNodes:
         return None
 
     def _refuse(self, node: int, text: str, now_s: float) -> None:
-        if self._limit.may_say(text, now_s) is not None:
-            self._say("boot", node, text)
+        if self._limit.admit(text, now_s) is not None:
+            self._log("boot", node, text)
 
 
 def gear_ratio_error(config: Config, node: int, found: float | None) -> str | None:
-    """A drive that tells another gear ratio (6091h) than the joint file belongs to another joint."""
+    """Compare the gear ratio that a drive reports (6091h) with the joint file; returns what is wrong, or None."""
     for joint in config.joints:
         expected = joint.joint.gear_ratio
         if joint.node_id == node and found and abs(found - expected) > 0.005 * expected:

@@ -18,13 +18,6 @@ from jtqd.drivers.eds.own_objects import BUS_FIELDS
 from jtqd.drivers.emcy import COMMUNICATION, EMCY, GENERIC, NO_ERROR, Emergency, ErrorHistory, describe, parse
 from jtqd.drivers.object_dictionary import ObjectStore
 
-# State of the CAN controller, from the error messages of its driver (linux/can/error.h). Pure: bytes in.
-#
-# The kernel's driver sends them as frames with CAN_ERR_FLAG to those who ask for them: error warning, error passive, bus-
-# off and restart, lost arbitration, missing acknowledge, protocol errors, overruns, and where it can the two error
-# counters. vcan and the unix hub make none by themselves, but carry those that somebody sends.
-
-
 ACTIVE, WARNING, PASSIVE, BUS_OFF, DOWN = 0, 1, 2, 3, 4
 STATE_NAMES = ("error active", "error warning", "error passive", "bus-off", "interface down")
 
@@ -43,7 +36,15 @@ class BusChange(NamedTuple):
 
 
 class BusState:
-    """Counts of one interface, by the names of `BUS_FIELDS`."""
+    """State of the CAN controller and counts of one interface, from the error messages of its driver (linux/can/error.h).
+
+    The kernel's driver sends them as frames with CAN_ERR_FLAG to those who ask for them: error warning, error passive,
+    bus-off and restart, lost arbitration, missing acknowledge, protocol errors, overruns, and where it can the two error
+    counters. vcan and the unix hub make none by themselves, but carry those that somebody sends.
+
+    Attributes:
+        counts: by the names of `BUS_FIELDS`.
+    """
 
     def __init__(self) -> None:
         self.counts = dict.fromkeys(BUS_FIELDS, 0)
@@ -58,7 +59,7 @@ class BusState:
         return tuple(self.counts.values())
 
     def error_frame(self, can_id: int, data: bytes) -> BusChange | None:
-        """One message of the driver; the change of state that it tells, if any. A short one is taken as far as it goes."""
+        """Take one message of the driver; returns the change of state, if any. A short one is taken as far as it goes."""
         counts = self.counts
         data = data.ljust(8, b"\0")
         for bit, name in (
@@ -111,13 +112,6 @@ class BusState:
         return BusChange(before, state)
 
 
-# EMCY messages of the nodes: a bounded history of each, and few lines for the operator. Pure: bytes and times in.
-#
-# Every message is kept in the ring of its node and counted. A line is said at once for the first message of a code; what
-# repeats is counted and told with the next line (`daemon/shared/log_lines.py`), so that a storm is a few lines in five
-# seconds.
-
-
 DEPTH = 32
 """Messages kept of each node."""
 
@@ -137,7 +131,11 @@ class _Node:
 
 
 class EmcyLog:
-    """Histories of these nodes; a message of any other is passed over."""
+    """EMCY messages of these nodes: a bounded history of each, and few lines. A message of any other is passed over.
+
+    Every message is kept in the ring of its node and counted. There is a line at once for the first message of a code;
+    what repeats is counted and named in the next line, so that a storm is a few lines in five seconds.
+    """
 
     def __init__(self, nodes: Iterable[int]) -> None:
         self._nodes = {node: _Node() for node in nodes}
@@ -145,7 +143,7 @@ class EmcyLog:
         """Messages of all nodes."""
 
     def receive(self, node: int, data: bytes, now_s: float) -> str | None:
-        """Take a message; the line to be said, if any."""
+        """Take a message; returns the line to be logged, if any."""
         seen = self._nodes.get(node)
         if seen is None:
             return None
@@ -153,12 +151,12 @@ class EmcyLog:
         self.count += 1
         seen.count += 1
         seen.history.append(Kept(now_s, emergency))
-        unsaid = seen.limit.may_say((emergency.code, emergency.register), now_s)
-        if unsaid is None:
+        refused = seen.limit.admit((emergency.code, emergency.register), now_s)
+        if refused is None:
             return None
         over = emergency.code == NO_ERROR and not emergency.register
         what = "EMCY 0000h: no error any more" if over else describe(emergency)
-        return f"node {node}: {what}" + (f" ({unsaid} more before)" if unsaid else "")
+        return f"node {node}: {what}" + (f" ({refused} more before)" if refused else "")
 
     def history(self, node: int) -> list[Kept]:
         """Messages of a node, the oldest first, `DEPTH` at most."""
@@ -174,21 +172,6 @@ class EmcyLog:
         return history[-1].emergency if history else None
 
 
-# jtqd's own errors: what is present, 1001h, 1003h, and the EMCY messages that tell it, with inhibit time. Pure.
-#
-# An error is a code with a detail (which PDO, which node); each is told when it comes and when it has gone, and not between.
-# The end of one is EMCY 0000h with the register of what is left; the manufacturer's field names the code and detail:
-#
-#     bytes 0..1  error code, 0000h for an end
-#     byte  2     error register 1001h
-#     bytes 3..4  the code that ended (0000h only), else 0
-#     bytes 5..6  detail: COB-ID or node-ID
-#     byte  7     joints concerned: bit 0 joint 1, bit 1 joint 2
-#
-# Between two messages passes the inhibit time 1015h. What comes meanwhile waits, in order; an error that has come and gone
-# before it could be told is not told, but it is in the history.
-
-
 _FIELD = struct.Struct("<HHB")
 _INHIBIT = 0x1015
 _INHIBIT_UNIT_S = 1e-4
@@ -200,7 +183,19 @@ Error = tuple[int, int]
 
 
 class OwnErrors:
-    """Errors of jtqd's own node.
+    """Errors of jtqd's own node: what is present, 1001h, 1003h, and the EMCY messages, with inhibit time.
+
+    An error is a code with a detail (which PDO, which node). There is one message when it comes and one when it has gone:
+    EMCY 0000h with the register of what is left; the manufacturer's field names code and detail:
+
+        bytes 0..1  error code, 0000h for an end
+        byte  2     error register 1001h
+        bytes 3..4  the code that ended (0000h only), else 0
+        bytes 5..6  detail: COB-ID or node-ID
+        byte  7     joints concerned: bit 0 joint 1, bit 1 joint 2
+
+    Between two messages passes the inhibit time 1015h. What comes meanwhile waits, in order; an error that has come and
+    gone before its message could be sent has none, but it is in the history.
 
     Args:
         store: its object dictionary; 1001h, 1003h and 1015h are kept and read there.
@@ -210,8 +205,8 @@ class OwnErrors:
         self._store = store
         self._history = ErrorHistory(store)
         self._present: dict[Error, tuple[int, int]] = {}  # -> register, joints
-        self._told: set[Error] = set()
-        self._queue: dict[Error, int] = {}  # errors with something to tell -> joints
+        self._sent: set[Error] = set()
+        self._queue: dict[Error, int] = {}  # errors with a message to be sent -> joints
         self._not_before = -inf
 
     def follow(self, change: Change) -> None:
@@ -238,10 +233,10 @@ class OwnErrors:
         self._present[error] = register | GENERIC, joints
         self._store.set_number(0x1001, 0, self.register)
         self._history.push(code | detail << 16)
-        if error in self._told:
+        if error in self._sent:
             self._queue.pop(
                 error, None
-            )  # its end had not been told: nothing has changed for those who listen
+            )  # its end had not been sent: nothing has changed for those who listen
         elif len(self._queue) < _WAITING:
             self._queue[error] = joints
         return True
@@ -253,31 +248,31 @@ class OwnErrors:
             return False
         _, joints = self._present.pop(error)
         self._store.set_number(0x1001, 0, self.register)
-        if error in self._told:
+        if error in self._sent:
             self._queue[error] = joints
         else:
             self._queue.pop(error, None)
         return True
 
     def happened(self, code: int, detail: int = 0, *, joints: int = 0, register: int = COMMUNICATION) -> None:
-        """Something that does not last, as a recovery from bus-off: told as an error and in the history."""
+        """Something that does not last, as a recovery from bus-off: an error message and an entry in the history."""
         if self.come(code, detail, joints=joints, register=register):
             del self._present[code, detail]
             self._store.set_number(0x1001, 0, self.register)
 
     def tick(self, now_s: float) -> bytes | None:
-        """The message that is due: 8 bytes for COB-ID 080h + node-ID. It counts as told."""
+        """The message that is due: 8 bytes for COB-ID 080h + node-ID. It counts as sent."""
         if not self._queue or now_s < self._not_before:
             return None
         error, joints = next(iter(self._queue.items()))
         del self._queue[error]
         self._not_before = now_s + self._store.number(_INHIBIT) * _INHIBIT_UNIT_S
         code, detail = error
-        if error in self._told and error not in self._present:
-            self._told.discard(error)
+        if error in self._sent and error not in self._present:
+            self._sent.discard(error)
             return EMCY.pack(NO_ERROR, self.register, _FIELD.pack(code, detail & 0xFFFF, joints))
         if error in self._present:
-            self._told.add(error)
+            self._sent.add(error)
         return EMCY.pack(code, self.register | GENERIC, _FIELD.pack(0, detail & 0xFFFF, joints))
 
     def all_present(self) -> list[Error]:

@@ -1,7 +1,7 @@
-"""The nodes in service: who needs a boot and is there, and is everybody still configured as at the boot.
+"""The nodes in service: heartbeats, who needs a boot and is there, and whether each is configured as at its boot.
 
-It owns the SDO queues of the nodes. Pure but for the boot processes that `returning_nodes` starts: replies and times in,
-requests out.
+`NodeWatch` follows the heartbeats, `ConfigurationWatch` the objects of one node, and `NodeCare` joins them with the boots in
+service; it owns the SDO queues of the nodes. Pure but for the boot processes: replies and times in, requests out.
 """
 
 from __future__ import annotations
@@ -14,21 +14,12 @@ from typing import Any, NamedTuple
 
 from jtqd.daemon.bus.boot import ReturningNodes
 from jtqd.daemon.shared.log_lines import RateLimit
-from jtqd.daemon.shared.snapshot import SnapshotReader, View
+from jtqd.daemon.shared.snapshot import NMT_STATES, SnapshotReader, View
 from jtqd.drivers.boot_procedure import VERIFY_CONFIGURATION, signature
 from jtqd.drivers.sdo import NO_OBJECT, NO_SUBINDEX, SdoQueue, SdoResult
 
-# Heartbeat consumers of all nodes (CiA 301, 7.2.8.3.2.2), with the boot timeout that the standard lacks. Pure.
-#
-# A node is watched from the moment it is configured. One that is not heard within the timeout from then on is reported as
-# well as one that was heard and is not any more: a consumer that waits for the first heartbeat would never miss it. What
-# is not one byte, or says a state that does not exist, is counted and does not count as a heartbeat. Two producers with
-# one node-ID show by a rate of nearly twice what was configured.
-
-
 NOT_WATCHED, WAITING, ACTIVE, LOST = 0, 1, 2, 3
 """States of a watch, as in CANopenNode: unconfigured, unknown, active, timeout."""
-_STATES = {0: "boot-up", 4: "stopped", 5: "operational", 127: "pre-operational"}
 _WINDOW = 20
 """Heartbeats over which the rate is taken."""
 _TWICE = 0.65
@@ -36,7 +27,7 @@ _TWICE = 0.65
 _LATE = 5.0
 """Heartbeats after which a reader was away for too long: what has queued up meanwhile says nothing about the rate."""
 _OTHERS = 16
-"""Foreign nodes that are told."""
+"""Foreign nodes that are logged."""
 
 
 class NodeEvent(NamedTuple):
@@ -58,14 +49,19 @@ class _Watch:
         self.heard_s = -inf
         self.since_s = 0.0
         self.lost_s = 0.0
-        self.said: int | None = None
+        self.last_state: int | None = None
         self.window: list[float] = []
         self.doubled = False
         self.limit = limit
 
 
 class NodeWatch:
-    """Watches the heartbeats of the nodes of the configuration.
+    """Heartbeat consumers of all nodes (CiA 301, 7.2.8.3.2.2), with the boot timeout that the standard lacks.
+
+    A node is watched from the moment it is configured. One that is not heard within the timeout from then on is reported
+    as well as one that was heard and is not any more: a consumer that waits for the first heartbeat would never miss it.
+    What is not one byte, or has a state that does not exist, is counted and does not count as a heartbeat. Two producers
+    with one node-ID show by a rate of nearly twice what was configured.
 
     Args:
         nodes: their node-IDs.
@@ -112,7 +108,7 @@ class NodeWatch:
         watch = self._watches.get(node)
         if watch is None:
             return self._foreign(node, data)
-        if len(data) != 1 or data[0] not in _STATES:
+        if len(data) != 1 or data[0] not in NMT_STATES:
             self.malformed += 1
             found = f"{len(data)} bytes" if len(data) != 1 else f"state {data[0]:02X}h"
             return [
@@ -129,10 +125,10 @@ class NodeWatch:
             events.append(NodeEvent("back", node, "", now_s))
         if watch.state in (WAITING, LOST):
             watch.state = ACTIVE
-        if data[0] and watch.said is not None and data[0] != watch.said:
-            said = _STATES[data[0]]
-            events.append(self._event("state", node, watch, now_s, lambda: f"it is {said} now"))
-        watch.said = data[0] or None
+        if data[0] and watch.last_state is not None and data[0] != watch.last_state:
+            name = NMT_STATES[data[0]]
+            events.append(self._event("state", node, watch, now_s, lambda: f"it is {name} now"))
+        watch.last_state = data[0] or None
         if data[0]:
             events += self._rate(node, watch, now_s)
         return events
@@ -181,23 +177,11 @@ class NodeWatch:
 
     @staticmethod
     def _event(kind: str, node: int, watch: _Watch, now_s: float, text: Callable[[], str]) -> NodeEvent:
-        unsaid = watch.limit.may_say(kind, now_s)
-        if unsaid is None:
+        refused = watch.limit.admit(kind, now_s)
+        if refused is None:
             return NodeEvent(kind, node, "", now_s)
-        line = f"node {node}: {text()}" + (f" ({unsaid} more before)" if unsaid else "")
+        line = f"node {node}: {text()}" + (f" ({refused} more before)" if refused else "")
         return NodeEvent(kind, node, line, now_s)
-
-
-# Is a node still configured as it was at its boot? Its objects are read again in service, one at a time. Pure.
-#
-# A node with 1020h says itself whether anybody has written to its configuration: the object holds the signature that the
-# boot wrote, until somebody does (CiA 301). It need not cover the scaling, and a value may change by other ways than an
-# SDO. So all objects are read, one after the other and again from the beginning, that the meaning of its PDOs depends on
-# (`drivers/boot_procedure.py`): COB-ID, transmission type and mapping of the TPDOs, rated current, encoder resolutions,
-# gear ratio, the sensor's unit and decimals. The signature is read between them, in every `SIGNATURE_EVERY`th reading.
-#
-# A signature that is gone while these are unchanged is somebody else's business (the commander maps RPDOs) and is said once.
-# The mode of operation that a drive displays (6061h) means nothing for the estimate; a change of it is said.
 
 
 SIGNATURE_EVERY = 4
@@ -247,7 +231,16 @@ def checks_of(node: Mapping[str, Any]) -> list[Check]:
 
 
 class ConfigurationWatch:
-    """One node. `next` says what to read, `result` takes it.
+    """Whether one node is still configured as at its boot: `next` is the object to be read, `result` takes its value.
+
+    A node with 1020h shows whether anybody has written to its configuration: the object holds the signature that the boot
+    wrote, until somebody does (CiA 301). It need not cover the scaling, and a value may change by other ways than an SDO. So
+    all objects are read, one after the other and again from the beginning, that the meaning of its PDOs depends on
+    (`jtqd.drivers.boot_procedure`): COB-ID, transmission type and mapping of the TPDOs, rated current, encoder resolutions,
+    gear ratio, the sensor's unit and decimals. The signature is read between them, in every `SIGNATURE_EVERY`th reading.
+
+    A signature that is gone while these are unchanged is somebody else's business (the commander maps RPDOs) and is logged
+    once. The mode of operation that a drive displays (6061h) means nothing for the estimate; a change of it is logged.
 
     Args:
         report: the node's part of the boot report.
@@ -327,10 +320,10 @@ class NodeCare:
         reader: tells the loop which nodes may be believed.
         returning: boots nodes.
         heartbeats: who is heard; nodes are watched from their boot on.
-        say: takes topic, node and line for the operator.
+        log: takes topic, node and line of an event.
 
     Attributes:
-        changed: nodes that were found to be configured otherwise and have not been configured since, with what was found.
+        changed: nodes that are configured otherwise than at their boot, and what has shown it.
     """
 
     def __init__(
@@ -339,9 +332,9 @@ class NodeCare:
         reader: SnapshotReader,
         returning: ReturningNodes,
         heartbeats: NodeWatch,
-        say: Callable[[str, int, str], None],
+        log: Callable[[str, int, str], None],
     ) -> None:
-        self._reader, self._returning, self._heartbeats, self._say = reader, returning, heartbeats, say
+        self._reader, self._returning, self._heartbeats, self._log = reader, returning, heartbeats, log
         self._queues = {node: SdoQueue() for node in nodes}
         self._out: list[tuple[int, bytes]] = []
         self._checks: dict[int, ConfigurationWatch] = {}
@@ -465,7 +458,7 @@ class NodeCare:
         if finding is None:
             return
         if not finding.changed:
-            self._say("boot", node, f"node {node}: {finding.text}")
+            self._log("boot", node, f"node {node}: {finding.text}")
             return
         del self._checks[node]
         self.changed[node] = finding.text.removeprefix(CHANGED)

@@ -56,7 +56,7 @@ class OwnNode:
         self.set_parameters(config)
 
     def answer(self, request: bytes) -> bytes | None:
-        """SDO answer to what came under 600h + node-ID; None: nothing to say."""
+        """SDO answer to what came under 600h + node-ID; None: none is due."""
         return self._server.handle(request)
 
     def watch(self, cycle: int) -> None:
@@ -88,7 +88,7 @@ class OwnNode:
         """Torque (0), sigma (1) or status (2) of a joint as on the bus."""
         view = self._reader.read()
         if view.cycle == self._last_cycle and time.monotonic() - self._last_change > _STANDSTILL_S:
-            return field(nan, inf, STALE)[part]  # the loop stands still: what it said last is old
+            return field(nan, inf, STALE)[part]  # the loop stands still: its last estimate is old
         last = view.joints[joint]
         return field(last.torque_nm, last.sigma_nm, last.status)[part]
 
@@ -121,8 +121,7 @@ class OwnNode:
         return min(count, 0xFF) << 24 | register << 16 | code
 
     def set_parameters(self, config: Config) -> None:
-        """Objects that show the configuration; called again when another one has come into force."""
-        """What the objects say of the configuration in force."""
+        """Show a configuration in the objects that do; called again when another one has come into force."""
         store = self._store
         store.set_text(0x100A, 0, VERSION)
         store.set_number(0x1006, 0, config.period_ns // 1000)

@@ -1,4 +1,4 @@
-"""What jtqd does on the bus beside the loop: own node, EMCY, heartbeats, bus state, nodes that return, checks in service.
+"""Duties on the bus beside the loop: own node, EMCY, heartbeats, bus state, nodes that return, checks in service.
 
 Runs in the supervisor, on a frame socket of its own. No frame of a cycle passes here, and nothing here can delay one. The
 parts are pure and tested by themselves; this one only moves frames, times and lines between them.
@@ -39,20 +39,19 @@ from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, 
 from jtqd.drivers.frame_socket import BusDown, FrameSocket
 from jtqd.drivers.object_dictionary import ObjectStore
 
-# What the supervisor sees of the bus, as a small JSON file in the runtime directory: for `jtq status` and people.
-#
-# `bus.json`, replaced as a whole twice a second:
-#     {"state": "error active", "counts": {2205h by name}, "foreign_nmt": 0,
-#      "nodes": {"1": {"heartbeat": "heard", "emcy": 2, "last_emcy": "EMCY 2310h (...)", "absent": false, "sdo": {...}}},
-#      "errors": [{"code": "8250h", "name": "RPDO timeout", "detail": "181h"}], "error_register": 17}
-
-
 FILE = "bus.json"
 _HEARTBEATS = ("not watched", "awaited", "heard", "lost")
 
 
 class BusReport:
-    """Writes the file into `directory`; what cannot be written is left out, as nothing depends on it."""
+    """Keeps `bus.json` in `directory`: what the supervisor sees of the bus, replaced as a whole when something has changed.
+
+        {"state": "error active", "counts": {2205h by name}, "foreign_nmt": 0,
+         "nodes": {"1": {"heartbeat": "heard", "emcy": 2, "last_emcy": "EMCY 2310h (...)", "absent": false, "sdo": {...}}},
+         "errors": [{"code": "8250h", "name": "RPDO timeout", "detail": "181h"}], "error_register": 17}
+
+    What cannot be written is left out, as nothing depends on it.
+    """
 
     def __init__(self, directory: Path) -> None:
         self._path = directory / FILE
@@ -72,7 +71,7 @@ class BusReport:
 
 
 def content(service: BusService) -> dict[str, Any]:
-    """The same as plain data."""
+    """Content of `bus.json` as plain data."""
     nodes = {}
     for node, state in service.heartbeats.states().items():
         last = service.emergencies.last(node)
@@ -115,7 +114,7 @@ _NODE_CONDITIONS = {
 """What an event of `NodeWatch` begins or ends."""
 _NODE_LINES = ("restarted", "state", "malformed", "foreign")
 
-Say = Callable[[str, int, str], None]
+LogEvent = Callable[[str, int, str], None]
 
 
 def service_filters(config: Config) -> list[CanFilter]:
@@ -144,7 +143,7 @@ class BusService:
         store: object dictionary of the own node.
         returning: boots nodes in service.
         conditions: take what is observed here; each change of one that has a code is an EMCY.
-        say: takes topic, node and line of an event.
+        log: takes topic, node and line of an event.
         directory: where `bus.json` is kept up to date; None: nowhere.
     """
 
@@ -158,11 +157,11 @@ class BusService:
         store: ObjectStore,
         returning: ReturningNodes,
         conditions: Conditions,
-        say: Say,
+        log: LogEvent,
         directory: Path | None = None,
     ) -> None:
         self.socket = socket
-        self._config, self._say, self._conditions = config, say, conditions
+        self._config, self._log, self._conditions = config, log, conditions
         nodes = nodes_of(config)
         joints = {joint.node_id: 1 << n for n, joint in enumerate(config.joints)}
         self._subjects = {node: Subject(f"node {node}", node, joints.get(node, 0), node) for node in nodes}
@@ -181,7 +180,7 @@ class BusService:
             lambda node: self.care.state(node, self._view),
             self._emergency,
         )
-        self.care = NodeCare(nodes, reader, returning, self.heartbeats, say)
+        self.care = NodeCare(nodes, reader, returning, self.heartbeats, log)
         self._limit = RateLimit()
         self._report_due = 0.0
         self._view = reader.read()
@@ -203,10 +202,10 @@ class BusService:
         for number, node in self._first["nodes"].items():
             self.care.configured(int(number), node, now_s)
             for note in node.get("notes", ()):
-                self._say("boot", int(number), f"node {number}: {note}")
+                self._log("boot", int(number), f"node {number}: {note}")
         for number, error in self._first.get("absent", {}).items():
             text = f"{error['message']}: it is optional; jtqd goes on, and configures it when it appears"
-            self._say("boot", int(number), text)
+            self._log("boot", int(number), text)
 
     def turn(self, view: View, now_s: float) -> None:
         """Take what has arrived and send what is due. Raises BusGone."""
@@ -283,7 +282,7 @@ class BusService:
     def _on_emergency(self, node: int, data: bytes, now_s: float) -> None:
         line = self.emergencies.receive(node, data, now_s)
         if line is not None:
-            self._say("emcy", node, line)
+            self._log("emcy", node, line)
         last, subject = self.emergencies.last(node), self._subjects.get(node)
         if last is not None and subject is not None:
             error = last.code != emcy.NO_ERROR or last.register != 0
@@ -294,10 +293,10 @@ class BusService:
         if self.care.is_booting(now_s):
             return
         self.foreign_nmt += 1
-        if len(data) == 2 and self._limit.may_say(("nmt", data), now_s) is not None:
+        if len(data) == 2 and self._limit.admit(("nmt", data), now_s) is not None:
             command = _NMT.get(data[0], f"{data[0]:02X}h")
             whom = f"node {data[1]}" if data[1] else "all nodes"
-            self._say("nmt", data[1] & 0x7F, f"NMT command '{command}' to {whom} from somebody else")
+            self._log("nmt", data[1] & 0x7F, f"NMT command '{command}' to {whom} from another master")
 
     def _bus_change(self, change: BusChange | None, now_s: float) -> None:
         if change is None:
@@ -328,7 +327,7 @@ class BusService:
                 and text
                 and not (kind in ("restarted", "state") and node == self.care.busy)
             ):
-                self._say("heartbeat", node, text)
+                self._log("heartbeat", node, text)
 
     # What the own node shows ----------------------------------------------------------------------------------------------
 

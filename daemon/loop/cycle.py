@@ -1,4 +1,4 @@
-"""One cycle of the loop, stage by stage. The stages are methods so that a benchmark can time each of them.
+"""One cycle of the loop, stage by stage. The stages are methods of `Cycle`, so that a benchmark can time each of them.
 
     begin    take what came late, send SYNC
     gather   one wake-up for all inputs, then wait for stragglers until the deadline
@@ -30,15 +30,14 @@ from jtqd.drivers.frame_socket import BusDown, FrameSocket
 from jtqd.estimator import status as st
 from jtqd.estimator.methods import AnyEstimator
 
-# Nodes that restarted, are in doubt or were absent at the start count (again) once the supervisor has configured them.
-
 
 class ConfiguredNodes:
-    """Looks at the snapshot's `configured` while a node waits.
+    """Nodes that restarted, are in doubt or were absent at the start: used (again) once the supervisor has configured them.
 
-    What counts is a configuration that was noted after the node had begun to wait: one that was only stopped is configured
-    again without ever waiting, and that must not answer for its next restart. And it must have begun after the node's last
-    boot-up message: a node may restart when its boot has just ended and is not yet noted.
+    It looks at the snapshot's `configured` while a node waits. What counts is a configuration that was noted after the node
+    had begun to wait: one that was only stopped is configured again without ever waiting, and that must not answer for its
+    next restart. And it must have begun after the node's last boot-up message: a node may restart when its boot has just
+    ended and is not yet noted.
     """
 
     def __init__(self, snapshot: Snapshot, intake: Intake, joints: Sequence[JointCycle]) -> None:
@@ -66,18 +65,15 @@ class ConfiguredNodes:
 
     def doubt(self) -> None:
         """Between two cycles: nothing more of the nodes that the supervisor has found to be configured otherwise."""
-        told = self._snapshot.doubts
-        for node, (before, now) in enumerate(zip(self._doubts, told, strict=True)):
+        doubts = self._snapshot.doubts
+        for node, (before, now) in enumerate(zip(self._doubts, doubts, strict=True)):
             if now != before:
                 self._doubts[node] = now
                 self._intake.nodes.doubt(node)
 
 
-# Frames of a cycle, copied into its record as they came: 16 bytes each beside their stamps.
-
-
 class CycleFrames:
-    """Fills the frame part of one record after the other.
+    """Frames of a cycle, copied into its record as they came: 16 bytes each beside their stamps.
 
     Attributes:
         slot: record of the current cycle in the ring.
@@ -322,7 +318,7 @@ class Cycle:
         self._counters.cycle(self._flags, work_ns, self.late_ns, self.grid.missed)
         self._counters.statuses(one.status, two.status)
         if self.index % _SNAPSHOT_EVERY == 0:
-            self._tell()
+            self._write_snapshot()
         self.index += 1
 
     def hold_back(self) -> bool:
@@ -366,15 +362,15 @@ class Cycle:
             joint.use(joint.estimator, joint.safety)
 
     def leave(self) -> None:
-        """Last words on the bus: an estimate with status off, so that nobody holds on to the last number."""
+        """Send a last estimate with status off, so that nobody holds on to the last number."""
         one, two = self._joints
         one.withdraw(st.OFF)
         two.withdraw(st.OFF)
         self._send(pack(self._estimate_id, estimate_pdo.encode(one.published, two.published, self.counter)))
-        self._tell()
+        self._write_snapshot()
 
-    def _tell(self) -> None:
-        """Counters, inputs and the last estimate to the snapshot."""
+    def _write_snapshot(self) -> None:
+        """Copy counters, inputs and the last estimate into the snapshot."""
         one, two = self._joints
         self.snapshot.begin()
         self._counters.flush(self.grid.missed, self._sync_ns)

@@ -1,4 +1,7 @@
-"""The PDOs that the loop waits for, and those that it takes when they come, by configuration."""
+"""Input PDOs of a configuration: those that the loop waits for, and temperatures that come in between.
+
+Pure: frames and cycle numbers in, values out.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +21,6 @@ from jtqd.drivers.devices import (
     sensor_tpdo2,
 )
 from jtqd.drivers.pdo import PdoMap
-
-# What the intake knows of one synchronous input PDO: its frame of this cycle, its debt, and when it usually comes. Pure.
-
 
 _BAND_MARGIN_NS = 50_000
 """Allowance around the learned delays: one frame of 135 bits may have been in the way less than twice."""
@@ -50,7 +50,10 @@ class InputPdo:
 
 
 class InputState:
-    """What is known of one PDO; slots because five of them are touched in every cycle."""
+    """What the intake knows of one synchronous PDO: its frame of this cycle, its debt, and when it usually comes.
+
+    With slots, because five of them are touched in every cycle.
+    """
 
     __slots__ = (
         "band_high_ns",
@@ -125,19 +128,16 @@ class InputState:
             self.band_high_ns -= int((self.band_high_ns - delay_ns) * _BAND_LEAK)
 
 
-# Temperature of one joint: what its drive sent last by TPDO3, for as long as that is worth something. Pure.
-#
-# TPDO3 comes by an event timer, not with SYNC, so it belongs to no cycle: a value holds from the cycle that took its frame
-# until the next one, or until it is TEMPERATURE_LIFE_S old. Its age is counted in slots and not by stamps, because
-# CLOCK_REALTIME may be stepped, and so that the frames and cycle numbers of a log alone say what each cycle had.
-
-
 _NEVER = 1 << 62
 _FIELD = struct.Struct("<h")
 
 
 class JointTemperature:
-    """Last temperature of a joint.
+    """Temperature of a joint: what its drive sent last by TPDO3, for as long as that is worth something.
+
+    TPDO3 comes by an event timer, not with SYNC, so it belongs to no cycle: a value holds from the cycle that took its
+    frame until the next one, or until it is TEMPERATURE_LIFE_S old. Its age is counted in slots and not by stamps, because
+    CLOCK_REALTIME may be stepped, and so that the frames and cycle numbers of a log alone say what each cycle had.
 
     Args:
         cob_id: of TPDO3.

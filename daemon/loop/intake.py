@@ -20,7 +20,7 @@ the same PDO can still be under way:
   then the input is not used in that cycle;
 * a wrong length, a 29-bit identifier or a remote frame under one of our identifiers is rejected and counted;
 * a SYNC that is not our own echo makes every input of the cycle doubtful: none is used;
-* the PDOs of a node that is not believed (`daemon/loop/intake.py`) are not used.
+* the PDOs of a node that is not believed (`NodeTrust`) are not used.
 
 A joint's temperature (TPDO3) is not bound to SYNC: it belongs to no cycle, nobody waits for it, and none of the above but
 the last two rules concerns it (`daemon/loop/input_pdos.py`).
@@ -37,12 +37,6 @@ from jtqd.daemon.loop.input_pdos import InputPdo, InputState, JointTemperature
 from jtqd.drivers.devices import SYNC_COB_ID
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_RTR_FLAG
 
-# Slots without SYNC: what comes in one is late, and what has not come by the end of a silent one was lost. Plain state.
-#
-# The rule is in `daemon/loop/intake.py`; it asks for a gap where the delay of a frame does not tell whether it is a late
-# one.
-
-
 _LONGEST = 10
 """Slots; after that SYNC goes on and the debts stay."""
 _PAUSE = 20
@@ -50,7 +44,9 @@ _PAUSE = 20
 
 
 class Gaps:
-    """Gaps so far, and the one that is open.
+    """Slots without SYNC: what comes in one is late, and what has not come by the end of a silent one was lost.
+
+    `Intake` asks for a gap where the delay of a frame does not tell whether it is a late one.
 
     Attributes:
         count: slots without SYNC so far.
@@ -81,13 +77,6 @@ class Gaps:
         return self.open and self.arrivals > 0 and self.length < _LONGEST
 
 
-# Which nodes may be believed: what their heartbeats say, who has restarted, who has been configured since. Pure.
-#
-# A node that sent its boot-up message has lost its PDO mapping. None of its PDOs is used or waited for until
-# `configured`. The same holds for one that was found to be configured otherwise (`doubt`), and for an optional one that
-# is absent.
-
-
 _HEARTBEAT_BASE = 0x700
 _BOOT_UP = 0
 _NMT_STATES = frozenset((_BOOT_UP, 4, 5, 127))
@@ -95,7 +84,10 @@ _NMT_STATES = frozenset((_BOOT_UP, 4, 5, 127))
 
 
 class NodeTrust:
-    """The producers of the input PDOs.
+    """Which producers of the input PDOs may be believed: heartbeats, who has restarted, who has been configured since.
+
+    A node that sent its boot-up message has lost its PDO mapping. None of its PDOs is used or waited for until `configured`.
+    The same holds for one that was found to be configured otherwise (`doubt`), and for an optional one that is absent.
 
     Args:
         pdos: states of all input PDOs; `wanted` of each is kept here.

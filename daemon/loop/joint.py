@@ -18,9 +18,6 @@ from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_POSITION, FLAG_SEN
 from jtqd.estimator import status as st
 from jtqd.estimator.methods import AnyEstimator
 
-# A 32-bit position that rolls over, made continuous.
-
-
 _HALF_RANGE, _FULL_RANGE = 1 << 31, 1 << 32
 
 

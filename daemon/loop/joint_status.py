@@ -1,4 +1,11 @@
-"""From what each cycle says of a joint to the status that is published: bad at once, good only after a while. Pure.
+"""Status of a joint, from the estimate and inputs of each cycle: worse at once, better only after a while. Pure.
+
+    estimate and inputs  ->  faults of this cycle  ->  status with hysteresis and latches  ->  status and flags
+
+`JointSafety` holds limits and checks, `JointStatus` the hysteresis, `JointTally` counts, and `JointRules` applies the rules
+of docs/safety.md to one cycle after the other: a number leaves only through `JointRules.judge`. What it needs beside the
+estimate comes from the log again: the inputs, `cr.FLAG_WITHDRAWN` (`late`), `cr.FLAG_RESET` (`reset_latch`),
+`FLAG_NETWORK_SKIPPED`. So a replay gives the same.
 
 The statuses have an order, from good to bad:
 
@@ -31,15 +38,14 @@ from jtqd.estimator.plausibility import Plausibility
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import Estimate
 
-# What the loop, or a replay of its log, needs of one joint to keep the rules of docs/safety.md; made once.
-
-
 TORQUE_RANGE_NM: Final = 327.67
 """Of the field of the estimate PDO."""
 
 
 class JointSafety:
-    """Limits and checks of one joint. Without a joint there is no check that needs its parameters.
+    """Limits and checks of one joint, for the loop or a replay of its log; made once.
+
+    Without a joint there is no check that needs its parameters.
 
     Attributes:
         settings: as configured.
@@ -234,9 +240,6 @@ def _worse(a: int, b: int) -> int:
     return a if _RANK[a] >= _RANK[b] else b
 
 
-# What one joint counts: why its network was dropped, its faults, and its squared errors against the sensor.
-
-
 _FALLBACKS, _LATCHES = COUNTERS.index("network_fallbacks"), COUNTERS.index("latches")
 _NOT_FINITE, _FAR, _OUTSIDE, _NO_TIME = (
     COUNTERS.index(f"network_{why}") for why in ("not_finite", "far", "outside", "no_time")
@@ -257,7 +260,7 @@ class JointCounts(Protocol):
 
 
 class JointTally:
-    """Counts of joint `number` (0 or 1)."""
+    """Counts of joint `number` (0 or 1): why its network was dropped, its faults, its squared errors against the sensor."""
 
     __slots__ = ("_counters", "_errors", "_number")
 
@@ -304,17 +307,9 @@ class JointTally:
         errors[2 * number + 1] += 1.0
 
 
-# What of a joint's estimate may be published: the rules of docs/safety.md, applied to one cycle after the other. Pure.
-#
-#     estimate and inputs  ->  faults of this cycle  ->  status (`joint_status.py`)  ->  status and flags
-#
-# A number leaves only through `JointRules.judge`. Everything that it needs beside the estimate comes from the log again: the
-# inputs, `cr.FLAG_WITHDRAWN` (`late`), `cr.FLAG_RESET` (`reset_latch`), `FLAG_NETWORK_SKIPPED`. So a replay gives the same.
-
-
 _POWERED = {0x27, 0x07}
 """Operation enabled and quick stop active (6041h masked with 6Fh): the states in which the motor carries current."""
-_JOINT_RULES_FAULTS = {0x0F, 0x08}
+_FAULT_STATES = {0x0F, 0x08}
 """Fault reaction active and fault (6041h masked with 4Fh)."""
 _USUAL: Final = frozenset((st.VALID, st.STANDSTILL))
 _PUBLISHED, _INVALID, _STARTING = frozenset(st.PUBLISHED), st.INVALID, st.STARTING
@@ -324,7 +319,7 @@ def drive_status(statusword: int) -> int | None:
     """Status that a drive's statusword (6041h) puts in place of any other; None for a motor that carries current."""
     if statusword & 0x6F in _POWERED:
         return None
-    return st.DRIVE_FAULT if statusword & 0x4F in _JOINT_RULES_FAULTS else st.OFF
+    return st.DRIVE_FAULT if statusword & 0x4F in _FAULT_STATES else st.OFF
 
 
 def _no_check(_dt_s: float, _motor: float, _speed: float, _link: float, _current: float) -> int:

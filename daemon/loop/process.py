@@ -42,31 +42,29 @@ from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.methods import AnyEstimator, load_network, make_estimator
 from jtqd.estimator.onnx_graph import NetworkError
 
-# What the loop does in the pause after a cycle, beside its work: the watchdog, orders of the supervisor, a hand-over.
-#
-# Costs one call per cycle and, every n-th cycle, one datagram and one look at shared memory (docs/deployment.md).
-
-
 _ORDERS_EVERY = 16
 """Cycles between two looks at the orders."""
 
 
 class Duties:
-    """Call it once after each cycle; True: the bus belongs to the successor, leave without a word.
+    """Duties in the pause after a cycle: the watchdog, orders of the supervisor, a hand-over.
+
+    Call it once after each cycle; True: the bus belongs to the successor, leave it silently. Costs one call per cycle and,
+    every n-th cycle, one datagram and one look at shared memory (docs/deployment.md).
 
     Args:
         cycle: the loop's.
         watchdog: to be fed.
         giver: hands the bus over when SIGUSR2 has asked for it.
-        tell: says to the supervisor why a hand-over came to nothing.
+        report: tells the supervisor why a hand-over came to nothing.
     """
 
     def __init__(
-        self, cycle: Cycle, watchdog: LoopWatchdog, giver: Giver, tell: Callable[[str], None]
+        self, cycle: Cycle, watchdog: LoopWatchdog, giver: Giver, report: Callable[[str], None]
     ) -> None:
         self._cycle, self._orders = cycle, cycle.snapshot.orders
         self._advanced = watchdog.advanced
-        self._giver, self._tell = giver, tell
+        self._giver, self._report = giver, report
         self._left = _ORDERS_EVERY
         self._wanted = self._giving = False
         signal.signal(signal.SIGUSR2, self._on_signal)
@@ -91,7 +89,7 @@ class Duties:
         given = self._giver.step()
         if given is None:
             self._giving = False
-            self._tell(self._giver.refused or "")
+            self._report(self._giver.refused or "")
         return bool(given)
 
     def _reset(self) -> None:
@@ -235,7 +233,7 @@ def run(
 
 
 def answer(**content: Any) -> None:
-    """Tell the supervisor."""
+    """Send one JSON line to the supervisor."""
     try:
         print(json.dumps(content), flush=True)
     except BrokenPipeError:  # the supervisor has gone, and we are about to
@@ -287,7 +285,7 @@ def build_estimators(request: dict[str, Any]) -> tuple[Config, list[AnyEstimator
 
 
 def serve(request: dict[str, Any]) -> int:
-    """Build, say ready, wait for the boot report, run, say what happened. Returns the exit status."""
+    """Build, report ready, wait for the boot report, run, report the end. Returns the exit status."""
     stop = Stop()
     config, estimators = build_estimators(request)
     answer(ready=True)
@@ -314,7 +312,7 @@ def make_duties(cycle: Cycle, request: dict[str, Any]) -> tuple[Duties, Giver]:
 
 
 def finish(cycle: Cycle, go: Callable[[], bool]) -> int:
-    """Run, take leave of the bus unless it is somebody else's by then, say what happened. Returns the exit status."""
+    """Run, leave the bus unless it is a successor's by then, report the end. Returns the exit status."""
     error = None
     try:
         if go():

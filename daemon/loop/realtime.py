@@ -1,4 +1,4 @@
-"""What the loop asks of the kernel: FIFO scheduling, locked memory, one CPU, no garbage collection, precise timers.
+"""Requests to the kernel: FIFO scheduling, locked memory, one CPU, no garbage collection, precise timers; and stolen time.
 
 Everything is asked for and nothing is assumed: `prepare` returns a line for each thing that was refused, and jtqd prints it.
 """
@@ -57,14 +57,14 @@ def freeze() -> None:
     gc.disable()
 
 
-# Processor time that a hypervisor took from this machine: no scheduling priority helps against it (proc(5), /proc/stat).
-
-
 _FIELD = 8  # cpu user nice system idle iowait irq softirq steal
 
 
 def stolen_s(stat: Path = Path("/proc/stat")) -> float:
-    """Taken from all processors since the machine's start [s], in steps of 10 ms; 0 where the kernel does not tell."""
+    """Read what a hypervisor took from all processors since the machine's start [s], in steps of 10 ms.
+
+    From proc(5), /proc/stat; 0 where the kernel does not tell. No scheduling priority helps against it.
+    """
     try:
         return int(stat.read_text().split("\n", 1)[0].split()[_FIELD]) / os.sysconf("SC_CLK_TCK")
     except (OSError, IndexError, ValueError):

@@ -1,20 +1,13 @@
-"""Is there time for the networks before the next SYNC? If not, this cycle is physics only. Pure: times are arguments [ns].
+"""Schedule of a cycle: the time grid, when to wake up for the inputs, and whether there is time for the networks.
 
-How long a joint's estimate takes with its network is learned: the shorter of its last two times, which one stall of the
-machine does not change, at once upwards and slowly downwards. The first slow call of a network cannot be foreseen: such a
-cycle is late as a whole and withdrawn. After the second the network is left out; after FORGET_CYCLES or so it is tried
-again. When inputs come so late that there is no time, it is left out at once.
-
-Joint 1 comes first and leaves time for joint 2.
+Pure: times are arguments, integer ns of CLOCK_MONOTONIC.
 """
 
 from __future__ import annotations
 
-# Absolute time grid of the loop: missed slots are counted and skipped, never made up in a burst.
-
 
 class Grid:
-    """Slots at `start + n * period`; all times are CLOCK_MONOTONIC in integer ns, handed in by the caller.
+    """Absolute time grid of the loop, slots at `start + n * period`; missed ones are counted and skipped, never made up.
 
     A slot is missed when it cannot be begun within half a period of its time: a SYNC later than that would leave its
     successor less than half a cycle, and drives would see two SYNCs in quick succession.
@@ -48,16 +41,13 @@ class Grid:
         return now_ns - self.slot_ns > self._half_ns
 
 
-# When to wake up for the inputs of a cycle: when 99 of 100 times all have come; each one waited for is a wake-up more.
-
-
 _STEP_NS = 160
 _MARGIN_NS = 10_000
 _SHORTEST_NS = 50_000
 
 
 class WakeUp:
-    """Follows the arrival of the last input.
+    """When to wake up for the inputs of a cycle: when 99 of 100 times all have come; each one waited for is a wake-up more.
 
     Attributes:
         wait_ns: from SYNC to the wake-up.
@@ -85,7 +75,7 @@ _SETTLE_CYCLES = 16
 """... and with it."""
 
 
-class _Joint:
+class _Cost:
     """What one joint's estimate takes with its network, as far as known."""
 
     __slots__ = ("cost_ns", "last_ns", "wanted")
@@ -107,12 +97,21 @@ class _Joint:
 
 
 class NetworkBudget:
-    """Call `first`, `second` and `ended` in each cycle, around the estimates of joint 1 and joint 2."""
+    """Is there time for the networks before the next SYNC? If not, this cycle is physics only.
+
+    Call `first`, `second` and `ended` in each cycle, around the estimates of joint 1 and joint 2. Joint 1 comes first and
+    leaves time for joint 2.
+
+    How long a joint's estimate takes with its network is learned: the shorter of its last two times, which one stall of the
+    machine does not change, at once upwards and slowly downwards. The first slow call of a network cannot be foreseen:
+    such a cycle is late as a whole and withdrawn. After the second the network is left out; after FORGET_CYCLES or so it is
+    tried again. When inputs come so late that there is no time, it is left out at once.
+    """
 
     __slots__ = ("_end_ns", "_one", "_since_ns", "_two")
 
     def __init__(self) -> None:
-        self._one, self._two = _Joint(), _Joint()
+        self._one, self._two = _Cost(), _Cost()
         self._end_ns = self._since_ns = 0
 
     def first(self, now_ns: int, next_sync_ns: int) -> bool:

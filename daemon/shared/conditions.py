@@ -18,7 +18,7 @@ What only happens (a boot-up message, an EMCY of a node, an NMT command of someb
 [('node_lost', 'node 2', 'no heartbeat for 0.3 s')]
 >>> conditions.update("node_lost", drive, False, 12.5)
 >>> [each.text for each in conditions.lines(12.5)]
-['node 2: heartbeat is back after 2.5 s: no heartbeat for 0.3 s']
+['node 2: heartbeat is back after 2.5 s (no heartbeat for 0.3 s)']
 """
 
 from __future__ import annotations
@@ -396,7 +396,7 @@ class _State:
         if self._unlogged > 1:
             text += f", {self._unlogged} times"
         if not self._logged:
-            text += f": {self.text}"
+            text += f" ({self.text})"
             self._not_before_s = now_s + QUIET_S
         self.no_end_line()
         return Line(definition, self.subject, INFO, text)

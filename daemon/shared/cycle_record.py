@@ -149,8 +149,7 @@ def frames_of(record: bytes | memoryview) -> list[tuple[bytes, int]]:
     ]
 
 
-# Faults that make an estimate invalid or that may be latched: their bits, names and statuses. One list for everybody.
-
+# Faults that make an estimate invalid or that may be latched: bits, names and statuses
 
 NOT_FINITE: Final = 0x01
 """The estimator gave a number that is none, or a sigma that is none, as if it were good."""

@@ -1,4 +1,4 @@
-"""What the supervisor has to say about the bus, in a bounded ring of memory: for the log's /events and /log.
+"""Events and lines of the supervisor in a bounded ring of memory: for the log's /events and /log.
 
 One writer (the supervisor), any number of readers (recorder, `jtq` tools). The file `notices` of the runtime directory holds
 the last `CAPACITY` notices; a reader that comes late is told how many it has missed, and nobody waits for anybody.
@@ -49,7 +49,8 @@ class Notice(NamedTuple):
         realtime_ns: CLOCK_REALTIME when it was written.
         level: INFO, WARNING or ERROR.
         node: node-ID that it is about; 0 for none (the bus, the daemon).
-        topic: what kind: "boot", "heartbeat", "emcy", "own_emcy", "bus", "pdo", "nmt", "sync", "input".
+        topic: what kind: "boot", "heartbeat", "emcy", "bus", "pdo", "nmt", "sync", "input",
+            "fault", "loop", "recorder", "machine" (`jtqd.daemon.shared.conditions`).
         text: one line for the operator.
     """
 

@@ -2,6 +2,9 @@
 
 The directory is open to the daemon's group (0750): the snapshot, `about.json` and the recorder's account can be read by its
 members (`jtq status`); what only the daemon's own processes need (`ring`, `lock`, `control`) stays with its user.
+
+`about.json` is what a running jtqd is, for tools that look at it: written by the supervisor at its start, before the nodes
+are booted, and when another configuration has come into force. Numbers that change are in the snapshot, not here.
 """
 
 from __future__ import annotations
@@ -18,6 +21,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+FILE = "about.json"
+SCHEMA = "jtqd.about/1"
 _LOCK = "lock"
 _ATTEMPTS = 100
 
@@ -113,16 +118,6 @@ def instance_name(bus: str) -> str:
     """Name of the instance as it can stand in a file name: "vcan0", or "unix-tmp-bench-1f3a" with part of a hash."""
     name = re.sub(r"[^A-Za-z0-9_.]+", "-", bus).strip("-")
     return name if name == bus else f"{name}-{hashlib.sha256(bus.encode()).hexdigest()[:4]}"
-
-
-# `about.json` in the runtime directory: what a running jtqd is, for tools that look at it.
-#
-# Written once by the supervisor at its start, before the nodes are booted; readable by the daemon's group. Numbers that
-# change are in the snapshot, not here.
-
-
-FILE = "about.json"
-SCHEMA = "jtqd.about/1"
 
 
 class AboutError(Exception):

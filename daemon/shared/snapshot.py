@@ -15,9 +15,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-# What a reading of the loop's snapshot holds (`daemon/shared/snapshot.py` says where it lies in memory).
-
-
 STATUS_CODES = 16
 MAX_NODE = 128
 

@@ -1,4 +1,4 @@
-"""Words to systemd (sd_notify): ready, status, stopping, and the watchdog that only a loop that advances feeds.
+"""Messages to systemd (sd_notify): ready, status, stopping, and the watchdog that only a loop that advances feeds.
 
 One datagram to $NOTIFY_SOCKET by a socket that is connected once and never blocks; where nobody listens, nothing is sent.
 """
@@ -50,7 +50,7 @@ class Notifier:
         return True
 
     def close(self) -> None:
-        """Say nothing any more."""
+        """Close the connection: nothing is sent any more."""
         if self._socket is not None:
             with suppress(OSError):
                 self._socket.close()

@@ -1,4 +1,4 @@
-"""The control socket of a running daemon: orders from its own user and from root, one JSON object each way.
+"""Control socket of a running daemon: orders from its own user and from root, one JSON object each way.
 
 `control` in the runtime directory, AF_UNIX SOCK_SEQPACKET, mode 0600. One connection is one request and one reply:
 

@@ -30,7 +30,7 @@ from jtqd.daemon.recording.request import recording_request
 from jtqd.daemon.reload.files import SOCKET, Reload, ReloadError
 from jtqd.daemon.shared.child_process import Child, ChildError, ChildSilence
 from jtqd.daemon.shared.conditions import JOINT, PDO, THE_MACHINE, Conditions, ConditionsFile
-from jtqd.daemon.shared.log_lines import ERROR, WARNING, Say, Teller
+from jtqd.daemon.shared.log_lines import ERROR, WARNING, EventLog, OperatorLog
 from jtqd.daemon.shared.notices import FILE as NOTICES
 from jtqd.daemon.shared.notices import Notices
 from jtqd.daemon.shared.runtime_dir import About, claim, instance_name, remove, write_about
@@ -44,9 +44,6 @@ from jtqd.drivers.bus_load import BusLoad, BusLoadError, check_bus_load
 from jtqd.drivers.frame import pack
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
 from jtqd.drivers.object_dictionary import ObjectStore, entries_from_json
-
-# Steps of the start and of the end: bench, boot of the nodes, answers of children; all end early when the operator says.
-
 
 _WARM_UP_TIMEOUT_S = 60.0
 """Generous: a controller that loads its libraries from a slow card may take its time; nothing is published meanwhile."""
@@ -72,7 +69,7 @@ def checked_load(config: Config) -> BusLoad:
 def log_directory(record: str | None) -> Path | None:
     """Where logs go, from the option `--record`, made where it is missing; None: nowhere.
 
-    A disk that is full, read-only or closed to us now may not be so later: that is the recorder's to say and to wait for.
+    A disk that is full, read-only or closed to us now may not be so later: the recorder reports it and waits for it.
 
     Raises:
         SupervisorError: the path can be no directory, whatever becomes of the disk.
@@ -239,8 +236,8 @@ class Supervisor:
         self._children: list[Child] = []
         self._recorder = Keeper(self._child, self._directory, self._snapshot)
         self._live = None if live is None else LiveKeeper(self._child, live)
-        self._say = Say()
-        self._tell = Teller(self._say)
+        self._log = OperatorLog()
+        self._log_event = EventLog(self._log)
         self._conditions = Conditions()
         self._conditions_file = ConditionsFile(self._directory)
         self._health = Health(config, self._conditions)
@@ -248,7 +245,7 @@ class Supervisor:
             config,
             self._directory,
             self._instance,
-            self._say,
+            self._log,
             save=self._recorder.save,
             renew=self._renew,
             conditions=self._conditions,
@@ -303,12 +300,12 @@ class Supervisor:
         if running is None:
             return None
         for line in running["refused"]:
-            self._say(f"not granted: {line}", WARNING)
+            self._log(f"not granted: {line}", WARNING)
         if running["refused"]:
             text = "; ".join(running["refused"])
             self._conditions.update("not_granted", THE_MACHINE, True, time.monotonic(), text)
         reader = SnapshotReader(self._snapshot, supervisor=True)
-        self._tell.notices = Notices(self._directory / NOTICES)
+        self._log_event.notices = Notices(self._directory / NOTICES)
         self._record(report)
         if self._live is not None:
             self._live.start(self._config, self._directory, self._instance)
@@ -319,9 +316,9 @@ class Supervisor:
             report,
             reader=reader,
             store=store,
-            returning=ReturningNodes(self._config, self._bus, report, self._child, self._tell),
+            returning=ReturningNodes(self._config, self._bus, report, self._child, self._log_event),
             conditions=self._conditions,
-            say=self._tell,
+            log=self._log_event,
             directory=self._directory,
         )
         self._node = node = self._bus_service.own
@@ -334,7 +331,7 @@ class Supervisor:
         self._leave()
         failed = result.get("error") or result.get("failed")
         if failed:
-            self._say(f"ended: {failed}", ERROR)
+            self._log(f"ended: {failed}", ERROR)
         recording = self._recorder.end(failed=bool(failed))
         return summary_of(
             reader,
@@ -393,7 +390,7 @@ class Supervisor:
         """Until the loop ends: table, SDO requests, recorder. Returns the loop's last answer."""
         title = f"jtqd on {self._instance}, node {self._config.node_id:02X}h, {self._config.estimator.method}"
         stopping = 0.0
-        with Display(reader, self._config.bitrate, title, self._say) as display:
+        with Display(reader, self._config.bitrate, title, self._log) as display:
             while True:
                 sockets = [] if self._bus_gone else [self._bus_service.socket.fd]
                 select.select([*loop.outputs, *sockets, *self._service.descriptors], [], [], 0.05)
@@ -406,7 +403,7 @@ class Supervisor:
                     final = loop.poll_answer()
                     return final or {"error": f"the loop ended with exit status {loop.process.returncode}"}
                 if bench is not None and not bench.alive():
-                    self._say(f"the emulated bench ended with exit status {bench.process.returncode}", ERROR)
+                    self._log(f"the emulated bench ended with exit status {bench.process.returncode}", ERROR)
                     bench = None
                 if self._stop and not stopping:
                     stopping = time.monotonic()
@@ -435,11 +432,11 @@ class Supervisor:
         for line in self._conditions.lines(now):
             # What concerns a joint may come and go with its cable: few lines of each joint reach the operator.
             kind = line.subject.name if line.definition.about in (JOINT, PDO) else ""
-            self._tell(line.definition.topic, line.subject.node, line.text, kind, line.severity)
+            self._log_event(line.definition.topic, line.subject.node, line.text, kind, line.severity)
         self._conditions_file.write(self._conditions.present())
 
     def _serve(self, view: View, now: float) -> None:
-        """The own node's duties, for as long as there is a bus; what became of it the loop says."""
+        """The own node's duties, for as long as there is a bus; the loop reports its end."""
         if self._bus_gone:
             return
         known = len(self._report["nodes"])
@@ -474,7 +471,7 @@ class Supervisor:
             raise ReloadError(wrong)
 
     def _renew(self, config: Config) -> None:
-        """Another configuration is in force: say so wherever it shows."""
+        """Show another configuration, which has come into force, wherever it shows."""
         self._config = config
         self._health.use(config)
         self._node.set_parameters(config)

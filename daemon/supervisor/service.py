@@ -1,6 +1,8 @@
-"""What the supervisor does for those who look after a daemon: systemd, the control socket, reloads, the metrics file.
+"""Service to those who look after a daemon: systemd, the control socket, reloads, the metrics file.
 
-Nothing here touches the loop but through shared memory and signals.
+Nothing here touches the loop but through shared memory and signals. The metrics are a Prometheus text file for a node
+exporter's textfile collector: off unless the configuration has `metrics: {file: PATH}`; a name without a directory lies in
+the runtime directory.
 """
 
 from __future__ import annotations
@@ -17,17 +19,11 @@ from jtqd.daemon.config import Config
 from jtqd.daemon.reload.files import Reload, ReloadError
 from jtqd.daemon.shared.child_process import Child
 from jtqd.daemon.shared.conditions import CATALOGUE, Condition, Conditions
-from jtqd.daemon.shared.log_lines import ERROR, NOTICE, WARNING, Say
+from jtqd.daemon.shared.log_lines import ERROR, NOTICE, WARNING, OperatorLog
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.daemon.shared.systemd import Notifier
 from jtqd.daemon.supervisor.control import FILE, Answer, ControlError, ControlServer, Reply
 from jtqd.estimator import status as st
-
-# The daemon's counters as a Prometheus text file, for a node exporter's textfile collector.
-#
-# Written by the supervisor under another name and then renamed: a reader never sees half of it. Off unless the configuration
-# has `metrics: {file: PATH}`; a name without a directory lies in the runtime directory.
-
 
 _GAUGES = frozenset(("work_max_ns", "late_max_ns"))
 _SHARES = (0.5, 0.99, 1.0)
@@ -85,7 +81,7 @@ def metrics_text(
 
 
 def write_metrics(path: Path, text: str) -> None:
-    """Replace the file at once. Raises OSError."""
+    """Replace the file at once: a reader never sees half of it. Raises OSError."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         temporary.write_text(text, encoding="utf-8")
@@ -118,7 +114,7 @@ class Service:
         config: in force at the start.
         directory: runtime directory.
         bus: name for the metrics.
-        say: tells the operator.
+        log: of the operator.
         save: has the flight recording written; False where there is no recorder.
         renew: called with a new configuration that has come into force.
         conditions: for the metrics.
@@ -129,13 +125,13 @@ class Service:
         config: Config,
         directory: Path,
         bus: str,
-        say: Say,
+        log: OperatorLog,
         *,
         save: Callable[[], bool],
         renew: Callable[[Config], None],
         conditions: Conditions,
     ) -> None:
-        self._config, self._bus, self._say = config, bus, say
+        self._config, self._bus, self._log = config, bus, log
         self._conditions = conditions
         self._directory, self._save, self._renew = directory, save, renew
         self._notifier = Notifier()
@@ -229,7 +225,7 @@ class Service:
     def _ask_save(self, request: Reply) -> Reply:
         if not self._save():
             raise ControlError("nothing is recorded")
-        self._say("the flight recording is written, as asked", NOTICE, "save")
+        self._log("the flight recording is written, as asked", NOTICE, "save")
         return {"ok": True}
 
     def _reset(self, request: Reply) -> Answer:
@@ -237,7 +233,7 @@ class Service:
         assert reader is not None
         before = sum(each.latched for each in reader.read().joints)
         number, until = reader.ask_reset(), time.monotonic() + _RESET_S
-        self._say("reset of latched faults, as asked", NOTICE, "reset")
+        self._log("reset of latched faults, as asked", NOTICE, "reset")
 
         def answer() -> Reply | None:
             if reader.resets_done >= number:
@@ -281,7 +277,7 @@ class Service:
         try:
             self._renew(self._config)
         except OSError as error:  # the loop has taken over all the same
-            self._say(f"reloaded, but the runtime directory cannot be written: {error.strerror}", ERROR)
+            self._log(f"reloaded, but the runtime directory cannot be written: {error.strerror}", ERROR)
         missed = self._missed() - int(about["missed_before"])
         self._outcome.append(
             {
@@ -297,7 +293,7 @@ class Service:
             for name, change in about["changes"].items()
             if change["rms_change_nm"] is not None
         )
-        self._say(
+        self._log(
             f"reloaded {self._config.path}: in force from cycle {about['took_over']} on, {missed} cycles missed; "
             f"on the last {about['cycles']} cycles the estimate changes: {changes or 'nothing to compare'}",
             NOTICE,
@@ -311,7 +307,7 @@ class Service:
 
     def _reload_failed(self, error: ReloadError) -> None:
         self._outcome.append({"ok": False, "error": str(error)})
-        self._say(f"not reloaded, the old files stay in force: {error}", ERROR)
+        self._log(f"not reloaded, the old files stay in force: {error}", ERROR)
         self._notifier.send("READY=1")
 
     # State ---------------------------------------------------------------------------------------------------------------
@@ -333,7 +329,7 @@ class Service:
             present = self._conditions.present()
             write_metrics(path, metrics_text(view, self._reader, self._bus, recorder_lost, present))
         except OSError as error:
-            self._say(f"metrics: {path}: {error.strerror}", WARNING, "metrics")
+            self._log(f"metrics: {path}: {error.strerror}", WARNING, "metrics")
 
 
 def _status(view: View) -> str:

@@ -1,4 +1,4 @@
-"""How the loop is doing, for whoever looks: a live table on a terminal, a line every few seconds elsewhere."""
+"""Live table of the running loop on a terminal; a line every few seconds elsewhere."""
 
 from __future__ import annotations
 
@@ -13,12 +13,9 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-from jtqd.daemon.shared.log_lines import INFO, Say
+from jtqd.daemon.shared.log_lines import INFO, OperatorLog
 from jtqd.daemon.shared.snapshot import JointView, SnapshotReader, View
 from jtqd.estimator.status import NAMES, PUBLISHED
-
-# The table that `jtqd` shows while it runs: torque, sigma and status of both joints, and how the loop is doing.
-
 
 COLOURS = {"valid": "green", "degraded": "yellow", "standstill": "cyan", "starting": "blue", "off": "dim"}
 """Style of a status; what is not here is bad news."""
@@ -135,14 +132,14 @@ class Display:
         reader: of the loop's snapshot.
         bitrate: of the bus [bit/s].
         title: of the table.
-        say: takes the lines.
+        log: takes the lines.
     """
 
-    def __init__(self, reader: SnapshotReader, bitrate: int, title: str, say: Say) -> None:
+    def __init__(self, reader: SnapshotReader, bitrate: int, title: str, log: OperatorLog) -> None:
         console = Console(stderr=True)
         self._terminal = console.is_terminal
         self._live = Live(console=console, auto_refresh=False, transient=False)
-        self._reader, self._bitrate, self._title, self._say = reader, bitrate, title, say
+        self._reader, self._bitrate, self._title, self._log = reader, bitrate, title, log
         self._previous = reader.read()
         self._shown = time.monotonic()
 
@@ -165,5 +162,5 @@ class Display:
             self._live.update(table, refresh=True)
         else:
             line = plain_line(self._reader, self._previous, view, self._bitrate)
-            self._say(line.removeprefix("jtqd: "), INFO)
+            self._log(line.removeprefix("jtqd: "), INFO)
         self._previous, self._shown = view, now

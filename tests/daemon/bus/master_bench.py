@@ -65,7 +65,7 @@ class MasterBench:
         self.report = json.loads(json.dumps(booted.as_json()))  # as the supervisor gets it
         for node in (1, 2, 3):
             self.snapshot.node_states[node] = 5
-        self.returning = ReturningNodes(self.config, self.bus, self.report, self._child, self._say)
+        self.returning = ReturningNodes(self.config, self.bus, self.report, self._child, self._log)
         self.tester = open_frame_socket(self.bus, [CanFilter(0, CAN_RTR_FLAG)])
         self.service = BusService(
             socket,
@@ -75,7 +75,7 @@ class MasterBench:
             store=ObjectStore(EDS / "jtqd.eds", OWN),
             returning=self.returning,
             conditions=self.conditions,
-            say=self._say,
+            log=self._log,
             directory=self._directory,
         )
         self.service.begin(time.monotonic())
@@ -90,7 +90,7 @@ class MasterBench:
         self.children.append(Child(module, arguments, name=name))
         return self.children[-1]
 
-    def _say(self, topic: str, node: int, line: str) -> None:
+    def _log(self, topic: str, node: int, line: str) -> None:
         self.lines.append(line)
 
     def appear(self) -> None:

@@ -63,6 +63,6 @@ def test_a_storm_is_a_few_lines_and_bounded_memory() -> None:
 
 def test_lines_are_limited_by_kind_and_together() -> None:
     limit = RateLimit(quiet_s=5.0, burst=3)
-    assert [limit.may_say(kind, 0.0) for kind in ("a", "a", "b", "c", "d")] == [0, None, 1, 0, None]
-    assert limit.may_say("a", 5.0) == 1
-    assert limit.may_say("a", 9.9) is None
+    assert [limit.admit(kind, 0.0) for kind in ("a", "a", "b", "c", "d")] == [0, None, 1, 0, None]
+    assert limit.admit("a", 5.0) == 1
+    assert limit.admit("a", 9.9) is None

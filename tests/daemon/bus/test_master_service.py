@@ -101,7 +101,7 @@ def test_nmt_commands_and_nodes_of_somebody_else_are_told(bench: MasterBench) ->
     bench.send(0x000, b"\x02\x00")
     bench.send(0x705, b"\x00")
     assert bench.run(lambda: len(bench.lines) >= 2)
-    assert "NMT command 'stop' to all nodes from somebody else" in bench.lines
+    assert "NMT command 'stop' to all nodes from another master" in bench.lines
     assert "node 5: it is on the bus and not in the configuration (status A)" in bench.lines
     assert bench.service.foreign_nmt == 1
 
@@ -113,7 +113,7 @@ def test_a_stopped_node_is_booted_and_its_boot_is_nobodys_foreign_command(bench:
     bench.snapshot.node_states[1] = 5
     assert bench.run(lambda: bench.said("node 1 was away and is configured again"))
     bench.pause(0.3)
-    assert not bench.said("somebody else")
+    assert not bench.said("another master")
     assert bench.snapshot.configured[1] == 1
 
 

@@ -64,7 +64,7 @@ def test_a_flapping_contact_is_two_lines_in_five_seconds_and_nothing_is_left_out
 
 def test_a_loss_that_was_too_soon_to_be_told_is_told_with_its_end_and_cause():
     assert told((1.0, 1.5), (2.0, 2.5), until=10)[2:] == [
-        (6.125, "back after 0.5 s: inputs lost: asked at 2.125")
+        (6.125, "back after 0.5 s (inputs lost: asked at 2.125)")
     ]
 
 
@@ -77,8 +77,8 @@ def test_a_loss_too_soon_that_lasts_is_told_as_soon_as_allowed():
 
 def test_two_losses_are_two_and_the_next_line_waits_for_its_time():
     lines = told((1.0, 1.5), (2.0, 2.5), (3.0, 3.5), (7.0, 7.5), until=20)
-    assert lines[2] == (6.125, "back after 1.0 s, 2 times: inputs lost: asked at 3.125")
-    assert lines[3] == (11.125, "back after 0.5 s: inputs lost: asked at 7.125")
+    assert lines[2] == (6.125, "back after 1.0 s, 2 times (inputs lost: asked at 3.125)")
+    assert lines[3] == (11.125, "back after 0.5 s (inputs lost: asked at 7.125)")
 
 
 def test_the_catalogue_is_complete_and_consistent():

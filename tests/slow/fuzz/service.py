@@ -13,6 +13,7 @@ from typing import Any
 
 from jtqd.daemon.bus.boot import ReturningNodes
 from jtqd.daemon.bus.service import BusService, service_filters
+from jtqd.daemon.shared.conditions import Conditions
 from jtqd.drivers.filters import CanFilter
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_ERR_FLAG, CAN_RTR_FLAG, CAN_SFF_MASK, FRAME
 from jtqd.drivers.frame_socket import CAPACITY
@@ -117,9 +118,10 @@ def fuzz_service(directory: Path, seed: int, count: int) -> dict[str, Any]:
     lines: list[str] = []
     exceptions, first, base_kb, passed, sdo_replies, emcys = 0, "", 0, 0, 0, 0
     with MasterBench(directory) as bench:
-        say = lambda _topic, _node, line: lines.append(line)  # noqa: E731
+        conditions = Conditions()
+        log = lambda _topic, _node, line: lines.append(line)  # noqa: E731
         socket = _Socket(service_filters(bench.config))
-        returning = ReturningNodes(bench.config, bench.bus, bench.report, lambda *_: _EndedBoot(), say)  # type: ignore[arg-type,return-value]
+        returning = ReturningNodes(bench.config, bench.bus, bench.report, lambda *_: _EndedBoot(), log)  # type: ignore[arg-type,return-value]
         store = ObjectStore(EDS / "jtqd.eds", OWN)
         service = BusService(
             socket,  # type: ignore[arg-type]
@@ -128,7 +130,8 @@ def fuzz_service(directory: Path, seed: int, count: int) -> dict[str, Any]:
             reader=bench.reader,
             store=store,
             returning=returning,
-            say=say,
+            conditions=conditions,
+            log=log,
             directory=directory,
         )
         now_s, given = 1000.0, 0
@@ -140,6 +143,7 @@ def fuzz_service(directory: Path, seed: int, count: int) -> dict[str, Any]:
             now_s += source.choice((0.001, 0.02, 0.05, 0.05, 0.5))
             try:
                 service.turn(bench.reader.read(), now_s)
+                lines += [line.text for line in conditions.lines(now_s)]
             except Exception as error:
                 import traceback
 

@@ -4,7 +4,7 @@ import io
 import os
 from pathlib import Path
 
-from jtqd.daemon.shared.log_lines import BURST, ERROR, NOTICE, WARNING, WINDOW_S, Say, in_journal
+from jtqd.daemon.shared.log_lines import BURST, ERROR, NOTICE, WARNING, WINDOW_S, OperatorLog, in_journal
 
 
 class Clock:
@@ -17,37 +17,37 @@ class Clock:
 
 def test_on_a_terminal_a_line_names_the_program() -> None:
     stream = io.StringIO()
-    say = Say(stream, journal=False)
-    assert say("not granted: memory lock", WARNING)
+    log = OperatorLog(stream, journal=False)
+    assert log("not granted: memory lock", WARNING)
     assert stream.getvalue() == "jtqd: not granted: memory lock\n"
 
 
 def test_in_the_journal_each_line_has_its_priority() -> None:
     stream = io.StringIO()
-    say = Say(stream, journal=True)
-    say("one\ntwo", ERROR)
-    say("three", NOTICE)
+    log = OperatorLog(stream, journal=True)
+    log("one\ntwo", ERROR)
+    log("three", NOTICE)
     assert stream.getvalue() == "<3>one\n<3>two\n<5>three\n"
 
 
 def test_each_kind_is_limited_by_itself_and_what_was_held_back_is_counted() -> None:
     stream, clock = io.StringIO(), Clock()
-    say = Say(stream, journal=False, clock=clock)
-    said = [say(f"lost {n}", WARNING, "joint 1") for n in range(100)]
+    log = OperatorLog(stream, journal=False, clock=clock)
+    said = [log(f"lost {n}", WARNING, "joint 1") for n in range(100)]
     assert said == [True] * BURST + [False] * (100 - BURST)
-    assert say("lost", WARNING, "joint 2"), "another kind is not held back for it"
+    assert log("lost", WARNING, "joint 2"), "another kind is not held back for it"
     clock.now += WINDOW_S
-    assert say("back", WARNING, "joint 1")
+    assert log("back", WARNING, "joint 1")
     last = stream.getvalue().splitlines()[-1]
     assert last == f"jtqd: back ({100 - BURST} lines like this one were held back)"
 
 
 def test_errors_and_lines_without_a_kind_always_come() -> None:
     stream = io.StringIO()
-    say = Say(stream, journal=False, clock=Clock())
+    log = OperatorLog(stream, journal=False, clock=Clock())
     for _ in range(50):
-        assert say("failed", ERROR, "reload")
-        assert say("summary")
+        assert log("failed", ERROR, "reload")
+        assert log("summary")
     assert len(stream.getvalue().splitlines()) == 100
 
 
@@ -55,7 +55,7 @@ def test_a_reader_that_has_gone_is_no_reason_to_end() -> None:
     read, write = os.pipe()
     os.close(read)
     with os.fdopen(write, "w") as stream:
-        Say(stream, journal=False)("anybody there?")
+        OperatorLog(stream, journal=False)("anybody there?")
         try:
             stream.flush()
         except BrokenPipeError:
