@@ -1,4 +1,4 @@
-"""`jtq fit`: which part of a joint file is to be fitted; each kind has a module of its own."""
+"""`jtq fit efficiency|friction|losses`: fit one section of a joint file to measured runs and write it into a new file."""
 
 from __future__ import annotations
 
@@ -40,8 +40,6 @@ from jtqd.sysid.fit.signals import RunSignals, run_signals
 from jtqd.sysid.fit.torsion import TorsionError
 from jtqd.sysid.runs.files import RunError
 from jtqd.sysid.runs.inputs import InputRun, channel_findings, joint_number, plateaus_of, progress, read_runs
-
-# What all kinds of `jtq fit` ask for on the command line.
 
 
 def fit_parser(kind: str, description: str, examples: str) -> argparse.ArgumentParser:
@@ -110,9 +108,6 @@ def positive(text: str) -> float:
 def today() -> str:
     """The date of a fit, ISO 8601, local time."""
     return dt.datetime.now().astimezone().date().isoformat()
-
-
-# `jtq fit efficiency`: plateaus of the runs, eta by quadrant, Eq. (8), and a new joint file.
 
 
 EFFICIENCY_BY = "jtq fit efficiency"
@@ -225,7 +220,7 @@ def _new_joint(joint: Joint, result: EfficiencyResult, options: argparse.Namespa
 
 
 def _refuse(result: EfficiencyResult, options: argparse.Namespace) -> int:
-    """Say on standard error why nothing was written."""
+    """Report on standard error why nothing was written; returns the exit status."""
     nothing = f"nothing was written to {options.out}" if options.out is not None else "not fitted"
     if result.findings:
         count = len(result.findings)
@@ -250,9 +245,6 @@ def _draw(joint: Joint, result: EfficiencyResult, path: Path) -> None:
     print(f"{EFFICIENCY_BY}: wrote {path}", file=sys.stderr)
 
 
-# `jtq fit friction`: Coulomb and viscous friction at no load, from plateaus, into a new joint file.
-
-
 FRICTION_BY = "jtq fit friction"
 
 
@@ -273,7 +265,10 @@ def friction_main(argv: list[str]) -> int:
         if found:
             for item in found:
                 print(f"{item.kind}: {item.text}")
-            print(f"{FRICTION_BY}: {len(found)} findings, not fitted", file=sys.stderr)
+            print(
+                f"{FRICTION_BY}: {len(found)} finding{'s' if len(found) > 1 else ''}, not fitted",
+                file=sys.stderr,
+            )
             return 3
         plateaus = plateaus_of(runs, number, joint, PlateauRules(shortest_s=options.min_hold))
         chosen = no_load(plateaus, joint, options.min_current or default_current_min(joint))
@@ -314,9 +309,6 @@ def _friction_mapping(
         "warnings": list(fit.warnings),
         "plateaus": [plateau_mapping(plateau) for plateau in plateaus],
     }
-
-
-# `jtq fit losses`: additive loss, torsion and standard deviations from whole runs: section `fused` of a joint file.
 
 
 LOSSES_BY = "jtq fit losses"
