@@ -1,4 +1,4 @@
-"""`jtq plot`: a log as a picture: estimate with its standard deviation beside the sensor, and their difference."""
+"""`jtq plot`: draw a log: estimate with its standard deviation beside the sensor, and their difference."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def main(argv: list[str]) -> int:
 
 
 def draw(log: Records, joint: int, path: Path) -> float:
-    """Two panels over time: torque and sensor, then their difference; shaded where the status is not valid.
+    """Draw two panels over time: torque and sensor, then their difference; shaded where the status is not valid.
 
     Returns:
         The RMSE in the title [Nm], over what was published while the joint moved and the sensor was valid; NaN without any.

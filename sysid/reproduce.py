@@ -1,4 +1,4 @@
-"""`jtq reproduce`: the paper's whole procedure and ours from nothing: campaigns, fits, training, evaluation, report.
+"""`jtq reproduce`: run the paper's whole procedure and ours: campaigns, fits, training, evaluation, report.
 
 Every step is a `jtq` command of its own, printed before it runs, so that it can be repeated alone. Campaigns go on where
 they were interrupted; fits and training give the same files from the same runs.

@@ -121,7 +121,7 @@ def _make(directory: Path) -> None:
 
 
 def _distinct(inputs: Inputs, outside: Inputs) -> tuple:  # type: ignore[type-arg]
-    """The runs to judge; one that is also given as outside would count in two places. Raises ConfigError."""
+    """Return the runs to evaluate; one that is also given as outside would count twice. Raises ConfigError."""
     beyond = {run.sha256: run.name for run in outside.runs}
     for run in inputs.runs:
         if run.sha256 in beyond:

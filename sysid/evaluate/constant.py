@@ -1,7 +1,10 @@
-"""Section IV.A: the error of every method at constant velocity and load, plateau by plateau. Pure.
+"""Score every method at constant velocity and load, plateau by plateau (section IV.A), and ours outside its envelope.
 
-Plateaus are found by the data (sysid.fit.plateaus). Their means run over whole ripple periods, so that what is left is the
-error of the loss and not the ripple.
+Plateaus are detected in the data (sysid.fit.plateaus). Their means run over whole ripple periods, so that the error is
+that of the loss and not the ripple.
+
+Outside is defined by the network's own envelope of load and temperature: |motor torque| beyond the last cell of its map
+that any speed has, or a temperature beyond the range of its training runs, independent of the published status.
 """
 
 from __future__ import annotations
@@ -27,7 +30,7 @@ WORST_TORQUE_NM: Final = (25.0, 35.0)
 """What counts as "2.5 rad/s and 30 Nm": no plateau has just that torque, because currents are commanded."""
 
 NO_LOAD: Final = 0.05
-"""Share of rated torque below which an error relative to the torque says nothing."""
+"""Share of rated torque below which an error relative to the torque has no meaning."""
 WHOLE: Final = 0.9
 """Share of a plateau's samples at which every method must have a value."""
 CONSTANT_SHARE: Final = 0.25
@@ -69,7 +72,7 @@ def plateaus_of(name: str, time_s: np.ndarray, columns: JointColumns, joint: Joi
 
 
 def is_constant(plateaus: Sequence[Plateau], samples: Samples) -> bool:
-    """Tell a run at constant velocity by the share of its moving time that plateaus take."""
+    """Return whether a run is at constant velocity: plateaus take a large share of its moving time."""
     speed = np.abs(np.nan_to_num(samples.velocity_rad_s))
     steps = np.diff(samples.time_s, prepend=samples.time_s[0])
     moving_s = float(np.sum(steps[speed > _MOVING_RAD_S]))
@@ -140,15 +143,8 @@ def speed_groups(plateaus: Iterable[PlateauScore]) -> dict[tuple[str, float], li
     return dict(sorted(groups.items(), key=lambda item: (item[0][0] != "forward", item[0][1])))
 
 
-# Outside of what our network was trained on: is ours no worse than its physics there, and does it say so? Pure.
-#
-# Outside is what the network's own envelope calls so, by load and temperature: |motor torque| beyond the last cell of
-# its map that any speed has, or a temperature beyond the range of its training runs. The status, which is what is judged,
-# has no part in it.
-
-
 FLAGGED: Final = 0.95
-"""Share of samples outside whose status must say degraded."""
+"""Least share of the samples outside whose status is degraded."""
 
 
 class Range(NamedTuple):

@@ -1,4 +1,7 @@
-"""The whole evaluation: samples of every run and joint, then every table of the report. No file, no clock."""
+"""Evaluate all methods on all runs: samples of every run and joint, every table of the report, and the targets.
+
+No file and no clock: a pure function of runs and models.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +13,7 @@ import numpy as np
 
 from jtqd.estimator.network import FusedNetwork
 from jtqd.estimator.validity import Envelope
-from jtqd.sysid.evaluate import constant
-from jtqd.sysid.evaluate import constant as outside
-from jtqd.sysid.evaluate import scores as intervals
+from jtqd.sysid.evaluate import constant, scores
 from jtqd.sysid.evaluate.constant import (
     Outside,
     PlateauScore,
@@ -41,6 +42,7 @@ from jtqd.sysid.evaluate.scores import (
 )
 from jtqd.sysid.fit.efficiency_report import TITLES as QUADRANT_TITLES
 from jtqd.sysid.fit.plateaus import Plateau
+from jtqd.sysid.report.numbers import counted
 from jtqd.sysid.runs.checks import RunIssue
 
 SILENT_SHARE: Final = 0.01
@@ -106,7 +108,7 @@ def evaluate(
     progress: Progress[JudgedRun] = lambda items, text: items,
     measured: LoopTime | None = None,
 ) -> Evaluation:
-    """Judge all methods on runs, and ours outside its envelope on the runs `outside`; measured: what their steps cost.
+    """Score all methods on runs, and ours outside its envelope on the runs `outside`; measured: the cost of their steps.
 
     Raises ConfigError when a joint and its networks do not fit, ValueError when no run has a sample to score.
     """
@@ -114,9 +116,7 @@ def evaluate(
     judged = _judge(progress(runs, "estimating"), models, findings)
     beyond = _judge(progress(outside, "estimating outside"), models, findings)
     if not judged:
-        raise ValueError(
-            "found no run with a moving sample that every method has a value for: nothing to judge"
-        )
+        raise ValueError("found no run with a moving sample that every method has a value for, expected one")
     constant: list[_Judged] = []
     variable: list[_Judged] = []
     for each in judged:
@@ -236,9 +236,6 @@ def _record(judged: _Judged, kind: str) -> RunRecord:
     return RunRecord(run.name, run.sha256, kind, duration, run.velocity_joint, run.by, joints)
 
 
-# The figures to reach: each one computed from the evaluation, beside the paper's and the goal. Pure.
-
-
 TOB_RANGE_NM2: Final = (7.0, 14.0)
 """MSE of the classical TOB from which on, and up to which, the emulated bench is as hard as the paper's."""
 TOB_TO_PAPER: Final = 46.0
@@ -265,7 +262,7 @@ class Target(NamedTuple):
 
 
 def targets(result: Evaluation) -> tuple[Target, ...]:
-    """Return the table of the figures to reach."""
+    """Return the targets, each beside the paper's figure and ours."""
     return (
         _tob(result.variable.tested),
         _tob_to_paper(result),
@@ -306,7 +303,7 @@ def _tob(tested: Row) -> Target:
         f"{low:g} to {high:g} Nm²",
         "not known" if found is None else f"{found:.2f} Nm²",
         None if found is None else low <= found <= high,
-        ("how hard the bench is, not how good the estimate",),
+        ("a property of the bench, not of the estimate",),
     )
 
 
@@ -363,7 +360,7 @@ def _back_drive(plateaus: Sequence[constant.PlateauScore]) -> Target:
     hard = constant.hardest(plateaus)
     ours = constant.worst(hard, OURS, constant.PlateauScore.rated_percent)
     tob = constant.worst(hard, "tob", constant.PlateauScore.percent)
-    details = [f"{len(hard)} plateaus at 2.4 to 2.6 rad/s and 25 to 35 Nm, back-driven"]
+    details = [f"{counted(len(hard), 'plateau')} at 2.4 to 2.6 rad/s and 25 to 35 Nm, back-driven"]
     if tob is not None:
         details.append(f"classical TOB {tob[0]:.1f} % of the torque, {_place(tob[1])}")
     if ours is not None:
@@ -379,8 +376,8 @@ def _back_drive(plateaus: Sequence[constant.PlateauScore]) -> Target:
     )
 
 
-def _coverage(variable: intervals.IntervalTables | None, every: intervals.IntervalTables | None) -> Target:
-    low, high = (100.0 * share for share in intervals.ALLOWED)
+def _coverage(variable: scores.IntervalTables | None, every: scores.IntervalTables | None) -> Target:
+    low, high = (100.0 * share for share in scores.ALLOWED)
     cells = (
         {}
         if variable is None
@@ -407,17 +404,19 @@ def _coverage(variable: intervals.IntervalTables | None, every: intervals.Interv
     )
 
 
-def _outside(found: Sequence[outside.Outside]) -> tuple[Target, Target]:
+def _outside(found: Sequence[constant.Outside]) -> tuple[Target, Target]:
     worst = max(found, key=lambda each: each.ours.rmse_nm / each.physics.rmse_nm, default=None)
     flagged = min((each.flagged for each in found), default=None)
-    goal = 100.0 * outside.FLAGGED
+    goal = 100.0 * constant.FLAGGED
     return (
         Target(
             "outside_rmse",
             "RMSE ours : physics, outside the envelope",
             "-",
             f"at most {_NO_WORSE:g}",
-            "not asked (--outside)" if worst is None else f"{worst.ours.rmse_nm / worst.physics.rmse_nm:.4f}",
+            "not evaluated (--outside)"
+            if worst is None
+            else f"{worst.ours.rmse_nm / worst.physics.rmse_nm:.4f}",
             None
             if worst is None
             else all(each.ours.rmse_nm <= _NO_WORSE * each.physics.rmse_nm for each in found),
@@ -432,8 +431,8 @@ def _outside(found: Sequence[outside.Outside]) -> tuple[Target, Target]:
             "flagged degraded outside the envelope",
             "-",
             f"at least {goal:g} %",
-            "not asked (--outside)" if flagged is None else f"{100.0 * flagged:.2f} %",
-            None if flagged is None else flagged >= outside.FLAGGED,
+            "not evaluated (--outside)" if flagged is None else f"{100.0 * flagged:.2f} %",
+            None if flagged is None else flagged >= constant.FLAGGED,
         ),
     )
 

@@ -1,4 +1,10 @@
-"""From run files to runs that may be judged: trained-on runs refuse everything, broken ones are named and left out."""
+"""Read the runs of an evaluation: a run that a model was made from refuses all, a broken one is named and left out.
+
+Which joint of a run was in velocity mode (the paper's tested joint) comes from the campaign's marks, else from the data: a
+velocity loop turns its current over by twice the friction within milliseconds wherever the joint reverses, and follows
+every ripple; a current drive follows a smooth command. The second difference of the current over cells of 10 ms is 10 to
+50 times larger in velocity mode on the emulated bench.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +24,6 @@ from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.checks import RunIssue, check_channels
 from jtqd.sysid.runs.files import ColumnMap, RunError, RunFile, read_run, run_paths
 
-# Which joint of a run was in velocity mode, the paper's tested joint: by the campaign's marks, else by the data. Pure.
-#
-# A velocity loop turns its current over by twice the friction within milliseconds wherever the joint reverses, and follows
-# every ripple; a current drive follows a smooth command. The second difference of the current over cells of 10 ms is 10 to
-# 50 times larger in velocity mode on the emulated bench.
-
-
 _CELL_S: Final = 0.01
 _CLEAR: Final = 3.0
 """Ratio of the two joints' roughness from which on the rougher one is called the velocity joint."""
@@ -37,7 +36,7 @@ def by_marks(marks: Any) -> int | None:
 
 
 def by_data(table: RunTable) -> int | None:
-    """Return the velocity joint of a run of two joints by their currents, None where the data do not tell."""
+    """Return the velocity joint of a run of two joints by their currents, None where the data are ambiguous."""
     rough = {
         number: _roughness(table.time_s, columns.current_a)
         for number, columns in table.joints.items()
@@ -82,7 +81,7 @@ class Inputs(NamedTuple):
 
 
 class LeakError(ConfigError):
-    """Runs to judge by are runs that the models were made from; one line per run."""
+    """Runs of the evaluation are runs that the models were made from; one line per run."""
 
 
 def read_inputs(
@@ -156,7 +155,7 @@ def _judged(
 
 
 def _check(name: str, file: RunFile, number: int, joint: Joint) -> list[RunIssue]:
-    """What keeps a joint of a run from being judged."""
+    """Return the reasons to leave out a joint of a run."""
     where = f"{name}: j{number}"
     if number not in file.table.joints:
         return [RunIssue("missing_joint", f"{where}: found no columns of this joint: not judged")]

@@ -1,7 +1,7 @@
-"""What a step of each method costs, on samples of a run that is judged: the part of jtqd's loop that the method decides.
+"""Measure the time of one step of each method on samples of an evaluated run: its part of jtqd's loop.
 
 Every step is timed alone, as the loop would call it, with the loop's own estimators and networks; the methods take turns
-in short blocks, so that a busy machine hurts all alike, and the median leaves out the steps in which the machine did
+in short blocks, so that a busy machine affects all alike, and the median leaves out the steps in which the machine did
 something else. One process in a tight loop: caches are warmer than in a loop that sleeps between its cycles.
 """
 

@@ -1,7 +1,11 @@
-"""The methods that are compared, and the directory of models they come from.
+"""Load the methods that are compared from a directory of models, and estimate one joint of a run with each.
 
 DIR holds jointN.yaml (joint file), jointN.onnx (the paper's network) and jointN.fused.onnx (ours). What is missing
-leaves its methods out, by name.
+leaves its methods out, by name. Joint files name the runs that they were made from in `provenance` (every mapping of a
+section's `sha256`), networks in the metadata key `runs` and in a card jointN.json or jointN.fused.json beside them.
+
+Only samples at which all methods move and have a value are scored, the same ones for each: a method must not look better
+because it was silent where the others were wrong.
 """
 
 from __future__ import annotations
@@ -30,12 +34,6 @@ from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
 from jtqd.estimator.whole_run import EstimateRun, ObservedRun, estimate_observed, observe_run, quadrant_many
 from jtqd.models.files import load_joint
 from jtqd.sysid.fit.signals import same_age
-
-# Leakage guard: which runs the models were made from, by the hashes that models carry; a run among them judges nothing.
-#
-# Joint files name them in `provenance` (every mapping of a section's `sha256`), networks in the metadata key `runs` and
-# in a card jointN.json or jointN.fused.json beside them.
-
 
 KEY: Final = "runs"
 _COMPRESSION: Final = 6
@@ -68,7 +66,7 @@ def joint_training_runs(name: str, joint: Joint) -> TrainingRuns:
 
 
 def network_training_runs(path: Path) -> TrainingRuns:
-    """Return the runs that a network was trained on; one that does not say so is `silent`."""
+    """Return the runs that a network was trained on; one without that information is `silent`."""
     import onnx
 
     model = onnx.load_model(str(path), load_external_data=False)
@@ -224,12 +222,6 @@ def _joint_models(directory: Path, number: int) -> JointModels:
     methods = tuple(method for method in TITLES if method not in missing)
     ordered = {method: missing[method] for method in TITLES if method in missing}
     return JointModels(number, joint, networks, methods, ordered, training, files)
-
-
-# One joint of one run: every method's estimate beside the sensor of the same age, and which samples count. Pure.
-#
-# Only samples at which all methods move and have a value are scored, the same ones for each: a method must not look better
-# because it was silent where the others were wrong.
 
 
 SETTLE_S: Final = 0.1

@@ -1,8 +1,16 @@
-"""Jumps of the estimate where a joint changes its quadrant: at v = 0 and at tau = 0. Pure.
+"""Score errors and intervals of the estimates, and their jumps where a joint changes its quadrant.
+
+Errors: several blocks of samples (runs, joints) are pooled, every sample counts alike; errors in percent are relative to
+each block's own rated torque. Tables are per method and joint, run, quadrant and velocity.
+
+Intervals: in motion value +- z sigma, z of the normal distribution (sysid.fit.fused: sigma is calibrated for z = 1.645,
+90 %); at standstill value +- sigma, which is an interval and not a standard deviation.
+
+Jumps at v = 0 and at tau = 0:
 
     jump = R(estimate) - max R(sensor),      R: max - min over 20 ms
 
-What the torque itself does in that time is not held against the estimate, and a spike that comes and goes is not missed.
+The torque's own change in that time does not count against the estimate, and a spike that comes and goes is not missed.
 The maximum is over the sensor's windows shifted by up to 10 ms: the torque of a reversing joint swings by 10 Nm in 20 ms,
 and an estimate that follows it 2 ms late is late and does not jump. `unshifted_nm` is without that allowance.
 
@@ -25,12 +33,6 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import QUADRANTS
 from jtqd.sysid.evaluate.methods import OURS, TITLES, Samples
 from jtqd.sysid.fit.fused import GAUSS
-
-# Scores of errors and of intervals. Pure; nothing here knows what a run is.
-#
-# Several blocks of samples (runs, joints) are pooled: every sample counts alike. Errors in percent are relative to each
-# block's own rated torque.
-
 
 VELOCITY_EDGES_RAD_S: Final = (0.0, 0.05, 0.2, 0.5, 1.0, 2.0, math.inf)
 """Bins of |v|, joint side: creeping, the paper's slowest, slow, medium, fast, faster."""
@@ -124,9 +126,6 @@ def bin_name(index: int) -> str:
 def ratio(a: float | None, b: float | None) -> float | None:
     """Return a/b; None where one is missing or b is zero."""
     return None if a is None or b is None or b == 0.0 else a / b
-
-
-# Errors over samples: per method and joint, per run, quadrant and velocity; and the paper's three figures. Pure.
 
 
 PAPER_MSE_NM2: Final = {"tob": 10.07, "efficiency": 1.97, "network": 0.22}
@@ -224,12 +223,6 @@ def _bare(samples: Sequence[Samples]) -> float | None:
     parts = [(each.bare_nm - each.sensor_nm)[each.scored] for each in samples]
     error = np.concatenate(parts) if parts else np.zeros(0)
     return float(np.mean(error * error)) if len(error) and np.isfinite(error).all() else None
-
-
-# Does the interval of an estimate hold the sensor as often as it says? Moving samples and standstill. Pure.
-#
-# Moving: value +- z sigma, z of the normal distribution (jtqd.sysid.fit.fused: sigma is calibrated for z = 1.645, 90 %).
-# Standing: value +- sigma, which is an interval and not a standard deviation.
 
 
 NOMINAL: Final = 0.9

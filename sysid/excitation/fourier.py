@@ -1,4 +1,4 @@
-"""Excitation motions as finite Fourier series: Eq. (10) of the paper for a joint, and its like for a current. Pure.
+"""Excitation motions as finite Fourier series: Eq. (10) of the paper for a joint, and its like for a current.
 
 A trajectory must begin and end at rest. The paper adds a fifth-order polynomial to the series, which has just enough
 coefficients for position, velocity and acceleration at both ends. For a current that would be of no use: the same

@@ -1,4 +1,4 @@
-"""What the bench does with an excitation run, by the joint files: torque, limits by radial scaling, information. Pure.
+"""Predict torque and limits of an excitation run from the joint files, and scale it radially into the limits.
 
 Everything takes many candidates at once: a genome [4 H + 1] holds amplitudes a, b of the velocity, a, b of the current
 and its offset, H harmonics each; only their direction counts, their size follows from the limits.

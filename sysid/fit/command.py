@@ -1,4 +1,4 @@
-"""`jtq fit`: which part of a joint file is to be fitted; each kind has a module of its own."""
+"""`jtq fit efficiency|friction|losses`: fit one section of a joint file to measured runs and write it into a new file."""
 
 from __future__ import annotations
 
@@ -42,8 +42,6 @@ from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.checks import channel_findings
 from jtqd.sysid.runs.files import RunError, RunFile, read_runs
 from jtqd.sysid.runs.joints import joint_number
-
-# What all kinds of `jtq fit` ask for on the command line.
 
 
 def fit_parser(kind: str, description: str, examples: str) -> argparse.ArgumentParser:
@@ -116,9 +114,6 @@ def positive(text: str) -> float:
 def today() -> str:
     """The date of a fit, ISO 8601, local time."""
     return dt.datetime.now().astimezone().date().isoformat()
-
-
-# `jtq fit efficiency`: plateaus of the runs, eta by quadrant, Eq. (8), and a new joint file.
 
 
 EFFICIENCY_BY = "jtq fit efficiency"
@@ -232,7 +227,7 @@ def _new_joint(joint: Joint, result: EfficiencyResult, options: argparse.Namespa
 
 
 def _refuse(result: EfficiencyResult, options: argparse.Namespace) -> int:
-    """Say on standard error why nothing was written."""
+    """Report on standard error why nothing was written; returns the exit status."""
     nothing = f"nothing was written to {options.out}" if options.out is not None else "not fitted"
     if result.findings:
         count = len(result.findings)
@@ -255,9 +250,6 @@ def _draw(joint: Joint, result: EfficiencyResult, path: Path) -> None:
     except ValueError as error:  # matplotlib's own: an ending that it does not know
         raise ConfigError(f"--plot {path}: {error}") from None
     print(f"{EFFICIENCY_BY}: wrote {path}", file=sys.stderr)
-
-
-# `jtq fit friction`: Coulomb and viscous friction at no load, from plateaus, into a new joint file.
 
 
 FRICTION_BY = "jtq fit friction"
@@ -285,7 +277,10 @@ def friction_main(argv: list[str]) -> int:
         if found:
             for item in found:
                 print(f"{item.kind}: {item.text}")
-            print(f"{FRICTION_BY}: {len(found)} findings, not fitted", file=sys.stderr)
+            print(
+                f"{FRICTION_BY}: {len(found)} finding{'s' if len(found) > 1 else ''}, not fitted",
+                file=sys.stderr,
+            )
             return 3
         plateaus = plateaus_of(runs, number, joint, PlateauRules(shortest_s=options.min_hold))
         chosen = no_load(plateaus, joint, options.min_current or default_current_min(joint))
@@ -326,9 +321,6 @@ def _friction_mapping(
         "warnings": list(fit.warnings),
         "plateaus": [plateau_mapping(plateau) for plateau in plateaus],
     }
-
-
-# `jtq fit losses`: additive loss, torsion and standard deviations from whole runs: section `fused` of a joint file.
 
 
 LOSSES_BY = "jtq fit losses"

@@ -1,8 +1,17 @@
-"""What cannot be: a joint that gives energy instead of losing it, and coefficients written under the wrong name.
+"""Fit the paper's Eq. (8) to measured plateaus, one polynomial per quadrant of (i, omega_m), and check what cannot be.
+
+    eta = p00 + p10 i + p01 v + p20 i^2 + p11 i v + p02 v^2        v = omega_m/G [rad/s], i [A], both signed
+
+eta has two names, and this file carries both: "joint_over_motor", tau_j/(G Kt i), as in Table I; "motor_over_joint",
+G Kt i/tau_j, as in Eq. (6). A point is measured once, as tau_j and i; its eta in either convention follows from these.
+
+At constant velocity the motor's inertia carries nothing, so G Kt i = tau_j + loss, and the loss has the sign of v. Below
+the current that overcomes the joint's own friction, (Fc + Fs)/(G Kt), the torque of a driving joint may be of either
+sign and eta goes through 0/0: such points are left out and counted.
 
 At every plateau the loss (G Kt i - tau_j) sign(v) is positive: eta = tau_j/(G Kt i) is below 1 when driving, above 1
-when back-driven, never negative. A measurement that says otherwise by more than its standard errors and the sensor's
-zero is not a joint with odd friction but a wrong number in the joint file or a wrong channel, and is not fitted.
+when back-driven, never negative. A measurement that differs by more than its standard errors and the sensor's zero is
+not a joint with odd friction but a wrong number in the joint file or a wrong channel, and is not fitted.
 """
 
 from __future__ import annotations
@@ -27,21 +36,9 @@ from jtqd.estimator.losses import (
 from jtqd.sysid.fit.plateaus import Plateau
 from jtqd.sysid.runs.checks import RunIssue
 
-# Least squares of the paper's Eq. (8) to measured plateaus, one polynomial per quadrant of (i, omega_m).
-#
-#     eta = p00 + p10 i + p01 v + p20 i^2 + p11 i v + p02 v^2        v = omega_m/G [rad/s], i [A], both signed
-#
-# eta has two names, and this file carries both: "joint_over_motor", tau_j/(G Kt i), as in Table I; "motor_over_joint",
-# G Kt i/tau_j, as in Eq. (6). A point is measured once, as tau_j and i; its eta in either convention follows from these.
-#
-# At constant velocity the motor's inertia carries nothing, so G Kt i = tau_j + loss, and the loss has the sign of v. Below
-# the current that overcomes the joint's own friction, (Fc + Fs)/(G Kt), the torque of a driving joint may be of either
-# sign and eta goes through 0/0: such points are left out and counted.
-
-
 COEFFICIENTS: Final = ("p00", "p10", "p01", "p20", "p11", "p02")
 FEWEST_DISTINCT: Final = len(COEFFICIENTS) + 1
-"""Operating points per quadrant: six coefficients, and one more to judge them by."""
+"""Least operating points per quadrant: six coefficients, and one more to check them."""
 HIGHEST_CONDITION: Final = 3000.0
 """Of the columns scaled to unit length: 30 to 60 for the points of section II. Beyond this the data do not span Eq. (8)."""
 SAME_VELOCITY_RAD_S: Final = 0.03
@@ -260,12 +257,6 @@ def _span(values: FloatArray) -> str:
     return f"{float(values.min()):.3g} to {float(values.max()):.3g}"
 
 
-# Numbers of the paper: Table I, the fitted efficiency of its integrated joint.
-#
-# Table I holds eta = tau_j/(G Kt i), below 1 when driving: the reciprocal of the paper's Eq. (6), so that its
-# Eq. (7) must multiply by it. Velocity is omega_m/G [rad/s], 0.2 to 3; current in A.
-
-
 TABLE_I: Final = Efficiency(
     convention="joint_over_motor",
     i_pos_w_pos=QuadrantPolynomial(0.2530, 0.1493, -0.0820, -0.0117, 0.0060, 0.0066, rmse=0.01963),
@@ -273,6 +264,8 @@ TABLE_I: Final = Efficiency(
     i_neg_w_pos=QuadrantPolynomial(1.8830, 0.4870, 0.2602, 0.0658, 0.0435, -0.0168, rmse=0.05599),
     i_pos_w_neg=QuadrantPolynomial(1.8660, -0.4769, -0.2342, 0.0645, 0.04295, -0.0101, rmse=0.05504),
 )
+"""The paper's fitted efficiency of its integrated joint: eta = tau_j/(G Kt i), below 1 when driving, the reciprocal of its
+Eq. (6), so that its Eq. (7) must multiply by it. Velocity omega_m/G 0.2 to 3 rad/s, current in A."""
 
 
 STANDARD_ERRORS: Final = 3.0
@@ -280,7 +273,7 @@ STANDARD_ERRORS: Final = 3.0
 
 
 def efficiency_findings(points: Sequence[EtaPoint], joint: Joint) -> list[RunIssue]:
-    """Return what the plateaus say against the joint file or the channels; an empty list is good."""
+    """Return where the plateaus contradict the joint file or the channels; an empty list is good."""
     zero_nm = ZERO_SHARE * joint.rated_torque_nm
     against = [
         p

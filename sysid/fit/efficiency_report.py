@@ -1,4 +1,4 @@
-"""The efficiency fit as text and as plain values: measured eta, coefficients beside Table I, what was left out and why."""
+"""Report an efficiency fit: text, plain values, and the paper's Fig. 6 (measured eta and fitted surface per quadrant)."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ TITLES: Final = {
 
 @dataclass(frozen=True)
 class EfficiencyResult:
-    """Everything that one `jtq fit efficiency` found; `fits` holds the one to be written first, then those beside it."""
+    """Result of one `jtq fit efficiency`; `fits` holds the one to be written first, then those for comparison."""
 
     joint: str
     number: int
@@ -200,9 +200,6 @@ def plateau_mapping(plateau: Plateau) -> dict[str, Any]:
             value = None
         out[item.name] = value
     return out
-
-
-# The paper's Fig. 6 of one fit: measured eta and the fitted surface, one panel per quadrant, one curve per velocity.
 
 
 _RATIOS: Final = {"joint_over_motor": "τ_j / (G Kt i)", "motor_over_joint": "G Kt i / τ_j"}

@@ -1,4 +1,4 @@
-"""Fit of nothing but a joint file's friction to one measured run: linear least squares, honest intervals.
+"""Fit only a joint file's friction to one measured run: linear least squares with intervals for coloured residuals.
 
 Model (joint side, w = omega_m/G, s(w) the estimator's own smooth direction):
 
@@ -57,7 +57,7 @@ class Term:
 
 @dataclass(frozen=True)
 class FrictionFit:
-    """The friction for the joint file, and what it rests on. RMSE in Nm over the rows in motion, filtered."""
+    """The friction for the joint file, and the data behind it. RMSE in Nm over the rows in motion, filtered."""
 
     friction: Friction
     terms: tuple[Term, ...]

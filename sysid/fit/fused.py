@@ -1,7 +1,18 @@
-"""The whole fit of section `fused` of a joint file: torsion, loss, standard deviations and their calibration. Pure.
+"""Fit section `fused` of a joint file: torsion, loss, standard deviations and their calibration.
 
-Standard deviations come from runs that the fit had not seen: the runs are dealt into folds, each fold is judged by a
+Standard deviations come from runs that the fit had not seen: the runs are split into folds, each fold is compared with a
 fit on the others, and the parameters that are written are those of all runs together.
+
+With residuals e_c = tau_raw - loss - sensor and e_t = tau_t - sensor on runs not seen:
+
+    reference^2 = covariance of the two paths' run means: what both share is the sensor's zero
+    e_c^2 - reference^2 ~ current^2 + (viscous v)^2 + (load tau_raw)^2
+    e_t^2 - reference^2 - open^2 ~ torsion^2 + (load tau_t)^2
+    scale_q = 90 % quantile of |error|/sigma in quadrant q, over 1.645: split conformal prediction by runs
+              (Vovk et al. 2005), every run weighted alike, its level set so that a run left out is covered to 90 %
+
+The level of 90 % is unbiased, not the conservative one that guarantees at least 90 %. Where a whole run shares its error
+(its zeros), n runs have not shown the largest yet: 8 of them cover 87 % of others.
 """
 
 from __future__ import annotations
@@ -21,20 +32,6 @@ from jtqd.estimator.whole_run import QuadrantArray, quadrant_many
 from jtqd.sysid.fit.losses import LossFit, fit_loss
 from jtqd.sysid.fit.signals import RunSignals
 from jtqd.sysid.fit.torsion import fit_torsion, torsion_torque
-
-# Standard deviations of the fused estimator's paths and their calibration, from residuals on unseen runs. Pure.
-#
-# Residuals e_c = tau_raw - loss - sensor and e_t = tau_t - sensor, each from a fit that had not seen the run:
-#
-#     reference^2 = covariance of the two paths' run means: what both share is the sensor's zero
-#     e_c^2 - reference^2 ~ current^2 + (viscous v)^2 + (load tau_raw)^2
-#     e_t^2 - reference^2 - open^2 ~ torsion^2 + (load tau_t)^2
-#     scale_q = 90 % quantile of |error|/sigma in quadrant q, over 1.645: split conformal prediction by runs
-#               (Vovk et al. 2005), every run weighted alike, its level set so that a run left out is covered to 90 %
-#
-# What is asked is 90 %, neither less nor more: the level is unbiased, not the conservative one that promises at least 90 %.
-# Where a whole run shares its error (its zeros), n runs have not shown the largest yet: 8 of them cover 87 % of others.
-
 
 COVERAGE: Final = 0.9
 GAUSS: Final = 1.6448536269514722
@@ -188,7 +185,7 @@ class FusedFit:
 
 
 def folds(runs: Sequence[RunSignals], count: int = FOLDS) -> Iterator[tuple[list[RunSignals], list[int]]]:
-    """Yield (runs to fit, indices of runs to judge); whole runs only, every run judged once and never fitted then."""
+    """Yield (runs to fit, indices of the runs left out); whole runs, each left out exactly once."""
     for k in range(min(count, len(runs))):
         judged = [n for n in range(len(runs)) if n % count == k]
         yield [run for n, run in enumerate(runs) if n not in judged], judged

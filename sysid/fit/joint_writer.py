@@ -1,6 +1,6 @@
-"""Joint files written back: every section the joint has, and which runs each fitted section comes from.
+"""Write joint files: every section the joint has, and the runs from which each fitted section comes.
 
-A file is put in place only after it has been read back as the very joint that was meant.
+A file is put in place only after it has been read back as the same joint.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Fit of the additive loss: penalised least squares over runs, with what differs from run to run as nuisance. Pure.
+"""Fit the additive loss: penalised least squares over runs, with run-to-run differences as nuisance parameters.
 
     tau_raw - sensor = (1+s)/2 L_+ - (1-s)/2 L_- + kappa g(T) v + zero_r + u_r v + ripple
 

@@ -3,9 +3,9 @@
     G Kt i - tau = Fc s(v) + Fv v + zero          s(v) the estimator's own smooth direction, v = omega_m/G
 
 at plateaus whose motor carries next to no current (the other joint drives it round) or whose output carries next to no
-torque. The zero of sensor and current together does not turn round with the direction, so that it is told from friction
-where both directions are there; where only one is, it is taken for nothing and the report says so. The Stribeck peak is
-the joint file's.
+torque. The zero of sensor and current together does not turn round with the direction, so that it can be separated
+from friction where both directions are there; with only one it is taken as zero, and the report states that. The Stribeck
+peak is the joint file's.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ ZERO: Final = "zero_nm"
 
 @dataclass(frozen=True)
 class NoLoadFit:
-    """Friction for the joint file, its terms with the zero, the RMS residual [Nm] and the plateaus it rests on."""
+    """Friction for the joint file, its terms with the zero, the RMS residual [Nm] and its plateaus."""
 
     friction: Friction
     terms: tuple[Term, ...]

@@ -1,14 +1,14 @@
-"""Plateaus of a run, found by the data alone: where velocity and load had settled, and what they were on average.
+"""Detect plateaus of a run from the data alone: settled velocity and load, with their means and standard errors.
 
-Means over whole ripple periods (`ripple_cells`) may be asked whether they agree. The longest stretch of them in which
+Means over whole ripple periods (`ripple_cells`) are compared. The longest stretch of them in which
 velocity, torque and motor torque G Kt i each stay within a band is a plateau; then the longest of what is left, and so
-on. What the ends still carry of the settling is cut off. No marks, no set-points, no threshold on the derivative of
+on. The settling at its ends is cut off. No marks, no set-points, no threshold on the derivative of
 a noisy signal.
 
 Standard errors are those of means of coloured noise: the standard deviation without the ripple over the square root of
 the effective number of samples, by their autocorrelation. Noise with a memory of a twentieth of the plateau still gets
-an error that is right within a third; at a tenth it is 1.7 times too small, because so slow a noise cannot be told from
-the level. A channel that moves by less than its own resolution is known to resolution/sqrt(12), not better.
+an error that is right within a third; at a tenth it is 1.7 times too small, because such slow noise looks
+like a change of level. A channel that moves by less than its own resolution is known to resolution/sqrt(12), not better.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from jtqd.sysid.runs.channels import integral
 from jtqd.sysid.runs.files import RunFile
 
 RIPPLE_ORDERS: Final = (1.0, 2.0, 4.0)
-"""Orders per motor revolution that are taken out of the samples before their noise is judged."""
+"""Orders per motor revolution that are removed from the samples before their noise is estimated."""
 
 
 class PlateauError(ValueError):
-    """A run lacks a column, or nothing in it ever settled; one line with what was found and expected."""
+    """A run lacks a column, or nothing in it ever settled; one line: found and expected."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What fits of the fused estimator see of a run: the observer's outputs beside the sensor of the same age. Pure."""
+"""Signals of a run for the fits of the fused estimator: the observer's outputs beside the sensor of the same age."""
 
 from __future__ import annotations
 

@@ -1,13 +1,13 @@
-"""Fit of the torsion: stiffness and kinematic error from both encoders and the torque sensor. Pure.
+"""Fit the torsion: stiffness and kinematic error from both encoders and the torque sensor.
 
     sensor = K d + K3 d^3 + D d' + H z - K sum_n (c_n cos(n theta_m) + s_n sin(n theta_m)) + zero of the run
 
-d is the filtered torsion angle less its offsets, and so are the waves; the fit is repeated with the offsets found, so
+d is the filtered torsion angle less its offsets, and so are the waves; the fit is repeated with the fitted offsets, so
 that the cubic acts on the deflection alone. Each run has a zero of its own: the sensor's zero and the link
 encoder's cannot be told apart in one run; their mean over the runs is the torsion's zero.
 
-z is d through a Maxwell-slip element; its travel is the best of a grid. A hysteresis is written only when it takes away
-a twentieth of the residual variance and dissipates (H > 0); a damping when it dissipates (D > 0). Without the damping
+z is d through a Maxwell-slip element; its travel is the best of a grid. A hysteresis is written only when it removes a
+twentieth of the residual variance and dissipates (H > 0); a damping when it dissipates (D > 0). Without the damping
 the slip would take its part: ripple of 100 rad/s loses as much in either.
 """
 

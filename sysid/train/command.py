@@ -1,4 +1,4 @@
-"""`jtq train`: a network per joint from runs, as ONNX with its metadata and a model card in words and figures."""
+"""`jtq train`: train a network per joint on runs; write it as ONNX with metadata, a model card and a figure."""
 
 from __future__ import annotations
 
@@ -27,9 +27,6 @@ from jtqd.sysid.runs.files import RunError, RunFile, read_runs
 from jtqd.sysid.runs.joints import joint_number
 from jtqd.sysid.train.ours import train_fused
 from jtqd.sysid.train.paper import TrainedNetwork, paper_block, split_by_sample, train_paper
-
-# Model card of a network: what it is, what it saw, how it did on runs it did not see; one page of text, one figure.
-
 
 _WHAT = {
     "paper": "The paper's network (section III): current, angles and velocities of both sides and the efficiency "

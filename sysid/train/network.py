@@ -1,10 +1,14 @@
-"""Writes a trained network as ONNX: normalisation inside the graph (folded into its weights), float64, with metadata.
+"""Train fully connected networks with the paper's activation on standardised data, and export them as ONNX.
 
     y = mean_y + std_y (W_n h_n + b_n),  h_(k+1) = sigma(h_k W_k + b_k),  h_0 = (x - mean_x)/std_x
+    sigma(x) = (1 - e^-x)/(1 + e^-x) = tanh(x/2), Eq. (9)
 
-with the paper's activation sigma(x) = (1 - e^-x)/(1 + e^-x) = tanh(x/2), Eq. (9). Exporting the weights to
-a plain tanh would change the output without any error, so the factor 1/2 is folded in by this file, and the result is
-tested against `forward`, which knows nothing of that.
+The same data and seed give the same weights: one thread, deterministic algorithms, every random choice from the seed.
+One thread is also the fastest: the layers are so small that two threads mostly wait for each other.
+
+In the graph (float64, with metadata) the normalisation is folded into the weights. Exporting them to a plain tanh would
+change the output without any error, so the factor 1/2 is folded in here, and the result is tested against `forward`,
+which knows nothing of that.
 """
 
 from __future__ import annotations
@@ -18,12 +22,6 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-
-# Training of fully connected networks with the paper's activation sigma(x) = tanh(x/2), on standardised data, with torch.
-#
-# The same data and seed give the same weights: one thread, deterministic algorithms, every random choice from the seed.
-# One thread is also the fastest way: the layers are so small that two threads mostly wait for each other.
-
 
 Layer = tuple[FloatArray, FloatArray]
 

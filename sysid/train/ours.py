@@ -1,9 +1,11 @@
-"""Our network trained on runs: a correction to the fused physics, its envelope, and its calibrated sigma. Pure.
+"""Train our network on runs: a correction to the fused physics, its envelope, and its calibrated sigma.
 
-The network gives gains of waves (sysid/train/ours.py): it corrects what turns with the motor and cannot
-learn anything else, as a run's zeros or a day's friction. What is slow in a run's residual is taken out of its target
-too (a running mean over half a second), because it is nothing but noise to these gains. sigma_scale comes from runs
-that neither the physics nor the network of their fold had seen.
+    y = std_y sum_m g_m wave_m,   g = gains of a fully connected network over the first inputs, sigma(x) = tanh(x/2)
+
+The outputs are gains of waves of the motor angle: over a turn the waves average to zero, so no offset, friction or drift
+of a training run can hide in the network. The slow part of a run's residual is removed from its target too (a running
+mean over half a second), because it is only noise to these gains. sigma_scale comes from runs that neither the physics
+nor the network of their fold had seen.
 """
 
 from __future__ import annotations
@@ -27,13 +29,6 @@ from jtqd.sysid.fit.signals import RunSignals
 from jtqd.sysid.fit.torsion import fit_torsion, torsion_torque
 from jtqd.sysid.train.network import IR_VERSION, OPSET, Trained, folded_layers, hidden_output, train
 from jtqd.sysid.train.paper import TrainedNetwork, digest_of, thinned
-
-# A network whose outputs are gains of waves: sum over m of gain_m(x) wave_m, in numpy and as ONNX.
-#
-#     y = std_y sum_m g_m wave_m,   g = gains of a fully connected network over the first inputs, sigma(x) = tanh(x/2)
-#
-# What turns with the motor is corrected, and nothing else can be: over a turn of the angle the waves average to zero, so
-# no offset, friction or drift of a training run can hide in the network.
 
 
 def gated_output(trained: Trained, core: FloatArray, waves: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""The paper's network (section III) trained on runs: its six features, sensor torque as target, 6-20-40-10-1. Pure."""
+"""Train the paper's network (section III) on runs: its six features, sensor torque as target, 6-20-40-10-1."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def train_paper(
     seed: int,
     progress: Callable[[int, float], None],
 ) -> TrainedNetwork:
-    """Train on four of five runs and judge on the others; the network that is written is trained on all runs alike.
+    """Train on four of five runs and test on the others; the network that is written is trained on all runs alike.
 
     runs: name and SHA-256 of every run. Raises ValueError for fewer than 5.
     """
@@ -110,7 +110,7 @@ def train_paper(
 def split_by_sample(
     blocks: Sequence[PaperBlock], *, iterations: int, seed: int, progress: Callable[[int, float], None]
 ) -> float:
-    """Return the MSE [Nm^2] that a random split by sample claims: 80 % to train on, the rest of the same runs to judge.
+    """Return the MSE [Nm^2] that a random split by sample claims: 80 % to train on, the rest of the same runs to test.
 
     Neighbouring samples and each run's own zeros are then on both sides: for comparison only (docs/training.md).
     """
