@@ -10,7 +10,7 @@ import time
 
 from tests.paths import GOLDEN
 
-LOG = GOLDEN / "fused.mcap"
+LOG = GOLDEN / "network.mcap"
 
 
 def started(*arguments):

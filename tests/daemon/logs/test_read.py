@@ -466,7 +466,7 @@ def test_a_summary_that_fails_its_crc_is_not_believed(tmp_path):
 # ---- parts of a run: what two of them have comes once ----
 
 
-GOLDEN_LOG = GOLDEN / "fused.mcap"
+GOLDEN_LOG = GOLDEN / "network.mcap"
 NAME = "jtqd-can0-20261121T173111Z-{:04d}.mcap"
 IN_PARTS = ("/joint/1/state", "/joint/2/state", "/can/frames", "/diagnostics", "/events")
 

@@ -279,7 +279,7 @@ def test_in_arrays_rounding_is_no_finding(
 
 def test_logs_of_another_version(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Fields with other names and types: one line, never numbers of something else."""
-    log = GOLDEN / "tob.mcap"
+    log = GOLDEN / "network.mcap"
     for old, new, said in (
         (b"motor_position_rad", b"position_of_motor_x", "found no field motor_position_rad"),
         (b"float64 dt_s", b"int64 dt_s", "found dt_s of type int64, expected float64"),

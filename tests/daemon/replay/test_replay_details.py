@@ -31,7 +31,7 @@ from tests.daemon.replay.replay_helpers import cut, cycles
 from tests.daemon.replay.test_replay_parts import CONFIG, MS, records
 from tests.paths import GOLDEN
 
-LOG = GOLDEN / "efficiency.mcap"
+LOG = GOLDEN / "network.mcap"
 
 
 def test_one_lost_cycle_is_seen() -> None:

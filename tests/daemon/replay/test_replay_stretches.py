@@ -17,7 +17,7 @@ from jtqd.daemon.replay.session import Result, Wishes, replay, replay_each
 from tests.daemon.replay.replay_helpers import cut, cycles
 from tests.paths import GOLDEN
 
-LOGS = ("efficiency", "fused", "faults")
+LOGS = ("network", "faults")
 
 
 def joined(results: list[Result], number: int) -> np.ndarray:
@@ -60,7 +60,7 @@ def test_pieces_of_one_log_give_what_the_whole_gives(name: str, exact: bool) -> 
 @pytest.mark.parametrize("exact", [True, False])
 def test_parts_of_a_run_are_joined_up_to_the_limit(tmp_path: Path, exact: bool) -> None:
     """Parts of 400, 300, 300 and the rest with a limit of 700: two stretches or three, in any order of the files."""
-    log = GOLDEN / "efficiency.mcap"
+    log = GOLDEN / "network.mcap"
     parts = parts_of(log, tmp_path / "p", 400, 700, 1000)
     (whole,) = replay([log], Wishes(exact=exact))
     found = list(replay_each(parts[::-1], Wishes(exact=exact), stretch=700))
@@ -76,9 +76,9 @@ def test_parts_of_a_run_are_joined_up_to_the_limit(tmp_path: Path, exact: bool) 
 def test_a_difference_in_a_later_stretch_is_found(tmp_path: Path) -> None:
     """One bit in the last stretch, whose state goes on from the one before.
 
-    The library's writer ends a chunk within a cycle: of cycle 1207 one joint is in the first chunk, the other in the second.
+    The library's writer ends a chunk within a cycle: one joint of it is in the first chunk, the other in the second.
     """
-    log = GOLDEN / "efficiency.mcap"
+    log = GOLDEN / "network.mcap"
     numbers = cycles(log)
     wrong = numbers[-10]
     at = 4 + 8 + 16 + 16 + 6 * 8  # encapsulation, stamp, frame_id, cycle and time, six quantities: torque_nm
@@ -110,7 +110,7 @@ def test_only_one_stretch_is_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
         return result
 
     monkeypatch.setattr(session, "_replay_run", counting)
-    results = replay_each([GOLDEN / "tob.mcap"], Wishes(exact=True), stretch=300)
+    results = replay_each([GOLDEN / "network.mcap"], Wishes(exact=True), stretch=300)
     while (result := next(results, None)) is not None:
         del result
     assert alive == [0, 0, 0]
@@ -119,7 +119,7 @@ def test_only_one_stretch_is_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_command_tells_every_stretch(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log = GOLDEN / "efficiency.mcap"
+    log = GOLDEN / "network.mcap"
     real = session.replay_each
     monkeypatch.setattr(command, "replay_each", lambda *given: real(*given, stretch=500))
     target = tmp_path / "both.mcap"
@@ -137,7 +137,7 @@ def test_the_command_tells_every_stretch(
 
 
 def test_several_runs_at_once_and_one_log_twice(tmp_path: Path) -> None:
-    one, two = GOLDEN / "efficiency.mcap", GOLDEN / "tob.mcap"
+    one, two = GOLDEN / "network.mcap", GOLDEN / "faults.mcap"
     read = []
     for n, path in enumerate((one, two)):
         (tmp_path / str(n)).mkdir()
