@@ -34,7 +34,7 @@ from jtqd.daemon.logs.export import main as export
 from jtqd.daemon.logs.log_file import _indexed
 from jtqd.daemon.recording.schemas import SCHEMAS
 from jtqd.daemon.replay.command import main as replay
-from jtqd.daemon.replay.session import Wishes
+from jtqd.daemon.replay.session import ReplayOptions
 from jtqd.daemon.replay.session import replay as replayed
 from tests.daemon.logs.log_files import ATTACHMENTS, cycles, foreign, ours, record_starts
 from tests.daemon.recording.recorder_bench import record_of as cycle_record
@@ -522,7 +522,7 @@ def test_what_only_looks_alike_is_kept(parts, tmp_path):
     assert len(found) == len(read_topic(GOLDEN_LOG, "/joint/1/state")) + 1
     assert np.count_nonzero(found == cycle) == 2
     with pytest.raises(LogError, match="given twice"):
-        replayed([tmp_path], Wishes())
+        replayed([tmp_path], ReplayOptions())
 
 
 def test_replay_of_a_directory(parts, capsys):
