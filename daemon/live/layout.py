@@ -1,8 +1,9 @@
-"""Layout of Foxglove and Lichtblick for jtqd's topics: what their "Import from file..." takes. Pure.
+"""`jtq layout`: layout of Foxglove and Lichtblick for jtqd's topics, as their "Import from file..." takes it.
 
 The messages hold torque, sigma and sensor torque; a viewer's message path cannot add two fields. So the layout
-brings user scripts (`jtqd.daemon.live.layout`), which the viewer runs itself, on a file as on the live view:
-they make the sigma band, the residual to the sensor and the cycle time, and cost no byte in the log.
+brings user scripts, which the viewer compiles and runs itself, on a file as on the live view: they make the sigma band, the
+residual to the sensor and the cycle time, and cost no byte in the log. They are TypeScript: `inputs`, `output` (a topic
+below /studio_script/) and a default export that turns one message into one message.
 """
 
 from __future__ import annotations
@@ -18,11 +19,7 @@ from typing import Any
 from jtqd.daemon.recording import schemas
 from jtqd.estimator.checked import seconds
 
-# User scripts of the viewers' layout: quantities of two fields, which a message path cannot form. Pure.
-#
-# TypeScript as Foxglove and Lichtblick take it: `inputs`, `output` (a topic below /studio_script/) and a default
-# export that turns one message into one message. The viewer compiles and runs them; the daemon never does.
-
+# ---- user scripts ----
 
 _PREFIX = "/studio_script/"
 JOINT_TOPICS = {1: f"{_PREFIX}joint_1", 2: f"{_PREFIX}joint_2"}
@@ -312,8 +309,7 @@ def layout(follow_s: float | None = None) -> dict[str, Any]:
     }
 
 
-# `jtq layout`: the layout file for Foxglove and Lichtblick.
-
+# ---- command ----
 
 _EXAMPLES = """examples:
   jtq layout --out jtqd.layout.json     then "Import from file..." in the layouts menu of Foxglove or Lichtblick

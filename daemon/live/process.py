@@ -1,5 +1,8 @@
 """The live view's process: `python -m jtqd.daemon.live.process REQUEST` reads the loop's shared memory and serves viewers.
 
+It sends one set of the cycle's messages per 20 ms, with the log's bytes; a change of status and a missed slot are seen in
+every cycle and sent as events, so that nothing that lasts less than 20 ms stays unseen.
+
 It maps ring, snapshot and notices read-only, and nothing that a viewer sends goes anywhere: the server has no capability
 (no publishing, no parameters, no services). A viewer that is too slow loses its oldest messages, not others theirs.
 It ends on SIGTERM, which it also gets when its parent has gone.
@@ -44,11 +47,7 @@ from jtqd.daemon.shared.notices import Notice, NoticesError, NoticesReader
 from jtqd.daemon.shared.ring import RingError, RingReader
 from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader, View
 
-# What the live view sends of the cycles: the log's messages, fewer of them. Pure.
-#
-# One set of the cycle's messages per 20 ms; a change of status and a missed slot are seen in every cycle and sent
-# as events, so that nothing that lasts less than 20 ms stays unseen. Bytes as in the log (`jtqd.daemon.recording.messages`).
-
+# ---- messages ----
 
 PERIOD_NS = 20_000_000
 """50 Hz."""
@@ -145,7 +144,7 @@ class LiveStream:
         return made
 
     def notices(self, news: Iterable[Notice]) -> list[Message]:
-        """What the supervisor had to say."""
+        """Messages of the supervisor's notices."""
         made: list[Message] = []
         for notice in news:
             made += self.note(
@@ -195,8 +194,7 @@ class LiveStream:
         return Message(schemas.DIAGNOSTICS.number, now_ns, diagnostics(now_ns, statuses))
 
 
-# The websocket server of the live view: foxglove-sdk, with the log's topics and nothing that a viewer could change.
-
+# ---- websocket server ----
 
 _BACKLOG = 512
 """Messages kept for a slow viewer: 2.5 s of all topics."""

@@ -1,4 +1,4 @@
-"""What the recorder notes while it records: each occurrence once as a message on /events and once on /log."""
+"""Events of a recording: each occurrence once as a message on /events and once on /log, some also for the operator."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ class Journal:
 
     Args:
         builder: of the chunks.
-        say: called with one line for the operator.
+        warn: called with one line for the operator.
 
     Attributes:
         newest: index and CLOCK_REALTIME of the newest cycle.
         left_out: events for which there was no room.
     """
 
-    def __init__(self, builder: ChunkBuilder, say: Callable[[str], None]) -> None:
+    def __init__(self, builder: ChunkBuilder, warn: Callable[[str], None]) -> None:
         self.builder = builder
-        self.say = say
+        self.warn = warn
         self.newest = (0, 0)
         self.left_out = 0
         self._in_chunk = 0
@@ -59,7 +59,7 @@ class Journal:
         self.builder.add(schemas.EVENTS.number, when, payload)
         self.builder.add(schemas.LOG.number, when, log(when, level, text))
 
-    def tell(self, kind: int, text: str, *, level: int, count: int = 0) -> None:
-        """The same for what the operator must hear too."""
-        self.say(text)
+    def report(self, kind: int, text: str, *, level: int, count: int = 0) -> None:
+        """Note an event, and pass its text to the operator too."""
+        self.warn(text)
         self.note(kind, text, level=level, count=count)

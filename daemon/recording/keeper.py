@@ -1,4 +1,4 @@
-"""The supervisor's side of recording: starts the recorder, again when it dies, and settles the account at the end."""
+"""The supervisor's side of recording: start the recorder, restart it when it dies, account for every cycle."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from jtqd.daemon.shared.snapshot import SnapshotReader
 _STARTS = 5
 """A recorder that has been started more often than this in a minute waits for `_LONG_PAUSE_S`."""
 _PAUSE_S, _LONG_PAUSE_S = 1.0, 60.0
-_LAST_WORD_S = 10.0
+_END_LIMIT_S = 10.0
 
 
 class Keeper:
@@ -90,11 +90,11 @@ class Keeper:
         often = len(self._starts) > _STARTS
         if time.monotonic() - self._starts[-1] > (_LONG_PAUSE_S if often else _PAUSE_S):
             self._waits = False
-            self._say("started again, the loop goes on")
+            self._warn("started again, the loop goes on")
             self._run()
         elif often and not self._waits:
             self._waits = True
-            self._say(f"{len(self._starts)} times in a minute; the next try in {_LONG_PAUSE_S:.0f} s")
+            self._warn(f"{len(self._starts)} times in a minute; the next try in {_LONG_PAUSE_S:.0f} s")
 
     def end(self, *, failed: bool = False) -> dict[str, Any] | None:
         """End the recorder; its account, or what is known of it. None where nothing was to be recorded.
@@ -108,13 +108,13 @@ class Keeper:
             self._child.process.send_signal(signal.SIGTERM)
             self._child.process.send_signal(signal.SIGCONT)  # a stopped one would sleep through it
             try:
-                self._result = self._child.answer(_LAST_WORD_S)
+                self._result = self._child.answer(_END_LIMIT_S)
             except ChildError as error:
                 self._result = self._account(str(error))
             self._child = None
         return None if self._result is None else self._result | {"left": self._leftovers()}
 
-    def _say(self, what: str) -> None:
+    def _warn(self, what: str) -> None:
         assert self._child is not None
         code = self._child.process.returncode
         print(f"jtqd: the recorder ended with exit status {code}; {what}", file=sys.stderr)
@@ -135,7 +135,7 @@ class Keeper:
         return ProgressFile(self.progress).load() if self.progress.exists() else Account()
 
     def _account(self, error: str) -> dict[str, Any]:
-        """What the recorder left behind that could not say it itself; what nobody wrote counts as lost."""
+        """The account of a recorder that gave none itself; cycles that nobody wrote count as lost."""
         settled = self._settled()
         cycles = SnapshotReader(self._snapshot).read().counters["cycles"]
         return {

@@ -1,8 +1,12 @@
-"""MCAP file made of whole chunks: what is on disk is always a valid beginning of the file.
+"""Write MCAP files out of whole chunks: what is on disk is always a valid beginning of the file (https://mcap.dev/spec).
 
-Header, the metadata `jtqd`, attachments, schemas and channels come first, outside any chunk. Each chunk is one write with
-its message indexes, then `fdatasync`. A write that fails is taken back and only that chunk is gone. Blocks for the summary
-are taken from the disk before they are needed, so that a file can be ended on a disk that has become full.
+`ChunkBuilder` collects messages into a `SealedChunk`: compressed, with CRC and message indexes. `McapFile` writes header,
+the metadata `jtqd`, attachments, schemas and channels first, outside any chunk; each chunk is one write, then `fdatasync`.
+A write that fails is taken back and only that chunk is gone. Blocks for the summary are taken from the disk before they are
+needed, so that a file can be ended on a disk that has become full.
+
+Compared with the library's Writer, the messages of a cycle enter as ready-made bytes: 0.5 us a message instead of 3.5, and a
+chunk that could not be written leaves no entry in the index.
 """
 
 from __future__ import annotations
@@ -40,9 +44,6 @@ from mcap.records import (
     SummaryOffset,
 )
 
-# Bytes of MCAP records by the mcap library, and of what stands behind the data of a file. Pure.
-
-
 MAGIC = b"\x89MCAP0\r\n"
 
 
@@ -76,8 +77,7 @@ def tail_bytes(groups: Iterable[tuple[int, bytes]], data_end: int) -> bytes:
     return end + summary + bytes_of(Footer(start, offsets_at, zlib.crc32(summary + beginning))) + MAGIC
 
 
-# A file that only grows by whole pieces, with room kept on the disk for what must still come.
-
+# ---- the file on the disk ----
 
 _STEP = 256 * 1024
 """Room is taken in steps of this many bytes: the disk is asked for it about once a second."""
@@ -95,7 +95,9 @@ def _fallocate(descriptor: int, start: int, length: int) -> None:
 
 
 class Appender:
-    """One new file, open for writing. What raises OSError leaves in it what it held before.
+    """One new file that grows by whole pieces, with room kept on the disk for what must still come.
+
+    What raises OSError leaves in it what it held before.
 
     It is locked (`flock`) as long as it is open: whoever finds it unlocked may take it for left behind.
 
@@ -167,15 +169,7 @@ class Appender:
         os.close(self._file)
 
 
-# Messages collected into one MCAP chunk: compressed, with CRC and message indexes, ready to be put into any file. Pure.
-#
-# Schemas and channels are repeated inside the first and every so many chunks, so that a file with a damaged head can be
-# read. Messages stand in the order of their log times: what is heard of late (a notice of the supervisor) goes to its
-# place.
-#
-# Compared with the library's Writer, the messages of a cycle enter as ready-made bytes: 0.5 us a message instead of 3.5,
-# and a chunk that could not be written leaves no entry in the index.
-
+# ---- chunks ----
 
 _COMPRESSION = "zstd"
 _LEVEL = 3
@@ -230,6 +224,9 @@ class SealedChunk:
 
 class ChunkBuilder:
     """Collects messages until `seal`.
+
+    Schemas and channels are repeated inside the first and every so many chunks, so that a file with a damaged head can be
+    read. Messages stand in the order of their log times: a late one (a notice of the supervisor) goes to its place.
 
     Args:
         schemas, channels: of mcap.records, repeated in some chunks; their identifiers are the caller's.
@@ -351,6 +348,8 @@ def _index_record(channel: int, entries: Sequence[int]) -> bytes:
     head = _MESSAGE_INDEX.pack(Opcode.MESSAGE_INDEX, 6 + size, channel, size)
     return head + struct.pack(f"<{len(entries)}Q", *entries)
 
+
+# ---- the MCAP file ----
 
 METADATA = "jtqd"
 """Name of the record that says which run and part a file is."""

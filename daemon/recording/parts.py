@@ -1,7 +1,11 @@
-"""The files of one run, one after the other: rotation, budget, reserve, and what is done when the disk takes no more.
+"""The files ("parts") of one run: their names, rotation, disk budget and reserve, and what happens when the disk is full.
 
-A file that cannot go on is ended with its summary; its cycles from then on are counted, the matter is said once, and another
-part is begun as soon as that is possible. Nothing here raises for a disk that fails.
+A file is named PREFIX-RUN-PART.mcap, with `.active` behind it while it is being written. RUN is the time at which the run
+began, `YYYYmmddTHHMMSSZ` (UTC), with `_2`, `_3` ... where another run of that prefix has it already; PART counts from 0001.
+Nothing else in a directory is ours: it is neither repaired nor removed.
+
+A file that cannot go on is ended with its summary; its cycles from then on are counted as lost, the obstacle is reported
+once, and another part is begun as soon as that is possible. Nothing here raises for a disk that fails.
 """
 
 from __future__ import annotations
@@ -20,11 +24,7 @@ from jtqd.daemon.recording.journal import ERROR, INFO, WARN, Journal
 from jtqd.daemon.recording.mcap_file import Head, McapFile, NamedData, SealedChunk
 from jtqd.daemon.recording.progress import Account
 
-# Names of log files: PREFIX-RUN-PART.mcap, and `.active` behind it while it is being written.
-#
-# RUN is the time at which the run began, `YYYYmmddTHHMMSSZ` (UTC), with `_2`, `_3` ... where another run of that prefix has
-# it already; PART counts from 0001. Nothing else in a directory is ours: it is neither repaired nor removed.
-
+# ---- names ----
 
 ACTIVE = ".active"
 _RUN = r"(?P<stamp>\d{8}T\d{6}Z)(?:_(?P<again>[1-9]\d*))?"
@@ -77,8 +77,7 @@ def free_run(directory: Path, prefix: str, time_ns: int) -> str:
     return f"{stamp}_{max(taken) + 1}" if taken else stamp
 
 
-# How much disk the logs may take: what a budget removes, and when there is room to record.
-
+# ---- disk space ----
 
 MEGABYTE = 1_000_000
 
@@ -131,6 +130,8 @@ def free_bytes(directory: Path) -> int:
     return found.f_bavail * found.f_frsize
 
 
+# ---- the parts of a run ----
+
 _RETRY_NS = 900_000_000
 """An attempt to begin a file costs little: at most this, and what was being collected, is lost when the disk is back."""
 _ROOM_AGAIN = 1.25
@@ -180,7 +181,7 @@ class Parts:
         self.all_ended = True
         """Every part got its summary and its name."""
 
-    # What diagnostics show -------------------------------------------------------------------------------------------------
+    # ---- for /diagnostics ----
 
     @property
     def part(self) -> int:
@@ -199,7 +200,7 @@ class Parts:
 
     @property
     def free_bytes(self) -> int:
-        """Free space; -1 where it cannot be told."""
+        """Free space; -1 where it is unknown."""
         try:
             return free_bytes(self._rules.directory) if self._file is None else self._file.free_bytes
         except OSError:
@@ -210,10 +211,10 @@ class Parts:
         """There is a file."""
         return self._file is not None
 
-    # Begin and end ---------------------------------------------------------------------------------------------------------
+    # ---- begin and end ----
 
     def open(self, why: str) -> bool:
-        """Begin the next part; False, said once, where that is not possible."""
+        """Begin the next part; False, reported once, where that is not possible."""
         rules = self._rules
         try:
             if free_bytes(rules.directory) < rules.reserve * (_ROOM_AGAIN if self.obstacle else 1.0):
@@ -258,7 +259,7 @@ class Parts:
             file.finish(part_name(self._rules.prefix, self._rules.run, self._part))
         except OSError as error:
             self.all_ended = False
-            self._journal.say(
+            self._journal.warn(
                 f"part {self._part} could not be ended and keeps its name {ACTIVE}: {error.strerror or error}"
             )
 
@@ -272,7 +273,7 @@ class Parts:
             self.end()
             self.open(why)
 
-    # Chunks ----------------------------------------------------------------------------------------------------------------
+    # ---- chunks ----
 
     def write(self, chunk: SealedChunk, at_ns: int) -> None:
         """Have a chunk on the disk, or count it; `at_ns` is the CLOCK_MONOTONIC time of its last cycle."""
@@ -328,10 +329,10 @@ class Parts:
         count, self._cycles = self._cycles, 0
         self._account.written -= count
         self._account.unwritten += count
-        text = f"part {self._part} was removed while it was being written: {count} cycles are gone with it"
-        self._journal.tell(schemas.FILE_REMOVED, text, level=ERROR, count=count)
+        text = f"part {self._part} was removed while it was being written: {count} cycles are lost with it"
+        self._journal.report(schemas.FILE_REMOVED, text, level=ERROR, count=count)
 
-    # Obstacles -------------------------------------------------------------------------------------------------------------
+    # ---- obstacles ----
 
     def _no_room(self) -> bool:
         """Less is free than shall stay free. Always False."""
@@ -350,9 +351,9 @@ class Parts:
         return False
 
     def _stop_for(self, obstacle: str) -> None:
-        """Say an obstacle once, and wait a little before the next attempt."""
+        """Report an obstacle once, and wait a little before the next attempt."""
         if not self.obstacle:
-            self._journal.say(f"{obstacle}; cycles are counted as lost until it goes on")
+            self._journal.warn(f"{obstacle}; cycles are counted as lost until it goes on")
         self.obstacle = obstacle
         self._retry_ns = self._now_ns + _RETRY_NS
 
@@ -365,9 +366,9 @@ class Parts:
         self.obstacle = ""
         count, self._missed = self._missed, 0
         text = f"recording goes on in part {self._part}; {count} cycles could not be written"
-        self._journal.tell(schemas.WRITE_FAILED, text, level=ERROR if count else WARN, count=count)
+        self._journal.report(schemas.WRITE_FAILED, text, level=ERROR if count else WARN, count=count)
 
-    # Budget ----------------------------------------------------------------------------------------------------------------
+    # ---- budget ----
 
     def _enforce_budget(self) -> None:
         """Remove what the budget asks for, oldest first."""
@@ -380,14 +381,14 @@ class Parts:
                 try:
                     each.file.path.unlink()
                 except OSError as error:
-                    self._journal.say(f"{each.file.path} cannot be removed: {error.strerror}")
+                    self._journal.warn(f"{each.file.path} cannot be removed: {error.strerror}")
                     continue
                 found.remove(each)
                 text = f"removed {each.file.path.name}: budget of {rules.budget / MEGABYTE:g} MB"
-                self._journal.tell(schemas.FILE_RETIRED, text, level=INFO)
+                self._journal.report(schemas.FILE_RETIRED, text, level=INFO)
         self._others = sum(each.size for each in found)
         over = rules.budget is not None and self.total_size > rules.budget
         if over and not self._over_budget:
             text = "the budget is exceeded by files that are not removed; recording goes on"
-            self._journal.tell(schemas.FILE_RETIRED, text, level=WARN)
+            self._journal.report(schemas.FILE_RETIRED, text, level=WARN)
         self._over_budget = over

@@ -1,4 +1,4 @@
-"""How far the recorder has come, in shared memory: another one can go on where it died, and losses are seen at once."""
+"""Account of recorded cycles in shared memory: another recorder can go on where one died, and losses are seen at once."""
 
 from __future__ import annotations
 

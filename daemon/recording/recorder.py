@@ -28,7 +28,7 @@ from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head
 from jtqd.daemon.recording.messages import BLOCK_PARTS, JointStateMessage, diagnostics
 from jtqd.daemon.recording.parts import MEGABYTE, Parts, Rules, free_run, own_files, sized
 from jtqd.daemon.recording.progress import Account, ProgressFile
-from jtqd.daemon.recording.recording import Flight, Recording
+from jtqd.daemon.recording.recording import FlightRecorder, Recording
 from jtqd.daemon.recording.request import RecorderRequest, RequestError
 from jtqd.daemon.recording.schemas import definitions
 from jtqd.daemon.shared import cycle_record
@@ -38,45 +38,42 @@ from jtqd.daemon.shared.notices import NoticesError, NoticesReader
 from jtqd.daemon.shared.ring import RingError, RingReader
 from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader
 
-# Everything of one recording put together from its request: files or flight recorder, journal, diagnostics, repair.
-
-
 _REPEAT_EVERY, _REPEAT_EVERY_IN_MEMORY = 60, 10
 """Chunks after which schemas and channels are repeated; a flight recording begins with any chunk."""
 _QUANTILES = (0.5, 0.99, 1.0)
 
 
 class Session:
-    """One recorder's work, driven by `jtqd.daemon.recording.recorder`.
+    """One recording, put together from its request: files or flight recorder, journal, diagnostics, repair.
 
     Args:
         request: what to do.
         account: of an earlier recorder of the same run, or a new one.
-        say: takes one line for the operator.
+        warn: takes one line for the operator.
 
     Raises:
         SnapshotError: the request names a snapshot that is none.
     """
 
-    def __init__(self, request: RecorderRequest, account: Account, say: Callable[[str], None]) -> None:
+    def __init__(self, request: RecorderRequest, account: Account, warn: Callable[[str], None]) -> None:
         self._request = request
         self.account = account
         now_ns = time.time_ns()
         self.run = request.run or free_run(request.directory, request.prefix, now_ns)
         attachments, problems = request.load_attachments()
         for problem in problems:
-            say(problem)
-        self._say = say
+            warn(problem)
+        self._warn = warn
         schema_records, channel_records = definitions(request.channel_metadata)
         head = Head(schema_records, channel_records, attachments)
         in_flight = request.flight_recorder_s is not None
         repeat = _REPEAT_EVERY_IN_MEMORY if in_flight else _REPEAT_EVERY
         builder = ChunkBuilder(schema_records, channel_records, BLOCK_PARTS, repeat)
-        self.journal = Journal(builder, say)
+        self.journal = Journal(builder, warn)
         self.parts = Parts(_rules(request, self.run), head, self.journal, account)
-        self._flight: Flight | None = None
+        self._flight: FlightRecorder | None = None
         if request.flight_recorder_s is not None:
-            self._flight = Flight(self.parts, self.journal, account, request.flight_recorder_s)
+            self._flight = FlightRecorder(self.parts, self.journal, account, request.flight_recorder_s)
         overview = JointStateMessage(request.joint_names, request.gear_ratios)
         sink = self._flight or self.parts
         self.recording = Recording(self.journal, sink, overview, int(request.chunk_s * 1e9), account)
@@ -102,7 +99,7 @@ class Session:
         """Other files are in force in the loop: they are attached to the part that begins now, and to all after it."""
         attachments, problems = request.load_attachments()
         for problem in problems:
-            self._say(problem)
+            self._warn(problem)
         self.recording.flush()
         self.parts.attach(attachments)
         if self._flight is None:
@@ -113,16 +110,16 @@ class Session:
         if self._flight is not None:
             self.save(why)
 
-    def look_round(self) -> None:
-        """After each round of records: faults, notices of the supervisor, files left behind."""
+    def poll(self) -> None:
+        """Handle, after each round of records, faults, notices of the supervisor and the repair of earlier files."""
         fault, self.recording.fault = self.recording.fault, ""
         if fault:
             self.fault(fault)
         self._read_notices()
-        self._look_after_repair()
+        self._poll_repair()
 
     def diagnose(self, backlog: int, cpu_percent: float) -> None:
-        """The once-per-second /diagnostics."""
+        """Write /diagnostics, once a second."""
         now_ns = time.time_ns()
         parts, flight, request = self.parts, self._flight, self._request
         mode = "recording" if flight is None else "saving" if flight.saving else "in memory"
@@ -153,7 +150,7 @@ class Session:
         self.journal.builder.add(schemas.DIAGNOSTICS.number, now_ns, diagnostics(now_ns, statuses))
 
     def finish(self) -> dict[str, Any]:
-        """End everything; what there is to say of it."""
+        """End everything; returns the summary of the run."""
         account = self.account
         text = f"recorder stopped: {account.cycles} cycles seen, {account.lost} lost"
         self.journal.note(schemas.RECORDER_STOPPED, text, level=INFO, time_ns=time.time_ns())
@@ -207,8 +204,8 @@ class Session:
                 count=notice.node,
             )
 
-    def _look_after_repair(self) -> None:
-        """Start it once something has been recorded, and pass on what it says."""
+    def _poll_repair(self) -> None:
+        """Start the repair of earlier files once something has been recorded, and report its results."""
         request = self._request
         if self._repair_due and self._has_begun():
             self._repair_due = False
@@ -227,7 +224,7 @@ class Session:
             answer = {"text": str(error), "lossy": True}
         if answer is not None:
             level = WARN if answer["lossy"] else INFO
-            self.journal.tell(schemas.FILE_REPAIRED, str(answer["text"]), level=level)
+            self.journal.report(schemas.FILE_REPAIRED, str(answer["text"]), level=level)
         elif ended:
             self._repair = None
 
@@ -249,6 +246,8 @@ def _rules(request: RecorderRequest, run: str) -> Rules:
     )
 
 
+# ---- the process ----
+
 POLL_S = 0.05
 QUIET_S = 0.15
 """After the order to end: the loop is taken to have ended when it has written nothing for this long."""
@@ -257,13 +256,13 @@ DRAIN_LIMIT_S = 5.0
 _NICE = 5
 
 
-def _say(text: str) -> None:
+def _warn(text: str) -> None:
     with suppress(OSError):
         print(f"recorder: {text}", file=sys.stderr, flush=True)
 
 
 class _Signals:
-    """What was asked for, by signals or by the end of the parent."""
+    """Requests by signals, or by the end of the parent."""
 
     def __init__(self) -> None:
         self._parent = os.getppid()
@@ -327,12 +326,12 @@ class Recorder:
         self._progress = progress
 
     def _take(self) -> int:
-        """Everything that is in the ring now; returns how many cycles that were."""
+        """Take everything that is in the ring now; returns how many cycles that were."""
         taken = 0
         while True:
             batch = self._reader.read()
             if batch.lost:
-                self._recording.lose(batch.lost, time.time_ns())
+                self._recording.count_lost(batch.lost, time.time_ns())
             for record in batch.records:
                 self._recording.add(record)
             taken += batch.lost + len(batch.records)
@@ -344,7 +343,7 @@ class Recorder:
         """Record until told to end, then until the loop is quiet."""
         settled = self._recording.account.cycles
         if self._reader.position > settled:
-            self._recording.lose(self._reader.position - settled, time.time_ns())
+            self._recording.count_lost(self._reader.position - settled, time.time_ns())
         else:
             self._reader.position = settled
         now = time.monotonic()
@@ -354,7 +353,7 @@ class Recorder:
             backlog = self._reader.backlog
             taken = self._take()
             self._answer_signals()
-            self._session.look_round()
+            self._session.poll()
             now = time.monotonic()
             if taken:
                 last_taken = now
@@ -398,12 +397,12 @@ class Recorder:
         try:
             request = RecorderRequest.from_file(self._request_path)
         except RequestError as error:
-            _say(str(error))
+            _warn(str(error))
             return
         self._session.renew(request)
 
     def settle(self) -> None:
-        """Leave word of how far we are."""
+        """Store how far the recording is."""
         if self._progress is not None:
             self._progress.store(self._recording.progress)
 
@@ -422,7 +421,7 @@ def record(request: RecorderRequest, request_path: Path | None = None) -> int:
     reader = _open_ring(request, signals)
     progress = None if request.progress is None else ProgressFile(request.progress)
     account = Account() if progress is None else progress.load()
-    session = Session(request, account, _say)
+    session = Session(request, account, _warn)
     recorder = Recorder(
         reader,
         session,
@@ -445,19 +444,19 @@ def main(arguments: list[str] | None = None) -> int:
     """Command line of the process."""
     arguments = sys.argv[1:] if arguments is None else arguments
     if len(arguments) != 1 or arguments[0].startswith("-"):
-        _say("usage: python -m jtqd.daemon.recording.recorder REQUEST.json (see docs/recording.md)")
+        _warn("usage: python -m jtqd.daemon.recording.recorder REQUEST.json (see docs/recording.md)")
         return 2
     try:
         path = Path(arguments[0])
         return record(RecorderRequest.from_file(path), path)
     except RequestError as error:
-        _say(str(error))
+        _warn(str(error))
         return 2
     except (RingError, SnapshotError) as error:
-        _say(str(error))
+        _warn(str(error))
         return 1
     except OSError as error:  # of the progress: files of the log have their own way
-        _say(f"{error.filename or path}: {error.strerror or error}")
+        _warn(f"{error.filename or path}: {error.strerror or error}")
         return 1
 
 

@@ -1,7 +1,7 @@
-"""What is recorded of the cycles: messages of each cycle, the overview, events, diagnostics, and the account.
+"""Turn cycle records into sealed chunks: messages of each cycle, the overview, events, and the account of cycles.
 
-Records and times come in, sealed chunks go to the files (`jtqd.daemon.recording.parts`) or to the flight recorder. It never
-raises for a disk that fails.
+Records and times come in; sealed chunks go to a sink: the files of the run (`jtqd.daemon.recording.parts`), or the flight
+recorder, which keeps them in memory until something happens. Nothing raises for a disk that fails.
 """
 
 from __future__ import annotations
@@ -17,14 +17,7 @@ from jtqd.daemon.recording.parts import Parts
 from jtqd.daemon.recording.progress import Account
 from jtqd.daemon.shared import cycle_record as cycle
 
-# Flight recorder: the last seconds stay in memory, compressed, and go to a file when something happens.
-#
-# Around an occurrence: everything that memory holds before it, and `AFTER_S` behind it; another occurrence in that time
-# prolongs it. What falls out of memory unwritten counts as let go, and so does what memory holds.
-#
-# Occurrences: a joint becomes DRIVE_FAULT or INVALID, a joint is STALE for longer than `STALE_S`, the loop ends in an error,
-# jtqd goes away without ending the recorder, or somebody asks (SIGUSR1, `jtq control save`).
-
+# ---- flight recorder ----
 
 AFTER_S = 5.0
 _NOTICED_S = 0.1
@@ -36,14 +29,14 @@ _STALE = next(code for code, name in schemas.STATUS_NAMES.items() if name == "ST
 
 
 class FaultTrigger:
-    """Says when a joint's status is worth a recording: once when it begins. Pure."""
+    """Decides when a joint's status is worth a recording: once, when it begins. Pure."""
 
     def __init__(self) -> None:
         self._statuses = (0, 0)
         self._stale_since: list[int | None] = [None, None]
 
     def changed(self, statuses: tuple[int, int], at_ns: int) -> str:
-        """The statuses are new; why to save, or nothing."""
+        """Take new statuses; returns why to save, or nothing."""
         before, self._statuses = self._statuses, statuses
         why = ""
         for n, (old, new) in enumerate(zip(before, statuses, strict=True)):
@@ -54,7 +47,7 @@ class FaultTrigger:
         return why
 
     def passed(self, at_ns: int) -> str:
-        """It is that late; why to save, or nothing."""
+        """Take the time; returns why to save, or nothing."""
         for n, since in enumerate(self._stale_since):
             if since is not None and at_ns - since > STALE_S * _NS:
                 self._stale_since[n] = None
@@ -62,8 +55,14 @@ class FaultTrigger:
         return ""
 
 
-class Flight:
-    """Takes sealed chunks as `Parts` does, and hands them on around an occurrence only.
+class FlightRecorder:
+    """Keeps the last seconds in memory, as sealed chunks, and writes them to a file when something happens.
+
+    Around an occurrence: everything that memory holds before it, and `AFTER_S` behind it; another occurrence in that time
+    prolongs it. What falls out of memory unwritten counts as let go, and so does what memory holds.
+
+    Occurrences: a joint becomes DRIVE_FAULT or INVALID, or is STALE for longer than `STALE_S` (`FaultTrigger`), the loop
+    ends in an error, jtqd goes away without ending the recorder, or a request (SIGUSR1, `jtq control save`).
 
     Args:
         parts: writes the files.
@@ -116,7 +115,7 @@ class Flight:
         if not begun:
             return
         self.saved += 1
-        self._journal.tell(schemas.FLIGHT_SAVED, f"flight recording: {why}", level=WARN)
+        self._journal.report(schemas.FLIGHT_SAVED, f"flight recording: {why}", level=WARN)
         self._parts.open(why)
         while self._memory:
             chunk, at_ns = self._memory.popleft()
@@ -128,6 +127,8 @@ class Flight:
         self._until_ns = None
         self._parts.end()
 
+
+# ---- cycles ----
 
 OVERVIEW_PERIOD_NS = 20_000_000
 """/joint_states comes at 50 Hz."""
@@ -186,7 +187,7 @@ class Recording:
         """Slots missed as the newest cycle says; None before the first."""
 
     def add(self, record: bytes) -> None:
-        """One cycle record. Costs about 3 us: this is the path of every cycle."""
+        """Take one cycle record. Costs about 3 us: this is the path of every cycle."""
         self.account.cycles += 1
         builder = self._builder
         index, monotonic, realtime, flags, missed, counter, count, status_1, status_2 = _SCAN.unpack_from(
@@ -252,11 +253,11 @@ class Recording:
             text = f"the loop missed {count} {'slot' if count == 1 else 'slots'}"
             self.journal.note(schemas.SLOTS_MISSED, text, level=WARN, count=count)
 
-    def lose(self, count: int, time_ns: int) -> None:
+    def count_lost(self, count: int, time_ns: int) -> None:
         """Count cycles that the ring overwrote before they were read."""
         self.account.cycles += count
         self.account.overwritten += count
-        text = f"{count} cycles overwritten before the recorder read them"
+        text = f"{count} cycle{'' if count == 1 else 's'} overwritten before the recorder read them"
         self.journal.note(schemas.RECORDS_LOST, text, level=ERROR, time_ns=time_ns, count=count)
 
     def flush(self) -> None:

@@ -1,4 +1,8 @@
-"""What the recorder is asked to do: the JSON file that `python -m jtqd.daemon.recording.recorder` gets."""
+"""The recorder's request: the JSON file that `python -m jtqd.daemon.recording.recorder` gets, read and made.
+
+`RecorderRequest` is the recorder's side. `recording_request` is the supervisor's: it attaches what a log must carry to be
+understood without the machine that wrote it.
+"""
 
 from __future__ import annotations
 
@@ -156,8 +160,7 @@ def _content(item: dict[str, str]) -> bytes:
     return item["text"].encode() if "text" in item else Path(item["path"]).read_bytes()
 
 
-# Request for the recorder: what a log must carry to be understood without the machine that wrote it.
-
+# ---- made by the supervisor ----
 
 _EDS_DIRECTORY = Path(__file__).resolve().parents[2] / "drivers" / "eds"
 _PACKAGES = ("jtqd", "numpy", "onnxruntime", "python-can", "canopen", "mcap")
@@ -181,9 +184,9 @@ def recording_request(
         report: boot report with the scaling read from the devices.
         directory: where logs go.
         ring: the loop's ring of cycle records.
-        progress: file in which the recorder says how far it is.
+        progress: file in which the recorder stores how far it is.
         snapshot: the loop's counters.
-        notices: what the supervisor says.
+        notices: the supervisor's notices.
         instance: name of the bus as it can stand in a file name.
     """
     attachments: list[dict[str, str]] = [

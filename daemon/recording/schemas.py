@@ -236,9 +236,6 @@ LOG = Topic(7, "/log", "rcl_interfaces/msg/Log")
 TOPICS = (JOINT_1, JOINT_2, CAN_FRAMES, JOINT_STATES, DIAGNOSTICS, EVENTS, LOG)
 
 
-# MCAP schema and channel records of every topic.
-
-
 def definitions(metadata: Mapping[str, Mapping[str, str]] | None) -> tuple[list[Schema], list[Channel]]:
     """Schema and channel records of every topic; `metadata` adds to a topic's own."""
     numbers = {name: number for number, name in enumerate(SCHEMAS, start=1)}

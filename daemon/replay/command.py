@@ -20,13 +20,13 @@ from jtqd.daemon.recording.parts import ACTIVE
 from jtqd.daemon.recording.schemas import SCHEMAS
 from jtqd.daemon.replay.compare import Comparison, Difference, Identity, Unknown
 from jtqd.daemon.replay.origin import SAMPLE
-from jtqd.daemon.replay.session import SHORT_CYCLES, Result, Wishes, replay_each
+from jtqd.daemon.replay.session import SHORT_CYCLES, ReplayOptions, Result, replay_each
 from jtqd.estimator.arrays import RecordArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.onnx_graph import NetworkError
 from jtqd.estimator.settings import METHODS
 
-# Results of a replay as lines for people.
+# ---- results as text ----
 
 
 def number(count: int) -> str:
@@ -145,8 +145,7 @@ def _comparison(each: Comparison, other: bool) -> list[str]:
     return lines
 
 
-# A new MCAP with both for one picture: what was logged on /joint/N/state, the replay on /joint/N/replay.
-
+# ---- MCAP with the logged states on /joint/N/state and the replay on /joint/N/replay ----
 
 _SCHEMA = "jtqd_msgs/msg/JointEstimate"
 TOPICS = ("/joint/1/state", "/joint/1/replay", "/joint/2/state", "/joint/2/replay")
@@ -326,10 +325,12 @@ def main(argv: list[str]) -> int:
     if options.out is not None and options.out.exists():
         print(f"jtq replay: {options.out}: exists already, expected a new file", file=sys.stderr)
         return 2
-    wishes = Wishes(options.model, options.method, True if options.exact or _short(options) else None)
+    replay_options = ReplayOptions(
+        options.model, options.method, True if options.exact or _short(options) else None
+    )
     bar = _Bar()
     try:
-        good = _replay(options, wishes, bar)
+        good = _replay(options, replay_options, bar)
     except (LogError, ConfigError, NetworkError) as error:
         return _failed(bar, str(error))
     except OSError as error:
@@ -337,12 +338,12 @@ def main(argv: list[str]) -> int:
     return 0 if good else 3
 
 
-def _replay(options: argparse.Namespace, wishes: Wishes, bar: _Bar) -> bool:
+def _replay(options: argparse.Namespace, replay_options: ReplayOptions, bar: _Bar) -> bool:
     """Replay, print, and write what is asked for; whether all is good. Only --out keeps more than one result in memory."""
     kept: list[Result] = []
     made: list[Any] = []
     good = True
-    results = replay_each(options.logs, wishes, bar.update)
+    results = replay_each(options.logs, replay_options, bar.update)
     while (result := next(results, None)) is not None:
         good &= result.good
         made.append(result.to_mapping() if options.json else text(result, compared=options.compare))

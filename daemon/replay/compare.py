@@ -118,8 +118,7 @@ def _changes(before: npt.NDArray[np.uint16], after: npt.NDArray[np.uint16]) -> t
     return tuple(sorted(found, key=lambda each: -each.cycles))
 
 
-# Whether a replay is what was logged: bit for bit, cycle by cycle, and where not, since when and why. Pure.
-
+# ---- identity with the log: bit for bit, and where not, since when and why ----
 
 SETTLED_CYCLES = 200
 """So many cycles with inputs in a row that are identical: what was not known has been forgotten (40 time constants of the
@@ -216,12 +215,12 @@ def identity(
     cycle = logged[0]["cycle"].astype(np.int64)
     same = [_same(one, two, tolerance_nm) for one, two in zip(logged, replayed, strict=True)]
     bits = [_same(one, two, 0.0) for one, two in zip(logged, replayed, strict=True)] if tolerance_nm else same
-    told = pdo = np.ones(len(cycle), np.bool_)
+    recorded = pdo = np.ones(len(cycle), np.bool_)
     if estimate is None:
-        told = ~pdo
+        recorded = ~pdo
     else:
-        sent, made, told = estimate
-        pdo = ~told | (sent == made).all(axis=1)
+        sent, made, recorded = estimate
+        pdo = ~recorded | (sent == made).all(axis=1)
     unknown: list[Unknown] = []
     differences: list[Difference] = []
     for n in (0, 1):
@@ -246,8 +245,8 @@ def identity(
     return Identity(
         len(cycle),
         int((bits[0] & bits[1] & pdo).sum()),
-        int(told.sum()),
-        int((told & pdo).sum()),
+        int(recorded.sum()),
+        int((recorded & pdo).sum()),
         tuple(sorted(unknown, key=lambda each: (each.first_cycle, each.joint))),
         tuple(_first_of_each(differences)),
         int(cycle[start]) if start < len(cycle) else None,

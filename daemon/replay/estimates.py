@@ -1,7 +1,13 @@
-"""Replay of whole runs in arrays, by the vectorised twins of the estimators: the same numbers to rounding, much faster.
+"""Estimates of a replay, two ways: cycle by cycle through the loop's own code, and in arrays.
 
-Inputs are the SI values of the log, which the exact replay compares with the raw frames. What the loop decides after the
-estimate (starting, drive off or in fault, too late, what fits the field of the PDO) is decided here again, in arrays.
+Cycle by cycle (`ExactReplay`), what comes out is bit for bit what the loop had, or something differs. Taken from the log
+is what only the loop could know: which inputs counted, how long a step was, that an estimate was ready too late. Everything
+else (positions that roll over, temperatures and their age, estimate, status, the bytes of the estimate PDO) is computed from
+the raw frames again.
+
+In arrays (`replay_whole`), the vectorised twins of the estimators give the same numbers to rounding, much faster. Inputs are
+the SI values of the log. What the loop decides after the estimate (starting, drive off or in fault, too late, what fits the
+field of the PDO) is decided here again.
 """
 
 from __future__ import annotations
@@ -37,17 +43,11 @@ from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import DEGRADED, INVALID, OFF, PUBLISHED, STALE, STANDSTILL, STARTING, VALID
 from jtqd.estimator.whole_run import EstimateRun
 
-# Replay cycle by cycle through the loop's own code (`jtqd.daemon.loop.joint.JointCycle`).
-#
-# What comes out is bit for bit what the loop had, or something is different.
-#
-# Taken from the log is what only the loop could know: which inputs counted, how long a step was, that an estimate was ready
-# too late. Everything else (positions that roll over, temperatures and their age, estimate, status, the bytes of the
-# estimate PDO) is computed from the raw frames again.
+# ---- cycle by cycle, through the loop's own code ----
 
 
 @dataclass
-class _Tally:
+class _Counters:
     """What the loop counts in shared memory; nobody reads it here."""
 
     counters: list[int] = field(default_factory=lambda: [0] * len(COUNTERS))
@@ -70,7 +70,7 @@ class Replayed:
 
 
 class ExactReplay:
-    """Keeps the joints from one part of a log to the next.
+    """Replay cycle by cycle; keeps the joints from one part of a log to the next.
 
     Args:
         origin: configuration and scaling.
@@ -83,14 +83,14 @@ class ExactReplay:
         config = origin.config
         self._origin = origin
         self._intake = Intake(input_pdos(config), joint_temperatures(config))
-        tally = _Tally()
+        counters = _Counters()
         self._joints = [
             JointCycle(
                 n,
                 inputs,
                 estimator,
                 intake=self._intake,
-                snapshot=tally,
+                snapshot=counters,
                 period_ns=config.period_ns,
                 safety=limits,
             )
@@ -107,7 +107,7 @@ class ExactReplay:
         steps: Sequence[Steps],
         progress: Callable[[int], None] = lambda _: None,
     ) -> Replayed:
-        """Replay the cycles of one part; `joints` are its states as logged. `progress` is told the cycles done."""
+        """Replay the cycles of one part; `joints` are its states as logged. `progress` is called with the cycles done."""
         count = len(joints[0])
         views = self._intake.views()
         feeds = [_feed(each) for each in frames.pdos]

@@ -39,14 +39,14 @@ class Frames:
     Attributes:
         pdos: in the order of `input_pdos`.
         temperatures: of each joint that tells one: (cycle row, frame as `struct can_frame`) in order of arrival.
-        estimate: estimate PDO [n, 8]; told: it is in the record [n].
+        estimate: estimate PDO [n, 8]; recorded: it is in the record [n].
         from_si: inputs whose frame may not be in the record.
     """
 
     pdos: tuple[Pdo, ...]
     temperatures: tuple[tuple[tuple[int, bytes], ...], ...]
     estimate: npt.NDArray[np.uint8]
-    told: BoolArray
+    recorded: BoolArray
     from_si: int
 
 
@@ -92,12 +92,12 @@ def decode(origin: Origin, records: RecordArray, joints: Sequence[RecordArray]) 
             for column, known in zip(values, _counts(index, origin.inputs, joints), strict=True):
                 column[absent] = known[absent]
         pdos.append(Pdo(tuple(values), fresh))
-    told, estimate = table.last(0x180 + origin.config.node_id, _ESTIMATE_LENGTH)
+    recorded, estimate = table.last(0x180 + origin.config.node_id, _ESTIMATE_LENGTH)
     return Frames(
         tuple(pdos),
         tuple(table.every(each.cob_id) for each in joint_temperatures(origin.config)),
         estimate,
-        told,
+        recorded,
         from_si,
     )
 

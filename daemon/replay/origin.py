@@ -25,8 +25,7 @@ from jtqd.daemon.shared import cycle_record as cr
 from jtqd.estimator.checked import ConfigError
 from jtqd.models.files import load_yaml
 
-# What a replay needs of a log's messages: names and types. A log of another version may have others.
-
+# ---- names and types that a replay needs of a log's messages; another version may have others ----
 
 SAMPLE = np.dtype(
     [

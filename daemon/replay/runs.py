@@ -3,6 +3,10 @@
 Two logs are parts of one run when their configuration, joint files and networks are the same and their cycles lie on one
 grid: cycle numbers and the monotonic clock advance together. After a change of models (`jtq control reload`) a run is two.
 
+The time step that a joint used (`Steps`) is the time since its last inputs. A step of 0 says that it began anew: from there
+on everything about it is known. A step that is not the time since the last inputs *in the log* says that inputs are missing
+from the log: it begins in the middle of a run, or has lost cycles.
+
 A long run comes in stretches, one after the other, so that memory holds one of them whatever the length of the log.
 """
 
@@ -30,12 +34,7 @@ from jtqd.daemon.replay.origin import FRAMES, JOINT, Origin, check_fields, open_
 from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_POSITION
 from jtqd.estimator.arrays import RecordArray
 
-# Where the state of an estimator is known and where it is not: a log may begin in the middle, or have lost cycles. Pure.
-#
-# The time step that a joint used is the time since its last inputs. A step of 0 says that it began anew: from there on
-# everything about it is known. A step that is not the time since the last inputs *in the log* says that inputs are
-# missing from the log.
-
+# ---- where the state of an estimator is known ----
 
 _BOTH = FLAG_POSITION | FLAG_MOTION
 BEGINS, LOST = "the log begins in the middle of the run", "cycles are missing from the log"
@@ -75,8 +74,8 @@ def steps_of(records: RecordArray, config: Config) -> Steps:
     used = (records["input_flags"] & _BOTH) == _BOTH
     rows = np.flatnonzero(used)
     dt_ns = np.zeros(len(records), np.int64)
-    told = np.rint(records["dt_s"][rows] * 1e9)
-    dt_ns[rows] = np.where(np.isfinite(told), told, 0.0).astype(np.int64)
+    dt = np.rint(records["dt_s"][rows] * 1e9)
+    dt_ns[rows] = np.where(np.isfinite(dt), dt, 0.0).astype(np.int64)
     begins = rows[dt_ns[rows] == 0]
     if not len(rows):
         return Steps(used, dt_ns, begins, ())

@@ -40,8 +40,7 @@ from jtqd.estimator.methods import AnyEstimator, AnyNetwork, load_network, make_
 from jtqd.estimator.onnx_graph import NetworkError
 from jtqd.models.files import load_joint
 
-# What a log is replayed with: the files it carries, or others from a directory.
-
+# ---- models: those that the log carries, or others from a directory ----
 
 AS_LOGGED = "as logged"
 _WITH_NETWORK = ("network", "fused")
@@ -159,8 +158,8 @@ ROUNDING_NM = 1e-9
 
 
 @dataclass(frozen=True)
-class Wishes:
-    """What is asked for.
+class ReplayOptions:
+    """What to replay, and how.
 
     Attributes:
         model: directory with other joint files and networks.
@@ -253,14 +252,16 @@ Progress = Callable[[str, int, int], None]
 """Told what is being done, how much of it, and of how much."""
 
 
-def replay(paths: Sequence[Path], wishes: Wishes, progress: Progress = lambda *_: None) -> list[Result]:
+def replay(
+    paths: Sequence[Path], options: ReplayOptions, progress: Progress = lambda *_: None
+) -> list[Result]:
     """As `replay_each`, all results at once."""
-    return list(replay_each(paths, wishes, progress))
+    return list(replay_each(paths, options, progress))
 
 
 def replay_each(
     paths: Sequence[Path],
-    wishes: Wishes,
+    options: ReplayOptions,
     progress: Progress = lambda *_: None,
     stretch: int = STRETCH_CYCLES,
 ) -> Iterator[Result]:
@@ -280,7 +281,7 @@ def replay_each(
             run = next(runs, None)
             if run is None:
                 return
-            yield _replay_run(run, wishes, progress, time.perf_counter() - begun, replayers)
+            yield _replay_run(run, options, progress, time.perf_counter() - begun, replayers)
             del run  # its states take most of the memory
 
 
@@ -292,23 +293,23 @@ def _parts(logs: Sequence[Path], scratch: Path, progress: Progress, stretch: int
         yield from read_pieces(path, directory, stretch)
 
 
-def _models(run: Run, wishes: Wishes) -> Models:
+def _models(run: Run, options: ReplayOptions) -> Models:
     try:
-        if wishes.other:
-            return other_models(run.origin, wishes.model, wishes.method)
+        if options.other:
+            return other_models(run.origin, options.model, options.method)
         return logged_models(run.origin)
     except (ConfigError, NetworkError) as error:
-        if wishes.other:
+        if options.other:
             raise
         raise LogError(f"{run.parts[0].path}: its models: {error}") from None
 
 
 def _replay_run(
-    run: Run, wishes: Wishes, progress: Progress, read_s: float, replayers: dict[int, ExactReplay]
+    run: Run, options: ReplayOptions, progress: Progress, read_s: float, replayers: dict[int, ExactReplay]
 ) -> Result:
-    models = _models(run, wishes)
+    models = _models(run, options)
     short = run.before is None and run.cycles <= SHORT_CYCLES
-    exact = (not wishes.other and short) if wishes.exact is None else wishes.exact
+    exact = (not options.other and short) if options.exact is None else options.exact
     logged = run.joints
     begun = time.perf_counter()
     if exact:
@@ -318,7 +319,7 @@ def _replay_run(
             safety = models.safety(run.origin.config)
             replayers[run.number] = replayer = ExactReplay(run.origin, models.estimators(), safety)
         found = _exact(run, replayer, steps, progress)
-        estimate = (found.sent, found.made, found.told)
+        estimate = (found.sent, found.made, found.recorded)
     else:
         progress("replaying", 0, run.cycles)
         found, steps = _in_arrays(run, models)
@@ -326,7 +327,7 @@ def _replay_run(
     replay_s = time.perf_counter() - begun
     progress("replaying", run.cycles, run.cycles)
     same = None
-    if not wishes.other:
+    if not options.other:
         same = identity(logged, found.joints, steps, estimate, 0.0 if exact else ROUNDING_NM)
     taken = [_known(run, same, n) for n in (1, 2)]
     first, second = (compare(n + 1, logged[n], found.joints[n], taken[n]) for n in (0, 1))
@@ -368,7 +369,7 @@ class _Exact:
     joints: tuple[RecordArray, RecordArray]
     sent: npt.NDArray[np.uint8]
     made: npt.NDArray[np.uint8]
-    told: npt.NDArray[np.bool_]
+    recorded: npt.NDArray[np.bool_]
     from_si: int
     temperatures: int
 
@@ -383,8 +384,8 @@ def _in_arrays(run: Run, models: Models) -> tuple[_Exact, tuple[Steps, Steps]]:
         end = len(records[0])
         one, two = (cut_before(each.part(kept, end)) for each in (one, two))
     empty = np.zeros((run.cycles, 8), np.uint8)
-    told = np.zeros(run.cycles, np.bool_)
-    return _Exact((made[0][kept:], made[1][kept:]), empty, empty, told, 0, 0), (one, two)
+    recorded = np.zeros(run.cycles, np.bool_)
+    return _Exact((made[0][kept:], made[1][kept:]), empty, empty, recorded, 0, 0), (one, two)
 
 
 def _exact(run: Run, replayer: ExactReplay, steps: Sequence[Steps], progress: Progress) -> _Exact:
@@ -393,7 +394,7 @@ def _exact(run: Run, replayer: ExactReplay, steps: Sequence[Steps], progress: Pr
     `replayer`: new, or as the stretch before has left it.
     """
     done, from_si, temperatures = 0, 0, 0
-    joints, sent, made, told = [], [], [], []
+    joints, sent, made, recorded = [], [], [], []
     for part in run.parts:
         end = done + len(part.joints[0])
         frames = decode(run.origin, part.frames(), part.joints)
@@ -402,7 +403,7 @@ def _exact(run: Run, replayer: ExactReplay, steps: Sequence[Steps], progress: Pr
         joints.append(result.joints)
         sent.append(frames.estimate)
         made.append(result.estimate)
-        told.append(frames.told)
+        recorded.append(frames.recorded)
         from_si += frames.from_si
         temperatures += result.temperatures_from_log
         done = end
@@ -411,7 +412,7 @@ def _exact(run: Run, replayer: ExactReplay, steps: Sequence[Steps], progress: Pr
         (first, second),
         np.concatenate(sent),
         np.concatenate(made),
-        np.concatenate(told),
+        np.concatenate(recorded),
         from_si,
         temperatures,
     )

@@ -15,7 +15,7 @@ from jtqd.daemon import jtq
 from jtqd.daemon import jtqd as daemon
 from tests.paths import GOLDEN
 
-LOG = GOLDEN / "fused.mcap"
+LOG = GOLDEN / "network.mcap"
 
 
 @pytest.mark.parametrize("main", [jtq.main, daemon.main], ids=["jtq", "jtqd"])

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from jtqd.daemon.replay.session import Result, Wishes, replay
+from jtqd.daemon.replay.session import ReplayOptions, Result, replay
 from jtqd.estimator.status import NAMES
 
 HERE = Path(__file__).resolve().parent
@@ -28,14 +28,26 @@ class Output:
     values: dict[str, Any]
 
 
-def logs() -> list[Path]:
-    """Golden logs by name."""
-    return sorted(HERE.glob("*.mcap"))
+@dataclass(frozen=True)
+class Case:
+    """A golden log, and another method that is given its inputs; None: the one it was recorded with."""
+
+    log: str
+    method: str | None = None
 
 
-def replayed(log: Path) -> tuple[Output, Result]:
-    """Output of the estimator as it is now, cycle by cycle."""
-    (result,) = replay([log], Wishes(exact=True))
+CASES = {
+    "faults": Case("faults"),
+    "network": Case("network"),
+    "network_efficiency": Case("network", "efficiency"),
+    "network_tob": Case("network", "tob"),
+}
+"""Name of a stored output -> what gives it: every method, two of them as recorded."""
+
+
+def replayed(case: Case, *, exact: bool = True) -> tuple[Output, Result]:
+    """Output of the estimator as it is now, cycle by cycle or in arrays."""
+    (result,) = replay([HERE / f"{case.log}.mcap"], ReplayOptions(exact=exact, method=case.method))
     values = {
         f"j{n}.{name}": np.asarray(records[name], np.float64)
         for n, records in enumerate(result.joints, start=1)
@@ -44,17 +56,17 @@ def replayed(log: Path) -> tuple[Output, Result]:
     return Output(result.run.joints[0]["cycle"].astype(np.int64), values), result
 
 
-def stored(log: Path) -> Output:
-    """What is stored beside the log."""
-    with log.with_suffix(".csv").open(newline="") as file:
+def stored(name: str, directory: Path = HERE) -> Output:
+    """What is stored under a name."""
+    with (directory / f"{name}.csv").open(newline="") as file:
         head, *rows = csv.reader(file)
     columns = dict(zip(head, np.array(rows, np.float64).T, strict=True))
     return Output(columns.pop("cycle").astype(np.int64), columns)
 
 
-def store(log: Path, output: Output) -> None:
-    """Write the output beside the log."""
-    with log.with_suffix(".csv").open("w", newline="") as file:
+def store(name: str, output: Output, directory: Path = HERE) -> None:
+    """Write an output under a name."""
+    with (directory / f"{name}.csv").open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["cycle", *output.values])
         columns = [

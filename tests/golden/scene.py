@@ -62,10 +62,7 @@ def _faults() -> None:
 
 
 SCENES = {
-    "fused": Scene("fused", 1.3),
     "network": Scene("network", 2.1, period_us=2000),
-    "efficiency": Scene("efficiency", 2.5, period_us=2000),
-    "tob": Scene("tob", 2.2, period_us=2000),
     "faults": Scene("fused", 1.2, happens=_faults),
 }
 """Joint 1 stands for 1 s, moves and reverses at 2.41 s; joint 2 follows a torque from the start."""

@@ -8,23 +8,38 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jtqd.estimator.settings import METHODS
 from tests.benchmarks import replay_speed
-from tests.golden.reference import Output, difference, logs, replayed, store, stored
+from tests.golden.reference import CASES, HERE, Case, Output, difference, replayed, store, stored
 from tests.golden.scene import SCENES
 
 MOST_BYTES = 450_000
 
 
 def test_all_scenes_are_there_and_small() -> None:
-    assert {log.stem for log in logs()} == set(SCENES)
-    assert all(log.stat().st_size < MOST_BYTES for log in logs())
+    assert {log.stem for log in HERE.glob("*.mcap")} == {case.log for case in CASES.values()} == set(SCENES)
+    assert all(log.stat().st_size < MOST_BYTES for log in HERE.glob("*.mcap"))
+    assert {
+        result.run.origin.config.estimator.method for result in (replayed(CASES[name])[1] for name in SCENES)
+    } | {case.method for case in CASES.values() if case.method} == set(METHODS)
 
 
-@pytest.mark.parametrize("log", logs(), ids=lambda log: log.stem)
-def test_golden(log: Path) -> None:
-    now, _ = replayed(log)
-    lines = difference(stored(log), now)
+@pytest.mark.parametrize("name", CASES)
+def test_golden(name: str) -> None:
+    now, result = replayed(CASES[name])
+    lines = difference(stored(name), now)
     assert not lines, "\n".join([*lines, "on purpose: python -m tests.golden.update -m WHY"])
+    if CASES[name].method is None:  # as it was recorded, bit for bit
+        assert result.identity is not None
+        assert result.identity.whole
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_in_arrays_the_same_to_rounding(case: Case) -> None:
+    exact, _ = replayed(case)
+    whole, _ = replayed(case, exact=False)
+    for name, values in exact.values.items():
+        np.testing.assert_allclose(whole.values[name], values, rtol=0, atol=1e-9, err_msg=name)
 
 
 def output() -> Output:
@@ -77,15 +92,15 @@ def test_statuses_that_moved_or_came() -> None:
 def test_stored_text_comes_back(tmp_path: Path) -> None:
     now = output()
     now.values["j1.torque_nm"][3] = np.nan
-    store(tmp_path / "x.mcap", now)
-    assert difference(stored(tmp_path / "x.mcap"), now) == []
+    store("x", now, tmp_path)
+    assert difference(stored("x", tmp_path), now) == []
     head, first, *_ = (tmp_path / "x.csv").read_text().splitlines()
     assert (head, first) == ("cycle,j1.torque_nm,j1.status", "5,0.000000,6")
 
 
 def test_the_benchmark_of_replay_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On a golden log that is made longer, so that whole-run observers are used; no time is asserted."""
-    monkeypatch.setattr(replay_speed, "METHODS", ("tob",))
+    monkeypatch.setattr(replay_speed, "METHODS", {"tob": "network"})
     (found,) = replay_speed.run(tmp_path, seconds=5.0)
     assert found["cycles"] > 2000
     assert found["arrays_times"] > found["exact_times"] > 0

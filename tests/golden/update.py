@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 
 from jtqd.sim_can.bench_kernel import guest
-from tests.golden.reference import HERE, difference, logs, replayed, store, stored
+from tests.golden.reference import CASES, HERE, difference, replayed, store, stored
 from tests.golden.scene import SCENES
 
 CHANGES = HERE / "changes.md"
@@ -51,18 +51,18 @@ def main() -> None:
     if options.logs:
         record(names)
     said = []
-    for log in logs():
-        if log.stem not in names:
+    for name, case in CASES.items():
+        if case.log not in names:
             continue
-        now, _ = replayed(log)
+        now, _ = replayed(case)
         lines = ["recorded anew"] if options.logs else []
         if not options.logs:
-            lines = difference(stored(log), now) if log.with_suffix(".csv").exists() else ["new"]
+            lines = difference(stored(name), now) if (HERE / f"{name}.csv").exists() else ["new"]
         for line in lines:
-            print(f"{log.stem}: {line}")
+            print(f"{name}: {line}")
         if lines:
-            store(log, now)
-            said.append(log.stem)
+            store(name, now)
+            said.append(name)
     if not said:
         print("golden: nothing differs, nothing stored")
         return

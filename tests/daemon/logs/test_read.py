@@ -34,7 +34,7 @@ from jtqd.daemon.logs.export import main as export
 from jtqd.daemon.logs.log_file import _indexed
 from jtqd.daemon.recording.schemas import SCHEMAS
 from jtqd.daemon.replay.command import main as replay
-from jtqd.daemon.replay.session import Wishes
+from jtqd.daemon.replay.session import ReplayOptions
 from jtqd.daemon.replay.session import replay as replayed
 from tests.daemon.logs.log_files import ATTACHMENTS, cycles, foreign, ours, record_starts
 from tests.daemon.recording.recorder_bench import record_of as cycle_record
@@ -466,7 +466,7 @@ def test_a_summary_that_fails_its_crc_is_not_believed(tmp_path):
 # ---- parts of a run: what two of them have comes once ----
 
 
-GOLDEN_LOG = GOLDEN / "fused.mcap"
+GOLDEN_LOG = GOLDEN / "network.mcap"
 NAME = "jtqd-can0-20261121T173111Z-{:04d}.mcap"
 IN_PARTS = ("/joint/1/state", "/joint/2/state", "/can/frames", "/diagnostics", "/events")
 
@@ -522,7 +522,7 @@ def test_what_only_looks_alike_is_kept(parts, tmp_path):
     assert len(found) == len(read_topic(GOLDEN_LOG, "/joint/1/state")) + 1
     assert np.count_nonzero(found == cycle) == 2
     with pytest.raises(LogError, match="given twice"):
-        replayed([tmp_path], Wishes())
+        replayed([tmp_path], ReplayOptions())
 
 
 def test_replay_of_a_directory(parts, capsys):

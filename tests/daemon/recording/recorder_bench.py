@@ -199,8 +199,8 @@ def one_file(path, chunk_ns=99_000_000):
     return Recording(journal, sink, overview, chunk_ns, Account()), sink
 
 
-def session_on(directory, say=lambda _: None, **request):
+def session_on(directory, warn=lambda _: None, **request):
     """A `Session` in this process, with files in DIRECTORY/logs and no repair."""
     values = {"ring": directory / "ring", "directory": directory / "logs", "prefix": "test", "repair": False}
     values |= {key: tuple(value) if key == "attachments" else value for key, value in request.items()}
-    return Session(RecorderRequest(**values), Account(), say)
+    return Session(RecorderRequest(**values), Account(), warn)

@@ -144,7 +144,7 @@ def test_other_files_in_force_are_attached_from_the_next_part_on(tmp_path):
         attachments=({"name": "joint.yaml", "text": "new"}, {"name": "broken", "base64": "?"}),
     )
     said = []
-    session._say = said.append
+    session._warn = said.append
     session.renew(again)
     session.recording.add(record_of(1))
     summary = session.finish()

@@ -181,9 +181,9 @@ def test_notices_of_the_supervisor_become_events_and_log_lines(tmp_path):
     notices = Notices(tmp_path / "notices")
     notices.add(INFO, "boot", 2, "node 2: boot-up")
     session = session_on(tmp_path, notices=tmp_path / "notices")
-    session.look_round()
+    session.poll()
     notices.add(ERROR, "emcy", 1, "node 1: EMCY 8611h following error")
-    session.look_round()
+    session.poll()
     path = session.finish()["path"]
     found = messages_of(path)
     told = [

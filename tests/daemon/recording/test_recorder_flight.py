@@ -33,13 +33,13 @@ def feed(session, first, count, statuses=(2, 2)):
     for n in range(first, first + count):
         session.recording.add(record_of(n, statuses=statuses))
         if n % 50 == 49:
-            session.look_round()
+            session.poll()
 
 
 @pytest.mark.parametrize("status", ["DRIVE_FAULT", "INVALID"])
 def test_fault_writes_the_time_before_and_after_it(tmp_path, status):
     said = []
-    session = session_on(tmp_path, say=said.append, flight_recorder_s=3.0)
+    session = session_on(tmp_path, warn=said.append, flight_recorder_s=3.0)
     feed(session, 0, 10_000)
     assert not (tmp_path / "logs").exists()
     feed(session, 10_000, 12_000, (2, STATUS[status]))

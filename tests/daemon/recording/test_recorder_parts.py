@@ -233,7 +233,7 @@ def free(monkeypatch):
 
 def test_recording_ends_at_the_reserve_and_goes_on_when_there_is_room(tmp_path, free):
     said = []
-    session = session_on(tmp_path, say=said.append, reserve_mb=100.0, chunk_s=0.1)
+    session = session_on(tmp_path, warn=said.append, reserve_mb=100.0, chunk_s=0.1)
     for n in range(6000):
         free["free"] = 10**9 if n < 1000 else 99 * 10**6 if n < 3000 else 110 * 10**6 if n < 4000 else 10**9
         session.recording.add(record_of(n))
@@ -266,7 +266,7 @@ def test_recording_ends_at_the_reserve_and_goes_on_when_there_is_room(tmp_path, 
 def test_start_without_room(tmp_path, free):
     free["free"] = 0
     said = []
-    session = session_on(tmp_path, say=said.append, reserve_mb=1.0)
+    session = session_on(tmp_path, warn=said.append, reserve_mb=1.0)
     for n in range(3000):
         session.recording.add(record_of(n))
     assert (session.account.written, session.account.lost) == (0, session.recording.progress.cycles)
@@ -293,7 +293,7 @@ def test_disk_without_blocks_for_a_while(tmp_path, monkeypatch):
     monkeypatch.setattr(appender, "_fallocate", take)
     monkeypatch.setattr(appender, "_STEP", 4096)
     said = []
-    session = session_on(tmp_path, say=said.append, chunk_s=0.1)
+    session = session_on(tmp_path, warn=said.append, chunk_s=0.1)
     for n in range(3000):
         knob["full"] = 1000 <= n < 1700
         session.recording.add(record_of(n))
@@ -311,7 +311,7 @@ def test_disk_without_blocks_for_a_while(tmp_path, monkeypatch):
 
 def test_disk_that_never_recovers_is_tried_once_a_second_and_said_once(tmp_path, monkeypatch):
     attempts, said = [], []
-    session = session_on(tmp_path, say=said.append)
+    session = session_on(tmp_path, warn=said.append)
 
     def refuse(*_):
         raise OSError(5, "I/O error")
@@ -333,7 +333,7 @@ def test_disk_that_never_recovers_is_tried_once_a_second_and_said_once(tmp_path,
 
 def test_file_that_is_removed_costs_what_was_in_it(tmp_path):
     said = []
-    session = session_on(tmp_path, say=said.append)
+    session = session_on(tmp_path, warn=said.append)
     for n in range(2000):
         session.recording.add(record_of(n))
         if n == 1100:
@@ -342,7 +342,7 @@ def test_file_that_is_removed_costs_what_was_in_it(tmp_path):
     summary = session.finish()
     assert cycles_of(*summary["paths"]) == list(range(before, 2000))
     assert (summary["written"], summary["lost"]) == (2000 - before, before)
-    assert said == [f"part 1 was removed while it was being written: {before} cycles are gone with it"]
+    assert said == [f"part 1 was removed while it was being written: {before} cycles are lost with it"]
     assert metadata_of(summary["paths"][0])["part"] == "2"
     events = [event for _, event in messages_of(*summary["paths"])["/events"]]
     assert [event["count"] for event in events if event["kind"] == EVENT["FILE_REMOVED"]] == [before]

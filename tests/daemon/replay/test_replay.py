@@ -14,7 +14,7 @@ import pytest
 
 from jtqd.daemon.logs import read_attachments, read_topic
 from jtqd.daemon.replay.command import main
-from jtqd.daemon.replay.session import Wishes, replay
+from jtqd.daemon.replay.session import ReplayOptions, replay
 from tests.daemon.replay.replay_helpers import cut, cycles, provenance
 from tests.paths import GOLDEN
 
@@ -78,8 +78,8 @@ def test_what_was_recorded_comes_out_bit_for_bit(log: Path, capsys: pytest.Captu
 def test_in_arrays_the_same_to_rounding(log: Path) -> None:
     """Every method; the published statuses are the same, the numbers to 1e-9 Nm."""
     for method in ("tob", "efficiency", "fused"):
-        (exact,) = replay([log], Wishes(method=method, exact=True))
-        (whole,) = replay([log], Wishes(method=method, exact=False))
+        (exact,) = replay([log], ReplayOptions(method=method, exact=True))
+        (whole,) = replay([log], ReplayOptions(method=method, exact=False))
         for one, two in zip(exact.joints, whole.joints, strict=True):
             np.testing.assert_array_equal(one["status"], two["status"])
             for name in ("torque_nm", "sigma_nm", "physics_nm", "network_nm", "tob_nm"):
@@ -267,7 +267,7 @@ def test_in_arrays_rounding_is_no_finding(
     assert found["identity"]["differences"] == []
     assert main([str(log)]) == 0
     assert "  equal to 1e-09 Nm" in capsys.readouterr().out
-    (whole,) = replay([log], Wishes(exact=False))
+    (whole,) = replay([log], ReplayOptions(exact=False))
     logged, made = whole.run.joints, tuple(each.copy() for each in whole.joints)
     row = int(np.flatnonzero(np.isfinite(made[0]["torque_nm"]))[-50])
     made[0]["torque_nm"][row] += 1e-6
@@ -279,7 +279,7 @@ def test_in_arrays_rounding_is_no_finding(
 
 def test_logs_of_another_version(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Fields with other names and types: one line, never numbers of something else."""
-    log = GOLDEN / "tob.mcap"
+    log = GOLDEN / "network.mcap"
     for old, new, said in (
         (b"motor_position_rad", b"position_of_motor_x", "found no field motor_position_rad"),
         (b"float64 dt_s", b"int64 dt_s", "found dt_s of type int64, expected float64"),

@@ -23,7 +23,7 @@ from jtqd.daemon.replay.runs import (
     read_pieces,
     steps_of,
 )
-from jtqd.daemon.replay.session import Wishes, replay
+from jtqd.daemon.replay.session import ReplayOptions, replay
 from jtqd.daemon.shared import cycle_record as faults
 from jtqd.estimator.status import INVALID, VALID
 from jtqd.models.files import shipped
@@ -31,7 +31,7 @@ from tests.daemon.replay.replay_helpers import cut, cycles
 from tests.daemon.replay.test_replay_parts import CONFIG, MS, records
 from tests.paths import GOLDEN
 
-LOG = GOLDEN / "efficiency.mcap"
+LOG = GOLDEN / "network.mcap"
 
 
 def test_one_lost_cycle_is_seen() -> None:
@@ -91,7 +91,7 @@ def test_logs_that_tell_a_cycle_differently_are_refused(tmp_path: Path) -> None:
     numbers = cycles(LOG)
     first = cut(LOG, tmp_path / "1.mcap", lambda cycle: cycle < numbers[700])
     second = cut(LOG, tmp_path / "2.mcap", lambda cycle: cycle >= numbers[650])
-    (result,) = replay([first, second], Wishes(exact=True))
+    (result,) = replay([first, second], ReplayOptions(exact=True))
     assert result.run.cycles == len(numbers)
     assert result.identity is not None
     assert result.identity.whole
@@ -102,7 +102,7 @@ def test_logs_that_tell_a_cycle_differently_are_refused(tmp_path: Path) -> None:
 
     other = cut(LOG, tmp_path / "3.mcap", lambda cycle: cycle >= numbers[650], payload=payload)
     with pytest.raises(LogError, match=f"found cycle {numbers[650]}, which .*1.mcap has too"):
-        replay([first, other], Wishes())
+        replay([first, other], ReplayOptions())
 
 
 def test_two_files_for_one_joint_are_one_too_many(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

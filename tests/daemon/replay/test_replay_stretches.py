@@ -13,11 +13,11 @@ import pytest
 from jtqd.daemon.logs import LogError, read_topic
 from jtqd.daemon.replay import command, session
 from jtqd.daemon.replay.runs import Run, in_order, read_part, stretches
-from jtqd.daemon.replay.session import Result, Wishes, replay, replay_each
+from jtqd.daemon.replay.session import ReplayOptions, Result, replay, replay_each
 from tests.daemon.replay.replay_helpers import cut, cycles
 from tests.paths import GOLDEN
 
-LOGS = ("efficiency", "fused", "faults")
+LOGS = ("network", "faults")
 
 
 def joined(results: list[Result], number: int) -> np.ndarray:
@@ -39,8 +39,8 @@ def parts_of(log: Path, directory: Path, *ends: int) -> list[Path]:
 @pytest.mark.parametrize("name", LOGS)
 def test_pieces_of_one_log_give_what_the_whole_gives(name: str, exact: bool) -> None:
     log = GOLDEN / f"{name}.mcap"
-    (whole,) = replay([log], Wishes(exact=exact))
-    pieces = list(replay_each([log], Wishes(exact=exact), stretch=300))
+    (whole,) = replay([log], ReplayOptions(exact=exact))
+    pieces = list(replay_each([log], ReplayOptions(exact=exact), stretch=300))
     assert len(pieces) > 2
     assert all(each.run.cycles < 600 for each in pieces)
     assert sum(each.run.cycles for each in pieces) == whole.run.cycles
@@ -60,10 +60,10 @@ def test_pieces_of_one_log_give_what_the_whole_gives(name: str, exact: bool) -> 
 @pytest.mark.parametrize("exact", [True, False])
 def test_parts_of_a_run_are_joined_up_to_the_limit(tmp_path: Path, exact: bool) -> None:
     """Parts of 400, 300, 300 and the rest with a limit of 700: two stretches or three, in any order of the files."""
-    log = GOLDEN / "efficiency.mcap"
+    log = GOLDEN / "network.mcap"
     parts = parts_of(log, tmp_path / "p", 400, 700, 1000)
-    (whole,) = replay([log], Wishes(exact=exact))
-    found = list(replay_each(parts[::-1], Wishes(exact=exact), stretch=700))
+    (whole,) = replay([log], ReplayOptions(exact=exact))
+    found = list(replay_each(parts[::-1], ReplayOptions(exact=exact), stretch=700))
     assert [[part.path.name[-6] for part in each.run.parts] for each in found] == [["1", "2"], ["3", "4"]]
     assert [each.run.cycles for each in found] == [700, len(cycles(log)) - 700]
     for number in (0, 1):
@@ -76,9 +76,9 @@ def test_parts_of_a_run_are_joined_up_to_the_limit(tmp_path: Path, exact: bool) 
 def test_a_difference_in_a_later_stretch_is_found(tmp_path: Path) -> None:
     """One bit in the last stretch, whose state goes on from the one before.
 
-    The library's writer ends a chunk within a cycle: of cycle 1207 one joint is in the first chunk, the other in the second.
+    The library's writer ends a chunk within a cycle: one joint of it is in the first chunk, the other in the second.
     """
-    log = GOLDEN / "efficiency.mcap"
+    log = GOLDEN / "network.mcap"
     numbers = cycles(log)
     wrong = numbers[-10]
     at = 4 + 8 + 16 + 16 + 6 * 8  # encapsulation, stamp, frame_id, cycle and time, six quantities: torque_nm
@@ -89,7 +89,7 @@ def test_a_difference_in_a_later_stretch_is_found(tmp_path: Path) -> None:
         return data[:at] + bytes((data[at] ^ 1,)) + data[at + 1 :]
 
     spoilt = cut(log, tmp_path / "a.mcap", payload=payload)
-    found = list(replay_each([spoilt], Wishes(exact=True), stretch=400))
+    found = list(replay_each([spoilt], ReplayOptions(exact=True), stretch=400))
     assert sum(each.run.cycles for each in found) == len(numbers)
     assert [each.good for each in found] == [True] * (len(found) - 1) + [False]
     assert found[-1].identity is not None
@@ -110,7 +110,7 @@ def test_only_one_stretch_is_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
         return result
 
     monkeypatch.setattr(session, "_replay_run", counting)
-    results = replay_each([GOLDEN / "tob.mcap"], Wishes(exact=True), stretch=300)
+    results = replay_each([GOLDEN / "network.mcap"], ReplayOptions(exact=True), stretch=300)
     while (result := next(results, None)) is not None:
         del result
     assert alive == [0, 0, 0]
@@ -119,7 +119,7 @@ def test_only_one_stretch_is_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_command_tells_every_stretch(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log = GOLDEN / "efficiency.mcap"
+    log = GOLDEN / "network.mcap"
     real = session.replay_each
     monkeypatch.setattr(command, "replay_each", lambda *given: real(*given, stretch=500))
     target = tmp_path / "both.mcap"
@@ -137,13 +137,13 @@ def test_the_command_tells_every_stretch(
 
 
 def test_several_runs_at_once_and_one_log_twice(tmp_path: Path) -> None:
-    one, two = GOLDEN / "efficiency.mcap", GOLDEN / "tob.mcap"
+    one, two = GOLDEN / "network.mcap", GOLDEN / "faults.mcap"
     read = []
     for n, path in enumerate((one, two)):
         (tmp_path / str(n)).mkdir()
         read.append(read_part(path, tmp_path / str(n)))
     assert [run.number for run in stretches(read, 300)] == [0, 1]
     with pytest.raises(LogError, match="given twice"):
-        list(replay_each([one, one], Wishes(), stretch=300))
+        list(replay_each([one, one], ReplayOptions(), stretch=300))
     first, second = parts_of(one, tmp_path / "p", 600)
     assert in_order([second, first]) == [first, second]
