@@ -42,8 +42,8 @@ from jtqd.sysid.evaluate.scores import (
 )
 from jtqd.sysid.fit.efficiency_report import TITLES as QUADRANT_TITLES
 from jtqd.sysid.fit.plateaus import Plateau
-from jtqd.sysid.report.numbers import counted
 from jtqd.sysid.runs.checks import RunIssue
+from jtqd.sysid.text import counted
 
 SILENT_SHARE: Final = 0.01
 """Share of the moving samples that a method may leave without a value and not be named for it."""
