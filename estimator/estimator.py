@@ -118,11 +118,11 @@ class JointEstimator:
         Without network_wanted there is no time for it: this sample is physics only.
         """
         guard = self._guard
-        seen = guard.step(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
+        observed = guard.step(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
         status = guard.status
-        if seen is None:
+        if observed is None:
             return STARTING_ESTIMATE if status == STARTING else INVALID_ESTIMATE
-        raw, tob, v, link_velocity = seen
+        raw, tob, v, link_velocity = observed
         i = raw * self._inverse_gain
         efficiency = network = nan
         physics = tob
@@ -283,12 +283,12 @@ class FusedEstimator:
         network_wanted there is no time for it: this sample is physics only.
         """
         guard = self._guard
-        seen = guard.step(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
+        observed = guard.step(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
         status = guard.status
-        if seen is None:
+        if observed is None:
             self._half = 0.0
             return STARTING_ESTIMATE if status == STARTING else INVALID_ESTIMATE
-        raw, v, _, torsion, c2, s2, c4, s4, s, open_nm = seen
+        raw, v, _, torsion, c2, s2, c4, s4, s, open_nm = observed
         if temperature_c is not self._temperature:  # a joint reports it twice a second
             self._temperature = temperature_c
             self._thermal = self._thermal_of(temperature_c)

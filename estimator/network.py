@@ -141,7 +141,7 @@ FUSED_FEATURES: Final = (
     "cos_4_motor_filtered",
     "sin_4_motor_filtered",
 )
-"""The last four are waves: an absolute angle, or one that turns as slowly as the link, would tell which run it is."""
+"""The last four are waves: an absolute angle, or one that turns as slowly as the link, would identify the run."""
 
 _FUSED_KEYS: Final = ("envelope", "sigma_scale", "input_low", "input_high", "joint", "data_sha256")
 

@@ -110,7 +110,7 @@ class OnnxGraph:
     def _open(self, data: bytes) -> Any:
         import onnxruntime as ort
 
-        ort.disable_telemetry_events()  # some builds report to their maker; a controller has nobody to report to
+        ort.disable_telemetry_events()  # some builds report usage to their maker
         options = ort.SessionOptions()
         options.intra_op_num_threads = 1
         options.inter_op_num_threads = 1
@@ -125,7 +125,7 @@ class OnnxGraph:
             raise self.error(f"not a usable ONNX model: {reason}") from None
 
     def _check_graph(self) -> str:
-        """Return the output's name when inputs and outputs are what this file says."""
+        """Return the output's name; NetworkError unless there is one input "x" [N, features] and one output [N, 1]."""
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         if [i.name for i in inputs] != ["x"]:
             raise self.error(f"found inputs {[i.name for i in inputs]}, expected one, 'x'")
@@ -144,17 +144,17 @@ class OnnxGraph:
             raw = self._session.get_modelmeta().custom_metadata_map
         except UnicodeDecodeError as error:
             raise self.error(f"metadata: found bytes that are not UTF-8 ({error.reason})") from None
-        found: dict[str, Any] = {}
+        metadata: dict[str, Any] = {}
         for key in ("features", *keys):
             if key not in raw:
                 raise self.error(f"metadata '{key}': missing, found only {sorted(raw)}")
             try:
-                found[key] = json.loads(raw[key])
+                metadata[key] = json.loads(raw[key])
             except ValueError:
                 raise self.error(f"metadata '{key}': found {raw[key][:60]!r}, expected JSON") from None
-        if found["features"] != list(features):
-            raise self.error(f"metadata 'features': found {found['features']}, expected {list(features)}")
-        return found
+        if metadata["features"] != list(features):
+            raise self.error(f"metadata 'features': found {metadata['features']}, expected {list(features)}")
+        return metadata
 
     def _bind(self, low: FloatArray, high: FloatArray) -> None:
         """Bind the buffers and prove that they are used in place; otherwise plain run() serves."""

@@ -40,9 +40,9 @@ LAG_S: Final = 0.05
 FROZEN_RAD: Final = 5.0
 """Motor side: a current that is regulated moves its last digits while the motor turns so far."""
 LONGEST_STEP_S: Final = 0.05
-"""After a longer one the differences say nothing."""
+"""Differences over a longer step are not judged."""
 _GAP_PERIODS: Final = 5.0
-"""A longer step is a gap: its slip is acceleration that nobody has seen, and not added up."""
+"""A longer step is a gap: its slip is acceleration that was not measured, and is not added up."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -139,13 +139,13 @@ class RunTable:
         Raises RunTableError naming the column that is missing and cannot be derived.
         """
         columns = self.joint(number, gear_ratio)
-        found = [self.dt_s]
+        inputs = [self.dt_s]
         for name in ("current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad"):
             column = getattr(columns, name)
             if column is None:
                 raise RunTableError(f"j{number}.{name}: missing, and nothing it could be derived from")
-            found.append(column)
-        return tuple(found)
+            inputs.append(column)
+        return tuple(inputs)
 
 
 def _slope(position: FloatArray, time_s: FloatArray) -> FloatArray:

@@ -62,7 +62,7 @@ def _block(a: FloatArray, x: FloatArray, state: FloatArray, warm: int) -> FloatA
     length = max(warm, _STRETCH)
     length += (9 - length) % 16  # columns a power of two apart would all meet in the same lines of the cache
     lanes = -(-count // length)
-    # In front: nothing happens, so that the first lane keeps its state. Behind: zeros that nobody looks at.
+    # In front: a = 1, x = 0, so that the first lane keeps its state. Behind: zeros whose results are cut off.
     padded = np.zeros((rows + 1, warm + lanes * length))
     padded[0, :warm] = 1.0
     padded[0, warm : warm + count] = a

@@ -355,7 +355,7 @@ def extended_run(  # noqa: PLR0917 - a sample, in arrays
         s.current_a = current = current_a - total("current_a") + seeming
         link = link_position_rad - total("link_rad")
         s.torsion_rad = motor_position_rad / joint.gear_ratio - link - torsion_zero(joint)
-        s.torque_nm = np.full_like(v, nan)  # nobody here needs it
+        s.torque_nm = np.full_like(v, nan)  # not used: see needs_torque
         link = link - total("twist_rad")
         current = current - total("loss_nm") / (joint.gear_ratio * joint.torque_constant_nm_per_a)
     return np.where(good, current, current_a), np.where(good, link, link_position_rad)

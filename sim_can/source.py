@@ -58,7 +58,7 @@ class DriveSignals:
         self.motor_velocity_rad_s = 0.0  # motor side
         self.link_position_rad = 0.0  # joint side
         self.current_a = 0.0
-        self.temperature_c = math.nan  # of the joint; nan: nobody measures it
+        self.temperature_c = math.nan  # of the joint; nan: not measured
         self.enabled = False
 
 
