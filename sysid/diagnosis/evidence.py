@@ -18,7 +18,7 @@ from jtqd.sysid.diagnosis.findings import CandidateEvidence as Evidence
 from jtqd.sysid.diagnosis.findings import JointName, Value
 from jtqd.sysid.diagnosis.mixed_model import Mixed, explained
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
-from jtqd.sysid.diagnosis.search import ENTER, HELD_OUT, Hypothesis, Search
+from jtqd.sysid.diagnosis.search import ENTER, HELD_OUT, Hypothesis, Search, order_of
 
 RELEVANT: Final = 1e-3
 """Part of the rated torque below which a contribution (rms over the runs) is not called an effect, however certain."""
@@ -28,10 +28,6 @@ _LARGEST: Final = 0.2
 """Part of the rated torque: a torque that would have to be larger to show is invisible."""
 _COLLINEAR: Final = 1e-4
 """Below this part of its information nothing is left beside a rival: no size would distinguish the two."""
-
-
-def _order(candidate: EffectCandidate) -> float:
-    return float(candidate.term.basis[0].get("order_per_motor_rev", 0.0))
 
 
 def information(
@@ -91,7 +87,7 @@ def minimum_size(search: Search, best: Hypothesis, candidate: EffectCandidate) -
             rival.effect.name == candidate.effect.name
             and rival.term.basis[0].keys() == candidate.term.basis[0].keys()
         )
-        if same and rival.joint != candidate.joint and _order(rival) == _order(candidate):
+        if same and rival.joint != candidate.joint and order_of(rival) == order_of(candidate):
             beside, beside_share = information(search.mixed, best, candidate, rival)
             if _COLLINEAR * known < beside < known:
                 known, share = beside, beside_share

@@ -68,145 +68,13 @@ class Location:
     line: Line | None = None
 
 
-@dataclass(frozen=True)
-class _Axis:
-    """An axis in one direction: energy explained; prediction [run][n] of the residual; energy explained per bin."""
-
-    axis: str
-    energy_nm2: float
-    prediction: list[FloatArray]
-    bins: FloatArray
-
-
-def explained_by_bins(
-    places: Sequence[np.ndarray[tuple[int], np.dtype[np.intp]]],
-    parts: Sequence[FloatArray],
-    bins: int,
-    step_s: float,
-) -> tuple[FloatArray, list[FloatArray]]:
-    """Return the energy that the bins' means over the other runs take off each run, and bin [runs, bins] (sum of squares
-    over samples, Nm^2), and those means at every sample [run][n]. places: bin of every sample.
-    """
-    sums, counts = np.zeros((len(parts), bins)), np.zeros((len(parts), bins))
-    for r, (place, x) in enumerate(zip(places, parts, strict=True)):
-        good = np.isfinite(x)
-        sums[r] = np.bincount(place[good], x[good], minlength=bins)
-        counts[r] = np.bincount(place[good], minlength=bins)
-    others = (sums.sum(axis=0) - sums) / (counts.sum(axis=0) - counts + _PRIOR_S / step_s)
-    # sum of x^2 - (x - m)^2 over a bin
-    explained: FloatArray = 2.0 * others * sums - others**2 * counts
-    return explained, [others[r][place] for r, place in enumerate(places)]
-
-
-def locate(  # noqa: PLR0917
-    runs: Sequence[RunData],
-    channel: Channel,
-    parts: Sequence[FloatArray],
-    limits: EventLimits | None,
-    lines: Sequence[Line],
-    maps: Mapping[str, AxisMap],
-) -> list[Location]:
-    """Return the locations of a channel's residual [run][n], first the one that explains most, at most MOST.
-
-    limits: None for a gap that has causes or none: events and wandering are left out, and an axis need not be certain;
-    maps: of this residual. Of a gap that is not explained an axis whose map could be chance is no location.
-    """
-    now = list(parts)
-    whole = float(np.nanmean(np.concatenate(now) ** 2))
-    out: list[Location] = []
-    while len(out) < MOST:
-        used = [t.axis for t in out]  # empty names: events, seconds, lines
-        axis = _best_axis(runs, channel, now, used, maps, LEAST * whole, certain=limits is not None)
-        rest = now if axis is None else [x - y for x, y in zip(now, axis.prediction, strict=True)]
-        found = [] if axis is None else [Location(axis.energy_nm2, axis.axis, _descending(axis.bins))]
-        found += [
-            Location(0.5 * x.amplitude_nm**2, line=x) for x in lines if all(t.line is not x for t in out)
-        ]
-        masked = now
-        if limits is not None and not any(t.burst is not None and t.burst.what == "events" for t in out):
-            seen = events(runs, channel, rest, limits.ar, limits.step_s, limits.jump_nm)
-            if seen is not None:
-                found.append(Location(seen.burst.excess_nm2, burst=seen.burst))
-                masked = [np.where(m, np.nan, x) for m, x in zip(seen.masks, now, strict=True)]
-                rest = [np.where(m, np.nan, x) for m, x in zip(seen.masks, rest, strict=True)]
-        if limits is not None and not any(t.burst is not None and t.burst.what == "seconds" for t in out):
-            off = wandering(runs, {channel: rest}, limits.step_s, {channel: limits.wander_nm})
-            found += [Location(b.excess_nm2, burst=b) for b in off]
-        best = max(found, key=lambda t: t.energy_nm2, default=None)
-        if best is None or best.energy_nm2 < LEAST * whole:
-            break
-        out.append(best)
-        if best.axis and axis is not None:
-            now = [x - y for x, y in zip(now, axis.prediction, strict=True)]
-        elif best.burst is not None and limits is not None:
-            now = masked if best.burst.what == "events" else _less_seconds(now, limits.step_s)
-    return out
-
-
-def _descending(explained: FloatArray) -> tuple[int, ...]:
-    """Return the bins that explain something, the largest first."""
-    return tuple(int(k) for k in np.argsort(-explained) if explained[k] > 0.0)
-
-
-def _less_seconds(parts: Sequence[FloatArray], step_s: float) -> list[FloatArray]:
-    """Return the residual less its mean over every second [run][n]."""
-    block = max(2, round(BLOCK_S / step_s))
-    out = []
-    for x in parts:
-        mean, use = block_means(x, block)
-        level = np.zeros(len(x))
-        level[: len(mean) * block] = np.repeat(np.where(use, mean, 0.0), block)
-        out.append(x - level)
-    return out
-
-
-def _best_axis(  # noqa: PLR0917
-    runs: Sequence[RunData],
-    channel: Channel,
-    parts: Sequence[FloatArray],
-    used: Sequence[str],
-    maps: Mapping[str, AxisMap],
-    least_nm2: float,
-    *,
-    certain: bool,
-) -> _Axis | None:
-    """Return the axis that explains most of what is left; certain: none that could be chance, by its map while nothing is
-    taken out (`used` is empty), else by a map of what is left.
-    """
-    step_s = float(np.median(np.diff(runs[0].time_s)))
-    count = max(sum(int(np.isfinite(x).sum()) for x in parts), 1)
-    ranked: list[tuple[float, str, FloatArray, list[FloatArray], list[FloatArray] | None, FloatArray]] = []
-    for axis, drawn in maps.items():
-        if axis in used or (certain and not used and drawn.p >= SIGNIFICANT):
-            continue
-        edges, bins = drawn.edges, len(drawn.edges) - 1
-        values = [axis_values(run.axes[channel.joint], axis) for run in runs]
-        places = [np.clip(np.searchsorted(edges, v, side="right") - 1, 0, bins - 1) for v in values]
-        for side in directions(runs, channel):
-            explained, means = explained_by_bins(places, signed(parts, side), bins, step_s)
-            explained /= count
-            if explained.sum() > least_nm2 and (explained.sum(axis=1) > 0.0).sum() >= _FEWEST_RUNS:
-                ranked.append((float(explained.sum()), axis, explained, signed(means, side), side, edges))
-    ranked.sort(key=lambda item: -item[0])
-    for energy, axis, explained, prediction, side, edges in ranked:
-        p = 0.0
-        if certain and used:
-            values = [axis_values(run.axes[channel.joint], axis) for run in runs]
-            block = max(2, round(BLOCK_S / step_s))
-            rng = np.random.default_rng(0)
-            p = axis_map(channel, axis, edges, values, signed(parts, side), block, rng).p
-        if p < _BEYOND:
-            return _Axis(axis, energy, prediction, explained.sum(axis=0))
-    return None
-
-
 def channel_gaps(dataset: Dataset, refined: Refined, left: Leftover | None) -> tuple[Gap, ...]:
     """Return the gaps of all channels, largest excess over the floor first; places of what is left over where `left`
     is given (nothing named), else of the whole gap.
     """
     residuals = _raw(dataset)
     # where the gap lives: without what each run has of its own, which would hide a small effect
-    shown = _calm(dataset, refined) if left is None else less_nuisances(dataset, refined)
+    shown = _before(dataset, refined) if left is None else less_nuisances(dataset, refined)
     maps = axis_maps(dataset.runs, shown, dataset.step_s) if left is None else left.maps
     out = []
     for channel, parts in residuals.items():
@@ -363,6 +231,138 @@ def _bin_name(m: AxisMap, k: int) -> str:
     return f"{m.edges[k]:.3g} to {m.edges[k + 1]:.3g} {m.unit}".strip()
 
 
+@dataclass(frozen=True)
+class _Axis:
+    """An axis in one direction: energy explained; prediction [run][n] of the residual; energy explained per bin."""
+
+    axis: str
+    energy_nm2: float
+    prediction: list[FloatArray]
+    bins: FloatArray
+
+
+def explained_by_bins(
+    places: Sequence[np.ndarray[tuple[int], np.dtype[np.intp]]],
+    parts: Sequence[FloatArray],
+    bins: int,
+    step_s: float,
+) -> tuple[FloatArray, list[FloatArray]]:
+    """Return the energy that the bins' means over the other runs take off each run, and bin [runs, bins] (sum of squares
+    over samples, Nm^2), and those means at every sample [run][n]. places: bin of every sample.
+    """
+    sums, counts = np.zeros((len(parts), bins)), np.zeros((len(parts), bins))
+    for r, (place, x) in enumerate(zip(places, parts, strict=True)):
+        good = np.isfinite(x)
+        sums[r] = np.bincount(place[good], x[good], minlength=bins)
+        counts[r] = np.bincount(place[good], minlength=bins)
+    others = (sums.sum(axis=0) - sums) / (counts.sum(axis=0) - counts + _PRIOR_S / step_s)
+    # sum of x^2 - (x - m)^2 over a bin
+    explained: FloatArray = 2.0 * others * sums - others**2 * counts
+    return explained, [others[r][place] for r, place in enumerate(places)]
+
+
+def locate(  # noqa: PLR0917
+    runs: Sequence[RunData],
+    channel: Channel,
+    parts: Sequence[FloatArray],
+    limits: EventLimits | None,
+    lines: Sequence[Line],
+    maps: Mapping[str, AxisMap],
+) -> list[Location]:
+    """Return the locations of a channel's residual [run][n], first the one that explains most, at most MOST.
+
+    limits: None for a gap that has causes or none: events and wandering are left out, and an axis need not be certain;
+    maps: of this residual. Of a gap that is not explained an axis whose map could be chance is no location.
+    """
+    now = list(parts)
+    whole = float(np.nanmean(np.concatenate(now) ** 2))
+    out: list[Location] = []
+    while len(out) < MOST:
+        used = [t.axis for t in out]  # empty names: events, seconds, lines
+        axis = _best_axis(runs, channel, now, used, maps, LEAST * whole, certain=limits is not None)
+        rest = now if axis is None else [x - y for x, y in zip(now, axis.prediction, strict=True)]
+        found = [] if axis is None else [Location(axis.energy_nm2, axis.axis, _descending(axis.bins))]
+        found += [
+            Location(0.5 * x.amplitude_nm**2, line=x) for x in lines if all(t.line is not x for t in out)
+        ]
+        masked = now
+        if limits is not None and not any(t.burst is not None and t.burst.what == "events" for t in out):
+            seen = events(runs, channel, rest, limits.ar, limits.step_s, limits.jump_nm)
+            if seen is not None:
+                found.append(Location(seen.burst.excess_nm2, burst=seen.burst))
+                masked = [np.where(m, np.nan, x) for m, x in zip(seen.masks, now, strict=True)]
+                rest = [np.where(m, np.nan, x) for m, x in zip(seen.masks, rest, strict=True)]
+        if limits is not None and not any(t.burst is not None and t.burst.what == "seconds" for t in out):
+            off = wandering(runs, {channel: rest}, limits.step_s, {channel: limits.wander_nm})
+            found += [Location(b.excess_nm2, burst=b) for b in off]
+        best = max(found, key=lambda t: t.energy_nm2, default=None)
+        if best is None or best.energy_nm2 < LEAST * whole:
+            break
+        out.append(best)
+        if best.axis and axis is not None:
+            now = [x - y for x, y in zip(now, axis.prediction, strict=True)]
+        elif best.burst is not None and limits is not None:
+            now = masked if best.burst.what == "events" else _less_seconds(now, limits.step_s)
+    return out
+
+
+def _descending(explained: FloatArray) -> tuple[int, ...]:
+    """Return the bins that explain something, the largest first."""
+    return tuple(int(k) for k in np.argsort(-explained) if explained[k] > 0.0)
+
+
+def _less_seconds(parts: Sequence[FloatArray], step_s: float) -> list[FloatArray]:
+    """Return the residual less its mean over every second [run][n]."""
+    block = max(2, round(BLOCK_S / step_s))
+    out = []
+    for x in parts:
+        mean, use = block_means(x, block)
+        level = np.zeros(len(x))
+        level[: len(mean) * block] = np.repeat(np.where(use, mean, 0.0), block)
+        out.append(x - level)
+    return out
+
+
+def _best_axis(  # noqa: PLR0917
+    runs: Sequence[RunData],
+    channel: Channel,
+    parts: Sequence[FloatArray],
+    used: Sequence[str],
+    maps: Mapping[str, AxisMap],
+    least_nm2: float,
+    *,
+    certain: bool,
+) -> _Axis | None:
+    """Return the axis that explains most of what is left; certain: none that could be chance, by its map while nothing is
+    taken out (`used` is empty), else by a map of what is left.
+    """
+    step_s = float(np.median(np.diff(runs[0].time_s)))
+    count = max(sum(int(np.isfinite(x).sum()) for x in parts), 1)
+    ranked: list[tuple[float, str, FloatArray, list[FloatArray], list[FloatArray] | None, FloatArray]] = []
+    for axis, drawn in maps.items():
+        if axis in used or (certain and not used and drawn.p >= SIGNIFICANT):
+            continue
+        edges, bins = drawn.edges, len(drawn.edges) - 1
+        values = [axis_values(run.axes[channel.joint], axis) for run in runs]
+        places = [np.clip(np.searchsorted(edges, v, side="right") - 1, 0, bins - 1) for v in values]
+        for side in directions(runs, channel):
+            explained, means = explained_by_bins(places, signed(parts, side), bins, step_s)
+            explained /= count
+            if explained.sum() > least_nm2 and (explained.sum(axis=1) > 0.0).sum() >= _FEWEST_RUNS:
+                ranked.append((float(explained.sum()), axis, explained, signed(means, side), side, edges))
+    ranked.sort(key=lambda item: -item[0])
+    for energy, axis, explained, prediction, side, edges in ranked:
+        p = 0.0
+        if certain and used:
+            values = [axis_values(run.axes[channel.joint], axis) for run in runs]
+            block = max(2, round(BLOCK_S / step_s))
+            rng = np.random.default_rng(0)
+            p = axis_map(channel, axis, edges, values, signed(parts, side), block, rng).p
+        if p < _BEYOND:
+            return _Axis(axis, energy, prediction, explained.sum(axis=0))
+    return None
+
+
 def _causes(dataset: Dataset, refined: Refined, channel: Channel) -> list[FloatArray]:
     """Return what the causes explain, per run [n]: before less after, the runs' own changes in neither."""
     return [
@@ -384,7 +384,7 @@ def _after(dataset: Dataset, refined: Refined) -> dict[Channel, list[FloatArray]
     return out
 
 
-def _calm(dataset: Dataset, refined: Refined) -> dict[Channel, list[FloatArray]]:
+def _before(dataset: Dataset, refined: Refined) -> dict[Channel, list[FloatArray]]:
     """Return the residual with the joint files, less what each run has of its own [run][n]."""
     after = _after(dataset, refined)
     return {c: [a + b for a, b in zip(after[c], _causes(dataset, refined, c), strict=True)] for c in after}
@@ -394,7 +394,7 @@ def traces(dataset: Dataset, refined: Refined) -> tuple[Trace, ...]:
     """Return the residual before and after for plots, thinned, one per run and channel."""
     out = []
     after = _after(dataset, refined)
-    raw = _calm(dataset, refined)
+    raw = _before(dataset, refined)
     for r, run in enumerate(dataset.runs):
         for channel in run.channels:
             every = max(1, len(run.time_s) // _TRACE_POINTS)

@@ -161,7 +161,7 @@ def leftover(dataset: Dataset, refined: Refined, noise: Noise, joints: Mapping[i
     whole = less_nuisances(dataset, refined)
     found = _bursts(dataset, whole, noise, joints)
     # maps and lines of what is no event: a few moments say nothing about a condition
-    residuals = {c: _calm(parts, found.get(c)) for c, parts in whole.items()}
+    residuals = {c: _without_rare_events(parts, found.get(c)) for c, parts in whole.items()}
     maps = axis_maps(refined.runs, residuals, dataset.step_s)
     significant = tuple(
         m for m in maps if m.p < SIGNIFICANT and m.energy_nm2 > _least(joints[m.channel.joint])
@@ -185,7 +185,7 @@ def leftover(dataset: Dataset, refined: Refined, noise: Noise, joints: Mapping[i
     return Leftover(tuple(maps), significant, burst, lines, limits)
 
 
-def _calm(parts: Sequence[FloatArray], found: Events | None) -> list[FloatArray]:
+def _without_rare_events(parts: Sequence[FloatArray], found: Events | None) -> list[FloatArray]:
     """Return the residual without its events where they are rare [run][n]."""
     if found is None or found.part >= MOST_OF_THE_TIME:
         return list(parts)

@@ -271,7 +271,7 @@ def _axes(s: JointSignals, samples: int) -> dict[str, FloatArray]:
 
 
 def gain_columns(candidates: Sequence[EffectCandidate]) -> set[int]:
-    """Return the columns of the torque sensor's gain (see `whitening.saturated_residuals`)."""
+    """Return the columns of the torque sensor's gain (see `noise.saturated_residuals`)."""
     return {k for c in candidates if c.effect.name == "sensor_gain" for k in c.columns}
 
 

@@ -141,7 +141,7 @@ class Search:
             return False
         for one in chosen:
             if one.key == candidate.key and (
-                candidate.effect.name not in _WAVES or _order(one) == _order(candidate)
+                candidate.effect.name not in _WAVES or order_of(one) == order_of(candidate)
             ):
                 return False
         return True
@@ -263,5 +263,6 @@ def within(candidate: EffectCandidate, coefficients: Sequence[float]) -> bool:
     return all(p.low <= values[p.name] <= p.high for p in candidate.effect.parameters if p.name in values)
 
 
-def _order(candidate: EffectCandidate) -> float:
+def order_of(candidate: EffectCandidate) -> float:
+    """Return the order per motor revolution of a wave, 0 for what is none."""
     return float(candidate.term.basis[0].get("order_per_motor_rev", 0.0))

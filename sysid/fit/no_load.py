@@ -22,6 +22,7 @@ from jtqd.estimator.losses import FrictionModel
 from jtqd.sysid.fit.efficiency import SAME_VELOCITY_RAD_S
 from jtqd.sysid.fit.friction import COULOMB, VISCOUS, FitError, Term, student_975
 from jtqd.sysid.fit.plateaus import Plateau
+from jtqd.sysid.text import counted
 
 NO_LOAD_SHARE: Final = 0.05
 """Share of rated torque that still counts as no load."""
@@ -63,7 +64,8 @@ def fit_no_load(plateaus: Sequence[Plateau], joint: Joint) -> NoLoadFit:
     distinct = int(np.count_nonzero(np.diff(speeds, prepend=-1.0) > SAME_VELOCITY_RAD_S))
     if distinct < FEWEST_VELOCITIES:
         raise FitError(
-            f"found {distinct} velocities at no load ({len(plateaus)} plateaus), expected at least {FEWEST_VELOCITIES}: "
+            f"found {counted(distinct, 'velocity', 'velocities')} at no load ({counted(len(plateaus), 'plateau')}), "
+            f"expected at least {FEWEST_VELOCITIES}: "
             "the joint driven round by the other one at zero current"
         )
     nm_per_a = joint.gear_ratio * joint.torque_constant_nm_per_a

@@ -1,4 +1,4 @@
-"""Parameters refined on runs by the equations, the noise floor of repetitions, rests, folding, and joints put together."""
+"""Parameters refined on runs by the equations, noise floor of repetitions, current at rest, effects put into the file."""
 
 from __future__ import annotations
 
