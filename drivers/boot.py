@@ -91,6 +91,7 @@ def _boot_nodes(
     absent: dict[int, BootError] = {}
 
     def attempt(node: int, step: Callable[[], None]) -> None:
+        """Do one step; an optional node that fails is absent from then on."""
         try:
             step()
         except BootError as error:
@@ -99,13 +100,11 @@ def _boot_nodes(
             absent[node] = error
             booted.pop(node, None)
 
+    def configure(profile: Profile) -> None:
+        booted[profile.node_id] = _configure(network, request, profile, heartbeats)
+
     for profile in request.profiles:
-        node = profile.node_id
-
-        def configure(profile: Profile = profile, node: int = node) -> None:
-            booted[node] = _configure(network, request, profile, heartbeats)
-
-        attempt(node, configure)
+        attempt(profile.node_id, partial(configure, profile))
     for node in list(booted):
         attempt(node, partial(_require_heartbeat, heartbeats, node, wait_s))
     foreign.require_none()

@@ -99,7 +99,7 @@ class NodeBoot:
         self._notes: list[str] = []
 
     def run(self, device_type: int) -> BootedNode:
-        """All steps between `check_device_type`, whose result it takes, and error control and NMT start."""
+        """Do all steps between `check_device_type`, whose result it takes, and error control and NMT start."""
         serial = self.check_identity()
         self.check_temperature()
         self.configure_pdos()
@@ -126,7 +126,7 @@ class NodeBoot:
         )
 
     def check_device_type(self) -> int:
-        """1000h: the low word is the number of the device profile (402, 404)."""
+        """Check 1000h, whose low word is the number of the device profile (402, 404), and return it."""
         found = self._objects.number((0x1000, 0), 4, letter="B")
         number = self._profile.profile_number
         if found & 0xFFFF != number:
@@ -137,7 +137,7 @@ class NodeBoot:
         return found
 
     def check_identity(self) -> int:
-        """1018h:1..4 against what is expected; returns the serial number (0: the device has none)."""
+        """Check 1018h:1..4 and 100Ah against the profile; return the serial number (0: the device has none)."""
         serial = 0
         for subindex, (field, name, letter) in enumerate(_IDENTITY, 1):
             expected = getattr(self._profile.identity, field)
@@ -153,7 +153,7 @@ class NodeBoot:
         return serial
 
     def _check_software(self) -> None:
-        """100Ah; jtqd loads no programs into its nodes, so another version is refused and not replaced."""
+        """Check 100Ah; jtqd loads no programs into its nodes, so another version is refused and not replaced."""
         expected = self._profile.identity.software
         if expected is None:
             return
@@ -165,7 +165,7 @@ class NodeBoot:
             raise mismatch(self._node, key, name, expected=expected, found=found, letter="H")
 
     def check_temperature(self) -> None:
-        """3001h must be there on a drive whose temperature is asked for; its value does not matter here."""
+        """Require 3001h of a drive whose temperature is asked for; its value does not matter here."""
         profile = self._profile
         if (
             isinstance(profile, DriveProfile)
@@ -179,7 +179,7 @@ class NodeBoot:
             )
 
     def configure_pdos(self) -> None:
-        """The profile's TPDOs, each written in the order of CiA 301; other TPDOs of 1..4 are switched off."""
+        """Write the profile's TPDOs, each in the order of CiA 301; switch off the others of 1..4."""
         wanted = {(pdo.cob_id - 0x80) // 0x100: pdo for pdo in self._profile.tpdos}
         for number in range(1, _TPDO_COUNT + 1):
             pdo = wanted.get(number)
@@ -215,13 +215,13 @@ class NodeBoot:
         self._objects.require((communication, 1), enabled, 4, "COB-ID")
 
     def _configure_timer(self, communication: int) -> None:
-        """Event timer, and inhibit time where the node has one: a value that flickers must not fill the bus."""
+        """Set event timer, and inhibit time where the node has one: a value that flickers must not fill the bus."""
         if self._objects.read((communication, _INHIBIT_TIME)) is not None:
             self._objects.put((communication, _INHIBIT_TIME), 10 * EVENT_MS, 2, "inhibit time in 100 us")
         self._objects.put((communication, _EVENT_TIMER), EVENT_MS, 2, "event timer in ms")
 
     def configure_sync(self) -> None:
-        """1005h must be the SYNC that jtqd sends; 1019h, where the node has it, announces the counter byte."""
+        """Check that 1005h is jtqd's SYNC; announce the counter byte in 1019h where the node has it."""
         found = self._objects.number((0x1005, 0), 4)
         wanted = self._settings.sync_cob_id
         if found & CAN_ID != wanted:
@@ -233,7 +233,7 @@ class NodeBoot:
             self._objects.put((0x1019, 0), overflow, 1, "SYNC counter overflow")
 
     def configure_heartbeat(self) -> None:
-        """The node's heartbeat, and on drives the supervision of the master's: its loss must stop them."""
+        """Set the node's heartbeat, and on drives the supervision of the master's, whose loss must stop them."""
         settings = self._settings
         if isinstance(self._profile, DriveProfile):
             consumer = settings.master_node << 16 | settings.master_timeout_ms
@@ -241,7 +241,7 @@ class NodeBoot:
         self._objects.put((0x1017, 0), settings.heartbeat_ms, 2, "producer heartbeat time")
 
     def configure_error_behaviour(self) -> None:
-        """1029h:1 where the node has it; a note for a drive whose 6007h lets it run on without its master."""
+        """Set 1029h:1 where the node has it; note a drive whose 6007h lets it run on without its master."""
         behaviour = self._settings.error_behaviour
         if behaviour is None:
             return
@@ -255,7 +255,7 @@ class NodeBoot:
                 )
 
     def sign(self, sha256: str) -> bool:
-        """1020h, where the node has it: it keeps the signature until anybody changes its configuration (CiA 301)."""
+        """Write the signature to 1020h where the node has it; it holds until the configuration is changed (CiA 301)."""
         if self._objects.read((VERIFY_CONFIGURATION, 1)) is None:
             return False
         for subindex, word in enumerate(signature(sha256), 1):
@@ -263,7 +263,7 @@ class NodeBoot:
         return True
 
     def read_scaling(self) -> tuple[DriveScaling | SensorScaling, float | None]:
-        """Scaling objects, checked for plausibility; (scaling, gear ratio)."""
+        """Read the scaling objects and check them for plausibility; return (scaling, gear ratio)."""
         profile = self._profile
         values = {key: self._objects.number(key, 4) for key in profile.scaling_objects}
         if isinstance(profile, DriveProfile):

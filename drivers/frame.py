@@ -16,7 +16,6 @@ FRAME = struct.Struct("<IB3x8s")
 FRAME_SIZE = FRAME.size
 MAX_LENGTH = 8
 
-ECHO_OFFSET = 5
 ECHO_BIT = 1
 """Bit 0 of byte 5 (padding): on a unix bus the sender asks the hub for an echo of this frame."""
 

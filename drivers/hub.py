@@ -210,10 +210,6 @@ class Hub:
         if self.wire is not None:
             self._advance(self.wire)
 
-    def poll(self, timeout_s: float | None = 0.0) -> None:
-        """Do what is ready; the same as `run_once`."""
-        self.run_once(timeout_s)
-
     @property
     def clients(self) -> int:
         """Connected sockets; local ports do not count."""

@@ -27,7 +27,7 @@ from jtqd.drivers.sdo import (
 )
 
 # Data types of CiA 301 7.4.7 that are numbers, with their struct letters. A BOOLEAN takes a byte in an SDO.
-BOOLEAN, REAL32, VISIBLE_STRING, OCTET_STRING, DOMAIN, REAL64 = 0x01, 0x08, 0x09, 0x0A, 0x0F, 0x11
+BOOLEAN, REAL32, VISIBLE_STRING, REAL64 = 0x01, 0x08, 0x09, 0x11
 _LETTERS = {
     BOOLEAN: "B",
     0x02: "b",
@@ -64,22 +64,22 @@ class Entry:
 
     @property
     def readable(self) -> bool:
-        """A client may upload it."""
+        """Whether a client may upload it."""
         return self.access != "wo"
 
     @property
     def writable(self) -> bool:
-        """A client may download it."""
+        """Whether a client may download it."""
         return self.access in ("wo", "rw", "rwr", "rww")
 
     @property
     def is_integer(self) -> bool:
-        """A whole number of 8..64 bits: what a PDO may map."""
+        """Whether it is a whole number of 8..64 bits, which a PDO may map."""
         return self.data_type in _LETTERS and self.data_type != BOOLEAN
 
     @property
     def signed(self) -> bool:
-        """The number is a two's complement one."""
+        """Whether the number is a two's complement one."""
         return self.data_type in _SIGNED
 
     @property

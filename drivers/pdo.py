@@ -19,7 +19,6 @@ from jtqd.drivers.object_dictionary import ObjectStore
 from jtqd.drivers.sdo import DEVICE_STATE, NOT_MAPPABLE, PDO_TOO_LONG, VALUE_RANGE, SdoAbort, label
 
 MAX_PDO_BYTES = 8
-MAX_ENTRIES = 8  # whole bytes only: 8 entries fill a frame
 LOWEST_PDO_ID, HIGHEST_PDO_ID = (
     0x181,
     0x57F,

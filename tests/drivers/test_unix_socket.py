@@ -145,9 +145,9 @@ def test_a_bus_in_a_deep_directory(tmp_path):
         Hub(str(path))
     one, two = open_frame_socket(bus, None), open_frame_socket(bus, None)
     for _ in range(3):
-        hub.poll(0.0)
+        hub.run_once(0.0)
     one.send(SYNC)
-    hub.poll(0.1)
+    hub.run_once(0.1)
     assert two.wait(1.0)
     assert two.receive() == 1
     for each in (one, two, hub):
