@@ -150,7 +150,7 @@ class JointConfig:
     network: NetworkFile | None
     sensor_channel: int | None
     temperature: bool
-    """The drive tells the joint's temperature (3001h by TPDO3)."""
+    """The drive sends the joint's temperature (3001h by TPDO3)."""
     mandatory: bool
     """jtqd does not start without it."""
     joint_data: bytes = field(default=b"", repr=False)
@@ -319,7 +319,7 @@ class _File:
 
 @dataclass(frozen=True)
 class Config:
-    """Everything jtqd was told. `text` is the YAML as read, for the log; `sha256` its hash."""
+    """Configuration of jtqd with its joint files and networks. `text`: the YAML as read, for the log; `sha256`: its hash."""
 
     path: Path
     text: str

@@ -86,6 +86,13 @@ class Section:
         """Return (not raise) the error of one key, for checks that this class does not know."""
         return ConfigError(f"{self.where}: {self._at(key)}: found {shown(found)}, expected {expected}")
 
+    def as_written(self, key: str, value: object) -> object:
+        """Return the value of a dotted key as it stands in the file when it equals `value` (1 for 1.0), else `value`."""
+        found: Any = self._mapping
+        for part in key.split("."):
+            found = found.get(part) if isinstance(found, Mapping) else None
+        return found if found == value else value
+
     def _take(self, key: str, default: object, expected: str) -> Any:
         self._known[key] = None
         if key in self._mapping:

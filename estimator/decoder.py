@@ -111,7 +111,8 @@ def decode(kind: type[T], section: Section, **given: Any) -> T:
     try:
         return kind(**given)
     except FieldError as error:
-        raise section.error(error.key, error.found, error.expected) from None
+        found = section.as_written(error.key, error.found)
+        raise section.error(error.key, found, error.expected) from None
 
 
 def check(value: Any, where: str) -> None:

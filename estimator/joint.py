@@ -100,7 +100,7 @@ class AdditiveLoss:
 
     load_nodes_nm: increasing, the lists of both sides as long as it (else ConfigError); velocity_max_rad_s:
     fastest measured, faster counts as this; temperature_c: of the fit; thermal_viscous_nms_per_rad: friction
-    that falls as exp(-viscous_per_k (T - temperature_c)).
+    that falls as exp(-viscous_per_k (T - temperature_c)). The ranges hold in files; a fit may look beyond them.
     """
 
     load_nodes_nm: Annotated[tuple[float, ...], limits("Nm", length=(2, MAX_NODES))]
@@ -116,7 +116,6 @@ class AdditiveLoss:
         nodes = self.load_nodes_nm
         if len(nodes) < 2 or not all(a < b for a, b in pairwise(nodes)):
             raise FieldError("fused.loss", "load_nodes_nm", list(nodes), "at least 2 rising numbers")
-        check(self, "fused.loss")
         for name in ("positive", "negative"):
             side = getattr(self, name)
             for key in ("constant_nm", "viscous_nms_per_rad", "quadratic_nms2_per_rad2"):
@@ -128,7 +127,8 @@ class Torsion:
     """Torque from both encoders: tau = K d + K3 d^3 + D d' + H z, d = theta_m/G - theta_l - zero - kinematic error [rad].
 
     z follows d through a Maxwell-slip element, dz = dd/travel held in [-1, 1]: elastic hysteresis of half width H.
-    Kinematic error: sum over orders n per motor revolution of c cos(n theta_m) + s sin(n theta_m).
+    Kinematic error: sum over orders n per motor revolution of c cos(n theta_m) + s sin(n theta_m). The ranges hold in
+    files; a fit may look beyond them.
     """
 
     stiffness_nm_per_rad: Annotated[float, limits("Nm/rad", gt=0.0)]
@@ -142,7 +142,6 @@ class Torsion:
     damping_nms_per_rad: Annotated[float, limits("Nms/rad", ge=0.0)] = 0.0
 
     def __post_init__(self) -> None:
-        check(self, "fused.torsion")
         for key in ("cos_rad", "sin_rad"):
             orders = len(self.orders_per_motor_rev)
             _check_length("fused.torsion", key, getattr(self, key), orders, "orders_per_motor_rev")

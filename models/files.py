@@ -1,4 +1,4 @@
-"""Reading of joint files and other YAML: checked values out; errors are one-line ConfigErrors."""
+"""Read joint files and other YAML; every error is a ConfigError of one line."""
 
 from __future__ import annotations
 

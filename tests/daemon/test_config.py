@@ -6,8 +6,9 @@ from typing import Any
 import pytest
 import yaml
 
-from jtqd.daemon.config import load_config
+from jtqd.daemon.config import Identity, Realtime, RecordingSettings, SafetySettings, load_config
 from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import shipped
 
 BENCH = yaml.safe_load(shipped("bench.yaml").read_text())
@@ -33,6 +34,33 @@ def test_the_shipped_configuration_is_read() -> None:
     assert config.sensor is not None
     assert config.period_ns == 1_000_000
     assert config.node_id == 0x20
+    assert (config.input_wait_ns, config.input_deadline_ns) == (500_000, 850_000)
+    assert config.estimator == EstimatorSettings(method="fused", bandwidth_rad_s=200.0)
+    assert config.realtime == Realtime(80, None, True)
+    assert all(joint.network is not None and joint.temperature for joint in config.joints)
+
+
+def test_what_is_left_out_has_its_default(tmp_path: Path) -> None:
+    """Old configurations say less: two joints are enough, and the times follow from the period and the heartbeat."""
+
+    def change(content: dict[str, Any]) -> None:
+        for key in set(content) - {"node_id", "joint_1", "joint_2", "estimator"}:
+            del content[key]
+        for joint in ("joint_1", "joint_2"):
+            del content[joint]["sensor_channel"]
+        content["sync"] = {"period_us": 2000}
+        content["nodes"] = {"heartbeat_ms": 200}
+        content["inputs"] = None
+
+    config = load_config(write(tmp_path, change))
+    assert (config.bitrate, config.period_ns, config.counter_overflow) == (1_000_000, 2_000_000, 240)
+    assert (config.input_wait_ns, config.input_deadline_ns) == (1_000_000, 1_700_000)
+    assert (config.heartbeat_ms, config.heartbeat_timeout_ms, config.emcy_inhibit_ms) == (200, 600, 10)
+    assert (config.error_behaviour, config.boot_timeout_s, config.sensor) == (0, 2.0, None)
+    assert (config.safety, config.recording) == (SafetySettings(), RecordingSettings())
+    assert (config.realtime, config.metrics_file) == (Realtime(80, None, True), None)
+    assert config.joints[0].identity == Identity(None, None, None, None, None)
+    assert (config.joints[0].given, config.joints[0].mandatory) == ({}, True)
 
 
 def put(key: str, value: Any) -> Any:
@@ -69,6 +97,14 @@ def drop(key: str) -> Any:
         (put("sensor.node", 32), ["sensor.node", "32", "node_id"]),
         (put("nodes.heartbeat_ms", 0), ["nodes.heartbeat_ms", "found 0"]),
         (put("realtime.priority", 99), ["realtime.priority", "99"]),
+        (put("inputs.wait_us", 1001), ["inputs.wait_us", "found 1001", "a number in us from 50 to 1000"]),
+        (put("inputs.deadline_us", 499), ["inputs.deadline_us", "found 499", "from 500 to 950"]),
+        (put("nodes.heartbeat_timeout_ms", 199), ["nodes.heartbeat_timeout_ms", "from 200 to 65535"]),
+        (put("nodes.error_behaviour", "stop"), ["nodes.error_behaviour", "'stop'", "'stopped'"]),
+        (put("joint_1.given", {"6091h:1": -1}), ["joint_1.given.6091h:1", "found -1", ">= 0"]),
+        (put("joint_1.identity", {"vendor": 1 << 32}), ["joint_1.identity.vendor", "from 0 to 4294967295"]),
+        (drop("sensor"), ["joint_1.sensor_channel", "found 1", "no channel without a sensor"]),
+        (put("metrics", {}), ["metrics.file", "missing", "a text"]),
         (put("joint_1.temperature", 1), ["joint_1.temperature", "found 1", "true or false"]),
         (put("joint_1.temperatur", True), ["joint_1.temperatur", "did you mean 'temperature'"]),
         (put("joint_1.network", {"file": "bench.yaml", "sha256": "00"}), ["sha256", "expected 00"]),

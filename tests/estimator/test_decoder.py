@@ -107,7 +107,7 @@ ENDLESS.append(ENDLESS)
         ({"inner": {"gain": 1, "at": [1.0, math.nan]}}, "found [1.0, nan], expected a list of 1 to 3 finite"),
         ({"inner": {"gain": 1, "at": {1.0}}}, "found {1.0}, expected a list of 1 to 3 finite numbers in rad"),
         ({"inner": {"gain": 1, "at": ENDLESS}}, "expected a list of 1 to 3 finite numbers in rad"),
-        ({"other": LEAST["inner"]}, "'top.other.gain': found 2.0, expected another gain"),
+        ({"other": LEAST["inner"]}, "'top.other.gain': found 2, expected another gain"),
     ],
 )
 def test_what_is_wrong_is_named_in_one_line(change: dict[str, Any], message: str) -> None:
