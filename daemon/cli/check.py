@@ -182,15 +182,15 @@ def _boot(bus: str, config: Config) -> CheckResult:
     try:
         child.tell(boot_request(config, bus))
         child.end_of_input()
-        report = child.answer(60.0)
+        answer = child.answer(60.0)
     finally:
         child.end()
-    if not report["ok"]:
+    if not answer["ok"]:
         hint = (
             "identity, mapping or scaling of a node is not what the configuration says, or the node is silent"
         )
-        return CheckResult("boot", FAIL, str(report["error"]["message"]), hint)
-    nodes = ", ".join(sorted(report["nodes"]))
+        return CheckResult("boot", FAIL, str(answer["error"]["message"]), hint)
+    nodes = ", ".join(sorted(answer["nodes"]))
     return CheckResult(
         "boot", GOOD, f"nodes {nodes}: identity, mapping and scaling as configured, operational"
     )
