@@ -84,7 +84,7 @@ def parser() -> argparse.ArgumentParser:
     size(
         "--seed", type=natural, default=0, metavar="N", help="of trajectories and emulated bench (default 0)"
     )
-    size("--evaluations", type=count, metavar="N", help="of the genetic algorithm, per trajectory")
+    size("--evaluations", type=count, metavar="N", help="motions that each search tries, per trajectory")
     return made
 
 

@@ -309,7 +309,7 @@ class Scale:
 
     Attributes:
         runs: number of Fourier runs. seconds: length of one. hold_s: of a point at constant velocity.
-        seed: of the trajectories. evaluations: of each search of the genetic algorithm.
+        seed: of the trajectories. evaluations: of each search.
         quick: a small campaign of the same kind: enough points for every fit, too few for a good one.
         limits: of the plan; the Fourier runs stay well within them.
         joints: of the bench, for what a motion takes; None: those that ship.

@@ -19,7 +19,6 @@ import yaml
 from jtqd.sysid.diagnosis.findings import Trace
 from jtqd.sysid.diagnosis.report.views import evidence_views
 from jtqd.sysid.diagnosis.report.words import effect_title
-from jtqd.sysid.report import page as theme
 from tests.sysid.diagnosis import findings_examples as examples
 
 pytest.importorskip("jinja2")
@@ -107,15 +106,6 @@ def test_whoever_cannot_see_the_pictures_is_told_what_they_show(pages: dict[str,
     assert levels[0] == 1
     assert levels.count(1) == 1
     assert all(after <= before + 1 for before, after in itertools.pairwise(levels))
-
-
-def test_text_is_readable_on_its_ground_in_light_and_dark() -> None:
-    for colours in (theme.LIGHT, theme.DARK):
-        for role in (*theme.TEXT,):
-            for ground in ("paper", "panel"):
-                assert theme.contrast(colours[role], colours[ground]) >= 4.5, (role, ground)
-    assert theme.contrast("#000000", "#ffffff") == pytest.approx(21.0)
-    assert theme.LIGHT.keys() == theme.DARK.keys()
 
 
 def test_pictures_follow_the_page_into_the_dark(pages: dict[str, str]) -> None:
