@@ -1,1 +1,5 @@
-"""jtqd: configuration, fixed-step loop, recorder, supervision and the command lines."""
+"""The daemon `jtqd` and the toolbox `jtq`: configuration, loop, CANopen master, recorder, supervision, commands.
+
+`jtqd` and `jtq` are the entry points, `config` what a configuration file holds; each folder is one process or one concern of them.
+Imports drivers, estimator and models; never torch, scipy, sysid or sim_can: the bench is a process, a command a module's name.
+"""
