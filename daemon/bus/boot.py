@@ -148,7 +148,7 @@ class ReturningNodes:
             now_s: CLOCK_MONOTONIC.
         """
         if self._child is not None:
-            running = self._child.alive()  # asked first: what it said before its end is then there to be read
+            running = self._child.alive()  # asked first: its last answer is then there to be read
             answer = self._child.poll_answer()
             if answer is None and running:
                 return None

@@ -90,7 +90,7 @@ class BusState:
     def alive(self) -> BusChange | None:
         """A frame of somebody else has come: the interface is up, and its controller is not bus-off (any more).
 
-        Some drivers tell no restart, and an interface that was set up starts error active without a word.
+        Some drivers report no restart, and an interface that was set up starts error active without a message.
         """
         return self._become(ACTIVE) if self.state in (BUS_OFF, DOWN) else None
 

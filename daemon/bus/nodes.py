@@ -209,7 +209,7 @@ CHANGED = "its configuration was changed "
 
 
 class ConfigurationMismatch(NamedTuple):
-    """What a reading has shown: with `changed`, the node is not to be used before a new boot; else it is only told."""
+    """What a reading has shown: with `changed`, the node is not to be used before a new boot; else it is only logged."""
 
     changed: bool
     text: str

@@ -183,7 +183,7 @@ class JointTemperature:
 
 
 UNKNOWN = JointTemperature(0, 0, "none", 0)
-"""Of a joint whose drive tells none."""
+"""Of a joint whose drive sends none."""
 
 
 def input_pdos(config: Config) -> list[InputPdo]:
@@ -212,7 +212,7 @@ def sensor_index(config: Config, channel: int | None) -> int | None:
 
 
 def joint_temperatures(config: Config) -> list[JointTemperature]:
-    """Temperature of each joint whose drive tells one, in the order of the joints; all unknown yet."""
+    """Temperature of each joint whose drive sends one, in the order of the joints; all unknown yet."""
     life = round(TEMPERATURE_LIFE_S * 1e9 / config.period_ns)
     return [
         JointTemperature(cob_id, node, f"{cob_id:03X}h drive {node} TPDO3", life)

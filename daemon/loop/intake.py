@@ -115,7 +115,7 @@ class NodeTrust:
         self.restarts: dict[int, int] = {}
 
     def heartbeat(self, node_id: int, state: int, stamp_ns: int) -> bool:
-        """A heartbeat of one byte; False for one that says an impossible state: it is none."""
+        """A heartbeat of one byte; False for one with an impossible state: it is none."""
         if state not in _NMT_STATES:
             return False
         self.states[node_id] = state

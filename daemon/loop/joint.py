@@ -56,7 +56,7 @@ class JointInputs:
         position: index of TPDO1 (motor position, link position).
         motion: index of TPDO2 (motor velocity, current, statusword).
         sensor: index of the sensor's PDO, None without reference.
-        temperature: index among the intake's temperatures, None where the drive tells none.
+        temperature: index among the intake's temperatures, None where the drive sends none.
         motor_rad_per_count, motor_rad_s_per_unit, link_rad_per_count, ampere_per_unit, sensor_nm_per_unit: scaling, SI.
     """
 

@@ -143,7 +143,7 @@ def _scaling(report: dict[str, Any], node: int, names: tuple[str, ...]) -> dict[
 def joint_inputs(config: Config, report: dict[str, Any]) -> list[JointInputs]:
     """Indices into `input_pdos` and the scaling that the boot read from the devices."""
     result = []
-    told = [joint.number for joint in config.joints if joint.temperature]
+    measured = [joint.number for joint in config.joints if joint.temperature]
     for number, joint in enumerate(config.joints):
         drive = _scaling(report, joint.node_id, _DRIVE_FACTORS)
         sensor_nm = 0.0
@@ -157,7 +157,7 @@ def joint_inputs(config: Config, report: dict[str, Any]) -> list[JointInputs]:
                 sensor=sensor_index(config, joint.sensor_channel),
                 **drive,
                 sensor_nm_per_unit=sensor_nm,
-                temperature=told.index(joint.number) if joint.temperature else None,
+                temperature=measured.index(joint.number) if joint.temperature else None,
             )
         )
     return result

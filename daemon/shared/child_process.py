@@ -20,7 +20,7 @@ class ChildError(Exception):
 
 
 class ChildSilence(ChildError):  # noqa: N818  (not an error of this side)
-    """It runs and has said nothing yet."""
+    """It runs and has not answered yet."""
 
 
 _LIBC = ctypes.CDLL(None)
@@ -94,7 +94,7 @@ class Child:
             pass
 
     def end_of_input(self) -> None:
-        """Nothing more will be told."""
+        """Close its standard input: nothing more will be sent."""
         assert self.process.stdin is not None
         try:
             self.process.stdin.close()
@@ -126,7 +126,7 @@ class Child:
         """
         deadline = time.monotonic() + timeout_s
         while True:
-            ended = not self.alive()  # asked first: what it said before its end is then in the pipe
+            ended = not self.alive()  # asked first: its last answer is then in the pipe
             found = self.poll_answer()
             if found is not None:
                 return found

@@ -124,8 +124,10 @@ _ROWS = (
         topic="fault",
         hold_s=_HOLD_S,
     ),
-    Definition("drive_off", JOINT, INFO, "the drive carries no current: {}", logged=False),
-    Definition("degraded", JOINT, INFO, "the network is not alone in charge: {}", logged=False),
+    Definition("drive_off", JOINT, INFO, "the drive carries no current: {}", hold_s=_HOLD_S, logged=False),
+    Definition(
+        "degraded", JOINT, INFO, "the network is not alone in charge: {}", hold_s=_HOLD_S, logged=False
+    ),
     Definition(
         "deviation",
         JOINT,
@@ -325,8 +327,8 @@ class Occurrences(NamedTuple):
 class _State:
     """One condition of one subject: present or not, since when, and which lines about it are due.
 
-    A begin that comes sooner than QUIET_S after the last line that told one is told together with its end, or with
-    those that follow: neither a flicker nor a flapping contact floods the log.
+    A begin sooner than QUIET_S after the last line about one is reported together with its end, or with those that
+    follow: neither a flicker nor a flapping contact floods the log.
     """
 
     def __init__(self, definition: Definition, subject: Subject) -> None:

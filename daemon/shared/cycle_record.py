@@ -91,7 +91,7 @@ class JointRecord(NamedTuple):
     link_position_rad: float
     sensor_torque_nm: float
     temperature_c: float
-    """Of the joint, as its drive told last; NaN where it told none for 2 s."""
+    """Of the joint, as its drive sent it last; NaN where it sent none for 2 s."""
     torque_nm: float
     sigma_nm: float
     tob_nm: float

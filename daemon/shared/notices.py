@@ -1,7 +1,7 @@
 """Events and lines of the supervisor in a bounded ring of memory: for the log's /events and /log.
 
 One writer (the supervisor), any number of readers (recorder, `jtq` tools). The file `notices` of the runtime directory holds
-the last `CAPACITY` notices; a reader that comes late is told how many it has missed, and nobody waits for anybody.
+the last `CAPACITY` notices; a reader that comes late gets the number of those it has missed, and nobody waits for anybody.
 
     notices = Notices(directory / FILE)                       # writer
     notices.add(WARNING, "heartbeat", 3, "node 3: no heartbeat for 0.3 s")

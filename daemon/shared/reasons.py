@@ -183,7 +183,7 @@ def sensor_reason(node: int | None, name: str, seen: JointView, view: View) -> s
         unready = "" if node is None else unready_reason(node, view)
         return unready or f"{name} not received in time"
     reasons = [text for bit, text in _SENSOR_STATUS.items() if seen.sensor_status & bit]
-    return f"{name} says {', '.join(reasons) or 'no number'}"
+    return f"{name} reports {', '.join(reasons) or 'no number'}"
 
 
 def silent_s(view: View, node: int, heartbeat_ms: int) -> float | None:

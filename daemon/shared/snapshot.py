@@ -99,7 +99,7 @@ class JointView(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """What one joint's inputs said in the same cycle, SI units; NaN where an input is missing."""
+    """Inputs of one joint in the same cycle, SI units; NaN where an input is missing."""
 
     current_a: float
     motor_position_rad: float
@@ -228,7 +228,7 @@ class Snapshot:
     With `attach` it takes over the memory that another loop has made, as it is; from `own` on it is this process's.
 
     Attributes:
-        orders: requests of the supervisor and what became of them: [resets asked, done, doubts told, seen].
+        orders: requests of the supervisor and what became of them: [resets asked, done, doubts reported, seen].
         counters: memory of the counters, one unsigned 64-bit word each, in the order of `COUNTERS`.
         work: histogram of the work per cycle, `WORK_BIN_NS` per bin, the last bin takes the rest.
         late: histogram of the SYNC's lateness, `LATE_BIN_NS` per bin.

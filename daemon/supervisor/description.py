@@ -1,4 +1,4 @@
-"""What a daemon says of itself in `about.json`, from its configuration."""
+"""Description of the running daemon for `about.json`, from its configuration."""
 
 from __future__ import annotations
 

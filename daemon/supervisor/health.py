@@ -128,7 +128,7 @@ class _PdoState:
 class PdoWatch:
     """Errors 8250h, 8210h and 8220h of each input PDO by itself, from the loop's counts.
 
-    The loop decides per cycle; this says what lasts. A PDO has timed out when it brought no valid input for
+    The loop decides per cycle; this reports what lasts. A PDO has timed out when it brought no valid input for
     `TIMEOUT_CYCLES` cycles in a row, and is back with the next valid one. A frame of a wrong length is never used: a short
     one cannot be, and of a longer one CiA 301 allows to take the first bytes, but a node that sends another length than
     was configured has lost its mapping, and then the first bytes are not what we think they are.
@@ -291,7 +291,9 @@ class Health:
         if joint.temperature is not None:
             # It comes twice a second: at the start nobody can have it yet.
             gone = not seen.input_flags & FLAG_TEMPERATURE and view.cycle * view.period_s > TEMPERATURE_LIFE_S
-            text = f"{joint.temperature} not received for {TEMPERATURE_LIFE_S:g} s, or it says not measured"
+            text = (
+                f"{joint.temperature} not received for {TEMPERATURE_LIFE_S:g} s, or reported as not measured"
+            )
             conditions.update("temperature_lost", subject, gone, now_s, text)
 
     def _observe_status(self, joint: _Joint, seen: JointView, limit_nm: float, now_s: float) -> None:

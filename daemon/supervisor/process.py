@@ -127,7 +127,7 @@ def boot_nodes(config: Config, bus: str, start_child: StartChild, stopped: Stopp
 
 
 def check_gears(config: Config, report: dict[str, Any]) -> str | None:
-    """What is wrong with a gear ratio that a device tells; None where all fit."""
+    """Check the gear ratios that the devices report; what is wrong with one, or None."""
     for number, booted in report["nodes"].items():
         wrong = gear_ratio_error(config, int(number), booted.get("gear_ratio"))
         if wrong is not None:
@@ -140,7 +140,7 @@ def wait_for(child: Child, stopped: Stopped) -> dict[str, Any] | None:
 
     Raises:
         ChildError: it ended, or kept silent for too long.
-        SupervisorError: it says that it has failed.
+        SupervisorError: it reports that it has failed.
     """
     deadline = time.monotonic() + _WARM_UP_TIMEOUT_S
     while not stopped():
@@ -198,7 +198,7 @@ class Supervisor:
         bus: SocketCAN interface, "unix:PATH" or "sim".
         config_path: the file, None for the one that ships.
         record: directory for logs, "none", or None for the default.
-        duration_s: end by itself after this time, None to run until told.
+        duration_s: end by itself after this time, None to run until stopped.
         live: where to serve viewers, None for no live view.
     """
 

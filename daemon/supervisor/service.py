@@ -193,7 +193,7 @@ class Service:
         return self._reload is not None and self._reload.running
 
     def not_handed_over(self, why: str) -> None:
-        """The running loop says why it has kept the bus."""
+        """Take the running loop's reason for having kept the bus."""
         if self._reload is not None and self._reload.running:
             self._reload_failed(self._reload.refused(why))
 

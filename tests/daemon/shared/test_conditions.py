@@ -122,14 +122,14 @@ def test_listeners_hear_each_change_once_and_in_order():
 def test_the_file_shows_what_is_present_the_worst_first(tmp_path):
     conditions, file = Conditions(), ConditionsFile(tmp_path)
     assert read_conditions(tmp_path) == []
-    conditions.update("drive_off", JOINT, True, 1.0, "drive 1: switch on disabled (6041h 0040h)")
+    conditions.update("late_loop", JOINT, True, 1.0)
     conditions.update("joint_fault", JOINT, True, 2.0, "the motor position jumped (motor_jump)")
     file.write(conditions.present())
     found = read_conditions(tmp_path)
     assert found == conditions.present()
     assert [(each.name, each.since_ns) for each in found] == [
         ("joint_fault", 2_000_000_000),
-        ("drive_off", 1_000_000_000),
+        ("late_loop", 1_000_000_000),
     ]
     assert worst(found, "joint 1") == found[0]
     assert worst(found, "joint 2") is None

@@ -72,9 +72,9 @@ def test_inputs_that_are_missing_from_the_first_cycle_on_are_told():
     ("flags", "status", "cause"),
     [
         (3, 0, "not received in time"),
-        (7, 1, "says not valid"),
-        (7, 2, "says positive overload"),
-        (7, 5, "says not valid, negative overload"),
+        (7, 1, "reports not valid"),
+        (7, 2, "reports positive overload"),
+        (7, 5, "reports not valid, negative overload"),
     ],
 )
 def test_the_sensor_has_its_own_line(flags, status, cause):
@@ -95,7 +95,7 @@ def warmth(known, *, seconds, start_s=100.0):
 def test_a_temperature_that_is_lost_and_comes_back_has_its_own_lines():
     lines = warmth(lambda t: not 1.0 <= t < 3.0, seconds=5.0)
     assert lines == [
-        "joint 1: temperature lost: 381h drive 1 TPDO3 not received for 2 s, or it says not measured",
+        "joint 1: temperature lost: 381h drive 1 TPDO3 not received for 2 s, or reported as not measured",
         "joint 1: temperature back after 2.0 s",
     ]
 
