@@ -6,7 +6,8 @@ import math
 
 import pytest
 
-from jtqd.sysid.report.numbers import counted, number, percent, with_interval, with_unit
+from jtqd.sysid.report.numbers import number, percent, with_interval, with_unit
+from jtqd.sysid.text import counted
 
 PLAIN_SPACE = str.maketrans("\u00a0\u202f", "  ")
 
