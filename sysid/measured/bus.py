@@ -56,7 +56,7 @@ _END_S = 120.0
 class BusRun:
     """One joint in one played run under one configuration, row by row of the log [n] (one row per cycle).
 
-    `published_nm` is what stood in the estimate PDO, NaN where it said "no torque". `reference_nm` is the
+    `published_nm` is what stood in the estimate PDO, NaN where it has no torque. `reference_nm` is the
     sensor as it came over the bus, filtered like the estimate; `offline_nm` the whole-run estimate from the
     file at the row that was played, NaN after the run's end.
     """
@@ -107,7 +107,7 @@ def configured(config: Path) -> tuple[tuple[Joint, Joint], EstimatorSettings]:
 
 
 def published_torque(frames: Records, joint: int) -> Array:
-    """Torque of joint 0 or 1 in the estimate PDO of each cycle [n]; NaN: none there, or it says "no torque"."""
+    """Torque of joint 0 or 1 in the estimate PDO of each cycle [n]; NaN: no PDO, or one without a torque."""
     raw = frames["frames"]
     at = (raw["id"] == ESTIMATE_COB_ID) & (np.arange(raw.shape[1]) < frames["frame_count"][:, None])
     data = raw["data"][np.arange(len(raw)), np.argmax(at, axis=1)]

@@ -156,7 +156,7 @@ def evaluate(joint_files: Path | None, date: str) -> tuple[list[Case], dict[tupl
 def table_lines(cases: list[Case]) -> list[str]:
     """RMSE per joint and run in Nm and in percent of rated torque, with what the fit did to it."""
     lines = [
-        f"{'joint':>5}  {'judged on':<20}{'fitted on':<20}"
+        f"{'joint':>5}  {'scored on':<20}{'fitted on':<20}"
         f"{'no friction':>16}{'before':>16}{'after':>16}  the fit made it"
     ]
     for case in cases:

@@ -43,7 +43,7 @@ def render(findings: Findings, made: str = "", effects: Mapping[str, Effect] | N
         "gain_sentence": gain_sentence(findings),
         "scope": _scope(findings),
         "has_gap": findings.verdict in {CAUSE, AMBIGUOUS, UNEXPLAINED},
-        "said": findings.verdict in {UNEXPLAINED, INSUFFICIENT},
+        "reasons_first": findings.verdict in {UNEXPLAINED, INSUFFICIENT},
         "causes": views.cause_views(findings, library() if effects is None else effects),
         "gaps": gap_views(findings.gaps),
         "evidence": evidence,

@@ -34,7 +34,7 @@ from jtqd.sysid.report.numbers import (
 _HOT: Final = 2.0
 """A bin with this many times its even share of the gap is marked."""
 _EVEN: Final = 1.5
-"""An axis without a bin above this many even shares tells nothing, and is shown on demand."""
+"""An axis without a bin above this many even shares is shown on demand only."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,8 @@ class PlaceView:
 
 @dataclass(frozen=True)
 class GapView:
-    """One balance of one joint; floor: share of the residual that is noise; places: the first of each axis; telling, even:
-    axes over which the gap is uneven, and the others.
+    """One balance of one joint; floor: share of the residual that is noise; places: the first of each axis; uneven_axes,
+    even_axes: axes over which the gap is uneven, and the others.
     """
 
     title: str
@@ -82,8 +82,8 @@ class GapView:
     floor: float
     floor_from: str
     places: tuple[PlaceView, ...]
-    telling: tuple[AxisView, ...]
-    even: tuple[AxisView, ...]
+    uneven_axes: tuple[AxisView, ...]
+    even_axes: tuple[AxisView, ...]
 
 
 def gap_views(gaps: Sequence[Gap]) -> list[GapView]:
@@ -95,7 +95,7 @@ def _gap(gap: Gap) -> GapView:
     axes: dict[str, list[Place]] = {}
     for each in gap.map:
         axes.setdefault(each.axis, []).append(each)
-    axes = {name: _together(bins) for name, bins in axes.items()}
+    axes = {name: _normalised(bins) for name, bins in axes.items()}
     highest = max((each.share * len(places) for places in axes.values() for each in places), default=1.0)
     views = [_axis(name, places, max(highest, _HOT)) for name, places in axes.items()]
     views.sort(key=lambda view: -view.uneven)
@@ -112,7 +112,7 @@ def _gap(gap: Gap) -> GapView:
     )
 
 
-def _together(places: Sequence[Place]) -> list[Place]:
+def _normalised(places: Sequence[Place]) -> list[Place]:
     """Return the bins of one axis with shares that are at most the whole: where the gap is small beside the noise, the
     excess of some bins is larger than that of all.
     """
@@ -178,7 +178,7 @@ class ParameterView:
 
 @dataclass(frozen=True)
 class CauseView:
-    """One effect found; others: what it cannot be told from; equation, tell_tale: "" for effects not in the library."""
+    """One effect found; others: effects indistinguishable from it; equation, tell_tale: "" without a library effect."""
 
     title: str
     name: str

@@ -94,7 +94,7 @@ def listed(items: Sequence[str], word: str = "and") -> str:
 
 
 def cause_phrase(cause: Cause) -> str:
-    """Return one cause; a class is said whole: "either link inertia or channel delay of joint 1"."""
+    """Return one cause; a class is listed whole: "either link inertia or channel delay of joint 1"."""
     titles = [effect_title(name) for name in cause.names]
     if len(titles) <= 1:
         return of_place(cause.name, cause.joint)
@@ -104,7 +104,7 @@ def cause_phrase(cause: Cause) -> str:
 
 
 def _known_phrases(causes: Sequence[Cause]) -> list[str]:
-    """Return the causes that are told from all others; the same effect in both joints is said once."""
+    """Return the causes that are distinguished from all others; an effect of both joints is one phrase."""
     joints: dict[str, list[JointName]] = {}
     for cause in causes:
         joints.setdefault(cause.name, []).append(cause.joint)
@@ -121,7 +121,7 @@ def _known_phrases(causes: Sequence[Cause]) -> list[str]:
 
 
 def verdict_sentence(findings: Findings) -> str:
-    """Return what a reader takes home if nothing else is read."""
+    """Return the verdict as one sentence."""
     worst = findings.gaps[0] if findings.gaps else None
     if findings.verdict == NO_GAP:
         return f"The simulation explains these runs{_left(worst, '; ')}."
@@ -176,7 +176,7 @@ def where(place_: Place) -> str:
 def _left(gap: Gap | None, joined: str) -> str:
     if gap is None:
         return ""
-    return f"{joined}what is left over, {number(gap.rmse_nm)}{SPACE}Nm, is noise ({number(gap.noise_floor_nm)}{SPACE}Nm)"
+    return f"{joined}the remaining error of {number(gap.rmse_nm)}{SPACE}Nm is noise ({number(gap.noise_floor_nm)}{SPACE}Nm)"
 
 
 def _unexplained(gap: Gap | None) -> str:

@@ -28,7 +28,7 @@ PLAIN_SPACE = str.maketrans("\u00a0\u202f", "  ")
         ),
         (
             examples.no_gap,
-            "The simulation explains these runs; what is left over, 0.155 Nm, is noise (0.153 Nm).",
+            "The simulation explains these runs; the remaining error of 0.155 Nm is noise (0.153 Nm).",
         ),
         (
             examples.unexplained,
@@ -119,15 +119,15 @@ def test_a_size_that_no_run_would_show_is_called_invisible() -> None:
 
 def test_the_map_puts_axes_by_unevenness_and_marks_what_stands_out() -> None:
     (view,) = gap_views([gap(1, "motor", 0.6, 0.2, {"link_angle": {3: 0.52, 4: 0.21}, "velocity": {6: 0.3}})])
-    assert [a.title for a in view.telling][:2] == ["link angle", "velocity"]
-    assert {a.title for a in view.telling}.isdisjoint({a.title for a in view.even})
-    assert len(view.telling) + len(view.even) == 8
-    link = view.telling[0]
+    assert [a.title for a in view.uneven_axes][:2] == ["link angle", "velocity"]
+    assert {a.title for a in view.uneven_axes}.isdisjoint({a.title for a in view.even_axes})
+    assert len(view.uneven_axes) + len(view.even_axes) == 8
+    link = view.uneven_axes[0]
     assert [k for k, b in enumerate(link.bins) if b.hot] == [3, 4]
     assert link.bins[3].height == pytest.approx(1.0)
     assert link.bins[4].height == pytest.approx(0.21 / 0.52)
     # one scale for all axes: equal density is equal height
-    assert view.telling[1].bins[6].height == pytest.approx((0.3 * 12) / (0.52 * 16))
+    assert view.uneven_axes[1].bins[6].height == pytest.approx((0.3 * 12) / (0.52 * 16))
     assert link.even == pytest.approx(1.0 / (0.52 * 16))
     assert view.floor == pytest.approx(1.0 / 3.0)
 
@@ -136,13 +136,15 @@ def test_shares_of_one_axis_are_never_more_than_the_whole() -> None:
     """Where the gap is small beside the noise, the excess of a bin can be larger than that of all."""
     bins = tuple(Place("load", f"bin {k}", 1.0, float(k), k + 1.0, "Nm") for k in range(4))
     (view,) = gap_views([Gap(1, "motor", 0.21, 0.2, "repeated runs", (), bins)])
-    assert [b.text.translate(PLAIN_SPACE) for b in view.even[0].bins] == [f"bin {k}: 25 %" for k in range(4)]
+    assert [b.text.translate(PLAIN_SPACE) for b in view.even_axes[0].bins] == [
+        f"bin {k}: 25 %" for k in range(4)
+    ]
 
 
 def test_a_gap_without_a_map_still_says_where() -> None:
     base = gap(1, "motor", 0.6, 0.2, {"velocity": {6: 0.3}})
     (view,) = gap_views([replace(base, map=())])
-    assert (view.telling, view.even) == ((), ())
+    assert (view.uneven_axes, view.even_axes) == ((), ())
     assert [p.where.translate(PLAIN_SPACE) for p in view.places] == ["at velocity 0 to 0.3 rad/s"]
     (empty,) = gap_views([Gap(1, "motor", 0.0, 0.0, "repeated runs", ())])
     assert empty.floor == 1.0
