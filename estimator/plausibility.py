@@ -22,10 +22,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 from math import nan
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from jtqd.estimator.checked import ConfigError, Section
-from jtqd.estimator.joint import Joint
+
+if TYPE_CHECKING:  # the recorder imports this module, and stays without numpy
+    from jtqd.estimator.joint import Joint
 
 MOTOR_JUMP: Final = 0x04
 LINK_JUMP: Final = 0x08
