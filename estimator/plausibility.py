@@ -21,10 +21,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import nan
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 from jtqd.estimator.decoder import check, limits
-from jtqd.estimator.joint import Joint
+
+if TYPE_CHECKING:  # the recorder imports this module, and stays without numpy
+    from jtqd.estimator.joint import Joint
 
 MOTOR_JUMP: Final = 0x04
 LINK_JUMP: Final = 0x08

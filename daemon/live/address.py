@@ -14,7 +14,7 @@ NEEDED = "--live needs the package foxglove-sdk: pip install 'jtqd[live]'"
 
 
 def installed() -> bool:
-    """What the live view needs is there."""
+    """Whether the package that the live view needs is installed."""
     return importlib.util.find_spec(_PACKAGE) is not None
 
 
@@ -26,7 +26,7 @@ class Address(NamedTuple):
 
     @property
     def url(self) -> str:
-        """What a viewer is given."""
+        """URL for a viewer."""
         return f"ws://[{self.host}]:{self.port}" if ":" in self.host else f"ws://{self.host}:{self.port}"
 
     @property

@@ -1,4 +1,4 @@
-"""The supervisor's side of the live view: starts its process, says where it listens and what becomes of it."""
+"""The supervisor's side of the live view: start its process, restart it when it dies, report where it listens."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 from jtqd.daemon.config import Config
 from jtqd.daemon.live.address import Address
-from jtqd.daemon.recording.request import nodes_of
+from jtqd.daemon.recording.keeper import nodes_of
 from jtqd.daemon.shared.child_process import Child, ChildError
 from jtqd.daemon.shared.notices import FILE as NOTICES
 

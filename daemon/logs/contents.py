@@ -51,6 +51,7 @@ from jtqd.daemon.recording.mcap_file import MAGIC
 _CHUNK_MARK, _CHUNK_MARK_AT = struct.pack("<I4s", 4, b"zstd"), HEAD.size + 28
 """What every chunk of ours has at this offset: the name of its compression."""
 _WINDOW = 1 << 20
+_PRIVATE = 0x80
 _SMALL_KINDS: dict[int, type[McapRecord]] = {
     Opcode.HEADER: Header,
     Opcode.SCHEMA: Schema,
@@ -82,12 +83,12 @@ class WholeChunk(NamedTuple):
 
 @dataclass
 class Gap:
-    """Bytes that cannot be read. `chunks`: that begin there; `index`: only message indexes stood there."""
+    """Bytes that cannot be read. `chunks`: that begin there; `restored`: what stood there is made anew."""
 
     start: int
     end: int
     chunks: int
-    index: bool = False
+    restored: bool = False
     seconds: float = 0.0
 
 
@@ -142,6 +143,8 @@ def scan(source: Source, own: Summary | None) -> Contents:
     at = len(MAGIC)
     while at < limit:
         end = _take(source, at, limit, found)
+        if end is None and own is not None and at not in places:
+            end = _private_end(source, at, limit)
         if end is None and _data_end_here(source, at):
             break
         if end is None:
@@ -151,6 +154,12 @@ def scan(source: Source, own: Summary | None) -> Contents:
     found.end = min(at, limit)
     _settle_definitions(found)
     return found
+
+
+def _private_end(source: Source, at: int, limit: int) -> int | None:
+    """Where a private record ends (opcode 80h and above), which every reader skips; None where there is none."""
+    framed = source.head(at)
+    return framed[1] if framed is not None and framed[0] >= _PRIVATE and framed[1] <= limit else None
 
 
 def _take(source: Source, at: int, limit: int, found: Contents) -> int | None:
@@ -316,16 +325,19 @@ def _next_whole(source: Source, at: int, limit: int, places: list[int]) -> int:
 
 
 def _leave_out(source: Source, start: int, end: int, found: Contents) -> None:
-    opcode = source.read(start, 1)
-    found.loose_messages += opcode == bytes([Opcode.MESSAGE])
-    chunk = opcode == bytes([Opcode.CHUNK])
+    opcode = source.read(start, 1)[0]
+    framed = source.head(start)
+    found.loose_messages += opcode == Opcode.MESSAGE
+    chunk = int(opcode == Opcode.CHUNK)
+    # Message indexes are made anew; a definition is known elsewhere, or its chunks are left out.
+    restored = opcode == Opcode.MESSAGE_INDEX and bool(found.chunks) and not found.chunks[-1].indexed
+    restored |= opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and framed is not None and framed[1] == end
     last = found.gaps[-1] if found.gaps else None
-    index = opcode == bytes([Opcode.MESSAGE_INDEX]) and bool(found.chunks) and not found.chunks[-1].indexed
-    if last is not None and last.end == start and not last.index and not index:
+    if last is not None and last.end == start and not last.restored and not restored:
         last.end, last.chunks = end, last.chunks + chunk
     else:
-        found.gaps.append(Gap(start, end, int(chunk), index))
-        found.open_gap = found.open_gap if index else found.gaps[-1]
+        found.gaps.append(Gap(start, end, chunk, restored))
+        found.open_gap = found.open_gap if restored else found.gaps[-1]
 
 
 def _settle_definitions(found: Contents) -> None:
@@ -357,7 +369,7 @@ def _settle_definitions(found: Contents) -> None:
 
 def is_whole(found: Contents, own: Summary | None) -> bool:
     """The file ends with a summary that names everything that was found in it, and nothing else."""
-    if own is None or not found.magic or found.header is None or found.contradicted or found.undefined:
+    if own is None or not found.magic or found.header is None or found.contradicted or found.gaps:
         return False
     expected = [chunk.index for chunk in found.chunks]
     if not all(chunk.head_right and chunk.indexed for chunk in found.chunks):

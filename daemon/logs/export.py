@@ -116,7 +116,7 @@ def main(argv: list[str] | None = None) -> int:
     left_out = result.get("left_out", 0)
     if left_out:
         print(
-            f"jtq export: {left_out} cycles with a missing value left out (--all-cycles keeps them)",
+            f"jtq export: {left_out} {_cycles(left_out)} with a missing value left out (--all-cycles keeps all)",
             file=sys.stderr,
         )
     return 3 if left_out else 0
@@ -281,7 +281,7 @@ class RunTable:
         if not count:
             raise LogError(f"{path}: found no cycle of the joints in that time, expected one at least")
         if not found:
-            raise LogError(f"{path}: found no measured value in {count} cycles")
+            raise LogError(f"{path}: found no measured value in {count} {_cycles(count)}")
         self._wanted = {name: where for name, where in wanted.items() if name in found}
         self.columns = tuple(self._wanted)
 
@@ -306,7 +306,7 @@ class RunTable:
         kept = self.cycles - self.left_out
         if kept < 2:
             raise LogError(
-                f"{self._path}: found {kept} cycles with every column, expected at least 2 (--all-cycles keeps all)"
+                f"{self._path}: found {kept} {_cycles(kept)} with every column, expected at least 2 (--all-cycles keeps all)"
             )
 
     def _rows(self) -> Iterator[dict[int, Records]]:
@@ -329,6 +329,10 @@ class RunTable:
             raise LogError(
                 f"{self._path}: found cycles of one joint that the other does not have, expected the same"
             )
+
+
+def _cycles(number: int) -> str:
+    return "cycle" if number == 1 else "cycles"
 
 
 def _picked(records: Records, topic: str) -> Records:
@@ -407,7 +411,7 @@ def _of_mapping(value: Any) -> str:
 _ROWS, _GROUP_ROWS = 20_000, 60_000
 
 
-class Size(NamedTuple):
+class TableSize(NamedTuple):
     """Of a table that was written."""
 
     rows: int
@@ -416,7 +420,7 @@ class Size(NamedTuple):
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[IO[bytes]]:
-    """A file that is there when it is complete, or not at all; packed where its name ends in .gz.
+    """Open a file for writing that is there when it is complete, or not at all; packed where its name ends in .gz.
 
     A link is followed, and what is no file (a pipe, /dev/stdout) is written to as it is, never replaced. Raises OSError.
     """
@@ -443,8 +447,8 @@ def whole_file(path: Path) -> Iterator[IO[bytes]]:
                 partial.unlink()
 
 
-def write_csv(path: Path, blocks: Iterable[Columns]) -> Size:
-    """Numbers as the shortest text that reads back the same; NaN is an empty cell. Raises OSError."""
+def write_csv(path: Path, blocks: Iterable[Columns]) -> TableSize:
+    """Write a table: numbers as the shortest text that reads back the same, NaN as an empty cell. Raises OSError."""
     rows = 0
     names: tuple[str, ...] = ()
     with whole_file(path) as file:
@@ -462,7 +466,7 @@ def write_csv(path: Path, blocks: Iterable[Columns]) -> Size:
             text.flush()
         finally:
             text.detach()
-    return Size(rows, len(names))
+    return TableSize(rows, len(names))
 
 
 def _cells(values: NDArray[Any]) -> list[Any]:
@@ -472,8 +476,8 @@ def _cells(values: NDArray[Any]) -> list[Any]:
     return cells
 
 
-def write_parquet(path: Path, blocks: Iterable[Columns]) -> Size:
-    """Columns with their types, packed by zstd. Raises LogError where pyarrow is not installed, OSError."""
+def write_parquet(path: Path, blocks: Iterable[Columns]) -> TableSize:
+    """Write a table: columns with their types, packed by zstd. Raises LogError where pyarrow is not installed, OSError."""
     try:
         import pyarrow as pa
         from pyarrow import parquet
@@ -490,7 +494,7 @@ def write_parquet(path: Path, blocks: Iterable[Columns]) -> Size:
         finally:
             if writer is not None:
                 writer.close()
-    return Size(rows, columns)
+    return TableSize(rows, columns)
 
 
 def _gathered(blocks: Iterable[Columns]) -> Iterator[Columns]:
@@ -517,7 +521,7 @@ def _length(block: Columns) -> int:
 
 
 def candump_lines(frames: Frames, interface: str) -> Iterator[str]:
-    """One line a frame, without its end; the time to the microsecond."""
+    """Frames as lines of `candump -L`, without their ends: `(1700000000.000000) can0 181#0011223344556677`."""
     rows = zip(
         frames.stamps_ns.tolist(), frames.ids.tolist(), frames.lengths.tolist(), frames.data, strict=True
     )

@@ -1,4 +1,4 @@
-"""One MCAP file opened for reading: where its chunks are, what its channels are, and the bytes of each message.
+"""Open one MCAP file for reading: where its chunks are, what its channels are, and the bytes of each message.
 
 A finished file is read by its summary. One without (`.active`: being written, or left by a crash) is gone through from
 its beginning as far as it is whole.

@@ -171,7 +171,7 @@ def _report(source: Source, found: Contents, own: Summary | None) -> _Report:
     report = _Report()
     for gap in sorted(found.gaps, key=lambda each: each.start):
         size = gap.end - gap.start
-        if gap.index:
+        if gap.restored:
             continue
         at_end = gap.end == found.end and own is None
         zeros = at_end and all(block.count(0) == len(block) for block in source.blocks(gap.start, gap.end))

@@ -25,8 +25,7 @@ from jtqd.daemon.config import Config
 from jtqd.daemon.live.address import Address
 from jtqd.daemon.live.keeper import LiveKeeper
 from jtqd.daemon.loop.realtime import stolen_s
-from jtqd.daemon.recording.keeper import Keeper
-from jtqd.daemon.recording.request import recording_request
+from jtqd.daemon.recording.keeper import Keeper, recording_request
 from jtqd.daemon.reload.files import SOCKET, Reload, ReloadError
 from jtqd.daemon.shared.child_process import Child, ChildError, ChildSilence
 from jtqd.daemon.shared.conditions import JOINT, PDO, THE_MACHINE, Conditions, ConditionsFile

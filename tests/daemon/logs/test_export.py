@@ -379,7 +379,7 @@ def test_a_run_table_needs_two_cycles(tmp_path):
         if count == 2:
             assert [len(block["time_s"]) for block in table.blocks()] == [2]
             continue
-        with pytest.raises(LogError, match="found 1 cycles with every column, expected at least 2"):
+        with pytest.raises(LogError, match="found 1 cycle with every column, expected at least 2"):
             list(table.blocks())
         (tmp_path / "a.mcap").unlink()
 

@@ -13,11 +13,11 @@ from jtqd.daemon.config import load_config
 from jtqd.daemon.logs.recover import recover_leftover
 from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.journal import ERROR, WARN, Journal
-from jtqd.daemon.recording.keeper import Keeper
+from jtqd.daemon.recording.keeper import Keeper, recording_request
 from jtqd.daemon.recording.mcap_file import ChunkBuilder
 from jtqd.daemon.recording.parts import own_files, parse
 from jtqd.daemon.recording.recorder import main
-from jtqd.daemon.recording.request import RecorderRequest, recording_request
+from jtqd.daemon.recording.request import RecorderRequest
 from jtqd.daemon.recording.schemas import definitions
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.child_process import Child
