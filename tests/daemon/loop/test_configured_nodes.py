@@ -17,7 +17,7 @@ from jtqd.daemon.loop.cycle import ConfiguredNodes, Cycle
 from jtqd.daemon.loop.intake import Intake
 from jtqd.daemon.loop.process import Duties
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
-from tests.daemon.loop.cycle_helpers import I32, PDOS, ScriptedSocket, frame, inputs, make, turn
+from tests.daemon.loop.cycle_helpers import I32, PDOS, ExactTime, ScriptedSocket, frame, inputs, make, turn
 
 BOOT_UP = frame(0x701, b"\0")
 
@@ -46,7 +46,8 @@ class Loop:
 
 
 @pytest.fixture
-def loop(tmp_path: Path) -> Loop:
+def loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Loop:
+    ExactTime().install(monkeypatch)
     return Loop(tmp_path)
 
 
