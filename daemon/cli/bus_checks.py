@@ -12,6 +12,8 @@ from jtqd.daemon.bus.boot import bus_load_of
 from jtqd.daemon.cli.checks import FAIL, GOOD, SKIP, WARN, CheckResult, plural, share
 from jtqd.daemon.cli.traffic import SYNC, NodeCount, PdoCount, TimeHistogram, Timing, Traffic, described
 from jtqd.daemon.config import Config
+from jtqd.daemon.shared.conditions import Condition
+from jtqd.daemon.shared.notices import ERROR
 from jtqd.daemon.shared.snapshot import LATE_BIN_NS, NMT_STATES, View
 from jtqd.drivers.bus_load import LIMIT
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_SFF_MASK
@@ -324,6 +326,17 @@ def check_own_timing(
                 "SYNC waits in the transmit queue: who else sends on this machine?" if level == WARN else ""
             )
             yield CheckResult("SYNC echo", level, text, hint)
+
+
+def check_conditions(conditions: Sequence[Condition]) -> Iterator[CheckResult]:
+    """Return one result for each condition that the daemon on this bus reports, else one that there is none."""
+    for each in conditions:
+        level = FAIL if each.severity >= ERROR else WARN
+        yield CheckResult(
+            each.name.replace("_", " "), level, f"jtqd reports: {each.line}", "see `jtq status`"
+        )
+    if not conditions:
+        yield CheckResult("conditions", GOOD, "jtqd reports nothing wrong")
 
 
 def check_loop_timing(

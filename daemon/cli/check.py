@@ -13,7 +13,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from jtqd.daemon.bus.boot import boot_request
-from jtqd.daemon.cli.bus_checks import check_bus, check_loop_timing, check_own_timing, check_stolen_time
+from jtqd.daemon.cli.bus_checks import (
+    check_bus,
+    check_conditions,
+    check_loop_timing,
+    check_own_timing,
+    check_stolen_time,
+)
 from jtqd.daemon.cli.checks import FAIL, GOOD, CheckResult, report
 from jtqd.daemon.cli.reading import Daemon, find_daemons, on_bus
 from jtqd.daemon.cli.traffic import Traffic, drive, leave, listen, silent
@@ -21,6 +27,7 @@ from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.loop import realtime
 from jtqd.daemon.loop.realtime import stolen_s
 from jtqd.daemon.shared.child_process import Child, ChildError
+from jtqd.daemon.shared.conditions import read_conditions
 from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader
 from jtqd.drivers.frame_socket import BusError, FrameSocket, open_frame_socket
 from jtqd.estimator.checked import ConfigError, seconds
@@ -127,6 +134,8 @@ def _listen(bus: str, config: Config, for_s: float, daemon: Daemon | None) -> It
     elif timing is not None:
         yield from check_own_timing(timing, config.period_ns, refused, driven=False)
     yield from _check_traffic(traffic, config, bus, socket)
+    if daemon is not None:
+        yield from check_conditions(read_conditions(daemon.directory))
 
 
 def _drive(bus: str, config: Config, for_s: float, daemon: Daemon | None) -> Iterator[CheckResult]:

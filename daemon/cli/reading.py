@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jtqd.daemon.recording.progress import Account, read_account
+from jtqd.daemon.shared.conditions import Condition, read_conditions
 from jtqd.daemon.shared.notices import FILE as NOTICES
 from jtqd.daemon.shared.notices import Notice, NoticesError, NoticesReader
 from jtqd.daemon.shared.runtime_dir import FILE, About, AboutError, read_about
@@ -158,6 +159,8 @@ class Reading:
     log: CurrentLog | None = None
     notices: tuple[Notice, ...] = ()
     """The daemon's last notices about the bus."""
+    conditions: tuple[Condition, ...] = ()
+    """What is wrong now, the worst first."""
 
 
 class Watch:
@@ -190,6 +193,7 @@ class Watch:
             _three(self._reader.late_us(0.5, 0.99, 1.0)),
             _log(self.daemon),
             self._read_notices(),
+            tuple(read_conditions(self.daemon.directory)),
         )
 
     def _read_notices(self) -> tuple[Notice, ...]:

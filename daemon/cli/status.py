@@ -33,6 +33,7 @@ from jtqd.daemon.cli.reading import (
     find_daemons,
     on_bus,
 )
+from jtqd.daemon.shared.conditions import SEVERITIES, Condition
 from jtqd.daemon.shared.notices import ERROR, WARNING, Notice
 from jtqd.daemon.shared.reasons import drive_state, joint_reason, silent_s
 from jtqd.daemon.shared.runtime_dir import About
@@ -141,6 +142,17 @@ def content(reading: Reading) -> dict[str, Any]:
         }
         for each in reading.notices
     ]
+    now_ns = time.monotonic_ns()
+    result["conditions"] = [
+        {
+            "name": each.name,
+            "subject": each.subject,
+            "severity": SEVERITIES[each.severity],
+            "text": each.text,
+            "for_s": (now_ns - each.since_ns) * 1e-9,
+        }
+        for each in reading.conditions
+    ]
     log = reading.log
     result["recorder"] = log and {
         "path": str(log.path) if log.path else None,
@@ -224,6 +236,7 @@ class StatusView:
         yield _nodes(about, view)
         yield ""
         yield from _log(reading.log)
+        yield from _conditions(reading.conditions)
         yield from _notices(reading.notices)
 
 
@@ -404,13 +417,31 @@ def _log(log: CurrentLog | None) -> Iterator[RenderableType]:
     yield _line("disk", f"{size(log.disk_free)} free of {size(log.disk_size)}")
 
 
+def _style_of(level: int) -> str:
+    return "bold red" if level >= ERROR else "yellow" if level >= WARNING else ""
+
+
+def _conditions(conditions: Sequence[Condition]) -> Iterator[RenderableType]:
+    """What is wrong now, and for how long."""
+    if conditions:
+        yield ""
+    now_ns = time.monotonic_ns()
+    for each in conditions:
+        yield _line(
+            SEVERITIES[each.severity],
+            Text(
+                f"{each.line} (for {duration((now_ns - each.since_ns) * 1e-9)})",
+                style=_style_of(each.severity),
+            ),
+        )
+
+
 def _notices(notices: Sequence[Notice]) -> Iterator[RenderableType]:
     if notices:
         yield ""
     for each in notices[-_LAST_NOTICES:]:
         when = time.strftime("%H:%M:%S", time.localtime(each.realtime_ns * 1e-9))
-        style = "bold red" if each.level >= ERROR else "yellow" if each.level >= WARNING else ""
-        yield _line(when, Text(each.text, style=style))
+        yield _line(when, Text(each.text, style=_style_of(each.level)))
 
 
 def clock() -> RenderableType:
