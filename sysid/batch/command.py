@@ -86,15 +86,16 @@ def _error(text: object, status: int = 1) -> int:
 def _run(options: argparse.Namespace, groups: Sequence[Group], task: Task, parameters: dict[str, Any]) -> int:
     """Run the batch and write the summary. Raises BatchError, OSError."""
     (options.out / "results").mkdir(parents=True, exist_ok=True)
+    tool = tool_version()
     with executor(options.scheduler, options.jobs) as (workers, where), _progress(len(groups)) as progress:
         rows = run_batch(
             task, parameters, groups, options.out, workers, again=options.again, progress=progress
         )
-    mapping = to_mapping(task.command, parameters, tool_version(), rows, where)
+    mapping = to_mapping(task.command, parameters, tool, rows, where)
     text = json.dumps(mapping, indent=1, allow_nan=False)
     write_whole(options.out / SUMMARY, f"{text}\n")
     made = dt.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
-    foot = f"{made} · jtqd {tool_version()}"
+    foot = f"{made} · jtqd {tool}"
     foot += f" · options: {' '.join(task.arguments)}" if task.arguments else ""
     write_whole(options.out / PAGE, render(task.command, rows, where, foot))
     number = counts(rows)

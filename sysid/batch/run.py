@@ -25,7 +25,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
@@ -170,9 +169,8 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-@cache
 def tool_version() -> str:
-    """Return version and code hash of jtqd on this machine, e.g. "0.1.0+code.3fa9c1d2e4b7"; edited code is another tool."""
+    """Return version and code hash of jtqd here and now, e.g. "0.1.0+code.3fa9c1d2e4b7"; takes 0.1 s."""
     found = hashlib.sha256()
     for root in sorted(path for top in jtqd.__path__ for path in Path(top).iterdir() if path.is_dir()):
         for path in sorted(root.rglob("*")):
@@ -332,6 +330,7 @@ def run_batch(
         BatchError: the executor takes or returns no more tasks.
         OSError: a result cannot be kept.
     """
+    tool = tool_version()
     rows: dict[str, Row] = {}
     waiting: dict[str, tuple[list[Group], list[str]]] = {}
     running: dict[Future[Outcome], str] = {}
@@ -348,7 +347,7 @@ def run_batch(
             except OSError as error:
                 end(Row(group, FAILED, None, None, f"{error.filename}: {error.strerror}", 0.0))
                 continue
-            key = key_of(base.command, tool_version(), parameters, hashes)
+            key = key_of(base.command, tool, parameters, hashes)
             content = None if again else stored(out, key)
             if content is not None:
                 end(Row(group, KEPT, key, content, "", content["seconds"]))
@@ -362,7 +361,7 @@ def run_batch(
         while running:
             future = finished.get()
             key = running.pop(future)
-            outcome = _outcome(future)
+            outcome = _outcome(future, tool)
             content = None
             if not outcome.error:
                 made = {
@@ -386,9 +385,11 @@ def run_batch(
     return [rows[group.name] for group in groups]
 
 
-def _outcome(future: Future[Outcome]) -> Outcome:
-    """Return what the task returned, or one line for what its worker raised. Raises BatchError without a scheduler."""
-    here = tool_version()
+def _outcome(future: Future[Outcome], here: str) -> Outcome:
+    """Return what the task returned, or one line for what its worker raised; another tool than `here` is an error.
+
+    Raises BatchError when the scheduler is gone.
+    """
     try:
         outcome = future.result()
     except CancelledError:
