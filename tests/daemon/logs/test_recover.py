@@ -18,7 +18,7 @@ from mcap.reader import make_reader
 from jtqd.daemon.logs.recover import RecoverError, recover
 from jtqd.daemon.logs.recover_command import main
 from tests.daemon.logs.log_files import ATTACHMENTS, by_index, foreign, in_order, ours, record_starts
-from tests.paths import ROOT
+from tests.paths import GOLDEN, ROOT
 
 CHUNK, INDEX, DATA_END, ATTACHMENT, SCHEMA = 0x06, 0x07, 0x0F, 0x09, 0x03
 
@@ -158,6 +158,31 @@ def test_damaged_definitions_at_the_head_are_those_of_the_chunks(log, tmp_path):
     assert not result.lossy
     assert any("at the head" in finding for finding in result.findings)
     assert contents(now) == contents(log[0])
+
+
+def test_a_definition_that_cannot_be_read_is_written_anew(log, tmp_path):
+    """Its text is no UTF-8: an orderly reader stops there, although summary and chunks are whole."""
+    data = bytearray(log[0])
+    data[data.index(b"sensor_msgs/msg/JointState") + 3] = 0xFE
+    result, now = repaired(tmp_path / "a.mcap", bytes(data))
+    assert result.changed
+    assert not result.lossy
+    assert contents(now) == contents(log[0])
+
+
+@pytest.mark.parametrize("name", ["network", "faults"])
+def test_a_recorded_log_cut_at_two_thirds(tmp_path, name):
+    """What is before the torn chunk comes back as it was, with every attachment, and a clean end."""
+    whole = (GOLDEN / f"{name}.mcap").read_bytes()
+    result, now = repaired(tmp_path / "a.mcap.active", whole[: 2 * len(whole) // 3])
+    before = contents(whole)
+    assert result.lossy
+    assert result.messages > 0.3 * len(before)
+    assert contents(now) == before[: result.messages]
+    names = [
+        sorted(a.name for a in make_reader(io.BytesIO(data)).iter_attachments()) for data in (whole, now)
+    ]
+    assert names[0] == names[1]
 
 
 def test_first_chunk_and_all_definitions_before_it_gone(log, tmp_path):
