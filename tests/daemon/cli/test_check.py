@@ -11,12 +11,14 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from jtqd.daemon.cli.bus_checks import check_bus, check_own_timing, check_stolen_time
+from jtqd.daemon.cli.bus_checks import check_bus, check_conditions, check_own_timing, check_stolen_time
 from jtqd.daemon.cli.check import main
 from jtqd.daemon.cli.checks import FAIL, GOOD, SKIP, WARN, CheckResult, show
 from jtqd.daemon.cli.traffic import TimeHistogram, Timing, Traffic, described
 from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.loop.realtime import stolen_s
+from jtqd.daemon.shared.conditions import Condition
+from jtqd.daemon.shared.notices import ERROR, WARNING
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, stuffed_bits
 from tests.drivers.hub_helpers import until_it_listens
 
@@ -318,3 +320,16 @@ def test_what_cannot_be_checked_is_one_line(check: Check) -> None:
         assert said in error
         assert len(error.splitlines()) == 1
     assert check("-5")[0] == 2
+
+
+def test_conditions_of_the_daemon_are_results() -> None:
+    (good,) = check_conditions([])
+    assert good.level == GOOD
+    two = [
+        Condition("bus_off", "bus", ERROR, "bus-off", 1),
+        Condition("sensor_lost", "joint 1", WARNING, "no torque sensor", 1),
+    ]
+    assert [(each.item, each.level, each.text) for each in check_conditions(two)] == [
+        ("bus off", FAIL, "jtqd reports: bus: bus-off"),
+        ("sensor lost", WARN, "jtqd reports: joint 1: no torque sensor"),
+    ]

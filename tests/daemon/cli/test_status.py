@@ -16,7 +16,8 @@ import pytest
 from jtqd.daemon.cli.reading import find_daemons
 from jtqd.daemon.cli.status import main
 from jtqd.daemon.recording.progress import Account, ProgressFile
-from jtqd.daemon.shared.notices import WARNING, Notices
+from jtqd.daemon.shared.conditions import Condition, ConditionsFile
+from jtqd.daemon.shared.notices import ERROR, WARNING, Notices
 from jtqd.daemon.shared.runtime_dir import start_ticks, write_about
 from tests.daemon.cli.status_daemon import picture, running
 
@@ -190,3 +191,19 @@ def until(terminal: int, wanted: str) -> str:
         if select.select([terminal], [], [], 1.0)[0]:
             shown += os.read(terminal, 65536).decode(errors="replace")
     return shown
+
+
+def test_what_is_wrong_now_is_shown_with_its_age(tmp_path: Path, status: Status) -> None:
+    daemon = running(tmp_path)
+    since = time.monotonic_ns() - 3_000_000_000
+    lost = Condition("node_lost", "node 2", ERROR, "no heartbeat for 0.3 s", since)
+    ConditionsFile(daemon.directory).write([lost])
+    assert "node 2: no heartbeat for 0.3 s (for 3" in picture(daemon, 100)
+    (shown,) = json.loads(status("--json")[1])["conditions"]
+    assert shown.pop("for_s") == pytest.approx(3.0, abs=1.0)
+    assert shown == {
+        "name": "node_lost",
+        "subject": "node 2",
+        "severity": "error",
+        "text": "no heartbeat for 0.3 s",
+    }
