@@ -64,7 +64,7 @@ def test_the_examples_of_the_api_run(
         compile(code, f"docs/api.md, example {number + 1}", "exec"),
         {"__name__": "example", "GOLDEN": ROOT / "tests" / "golden"},
     )
-    expected = re.findall(r"#> (.*)", code)
+    expected = re.findall(r"# -> (.*)", code)
     assert capsys.readouterr().out.splitlines() == expected
 
 

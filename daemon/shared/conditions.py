@@ -451,7 +451,7 @@ class Conditions:
             state.describe(state.definition.text.format(text), again=log_again and not changed)
         if not changed:
             return
-        if superseded:
+        if superseded and not state.present:
             state.no_end_line()
         for listener in self._listeners:
             listener(Change(state.definition, subject, state.present))

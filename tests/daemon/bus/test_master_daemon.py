@@ -114,7 +114,7 @@ def test_a_node_that_stops_is_8250h_for_each_of_its_pdos(daemon: Daemon) -> None
     assert {each[5:] for each in come} == {frame("8201 02"), frame("8202 02")}
     gone = [each for each in daemon.emcys if each[:2] == b"\0\0"]
     assert {each[3:] for each in gone} == {frame("5082 8201 02"), frame("5082 8202 02")}
-    assert "NMT command 'stop' to node 2 from somebody else" in daemon.said()
+    assert "NMT command 'stop' to node 2 from another master" in daemon.said()
     assert daemon.until(daemon.well)
     assert (STALE, STALE) not in daemon.statuses[-50:]
 

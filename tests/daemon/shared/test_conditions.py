@@ -101,6 +101,16 @@ def test_a_condition_that_is_superseded_has_no_line_at_its_end():
     assert [line.text for line in conditions.lines(3.5)] == ["bus: error active after 1.5 s"]
 
 
+def test_a_condition_that_supersedes_another_one_has_its_own_end():
+    """One change ends the one and begins the other; both updates say `superseded`."""
+    conditions, bus = Conditions(), Subject("bus")
+    conditions.update("bus_passive", bus, False, 1.0, superseded=True)
+    conditions.update("bus_down", bus, True, 1.0, "error active", superseded=True)
+    assert [line.text for line in conditions.lines(1.0)] == ["bus: interface down, before: error active"]
+    conditions.update("bus_down", bus, False, 2.0)
+    assert [line.text for line in conditions.lines(2.0)] == ["bus: error active after 1.0 s"]
+
+
 def test_history_counts_and_adds_up():
     conditions = Conditions()
     for begin, end in ((1.0, 2.0), (3.0, 3.5)):
