@@ -1,4 +1,4 @@
-"""Errors of what an operator wrote: sections of a file read key by key, and numbers of a command line.
+"""Errors of what an operator wrote: sections of a file read key by key, numbers of a command line, nouns in messages.
 
 Every message names the file, the key, what was found and what was expected. Whole dataclasses are read by
 `jtqd.estimator.decoder`.
@@ -263,3 +263,15 @@ def _whole(text: str, low: int) -> int:
     if value < low:
         raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number >= {low}")
     return value
+
+
+# Words of messages.
+
+
+def counted(number: int, noun: str, plural: str = "") -> str:
+    """Return number and noun in agreement.
+
+    >>> counted(1, "run"), counted(2, "run"), counted(0, "velocity", "velocities")
+    ('1 run', '2 runs', '0 velocities')
+    """
+    return f"{number} {noun if number == 1 else plural or noun + 's'}"

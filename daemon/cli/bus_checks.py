@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from jtqd.daemon.bus.boot import bus_load_of
-from jtqd.daemon.cli.checks import FAIL, GOOD, SKIP, WARN, CheckResult, plural, share
+from jtqd.daemon.cli.checks import FAIL, GOOD, SKIP, WARN, CheckResult, share
 from jtqd.daemon.cli.traffic import SYNC, NodeCount, PdoCount, TimeHistogram, Timing, Traffic, described
 from jtqd.daemon.config import Config
 from jtqd.daemon.shared.conditions import Condition
@@ -17,6 +17,7 @@ from jtqd.daemon.shared.notices import ERROR
 from jtqd.daemon.shared.snapshot import LATE_BIN_NS, NMT_STATES, View
 from jtqd.drivers.bus_load import LIMIT
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_SFF_MASK
+from jtqd.estimator.checked import counted
 from jtqd.estimator.status import NAMES, PUBLISHED
 
 SUCCESS_GOOD, SUCCESS_FAIL = 0.99, 0.90
@@ -78,7 +79,7 @@ def check_bus(
         yield CheckResult(
             "this check",
             WARN,
-            f"read too late and lost {plural(lost, 'frame')}: some of what is missing above may be due to that",
+            f"read too late and lost {counted(lost, 'frame')}: some of what is missing above may be due to that",
             "run it on an idle machine, or give it real-time priority",
         )
 
@@ -103,7 +104,7 @@ def _sync(traffic: Traffic, config: Config) -> CheckResult:
         return CheckResult(
             "SYNC",
             FAIL,
-            f"{text}; {plural(traffic.counter_jumps, 'jump')} of its counter",
+            f"{text}; {counted(traffic.counter_jumps, 'jump')} of its counter",
             "is there a second SYNC producer, or has the one been restarted? (candump can0,080:7FF)",
         )
     if too_many < 0:
@@ -223,7 +224,7 @@ def _node(node: NodeCount, traffic: Traffic, config: Config) -> CheckResult:
         text += f"; {node.emergencies} EMCY, last {node.last_emergency:04X}h"
     hint = ""
     if node.boot_ups:
-        text += f"; {plural(node.boot_ups, 'restart')}"
+        text += f"; {counted(node.boot_ups, 'restart')}"
         hint = "supply voltage? watchdog of the drive?"
     elif node.longest_gap_ns > _HEARTBEAT_GAP * config.heartbeat_ms * 1e6:
         hint = "heartbeats are late or lost"
@@ -257,7 +258,7 @@ def _foreign(traffic: Traffic) -> CheckResult:
     most = traffic.strangers.most_common(5)
     text = ", ".join(f"{described(can_id)} {count / seconds:.3g} per s" for can_id, count in most)
     left = len(traffic.strangers) - len(most)
-    text += f" and {plural(left, 'more identifier')}" if left else ""
+    text += f" and {counted(left, 'more identifier')}" if left else ""
     ours = traffic.inputs.keys() | {SYNC}
     disguised = [
         each

@@ -15,6 +15,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from jtqd.estimator.checked import counted
+
 GOOD, WARN, FAIL, SKIP = "GOOD", "WARN", "FAIL", "-"
 """SKIP: does not apply here, and says why."""
 _STYLES = {GOOD: "green", WARN: "yellow", FAIL: "bold red", SKIP: "dim"}
@@ -82,7 +84,7 @@ def show(console: Console, results: Sequence[CheckResult]) -> None:
     console.print(
         Text.assemble(
             (status, _STYLES[status]),
-            f": {count[GOOD]} good, {plural(count[WARN], 'warning')}, {plural(count[FAIL], 'failure')}",
+            f": {count[GOOD]} good, {counted(count[WARN], 'warning')}, {counted(count[FAIL], 'failure')}",
         )
     )
 
@@ -142,8 +144,3 @@ def histogram(bins: Sequence[int], bin_us: float, columns: int) -> str:
     high = min(first + len(sums) * width, len(bins)) * bin_us
     more = " and more" if last == len(bins) - 1 else ""
     return f"{first * bin_us:.0f} {blocks} {high:.0f} us{more}"
-
-
-def plural(count: int, noun: str) -> str:
-    """Format a count with its noun: "1 slot", "2 slots"."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"

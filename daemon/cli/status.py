@@ -21,7 +21,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from jtqd.daemon.cli.checks import NOTHING, duration, histogram, number, plural, share, size
+from jtqd.daemon.cli.checks import NOTHING, duration, histogram, number, share, size
 from jtqd.daemon.cli.reading import (
     RUNNING,
     CurrentLog,
@@ -46,6 +46,7 @@ from jtqd.daemon.shared.snapshot import (
     View,
 )
 from jtqd.daemon.supervisor.table import COLOURS, bus_load, plain_line
+from jtqd.estimator.checked import counted
 from jtqd.estimator.status import NAMES, PUBLISHED
 
 SCHEMA = "jtq.status/1"
@@ -408,7 +409,7 @@ def _log(log: CurrentLog | None) -> Iterator[RenderableType]:
     yield _line(
         "recorder",
         Text.assemble(
-            f"{plural(log.account.written, 'cycle')} written, ",
+            f"{counted(log.account.written, 'cycle')} written, ",
             lost,
             f"{held}, {size(log.size)} in this file",
         ),

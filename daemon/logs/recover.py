@@ -42,6 +42,7 @@ from jtqd.daemon.logs.container import (
 from jtqd.daemon.logs.contents import Contents, Gap, WholeChunk, chunk_content, index_entries, is_whole, scan
 from jtqd.daemon.recording.mcap_file import MAGIC, bytes_of
 from jtqd.daemon.recording.parts import ACTIVE, OwnFile, own_files
+from jtqd.estimator.checked import counted
 
 _PARTIAL = ".recovering"
 """Ending of the copy while it is written."""
@@ -222,11 +223,6 @@ def _torn_seconds(source: Source, gap: Gap, found: Contents) -> float:
             return seconds
     data = gap.start - int(found.chunks[0].index.chunk_start_offset)
     return (found.end_ns - found.start_ns) * 1e-9 * (gap.end - gap.start) / max(data, 1)
-
-
-def counted(number: int, noun: str) -> str:
-    """ "1 chunk", "2 chunks"."""
-    return f"{number} {noun}" + ("" if number == 1 else "s")
 
 
 # ---- the copy ----

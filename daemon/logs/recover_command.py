@@ -10,8 +10,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from jtqd.daemon.logs.container import LogError, Source, footer_of
-from jtqd.daemon.logs.recover import Recovery, counted, recover
+from jtqd.daemon.logs.recover import Recovery, recover
 from jtqd.daemon.recording.parts import ACTIVE
+from jtqd.estimator.checked import counted
 
 _ENDINGS = (".mcap", ".mcap" + ACTIVE)
 _EXAMPLES = """examples:

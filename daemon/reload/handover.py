@@ -252,11 +252,11 @@ def _allowance(times_ns: list[int]) -> int:
     return round(_FACTOR * sorted(times_ns)[len(times_ns) * 3 // 4])
 
 
-# The successor's side of a hand-over (`daemon/reload/handover.py`): it puts in place what it is told, and takes over.
-
-
 class Taker:
-    """The successor's side: waits for the running loop at `path`. Raises OSError."""
+    """The successor's side: waits for the running loop at `path`, puts what it is told in place, takes over.
+
+    Raises OSError.
+    """
 
     def __init__(self, cycle: Cycle, path: Path) -> None:
         self._cycle, self._fill = cycle, Fill(cycle)

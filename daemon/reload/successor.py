@@ -1,7 +1,7 @@
 """The successor of a running loop: built and warmed up beside it with new files, it takes over between two cycles.
 
 build        estimators from the new files; whatever is wrong with them ends here, and the running loop never hears of it
-shadow       step them through the ring of cycles (`daemon/reload/successor.py`), at a priority below the running loop's
+shadow       step them through the ring of cycles, at a priority below the running loop's
 stand by     `answer(standing_by=...)`; the supervisor then tells the running loop to hand over (SIGUSR2)
 take over    see `daemon/reload/handover.py`; the cycle that follows is ours
 
@@ -46,9 +46,6 @@ from jtqd.daemon.shared.snapshot import SnapshotError
 from jtqd.drivers.frame_socket import BusDown, open_frame_socket
 from jtqd.estimator.methods import AnyEstimator
 from jtqd.estimator.status import INVALID
-
-# New estimators beside a running loop: they are stepped through the ring of its cycles until they have seen what it has.
-
 
 _INPUTS = FLAG_POSITION | FLAG_MOTION
 _SETTLED_S = 0.5

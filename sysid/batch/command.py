@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from jtqd.estimator.checked import ConfigError, count, seconds
+from jtqd.estimator.checked import ConfigError, count, counted, seconds
 from jtqd.sysid.batch.run import (
     BY_DIRECTORY,
     BY_RUN,
@@ -34,7 +34,6 @@ from jtqd.sysid.batch.run import (
 from jtqd.sysid.batch.summary import DIAGNOSE, REPLAY, counts, render, to_mapping
 from jtqd.sysid.runs.files import LOGS, TABLES, ColumnMap, RunError
 from jtqd.sysid.runs.joints import UsageError, joint_files
-from jtqd.sysid.text import counted
 
 BY: Final = "jtq batch"
 PAGE, SUMMARY = "index.html", "summary.json"

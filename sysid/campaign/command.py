@@ -21,7 +21,7 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.drivers.bus_load import LIMIT, BusLoad
-from jtqd.estimator.checked import ConfigError, count, natural, seconds
+from jtqd.estimator.checked import ConfigError, count, counted, natural, seconds
 from jtqd.estimator.joint import Joint
 from jtqd.models.files import shipped
 from jtqd.sysid.campaign.bench import Bench, BenchConfig
@@ -32,7 +32,6 @@ from jtqd.sysid.campaign.reporter import BETWEEN_RUNS_S, Designing, Reporter, cl
 from jtqd.sysid.campaign.runner import Outcome, attempt, go_through
 from jtqd.sysid.campaign.state import DONE, CampaignDirectory, StateError
 from jtqd.sysid.motion.setpoints import Limits, Setpoints
-from jtqd.sysid.text import counted
 
 EMULATED: Final = "sim"
 PLANT: Final = "campaign_plant.yaml"

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Final
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError, count, natural, seconds
+from jtqd.estimator.checked import ConfigError, count, counted, natural, seconds
 from jtqd.estimator.run import RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, TimeFunction, emulate_run
@@ -27,7 +27,6 @@ from jtqd.sysid.campaign.plan import Plan, Run, expand, marks_of
 from jtqd.sysid.campaign.plans import Scale, make_plan
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.files import write_run
-from jtqd.sysid.text import counted
 
 PLANT: Final = "campaign_plant.yaml"
 _RECIPE: Final = "emulated_runs.json"

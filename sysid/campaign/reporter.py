@@ -10,8 +10,8 @@ from typing import Final
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
+from jtqd.estimator.checked import counted
 from jtqd.sysid.campaign.state import DONE, RunState
-from jtqd.sysid.text import counted
 
 BETWEEN_RUNS_S: Final = 4.0
 """What a run takes beside its motion, until one has been measured: start of jtqd, set-up of the drives, table."""

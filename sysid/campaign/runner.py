@@ -19,6 +19,7 @@ import numpy as np
 
 from jtqd.daemon.logs import LogError
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.campaign.bench import Bench, BenchConfig, Play
 from jtqd.sysid.campaign.plan import Plan, Run, marks_of
@@ -29,7 +30,6 @@ from jtqd.sysid.motion.setpoints import PERIOD_S, MotionError, MotionResult, Set
 from jtqd.sysid.runs.checks import check_run
 from jtqd.sysid.runs.files import write_run
 from jtqd.sysid.runs.logs import LoggedRun, log_to_run
-from jtqd.sysid.text import counted
 
 _BUS_WAS_LATE: Final = re.compile(
     r"SYNC missing|missing for \d+ cycles|no heartbeat for|no temperature for|late by|transmit queue"

@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.checked import ConfigError, counted
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTableError
 from jtqd.sysid.campaign.plan import Plan
@@ -24,7 +24,6 @@ from jtqd.sysid.progress import waiting
 from jtqd.sysid.runs.checks import CheckedRuns, check_runs
 from jtqd.sysid.runs.files import ColumnMap, RunError, RunFile, read_runs
 from jtqd.sysid.runs.joints import UsageError, joint_files, joints_of
-from jtqd.sysid.text import counted
 
 BY: Final = "jtq diagnose"
 _NEEDED: Final = ("matplotlib", "jinja2")

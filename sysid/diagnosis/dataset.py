@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
+from jtqd.estimator.checked import counted
 from jtqd.estimator.effects.effect import Effect
 from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.joint import Joint
@@ -42,7 +43,6 @@ from jtqd.sysid.diagnosis.signals import (
     with_one_sensor,
 )
 from jtqd.sysid.diagnosis.structure import frequency_lines, order_lines, sharpened
-from jtqd.sysid.text import counted
 
 FEWEST_RUNS: Final = 2
 SHORTEST_MOVING_S: Final = 5.0

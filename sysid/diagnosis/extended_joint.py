@@ -13,10 +13,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
+from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.sysid.diagnosis.findings import Cause, Findings, Value
 from jtqd.sysid.fit.joint_writer import write_joint
-from jtqd.sysid.text import counted
 
 SENSOR: Final = "sensor"
 FILE: Final = "extended.joint.yaml"

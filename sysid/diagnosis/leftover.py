@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.events import (
@@ -31,7 +32,6 @@ from jtqd.sysid.diagnosis.structure import (
     order_lines,
     sharpened,
 )
-from jtqd.sysid.text import counted
 
 _RELEVANT: Final = 6e-4
 """Part of the rated torque (rms) from which structure counts as a gap."""

@@ -16,6 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from jtqd.estimator.checked import counted
 from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import LossModel
@@ -25,7 +26,6 @@ from jtqd.sysid.excitation.design import draw
 from jtqd.sysid.excitation.model import Bench as StaticBench
 from jtqd.sysid.excitation.model import ExcitationLimits
 from jtqd.sysid.motion.setpoints import Limits
-from jtqd.sysid.text import counted
 
 VELOCITY_RAD_S: Final = 2.0
 """Fastest motion where nothing else is given; joint files have no rated velocity."""

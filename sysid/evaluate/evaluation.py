@@ -11,6 +11,7 @@ from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 
+from jtqd.estimator.checked import counted
 from jtqd.estimator.network import FusedNetwork
 from jtqd.estimator.validity import Envelope
 from jtqd.sysid.evaluate import constant, scores
@@ -43,7 +44,6 @@ from jtqd.sysid.evaluate.scores import (
 from jtqd.sysid.fit.efficiency_report import TITLES as QUADRANT_TITLES
 from jtqd.sysid.fit.plateaus import Plateau
 from jtqd.sysid.runs.checks import RunIssue
-from jtqd.sysid.text import counted
 
 SILENT_SHARE: Final = 0.01
 """Share of the moving samples that a method may leave without a value and not be named for it."""

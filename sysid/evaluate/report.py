@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, Final
 
+from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import QUADRANTS
 from jtqd.sysid.evaluate import constant, figures
 from jtqd.sysid.evaluate.constant import PlateauScore, speed_groups
@@ -17,7 +18,6 @@ from jtqd.sysid.fit.efficiency_report import TITLES as QUADRANT_TITLES
 from jtqd.sysid.report import page
 from jtqd.sysid.report.figures import page_svg
 from jtqd.sysid.report.numbers import DASH
-from jtqd.sysid.text import counted
 
 SCHEMA: Final = "jtq.evaluation/1"
 

@@ -17,12 +17,12 @@ from typing import Final
 
 import numpy as np
 
+from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Friction, Joint
 from jtqd.estimator.losses import FrictionModel
 from jtqd.sysid.fit.efficiency import SAME_VELOCITY_RAD_S
 from jtqd.sysid.fit.friction import COULOMB, VISCOUS, FitError, Term, student_975
 from jtqd.sysid.fit.plateaus import Plateau
-from jtqd.sysid.text import counted
 
 NO_LOAD_SHARE: Final = 0.05
 """Share of rated torque that still counts as no load."""

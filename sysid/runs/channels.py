@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import FrictionModel, static_friction
 from jtqd.estimator.run import JointColumns
-from jtqd.sysid.text import counted
 
 
 class RunIssue(NamedTuple):

@@ -29,11 +29,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import Section
+from jtqd.estimator.checked import Section, counted
 from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable, RunTableError
 from jtqd.models.files import load_yaml
 from jtqd.sysid.progress import progress
-from jtqd.sysid.text import counted
 
 TIME: Final = "time_s"
 JOINTS: Final = range(1, 8)

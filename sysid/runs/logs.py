@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from jtqd.daemon.logs import LogError, Records, read_topics
 from jtqd.drivers.devices import NOT_MEASURED, TEMPERATURE_C_PER_UNIT, drive_tpdo3
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.checked import counted
 from jtqd.estimator.run import JointColumns, RunTable
-from jtqd.sysid.text import counted
 
 ALL_INPUTS: Final = 7
 """input_flags of the log: both PDOs of the drive and the sensor's are of this cycle."""

@@ -9,10 +9,10 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
 from jtqd.sysid.runs.channels import MOVING_RAD_S, RunIssue
-from jtqd.sysid.text import counted
 
 SLOWEST_HZ: Final = 50.0
 """Below it accelerations and reversals are not in the data; ripple of slow motion folds."""

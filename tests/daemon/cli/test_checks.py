@@ -14,7 +14,6 @@ from jtqd.daemon.cli.checks import (
     exit_status,
     histogram,
     number,
-    plural,
     report,
     share,
     size,
@@ -61,7 +60,6 @@ def test_numbers_for_people() -> None:
     assert [size(each) for each in (0, 999, 1000, 123_456, 1_230_000_000, None)] == [
         *("0 B", "999 B", "1 kB", "123 kB", "1.23 GB", "-"),
     ]
-    assert [plural(count, "slot") for count in (0, 1, 2)] == ["0 slots", "1 slot", "2 slots"]
     assert (number(-1.005), number(NAN), share(0.8476), share(NAN)) == ("-1.00", "-", "84.8 %", "-")
 
 

@@ -7,7 +7,6 @@ import math
 import pytest
 
 from jtqd.sysid.report.numbers import number, percent, with_interval, with_unit
-from jtqd.sysid.text import counted
 
 PLAIN_SPACE = str.maketrans("\u00a0\u202f", "  ")
 
@@ -45,7 +44,3 @@ def test_numbers_for_people() -> None:
     ]
     assert [percent(x).translate(PLAIN_SPACE) for x in (0.123, -0.001, math.inf)] == ["12 %", "0 %", "–"]
     assert with_unit(0.0063, "A", 2).translate(PLAIN_SPACE) == "6.3 mA"
-
-
-def test_one_thing_has_no_plural() -> None:
-    assert [counted(n, "group") for n in (0, 1, 2)] == ["0 groups", "1 group", "2 groups"]
