@@ -41,6 +41,7 @@ from jtqd.daemon.shared.snapshot import (
     BUS_COUNTERS,
     LATE_BIN_NS,
     NMT_STATES,
+    OPERATIONAL,
     WORK_BIN_NS,
     SnapshotReader,
     View,
@@ -62,7 +63,6 @@ _FAULTS = (
     "latches",
 )
 """Counters shown when they are not zero."""
-_OPERATIONAL = 5
 _LAST_NOTICES = 4
 _EXAMPLES = """examples:
   jtq status                     live view of the daemon that runs here; Ctrl-C ends the view
@@ -393,7 +393,7 @@ def _nodes(about: About, view: View) -> Columns:
             state = Text(f"silent, was {state.plain}", style="bold red")
         elif node in view.unconfigured:
             state = Text("restarted, not configured yet", style="bold red")
-        elif heard and view.node_states[node] != _OPERATIONAL:
+        elif heard and view.node_states[node] != OPERATIONAL:
             state.stylize("yellow")
         age = duration(max(0, view.sync_realtime_ns - heard) * 1e-9) + " ago" if heard else NOTHING
         table.add(f"{node:02X}h", what, state, age)
