@@ -16,7 +16,6 @@ from typing import Any
 
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.live import Live
-from rich.measure import Measurement
 from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
@@ -46,7 +45,7 @@ from jtqd.daemon.shared.snapshot import (
     SnapshotReader,
     View,
 )
-from jtqd.daemon.supervisor.table import COLOURS, bus_load, plain_line
+from jtqd.daemon.supervisor.table import COLOURS, bus_load, first_that_fits, plain_line
 from jtqd.estimator.checked import counted
 from jtqd.estimator.status import NAMES, PUBLISHED
 
@@ -266,12 +265,11 @@ class Columns:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Called by rich with the width of the terminal."""
-        unlimited = options.update(max_width=1000)
-        for dropped in range(len(self._dispensable) + 1):
-            table = self._table([name for name in self._headings if name not in self._dispensable[:dropped]])
-            if Measurement.get(console, unlimited, table).maximum <= options.max_width:
-                break
-        yield table
+        tables = [
+            self._table([name for name in self._headings if name not in self._dispensable[:dropped]])
+            for dropped in range(len(self._dispensable) + 1)
+        ]
+        yield first_that_fits(tables, console, options) or tables[-1]
 
     def _table(self, names: list[str]) -> Table:
         table = Table(
