@@ -21,6 +21,7 @@ from functools import partial
 import can
 import canopen
 
+from jtqd.drivers import nmt
 from jtqd.drivers.boot_error import BootError
 from jtqd.drivers.boot_procedure import BootedNode, NodeBoot, reset_during_boot
 from jtqd.drivers.boot_request import BootRequest, RequestError, node_report, parse_request
@@ -30,9 +31,6 @@ from jtqd.drivers.frame import CAN_RTR_FLAG, CAN_SFF_MASK
 from jtqd.drivers.object_dictionary import entries_to_json, read_eds
 from jtqd.drivers.sdo_client import NetworkChannel, SdoClient
 
-NMT_START, NMT_PRE_OPERATIONAL = 0x01, 0x80
-STATE_BOOT_UP, STATE_STOPPED, STATE_OPERATIONAL, STATE_PRE_OPERATIONAL = 0x00, 0x04, 0x05, 0x7F
-_STATE_NAMES = {STATE_BOOT_UP: "boot-up", STATE_STOPPED: "stopped", STATE_PRE_OPERATIONAL: "pre-operational"}
 SYNC_LISTEN_S = 0.12  # a little more than the longest period that jtqd itself may have
 NOTIFIER_S = 0.01  # canopen's default of 1 s is what closing the network would wait for
 _UNIX = "unix:"
@@ -109,7 +107,7 @@ def _boot_nodes(
         attempt(node, partial(_require_heartbeat, heartbeats, node, wait_s))
     foreign.require_none()
     for node in booted:
-        network.send_message(0, [NMT_START, node])
+        network.send_message(0, [nmt.START, node])
     for node in list(booted):
         attempt(node, partial(_require_operational, network, heartbeats, node, wait_s))
     return booted, absent
@@ -120,9 +118,9 @@ def _configure(
 ) -> BootedNode:
     """Identify and configure one node, which stays pre-operational."""
     node = profile.node_id
-    was_operational = heartbeats.wait(node, None, 0.0) == STATE_OPERATIONAL
+    was_operational = heartbeats.wait(node, None, 0.0) == nmt.OPERATIONAL
     # A running node would refuse to be re-mapped, and a stopped one does not answer SDO.
-    network.send_message(0, [NMT_PRE_OPERATIONAL, node])
+    network.send_message(0, [nmt.ENTER_PRE_OPERATIONAL, node])
     sdo = SdoClient(NetworkChannel(network, node), request.timeout_s(node))
     procedure = NodeBoot(sdo, profile, request.settings)
     device_type = procedure.check_device_type()
@@ -149,14 +147,14 @@ def _require_operational(network: canopen.Network, heartbeats: Heartbeats, node:
     A drive may still watch the heartbeat of a jtqd that ended a moment ago: not every device begins anew when 1016h is
     written. When that runs out it leaves operational (1029h), rightly, as it had no master; but it does so once.
     """
-    state = heartbeats.wait(node, STATE_OPERATIONAL, wait_s)
-    if state == STATE_PRE_OPERATIONAL and not heartbeats.restarted(node):
-        network.send_message(0, [NMT_START, node])
-        state = heartbeats.wait(node, STATE_OPERATIONAL, wait_s)
+    state = heartbeats.wait(node, nmt.OPERATIONAL, wait_s)
+    if state == nmt.PRE_OPERATIONAL and not heartbeats.restarted(node):
+        network.send_message(0, [nmt.START, node])
+        state = heartbeats.wait(node, nmt.OPERATIONAL, wait_s)
     if heartbeats.restarted(node):
         raise reset_during_boot(node)
-    if state != STATE_OPERATIONAL:
-        found = _STATE_NAMES.get(state, f"state {state}") if state is not None else "no heartbeat"
+    if state != nmt.OPERATIONAL:
+        found = nmt.STATES.get(state, f"state {state}") if state is not None else "no heartbeat"
         detail = f"NMT start: expected operational within {wait_s:g} s, found {found}"
         raise BootError(node, "NMT state", expected="operational", found=found, detail=detail)
 
@@ -203,7 +201,7 @@ class Heartbeats:
             return
         with self._changed:
             self._state[can_id - 0x700] = data[0] & 0x7F
-            if data[0] == STATE_BOOT_UP:
+            if data[0] == nmt.BOOT_UP:
                 self._restarted.add(can_id - 0x700)
             self._changed.notify_all()
 
@@ -250,7 +248,7 @@ class ForeignMaster:
     def announce(self) -> None:
         """Send jtqd's own boot-up message: another one that is booting too hears it, and neither goes on."""
         if self._request.check_foreign_sync:
-            self._network.send_message(0x700 + self._request.settings.master_node, [STATE_BOOT_UP])
+            self._network.send_message(0x700 + self._request.settings.master_node, [nmt.BOOT_UP])
 
     def require_none(self) -> None:
         """Wait until it has listened long enough. Raises BootError when somebody else is there."""

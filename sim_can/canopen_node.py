@@ -12,6 +12,7 @@ import struct
 from collections.abc import Callable, Mapping, Set
 from functools import partial
 
+from jtqd.drivers import nmt
 from jtqd.drivers.emcy import ErrorHistory
 from jtqd.drivers.frame import FRAME, pack
 from jtqd.drivers.object_dictionary import ObjectStore
@@ -190,8 +191,6 @@ class Emergency:
         return pack(0x080 + self._store.node_id, _EMCY.pack(code, register))
 
 
-STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0x04, 0x05, 0x7F
-_START, _STOP, _ENTER_PRE_OPERATIONAL, _RESET_NODE, _RESET_COMMUNICATION = 1, 2, 128, 129, 130
 HEARTBEAT_LOST = 0x8130
 PDO_TOO_SHORT = 0x8210
 SYNC_LENGTH = 0x8240
@@ -211,7 +210,7 @@ class CanopenNode:
     def __init__(self, store: ObjectStore) -> None:
         self.store = store
         self.node_id = store.node_id
-        self.state = PRE_OPERATIONAL
+        self.state = nmt.PRE_OPERATIONAL
         self.due_ns = 0
         self.getters: dict[tuple[int, int], Getter] = {}
         self.handlers: dict[tuple[int, int], Handler] = {}
@@ -258,17 +257,17 @@ class CanopenNode:
     def raise_error(self, code: int, register: int) -> list[bytes]:
         """Add an error with its bits of 1001h; return the EMCY, unless the node is stopped."""
         frames = self._emergency.come(code, register)
-        return [] if self.state == STOPPED else frames
+        return [] if self.state == nmt.STOPPED else frames
 
     def clear_error(self, *codes: int) -> list[bytes]:
         """Remove errors; return EMCY 0000h if one of them was present and the node is not stopped."""
         frames = self._emergency.gone(*codes)
-        return [] if self.state == STOPPED else frames
+        return [] if self.state == nmt.STOPPED else frames
 
     def event(self) -> list[bytes]:
         """Send the event-driven TPDOs (types 254, 255) whose values have changed, and those never sent."""
         frames: list[bytes] = []
-        if self.state == OPERATIONAL:
+        if self.state == nmt.OPERATIONAL:
             for transmit in self._pdo_maps():
                 if transmit.type > LAST_SYNC_TYPE and not (transmit.timed_only and transmit.last):
                     frame = transmit.frame()
@@ -282,14 +281,14 @@ class CanopenNode:
     def on_frame(self, can_id: int, data: bytes, t_ns: int) -> list[bytes]:
         """Handle any frame but SYNC: NMT, SDO request, RPDO, a watched heartbeat; others are ignored."""
         if can_id == 0x600 + self.node_id:
-            if self.state == STOPPED:
+            if self.state == nmt.STOPPED:
                 return []
             return self._on_sdo(data, t_ns)
         if can_id == 0:
             return self._on_nmt(data, t_ns)
         if 0x701 <= can_id <= 0x77F:
             return self._on_heartbeat(can_id - 0x700, data, t_ns)
-        if self.state == OPERATIONAL:
+        if self.state == nmt.OPERATIONAL:
             self._pdo_maps()
             pdo = self._receive.get(can_id)
             if pdo is not None:
@@ -298,7 +297,7 @@ class CanopenNode:
 
     def on_sync(self, data: bytes) -> list[bytes]:
         """Handle a SYNC: apply the synchronous RPDOs received before it, then send the TPDOs that are due."""
-        if self.state != OPERATIONAL:
+        if self.state != nmt.OPERATIONAL:
             return []
         frames: list[bytes] = []
         counter = data[0] if len(data) == 1 else 0
@@ -333,16 +332,16 @@ class CanopenNode:
         frames: list[bytes] = []
         if self._bootup_pending:
             self._bootup_pending = False
-            frames.append(pack(0x700 + self.node_id, b"\0"))
+            frames.append(nmt.heartbeat(self.node_id, nmt.BOOT_UP))
             self._plan_heartbeat(t_ns)
         if t_ns >= self._heartbeat_due_ns:
-            frames.append(pack(0x700 + self.node_id, bytes([self.state])))
+            frames.append(nmt.heartbeat(self.node_id, self.state))
             missed = (t_ns - self._heartbeat_due_ns) // self._heartbeat_ns
             self._heartbeat_due_ns += (missed + 1) * self._heartbeat_ns
         if t_ns >= self._consumer.due_ns and self._consumer.lost(t_ns):
             frames += self._on_master_lost()
         due = min(self._heartbeat_due_ns, self._consumer.due_ns)
-        if self.state == OPERATIONAL:
+        if self.state == nmt.OPERATIONAL:
             for transmit in self._pdo_maps():
                 if transmit.type > LAST_SYNC_TYPE and transmit.period_ns:
                     if t_ns >= transmit.due_ns:
@@ -384,17 +383,17 @@ class CanopenNode:
             return []
         command = data[0]
         self.due_ns = 0
-        if command == _START:
-            if self.state != OPERATIONAL:
-                self.state = OPERATIONAL
+        if command == nmt.START:
+            if self.state != nmt.OPERATIONAL:
+                self.state = nmt.OPERATIONAL
                 self._generation = -1
                 return self.event()  # event-driven TPDOs are sent once on entering
-        elif command == _STOP:
-            self.state = STOPPED
-        elif command == _ENTER_PRE_OPERATIONAL:
-            self.state = PRE_OPERATIONAL
-        elif command in (_RESET_NODE, _RESET_COMMUNICATION):
-            self._reset(command == _RESET_NODE)
+        elif command == nmt.STOP:
+            self.state = nmt.STOPPED
+        elif command == nmt.ENTER_PRE_OPERATIONAL:
+            self.state = nmt.PRE_OPERATIONAL
+        elif command in (nmt.RESET_NODE, nmt.RESET_COMMUNICATION):
+            self._reset(command == nmt.RESET_NODE)
             return self.tick(t_ns)
         return []
 
@@ -403,7 +402,7 @@ class CanopenNode:
         self.store.restore(0x1000, 0xFFFF if whole else 0x1FFF)
         if whole:
             self.on_reset()
-        self.state = PRE_OPERATIONAL
+        self.state = nmt.PRE_OPERATIONAL
         self._sdo = SdoServer(self.store)
         self._emergency.forget()
         self._generation = -1
@@ -428,10 +427,10 @@ class CanopenNode:
         frames = self.raise_error(HEARTBEAT_LOST, COMMUNICATION)
         frames += self.on_heartbeat_lost()
         behaviour = self.store.number(0x1029, 1)
-        if behaviour == 0 and self.state == OPERATIONAL:
-            self.state = PRE_OPERATIONAL
+        if behaviour == 0 and self.state == nmt.OPERATIONAL:
+            self.state = nmt.PRE_OPERATIONAL
         elif behaviour == 2:
-            self.state = STOPPED
+            self.state = nmt.STOPPED
         return frames
 
     def _on_rpdo(self, pdo: PdoMap, data: bytes) -> list[bytes]:

@@ -14,7 +14,7 @@ from typing import Any
 from jtqd.daemon.config import Config
 from jtqd.daemon.shared.child_process import Child
 from jtqd.daemon.shared.log_lines import RateLimit
-from jtqd.daemon.shared.snapshot import SnapshotReader, View
+from jtqd.daemon.shared.snapshot import NOT_OPERATIONAL, SnapshotReader, View
 from jtqd.drivers.bus_load import BusLoad, configured_load
 
 _OWN_EDS = Path(__file__).resolve().parents[2] / "drivers" / "eds" / "jtqd.eds"
@@ -75,8 +75,6 @@ def bus_load_of(config: Config) -> BusLoad:
 
 
 _RETRY_S, _LONGEST_RETRY_S = 0.5, 8.0
-_NOT_OPERATIONAL = (4, 127)
-"""Heartbeat states stopped and pre-operational (CiA 301)."""
 _SAY_AGAIN_S = 60.0
 """Between two lines that say the same about a boot that fails."""
 _SETTLED_S = 0.3
@@ -129,9 +127,7 @@ class ReturningNodes:
 
     def waiting(self, view: View, now_s: float) -> list[int]:
         """Nodes that need a boot and may be tried now, the one that has waited longest first."""
-        idle = [
-            int(node) for node in self._report["nodes"] if view.node_states[int(node)] in _NOT_OPERATIONAL
-        ]
+        idle = [int(node) for node in self._report["nodes"] if view.node_states[int(node)] in NOT_OPERATIONAL]
         wanted = dict.fromkeys((*view.unconfigured, *idle, *self._requested, *self.absent))
         due = [node for node in wanted if now_s >= self._not_before.get(node, 0.0)]
         return sorted(due, key=lambda node: self._not_before.get(node, 0.0))

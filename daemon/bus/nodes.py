@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 
 from jtqd.daemon.bus.boot import ReturningNodes
 from jtqd.daemon.shared.log_lines import RateLimit
-from jtqd.daemon.shared.snapshot import NMT_STATES, SnapshotReader, View
+from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.drivers.boot_procedure import VERIFY_CONFIGURATION, signature
+from jtqd.drivers.nmt import STATES
 from jtqd.drivers.sdo import NO_OBJECT, NO_SUBINDEX, SdoQueue, SdoResult
 
 NOT_WATCHED, WAITING, ACTIVE, LOST = 0, 1, 2, 3
@@ -108,7 +109,7 @@ class NodeWatch:
         watch = self._watches.get(node)
         if watch is None:
             return self._foreign(node, data)
-        if len(data) != 1 or data[0] not in NMT_STATES:
+        if len(data) != 1 or data[0] not in STATES:
             self.malformed += 1
             found = f"{len(data)} bytes" if len(data) != 1 else f"state {data[0]:02X}h"
             return [
@@ -126,7 +127,7 @@ class NodeWatch:
         if watch.state in (WAITING, LOST):
             watch.state = ACTIVE
         if data[0] and watch.last_state is not None and data[0] != watch.last_state:
-            name = NMT_STATES[data[0]]
+            name = STATES[data[0]]
             events.append(self._event("state", node, watch, now_s, lambda: f"it is {name} now"))
         watch.last_state = data[0] or None
         if data[0]:

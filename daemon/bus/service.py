@@ -31,7 +31,7 @@ from jtqd.daemon.config import Config
 from jtqd.daemon.shared.conditions import THE_BUS, Conditions, Subject
 from jtqd.daemon.shared.log_lines import RateLimit
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
-from jtqd.drivers import emcy
+from jtqd.drivers import emcy, nmt
 from jtqd.drivers.devices import COMMANDER_NODE
 from jtqd.drivers.emcy import describe, name_of
 from jtqd.drivers.filters import CanFilter, exact
@@ -100,7 +100,6 @@ def content(service: BusService) -> dict[str, Any]:
 _BATCHES = 8
 """Calls of `receive` in one turn: a storm of frames waits in the kernel's queue, and what overflows there is counted."""
 _REPORT_S = 0.5
-_NMT = {1: "start", 2: "stop", 128: "enter pre-operational", 129: "reset node", 130: "reset communication"}
 
 _BUS_CONDITIONS = {WARNING: "bus_warning", PASSIVE: "bus_passive", BUS_OFF: "bus_off", DOWN: "bus_down"}
 _NODE_CONDITIONS = {
@@ -294,7 +293,7 @@ class BusService:
             return
         self.foreign_nmt += 1
         if len(data) == 2 and self._limit.admit(("nmt", data), now_s) is not None:
-            command = _NMT.get(data[0], f"{data[0]:02X}h")
+            command = nmt.COMMANDS.get(data[0], f"{data[0]:02X}h")
             whom = f"node {data[1]}" if data[1] else "all nodes"
             self._log("nmt", data[1] & 0x7F, f"NMT command '{command}' to {whom} from another master")
 

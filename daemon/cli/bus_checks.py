@@ -14,7 +14,8 @@ from jtqd.daemon.cli.traffic import SYNC, NodeCount, PdoCount, TimeHistogram, Ti
 from jtqd.daemon.config import Config
 from jtqd.daemon.shared.conditions import Condition
 from jtqd.daemon.shared.notices import ERROR
-from jtqd.daemon.shared.snapshot import LATE_BIN_NS, NMT_STATES, View
+from jtqd.daemon.shared.snapshot import LATE_BIN_NS, View
+from jtqd.drivers import nmt
 from jtqd.drivers.bus_load import LIMIT
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_SFF_MASK
 from jtqd.estimator.checked import counted
@@ -37,7 +38,6 @@ _STOLEN_HINT = (
 )
 _TIMING_HINT = "`jtq doctor` says what real time lacks on this machine"
 _HEARTBEAT_GAP = 1.5
-_OPERATIONAL = 5
 _ERROR_CLASSES = {
     0x001: "transmit timeout",
     0x002: "arbitration lost",
@@ -218,7 +218,7 @@ def _node(node: NodeCount, traffic: Traffic, config: Config) -> CheckResult:
             hint = "not there, or not booted: a node has none before jtqd has configured it"
             return CheckResult(item, WARN, "none", hint)
         return CheckResult(item, FAIL, "none", "is it powered, wired, and at the right bit rate?")
-    state = NMT_STATES.get(node.state if node.state is not None else -1, f"state {node.state}")
+    state = nmt.STATES.get(node.state if node.state is not None else -1, f"state {node.state}")
     text = f"{state}; longest silence {node.longest_gap_ns / 1e6:.0f} ms, expected {config.heartbeat_ms} ms"
     if node.emergencies:
         text += f"; {node.emergencies} EMCY, last {node.last_emergency:04X}h"
@@ -228,7 +228,7 @@ def _node(node: NodeCount, traffic: Traffic, config: Config) -> CheckResult:
         hint = "supply voltage? watchdog of the drive?"
     elif node.longest_gap_ns > _HEARTBEAT_GAP * config.heartbeat_ms * 1e6:
         hint = "heartbeats are late or lost"
-    elif node.state != _OPERATIONAL:
+    elif node.state != nmt.OPERATIONAL:
         hint = "it sends no PDO in this state; jtqd starts it"
     elif node.emergencies:
         hint = "1003h of the node has its history"

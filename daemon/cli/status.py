@@ -16,7 +16,6 @@ from typing import Any
 
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.live import Live
-from rich.measure import Measurement
 from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
@@ -41,11 +40,12 @@ from jtqd.daemon.shared.snapshot import (
     BUS_COUNTERS,
     LATE_BIN_NS,
     NMT_STATES,
+    OPERATIONAL,
     WORK_BIN_NS,
     SnapshotReader,
     View,
 )
-from jtqd.daemon.supervisor.table import COLOURS, bus_load, plain_line
+from jtqd.daemon.supervisor.table import COLOURS, bus_load, first_that_fits, plain_line
 from jtqd.estimator.checked import counted
 from jtqd.estimator.status import NAMES, PUBLISHED
 
@@ -62,7 +62,6 @@ _FAULTS = (
     "latches",
 )
 """Counters shown when they are not zero."""
-_OPERATIONAL = 5
 _LAST_NOTICES = 4
 _EXAMPLES = """examples:
   jtq status                     live view of the daemon that runs here; Ctrl-C ends the view
@@ -266,12 +265,11 @@ class Columns:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Called by rich with the width of the terminal."""
-        unlimited = options.update(max_width=1000)
-        for dropped in range(len(self._dispensable) + 1):
-            table = self._table([name for name in self._headings if name not in self._dispensable[:dropped]])
-            if Measurement.get(console, unlimited, table).maximum <= options.max_width:
-                break
-        yield table
+        tables = [
+            self._table([name for name in self._headings if name not in self._dispensable[:dropped]])
+            for dropped in range(len(self._dispensable) + 1)
+        ]
+        yield first_that_fits(tables, console, options) or tables[-1]
 
     def _table(self, names: list[str]) -> Table:
         table = Table(
@@ -393,7 +391,7 @@ def _nodes(about: About, view: View) -> Columns:
             state = Text(f"silent, was {state.plain}", style="bold red")
         elif node in view.unconfigured:
             state = Text("restarted, not configured yet", style="bold red")
-        elif heard and view.node_states[node] != _OPERATIONAL:
+        elif heard and view.node_states[node] != OPERATIONAL:
             state.stylize("yellow")
         age = duration(max(0, view.sync_realtime_ns - heard) * 1e-9) + " ago" if heard else NOTHING
         table.add(f"{node:02X}h", what, state, age)

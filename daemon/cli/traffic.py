@@ -12,10 +12,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from jtqd.daemon.bus.boot import bus_load_of
+from jtqd.daemon.bus.service import nodes_of
 from jtqd.daemon.config import Config
 from jtqd.daemon.loop import estimate_pdo
 from jtqd.daemon.loop.input_pdos import input_pdos
 from jtqd.daemon.loop.schedule import Grid
+from jtqd.drivers import nmt
 from jtqd.drivers.frame import (
     CAN_EFF_FLAG,
     CAN_EFF_MASK,
@@ -61,7 +63,7 @@ class TimeHistogram:
 
 
 SYNC = 0x080
-_HEARTBEAT, _EMCY = 0x700, 0x080
+_EMCY = 0x080
 _SERVICES = (0x000, 0x100, 0x7E4, 0x7E5)
 """NMT, TIME, LSS: of nobody in particular."""
 _LATE = 1000
@@ -237,7 +239,7 @@ class Traffic:
         if node is None:
             return
         function = can_id & 0x780
-        if function == _HEARTBEAT and len(data) == 1:
+        if function == nmt.HEARTBEAT_BASE and len(data) == 1:
             if node.last_ns:
                 node.longest_gap_ns = max(node.longest_gap_ns, stamp_ns - node.last_ns)
             node.heartbeats += 1
@@ -254,10 +256,6 @@ def described(can_id: int) -> str:
     identifier = can_id & (CAN_EFF_MASK if extended else CAN_SFF_MASK)
     marks = [word for word, applies in (("29 bit", extended), ("remote", can_id & CAN_RTR_FLAG)) if applies]
     return f"{identifier:0{8 if extended else 3}X}h" + (f" ({', '.join(marks)})" if marks else "")
-
-
-_OPERATIONAL = b"\x05"
-_NMT_PRE_OPERATIONAL = 0x80
 
 
 @dataclass
@@ -298,7 +296,7 @@ def drive(socket: FrameSocket, traffic: Traffic, seconds: float, config: Config)
     """
     timing = Timing()
     syncs = [pack(SYNC, bytes((n,))) for n in range(config.counter_overflow + 1)]
-    heartbeat = pack(0x700 + config.node_id, _OPERATIONAL)
+    heartbeat = nmt.heartbeat(config.node_id, nmt.OPERATIONAL)
     every = max(1, config.heartbeat_ms * 1_000_000 // config.period_ns)
     counter, sent_ns = 0, 0
     for slot in _slots(seconds, config.period_ns, timing):
@@ -316,10 +314,8 @@ def drive(socket: FrameSocket, traffic: Traffic, seconds: float, config: Config)
 
 def leave(socket: FrameSocket, config: Config) -> None:
     """Put the nodes back to pre-operational, as jtqd does at its end. Raises BusError."""
-    nodes = [joint.node_id for joint in config.joints]
-    nodes += [config.sensor.node_id] if config.sensor else []
-    for node in nodes:
-        socket.send(pack(0x000, bytes((_NMT_PRE_OPERATIONAL, node))))
+    for node in nodes_of(config):
+        socket.send(nmt.command(nmt.ENTER_PRE_OPERATIONAL, node))
 
 
 def silent(socket: FrameSocket, seconds: float) -> bool:

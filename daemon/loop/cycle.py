@@ -27,6 +27,7 @@ from jtqd.daemon.shared.ring import Ring
 from jtqd.daemon.shared.snapshot import Snapshot
 from jtqd.drivers.frame import pack
 from jtqd.drivers.frame_socket import BusDown, FrameSocket
+from jtqd.drivers.nmt import OPERATIONAL, heartbeat
 from jtqd.estimator import status as st
 from jtqd.estimator.methods import AnyEstimator
 
@@ -191,7 +192,7 @@ class Cycle:
         self._wake_up = WakeUp(wait_ns, deadline_ns)
         self._sync_frames = [pack(0x080, bytes((n,))) for n in range(counter_overflow + 1)]
         self._estimate_id = 0x180 + node_id
-        self._heartbeat = pack(0x700 + node_id, b"\x05")
+        self._heartbeat = heartbeat(node_id, OPERATIONAL)
         self._heartbeat_cycles, self._heartbeat_due = heartbeat_cycles, 0
         self.index = self.counter = self.late_ns = 0
         self._flags = self._next_flags = 0

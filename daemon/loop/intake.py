@@ -36,6 +36,7 @@ from collections.abc import Sequence
 from jtqd.daemon.loop.input_pdos import InputPdo, InputState, JointTemperature
 from jtqd.drivers.devices import SYNC_COB_ID
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_RTR_FLAG
+from jtqd.drivers.nmt import BOOT_UP, HEARTBEAT_BASE, STATES
 
 _LONGEST = 10
 """Slots; after that SYNC goes on and the debts stay."""
@@ -77,12 +78,6 @@ class Gaps:
         return self.open and self.arrivals > 0 and self.length < _LONGEST
 
 
-_HEARTBEAT_BASE = 0x700
-_BOOT_UP = 0
-_NMT_STATES = frozenset((_BOOT_UP, 4, 5, 127))
-"""What a heartbeat may say (CiA 301): boot-up, stopped, operational, pre-operational."""
-
-
 class NodeTrust:
     """Which producers of the input PDOs may be believed: heartbeats, who has restarted, who has been configured since.
 
@@ -97,7 +92,7 @@ class NodeTrust:
         wanted: number of PDOs whose node is believed.
         unconfigured: nodes that are not, because they restarted, are in doubt or absent.
         absent: those of them that are missed by nobody.
-        states: last heartbeat state of each node (CiA 301: 0 boot-up, 4 stopped, 5 operational, 127 pre-operational).
+        states: last heartbeat state of each node (`drivers.nmt.STATES`).
         heard_ns: kernel stamp of that heartbeat, CLOCK_REALTIME.
         boot_ups: boot-up messages of all nodes.
         restarts: boot-up messages of each node that has sent one.
@@ -105,7 +100,7 @@ class NodeTrust:
 
     def __init__(self, pdos: Sequence[InputState]) -> None:
         self._pdos = tuple(pdos)
-        self.heartbeats = {_HEARTBEAT_BASE + state.pdo.node_id: state.pdo.node_id for state in pdos}
+        self.heartbeats = {HEARTBEAT_BASE + state.pdo.node_id: state.pdo.node_id for state in pdos}
         self.wanted = len(self._pdos)
         self.unconfigured: frozenset[int] = frozenset()
         self.absent: frozenset[int] = frozenset()
@@ -116,11 +111,11 @@ class NodeTrust:
 
     def heartbeat(self, node_id: int, state: int, stamp_ns: int) -> bool:
         """A heartbeat of one byte; False for one with an impossible state: it is none."""
-        if state not in _NMT_STATES:
+        if state not in STATES:
             return False
         self.states[node_id] = state
         self.heard_ns[node_id] = stamp_ns
-        if state == _BOOT_UP:  # the mapping is back to the device's default
+        if state == BOOT_UP:  # the mapping is back to the device's default
             self.boot_ups += 1
             self.restarts[node_id] = self.restarts.get(node_id, 0) + 1
             self.doubt(node_id)

@@ -22,13 +22,13 @@ from jtqd.drivers.devices import (
     sensor_tpdo1,
     sensor_tpdo2,
 )
+from jtqd.drivers.nmt import HEARTBEAT_BASE, STATES
 from jtqd.drivers.pdo import PdoMap
 
 if TYPE_CHECKING:
     from jtqd.daemon.config import Config
 
-SYNC_ID, EMCY_BASE, HEARTBEAT_BASE = 0x080, 0x080, 0x700
-_NMT_STATES = {0: "boot_up", 4: "stopped", 5: "operational", 127: "pre_operational"}
+SYNC_ID, EMCY_BASE = 0x080, 0x080
 _RECEIVER = "Vector__XXX"  # the format's word for "nobody in particular"
 _PDO_NUMBER = {0x180: 1, 0x280: 2, 0x380: 3, 0x480: 4}
 
@@ -99,7 +99,7 @@ def dbc_of(
             )
         name = f"{node_names[node]}_TPDO{_PDO_NUMBER[base]}"
         messages.append((pdo.cob_id, name, pdo.length, node, _pdo_signals(pdo, quantities)))
-    states = Quantity(values=_NMT_STATES)
+    states = Quantity(values={state: name.replace("-", "_") for state, name in STATES.items()})
     for node, name in node_names.items():
         emergency = [
             _Signal("error_code", 0, 16, False, _PLAIN),

@@ -211,26 +211,6 @@ class _Temperatures:
                 temperature.celsius = said
 
 
-def published_bytes(joints: Sequence[RecordArray]) -> npt.NDArray[np.uint8]:
-    """Estimate PDO [n, 8] by the states in a log: the bytes that the loop sent, as they follow from what it recorded."""
-    parts = [
-        zip(each["torque_nm"].tolist(), each["sigma_nm"].tolist(), each["status"].tolist(), strict=True)
-        for each in joints
-    ]
-    data = bytearray()
-    for first, second, counter in zip(*parts, joints[0]["sync_counter"].tolist(), strict=True):
-        data += estimate_pdo.encode(estimate_pdo.field(*first), estimate_pdo.field(*second), counter)
-    return np.frombuffer(bytes(data), np.uint8).reshape(-1, 8)
-
-
-def logged_samples(records: RecordArray) -> RecordArray:
-    """The same fields of a log's states, `SAMPLE` [n]."""
-    out = np.zeros(len(records), SAMPLE)
-    for name in SAMPLE.names or ():
-        out[name] = records[name]
-    return out
-
-
 WHOLE = np.dtype(
     [
         *((name, "<f8") for name in ("torque_nm", "sigma_nm", "tob_nm", "physics_nm", "network_nm")),

@@ -39,15 +39,14 @@ from jtqd.daemon.supervisor.health import Health
 from jtqd.daemon.supervisor.service import Service
 from jtqd.daemon.supervisor.summary import Summary, summary_of
 from jtqd.daemon.supervisor.table import Display
+from jtqd.drivers import nmt
 from jtqd.drivers.bus_load import BusLoad, BusLoadError, check_bus_load
-from jtqd.drivers.frame import pack
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
 from jtqd.drivers.object_dictionary import ObjectStore, entries_from_json
 
 _WARM_UP_TIMEOUT_S = 60.0
 """Generous: a controller that loads its libraries from a slow card may take its time; nothing is published meanwhile."""
 _BENCH_PRIORITY = 40
-_NMT_PRE_OPERATIONAL = 0x80
 
 StartChild = Callable[[str, list[str], str], Child]
 Stopped = Callable[[], bool]
@@ -159,7 +158,7 @@ def put_back(config: Config, send: Callable[[bytes], bool]) -> None:
     """The SYNC has ended, or never begun: the nodes that were started are pre-operational again."""
     for node in nodes_of(config):
         try:
-            send(pack(0x000, bytes((_NMT_PRE_OPERATIONAL, node))))
+            send(nmt.command(nmt.ENTER_PRE_OPERATIONAL, node))
         except BusError:
             return
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from math import isfinite
 from types import TracebackType
 
@@ -39,6 +40,15 @@ def bus_load(previous: View, now: View, bitrate: int) -> float:
     return bits / seconds / bitrate if previous.sync_realtime_ns and seconds > 0 else float("nan")
 
 
+def first_that_fits(tables: Iterable[Table], console: Console, options: ConsoleOptions) -> Table | None:
+    """Return the first of the tables that the terminal has room for without cutting; None: none of them."""
+    unlimited = options.update(max_width=1000)
+    fitting = (
+        table for table in tables if Measurement.get(console, unlimited, table).maximum <= options.max_width
+    )
+    return next(fitting, None)
+
+
 class LiveTable:
     """One picture of the running loop, as wide as the terminal allows: the status is there at any width.
 
@@ -56,12 +66,14 @@ class LiveTable:
         yield Text(self._line)
 
     def _widest_that_fits(self, console: Console, options: ConsoleOptions) -> RenderableType:
-        unlimited = options.update(max_width=1000)
-        for dropped in range(len(_DISPENSABLE) + 1):
-            for box in (HEAVY_HEAD, None) if dropped == len(_DISPENSABLE) else (HEAVY_HEAD,):
-                table = self._table([name for name in _COLUMNS if name not in _DISPENSABLE[:dropped]], box)
-                if Measurement.get(console, unlimited, table).maximum <= options.max_width:
-                    return table
+        tables = (
+            self._table([name for name in _COLUMNS if name not in _DISPENSABLE[:dropped]], box)
+            for dropped in range(len(_DISPENSABLE) + 1)
+            for box in ((HEAVY_HEAD, None) if dropped == len(_DISPENSABLE) else (HEAVY_HEAD,))
+        )
+        table = first_that_fits(tables, console, options)
+        if table is not None:
+            return table
         lines = (
             Text.assemble(f"{row['joint']}: {row['torque [Nm]']} Nm ", row["status"]) for row in self._rows
         )

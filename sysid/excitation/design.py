@@ -82,7 +82,6 @@ def minimise(criterion: Criterion, dimension: int, *, evaluations: int, rng: np.
 
 
 STRIBECK_VELOCITY_RAD_S: Final = 0.05
-COLUMNS: Final = 20
 _RIDGE: Final = 1e-9
 """Added to the diagonal of the information, whose columns have a mean square near 1: a run that leaves out a quadrant
 gets a bad log det in place of an infinite one; that of a useful run changes by less than 0.001."""

@@ -1,9 +1,10 @@
 """Detect plateaus of a run from the data alone: settled velocity and load, with their means and standard errors.
 
-Means over whole ripple periods (`ripple_cells`) are compared. The longest stretch of them in which
-velocity, torque and motor torque G Kt i each stay within a band is a plateau; then the longest of what is left, and so
-on. The settling at its ends is cut off. No marks, no set-points, no threshold on the derivative of
-a noisy signal.
+Means over cells of whole ripple periods (`cut_cells`) are compared: a harmonic drive's ripple has 2 periods per motor
+revolution, and a mean over whole ones does not contain it, however long or short they are. The longest stretch
+of them in which velocity, torque and motor torque G Kt i each stay within a band is a plateau; then the longest
+of what is left, and so on. The settling at its ends is cut off. No marks, no set-points, no threshold on the derivative
+of a noisy signal.
 
 Standard errors are those of means of coloured noise: the standard deviation without the ripple over the square root of
 the effective number of samples, by their autocorrelation. Noise with a memory of a twentieth of the plateau still gets
@@ -26,7 +27,6 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns
 from jtqd.sysid.fit.friction import effective_samples
-from jtqd.sysid.fit.ripple_cells import Cells, cut_cells, means_between
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.channels import integral
 from jtqd.sysid.runs.files import RunFile
@@ -283,3 +283,66 @@ def plateaus_of(
     for reason in unsettled:
         print(f"jtq fit: {reason}", file=sys.stderr)
     return plateaus
+
+
+class Cells(NamedTuple):
+    """Consecutive cells: means [n, m] of m signals, edges [n] in s, and whether a cell may be used [n].
+
+    Not usable: cells of a joint so slow that a ripple period takes longer than it may; they are cut by time instead.
+    """
+
+    means: FloatArray
+    start_s: FloatArray
+    end_s: FloatArray
+    usable: NDArray[np.bool_]
+
+
+def cut_cells(
+    time_s: FloatArray,
+    signals: Sequence[FloatArray],
+    motor_velocity_rad_s: FloatArray,
+    *,
+    shortest_s: float,
+    longest_s: float,
+    periods_per_motor_rev: float,
+) -> Cells:
+    """Cut a run [n] into cells of as many whole ripple periods as take at least `shortest_s`.
+
+    time_s rising, steps may be uneven; the angle is the motor velocity's integral, so that positions that roll over or
+    are not measured do not matter.
+    """
+    distance = integral(time_s, np.abs(motor_velocity_rad_s))
+    periods = distance * periods_per_motor_rev / math.tau
+    starts, ends, usable = [], [], []
+    start, last = float(time_s[0]), float(time_s[-1])
+    while start + shortest_s <= last:
+        at, ahead = np.interp((start, start + shortest_s), time_s, periods).tolist()
+        end = _time_of(at + max(1, math.ceil(ahead - at - 1e-9)), time_s, periods)
+        good = end - start <= longest_s
+        if not good:
+            end = start + shortest_s
+        starts.append(start)
+        ends.append(end)
+        usable.append(good)
+        start = end
+    edges = np.array(starts), np.array(ends)
+    means = np.array([means_between(time_s, signal, *edges) for signal in signals])
+    return Cells(means.T, *edges, np.array(usable, np.bool_))
+
+
+def means_between(
+    time_s: FloatArray, signal: FloatArray, start_s: FloatArray, end_s: FloatArray
+) -> FloatArray:
+    """Return the means [m] of a signal [n] over [start, end] (each [m]), samples at the ends taken in part."""
+    area = integral(time_s, signal)
+    result: FloatArray = np.interp(end_s, time_s, area) - np.interp(start_s, time_s, area)
+    return result / (end_s - start_s)
+
+
+def _time_of(period: float, time_s: FloatArray, periods: FloatArray) -> float:
+    """When the given number of ripple periods has passed; infinity if it never does."""
+    index = int(np.searchsorted(periods, period))
+    if index >= len(periods):
+        return math.inf
+    share = (period - periods[index - 1]) / (periods[index] - periods[index - 1])
+    return float(time_s[index - 1] + share * (time_s[index] - time_s[index - 1]))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
-
+from jtqd.drivers import nmt
 from jtqd.drivers.devices import COMMANDER_NODE, drive_rpdo1, drive_rpdo2
 from jtqd.drivers.frame import FRAME, pack
 from jtqd.drivers.sdo import Transfer
@@ -13,8 +12,6 @@ from jtqd.sysid.motion.setpoints import MotionError, Setpoints
 from jtqd.sysid.motion.setup import DriveUnits
 
 _COMMAND, _VELOCITY = drive_rpdo1(1).layout, drive_rpdo2(1).layout
-_BOOT_UP: Final = b"\x00"
-_OPERATIONAL: Final = b"\x05"
 
 
 class Commands:
@@ -70,12 +67,12 @@ class Heartbeat:
     def __init__(self, period_s: float, now_ns: int) -> None:
         self.due_ns = now_ns
         self._period_ns = round(period_s * 1e9)
-        self._state = _BOOT_UP
+        self._state = nmt.BOOT_UP
 
     def frames(self, now_ns: int) -> list[bytes]:
         """Return the heartbeat if it is due."""
         if now_ns < self.due_ns:
             return []
         self.due_ns += self._period_ns * (1 + (now_ns - self.due_ns) // self._period_ns)
-        state, self._state = self._state, _OPERATIONAL
-        return [pack(0x700 + COMMANDER_NODE, state)]
+        state, self._state = self._state, nmt.OPERATIONAL
+        return [nmt.heartbeat(COMMANDER_NODE, state)]

@@ -24,6 +24,7 @@ from jtqd.drivers.devices import (
     sensor_tpdo2,
 )
 from jtqd.drivers.emcy import NO_ERROR, Emergency, parse
+from jtqd.drivers.nmt import BOOT_UP, OPERATIONAL, STATES
 from jtqd.sysid.motion.cia402 import FAULTED, POWERED, State, describe, fast_state
 from jtqd.sysid.motion.setpoints import JointSample, Sample, Timing, Violation
 from jtqd.sysid.motion.setup import DriveUnits, SensorUnits
@@ -210,8 +211,7 @@ def _difference(counts: int) -> int:
 
 STILL_RAD_S: Final = 0.02
 """Joint side: below this a joint stands."""
-_OPERATIONAL: Final = 0x05
-_NMT_NAMES: Final = {0x00: "restarted (boot-up message)", 0x04: "stopped", 0x7F: "pre-operational"}
+_NMT_NAMES: Final = STATES | {BOOT_UP: "restarted (boot-up message)"}
 _MS: Final = 1e-6
 
 
@@ -297,7 +297,7 @@ class Supervision:
         if node.emergency is not None:
             code, register = node.emergency.code, node.emergency.register
             return Violation(f"{node.who}: EMCY {code:04X}h (error register {register:02X}h)", hard)
-        if node.nmt_state != _OPERATIONAL:
+        if node.nmt_state != OPERATIONAL:
             name = _NMT_NAMES.get(node.nmt_state, f"state {node.nmt_state}")
             return Violation(f"{node.who}: NMT {name}, expected operational", hard)
         age_ns = now_ns - node.beat_ns

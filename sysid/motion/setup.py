@@ -18,6 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
+from jtqd.drivers import nmt
 from jtqd.drivers.boot_error import BootError, mismatch
 from jtqd.drivers.boot_procedure import BusSettings, NodeBoot
 from jtqd.drivers.devices import (
@@ -33,7 +34,7 @@ from jtqd.drivers.devices import (
     drive_tpdo3,
 )
 from jtqd.drivers.filters import exact
-from jtqd.drivers.frame import FRAME, FRAME_SIZE, pack
+from jtqd.drivers.frame import FRAME, FRAME_SIZE
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
 from jtqd.drivers.pdo import CAN_ID, INVALID, PdoMap, split_word
 from jtqd.drivers.sdo import Key
@@ -260,7 +261,7 @@ def _switch_on_temperature(drive: NodeObjects) -> None:
         drive.put((0x1802, 1), cob_id & ~INVALID, 4, "COB-ID of TPDO3")
 
 
-_HEARTBEAT = pack(0x700 + COMMANDER_NODE, b"\x05")
+_HEARTBEAT = nmt.heartbeat(COMMANDER_NODE, nmt.OPERATIONAL)
 
 
 class BenchSetup:

@@ -9,7 +9,6 @@ from jtqd.sim_can.cost import map_pdos
 from jtqd.sim_can.source import VELOCITY, ChannelSignal, DriveRatings, DriveSignals
 
 MS = 1_000_000
-START, STOP, PRE_OPERATIONAL, RESET_NODE, RESET_COMMUNICATION = 1, 2, 128, 129, 130
 
 
 class FakeSource:

@@ -10,6 +10,7 @@ import pytest
 
 from jtqd.drivers.devices import COMMANDER_NODE
 from jtqd.drivers.frame import FRAME
+from jtqd.drivers.nmt import RESET_COMMUNICATION, RESET_NODE, START
 from jtqd.models.files import shipped
 from jtqd.sim_can.bench import bench_filters
 from jtqd.sim_can.days import day
@@ -19,9 +20,6 @@ from jtqd.sim_can.plant_source import PlantSource
 from jtqd.sim_can.source import CURRENT, VELOCITY
 from tests.sim_can.bench_player import (
     MS,
-    RESET_COMMUNICATION,
-    RESET_NODE,
-    START,
     FakeSource,
     Player,
     enabled,

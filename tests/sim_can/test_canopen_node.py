@@ -6,14 +6,10 @@ import struct
 import pytest
 
 from jtqd.drivers.devices import sensor_tpdo2
+from jtqd.drivers.nmt import ENTER_PRE_OPERATIONAL, RESET_COMMUNICATION, RESET_NODE, START, STOP
 from jtqd.sim_can.source import CURRENT
 from tests.sim_can.bench_player import (
     MS,
-    PRE_OPERATIONAL,
-    RESET_COMMUNICATION,
-    RESET_NODE,
-    START,
-    STOP,
     FakeSource,
     Player,
     mapped_player,
@@ -52,7 +48,7 @@ def test_heartbeat_comes_on_its_own_grid_with_the_state(player):
     assert player.tick(1000) == ["701#04"]  # missed ones are not made up for
     assert player.tick(1001) == []
     assert player.tick(1007) == ["701#04"]
-    player.nmt(PRE_OPERATIONAL)
+    player.nmt(ENTER_PRE_OPERATIONAL)
     player.put(1, 0x1017, 0, 0, 2)
     assert player.tick(5000) == []
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from jtqd.sim_can.canopen_node import PRE_OPERATIONAL, STOPPED
+from jtqd.drivers.nmt import PRE_OPERATIONAL, STOPPED
 from tests.slow.faults import acts, proofs
 from tests.slow.faults.case import STALE, STARTING, Case, codes
 from tests.slow.faults.injections import Added, AndThen, Changed, Late, Lost, Stopped

@@ -14,8 +14,15 @@ from jtqd.estimator.run import JointColumns
 from jtqd.models.files import shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant
-from jtqd.sysid.fit.plateaus import Plateau, PlateauError, PlateauRules, find_plateaus, standard_error
-from jtqd.sysid.fit.ripple_cells import cut_cells, means_between
+from jtqd.sysid.fit.plateaus import (
+    Plateau,
+    PlateauError,
+    PlateauRules,
+    cut_cells,
+    find_plateaus,
+    means_between,
+    standard_error,
+)
 from jtqd.sysid.runs.channels import integral
 from tests.estimator.estimator_helpers import joint1
 from tests.sysid.campaign_helpers import plateau_run

@@ -1,0 +1,42 @@
+"""Network management of CiA 301 (7.2.8): commands of the master, and the states that a heartbeat tells.
+
+>>> command(START, 2)[:4].hex(), STATES[PRE_OPERATIONAL]
+('00000000', 'pre-operational')
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from jtqd.drivers.frame import pack
+
+HEARTBEAT_BASE: Final = 0x700
+"""COB-ID of a node's heartbeat and boot-up message: this plus its node-ID."""
+
+BOOT_UP, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0x00, 0x04, 0x05, 0x7F
+STATES: Final = {
+    BOOT_UP: "boot-up",
+    STOPPED: "stopped",
+    OPERATIONAL: "operational",
+    PRE_OPERATIONAL: "pre-operational",
+}
+"""What a heartbeat may say."""
+
+START, STOP, ENTER_PRE_OPERATIONAL, RESET_NODE, RESET_COMMUNICATION = 0x01, 0x02, 0x80, 0x81, 0x82
+COMMANDS: Final = {
+    START: "start",
+    STOP: "stop",
+    ENTER_PRE_OPERATIONAL: "enter pre-operational",
+    RESET_NODE: "reset node",
+    RESET_COMMUNICATION: "reset communication",
+}
+
+
+def command(number: int, node: int) -> bytes:
+    """Return the frame that gives a node, or all of them (0), an NMT command."""
+    return pack(0x000, bytes((number, node)))
+
+
+def heartbeat(node: int, state: int) -> bytes:
+    """Return the heartbeat of a node in this state; BOOT_UP makes it the boot-up message."""
+    return pack(HEARTBEAT_BASE + node, bytes((state,)))
