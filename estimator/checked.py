@@ -6,8 +6,6 @@ Every message names the file, the key, what was found and what was expected. Who
 
 from __future__ import annotations
 
-import argparse
-import difflib
 import math
 import reprlib
 from collections.abc import Iterable, Mapping
@@ -199,6 +197,8 @@ class Section:
         self._known.update(dict.fromkeys(known))
         for key in self._mapping:
             if key not in self._known:
+                import difflib  # seldom needed, and not small
+
                 near = difflib.get_close_matches(key, self._known, n=1)
                 hint = f"did you mean '{near[0]}'?" if near else "known keys: " + ", ".join(self._known)
                 raise ConfigError(f"{self.where}: {self._at(key)}: unknown key, {hint}")
@@ -241,6 +241,8 @@ def seconds(text: str) -> float:
     except ValueError:
         value = math.nan
     if not 0.0 < value < 1e9:
+        import argparse  # the daemon reads no command line with it
+
         raise argparse.ArgumentTypeError(f"found {text!r}, expected a time in seconds > 0")
     return value
 
@@ -261,6 +263,8 @@ def _whole(text: str, low: int) -> int:
     except ValueError:
         value = low - 1
     if value < low:
+        import argparse  # the daemon reads no command line with it
+
         raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number >= {low}")
     return value
 

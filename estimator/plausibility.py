@@ -21,18 +21,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import nan
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
 from jtqd.estimator.decoder import check, limits
-
-if TYPE_CHECKING:  # the recorder imports this module, and stays without numpy
-    from jtqd.estimator.joint import Joint
-
-MOTOR_JUMP: Final = 0x04
-LINK_JUMP: Final = 0x08
-VELOCITY_MISMATCH: Final = 0x10
-TORSION: Final = 0x20
-CURRENT_FROZEN: Final = 0x40
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.status import CURRENT_FROZEN, LINK_JUMP, MOTOR_JUMP, TORSION, VELOCITY_MISMATCH
 
 FORGET_S: Final = 1.0
 JUMP_RAD_S: Final = 300.0

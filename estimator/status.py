@@ -32,6 +32,13 @@ NAMES: Final = {
 PUBLISHED: Final = frozenset((VALID, DEGRADED, STANDSTILL))
 """Only with these may a torque number leave the estimator."""
 
+MOTOR_JUMP: Final = 0x04
+LINK_JUMP: Final = 0x08
+VELOCITY_MISMATCH: Final = 0x10
+TORSION: Final = 0x20
+CURRENT_FROZEN: Final = 0x40
+"""Bits of faults that `jtqd.estimator.plausibility` finds."""
+
 
 class Estimate(NamedTuple):
     """Result of one step, whatever the method [Nm, joint side]; NaN where not computed or not to be published.

@@ -80,9 +80,12 @@ def parser() -> argparse.ArgumentParser:
 
 def _seconds(text: str) -> float:
     """Seconds that log times can hold."""
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
     if not abs(value) < 1e9:
-        raise argparse.ArgumentTypeError(f"found {text}, expected seconds")
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a time in seconds")
     return value
 
 

@@ -18,7 +18,7 @@ from collections.abc import Collection
 from typing import Final, NamedTuple
 
 from jtqd.estimator import status as st
-from jtqd.estimator.plausibility import CURRENT_FROZEN, LINK_JUMP, MOTOR_JUMP, TORSION, VELOCITY_MISMATCH
+from jtqd.estimator.status import CURRENT_FROZEN, LINK_JUMP, MOTOR_JUMP, TORSION, VELOCITY_MISMATCH
 
 JOINT_FORMAT = "12d4H"
 HEADER_FORMAT = "QqqIIiI8B"

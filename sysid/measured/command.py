@@ -35,7 +35,8 @@ def main(arguments: list[str] | None = None) -> int:
         else:
             _on_bus(options.bus, options.out, options.json)
     except (RunError, RunTableError, ConfigError, FitError, LogError, bus.PlayError, OSError) as error:
-        print(f"jtq measured: {error}", file=sys.stderr)
+        file = isinstance(error, OSError) and error.strerror
+        print(f"jtq measured: {f'{error.filename}: {error.strerror}' if file else error}", file=sys.stderr)
         return 1
     return 0
 

@@ -56,13 +56,16 @@ def main_pid():
     return int(show("MainPID"))
 
 
+LOOPS = {b"jtqd.daemon.loop.process", b"jtqd.daemon.reload.successor"}
+
+
 def loops(exclude=()):
-    """Process-IDs of loop processes."""
+    """Process-IDs of loop processes: the first one, or the successor of a reload."""
     found = []
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
             command = process.joinpath("cmdline").read_bytes().split(b"\0")
-            if b"jtqd.daemon.loop.process" in command and int(process.name) not in exclude:
+            if LOOPS & set(command) and int(process.name) not in exclude:
                 found.append(int(process.name))
     return found
 

@@ -20,7 +20,7 @@ from jtqd.daemon.shared.runtime_dir import About, AboutError, read_about, start_
 from jtqd.daemon.shared.snapshot import JointView
 from jtqd.daemon.supervisor.description import about
 from jtqd.estimator import status as st
-from jtqd.estimator.plausibility import LINK_JUMP, MOTOR_JUMP
+from jtqd.estimator.status import LINK_JUMP, MOTOR_JUMP
 from tests.daemon.cli.status_daemon import described, running
 from tests.daemon.supervisor.watch_views import NAN, WELL, view
 

@@ -19,7 +19,11 @@ from jtqd.daemon.shared.snapshot import SnapshotReader
 from tests.paths import ROOT
 from tests.slow.faults.ears import Ears
 
-_NAMES = {"jtqd.daemon.loop.process": "loop", "jtqd.daemon.recording.recorder": "recorder"}
+_NAMES = {
+    "jtqd.daemon.loop.process": "loop",
+    "jtqd.daemon.reload.successor": "loop",
+    "jtqd.daemon.recording.recorder": "recorder",
+}
 _MARKS = 200
 
 
