@@ -34,9 +34,11 @@ def main(arguments: list[str] | None = None) -> int:
             _offline(options.out, options.joint_files or options.out, options.json)
         else:
             _on_bus(options.bus, options.out, options.json)
-    except (RunError, RunTableError, ConfigError, FitError, LogError, bus.PlayError, OSError) as error:
-        file = isinstance(error, OSError) and error.strerror
-        print(f"jtq measured: {f'{error.filename}: {error.strerror}' if file else error}", file=sys.stderr)
+    except OSError as error:
+        print(f"jtq measured: {error.filename or options.out}: {error.strerror or error}", file=sys.stderr)
+        return 1
+    except (RunError, RunTableError, ConfigError, FitError, LogError, bus.PlayError) as error:
+        print(f"jtq measured: {error}", file=sys.stderr)
         return 1
     return 0
 
