@@ -13,7 +13,6 @@ from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sysid.excitation.design import (
-    COLUMNS,
     POPULATION,
     STARTS,
     Information,
@@ -239,7 +238,7 @@ def test_missing_quadrant_is_bad_but_finite():
 
 def test_condition_is_that_of_the_regressor():
     rng = np.random.default_rng(1)
-    X = rng.normal(size=(100, COLUMNS)) * np.linspace(1.0, 5.0, COLUMNS)
+    X = rng.normal(size=(100, 20)) * np.linspace(1.0, 5.0, 20)
     assert condition(X.T @ X / 100) == pytest.approx(np.linalg.cond(X))
 
 

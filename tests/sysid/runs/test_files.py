@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jtqd.estimator import checked
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
 from jtqd.models.files import shipped
-from jtqd.sysid import runs, text
+from jtqd.sysid import runs
 from jtqd.sysid.runs.files import ColumnMap, RunError, read_run, read_runs, write_run
 
 KINOVA = shipped("kinova_gen3/columns.yaml").parent
@@ -316,7 +317,7 @@ def test_a_column_map_may_be_given_as_its_file(tmp_path: Path) -> None:
 
 
 def test_the_examples_in_the_docstrings_hold() -> None:
-    for module in (runs, text):
+    for module in (runs, checked):
         result = doctest.testmod(module)
         assert result.attempted
         assert not result.failed
