@@ -18,7 +18,7 @@ The statuses have an order, from good to bad:
   had to wait) waits twice as long each time, at most MOST times as long: an input that comes and goes makes a joint that is
   stale, not one that flickers. A single lost frame costs little.
 - A fault that is latched (`safety.latch`) stays until `reset_latch()`: its status, or a worse one, is published whatever
-  the inputs say. Status 5, 4 or 15, see `jtqd.daemon.shared.cycle_record.status_of`.
+  the inputs say. Status 5, 4 or 15, see `jtqd.daemon.shared.faults.status_of`.
 
 No clock and no randomness: the same statuses and faults give the same answer again, in the loop and from a log.
 """
@@ -29,7 +29,7 @@ from math import inf, isnan
 from typing import Any, Final, Protocol
 
 from jtqd.daemon.config import Config, SafetySettings
-from jtqd.daemon.shared import cycle_record as faults
+from jtqd.daemon.shared import faults
 from jtqd.daemon.shared.cycle_record import FLAG_LATCHED, FLAG_NETWORK_SKIPPED
 from jtqd.daemon.shared.snapshot import COUNTERS
 from jtqd.estimator import status as st

@@ -32,7 +32,7 @@ from jtqd.daemon.replay.frames import Frames, Pdo, offsets
 from jtqd.daemon.replay.origin import SAMPLE, Origin
 from jtqd.daemon.replay.runs import Steps
 from jtqd.daemon.shared import cycle_record as cr
-from jtqd.daemon.shared import cycle_record as faults
+from jtqd.daemon.shared import faults
 from jtqd.daemon.shared.cycle_record import FLAG_LATCHED, FLAG_NETWORK_SKIPPED, FLAG_TEMPERATURE
 from jtqd.daemon.shared.snapshot import COUNTERS
 from jtqd.estimator.arrays import CodeArray, FloatArray, RecordArray

@@ -15,10 +15,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Collection
-from typing import Final, NamedTuple
-
-from jtqd.estimator import status as st
-from jtqd.estimator.status import CURRENT_FROZEN, LINK_JUMP, MOTOR_JUMP, TORSION, VELOCITY_MISMATCH
+from typing import NamedTuple
 
 JOINT_FORMAT = "12d4H"
 HEADER_FORMAT = "QqqIIiI8B"
@@ -103,7 +100,7 @@ class JointRecord(NamedTuple):
     sensor_status: int
     input_flags: int
     """Bit n set: input n of this joint (0 TPDO1, 1 TPDO2, 2 sensor) is of this cycle; bit 3: temperature_c is known; bit 4:
-    no time for the network; bit 5: a fault is latched; bits 8 to 15: the faults (below) for which there
+    no time for the network; bit 5: a fault is latched; bits 8 to 15: the faults (`faults.py`) for which there
     is no torque: of this cycle, of one not long ago, or latched."""
 
 
@@ -147,59 +144,3 @@ def frames_of(record: bytes | memoryview) -> list[tuple[bytes, int]]:
         (bytes(view[FRAMES_OFFSET + 16 * n : FRAMES_OFFSET + 16 * n + 16]), stamp)
         for n, stamp in enumerate(stamps)
     ]
-
-
-# Faults that make an estimate invalid or that may be latched: bits, names and statuses
-
-NOT_FINITE: Final = 0x01
-"""The estimator gave a number that is none, or a sigma that is none, as if it were good."""
-OUT_OF_RANGE: Final = 0x02
-"""The torque, or what it is made of, is beyond everything that the joint can do."""
-DEVIATION: Final = 0x80
-"""Too far from the torque sensor for too long; looked for only where it is latched."""
-DRIVE_FAULT: Final = 0x100
-STALE: Final = 0x200
-"""So many cycles in a row without a number, for want of inputs or of time, as `safety.stale_latch_cycles` says."""
-
-NAMES: Final = {
-    NOT_FINITE: "not_finite",
-    OUT_OF_RANGE: "out_of_range",
-    MOTOR_JUMP: "motor_jump",
-    LINK_JUMP: "link_jump",
-    VELOCITY_MISMATCH: "velocity_mismatch",
-    TORSION: "torsion",
-    CURRENT_FROZEN: "current_frozen",
-    DEVIATION: "deviation",
-    DRIVE_FAULT: "drive_fault",
-    STALE: "stale",
-}
-"""Name by bit: in the configuration, in the counters (`fault_NAME`) and in lines for the operator."""
-BITS: Final = {name: bit for bit, name in NAMES.items()}
-
-COUNTED: Final = tuple(bit for bit in NAMES if bit <= DEVIATION)
-"""Faults that a cycle can have besides its status: the low byte."""
-
-MEANINGS: Final = {
-    NOT_FINITE: "the estimator gave a number that is none",
-    OUT_OF_RANGE: "the torque is beyond what the joint can do",
-    MOTOR_JUMP: "the motor position jumped",
-    LINK_JUMP: "the link position jumped",
-    VELOCITY_MISMATCH: "motor position and motor velocity do not agree",
-    TORSION: "motor and link position are further apart than the gear can be twisted",
-    CURRENT_FROZEN: "the motor turns and its current does not change",
-    DEVIATION: "too far from the torque sensor for too long",
-    DRIVE_FAULT: "the drive was in fault",
-    STALE: "too many cycles in a row without a number",
-}
-
-
-def names_of(bits: int) -> tuple[str, ...]:
-    """Names of the faults in `bits`, in the order of their bits."""
-    return tuple(name for bit, name in NAMES.items() if bits & bit)
-
-
-def status_of(bits: int) -> int:
-    """Status that is published while these faults are latched; `bits` is not 0."""
-    if bits & DRIVE_FAULT:
-        return st.DRIVE_FAULT
-    return st.STALE if bits == STALE else st.INVALID

@@ -5,14 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from math import isfinite
 
-from jtqd.daemon.shared.cycle_record import (
-    FLAG_MOTION,
-    FLAG_NETWORK_SKIPPED,
-    FLAG_POSITION,
-    FLAG_SENSOR,
-    MEANINGS,
-    NAMES,
-)
+from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_NETWORK_SKIPPED, FLAG_POSITION, FLAG_SENSOR
+from jtqd.daemon.shared.faults import MEANINGS, NAMES
 from jtqd.daemon.shared.runtime_dir import About, AboutJoint
 from jtqd.daemon.shared.snapshot import NMT_STATES, NOT_OPERATIONAL, OPERATIONAL, JointView, View
 from jtqd.estimator import status as st

@@ -10,7 +10,7 @@ import pytest
 from jtqd.daemon.bus.errors import OwnErrors
 from jtqd.daemon.bus.own_node import OwnNode
 from jtqd.daemon.config import load_config
-from jtqd.daemon.shared import cycle_record as faults
+from jtqd.daemon.shared import faults
 from jtqd.daemon.shared.snapshot import COUNTERS, JointView, Snapshot, SnapshotReader, View
 from jtqd.daemon.supervisor.summary import Summary
 from jtqd.drivers.eds.own_objects import COUNTERS as OWN_COUNTERS

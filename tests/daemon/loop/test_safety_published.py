@@ -17,7 +17,7 @@ from jtqd.daemon.config import SafetySettings
 from jtqd.daemon.loop.estimate_pdo import decode
 from jtqd.daemon.loop.joint_status import JointSafety
 from jtqd.daemon.shared import cycle_record as cr
-from jtqd.daemon.shared import cycle_record as faults
+from jtqd.daemon.shared import faults
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import (

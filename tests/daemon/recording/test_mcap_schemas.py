@@ -8,7 +8,7 @@ import pytest
 
 from jtqd.daemon.recording import messages, schemas
 from jtqd.daemon.shared import cycle_record as cr
-from jtqd.daemon.shared import cycle_record as faults
+from jtqd.daemon.shared import faults
 from tests.daemon.recording.cdr_decoder import Definition
 
 DEFINITIONS = {name: Definition(name, text) for name, text in schemas.SCHEMAS.items()}

@@ -24,7 +24,7 @@ from jtqd.daemon.replay.runs import (
     steps_of,
 )
 from jtqd.daemon.replay.session import ReplayOptions, replay
-from jtqd.daemon.shared import cycle_record as faults
+from jtqd.daemon.shared import faults
 from jtqd.estimator.status import INVALID, VALID
 from jtqd.models.files import shipped
 from tests.daemon.replay.replay_helpers import cut, cycles

@@ -15,7 +15,7 @@ from jtqd.daemon.replay.frames import Pdo, offsets
 from jtqd.daemon.replay.origin import SAMPLE
 from jtqd.daemon.replay.runs import BEGINS, LOST, lost_cycles, steps_of
 from jtqd.daemon.shared import cycle_record as cr
-from jtqd.daemon.shared import cycle_record as faults
+from jtqd.daemon.shared import faults
 
 MS = 1_000_000
 CONFIG = load_config(None)
