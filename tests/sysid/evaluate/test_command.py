@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.methods import estimate_columns, load_network
+from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import RunTable
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import DEGRADED, VALID
 from jtqd.models.files import load_joint
 from jtqd.sysid.evaluate.command import main
-from jtqd.sysid.fit.friction import low_pass
 from jtqd.sysid.runs.files import read_run, write_run
 from tests.sysid.evaluate.evaluate_helpers import NO_PICTURES, evaluate, make_bench, report
 
