@@ -11,6 +11,7 @@ from cpython.bytes cimport PyBytes_AS_STRING, PyBytes_GET_SIZE
 from cpython.exc cimport PyErr_CheckSignals
 from cpython.mem cimport PyMem_Calloc, PyMem_Free
 from libc.errno cimport EAGAIN, ECONNRESET, EINTR, EINVAL, ENOBUFS, ENODEV, ENOMEM, EPIPE, errno
+from libc.math cimport isnan
 from libc.stdint cimport INT64_MAX, int64_t, uint8_t, uint16_t
 from libc.string cimport memcpy, memset
 from posix.time cimport CLOCK_MONOTONIC, clock_gettime, timespec
@@ -283,12 +284,12 @@ cdef class FrameSocket:
         cdef double timeout_ns
         if timeout_s is None:
             return self.ready(FOR_EVER)
-        timeout_ns = timeout_s * 1e9
-        if timeout_ns != timeout_ns:
+        timeout_ns = <double>timeout_s * 1e9
+        if isnan(timeout_ns):
             raise ValueError("a time to wait cannot be NaN")
-        return self.ready(
-            FOR_EVER if timeout_ns >= FOR_EVER else <int64_t>timeout_ns if timeout_ns > 0.0 else 0
-        )
+        if timeout_ns >= FOR_EVER:
+            return self.ready(FOR_EVER)
+        return self.ready(<int64_t>timeout_ns if timeout_ns > 0.0 else 0)
 
     cdef bint ready(self, int64_t timeout_ns) except -1:
         """As `wait`; a negative time is over already, INT64_MAX is for ever."""
@@ -301,8 +302,12 @@ cdef class FrameSocket:
         waited.fd, waited.events = self.fd, POLLIN
         if timeout_ns <= 0:
             timeout_ns = 0
-        elif timeout_ns != FOR_EVER:
-            end_ns = monotonic_ns() + timeout_ns
+        else:
+            end_ns = monotonic_ns()
+            if timeout_ns < FOR_EVER - end_ns:
+                end_ns += timeout_ns
+            else:
+                timeout_ns, end_ns = FOR_EVER, 0
         while True:
             left.tv_sec, left.tv_nsec = timeout_ns // NS_PER_S, timeout_ns % NS_PER_S
             with nogil:
