@@ -77,6 +77,11 @@ def _identity(result: Result, same: Identity) -> list[str]:
         lines = [
             f"  {word} to {same.tolerance_nm:g} Nm{from_on}; bit-identical: {verdict} (in arrays; --exact compares bits)"
         ]
+    elif same.explained and since is not None and same.network_nm:
+        lines = [
+            f"  equal to {same.network_nm:.1g} Nm{from_on}; bit-identical: {verdict} (the networks were evaluated otherwise "
+            "when this log was recorded)"
+        ]
     elif same.explained and since is not None:
         lines = [f"  bit-identical{from_on}: {verdict}"]
     else:

@@ -169,9 +169,9 @@ def test_lengths_and_emptiness() -> None:
     joint = fused_joint()
     empty = whole(joint, FUSED, FusedNetwork(fused_network().data), Motion(*([np.zeros(0)] * 5)), None)
     assert all(len(getattr(empty, name)) == 0 for name in FIELDS)
-    with pytest.raises(ValueError, match="expected five of one length"):
+    with pytest.raises(ValueError, match="expected all of one length"):
         observe_run(joint, FUSED, None, *([np.zeros(3)] * 4), np.zeros(4))
-    with pytest.raises(ValueError, match=r"temperatures of shape \(2,\), expected \(3,\)"):
+    with pytest.raises(ValueError, match="expected all of one length"):
         observe_run(joint, FUSED, None, *([np.zeros(3)] * 5), np.zeros(2))
     with pytest.raises(ValueError, match="read-only"):
         whole(joint, FUSED, None, twisted(1, 700), None).torque_nm[0] = 1.0

@@ -94,7 +94,7 @@ def test_logs_that_tell_a_cycle_differently_are_refused(tmp_path: Path) -> None:
     (result,) = replay([first, second], ReplayOptions(exact=True))
     assert result.run.cycles == len(numbers)
     assert result.identity is not None
-    assert result.identity.whole
+    assert result.identity.explained
 
     def payload(topic: str, cycle: int, data: bytes) -> bytes:
         spoilt = topic == "/joint/2/state" and cycle == numbers[660]
