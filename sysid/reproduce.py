@@ -55,6 +55,9 @@ def main(argv: list[str]) -> int:
     options = parser().parse_args(argv)
     out: Path = options.out
     worst = 0
+    if out.exists() and not out.is_dir():
+        print(f"jtq reproduce: --out {out}: found a file, expected a directory", file=sys.stderr)
+        return 1
     try:
         (out / "models").mkdir(parents=True, exist_ok=True)
         _write_outside_plan(out / "outside.plan.yaml", options.seed, 2 if options.quick else 6)

@@ -240,10 +240,11 @@ def _seconds(gap: Gap, found: Contents, own: Summary | None) -> float | None:
     """Time for which a gap stands [s]: between its neighbours, else what the summary says of the first or last message."""
     if gap.seconds is not None or own is None or own.statistics is None or not found.counts:
         return gap.seconds
+    statistics = own.statistics
     whole = [chunk.index.chunk_start_offset for chunk in found.chunks if chunk.counts]
     if gap.start < min(whole):
-        return max(0, found.start_ns - own.statistics.message_start_time) * 1e-9
-    return max(0, own.statistics.message_end_time - found.end_ns) * 1e-9 if gap.start > max(whole) else None
+        return max(0, found.start_ns - int(statistics.message_start_time)) * 1e-9
+    return max(0, int(statistics.message_end_time) - found.end_ns) * 1e-9 if gap.start > max(whole) else None
 
 
 def _torn_seconds(source: Source, gap: Gap, found: Contents) -> float | None:

@@ -33,7 +33,7 @@ from jtqd.sysid.batch.run import (
 )
 from jtqd.sysid.batch.summary import DIAGNOSE, REPLAY, counts, render, to_mapping
 from jtqd.sysid.runs.files import LOGS, TABLES, ColumnMap, RunError
-from jtqd.sysid.runs.joints import UsageError, joint_files
+from jtqd.sysid.runs.joints import UsageError, check_joint_files, joint_files
 
 BY: Final = "jtq batch"
 PAGE, SUMMARY = "index.html", "summary.json"
@@ -62,9 +62,9 @@ def main(argv: list[str]) -> int:
             options.logs, options.group_by or _GROUP_BY[options.command], _KINDS[options.command]
         )
         arguments, parameters = _diagnose(options) if options.command == DIAGNOSE else _replay(options)
-    except (UsageError, GroupError) as error:
+    except UsageError as error:
         return _error(error, 2)
-    except (ConfigError, RunError) as error:
+    except (GroupError, ConfigError, RunError) as error:
         return _error(error)
     for path in active:
         _error(f"{path}: left out, still being written (`jtq recover` ends it)")
@@ -134,6 +134,7 @@ def _diagnose(options: argparse.Namespace) -> tuple[tuple[str, ...], dict[str, A
     """Return the arguments of `jtq diagnose`, and the same by content. Raises UsageError, ConfigError, RunError."""
     columns = None if options.columns is None else ColumnMap.load(options.columns)
     files = joint_files(options.joint, columns)
+    check_joint_files(files)
     arguments: list[str] = []
     for text in options.joint:
         number, equals, path = text.rpartition("=")

@@ -125,7 +125,9 @@ def find_groups(
     active: list[Path] = []
     for path in named:
         if not path.exists():
-            raise GroupError(f"{path}: found nothing there, expected a log or a directory of logs")
+            raise GroupError(
+                f"{path}: found no such file or directory, expected a log or a directory of logs"
+            )
         inside = [each for each in path.rglob("*") if each.is_file()] if path.is_dir() else [path]
         unfinished = sorted(each for each in inside if each.name.endswith(_UNFINISHED))
         wanted = _first_kind(inside, kinds)

@@ -23,7 +23,7 @@ from jtqd.sysid.diagnosis.findings import INSUFFICIENT, NO_GAP, Findings, summar
 from jtqd.sysid.progress import waiting
 from jtqd.sysid.runs.checks import CheckedRuns, check_runs
 from jtqd.sysid.runs.files import ColumnMap, RunError, RunFile, read_runs
-from jtqd.sysid.runs.joints import UsageError, joint_files, joints_of
+from jtqd.sysid.runs.joints import UsageError, check_joint_files, joint_files, joints_of
 
 BY: Final = "jtq diagnose"
 _NEEDED: Final = ("matplotlib", "jinja2")
@@ -44,6 +44,7 @@ def main(argv: list[str]) -> int:
     try:
         columns = None if options.columns is None else ColumnMap.load(options.columns)
         files = joint_files(options.joint, columns)
+        check_joint_files(files)
         _check_out(options.out, options.force)
         runs = read_runs(options.runs, columns)
         joints = joints_of(files, runs)

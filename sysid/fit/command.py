@@ -39,6 +39,7 @@ from jtqd.sysid.fit.plateaus import Plateau, PlateauError, PlateauRules, plateau
 from jtqd.sysid.fit.signals import RunSignals, run_signals
 from jtqd.sysid.fit.torsion import TorsionError
 from jtqd.sysid.progress import progress
+from jtqd.sysid.report.figures import check_picture
 from jtqd.sysid.runs.checks import channel_findings
 from jtqd.sysid.runs.files import RunError, RunFile, read_runs
 from jtqd.sysid.runs.joints import joint_number
@@ -130,6 +131,8 @@ def efficiency_main(argv: list[str]) -> int:
         return 1
     try:
         joint = load_joint(options.joint)
+        if options.plot is not None:
+            check_picture(options.plot)
         runs = read_runs(options.runs, options.columns)
         number = joint_number(options.number, joint, runs)
         result = analyse(joint, runs, number, options)

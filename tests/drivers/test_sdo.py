@@ -15,6 +15,7 @@ from jtqd.drivers.sdo import (
     SdoResult,
     Transfer,
     TransferError,
+    describe_abort,
 )
 from jtqd.drivers.sdo_server import SdoServer
 from tests.drivers.canopen_nodes import drive_store
@@ -35,6 +36,21 @@ def talk(transfer: Transfer, server: SdoServer) -> list[str]:
         if transfer.done:
             return said
     raise AssertionError("endless")
+
+
+def test_every_abort_code_of_cia_301_has_words():
+    """CiA 301, 7.2.4.3.17, table 22: all 31 of them; another one shows its number."""
+    codes = (
+        "05030000 05040000 05040001 05040002 05040003 05040004 05040005 06010000 "
+        "06010001 06010002 06020000 06040041 06040042 06040043 06040047 06060000 "
+        "06070010 06070012 06070013 06090011 06090030 06090031 06090032 06090036 "
+        "060A0023 08000000 08000020 08000021 08000022 08000023 08000024 "
+    ).split()
+    words = [describe_abort(int(code, 16)) for code in codes]
+    assert len({text.partition(" (0")[0] for text in words}) == len(codes) == 31
+    assert not any(text.startswith("abort ") for text in words)
+    assert describe_abort(0x0609_0031) == "value too high (06090031h)"
+    assert describe_abort(0x0BAD_0000) == "abort (0BAD0000h)"
 
 
 def test_expedited_both_ways():
