@@ -41,12 +41,39 @@ def talk(transfer: Transfer, server: SdoServer) -> list[str]:
 def test_every_abort_code_of_cia_301_has_words():
     """CiA 301, 7.2.4.3.17, table 22: all 31 of them; another one shows its number."""
     codes = (
-        "05030000 05040000 05040001 05040002 05040003 05040004 05040005 06010000 "
-        "06010001 06010002 06020000 06040041 06040042 06040043 06040047 06060000 "
-        "06070010 06070012 06070013 06090011 06090030 06090031 06090032 06090036 "
-        "060A0023 08000000 08000020 08000021 08000022 08000023 08000024 "
-    ).split()
-    words = [describe_abort(int(code, 16)) for code in codes]
+        0x05030000,
+        0x05040000,
+        0x05040001,
+        0x05040002,
+        0x05040003,
+        0x05040004,
+        0x05040005,
+        0x06010000,
+        0x06010001,
+        0x06010002,
+        0x06020000,
+        0x06040041,
+        0x06040042,
+        0x06040043,
+        0x06040047,
+        0x06060000,
+        0x06070010,
+        0x06070012,
+        0x06070013,
+        0x06090011,
+        0x06090030,
+        0x06090031,
+        0x06090032,
+        0x06090036,
+        0x060A0023,
+        0x08000000,
+        0x08000020,
+        0x08000021,
+        0x08000022,
+        0x08000023,
+        0x08000024,
+    )
+    words = [describe_abort(code) for code in codes]
     assert len({text.partition(" (0")[0] for text in words}) == len(codes) == 31
     assert not any(text.startswith("abort ") for text in words)
     assert describe_abort(0x0609_0031) == "value too high (06090031h)"
