@@ -94,22 +94,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     command = parser()
     options = command.parse_intermixed_args(argv)  # options may stand before the logs
-    of_config = options.what == "dbc" and options.config is not None
-    if of_config == bool(options.logs):
-        command.error("expected a log" + (" or --config" if options.what == "dbc" else "") + ", and not both")
-    if options.what in ("csv", "parquet") and options.out is None:
-        command.error("expected --out FILE")
-    if options.out is None and options.json:
-        command.error("--json needs --out FILE: standard output takes one of them")
-    if options.out is not None and any(_same(options.out, log) for log in options.logs):
-        command.error(f"--out {options.out}: that is the log")
-    if options.start is not None and options.end is not None and options.end <= options.start:
-        command.error(f"--end: found {options.end:g}, expected a time above --start {options.start:g}")
-    twice = next(
-        (one for n, one in enumerate(options.logs) for other in options.logs[:n] if _same(one, other)), None
-    )
-    if twice is not None:
-        command.error(f"found the log {twice} twice, expected every part once")
+    _check_usage(command, options)
     try:
         result = _export(options)
     except (LogError, OSError) as error:
@@ -118,6 +103,8 @@ def main(argv: list[str] | None = None) -> int:
         text = str(error)
         if isinstance(error, OSError) and error.filename is not None:
             text = f"{error.filename}: {error.strerror}"
+        elif isinstance(error, OSError):
+            text = f"output: {error.strerror or error}"
         print(f"jtq export: {text}", file=sys.stderr)
         return 1
     if options.json:
@@ -131,6 +118,29 @@ def main(argv: list[str] | None = None) -> int:
             file=sys.stderr,
         )
     return 3 if left_out else 0
+
+
+def _check_usage(command: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Exit with status 2 where the combination of options cannot be meant."""
+    of_config = options.what == "dbc" and options.config is not None
+    if of_config == bool(options.logs):
+        command.error("expected a log" + (" or --config" if options.what == "dbc" else "") + ", and not both")
+    if options.what in ("csv", "parquet") and options.out is None:
+        command.error("expected --out FILE")
+    if options.out is None and options.json:
+        command.error("--json needs --out FILE: standard output takes one of them")
+    if options.out is not None and any(_same(options.out, log) for log in options.logs):
+        command.error(f"--out {options.out}: that is the log")
+    start = max(0.0, options.start or 0.0)
+    if options.end is not None and options.end <= start:
+        command.error(
+            f"--end: found {options.end:g}, expected a time above {start:g} s, where --start begins"
+        )
+    twice = next(
+        (one for n, one in enumerate(options.logs) for other in options.logs[:n] if _same(one, other)), None
+    )
+    if twice is not None:
+        command.error(f"found the log {twice} twice, expected every part once")
 
 
 def _same(out: Path, log: Path) -> bool:

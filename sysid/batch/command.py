@@ -7,13 +7,15 @@ import datetime as dt
 import importlib.util
 import json
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from jtqd.estimator.checked import ConfigError, count, counted, seconds
+from jtqd.estimator.checked import ConfigError, count, counted, make_directory, seconds
+from jtqd.estimator.settings import METHODS
 from jtqd.sysid.batch.run import (
     BY_DIRECTORY,
     BY_RUN,
@@ -38,6 +40,7 @@ from jtqd.sysid.runs.joints import UsageError, check_joint_files, joint_files
 BY: Final = "jtq batch"
 PAGE, SUMMARY = "index.html", "summary.json"
 _KINDS: Final = {DIAGNOSE: (TABLES, LOGS), REPLAY: (LOGS,)}
+_SCHEDULER: Final = re.compile(r"(\w+://)?[^\s/]+:\d{1,5}")
 _GROUP_BY: Final = {DIAGNOSE: BY_DIRECTORY, REPLAY: BY_RUN}
 _EXAMPLES: Final = """examples:
   jtq batch diagnose fleet/ --joint models/joint1.yaml --out fleet_diagnosis
@@ -62,6 +65,7 @@ def main(argv: list[str]) -> int:
             options.logs, options.group_by or _GROUP_BY[options.command], _KINDS[options.command]
         )
         arguments, parameters = _diagnose(options) if options.command == DIAGNOSE else _replay(options)
+        make_directory(options.out)
     except UsageError as error:
         return _error(error, 2)
     except (GroupError, ConfigError, RunError) as error:
@@ -194,9 +198,16 @@ def parser() -> argparse.ArgumentParser:
     )
     replay = _common(commands, REPLAY, "the estimator over each run again, and the difference")
     replay.add_argument("--model", type=Path, metavar="DIR", help="other models; see jtq replay --help")
-    replay.add_argument("--method", metavar="NAME", help="another method of the estimator")
+    replay.add_argument("--method", choices=METHODS, help="another method of the estimator")
     replay.add_argument("--exact", action="store_true", help="cycle by cycle, whatever the length")
     return result
+
+
+def _scheduler(text: str) -> str:
+    """Address of a scheduler. Raises argparse.ArgumentTypeError."""
+    if not _SCHEDULER.fullmatch(text):
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected tcp://HOST:PORT")
+    return text
 
 
 def _common(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
@@ -216,6 +227,7 @@ def _common(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
     )
     made.add_argument(
         "--scheduler",
+        type=_scheduler,
         metavar="tcp://HOST:PORT",
         help="dask scheduler (default: this machine; extra: cluster)",
     )

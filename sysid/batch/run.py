@@ -209,7 +209,10 @@ def run_task(task: Task) -> Outcome:
             return outcome(status, None, f"ended by {signal.Signals(-status).name}{reason}")
         if status not in (0, 3):
             lines = stderr.decode(errors="replace").strip().splitlines() or [f"exit status {status}"]
-            return outcome(status, None, lines[-1].removeprefix(f"jtq {task.command}: ")[:400])
+            text = lines[-1].removeprefix(f"jtq {task.command}: ")
+            if len(task.files) == 1:  # the group has its name
+                text = text.removeprefix(f"{task.files[0]}: ")
+            return outcome(status, None, text[:400])
         try:
             result = json.loads(stdout)
         except ValueError:

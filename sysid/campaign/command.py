@@ -246,7 +246,10 @@ def main(argv: list[str]) -> int:
         print(f"jtq campaign: {error}", file=sys.stderr)
         return 1
     except OSError as error:
-        print(f"jtq campaign: {error.filename or options.out}: {error.strerror or error}", file=sys.stderr)
+        print(
+            f"jtq campaign: {error.filename or options.out or 'output'}: {error.strerror or error}",
+            file=sys.stderr,
+        )
         return 1
 
 

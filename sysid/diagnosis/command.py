@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from jtqd.estimator.checked import ConfigError, counted
+from jtqd.estimator.checked import ConfigError, counted, make_directory
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTableError
 from jtqd.sysid.campaign.plan import Plan
@@ -157,11 +157,7 @@ def parser() -> argparse.ArgumentParser:
 
 def _check_out(directory: Path, force: bool) -> None:
     """Make DIR before minutes of work, and refuse to overwrite. Raises ConfigError."""
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        reason = "it is a file" if isinstance(error, FileExistsError) else error.strerror
-        raise ConfigError(f"--out {directory}: cannot be made: {reason}") from None
+    make_directory(directory)
     there = [name for name in _OWN if (directory / name).exists()]
     if there and not force:
         raise ConfigError(

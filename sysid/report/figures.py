@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.checked import ConfigError, check_output
 from jtqd.sysid.report.page import LIGHT
 
 SENSOR, BEFORE, AFTER = LIGHT["ink"], LIGHT["before"], LIGHT["after"]
@@ -52,10 +52,7 @@ def check_picture(path: Path) -> None:
             f"{path}: found {f'the ending {path.suffix!r}' if path.suffix else 'no ending'}, expected a picture: "
             f"{', '.join(PICTURES)}"
         )
-    if path.is_dir():
-        raise ConfigError(f"{path}: found a directory, expected the name of a picture")
-    if not path.parent.is_dir():
-        raise ConfigError(f"{path.parent}: found no such directory, expected one for {path.name}")
+    check_output(path)
 
 
 def page_svg(draw: Callable[[], Any], name: str) -> str:

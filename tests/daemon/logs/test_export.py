@@ -315,7 +315,8 @@ def test_a_topic_that_is_not_there_is_said_with_those_that_are(log, tmp_path, ca
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--start", "5", "--end", "2"], "--end: found 2, expected a time above --start 5"),
+        (["--start", "5", "--end", "2"], "--end: found 2, expected a time above 5 s"),
+        (["--end", "-1"], "--end: found -1, expected a time above 0 s"),
         (["--start", "nan"], "found 'nan'"),
         (["LOG"], "twice, expected every part once"),
     ],

@@ -180,7 +180,7 @@ def test_a_fleet_with_one_broken_log(tmp_path, capsys):
     said = capsys.readouterr()
     assert states(out) == {"r1/left": "done", "r1/right": "done", "r2": "failed"}
     assert "3 groups: 2 done, 0 finished before, 1 failed" in said.out
-    assert f"jtq batch: r2: {logs}/r2/bad.csv: " in said.err
+    assert "jtq batch: r2: found an empty file" in said.err
     broken = next(group for group in summary(out)["groups"] if group["name"] == "r2")
     assert broken["key"] not in results(out), "what failed is tried again"
     assert broken["figures"] is None
@@ -284,6 +284,7 @@ def test_a_task_that_takes_too_long_is_a_failed_one(tmp_path):
         (["diagnose", "logs", "--joint", "x=a.yaml"], (2, "found joint 'x', expected a number from 1 to 7")),
         (["replay", "nothere.mcap"], (1, "nothere.mcap: found no such file or directory")),
         (["diagnose", "logs", "--joint", "none.yaml"], (1, "none.yaml: cannot be read: No such file")),
+        (["replay", "logs", "--out", "logs/a.mcap"], (1, "--out logs/a.mcap: cannot be made: it is a file")),
         (["replay", "logs", "--model", "none"], (1, "--model none: found no such directory")),
     ],
 )
@@ -291,10 +292,21 @@ def test_wrong_usage_is_one_line(tmp_path, monkeypatch, capsys, command, expecte
     monkeypatch.chdir(tmp_path)
     touch(tmp_path, "logs/a.mcap")
     status, part = expected
-    assert jtq(["batch", *command, "--out", "out"]) == status
+    assert jtq(["batch", *command[:2], "--out", "out", *command[2:]]) == status
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("jtq batch: ")
     assert part in line
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("--method", "bogus"), ("--scheduler", "bogus"), ("--jobs", "0")]
+)
+def test_a_value_that_cannot_be_meant_is_wrong_use(tmp_path, capsys, option, value):
+    with pytest.raises(SystemExit) as left:
+        jtq(["batch", "replay", "logs", "--out", str(tmp_path / "out"), option, value])
+    assert left.value.code == 2
+    assert f"'{value}'" in capsys.readouterr().err.splitlines()[-1]
     assert not (tmp_path / "out").exists()
 
 

@@ -195,6 +195,26 @@ def test_bad_input_is_one_line(campaign: Path, tmp_path: Path, capsys: pytest.Ca
     assert "none.yaml: cannot be read" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("kind", "option", "words"),
+    [
+        *(
+            (kind, "--out=none/a.yaml", "none: found no such directory")
+            for kind in ("efficiency", "friction", "losses")
+        ),
+        ("efficiency", "--plot=none/a.png", "none: found no such directory"),
+        ("efficiency", "--plot=a.xyz", "found the ending '.xyz', expected a picture: .png"),
+    ],
+)
+def test_where_results_cannot_go_is_said_before_runs_are_read(
+    capsys: pytest.CaptureFixture[str], kind: str, option: str, words: str
+) -> None:
+    assert run(kind, "absent.csv", "--joint", JOINT, option) == 1
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1
+
+
 def test_usage_errors(campaign: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run() == 2
     assert run("--help") == 0

@@ -141,7 +141,7 @@ def test_other_formats_missing_files_and_missing_columns_are_named(tmp_path: Pat
         read_run(_file(tmp_path, GOOD, "run.xlsx"))
     with pytest.raises(RunError, match="not a readable MCAP file"):
         read_run(_file(tmp_path, b"\x89MCAP", "run.mcap"))
-    with pytest.raises(RunError, match="none.csv: found no such file"):
+    with pytest.raises(RunError, match=r"none\.csv: found no such file"):
         read_run(tmp_path / "none.csv")
     with pytest.raises(RunError, match="found a directory, expected a run file"):
         read_run(tmp_path)
