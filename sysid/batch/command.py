@@ -111,9 +111,14 @@ def _run(options: argparse.Namespace, groups: Sequence[Group], task: Task, param
         )
         for row in rows:
             if row.error:
-                print(f"  {row.group.name}: {row.error}")
+                print(f"  {_failure(row)}")
     _error(f"wrote {options.out / PAGE}")
     return 3 if number["failed"] else 0
+
+
+def _failure(row: Row) -> str:
+    """Return group and error of a row; a file that is its own group is named once."""
+    return f"{row.group.name}: {row.error.removeprefix(f'{Path(row.group.name).name}: ')}"
 
 
 @contextmanager
@@ -129,7 +134,7 @@ def _progress(groups: int) -> Iterator[Callable[[Row], None]]:
         def finished(row: Row) -> None:
             bar.advance(task)
             if row.state == FAILED:
-                _error(f"{row.group.name}: {row.error}")
+                _error(_failure(row))
 
         yield finished
 

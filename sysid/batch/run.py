@@ -210,8 +210,8 @@ def run_task(task: Task) -> Outcome:
         if status not in (0, 3):
             lines = stderr.decode(errors="replace").strip().splitlines() or [f"exit status {status}"]
             text = lines[-1].removeprefix(f"jtq {task.command}: ")
-            if len(task.files) == 1:  # the group has its name
-                text = text.removeprefix(f"{task.files[0]}: ")
+            for path in task.files:
+                text = text.replace(path, os.path.basename(path))
             return outcome(status, None, text[:400])
         try:
             result = json.loads(stdout)

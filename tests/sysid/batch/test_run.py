@@ -180,7 +180,7 @@ def test_a_fleet_with_one_broken_log(tmp_path, capsys):
     said = capsys.readouterr()
     assert states(out) == {"r1/left": "done", "r1/right": "done", "r2": "failed"}
     assert "3 groups: 2 done, 0 finished before, 1 failed" in said.out
-    assert "jtq batch: r2: found an empty file" in said.err
+    assert "jtq batch: r2: bad.csv: line 1: found no column" in said.err
     broken = next(group for group in summary(out)["groups"] if group["name"] == "r2")
     assert broken["key"] not in results(out), "what failed is tried again"
     assert broken["figures"] is None
@@ -297,6 +297,15 @@ def test_wrong_usage_is_one_line(tmp_path, monkeypatch, capsys, command, expecte
     assert line.startswith("jtq batch: ")
     assert part in line
     assert not (tmp_path / "out").exists()
+
+
+def test_a_broken_log_is_named_once(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    touch(tmp_path, "a.mcap")
+    assert jtq(["batch", "replay", "a.mcap", "--out", "out"]) == 3
+    line = capsys.readouterr().err.splitlines()[0]
+    assert line.startswith("jtq batch: a.mcap: not a readable MCAP file")
+    assert line.count("a.mcap") == 1
 
 
 @pytest.mark.parametrize(
