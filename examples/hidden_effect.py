@@ -33,6 +33,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError, count, natural, seconds
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.methods import estimate_columns
+from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import RunTable
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import VALID
@@ -41,7 +42,6 @@ from jtqd.sim_can.plant_file import plant_of_joint
 from jtqd.sysid.campaign.emulated import emulated
 from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Plan
 from jtqd.sysid.campaign.plans import variable_runs
-from jtqd.sysid.fit.friction import low_pass
 from jtqd.sysid.fit.joint_writer import write_joint
 from jtqd.sysid.measured.bus import published_torque, reference_torque, sync_time
 from jtqd.sysid.runs.files import RunError, read_run, write_run

@@ -22,7 +22,7 @@ from jtqd.daemon.replay.compare import Comparison, Difference, Identity, Unknown
 from jtqd.daemon.replay.origin import SAMPLE
 from jtqd.daemon.replay.session import SHORT_CYCLES, ReplayOptions, Result, replay_each
 from jtqd.estimator.arrays import RecordArray
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.checked import ConfigError, check_output
 from jtqd.estimator.onnx_graph import NetworkError
 from jtqd.estimator.settings import METHODS
 
@@ -335,11 +335,13 @@ def main(argv: list[str]) -> int:
     )
     bar = _Bar()
     try:
+        if options.out is not None:
+            check_output(options.out)
         good = _replay(options, replay_options, bar)
     except (LogError, ConfigError, NetworkError) as error:
         return _failed(bar, str(error))
     except OSError as error:
-        return _failed(bar, f"{error.filename or 'log'}: {error.strerror or error}")
+        return _failed(bar, f"{error.filename or options.out or 'output'}: {error.strerror or error}")
     return 0 if good else 3
 
 

@@ -25,6 +25,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from jtqd.estimator.arrays import FloatArray, QuadrantArray
+from jtqd.estimator.checked import counted
 from jtqd.estimator.estimator import quadrants
 from jtqd.estimator.fusion import Fusion, held
 from jtqd.estimator.joint import AdditiveLoss, Friction, Fused, FusedSigma, Torsion
@@ -198,7 +199,7 @@ def fit_fused(runs: Sequence[RunSignals], friction: Friction) -> FusedFit:
     """
     if len(runs) < _LEAST_RUNS:
         raise ValueError(
-            f"found {len(runs)} runs, expected at least {_LEAST_RUNS}: standard deviations need unseen runs"
+            f"found {counted(len(runs), 'run')}, expected at least {_LEAST_RUNS}: standard deviations need unseen runs"
         )
     unseen = _unseen(runs, friction)
     sigma = fit_sigma(unseen)

@@ -179,8 +179,8 @@ def _played_row(time_s: Array, run_s: Array) -> NDArray[np.intp]:
 def _offline(played: Played) -> Array:
     """Whole-run estimate from the file, as `offline` makes it; NaN where none would be published."""
     table, joint = played.table, played.joint
-    inputs = table.estimator_inputs(played.number, joint.gear_ratio)
-    result = JointEstimator(joint, played.settings).run(*inputs)
+    dt_s, current, motor, velocity, link = table.estimator_inputs(played.number, joint.gear_ratio)
+    result = JointEstimator(joint, played.settings).run(dt_s, current, motor, velocity, link)
     return np.where(np.isin(result.status, PUBLISHED), result.torque_nm, np.nan)
 
 

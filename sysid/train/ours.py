@@ -18,6 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.checked import counted
 from jtqd.estimator.envelope import Envelope
 from jtqd.estimator.estimator import FusedEstimator, quadrants
 from jtqd.estimator.fusion import Fusion, turning
@@ -134,7 +135,9 @@ def train_fused(
             f"joint {joint.name}: found no section 'fused' with torsion; 'jtq fit losses' makes one"
         )
     if len(runs) < 8:
-        raise ValueError(f"found {len(runs)} runs, expected at least 8: standard deviations need unseen runs")
+        raise ValueError(
+            f"found {counted(len(runs), 'run')}, expected at least 8: standard deviations need unseen runs"
+        )
     unseen: list[tuple[Seen, FloatArray]] = []
     for known, judged in folds(runs):
         loss, torsion = fit_loss(known, joint.friction).loss, fit_torsion(known)

@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.network import FEATURES
@@ -80,7 +81,7 @@ def train_paper(
     """
     if len(blocks) < _HELD_OUT:
         raise ValueError(
-            f"found {len(blocks)} runs, expected at least {_HELD_OUT}: a network is judged on whole runs"
+            f"found {counted(len(blocks), 'run')}, expected at least {_HELD_OUT}: a network is judged on whole runs"
         )
     held = blocks[_HELD_OUT - 1 :: _HELD_OUT]
     known = [block for n, block in enumerate(blocks) if n % _HELD_OUT != _HELD_OUT - 1]

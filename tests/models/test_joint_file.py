@@ -209,7 +209,15 @@ def test_files(tmp_path: Path) -> None:
     assert digest == hashlib.sha256(b"a: 1\nb: {c: 2.5}\n").hexdigest()
     for text, words in (
         (b"a: 1\na: 2\n", "line 2, column 1 not YAML: the key 'a' is given twice"),
-        (b"a: [1\n", "not YAML"),
+        (b"a: [1\n", "line 2, column 1 not YAML: expected ',' or ']', found the end of the file"),
+        (b'a: "b\n', "found the end of the file (while scanning a text in quotes that begins in line 1)"),
+        (
+            b"a: {b: 1\nc: 2\n",
+            "expected ',' or '}', found ':' (while parsing a mapping in { } that begins in line 1)",
+        ),
+        (b"a:\n\tb: 1\n", "line 2, column 1 not YAML: found a tab, expected spaces"),
+        (b"a: 1\nb\nc: 1\n", "found no ': ' behind a key"),
+        (b"\x89MCAP0\r\n", "not YAML: found 89h at offset 0, expected a text file"),
         (b"- 1\n", "found list"),
         (b"", "an empty file"),
         (b"\xff\xfe\x00", "not YAML"),

@@ -105,6 +105,13 @@ def test_logs_that_tell_a_cycle_differently_are_refused(tmp_path: Path) -> None:
         replay([first, other], ReplayOptions())
 
 
+def test_a_place_that_cannot_be_written_is_said_before_the_replay(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["absent.mcap", "--out", str(tmp_path / "none" / "a.mcap")]) == 1
+    assert "none: found no such directory" in capsys.readouterr().err
+
+
 def test_two_files_for_one_joint_are_one_too_many(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("joint1.yaml", "extended.joint1.yaml"):
         shutil.copy(shipped("joint1.yaml"), tmp_path / name)
