@@ -269,7 +269,12 @@ def _whole(text: str, low: int) -> int:
     return value
 
 
-# Words of messages.
+# Words of messages, and numbers of JSON.
+
+
+def finite(value: float) -> float | None:
+    """Return the number, or None for NaN and infinity, which JSON does not have."""
+    return value if math.isfinite(value) else None
 
 
 def counted(number: int, noun: str, plural: str = "") -> str:
