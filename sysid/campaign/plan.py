@@ -210,7 +210,7 @@ class Plan:
 
 def load_plan(path: Path) -> Plan:
     """Read a plan file. Raises ConfigError."""
-    mapping, _ = load_yaml(path)
+    mapping = load_yaml(path)
     return Plan.from_mapping(mapping, str(path))
 
 
