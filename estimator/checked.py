@@ -299,7 +299,12 @@ def make_directory(path: Path) -> None:
         )
 
 
-# Words of messages.
+# Words of messages, and numbers of JSON.
+
+
+def finite(value: float) -> float | None:
+    """Return the number, or None for NaN and infinity, which JSON does not have."""
+    return value if math.isfinite(value) else None
 
 
 def counted(number: int, noun: str, plural: str = "") -> str:

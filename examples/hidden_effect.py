@@ -87,7 +87,7 @@ def secrets(joint: Joint) -> Mapping[str, Effect]:
 def write_secret(directory: Path, name: str) -> Path:
     """Write the plant file of the secret bench and its joint files; returns its path. Raises ConfigError, OSError."""
     directory.mkdir(parents=True, exist_ok=True)
-    mapping: dict[str, Any] = load_yaml(shipped(_PLANT))[0]
+    mapping: dict[str, Any] = load_yaml(shipped(_PLANT))
     for number in NUMBERS:
         joint = load_joint(nominal_file(number))
         effects = (secrets(joint)[name],) if number == SECRET_JOINT else ()
@@ -109,7 +109,7 @@ def write_secret(directory: Path, name: str) -> Path:
 def write_config(path: Path, joint_files: Mapping[int, Path], method: str) -> Path:
     """Write a configuration of jtqd for the bench: these joint files, this method, no network. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    mapping: dict[str, Any] = load_yaml(shipped("bench.yaml"))[0]
+    mapping: dict[str, Any] = load_yaml(shipped("bench.yaml"))
     mapping["estimator"] = {**mapping["estimator"], "method": method}
     for number, file in joint_files.items():
         joint = mapping[f"joint_{number}"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from pathlib import Path
 from typing import Any, Final
@@ -48,10 +47,9 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def load_yaml(path: str | os.PathLike[str]) -> tuple[dict[str, Any], str]:
-    """Return the root mapping of a YAML file and the SHA-256 of its bytes (hex). Raises ConfigError."""
-    mapping, data = read_yaml(path)
-    return mapping, hashlib.sha256(data).hexdigest()
+def load_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Return the root mapping of a YAML file. Raises ConfigError."""
+    return read_yaml(path)[0]
 
 
 def read_yaml(path: str | os.PathLike[str]) -> tuple[dict[str, Any], bytes]:
@@ -129,7 +127,7 @@ def _marked(error: yaml.MarkedYAMLError) -> str:
 
 def load_joint(path: str | os.PathLike[str]) -> Joint:
     """Return the joint of a joint file. Raises ConfigError naming file, key, found and expected."""
-    mapping, _ = load_yaml(path)
+    mapping = load_yaml(path)
     return Joint.from_mapping(mapping, os.fspath(path))
 
 

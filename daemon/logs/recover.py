@@ -41,7 +41,7 @@ from jtqd.daemon.logs.container import (
 )
 from jtqd.daemon.logs.contents import Contents, Gap, WholeChunk, chunk_content, index_entries, is_whole, scan
 from jtqd.daemon.recording.mcap_file import MAGIC, bytes_of
-from jtqd.daemon.recording.parts import ACTIVE, OwnFile, own_files
+from jtqd.daemon.recording.own_files import ACTIVE, OwnFile, own_files
 from jtqd.estimator.checked import counted
 
 _PARTIAL = ".recovering"

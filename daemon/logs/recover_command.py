@@ -10,7 +10,7 @@ from pathlib import Path
 
 from jtqd.daemon.logs.container import LogError
 from jtqd.daemon.logs.recover import BeingWrittenError, OutsideChunksError, Recovery, recover
-from jtqd.daemon.recording.parts import ACTIVE
+from jtqd.daemon.recording.own_files import ACTIVE
 from jtqd.estimator.checked import counted
 
 _ENDINGS = (".mcap", ".mcap" + ACTIVE)

@@ -303,11 +303,15 @@ def store(out: Path, key: str, content: Mapping[str, Any], files: Mapping[str, b
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Put a file in place that is there whole or not at all. Raises OSError."""
+    """Put a file in place that is there whole or not at all; nothing is left of one that fails. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
 
 
 def run_batch(

@@ -95,7 +95,7 @@ class Played:
 
 def configured(config: Path) -> tuple[tuple[Joint, Joint], EstimatorSettings]:
     """Joints and estimator of a configuration of jtqd. Raises ConfigError."""
-    mapping, _ = load_yaml(config)
+    mapping = load_yaml(config)
     top = Section(mapping, str(config))
     sections = [top.section(f"joint_{number}") for number in (1, 2)]
     one, two = (

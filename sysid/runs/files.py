@@ -93,7 +93,7 @@ class ColumnMap:
     @classmethod
     def load(cls, path: Path) -> ColumnMap:
         """Read a column map file. Raises ConfigError."""
-        mapping, _ = load_yaml(path)
+        mapping = load_yaml(path)
         return cls.from_mapping(mapping, str(path), path.parent)
 
 

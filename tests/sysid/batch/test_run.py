@@ -166,6 +166,11 @@ def test_a_result_is_there_whole_or_not_at_all(tmp_path):
     path.write_text(json.dumps(kept | {"key": "another"}))
     assert stored(tmp_path, "k") is None
     write_whole(tmp_path / "x", "1")
+    with pytest.raises(UnicodeEncodeError):  # fails in the middle, as on a full disk
+        write_whole(tmp_path / "x", "2\udc80")
+    with pytest.raises(IsADirectoryError):
+        write_whole(tmp_path / "results", "3")
+    assert (tmp_path / "x").read_text() == "1"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["results", "x"]
 
 
