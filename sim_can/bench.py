@@ -1,31 +1,19 @@
 """The emulated bench: two drives and a torque sensor around one source. Frames and times in, frames out.
 
-While no master commands the drives the bench moves them itself. Its built-in motion "demo" fills all four quadrants: joint 1
-follows a velocity trajectory of two smooth bursts with rests between them, joint 2 a torque that varies on its own,
-non-commensurate periods. Everything starts from rest with zero slope. No socket, no clock.
+While no master commands the drives the bench moves them itself (`jtqd.sim_can.demo`). No socket, no clock.
 """
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 from jtqd.drivers.devices import COMMANDER_NODE, JTQD_NODE, SYNC_COB_ID
 from jtqd.drivers.filters import CanFilter, exact
 from jtqd.sim_can.canopen_node import CanopenNode
+from jtqd.sim_can.demo import demo_current, demo_velocity
 from jtqd.sim_can.drive_node import OPERATION_ENABLED, DriveNode
 from jtqd.sim_can.sensor_node import SENSOR_NODE, SensorNode
 from jtqd.sim_can.source import CURRENT, OFF, VELOCITY, Source
-
-PERIOD_S = 20.0
-# (start, length in s, amplitudes in rad/s of sin(2πk x), k = 1, 2, ..., x = -1/2..1/2 over the burst)
-BURSTS = (
-    (1.0, 8.4, (0.66, 1.38, -0.90, 0.66)),
-    (10.9, 7.6, (-0.42, -1.14, 0.54, 1.26)),
-)
-# (amplitude in A, period in s)
-LOADS = ((2.7, 7.3), (0.7, 2.9), (0.4, 1.7))
-LOAD_RISE_S = 2.0
 
 
 class Targets(NamedTuple):
@@ -33,27 +21,6 @@ class Targets(NamedTuple):
 
     mode: int
     target: float
-
-
-def demo_velocity(time_s: float) -> float:
-    """Return the velocity of joint 1 in rad/s, joint side.
-
-    Each burst is odd about its middle, so the joint comes back to where it began; the window cos² makes
-    velocity and acceleration zero at both ends.
-    """
-    t = time_s % PERIOD_S
-    for start, length, amplitudes in BURSTS:
-        x = (t - start) / length - 0.5
-        if -0.5 < x < 0.5:
-            window = math.cos(math.pi * x) ** 2
-            return window * sum(a * math.sin(2.0 * math.pi * k * x) for k, a in enumerate(amplitudes, 1))
-    return 0.0
-
-
-def demo_current(time_s: float) -> float:
-    """Return the motor current of joint 2 in A: a sum of sines that rises smoothly from zero within LOAD_RISE_S."""
-    rise = 1.0 if time_s >= LOAD_RISE_S else 0.5 - 0.5 * math.cos(math.pi * time_s / LOAD_RISE_S)
-    return rise * sum(a * math.sin(2.0 * math.pi * time_s / period) for a, period in LOADS)
 
 
 def targets(profile: str, time_s: float) -> tuple[Targets, Targets] | None:
@@ -111,7 +78,8 @@ class Bench:
     @property
     def due_ns(self) -> int:
         """Steady time at which `tick` has something to do next."""
-        due = min(node.due_ns for node in self.nodes)
+        one, two, three = self.nodes
+        due = min(one.due_ns, two.due_ns, three.due_ns)
         return min(due, self._idle_due_ns()) if self._moving() else due
 
     def on_frame(self, can_id: int, data: bytes, stamp_ns: int, now_ns: int) -> list[bytes]:

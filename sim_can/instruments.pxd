@@ -25,3 +25,11 @@ cdef class TorqueSensor:
     cdef Noise noise
     cdef public double offset_nm
     cpdef sample(self, ChannelSignal signal, double torque_nm)
+
+@cython.final
+cdef class Instruments:
+    cdef Encoders encoders_1, encoders_2
+    cdef DriveSignals drive_1, drive_2
+    cdef readonly tuple encoders, drives
+    cdef readonly TorqueSensor sensor
+    cdef readonly ChannelSignal channel

@@ -2,6 +2,7 @@
 
 from libc.math cimport M_PI, cos, exp, log, rint, sin, sqrt
 
+from jtqd.sim_can.plant cimport Plant
 from jtqd.sim_can.signals cimport ChannelSignal, DriveSignals
 
 
@@ -72,3 +73,33 @@ cdef class TorqueSensor:
     cpdef sample(self, ChannelSignal signal, double torque_nm):
         """Set the signal to what is read at this true torque."""
         signal.torque_nm = self.gain * torque_nm + self.offset_nm + self.noise_nm * self.noise.normal()
+
+
+cdef class Instruments:
+    """All instruments of the bench: `encoders` of both drives, `sensor`; `drives` and `channel` are what they read."""
+
+    def __init__(self, parameters, Noise noise not None):
+        self.encoders_1, self.encoders_2 = (Encoders(side, noise) for side in parameters.joints)
+        self.encoders = (self.encoders_1, self.encoders_2)
+        self.sensor = TorqueSensor(parameters.sensor, noise)
+        self.drive_1, self.drive_2, self.channel = DriveSignals(), DriveSignals(), ChannelSignal()
+        self.drives = (self.drive_1, self.drive_2)
+
+    def read(self, Plant plant not None, double dt_s, double torque_nm, errors):
+        """Sample everything, dt_s after the last time.
+
+        torque_nm: at the sensor; errors: what motor encoder, link encoder and current of both joints read above the truth,
+        None for nothing.
+        """
+        cdef double motor_1 = plant.state[0].angle, motor_2 = plant.state[1].angle
+        cdef double link_1 = plant.link_position, link_2 = -plant.link_position
+        cdef double current_1 = plant.drive_1.current_a, current_2 = plant.drive_2.current_a
+        if errors is not None:
+            (more_1, more_2) = errors
+            motor_1, link_1, current_1 = motor_1 + more_1[0], link_1 + more_1[1], current_1 + more_1[2]
+            motor_2, link_2, current_2 = motor_2 + more_2[0], link_2 + more_2[1], current_2 + more_2[2]
+        self.encoders_1.sample(self.drive_1, dt_s, motor_1, link_1, current_1)
+        self.encoders_2.sample(self.drive_2, dt_s, motor_2, link_2, current_2)
+        self.drive_1.temperature_c = plant.temperature_1.celsius
+        self.drive_2.temperature_c = plant.temperature_2.celsius
+        self.sensor.sample(self.channel, torque_nm)

@@ -17,11 +17,11 @@ from jtqd.estimator.effects.functions import Scalar
 from jtqd.estimator.joint import Joint
 from jtqd.sim_can.days import NOMINAL_DAY, Day, day
 from jtqd.sim_can.effect_plant import EffectPlant
-from jtqd.sim_can.instruments import Encoders, Noise, TorqueSensor
+from jtqd.sim_can.instruments import Instruments, Noise
 from jtqd.sim_can.joint_effects import effects_of
 from jtqd.sim_can.plant import Plant
 from jtqd.sim_can.plant_file import JointPlant, PlantParameters
-from jtqd.sim_can.source import OFF, ChannelSignal, DriveRatings, DriveSignals
+from jtqd.sim_can.source import OFF, DriveRatings
 
 Errors = tuple[float, float, float]
 """What motor encoder [rad, motor side], link encoder [rad] and current [A] read above the truth."""
@@ -227,11 +227,10 @@ class PlantSource:
     def __init__(self, parameters: PlantParameters, seed: int = 0, noise_seed: str | None = None) -> None:
         self.plant, self._readings = _plant_of(parameters)
         self.ratings = tuple(ratings_of(side) for side in parameters.joints)
-        self.drives = (DriveSignals(), DriveSignals())
-        self.channels = (ChannelSignal(),)
         noise = Noise(random.Random(seed if noise_seed is None else noise_seed).random)
-        self._encoders = tuple(Encoders(side, noise) for side in parameters.joints)
-        self._sensor = TorqueSensor(parameters.sensor, noise)
+        self._instruments = Instruments(parameters, noise)
+        self.drives = self._instruments.drives
+        self.channels = (self._instruments.channel,)
         self._zero_nm = parameters.sensor.offset_nm
         self._widths = parameters.run_to_run
         self._seed = seed
@@ -243,30 +242,18 @@ class PlantSource:
     def begin_day(self, values: Day = NOMINAL_DAY) -> None:
         """Set friction, temperature and zeros of another day. The joints stay where they are."""
         self.plant.begin_day(values)
-        for encoders, zero in zip(self._encoders, values.link_zero_rad, strict=True):
+        for encoders, zero in zip(self._instruments.encoders, values.link_zero_rad, strict=True):
             encoders.link_zero_rad = zero
-        self._sensor.offset_nm = self._zero_nm + values.sensor_zero_nm
+        self._instruments.sensor.offset_nm = self._zero_nm + values.sensor_zero_nm
 
     def advance(self, dt_s: float) -> bool:
         """Integrate by dt_s and sample everything. An emulated run has no end: always True."""
         plant = self.plant
         plant.step(dt_s)
-        one, two = plant.drives
-        link = plant.link_position
-        motor_1, motor_2 = plant.motor_position
-        drive_1, drive_2 = self.drives
-        link_1, link_2, current_1, current_2 = link, -link, one.current_a, two.current_a
-        torque_nm = plant.sensor_torque()
+        torque_nm, errors = plant.sensor_torque(), None
         if self._readings is not None:
-            (more_1, more_2), torque_nm = self._readings.read(torque_nm, dt_s)
-            motor_1, link_1, current_1 = motor_1 + more_1[0], link_1 + more_1[1], current_1 + more_1[2]
-            motor_2, link_2, current_2 = motor_2 + more_2[0], link_2 + more_2[1], current_2 + more_2[2]
-        self._encoders[0].sample(drive_1, dt_s, motor_1, link_1, current_1)
-        self._encoders[1].sample(drive_2, dt_s, motor_2, link_2, current_2)
-        warmth_1, warmth_2 = plant.temperatures
-        drive_1.temperature_c = warmth_1.celsius
-        drive_2.temperature_c = warmth_2.celsius
-        self._sensor.sample(self.channels[0], torque_nm)
+            errors, torque_nm = self._readings.read(torque_nm, dt_s)
+        self._instruments.read(plant, dt_s, torque_nm, errors)
         return True
 
     def command(self, drive: int, mode: int, target: float) -> None:

@@ -200,7 +200,7 @@ def test_another_day_begins_when_a_drive_is_enabled_after_both_were_off():
     source = PlantSource(CAMPAIGN, seed=9)
 
     def zero():
-        return source._sensor.offset_nm
+        return source._instruments.sensor.offset_nm
 
     days = [day(CAMPAIGN.run_to_run, 9, n).sensor_zero_nm for n in range(4)]
     source.advance(0.0)
