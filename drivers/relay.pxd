@@ -32,8 +32,9 @@ cdef class Relay:
     cdef FrameReceiver receiver
     cdef list members  # replaced, never changed: a delivery goes on with those that were there
     cdef object queue
-    cdef bint delivering
+    cdef bint delivering, heard
     cdef double paused_until
+    cpdef run_once(self, timeout_s)
     cdef int64_t bounded(self, timeout_s) except -1
     cdef int accept(self) except -1
     cdef int read(self, Client client) except -1

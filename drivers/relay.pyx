@@ -97,6 +97,7 @@ cdef class LocalPort(Member):
 
     cdef bint take(self, const Frame *frame, int64_t stamp_ns) except -1:
         if self.hears_all or frame.id <= STANDARD_ID and self.hears[frame.id]:
+            self.relay.heard = True
             self.on_frame(as_bytes(frame), stamp_ns)
         return True
 
@@ -168,7 +169,18 @@ cdef class Relay:
         """Connected sockets; local ports do not count."""
         return len(self._clients)
 
-    def run_once(self, timeout_s):
+    def serve(self, timeout_s):
+        """Do what is ready as it comes, until a node in this process has heard a frame or `timeout_s` have passed."""
+        end_s = time.monotonic() + timeout_s
+        self.heard = False
+        self.run_once(timeout_s)
+        while not self.heard:
+            left_s = end_s - time.monotonic()
+            if left_s <= 0.0:
+                return
+            self.run_once(left_s)
+
+    cpdef run_once(self, timeout_s):
         """Wait up to `timeout_s` (None: for ever) for something to do, and do what is ready."""
         cdef pollfd waited[MOST_CLIENTS + 1]
         cdef timespec left

@@ -5,8 +5,6 @@ While no master commands the drives the bench moves them itself (`jtqd.sim_can.d
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 from jtqd.drivers.devices import COMMANDER_NODE, JTQD_NODE, SYNC_COB_ID
 from jtqd.drivers.filters import CanFilter, exact
 from jtqd.sim_can.canopen_node import CanopenNode
@@ -14,21 +12,6 @@ from jtqd.sim_can.demo import demo_current, demo_velocity
 from jtqd.sim_can.drive_node import OPERATION_ENABLED, DriveNode
 from jtqd.sim_can.sensor_node import SENSOR_NODE, SensorNode
 from jtqd.sim_can.source import CURRENT, OFF, VELOCITY, Source
-
-
-class Targets(NamedTuple):
-    """Mode and target of one drive; VELOCITY targets are joint side here, in rad/s."""
-
-    mode: int
-    target: float
-
-
-def targets(profile: str, time_s: float) -> tuple[Targets, Targets] | None:
-    """Return the targets of both joints, or None when the profile leaves the drives alone ("rest")."""
-    if profile != "demo":
-        return None
-    return Targets(VELOCITY, demo_velocity(time_s)), Targets(CURRENT, demo_current(time_s))
-
 
 CLOCK_STEP_NS = 100_000_000  # stamps and steady clock never differ by this from SYNC to SYNC, unless CLOCK_REALTIME was set
 LONGEST_STEP_NS = 50_000_000  # a source never jumps further than this, however long SYNC was away
@@ -68,7 +51,7 @@ class Bench:
         self.sync_count = 0
         self._profile = profile
         self._profile_s = 0.0
-        self._gear = [rating.gear_ratio for rating in source.ratings]
+        self._gear = source.ratings[0].gear_ratio
         self._first_stamp_ns = 0
         self._last_time_ns = 0  # of the last SYNC, since the first one
         self._last_steady_ns = 0  # steady clock at the last step, for idle steps
@@ -152,14 +135,10 @@ class Bench:
             self._profile_s += dt_s
         else:
             self._profile_s = 0.0  # start, or start again after a stop, from rest
-        wanted = targets(self._profile, self._profile_s)
-        if wanted is None:
+        if self._profile != "demo":
             return []
-        frames = []
-        for drive, gear, target in zip(self.drives, self._gear, wanted, strict=True):
-            value = target.target * gear if target.mode == VELOCITY else target.target
-            frames += drive.run_by_itself(target.mode, value)
-        return frames
+        velocity, current = demo_velocity(self._profile_s), demo_current(self._profile_s)
+        return one.run_by_itself(VELOCITY, velocity * self._gear) + two.run_by_itself(CURRENT, current)
 
     def _hand_over(self) -> None:
         for drive in self.drives:

@@ -60,7 +60,7 @@ class _EmbeddedHub:
         self._bench = bench
         self._port = self._hub.attach(self._on_frame, [each.can_id for each in bench_filters()])
         self.send = self._port.send
-        self.serve = self._hub.run_once
+        self.serve = self._hub.serve
         self.close = self._hub.close
 
     def linger(self, end_ns: int | None) -> None:

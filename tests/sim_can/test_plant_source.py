@@ -10,7 +10,6 @@ import yaml
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Effect
 from jtqd.models.files import load_joint, shipped
-from jtqd.sim_can.bench import targets
 from jtqd.sim_can.cost import measure
 from jtqd.sim_can.demo import PERIOD_S, demo_current, demo_velocity
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
@@ -126,7 +125,6 @@ def test_demo_starts_from_rest_stays_in_travel_rests_and_fills_four_quadrants():
     assert 3.0 < np.max(np.abs(i)) < 4.0
     resting = np.flatnonzero(np.diff(np.concatenate([[0], (v == 0).astype(int), [0]])))
     assert max(resting[1::2] - resting[::2]) >= 1000
-    assert targets("rest", 3.0) is None
 
 
 def demo_run(seconds=20.0, seed=1):
