@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from jtqd.daemon.loop.intake import Intake
+from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.snapshot import (
     COUNTERS,

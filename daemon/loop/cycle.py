@@ -16,9 +16,9 @@ import time
 from collections.abc import Collection, Sequence
 from operator import attrgetter
 
+from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.loop import estimate_pdo
 from jtqd.daemon.loop.counters import LoopCounters
-from jtqd.daemon.loop.intake import Intake
 from jtqd.daemon.loop.joint import JointCycle, JointInputs
 from jtqd.daemon.loop.joint_status import JointSafety
 from jtqd.daemon.loop.schedule import Grid, NetworkBudget, WakeUp

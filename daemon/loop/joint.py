@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf, nan
 
+from jtqd.daemon.core.intake import UNKNOWN, Intake
 from jtqd.daemon.loop import estimate_pdo
-from jtqd.daemon.loop.input_pdos import UNKNOWN
-from jtqd.daemon.loop.intake import Intake
 from jtqd.daemon.loop.joint_status import (
     JointCounts,
     JointRules,

@@ -22,10 +22,10 @@ import numpy as np
 import numpy.typing as npt
 
 from jtqd.daemon.config import SafetySettings
+from jtqd.daemon.core.intake import Intake, JointTemperature
 from jtqd.daemon.loop import estimate_pdo
 from jtqd.daemon.loop.cycle import STARTING_CYCLES
-from jtqd.daemon.loop.input_pdos import JointTemperature, input_pdos, joint_temperatures
-from jtqd.daemon.loop.intake import Intake
+from jtqd.daemon.loop.input_pdos import input_pdos, joint_temperatures
 from jtqd.daemon.loop.joint import JointCycle
 from jtqd.daemon.loop.joint_status import JointSafety, JointStatus, drive_status
 from jtqd.daemon.replay.frames import Frames, Pdo, offsets

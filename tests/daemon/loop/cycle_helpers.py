@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
+from jtqd.daemon.core.intake import Intake, JointTemperature
 from jtqd.daemon.loop import cycle as cycle_module
 from jtqd.daemon.loop.cycle import Cycle
-from jtqd.daemon.loop.input_pdos import InputPdo, JointTemperature
-from jtqd.daemon.loop.intake import Intake
+from jtqd.daemon.loop.input_pdos import InputPdo
 from jtqd.daemon.loop.joint import JointInputs
 from jtqd.daemon.loop.joint_status import JointSafety
 from jtqd.daemon.loop.schedule import Grid

@@ -12,9 +12,9 @@ import pytest
 
 from jtqd.daemon.bus.boot import ReturningNodes
 from jtqd.daemon.config import load_config
+from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.loop.counters import LoopCounters
 from jtqd.daemon.loop.cycle import ConfiguredNodes, Cycle
-from jtqd.daemon.loop.intake import Intake
 from jtqd.daemon.loop.process import Duties
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
 from tests.daemon.loop.cycle_helpers import I32, PDOS, ExactTime, ScriptedSocket, frame, inputs, make, turn

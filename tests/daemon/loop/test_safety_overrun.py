@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.loop.estimate_pdo import decode
-from jtqd.daemon.loop.intake import Intake
 from jtqd.daemon.loop.joint import JointCycle, JointInputs
 from jtqd.daemon.loop.joint_status import JointSafety
 from jtqd.daemon.loop.schedule import RESERVED_NS, NetworkBudget

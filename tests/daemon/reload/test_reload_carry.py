@@ -181,7 +181,7 @@ def test_estimators_limits_and_sockets_stay_those_of_the_new_loop(tmp_path: Path
     [
         ([[["no_such_part"], ["x"], []]], "there is no no_such_part"),
         ([[["intake"], ["no_such_thing"], []]], "Intake has no no_such_thing"),
-        ([[["intake", "_states", 99], ["fresh"], []]], "there is no intake._states.99"),
+        ([[["intake", "states", 99], ["fresh"], []]], "there is no intake.states.99"),
     ],
 )
 def test_a_loop_of_another_version_is_refused(tmp_path: Path, found: Any, error: str) -> None:

@@ -218,7 +218,7 @@ def test_a_successor_of_another_version_refuses_and_says_why(
     tmp_path: Path, pair: tuple[Cycle, Cycle]
 ) -> None:
     one, other = pair
-    one.intake.something_new = 5  # type: ignore[attr-defined]
+    one.configured_nodes.something_new = 5  # type: ignore[attr-defined]
     taker = Taker(other, tmp_path / "handover")
     giver = Giver(one, tmp_path / "handover")
     giver.begin()
@@ -235,7 +235,7 @@ def test_a_successor_of_another_version_refuses_and_says_why(
     assert giver.refused is not None
     assert giver.refused in refused
     assert "the program has changed since jtqd started" in refused
-    assert "Intake has no something_new" in refused
+    assert "ConfiguredNodes has no something_new" in refused
 
 
 def test_messages_are_small_against_the_sockets_buffer(pair: tuple[Cycle, Cycle]) -> None:
