@@ -16,11 +16,12 @@ import time
 from collections.abc import Collection, Sequence
 from operator import attrgetter
 
+from jtqd.daemon.core import estimate_pdo
 from jtqd.daemon.core.intake import Intake
-from jtqd.daemon.loop import estimate_pdo
+from jtqd.daemon.core.joint import JointCycle
+from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.loop.counters import LoopCounters
-from jtqd.daemon.loop.joint import JointCycle, JointInputs
-from jtqd.daemon.loop.joint_status import JointSafety
+from jtqd.daemon.loop.input_pdos import JointInputs
 from jtqd.daemon.loop.schedule import Grid, NetworkBudget, WakeUp
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import Ring

@@ -34,6 +34,29 @@ class InputPdo:
     name: str
 
 
+@dataclass(frozen=True)
+class JointInputs:
+    """Where one joint's inputs stand among the intake's PDOs, and what one count of each is worth.
+
+    Attributes:
+        position: index of TPDO1 (motor position, link position).
+        motion: index of TPDO2 (motor velocity, current, statusword).
+        sensor: index of the sensor's PDO, None without reference.
+        temperature: index among the intake's temperatures, None where the drive sends none.
+        motor_rad_per_count, motor_rad_s_per_unit, link_rad_per_count, ampere_per_unit, sensor_nm_per_unit: scaling, SI.
+    """
+
+    position: int
+    motion: int
+    sensor: int | None
+    motor_rad_per_count: float
+    motor_rad_s_per_unit: float
+    link_rad_per_count: float
+    ampere_per_unit: float
+    sensor_nm_per_unit: float
+    temperature: int | None = None
+
+
 def input_pdos(config: Config) -> list[InputPdo]:
     """Expected PDOs: both TPDOs of each drive, then one per sensor channel in use."""
 

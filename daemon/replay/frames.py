@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from jtqd.daemon.loop.input_pdos import InputPdo, input_pdos, joint_temperatures
-from jtqd.daemon.loop.joint import JointInputs
+from jtqd.daemon.loop.input_pdos import InputPdo, JointInputs, input_pdos, joint_temperatures
 from jtqd.daemon.replay.origin import Origin
 from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_POSITION, FLAG_SENSOR
 from jtqd.estimator.arrays import BoolArray, FloatArray, IntegerArray, RecordArray

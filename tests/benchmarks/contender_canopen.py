@@ -17,7 +17,7 @@ from typing import Any
 import canopen
 
 from jtqd.daemon.config import load_config
-from jtqd.daemon.loop import estimate_pdo
+from jtqd.daemon.core import estimate_pdo
 from jtqd.daemon.loop import process as loop
 from jtqd.daemon.loop.schedule import Grid
 from jtqd.drivers.can_unix import UnixBus

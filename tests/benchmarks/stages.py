@@ -14,7 +14,7 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
-from jtqd.daemon.loop import estimate_pdo
+from jtqd.daemon.core import estimate_pdo
 from jtqd.daemon.loop import process as loop
 from jtqd.estimator.methods import AnyEstimator, load_network, make_estimator
 from tests.benchmarks.contender import serve

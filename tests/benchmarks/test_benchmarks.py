@@ -11,8 +11,8 @@ from types import SimpleNamespace
 import pytest
 
 from jtqd.daemon.config import load_config
+from jtqd.daemon.core import estimate_pdo
 from jtqd.daemon.loop import cycle as cycle_module
-from jtqd.daemon.loop import estimate_pdo
 from jtqd.daemon.loop import process as loop
 from jtqd.drivers.frame import FRAME, pack
 from tests.benchmarks import c_program, traffic

@@ -12,11 +12,10 @@ from typing import Any
 import pytest
 
 from jtqd.daemon.core.intake import Intake, JointTemperature
+from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.loop import cycle as cycle_module
 from jtqd.daemon.loop.cycle import Cycle
-from jtqd.daemon.loop.input_pdos import InputPdo
-from jtqd.daemon.loop.joint import JointInputs
-from jtqd.daemon.loop.joint_status import JointSafety
+from jtqd.daemon.loop.input_pdos import InputPdo, JointInputs
 from jtqd.daemon.loop.schedule import Grid
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import Ring, RingReader

@@ -97,7 +97,7 @@ def test_the_joint_of_a_drive_begins_again_and_no_other_one(loop: Loop) -> None:
     loop.answers[0] = frame(0x181, I32.pack(90_000, 2000))
     loop.supervisor.note_configured(1, 1)
     turn(loop.cycle)
-    assert one._last_ns == 0
+    assert one.last_ns == 0
     turn(loop.cycle)
     assert (one.sample[11], two.sample[11] > 0) == (0.0, True)
     assert one.latched == 0, "no jump"

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from jtqd.daemon.loop.estimate_pdo import decode
-from jtqd.daemon.loop.joint import Unwrap
+from jtqd.daemon.core.estimate_pdo import decode
+from jtqd.daemon.core.joint import Unwrap
 from jtqd.daemon.loop.schedule import WakeUp
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.snapshot import SnapshotReader

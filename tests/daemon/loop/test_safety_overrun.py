@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,10 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from jtqd.daemon.core.estimate_pdo import decode
 from jtqd.daemon.core.intake import Intake
-from jtqd.daemon.loop.estimate_pdo import decode
-from jtqd.daemon.loop.joint import JointCycle, JointInputs
-from jtqd.daemon.loop.joint_status import JointSafety
+from jtqd.daemon.core.joint import JointCycle
+from jtqd.daemon.core.joint_safety import JointSafety
+from jtqd.daemon.loop.input_pdos import JointInputs
 from jtqd.daemon.loop.schedule import RESERVED_NS, NetworkBudget
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.cycle_record import FLAG_NETWORK_SKIPPED
@@ -243,8 +245,8 @@ def replay(records: list[bytes], clock: ExactTime) -> Iterator[tuple[float, ...]
     intake = Intake(PDOS)
 
     class Tally:
-        counters = [0] * len(COUNTERS)
-        errors = [0.0] * 4
+        counters = array("Q", [0] * len(COUNTERS))
+        errors = array("d", [0.0] * 4)
 
     joint = JointCycle(
         0,

@@ -8,11 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from jtqd.daemon.core import estimate_pdo
 from jtqd.daemon.core.intake import Intake, JointTemperature
-from jtqd.daemon.loop import estimate_pdo
 from jtqd.daemon.loop.cycle import Cycle
-from jtqd.daemon.loop.input_pdos import InputPdo
-from jtqd.daemon.loop.joint import JointInputs
+from jtqd.daemon.loop.input_pdos import InputPdo, JointInputs
 from jtqd.daemon.loop.process import run
 from jtqd.daemon.loop.schedule import Grid
 from jtqd.daemon.shared import cycle_record as cr
