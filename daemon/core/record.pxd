@@ -28,3 +28,26 @@ cdef struct Record:
     Frame frames[FRAME_CAPACITY]
     int64_t stamps_ns[FRAME_CAPACITY]
     uint64_t tail
+
+cdef class RecordRing:
+    cdef object memory
+    cdef uint64_t[::1] head
+    cdef uint8_t[::1] records
+    cdef uint64_t *written
+    cdef uint64_t slots
+    cdef Record *slot(self) noexcept nogil
+    cdef void commit(self) noexcept nogil
+
+cdef struct HeldFrames:  # of slots without a record
+    int64_t count
+    Frame frames[FRAME_CAPACITY]
+    int64_t stamps_ns[FRAME_CAPACITY]
+
+cdef class CycleFrames:
+    cdef Record *record
+    cdef readonly int count, left_out
+    cdef HeldFrames held
+    cdef void begin(self, Record *record) noexcept nogil
+    cdef void hold(self, const Frame *frame, int64_t stamp_ns) noexcept nogil
+    cdef void keep(self, const Frame *frames, const int64_t *stamps_ns, int count) noexcept nogil
+    cdef void keep_one(self, const Frame *frame, int64_t stamp_ns) noexcept nogil

@@ -24,11 +24,11 @@ import numpy.typing as npt
 
 from jtqd.daemon.config import SafetySettings
 from jtqd.daemon.core import estimate_pdo
+from jtqd.daemon.core.cycle import STARTING_CYCLES
 from jtqd.daemon.core.intake import Intake, JointTemperature
 from jtqd.daemon.core.joint import JointCycle
 from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.core.status import JointStatus, drive_status
-from jtqd.daemon.loop.cycle import STARTING_CYCLES
 from jtqd.daemon.loop.input_pdos import input_pdos, joint_temperatures
 from jtqd.daemon.replay.frames import Frames, Pdo, offsets
 from jtqd.daemon.replay.origin import SAMPLE, Origin

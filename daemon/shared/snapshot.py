@@ -196,6 +196,7 @@ _ORDERS_OFFSET = 32
 _COUNTERS_OFFSET = 64
 _SEQUENCE_OFFSET = _COUNTERS_OFFSET + 8 * len(COUNTERS)
 _ESTIMATE_OFFSET = _SEQUENCE_OFFSET + 8
+ESTIMATE_SIZE = _ESTIMATE.size + 2 * _JOINT.size + _MEASURED.size
 _MEASURED_OFFSET = _ESTIMATE_OFFSET + _ESTIMATE.size + 2 * _JOINT.size
 _ERRORS_OFFSET = _MEASURED_OFFSET + _MEASURED.size
 _WORK_OFFSET = _ERRORS_OFFSET + 4 * 8
@@ -223,7 +224,7 @@ class SnapshotError(Exception):
 
 
 class Snapshot:
-    """Writer's side, one per loop.
+    """Writer's side, one per loop; the loop writes without going through Python (`daemon/core/counters.pyx`).
 
     With `attach` it takes over the memory that another loop has made, as it is; from `own` on it is this process's.
 
@@ -242,6 +243,8 @@ class Snapshot:
         restarts: boot-up messages of each node-ID.
         configured_for: of each node-ID, the `restarts` after which it was last configured; written by the supervisor.
         doubts: number of times each node-ID was found to be configured otherwise; written by the supervisor.
+        sequence: odd while the snapshot is being written.
+        estimate: the last estimate: times, status, `JointView` and `Measured` of both joints.
     """
 
     def __init__(self, path: Path, period_s: float, worst_load: float, *, attach: bool = False) -> None:
@@ -268,7 +271,8 @@ class Snapshot:
         self.restarts = view[_RESTARTS_OFFSET:_CONFIGURED_FOR_OFFSET].cast("Q")
         self.configured_for = view[_CONFIGURED_FOR_OFFSET:_DOUBTS_OFFSET].cast("Q")
         self.doubts = view[_DOUBTS_OFFSET:SIZE]
-        self._sequence = view[_SEQUENCE_OFFSET:_ESTIMATE_OFFSET].cast("Q")
+        self.sequence = view[_SEQUENCE_OFFSET:_ESTIMATE_OFFSET].cast("Q")
+        self.estimate = view[_ESTIMATE_OFFSET:_ERRORS_OFFSET]
         self._status = [-1, -1]
         self._since = [0, 0]
 
@@ -287,7 +291,7 @@ class Snapshot:
 
     def begin(self) -> None:
         """From here to the end of `write` a reader knows that what it sees is half new (counters and inputs included)."""
-        self._sequence[0] |= 1
+        self.sequence[0] |= 1
 
     def write(
         self,
@@ -303,7 +307,7 @@ class Snapshot:
         for n, joint in enumerate(joints):
             if joint[7] != self._status[n]:
                 self._status[n], self._since[n] = int(joint[7]), index
-        self._sequence[0] |= 1
+        self.sequence[0] |= 1
         memory = self._memory
         _ESTIMATE.pack_into(
             memory,
@@ -318,7 +322,7 @@ class Snapshot:
         offset = _ESTIMATE_OFFSET + _ESTIMATE.size
         _JOINT.pack_into(memory, offset, *joints[0])
         _JOINT.pack_into(memory, offset + _JOINT.size, *joints[1])
-        self._sequence[0] += 1
+        self.sequence[0] += 1
 
     def factors(self, node_id: int) -> tuple[float, ...]:
         """Four scaling factors that the supervisor has noted for a node (`note_factors`); zeros where none."""

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as hst
 
-from jtqd.daemon.loop.cycle import Cycle
+from jtqd.daemon.core.cycle import Cycle
 from tests.slow.fuzz.bus_in_time import BusInTime, Script
 from tests.slow.fuzz.frames import FrameReport, Oracle, fuzz_frames, make_cycle
 from tests.slow.fuzz.service import fuzz_service
@@ -135,7 +135,7 @@ def test_minimal_examples(tmp_path_factory: pytest.TempPathFactory, cycles: list
 
     from jtqd.daemon.loop.process import run
 
-    with bus.installed(), bus.installed_in_loop():
+    with bus.installed_in_loop():
         run(cycle, cycle.grid, lambda: False, after=after)
     assert not oracle.findings, oracle
     assert oracle.valid > 150

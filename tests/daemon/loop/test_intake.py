@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import pytest
 
+from jtqd.daemon.core.counters import frame_counts
 from jtqd.daemon.core.intake import Intake
-from jtqd.daemon.loop.counters import frame_counts
 from jtqd.daemon.loop.input_pdos import InputPdo
 
 PAIR = struct.Struct("<ii")

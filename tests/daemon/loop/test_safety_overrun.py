@@ -16,8 +16,8 @@ from jtqd.daemon.core.estimate_pdo import decode
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import JointCycle
 from jtqd.daemon.core.joint_safety import JointSafety
+from jtqd.daemon.core.schedule import RESERVED_NS, NetworkBudget
 from jtqd.daemon.loop.input_pdos import JointInputs
-from jtqd.daemon.loop.schedule import RESERVED_NS, NetworkBudget
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.cycle_record import FLAG_NETWORK_SKIPPED
 from jtqd.daemon.shared.snapshot import COUNTERS, SnapshotReader
@@ -154,7 +154,7 @@ def test_too_late_for_either_network_is_physics_for_both(tmp_path: Path, clock: 
     assert statuses(socket)[-1] == (DEGRADED, DEGRADED)
     pdo = decode(estimates(socket)[-1])
     assert None not in pdo.torque_nm
-    joint = [cr.joint_of(cycle._frames.slot, n) for n in (1, 2)]
+    joint = [cr.joint_of(cycle.frames.slot, n) for n in (1, 2)]
     assert [math.isnan(each.network_nm) for each in joint] == [True, True]
     assert [each.torque_nm for each in joint] == [each.physics_nm for each in joint]
     clock.turn(cycle, 8)

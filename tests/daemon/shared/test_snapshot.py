@@ -49,7 +49,7 @@ def test_quantiles_are_upper_edges_of_their_bins(tmp_path: Path) -> None:
 def test_an_odd_sequence_is_not_taken_for_a_whole_reading(tmp_path: Path) -> None:
     snapshot = Snapshot(tmp_path / "s", 1e-3, 0.5)
     snapshot.write(1, 1, 2, (ONE, TWO))
-    assert snapshot._sequence[0] == 2
+    assert snapshot.sequence[0] == 2
 
 
 def test_the_supervisor_tells_the_loop_what_it_configured(tmp_path: Path) -> None:
