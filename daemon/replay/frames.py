@@ -2,7 +2,7 @@
 the estimate PDO that went out. Pure, in arrays.
 
 The frames of a record are in order of arrival, late ones of the cycle before first. Of an input that counted, the last frame
-with its identifier and length is therefore the one that was used (see `loop.intake`); whether it counted is what the
+with its identifier and length is therefore the one that was used (see `core.intake`); whether it counted is what the
 log's `input_flags` say. Where a record had no room for all frames, the integers come from the SI values beside it.
 """
 
