@@ -11,8 +11,6 @@ cdef struct CounterState:
     int64_t bits
     int64_t used_ns[MOST_INPUTS]
     int64_t delay_ns[MOST_INPUTS]
-    int64_t status_since[2]
-    int status[2]
 
 cdef struct InputBlock:  # `INPUT` of the snapshot
     int64_t used_ns, delay_ns, low_ns, high_ns
@@ -35,13 +33,33 @@ cdef struct EstimateBlock:
     ViewBlock joints[2]
     MeasuredBlock measured[2]
 
+cdef struct ToldState:
+    int status[2]
+    int64_t since[2]
+
+cdef class LastEstimate:
+    cdef uint64_t[::1] sequence
+    cdef uint8_t[::1] memory
+    cdef ToldState now
+    cdef void begin_telling(self) noexcept nogil
+    cdef void tell(
+        self,
+        int64_t cycle,
+        int sync_counter,
+        int64_t sync_realtime_ns,
+        int64_t sync_monotonic_ns,
+        const ViewBlock *joints,
+        const MeasuredBlock *measured,
+    ) noexcept nogil
+
 cdef class LoopCounters:
+    cdef readonly LastEstimate last
     cdef CounterState now
     cdef Intake intake
     cdef Bus bus
-    cdef uint64_t[::1] counters, work, late, status_cycles, restarts, sequence
+    cdef uint64_t[::1] counters, work, late, status_cycles, restarts
     cdef int64_t[::1] node_heard
-    cdef uint8_t[::1] inputs, node_states, unconfigured, estimate
+    cdef uint8_t[::1] inputs, node_states, unconfigured
     cdef int64_t bits_of[MOST_INPUTS]
     cdef int64_t bits_complete
     cdef void count(self, int flags, int64_t work_ns, int64_t late_ns, int64_t missed) noexcept nogil
@@ -49,7 +67,6 @@ cdef class LoopCounters:
     cdef int flush_all(self, int64_t missed, int64_t sync_ns) except -1
     cdef void flush_nodes(self) noexcept nogil
     cdef void flush_inputs(self, int64_t sync_ns) noexcept nogil
-    cdef void begin_telling(self) noexcept nogil
     cdef void tell(
         self,
         int64_t cycle,
@@ -59,4 +76,3 @@ cdef class LoopCounters:
         const JointState *one,
         const JointState *two,
     ) noexcept nogil
-    cdef void tell_joint(self, int number, int64_t cycle, const JointState *joint) noexcept nogil

@@ -5,6 +5,8 @@ All of it goes into the memory of the snapshot (`jtqd.daemon.shared.snapshot`), 
 
 from libc.stdint cimport int64_t, uint8_t, uint64_t
 
+import struct
+
 from jtqd.daemon.core.block cimport copied, put_back
 from jtqd.daemon.core.bus cimport Bus, bus_of
 from jtqd.daemon.core.intake cimport MOST_INPUTS, NODES, Input, Intake, NodeState
@@ -52,6 +54,108 @@ if (sizeof(InputBlock), sizeof(EstimateBlock), NODES) != (shared.INPUT.size, sha
     raise ImportError("the snapshot has another layout than the one that is compiled in")
 
 
+cdef class LastEstimate:
+    """The last estimate of both joints in the snapshot, guarded by its sequence number.
+
+    snapshot: whose memory it is.
+    """
+
+    carried = ("state",)
+
+    def __init__(self, snapshot):
+        self.sequence, self.memory = snapshot.sequence, snapshot.estimate
+        self.now.status[0] = self.now.status[1] = -1
+
+    @property
+    def state(self):
+        """All of it as one block."""
+        return copied(&self.now, sizeof(ToldState))
+
+    @state.setter
+    def state(self, bytes block):
+        put_back(&self.now, sizeof(ToldState), block)
+
+    def begin(self):
+        """From here to the end of `write` a reader knows that what it sees is half new (counters and inputs included)."""
+        self.begin_telling()
+
+    def write(
+        self,
+        int64_t index,
+        int sync_counter,
+        int64_t sync_realtime_ns,
+        joints,
+        *,
+        int64_t sync_monotonic_ns=0,
+        measured=(shared.NOT_MEASURED, shared.NOT_MEASURED),
+    ):
+        """Publish the last estimate; `joints` are `JointView` tuples, `measured` begin with the fields of `Measured`."""
+        cdef ViewBlock views[2]
+        cdef MeasuredBlock inputs[2]
+        cdef int n
+        for n in range(2):
+            put_back(&views[n], sizeof(ViewBlock), shared.JOINT.pack(*joints[n]))
+            put_back(&inputs[n], sizeof(MeasuredBlock), struct.pack("<6d", *measured[n][:6]))
+        self.begin_telling()
+        self.tell(index, sync_counter, sync_realtime_ns, sync_monotonic_ns, views, inputs)
+
+    cdef void begin_telling(self) noexcept nogil:
+        """As `begin`."""
+        begin_write(&self.sequence[0])
+
+    cdef void tell(
+        self,
+        int64_t cycle,
+        int sync_counter,
+        int64_t sync_realtime_ns,
+        int64_t sync_monotonic_ns,
+        const ViewBlock *joints,
+        const MeasuredBlock *measured,
+    ) noexcept nogil:
+        """As `write`."""
+        cdef EstimateBlock *told = <EstimateBlock *> &self.memory[0]
+        cdef int n
+        told.cycle, told.sync_counter = cycle, sync_counter
+        told.sync_realtime_ns, told.sync_monotonic_ns = sync_realtime_ns, sync_monotonic_ns
+        for n in range(2):
+            if joints[n].status != self.now.status[n]:
+                self.now.status[n], self.now.since[n] = joints[n].status, cycle
+            told.status_since[n] = self.now.since[n]
+            told.joints[n], told.measured[n] = joints[n], measured[n]
+        end_write(&self.sequence[0])
+
+
+cdef ViewBlock _view(const JointState *joint) noexcept nogil:
+    """Return a joint's `JointView`."""
+    cdef const JointBlock *s = &joint.sample
+    return ViewBlock(
+        s.torque_nm,
+        s.sigma_nm,
+        s.tob_nm,
+        s.physics_nm,
+        s.network_nm,
+        s.sensor_torque_nm,
+        s.statusword,
+        s.status,
+        s.sensor_status,
+        s.input_flags,
+        joint.latched,
+    )
+
+
+cdef MeasuredBlock _measured(const JointState *joint) noexcept nogil:
+    """Return a joint's `Measured`."""
+    cdef const JointBlock *s = &joint.sample
+    return MeasuredBlock(
+        s.current_a,
+        s.motor_position_rad,
+        s.motor_velocity_rad_s,
+        s.link_position_rad,
+        s.sensor_torque_nm,
+        s.temperature_c,
+    )
+
+
 cdef class LoopCounters:
     """Counters, histograms, inputs, nodes and the last estimate in the snapshot, fed by the loop.
 
@@ -63,9 +167,10 @@ cdef class LoopCounters:
         bus_errors: calls that a bus which is down refused.
         overruns: cycles whose estimate was not ready before the next SYNC was due.
         latch_resets: joints whose latched faults were released by a reset.
+        last: the last estimate.
     """
 
-    carried = ("state",)
+    carried = ("state", "last")
 
     def __init__(self, snapshot, Intake intake, socket):
         cdef int n
@@ -77,12 +182,11 @@ cdef class LoopCounters:
         self.status_cycles, self.inputs = snapshot.status_cycles, snapshot.inputs
         self.node_heard, self.node_states = snapshot.node_heard, snapshot.node_states
         self.unconfigured, self.restarts = snapshot.unconfigured, snapshot.restarts
-        self.sequence, self.estimate = snapshot.sequence, snapshot.estimate
+        self.last = LastEstimate(snapshot)
         self.bits_complete = worst_case_bits(1) + worst_case_bits(8)
         for n in range(intake.count):
             self.bits_of[n] = worst_case_bits(intake.inputs[n].length)
             self.bits_complete += self.bits_of[n]
-        self.now.status[0] = self.now.status[1] = -1
 
     @property
     def state(self):
@@ -211,10 +315,6 @@ cdef class LoopCounters:
                 state.too_long,
             )
 
-    cdef void begin_telling(self) noexcept nogil:
-        """From here to the end of `tell` a reader knows that what it sees is half new (counters and inputs included)."""
-        begin_write(&self.sequence[0])
-
     cdef void tell(
         self,
         int64_t cycle,
@@ -225,41 +325,11 @@ cdef class LoopCounters:
         const JointState *two,
     ) noexcept nogil:
         """Publish the last estimate."""
-        cdef EstimateBlock *told = <EstimateBlock *> &self.estimate[0]
-        told.cycle, told.sync_counter = cycle, sync_counter
-        told.sync_realtime_ns, told.sync_monotonic_ns = sync_realtime_ns, sync_monotonic_ns
-        self.tell_joint(0, cycle, one)
-        self.tell_joint(1, cycle, two)
-        end_write(&self.sequence[0])
-
-    cdef void tell_joint(self, int number, int64_t cycle, const JointState *joint) noexcept nogil:
-        """The block of one joint."""
-        cdef EstimateBlock *told = <EstimateBlock *> &self.estimate[0]
-        cdef const JointBlock *s = &joint.sample
-        if s.status != self.now.status[number]:
-            self.now.status[number], self.now.status_since[number] = s.status, cycle
-        told.status_since[number] = self.now.status_since[number]
-        told.joints[number] = ViewBlock(
-            s.torque_nm,
-            s.sigma_nm,
-            s.tob_nm,
-            s.physics_nm,
-            s.network_nm,
-            s.sensor_torque_nm,
-            s.statusword,
-            s.status,
-            s.sensor_status,
-            s.input_flags,
-            joint.latched,
-        )
-        told.measured[number] = MeasuredBlock(
-            s.current_a,
-            s.motor_position_rad,
-            s.motor_velocity_rad_s,
-            s.link_position_rad,
-            s.sensor_torque_nm,
-            s.temperature_c,
-        )
+        cdef ViewBlock views[2]
+        cdef MeasuredBlock measured[2]
+        views[0], views[1] = _view(one), _view(two)
+        measured[0], measured[1] = _measured(one), _measured(two)
+        self.last.tell(cycle, sync_counter, sync_realtime_ns, sync_monotonic_ns, views, measured)
 
 
 def frame_counts(intake):

@@ -363,7 +363,7 @@ cdef class Cycle:
     cdef int write_snapshot(self) except -1:
         """Copy counters, inputs and the last estimate into the snapshot."""
         cdef CycleState *now = &self.now
-        self.counters.begin_telling()
+        self.counters.last.begin_telling()
         self.counters.flush_all(self.grid.now.missed, now.sync_ns)
         self.counters.tell(
             now.index, now.counter, now.sync_realtime_ns, now.sync_ns, &self.one.now, &self.two.now

@@ -39,7 +39,7 @@ def run(directory: Path, *, rounds: int = 9, cycles: int = 20_000) -> dict[str, 
 
     def write(n: int) -> None:
         counters.flush(0, n)
-        snapshot.write(n, 1, _REALTIME_NS, (view, view), sync_monotonic_ns=n, measured=(sample, sample))
+        counters.last.write(n, 1, _REALTIME_NS, (view, view), sync_monotonic_ns=n, measured=(sample, sample))
 
     def statuses(n: int) -> None:
         spent = snapshot.status_cycles
