@@ -83,7 +83,6 @@ if __name__ == "__main__":
             compiler_directives={
                 "language_level": 3,
                 "boundscheck": CHECKS,
-                "wraparound": False,
                 "initializedcheck": CHECKS,
                 "cdivision": True,  # as C and IEEE 754: 1/0 is infinite
                 "embedsignature": True,

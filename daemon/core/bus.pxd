@@ -2,7 +2,7 @@
 
 from libc.stdint cimport int64_t
 
-from jtqd.daemon.core.frame cimport Frame
+from jtqd.drivers.frame_socket cimport Frame
 
 cdef class Bus:
     cdef const Frame *frames

@@ -3,7 +3,7 @@
 from libc.stdint cimport int64_t
 from libc.string cimport memcpy
 
-from jtqd.daemon.core.frame cimport Frame
+from jtqd.drivers.frame_socket cimport Frame, FrameSocket
 from jtqd.drivers import frame_socket
 
 cdef enum:
@@ -37,7 +37,35 @@ cdef class Bus:
 
 
 cdef class SocketBus(Bus):
-    """A `FrameSocket`, or what takes its place in a test, through its Python methods."""
+    """A `FrameSocket`."""
+
+    cdef FrameSocket socket
+
+    def __init__(self, FrameSocket socket):
+        self.socket = socket
+        self.frames, self.stamps_ns, self.own = socket.frames_c, socket.stamps_c, socket.own_c
+
+    cdef int take(self) except -1:
+        """As `receive`."""
+        return self.socket.take()
+
+    cdef bint put(self, const Frame *frame) except -1:
+        """As `send`."""
+        return self.socket.put(frame)
+
+    cdef bint wait(self, int64_t timeout_ns) except -1:
+        """As `wait`."""
+        return self.socket.ready(timeout_ns)
+
+    cdef int64_t tx_dropped(self) except -1:
+        return self.socket.tx_dropped
+
+    cdef int64_t rx_dropped(self) except -1:
+        return self.socket.rx_dropped
+
+
+cdef class PythonBus(Bus):
+    """What takes the place of a frame socket in a test, through its Python methods."""
 
     cdef object socket
     cdef Frame frame_room[CAPACITY]
@@ -80,4 +108,4 @@ cdef class SocketBus(Bus):
 
 cdef Bus bus_of(object socket):
     """Return the bus behind a frame socket."""
-    return SocketBus(socket)
+    return SocketBus(socket) if isinstance(socket, FrameSocket) else PythonBus(socket)

@@ -5,7 +5,7 @@ from libc.stdint cimport int64_t, uint32_t
 from jtqd.daemon.core.bus cimport Bus
 from jtqd.daemon.core.clock cimport Clock
 from jtqd.daemon.core.counters cimport LoopCounters
-from jtqd.daemon.core.frame cimport Frame
+from jtqd.drivers.frame_socket cimport Frame
 from jtqd.daemon.core.intake cimport Intake
 from jtqd.daemon.core.joint cimport JointCycle
 from jtqd.daemon.core.record cimport CycleFrames, RecordRing

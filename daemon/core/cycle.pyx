@@ -20,7 +20,7 @@ from jtqd.daemon.core.clock cimport Clock
 from jtqd.daemon.core.configured_nodes import ConfiguredNodes
 from jtqd.daemon.core.counters cimport LoopCounters
 from jtqd.daemon.core.estimate_pdo cimport encode_into
-from jtqd.daemon.core.frame cimport Frame
+from jtqd.drivers.frame_socket cimport Frame
 from jtqd.daemon.core.intake cimport Intake, temperature_at
 from jtqd.daemon.core.joint cimport JointCycle
 from jtqd.daemon.core.joint_safety import JointSafety
@@ -57,7 +57,7 @@ cdef Frame _frame(uint32_t can_id, int length) noexcept nogil:
     """Return a frame without data."""
     cdef Frame frame
     memset(&frame, 0, sizeof(Frame))
-    frame.can_id, frame.length = can_id, length
+    frame.id, frame.length = can_id, length
     return frame
 
 
@@ -357,7 +357,7 @@ cdef class Cycle:
 
     cdef void hold(self, const Frame *frame, int64_t stamp_ns) noexcept nogil:
         """Of a slot without a record, temperatures go into the next one that there is."""
-        if self.intake.temperature_with(frame.can_id) != NULL:
+        if self.intake.temperature_with(frame.id) != NULL:
             self.frames.hold(frame, stamp_ns)
 
     cdef int write_snapshot(self) except -1:

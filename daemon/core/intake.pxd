@@ -2,7 +2,7 @@
 
 from libc.stdint cimport int8_t, int64_t, uint8_t, uint32_t
 
-from jtqd.daemon.core.frame cimport Frame
+from jtqd.drivers.frame_socket cimport Frame
 
 cdef enum:
     MOST_INPUTS = 16  # PDOs that the loop waits for, and as many temperatures

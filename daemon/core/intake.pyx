@@ -36,7 +36,7 @@ from libc.string cimport memcmp, memcpy, memset
 from typing import Final
 
 from jtqd.daemon.core.block cimport copied, put_back
-from jtqd.daemon.core.frame cimport Frame
+from jtqd.drivers.frame_socket cimport Frame
 from jtqd.drivers import devices, nmt
 from jtqd.drivers import frame as can_frame
 
@@ -767,7 +767,7 @@ cdef class Intake:
 
     cdef void take_frame(self, const Frame *frame, int64_t stamp_ns, bint own) noexcept nogil:
         """Sort one frame in."""
-        cdef Input *state = self.input_with(frame.can_id)
+        cdef Input *state = self.input_with(frame.id)
         if state == NULL:
             self.other(frame, stamp_ns, own)
         elif frame.length != state.length:
@@ -826,7 +826,7 @@ cdef class Intake:
 
     cdef void drain_frame(self, const Frame *frame, int64_t stamp_ns, bint own) noexcept nogil:
         """One frame that came after the cycle was closed."""
-        cdef Input *state = self.input_with(frame.can_id)
+        cdef Input *state = self.input_with(frame.id)
         if state == NULL:
             self.other(frame, stamp_ns, own)
         elif frame.length != state.length:
@@ -909,7 +909,7 @@ cdef class Intake:
 
     cdef void other(self, const Frame *frame, int64_t stamp_ns, bint own) noexcept nogil:
         """A frame that is none of the PDOs: SYNC, a heartbeat, a temperature, or one that should not be there."""
-        cdef uint32_t can_id = frame.can_id, identifier = can_id & IDENTIFIER
+        cdef uint32_t can_id = frame.id, identifier = can_id & IDENTIFIER
         cdef Temperature *temperature
         cdef Input *state
         if can_id == SYNC:

@@ -2,7 +2,7 @@
 
 from libc.stdint cimport int32_t, int64_t, uint8_t, uint16_t, uint32_t, uint64_t
 
-from jtqd.daemon.core.frame cimport Frame
+from jtqd.drivers.frame_socket cimport Frame
 
 cdef enum:
     FRAME_CAPACITY = 16
