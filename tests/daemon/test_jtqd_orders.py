@@ -105,7 +105,7 @@ def test_sighup_before_it_runs_is_no_reason_to_end(
     bench: str, run_directory: Path, configuration: Path
 ) -> None:
     process = started("--bus", bench, "--config", str(configuration), directory=run_directory)
-    until(lambda: loaded(process, "numpy"))
+    until(lambda: loaded(process, "msgspec"))
     process.send_signal(signal.SIGHUP)
     until(lambda: list(run_directory.glob("*/control")))
     process.terminate()
