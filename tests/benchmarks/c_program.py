@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from jtqd.daemon.config import Config, load_config
-from jtqd.daemon.loop import joint as joint_cycle
-from jtqd.daemon.loop import joint_status
+from jtqd.daemon.core import joint as joint_cycle
+from jtqd.daemon.core.status import NEEDED
 from jtqd.daemon.shared import cycle_record
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import BLEND_CURRENT_A, LossModel
@@ -47,7 +47,7 @@ def _header(config: Config) -> str:
         "FRAME_CAPACITY": cycle_record.FRAME_CAPACITY,
         "RING_SLOTS": config.ring_cycles,
         "STAMP_ACCURACY_NS": joint_cycle.STAMP_ACCURACY_NS,
-        "DEGRADED_CYCLES": joint_status.NEEDED[DEGRADED],
+        "DEGRADED_CYCLES": NEEDED[DEGRADED],
         "WAIT_NS": config.input_wait_ns,
         "DEADLINE_NS": config.input_deadline_ns,
         "MOTOR_RAD_PER_COUNT": SCALING["motor_rad_per_count"],
