@@ -63,7 +63,7 @@ def _header(config: Config) -> str:
 
 def _joint(joint: Joint, settings: EstimatorSettings, network: SmallNetwork) -> str:
     friction, losses = joint.friction, LossModel(joint)
-    assert losses._quadrants is not None
+    assert losses.has_efficiency
     margin = settings.envelope_margin
     limit = settings.network_limit * joint.rated_torque_nm
     values: dict[str, object] = {
@@ -79,7 +79,7 @@ def _joint(joint: Joint, settings: EstimatorSettings, network: SmallNetwork) -> 
         "inverse_stribeck": 1.0 / friction.stribeck_velocity_rad_s,
         "inverse_w0": 50.0,
         "static_friction": friction.coulomb_nm + friction.stribeck_nm,
-        "quadrants": losses._quadrants,
+        "quadrants": losses.quadrants,
         "torque_per_ampere": losses.torque_per_ampere,
         "inverse_gain": 1.0 / losses.torque_per_ampere,
         "inverse_blend": 1.0 / BLEND_CURRENT_A,
