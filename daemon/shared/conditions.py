@@ -102,7 +102,7 @@ _ROWS = (
         JOINT,
         ERROR,
         "no torque: {}",
-        "no fault any more",
+        "fault cleared",
         topic="fault",
         emcy=Emcy(0xFF01, _MANUFACTURER),
     ),
@@ -120,13 +120,13 @@ _ROWS = (
         JOINT,
         ERROR,
         "the drive reports {}",
-        "drive not in fault any more",
+        "drive fault cleared",
         topic="fault",
         hold_s=_HOLD_S,
     ),
     Definition("drive_off", JOINT, INFO, "the drive carries no current: {}", hold_s=_HOLD_S, logged=False),
     Definition(
-        "degraded", JOINT, INFO, "the network is not alone in charge: {}", hold_s=_HOLD_S, logged=False
+        "degraded", JOINT, INFO, "the network is not fully used: {}", hold_s=_HOLD_S, logged=False
     ),
     Definition(
         "deviation",
@@ -150,8 +150,8 @@ _ROWS = (
         "node_doubled",
         NODE,
         WARNING,
-        "{}: are there two nodes with this node-ID?",
-        "one producer of heartbeats again",
+        "{}: possibly two nodes with this node-ID",
+        "one heartbeat producer again",
         topic="heartbeat",
         emcy=Emcy(0x8150, detail=0x700, names_joints=False),
     ),
@@ -163,9 +163,9 @@ _ROWS = (
         topic="boot",
         emcy=Emcy(0xFF03, _MANUFACTURER),
     ),
-    Definition("node_absent", NODE, WARNING, "optional node, not there", topic="boot", logged=False),
+    Definition("node_absent", NODE, WARNING, "optional node absent", topic="boot", logged=False),
     Definition("node_unconfigured", NODE, WARNING, "not used: {}", topic="boot", logged=False),
-    Definition("node_not_operational", NODE, WARNING, "its state is {}", topic="heartbeat", logged=False),
+    Definition("node_not_operational", NODE, WARNING, "NMT state {}", topic="heartbeat", logged=False),
     Definition("node_error", NODE, WARNING, "reports {}", topic="emcy", logged=False),
     Definition(
         "pdo_timeout",
@@ -180,8 +180,8 @@ _ROWS = (
         "pdo_short",
         PDO,
         WARNING,
-        "PDO not processed, too short (8210h): it is not used",
-        "length as mapped again",
+        "PDO not processed due to length error (8210h): too short",
+        "length correct again",
         topic="pdo",
         emcy=Emcy(0x8210),
     ),
@@ -189,30 +189,30 @@ _ROWS = (
         "pdo_long",
         PDO,
         WARNING,
-        "PDO too long (8220h): it is not used",
-        "length as mapped again",
+        "PDO length exceeded (8220h): not used",
+        "length correct again",
         topic="pdo",
         emcy=Emcy(0x8220),
     ),
     # Bus
-    Definition("bus_warning", BUS, WARNING, "error warning, before: {}", "error active", topic="bus"),
+    Definition("bus_warning", BUS, WARNING, "error warning, previously {}", "error active", topic="bus"),
     Definition(
         "bus_passive",
         BUS,
         WARNING,
-        "error passive, before: {}",
+        "error passive, previously {}",
         "error active",
         topic="bus",
         emcy=Emcy(0x8120, names_joints=False),
     ),
-    Definition("bus_off", BUS, ERROR, "bus-off, before: {}", "error active", topic="bus"),
-    Definition("bus_down", BUS, ERROR, "interface down, before: {}", "error active", topic="bus"),
+    Definition("bus_off", BUS, ERROR, "bus-off, previously {}", "error active", topic="bus"),
+    Definition("bus_down", BUS, ERROR, "interface down, previously {}", "error active", topic="bus"),
     Definition(
         "foreign_sync",
         BUS,
         ERROR,
-        "another SYNC producer: no input of its cycles is used",
-        "no other SYNC producer any more",
+        "another SYNC producer: inputs of these cycles are not used",
+        "no other SYNC producer",
         topic="sync",
         emcy=Emcy(0x8150, detail=0x080),
     ),
@@ -224,7 +224,7 @@ _ROWS = (
         BUS,
         WARNING,
         "received frames were lost: the loop's socket was read too late",
-        "no received frame lost any more",
+        "no further received frames lost",
         topic="bus",
         emcy=Emcy(0x8110, detail=1),
     ),
@@ -240,13 +240,13 @@ _ROWS = (
     # Loop, recorder, machine
     Definition("loop_stopped", LOOP, ERROR, "no cycle for {}", "cycles again", topic="loop"),
     Definition(
-        "late_loop", LOOP, WARNING, "cycles are missed: the loop comes too late", topic="loop", logged=False
+        "late_loop", LOOP, WARNING, "cycles are missed: the loop is late", topic="loop", logged=False
     ),
     Definition(
-        "cycles_lost", RECORDER, ERROR, "cycles are lost: they are in no log", topic="recorder", logged=False
+        "cycles_lost", RECORDER, ERROR, "cycles are lost: not in the log", topic="recorder", logged=False
     ),
     Definition(
-        "stolen_time", MACHINE, INFO, "a hypervisor takes processor time away", topic="machine", logged=False
+        "stolen_time", MACHINE, INFO, "the hypervisor takes processor time", topic="machine", logged=False
     ),
     Definition("not_granted", MACHINE, WARNING, "not granted: {}", topic="machine", logged=False),
 )

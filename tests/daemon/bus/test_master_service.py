@@ -62,7 +62,7 @@ def test_error_frames_become_states_emcys_and_objects(bench: MasterBench) -> Non
     bench.send(CAN_ERR_FLAG | 0x204, frame("00 20 0000 0000 82 02"))
     assert bench.run(lambda: bool(bench.own(EMCY)))
     assert bench.own(EMCY) == [frame("2081 11 0000 0000 00")]
-    assert "bus: error passive, before: error active (TEC 130, REC 2)" in bench.lines
+    assert "bus: error passive, previously error active (TEC 130, REC 2)" in bench.lines
     assert [bench.sdo(0x2205, sub) for sub in (1, 2, 3, 5)] == [2, 130, 2, 1]
     bench.send(CAN_ERR_FLAG | 0x004, frame("00 40 0000 0000 0000"))
     assert bench.run(lambda: bool(bench.own(EMCY)))

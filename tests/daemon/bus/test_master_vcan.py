@@ -42,7 +42,7 @@ def test_error_messages_of_the_controller(daemon: Daemon) -> None:
     """CRTL with CNT: TX passive, 136 and 0 errors; then active again; then bus-off."""
     inject("20000204#0020000000008800")
     assert daemon.until(lambda: frame("2081 11 0000 0000 00") in daemon.emcys)
-    assert "bus: error passive, before: error active (TEC 136, REC 0)" in daemon.said()
+    assert "bus: error passive, previously error active (TEC 136, REC 0)" in daemon.said()
     inject("20000004#0040000000000000")
     assert daemon.until(lambda: frame("0000 00 2081 0000 00") in daemon.emcys)
     began = time.monotonic()

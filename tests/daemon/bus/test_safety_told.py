@@ -37,7 +37,7 @@ def test_a_fault_is_told_when_it_begins_and_when_all_are_over() -> None:
         "joint 1: no torque: motor and link position are further apart than the gear can be twisted (torsion)"
     ]
     assert watch.lines(reading(3, faulty(TORSION)), 20.0) == [], "told once"
-    assert watch.lines(reading(4), 22.5) == ["joint 1: no fault any more after 21.5 s"]
+    assert watch.lines(reading(4), 22.5) == ["joint 1: fault cleared after 21.5 s"]
 
 
 def test_a_latched_fault_says_how_it_is_released() -> None:
@@ -48,7 +48,7 @@ def test_a_latched_fault_says_how_it_is_released() -> None:
     ]
     assert watch.lines(reading(2, WELL, WELL._replace(latched=JUMP)), 1.0) == []
     assert watch.lines(reading(3), 2.0) == [
-        "joint 2: no fault any more after 2.0 s",
+        "joint 2: fault cleared after 2.0 s",
         "joint 2: latched faults released after 2.0 s",
     ]
 

@@ -140,12 +140,12 @@ def test_the_worst_condition_of_a_subject_is_its_level_and_text(bench):
         Condition("sensor_lost", "joint 1", WARNING, "torque sensor lost: node 3 is not there", 1),
         Condition("temperature_lost", "joint 1", WARNING, "temperature lost", 2),
         Condition("joint_fault", "joint 2", ERROR, "no torque: x", 3),
-        Condition("bus_off", "bus", ERROR, "bus-off, before: error passive", 4),
+        Condition("bus_off", "bus", ERROR, "bus-off, previously error passive", 4),
     ]
     found = bench.look(statuses=(2, 15), conditions=conditions)
     assert found["joint 1"][:2] == (WARN, "VALID: torque sensor lost: node 3 is not there")
     assert found["joint 2"][:2] == (FAULT, "INVALID: no torque: x")
-    assert found["bus"][:2] == (FAULT, "bus-off, before: error passive")
+    assert found["bus"][:2] == (FAULT, "bus-off, previously error passive")
 
 
 def test_node_that_was_never_heard(bench):
