@@ -35,7 +35,7 @@ GROUPS = {
         ),
         "recover": (
             "jtqd.daemon.logs.recover_command",
-            "repair logs that a crash has left, or that are damaged",
+            "repair unfinished or damaged logs",
         ),
         "replay": ("jtqd.daemon.replay.command", "run the estimator over a log again, and compare"),
         "batch": ("jtqd.sysid.batch.command", "diagnose or replay many logs, here or on a dask cluster"),

@@ -180,7 +180,7 @@ def checked_fused(joint: Joint, settings: EstimatorSettings, network: FusedNetwo
     if joint.fused is None:
         raise ConfigError(
             f"joint {joint.name}: found no section 'fused', which method 'fused' needs; "
-            "'jtq fit losses' makes one, methods 'tob' and 'efficiency' work without"
+            "'jtq fit losses' makes one, methods 'tob' and 'efficiency' do not need it"
         )
     if network is not None and network.joint != joint.name:
         raise ConfigError(

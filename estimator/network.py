@@ -63,7 +63,7 @@ def checked_network(
         )
     if settings.method == "efficiency" and joint.efficiency is None:
         raise ConfigError(
-            f"joint {joint.name}: found no efficiency, which method 'efficiency' needs; 'tob' works without"
+            f"joint {joint.name}: found no efficiency, which method 'efficiency' needs; 'tob' does not need it"
         )
     if settings.method != "network":
         return None

@@ -181,7 +181,9 @@ def main(arguments: list[str] | None = None) -> int:
         epilog=f"example:\n  python -m examples.{BY} --out kinova_diagnosis",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where reports and figures go")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="directory of reports and figures"
+    )
     parser.add_argument("--json", action="store_true", help="print the findings of all joints as JSON")
     options = parser.parse_args(arguments)
     try:

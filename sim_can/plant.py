@@ -120,9 +120,7 @@ class Plant:
 
     def __init__(self, parameters: PlantParameters) -> None:
         if parameters.has_effects and type(self) is Plant:
-            raise ValueError(
-                "found joints with effects, expected none: EffectPlant has the equations for these"
-            )
+            raise ValueError("found joints with effects, expected none: use EffectPlant")
         self.parameters = parameters
         one, two = parameters.joints
         self._joints = (_constants(one), _constants(two))

@@ -111,7 +111,7 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="everything goes there; made if missing"
+        "--out", type=Path, required=True, metavar="DIR", help="output directory; created if missing"
     )
     parser.add_argument(
         "--bus",

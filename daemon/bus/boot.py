@@ -153,7 +153,7 @@ class ReturningNodes:
             if view.restarts[node] != self._restarts:
                 self._refuse(
                     node,
-                    f"node {node} restarted while it was being configured: it is configured once more",
+                    f"node {node} restarted during its configuration: configuring again",
                     now_s,
                 )
                 booted = None
@@ -192,9 +192,9 @@ class ReturningNodes:
         why = self._requested.pop(node, None)
         if node in self.absent:
             self.absent.discard(node)
-            self._log("boot", node, f"node {node} has appeared and is configured")
+            self._log("boot", node, f"node {node} appeared and is configured")
         else:
-            text = f"node {node} was away and is configured again"
+            text = f"node {node} returned and is configured again"
             self._log("boot", node, text if why is None else f"node {node} is configured again: {why}")
         for note in booted.get("notes", ()):
             self._log("boot", node, f"node {node}: {note}")
@@ -203,7 +203,7 @@ class ReturningNodes:
         """The node's part of the report, if it may be used."""
         if answer is None or not answer["ok"]:
             reason = (
-                "the boot process ended without an answer" if answer is None else answer["error"]["message"]
+                "the boot process ended without a report" if answer is None else answer["error"]["message"]
             )
             self._refuse(node, f"boot in service: {reason}", now_s)
             return None

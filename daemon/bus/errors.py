@@ -155,7 +155,7 @@ class EmcyLog:
         if refused is None:
             return None
         over = emergency.code == NO_ERROR and not emergency.register
-        what = "EMCY 0000h: no error any more" if over else describe(emergency)
+        what = "EMCY 0000h: error reset" if over else describe(emergency)
         return f"node {node}: {what}" + (f" ({refused} more before)" if refused else "")
 
     def history(self, node: int) -> list[Kept]:

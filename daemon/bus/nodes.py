@@ -112,9 +112,7 @@ class NodeWatch:
         if len(data) != 1 or data[0] not in STATES:
             self.malformed += 1
             found = f"{len(data)} bytes" if len(data) != 1 else f"state {data[0]:02X}h"
-            return [
-                self._event("malformed", node, watch, now_s, lambda: f"a heartbeat that is none ({found})")
-            ]
+            return [self._event("malformed", node, watch, now_s, lambda: f"invalid heartbeat ({found})")]
         events = []
         watch.heard_s = now_s
         if data[0] == 0:
@@ -173,7 +171,7 @@ class NodeWatch:
         if node in self._known or len(self._known) > _OTHERS or len(data) != 1:
             return []
         self._known.add(node)
-        line = f"node {node}: it is on the bus and not in the configuration (status A)"
+        line = f"node {node}: on the bus but not in the configuration (status A)"
         return [NodeEvent("foreign", node, line, 0.0)]
 
     @staticmethod
@@ -286,7 +284,7 @@ class ConfigurationWatch:
         if check is not self._signature:
             return ConfigurationMismatch(True, f"{CHANGED}({text})")
         self._signature, self._position = None, 0
-        return ConfigurationMismatch(False, f"its configuration was written to by somebody else ({text})")
+        return ConfigurationMismatch(False, f"its configuration was written by another master ({text})")
 
     def _missing(self, check: Check) -> ConfigurationMismatch | None:
         if check.expected is not None:

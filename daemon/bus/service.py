@@ -203,7 +203,7 @@ class BusService:
             for note in node.get("notes", ()):
                 self._log("boot", int(number), f"node {number}: {note}")
         for number, error in self._first.get("absent", {}).items():
-            text = f"{error['message']}: it is optional; jtqd goes on, and configures it when it appears"
+            text = f"{error['message']}: it is optional; jtqd continues, and configures it when it appears"
             self._log("boot", int(number), text)
 
     def turn(self, view: View, now_s: float) -> None:

@@ -34,14 +34,14 @@ from jtqd.estimator.checked import ConfigError, seconds
 
 SCHEMA = "jtq.check/1"
 _EXAMPLES = """examples:
-  jtq check --bus can0                   listen for 10 s beside a running jtqd, or to whatever is there
+  jtq check --bus can0                   listen for 10 s, with or without a running jtqd
   jtq check 60 --bus can0 --config /etc/jtqd/can0.yaml
   jtq check --bus vcan0 --drive-sync     without jtqd: boot the nodes as it does, send SYNC, measure the answers
   jtq check 5 --bus sim                  this machine's timing, against the emulated bench
   jtq check --json | jq '.items[] | select(.level != "GOOD")'
 
 Without --drive-sync nothing is sent. With it the nodes are configured and started, and set to pre-operational at the
-end, exactly as by jtqd; no drive is commanded. It is refused where jtqd runs, or anybody else sends SYNC.
+end, as by jtqd; no drive is commanded. It is refused if jtqd runs, or if another node sends SYNC.
 
 exit status: 0 all good, 3 warnings, 1 failures, 2 usage"""
 _CAPACITY = 256
@@ -58,7 +58,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq check`."""
     result = argparse.ArgumentParser(
         prog="jtq check",
-        description="Measure a bus and the timing of this machine: GOOD, WARN or FAIL for each item, and what to do.",
+        description="Measure a bus and the timing of this machine: GOOD, WARN or FAIL for each item, with a remedy.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -72,7 +72,7 @@ def parser() -> argparse.ArgumentParser:
         "--config",
         type=Path,
         metavar="FILE",
-        help="configuration of the bus (default: that of the running jtqd, else the bench that ships)",
+        help="configuration of the bus (default: that of the running jtqd, else the shipped bench)",
     )
     result.add_argument("--drive-sync", action="store_true", help="boot the nodes and send SYNC")
     result.add_argument("--json", action="store_true", help="print as JSON")
@@ -146,7 +146,7 @@ def _drive(bus: str, config: Config, for_s: float, daemon: Daemon | None) -> Ite
         )
     socket = _open(bus, receive_own=True)
     if not silent(socket, _QUIET_S):
-        raise CheckError(f"somebody sends SYNC on {bus}: without --drive-sync this check listens")
+        raise CheckError(f"another node sends SYNC on {bus}: without --drive-sync this check listens")
     _progress(f"booting the nodes on {bus}")
     booted = _boot(bus, config)
     yield booted
@@ -195,9 +195,7 @@ def _boot(bus: str, config: Config) -> CheckResult:
     finally:
         child.end()
     if not answer["ok"]:
-        hint = (
-            "identity, mapping or scaling of a node is not what the configuration says, or the node is silent"
-        )
+        hint = "identity, mapping or scaling of a node differs from the configuration, or the node is silent"
         return CheckResult("boot", FAIL, str(answer["error"]["message"]), hint)
     nodes = ", ".join(sorted(answer["nodes"]))
     return CheckResult(

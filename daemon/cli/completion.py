@@ -18,8 +18,8 @@ _EXAMPLES = """examples:
   jtq completion bash jtqd > /etc/bash_completion.d/jtqd          the daemon's own options
   jtq completion zsh > ~/.zfunc/_jtq                              with fpath+=~/.zfunc before compinit
 
-The script completes commands, options, their choices, files and directories. Make it again after an update of jtqd.
-A command whose extra is not installed is completed without its options."""
+The script completes commands, options, their choices, files and directories. Generate it again after an update of jtqd.
+Without its extra, a command is completed without its options."""
 _FILE_WORDS = ("FILE", "RUN", "LOG", "YAML", "PATH")
 _BUSES = "grep -lx 280 /sys/class/net/*/type 2>/dev/null | cut -d/ -f5; echo sim"
 """Shell command that lists the CAN interfaces (ARPHRD_CAN) and the emulated bench."""
@@ -29,7 +29,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq completion`."""
     result = argparse.ArgumentParser(
         prog="jtq completion",
-        description="Print a completion script, made from the options of the installed version's commands.",
+        description="Print a completion script for the commands and options of the installed version.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -38,9 +38,9 @@ _SHM_FREE = 64 << 20
 _BYTES_AN_HOUR = 1.1e9
 SCHEMA = "jtq.doctor/1"
 _EXAMPLES = """examples:
-  jtq doctor                                          this machine, all its CAN interfaces, the shipped configuration
+  jtq doctor                                          all CAN interfaces of this machine, the shipped configuration
   jtq doctor --bus can0 --config /etc/jtqd/can0.yaml
-  sudo -u jtqd jtq doctor --bus can0                  as the user that jtqd runs as: rights are those of the caller
+  sudo -u jtqd jtq doctor --bus can0                  as jtqd's user: the rights of the caller are checked
   jtq doctor --json | jq '.items[] | select(.level == "FAIL")'
 
 exit status: 0 all good, 3 warnings, 1 failures, 2 usage"""
@@ -57,7 +57,7 @@ def check_files(config: Config) -> Iterator[CheckResult]:
         check_bus_load(load)
         yield CheckResult("bus load", GOOD, f"{share(load.worst)} in the worst case (`jtq bus-load`)")
     except BusLoadError as error:
-        yield CheckResult("bus load", FAIL, str(error), "`jtq bus-load` shows who takes how much")
+        yield CheckResult("bus load", FAIL, str(error), "`jtq bus-load` shows the share of each sender")
     for joint in config.joints:
         item = f"joint {joint.number}"
         shown = f"{joint.joint_path.name} {hashlib.sha256(joint.joint_path.read_bytes()).hexdigest()[:12]}"
@@ -93,13 +93,13 @@ def _directory(item: str, path: Path, wanted: int, what: str) -> CheckResult:
     text = f"{path}: {size(free)} free, {what}"
     if not os.access(existing, os.W_OK | os.X_OK):
         return CheckResult(
-            item, FAIL, f"{path}: this user may not write there", "owner and mode; LogsDirectory= in the unit"
+            item, FAIL, f"{path}: not writable for this user", "owner and mode; LogsDirectory= in the unit"
         )
     if existing != path:
-        text += "; it will be made"
+        text += "; it will be created"
     if free < wanted:
         return CheckResult(
-            item, WARN, text, f"less than {size(wanted)}: recording ends when the disk is full"
+            item, WARN, text, f"less than {size(wanted)}: recording pauses when the disk is full"
         )
     return CheckResult(item, GOOD, text)
 
@@ -164,7 +164,10 @@ def check_unit() -> CheckResult:
         if path.exists():
             return CheckResult("systemd unit", GOOD, str(path))
     return CheckResult(
-        "systemd unit", WARN, "not installed", "docs/deployment.md; jtqd then does not start with the machine"
+        "systemd unit",
+        WARN,
+        "not installed",
+        "see docs/deployment.md; without the unit jtqd does not start at boot",
     )
 
 
@@ -187,15 +190,15 @@ def check_leftovers(log: Path | None, search: DaemonSearch) -> Iterator[CheckRes
         names = ", ".join(str(path) for path in files[:3]) + (
             f" and {len(files) - 3} more" if len(files) > 3 else ""
         )
-        yield CheckResult("unended logs", WARN, names, "left by a crash: jtq recover FILE")
+        yield CheckResult("unfinished logs", WARN, names, "left by a crash: jtq recover FILE")
     else:
-        yield CheckResult("unended logs", GOOD, "none")
+        yield CheckResult("unfinished logs", GOOD, "none")
     if search.left_over:
         yield CheckResult(
             "left over",
             WARN,
             ", ".join(map(str, search.left_over)),
-            "of daemons that were killed; the next start on the same bus takes it over, or remove it",
+            "from killed daemons; removed by the next start, or remove it manually",
         )
 
 
@@ -210,10 +213,10 @@ def parser() -> argparse.ArgumentParser:
     )
     result.add_argument("--bus", help="interface, unix:PATH or sim (default: every CAN interface)")
     result.add_argument(
-        "--config", type=Path, metavar="FILE", help="configuration (default: the bench that ships)"
+        "--config", type=Path, metavar="FILE", help="configuration (default: the shipped bench)"
     )
     result.add_argument(
-        "--record", type=Path, metavar="DIR", help="directory of the logs (default: as jtqd's)"
+        "--record", type=Path, metavar="DIR", help="directory of the logs (default: that of jtqd)"
     )
     result.add_argument("--json", action="store_true", help="print as JSON")
     return result

@@ -107,16 +107,18 @@ def choose_daemon(bus: str | None) -> Daemon:
     """
     search = find_daemons()
     others = "".join(f"\n  --bus {each.about.instance:<24} pid {each.about.pid}" for each in search.daemons)
-    closed = "".join(f"\n  {path} belongs to others: join its group to look at it" for path in search.closed)
+    closed = "".join(
+        f"\n  {path} belongs to another user: join its group to read it" for path in search.closed
+    )
     if bus is not None:
         daemon = on_bus(search, bus)
         if daemon is None:
             raise NoDaemonError(f"no jtqd runs on {bus}{others}{closed}", 1)
         return daemon
     if not search.daemons:
-        raise NoDaemonError(f"no jtqd runs here{closed}", 1)
+        raise NoDaemonError(f"no jtqd runs on this machine{closed}", 1)
     if len(search.daemons) > 1:
-        raise NoDaemonError(f"several daemons run: which one?{others}", 2)
+        raise NoDaemonError(f"several daemons run; select one with --bus:{others}", 2)
     return search.daemons[0]
 
 
@@ -177,7 +179,7 @@ class Watch:
         """Read its state now."""
         view = self._view()
         if view is None:
-            return Reading(self.daemon, STARTING, "its nodes are being booted", None, None)
+            return Reading(self.daemon, STARTING, "booting its nodes", None, None)
         assert self._reader is not None
         earlier, self._earlier = self._earlier or view, view
         state, why = _state(view)

@@ -64,13 +64,13 @@ _FAULTS = (
 """Counters shown when they are not zero."""
 _LAST_NOTICES = 4
 _EXAMPLES = """examples:
-  jtq status                     live view of the daemon that runs here; Ctrl-C ends the view
-  jtq status --bus can0          of the one on can0, where there are several
-  jtq status --once              one picture, also into a file or a mail
+  jtq status                     live view of the daemon on this machine; Ctrl-C ends the view
+  jtq status --bus can0          of the daemon on can0
+  jtq status --once              one text output, also for a file or a mail
   jtq status --json | jq '.joints[].torque_nm'
 
-exit status: 0 it runs, 1 no daemon runs (or none that you may look at), 2 usage, 3 it does not advance, or is still starting
-what you may look at: your own daemons, and those whose group you are in (usermod -a -G jtqd YOU)"""
+exit status: 0 running, 1 no daemon runs (or none that you may read), 2 usage, 3 stalled or still starting
+you may read your own daemons and those of your groups (usermod -a -G jtqd YOU)"""
 _PERIOD_S = 0.2
 _PLAIN_PERIOD_S = 1.0
 _BETWEEN_S = 0.3
@@ -290,9 +290,9 @@ def _quantity(value: float, unit: str, digits: int = 2) -> str:
 
 def _joints(about: About, view: View, *, still: bool) -> Columns:
     headings = {"joint": "left", "status": "left"} | dict.fromkeys(
-        ("torque", "sigma", "sensor", "current", "motor", "temp.", "with a number"), "right"
+        ("torque", "sigma", "sensor", "current", "motor", "temp.", "with a torque"), "right"
     )
-    table = Columns(headings, ("with a number", "motor", "temp.", "current", "sensor", "sigma"))
+    table = Columns(headings, ("with a torque", "motor", "temp.", "current", "sensor", "sigma"))
     for n, (joint, seen) in enumerate(zip(about.joints, view.joints, strict=True)):
         known = seen.status in PUBLISHED and not still
         measured, spent = view.measured[n], view.status_cycles[n]
@@ -377,7 +377,7 @@ def _bus(about: About, view: View, earlier: View) -> RenderableType:
     now = bus_load(earlier, view, about.bitrate)
     return _line(
         "bus load",
-        f"{share(now)} now, counted with every stuff bit; {share(view.worst_load)} by configuration",
+        f"{share(now)} now, with worst-case stuff bits; {share(view.worst_load)} by configuration",
     )
 
 
@@ -388,7 +388,7 @@ def _nodes(about: About, view: View) -> Columns:
         silence = silent_s(view, node, about.heartbeat_ms)
         state = Text(NMT_STATES.get(view.node_states[node], "?") if heard else "no heartbeat yet")
         if silence is not None:
-            state = Text(f"silent, was {state.plain}", style="bold red")
+            state = Text(f"silent, last {state.plain}", style="bold red")
         elif node in view.unconfigured:
             state = Text("restarted, not configured yet", style="bold red")
         elif heard and view.node_states[node] != OPERATIONAL:
@@ -446,7 +446,7 @@ def _notices(notices: Sequence[Notice]) -> Iterator[RenderableType]:
 def clock() -> RenderableType:
     """The line below a live view."""
     return Padding(
-        Text(time.strftime("%H:%M:%S  Ctrl-C ends this view; jtqd goes on"), style="dim"), (1, 0, 0, 0)
+        Text(time.strftime("%H:%M:%S  Ctrl-C ends this view; jtqd continues"), style="dim"), (1, 0, 0, 0)
     )
 
 
@@ -454,15 +454,15 @@ def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq status`."""
     result = argparse.ArgumentParser(
         prog="jtq status",
-        description="Show how a running jtqd is doing: torque, status with its reason, inputs, timing, bus, nodes, log.",
+        description="Show the state of a running jtqd: torque, status with its reason, inputs, timing, bus, nodes, log.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     result.add_argument(
-        "--bus", help="whose daemon: can0, unix:PATH or sim (default: the only one that runs)"
+        "--bus", help="bus of the daemon: can0, unix:PATH or sim (default: the only running one)"
     )
-    result.add_argument("--once", action="store_true", help="one picture, then end")
-    result.add_argument("--json", action="store_true", help="one reading as JSON, then end")
+    result.add_argument("--once", action="store_true", help="print once, then end")
+    result.add_argument("--json", action="store_true", help="print once as JSON, then end")
     return result
 
 
@@ -508,7 +508,7 @@ def _live(console: Console, daemon: Daemon) -> int:
                 live.update(Group(StatusView(watch.read()), clock()), refresh=True)
             else:
                 live.update(
-                    f"jtqd on {daemon.about.instance} has ended; waiting for its return", refresh=True
+                    f"jtqd on {daemon.about.instance} has ended; waiting for its restart", refresh=True
                 )
                 again = on_bus(find_daemons(), daemon.about.instance)
                 if again is not None:

@@ -54,7 +54,9 @@ class LiveKeeper:
             "gear_ratios": [joint.joint.gear_ratio for joint in config.joints],
         }
         if not self._address.loopback:
-            _say(f"the live view is open to everyone who can reach {self._address.host}; it can only be read")
+            _say(
+                f"the live view accepts connections from every host that can reach {self._address.host}; it is read-only"
+            )
         self._run()
 
     @property
@@ -74,15 +76,15 @@ class LiveKeeper:
         if "listening" in answer:
             _say(f"live view: {answer['listening']}")
         if "failed" in answer:
-            _say(f"no live view: {answer['failed']}; the loop goes on")
+            _say(f"no live view: {answer['failed']}; the loop continues")
             self._child = None
         elif ended and time.monotonic() - self._starts[-1] > _PAUSE_S:
             code = self._child.process.returncode
             if len(self._starts) > _STARTS:
-                _say(f"the live view ended with exit status {code}, too often; the loop goes on without it")
+                _say(f"the live view ended with exit status {code}, too often; the loop continues without it")
                 self._child = None
                 return
-            _say(f"the live view ended with exit status {code}; started again, the loop goes on")
+            _say(f"the live view ended with exit status {code}; restarted, the loop continues")
             self._run()
 
     def _run(self) -> None:

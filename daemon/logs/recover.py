@@ -114,7 +114,7 @@ def recover(path: Path, *, dry_run: bool = False, keep_free: int = 0) -> Recover
         _refuse(path, found)
         now = os.fstat(descriptor)
         if (now.st_size, now.st_mtime_ns) != (before.st_size, before.st_mtime_ns):
-            raise RecoverError(f"{path}: found that it is being written, expected a file at rest")
+            raise RecoverError(f"{path}: found that it is being written, expected a closed file")
         final = _final_name(path)
         changed = not is_whole(found, own)
         report = _report(source, found, own) if changed else _Report()
@@ -152,7 +152,7 @@ def _refuse(path: Path, found: Contents) -> None:
         )
     summary = found.summary
     if not (found.header or found.chunks or summary.attachments or summary.metadata):
-        raise RecoverError(f"{path}: found nothing that can be read, expected an MCAP file")
+        raise RecoverError(f"{path}: found no readable content, expected an MCAP file")
 
 
 # ---- what is lost ----
@@ -179,7 +179,7 @@ def _report(source: Source, found: Contents, own: Summary | None) -> _Report:
         if zeros:
             what = f"{counted(size, 'byte')} of zeros at the end"
         elif at_end:
-            what = f"torn at byte {gap.start}: the last {counted(size, 'byte')} cannot be read"
+            what = f"truncated at byte {gap.start}: the last {counted(size, 'byte')} cannot be read"
         else:
             what = f"bytes {gap.start} to {gap.end} cannot be read{' (a chunk)' if gap.chunks else ''}"
         report.findings.append(what)
@@ -193,22 +193,20 @@ def _report(source: Source, found: Contents, own: Summary | None) -> _Report:
             report.findings.append(f"{counted(missing, 'message')} of the summary are not in the file")
             report.lossy = True
     if found.undefined:
-        report.findings.append(f"{counted(found.undefined, 'chunk')} with a channel that is defined nowhere")
+        report.findings.append(f"{counted(found.undefined, 'chunk')} with an undefined channel")
     if found.unproven:
-        report.findings.append(
-            "schemas and channels are in no chunk that can be read: taken from the head, unchecked"
-        )
+        report.findings.append("no readable chunk has schemas and channels: taken from the head, unchecked")
         report.lossy = True
     if found.contradicted:
         report.findings.append(
             "schemas or channels at the head are damaged: taken from a chunk or the summary"
         )
     if not found.magic or found.header is None:
-        report.findings.append("magic bytes or header damaged: written anew")
+        report.findings.append("magic bytes or header damaged: rewritten")
     anew = sum(not chunk.indexed for chunk in found.chunks)
     if anew:
-        report.findings.append(f"message indexes of {counted(anew, 'chunk')} written anew")
-    report.findings.append("no summary: written" if own is None else "summary written anew")
+        report.findings.append(f"message indexes of {counted(anew, 'chunk')} rewritten")
+    report.findings.append("no summary: written" if own is None else "summary rewritten")
     return report
 
 
@@ -279,7 +277,9 @@ def _replace(path: Path, source: Source, found: Contents, keep_free: int) -> int
         own = read_summary(written)
         again = scan(written, own)
         if not is_whole(again, own) or again.counts != found.counts:
-            raise RecoverError(f"{path}: found a copy that does not read back, expected what was written")
+            raise RecoverError(
+                f"{path}: found a copy that reads back differently, expected the written content"
+            )
         os.replace(partial, target)
         _sync_directory(target.parent)
     except BaseException:
@@ -349,7 +349,7 @@ def _lock(descriptor: int, path: Path, *, shared: bool) -> None:
     except OSError as error:
         if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
             raise RecoverError(
-                f"{path}: a recorder is writing it, expected a file that nobody writes"
+                f"{path}: found that a recorder is writing it, expected a closed file"
             ) from None
         # A file system without locks: what is left is the check that the file does not change meanwhile.
 

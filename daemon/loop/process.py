@@ -278,7 +278,7 @@ def build_estimators(request: dict[str, Any]) -> tuple[Config, list[AnyEstimator
     """Configuration and warm estimators of both joints; raises ConfigError or NetworkError."""
     config = load_config(Path(request["config"]) if request["config"] else None)
     if config.files_sha256 != request["config_sha256"]:
-        raise ConfigError(f"{config.path}: it or one of its joint files changed while jtqd was reading it")
+        raise ConfigError(f"{config.path}: it or one of its joint files was changed during reading")
     estimators = [build_estimator(config, joint) for joint in config.joints]
     warm_up(estimators)
     return config, estimators
@@ -320,7 +320,7 @@ def finish(cycle: Cycle, go: Callable[[], bool]) -> int:
             return 0
         cycle.leave()
     except BusGone as gone:
-        error = f"the bus went away: {gone}"
+        error = f"bus lost: {gone}"
     answer(done=True, error=error, counters=frame_counts(cycle.intake))
     return 1 if error else 0
 

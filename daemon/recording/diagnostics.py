@@ -133,7 +133,7 @@ class Diagnostics:
         if self._before and missed:
             text = f"{missed} {'slot' if missed == 1 else 'slots'} missed since the last message"
         if view.cycle == self._cycle:
-            level, text = STALE, "the loop stands still"
+            level, text = STALE, "the loop is stalled"
         values: dict[str, float | str] = {"cycle": view.cycle}
         values |= {name: count for name, count in view.counters.items() if name not in _OF_THE_BUS}
         for name, figures in (("work", work_us), ("late", late_us)):

@@ -99,7 +99,7 @@ class Keeper:
         often = len(self._starts) > _STARTS
         if time.monotonic() - self._starts[-1] > (_LONG_PAUSE_S if often else _PAUSE_S):
             self._waits = False
-            self._warn("started again, the loop goes on")
+            self._warn("restarted, the loop continues")
             self._run()
         elif often and not self._waits:
             self._waits = True

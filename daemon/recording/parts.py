@@ -283,7 +283,7 @@ class Parts:
             return
         # A file that was removed, or must not grow: the next one may do.
         if not self._append(chunk) and not (
-            self.open("the part before could not go on") and self._append(chunk)
+            self.open("the previous part could not be continued") and self._append(chunk)
         ):
             self._miss(chunk.cycles)
         file = self._file
@@ -338,7 +338,7 @@ class Parts:
         """Less is free than shall stay free. Always False."""
         free, reserve = self.free_bytes / MEGABYTE, self._rules.reserve / MEGABYTE
         text = (
-            f"recording ends: {free:.4g} MB are free in {self._rules.directory}, {reserve:.4g} MB stay free"
+            f"recording pauses: {free:.4g} MB are free in {self._rules.directory}, {reserve:.4g} MB stay free"
         )
         if not self.obstacle and self._file is not None:
             self._journal.note(schemas.SPACE_LOW, text, level=ERROR)
@@ -353,19 +353,19 @@ class Parts:
     def _stop_for(self, obstacle: str) -> None:
         """Report an obstacle once, and wait a little before the next attempt."""
         if not self.obstacle:
-            self._journal.warn(f"{obstacle}; cycles are counted as lost until it goes on")
+            self._journal.warn(f"{obstacle}; cycles are counted as lost until it continues")
         self.obstacle = obstacle
         self._retry_ns = self._now_ns + _RETRY_NS
 
     def _try_again(self) -> bool:
         if self.obstacle and self._now_ns < self._retry_ns:
             return False
-        return self.open("recording goes on" if self._part else "start")
+        return self.open("recording continues" if self._part else "start")
 
     def _went_on(self) -> None:
         self.obstacle = ""
         count, self._missed = self._missed, 0
-        text = f"recording goes on in part {self._part}; {count} cycles could not be written"
+        text = f"recording continues in part {self._part}; {count} cycles could not be written"
         self._journal.report(schemas.WRITE_FAILED, text, level=ERROR if count else WARN, count=count)
 
     # ---- budget ----
@@ -389,6 +389,6 @@ class Parts:
         self._others = sum(each.size for each in found)
         over = rules.budget is not None and self.total_size > rules.budget
         if over and not self._over_budget:
-            text = "the budget is exceeded by files that are not removed; recording goes on"
+            text = "the budget is exceeded by files that are not removed; recording continues"
             self._journal.report(schemas.FILE_RETIRED, text, level=WARN)
         self._over_budget = over

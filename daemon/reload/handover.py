@@ -105,7 +105,7 @@ class Giver:
                 raise Refused(self._why())
             return self._stage()
         except Changed:
-            self.refused = "a node came or began again meanwhile; order it once more"
+            self.refused = "a node appeared or restarted meanwhile; send the order again"
         except (OSError, Refused, ValueError) as error:
             self.refused = str(error)
         self._drop()
@@ -196,7 +196,7 @@ class Giver:
         self._tell(before_ns=before_ns)
         sock.setblocking(True)
         if sock.recv(64) != TAKEN:
-            raise Refused("the new loop ended while it took over")
+            raise Refused("the new loop ended during the hand-over")
         return True
 
     def _tell(self, **about: int) -> None:
@@ -300,7 +300,7 @@ class Taker:
             except ConnectionError:
                 data = b""
             if not data:
-                raise Refused("the running loop has given up")
+                raise Refused("the running loop has cancelled the hand-over")
             if self._take(self._socket, data):
                 return True
 

@@ -366,7 +366,9 @@ def _behind(before: Part, part: Part) -> Part:
     new = part.joints[0]["cycle"] > last
     for one, other in zip(before.joints, part.joints, strict=True):
         if not new.any() or _packed(one[one["cycle"] >= first]) != _packed(other[~new]):
-            raise LogError(f"{part.path}: found cycle {first}, which {before.path} has too: given twice?")
+            raise LogError(
+                f"{part.path}: found cycle {first}, which {before.path} has too: is it given twice?"
+            )
     return replace(part, joints=(part.joints[0][new], part.joints[1][new]))
 
 

@@ -187,7 +187,7 @@ class Result:
         run: its logs and states.
         files: of the models.
         method: of the estimator.
-        exact: cycle by cycle, by the loop's own code.
+        exact: cycle by cycle with the loop's code.
         seconds, read_s, replay_s: length of the run; wall time of reading and of estimating.
         lost: cycles that are missing in the middle of the logs.
         from_si: inputs whose frame was not in the log, from the SI values beside it (exact only).

@@ -125,9 +125,7 @@ _ROWS = (
         hold_s=_HOLD_S,
     ),
     Definition("drive_off", JOINT, INFO, "the drive carries no current: {}", hold_s=_HOLD_S, logged=False),
-    Definition(
-        "degraded", JOINT, INFO, "the network is not fully used: {}", hold_s=_HOLD_S, logged=False
-    ),
+    Definition("degraded", JOINT, INFO, "the network is not fully used: {}", hold_s=_HOLD_S, logged=False),
     Definition(
         "deviation",
         JOINT,
@@ -239,9 +237,7 @@ _ROWS = (
     ),
     # Loop, recorder, machine
     Definition("loop_stopped", LOOP, ERROR, "no cycle for {}", "cycles again", topic="loop"),
-    Definition(
-        "late_loop", LOOP, WARNING, "cycles are missed: the loop is late", topic="loop", logged=False
-    ),
+    Definition("late_loop", LOOP, WARNING, "cycles are missed: the loop is late", topic="loop", logged=False),
     Definition(
         "cycles_lost", RECORDER, ERROR, "cycles are lost: not in the log", topic="recorder", logged=False
     ),

@@ -76,8 +76,8 @@ class OperatorLog:
                 return False
             written.append(now)
             count = self._held_back.pop(kind, 0)
-            lines = "line like this one was" if count == 1 else "lines like this one were"
-            more = f" ({count} {lines} held back)" if count else ""
+            lines = "similar line was" if count == 1 else "similar lines were"
+            more = f" ({count} {lines} suppressed)" if count else ""
         for line in (text + more).splitlines():
             self._write(f"<{priority}>{line}" if self._journal else f"jtqd: {line}")
         return True

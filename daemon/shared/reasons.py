@@ -14,7 +14,7 @@ from jtqd.estimator import status as st
 SILENT_AFTER = 3.0
 """Heartbeat periods without a heartbeat after which a node is silent."""
 _FIRST_CYCLES = 20
-_HELD = "held until enough cycles in a row were good"
+_HELD = "waiting for enough consecutive good cycles"
 """Hysteresis of `jtqd.daemon.loop.joint_status`."""
 _DRIVE_STATES = {
     0x00: "not ready to switch on",
@@ -30,7 +30,7 @@ _STATUS_OF_STATE = {0x27: None, 0x07: None, 0x0F: st.DRIVE_FAULT, 0x08: st.DRIVE
 """As `jtqd.daemon.loop.joint_status.drive_status`: None where the motor carries current; every other state is off."""
 _ON_THE_BUS = (
     ("bus_errors", "the bus is down"),
-    ("foreign_sync", "another SYNC is on the bus"),
+    ("foreign_sync", "another SYNC producer is on the bus"),
     ("sync_errors", "the own SYNC waits in the transmit queue"),
 )
 """Counters whose rise makes every input of the bus doubtful, and what that means."""
@@ -60,18 +60,16 @@ def joint_reason(about: About, number: int, view: View, earlier: View) -> str:
         case st.OFF | st.DRIVE_FAULT:
             reason = f"drive {joint.node}: {drive_reason(seen)}"
         case st.STARTING if view.cycle <= _FIRST_CYCLES:
-            reason = "the first cycles"
+            reason = "first cycles after the start"
         case st.STARTING:
-            reason = "the observer starts again after a gap in the inputs"
+            reason = "the observer restarts after a gap in the inputs"
         case st.STANDSTILL:
-            reason = (
-                "slower than the standstill velocity: friction hides the torque, sigma is half the interval"
-            )
+            reason = "below the standstill velocity: the torque is known to an interval, sigma is half of it"
         case st.DEGRADED:
             reason = degraded_reason(seen, joint.network_limit_nm)
         case st.INVALID:
             faults = seen.input_flags >> 8
-            reason = fault_meanings(faults) if faults else f"a fault is over; {_HELD}"
+            reason = fault_meanings(faults) if faults else f"fault cleared; {_HELD}"
         case _:
             reason = ""
     return reason
@@ -108,13 +106,11 @@ def degraded_reason(seen: JointView, network_limit_nm: float) -> str:
     if seen.input_flags & FLAG_NETWORK_SKIPPED:
         return "no time for the network in this cycle: physics only"
     if not isfinite(seen.network_nm):
-        return "the network's answer is not a number: physics only"
+        return "the network output is not finite: physics only"
     apart = abs(seen.network_nm - seen.physics_nm)
     if apart > network_limit_nm:
-        return (
-            f"the network is {apart:.1f} Nm from physics, trusted to {network_limit_nm:.1f} Nm: physics only"
-        )
-    return "outside what the network was trained on: physics, with less or nothing of the network"
+        return f"the network is {apart:.1f} Nm from physics, limit {network_limit_nm:.1f} Nm: physics only"
+    return "outside the network's training range: physics with a reduced share of the network"
 
 
 def _stale(about: About, joint: AboutJoint, seen: JointView, view: View, earlier: View) -> str:
@@ -165,9 +161,9 @@ def unready_reason(node: int, view: View) -> str:
     if node not in view.unconfigured:
         return ""
     if not view.node_heard_ns[node] and not view.node_states[node]:
-        return f"node {node} is not there"
+        return f"node {node} is absent"
     if view.node_states[node] == OPERATIONAL:
-        return f"node {node} is not configured as it was"
+        return f"node {node} has a changed configuration"
     return f"node {node} has restarted and is not configured yet"
 
 

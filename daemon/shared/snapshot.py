@@ -436,7 +436,7 @@ class SnapshotReader:
         _FACTORS.pack_into(self._memory, _FACTORS_OFFSET + node_id * _FACTORS.size, *values)
 
     def note_doubt(self, node_id: int) -> None:
-        """Tell the loop that a node is not configured as it was: not to be used until it is again (supervisor only)."""
+        """Tell the loop that a node has a changed configuration: not to be used until it is again (supervisor only)."""
         offset = _DOUBTS_OFFSET + node_id
         self._memory[offset] = (self._memory[offset] + 1) % 256
         self._ask(2)

@@ -168,7 +168,7 @@ def _objection(sock: socket.socket) -> str | None:
     """The file's mode says who may connect; this is the second lock."""
     raw = sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
     _, uid, _ = _CREDENTIALS.unpack(raw)
-    return None if uid in (0, os.getuid()) else f"user {uid} may give no orders"
+    return None if uid in (0, os.getuid()) else f"user {uid} may not give orders"
 
 
 def _error(text: str) -> Reply:

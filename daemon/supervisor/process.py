@@ -86,7 +86,7 @@ def log_directory(record: str | None) -> Path | None:
             f"--record {record}: found a file there, expected a directory for logs"
         ) from None
     except FileNotFoundError:  # the way there exists, and takes none: /proc, a link that leads nowhere
-        raise SupervisorError(f"--record {record}: no directory can be made there") from None
+        raise SupervisorError(f"--record {record}: the directory cannot be created") from None
     except OSError:
         pass
     return directory

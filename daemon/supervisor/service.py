@@ -63,7 +63,7 @@ def metrics_text(
     metric(
         "condition",
         "gauge",
-        "Joints, nodes, ... that have this condition now (docs/faults.md).",
+        "Number of joints, nodes, ... with this condition (docs/faults.md).",
         [(f',name="{name}"', present[name]) for name in CATALOGUE],
     )
     work = zip(_SHARES, reader.work_us(*_SHARES), strict=True)
@@ -224,8 +224,8 @@ class Service:
 
     def _ask_save(self, request: Reply) -> Reply:
         if not self._save():
-            raise ControlError("nothing is recorded")
-        self._log("the flight recording is written, as asked", NOTICE, "save")
+            raise ControlError("recording is off")
+        self._log("flight recording written on request", NOTICE, "save")
         return {"ok": True}
 
     def _reset(self, request: Reply) -> Answer:
@@ -233,7 +233,7 @@ class Service:
         assert reader is not None
         before = sum(each.latched for each in reader.read().joints)
         number, until = reader.ask_reset(), time.monotonic() + _RESET_S
-        self._log("reset of latched faults, as asked", NOTICE, "reset")
+        self._log("latched faults reset on request", NOTICE, "reset")
 
         def answer() -> Reply | None:
             if reader.resets_done >= number:
@@ -277,7 +277,7 @@ class Service:
         try:
             self._renew(self._config)
         except OSError as error:  # the loop has taken over all the same
-            self._log(f"reloaded, but the runtime directory cannot be written: {error.strerror}", ERROR)
+            self._log(f"reloaded, but the runtime directory is not writable: {error.strerror}", ERROR)
         missed = self._missed() - int(about["missed_before"])
         self._outcome.append(
             {
@@ -295,7 +295,7 @@ class Service:
         )
         self._log(
             f"reloaded {self._config.path}: in force from cycle {about['took_over']} on, {missed} cycles missed; "
-            f"on the last {about['cycles']} cycles the estimate changes: {changes or 'nothing to compare'}",
+            f"on the last {about['cycles']} cycles the estimates change: {changes or 'nothing to compare'}",
             NOTICE,
         )
         self._notifier.send("READY=1")
@@ -307,7 +307,7 @@ class Service:
 
     def _reload_failed(self, error: ReloadError) -> None:
         self._outcome.append({"ok": False, "error": str(error)})
-        self._log(f"not reloaded, the old files stay in force: {error}", ERROR)
+        self._log(f"not reloaded, the old files remain in force: {error}", ERROR)
         self._notifier.send("READY=1")
 
     # State ---------------------------------------------------------------------------------------------------------------

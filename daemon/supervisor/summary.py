@@ -12,8 +12,8 @@ from jtqd.daemon.shared.notices import INFO
 from jtqd.daemon.shared.snapshot import SnapshotReader
 
 _AGES = (
-    "              (estimate and sensor reading of the same cycle; the estimate is filtered and about 5 ms old by then,\n"
-    "              which this RMSE includes)"
+    "              (estimate and sensor reading of the same cycle;\n"
+    "              the RMSE includes the delay of the estimate, about 5 ms)"
 )
 _REFUSED = ("overruns", "latches", "latch_resets")
 """Counters beside those of the faults (docs/safety.md)."""
@@ -81,17 +81,15 @@ class Summary:
         counters = self.counters
         lines = [
             f"cycles        {self.cycles}, missed {self.missed}, stale inputs {self.stale_inputs}",
-            "cycle work    p50 {:.0f} us, p99 {:.0f} us, max {:.0f} us (wake-up for the inputs to hand-over)".format(
+            "cycle work    p50 {:.0f} us, p99 {:.0f} us, max {:.0f} us (from wake-up to hand-over)".format(
                 *self.work_us
             ),
             "SYNC lateness p50 {:.0f} us, p99 {:.0f} us, max {:.0f} us".format(*self.late_us),
         ]
         if self.stolen_s > 0.0:
-            lines.append(
-                f"processors    taken away for {self.stolen_s:.2f} s by the hypervisor (stolen time)"
-            )
+            lines.append(f"processors    {self.stolen_s:.2f} s stolen by the hypervisor")
         for joint, rmse in enumerate(self.rmse_nm, start=1):
-            shown = f"{rmse:.3f} Nm against the sensor while it moves" if isfinite(rmse) else "no reference"
+            shown = f"{rmse:.3f} Nm against the sensor in motion" if isfinite(rmse) else "no reference"
             lines.append(f"RMSE joint {joint}  {shown}")
         if any(map(isfinite, self.rmse_nm)):
             lines.append(_AGES)
@@ -134,17 +132,14 @@ class Summary:
         else:
             lost, path = self.recording.get("lost", 0), self.recording.get("path")
             nothing = (
-                "nothing happened"
-                if self.recording.get("flight_recordings") == 0
-                else "it could not be written"
+                "no trigger" if self.recording.get("flight_recordings") == 0 else "it could not be written"
             )
             shown = path or f"none: {self.recording.get('error') or nothing}"
             parts = len(self.recording.get("paths", ()))
             shown += f" (the last of {parts} parts)" if parts > 1 else ""
             lines.append(f"log           {shown}" + (f", {lost} cycles lost" if lost else ""))
             lines += [
-                f"              {left} (left by a recorder that died)"
-                for left in self.recording.get("left", [])
+                f"              {left} (left by a killed recorder)" for left in self.recording.get("left", [])
             ]
         if self.error:
             lines.append(f"ended by      {self.error}")

@@ -75,7 +75,8 @@ class LiveTable:
         if table is not None:
             return table
         lines = (
-            Text.assemble(f"{row['joint']}: {row['torque [Nm]']} Nm ", row["status"]) for row in self._rows
+            Text.assemble(f"{row['joint']}: {_with_unit(row['torque [Nm]'])}", row["status"])
+            for row in self._rows
         )
         return Group(self._title, *lines)
 
@@ -127,6 +128,10 @@ def _plain(joint: JointView) -> str:
     if joint.status not in PUBLISHED:
         return name
     return f"{name} {_number(joint.torque_nm)} +- {_number(joint.sigma_nm)} Nm"
+
+
+def _with_unit(torque: str | Text) -> str:
+    return "" if str(torque) == "-" else f"{torque} Nm "
 
 
 def _number(value: float) -> str:

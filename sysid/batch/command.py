@@ -194,7 +194,7 @@ def parser() -> argparse.ArgumentParser:
     replay = _common(commands, REPLAY, "the estimator over each run again, and the difference")
     replay.add_argument("--model", type=Path, metavar="DIR", help="other models; see jtq replay --help")
     replay.add_argument("--method", metavar="NAME", help="another method of the estimator")
-    replay.add_argument("--exact", action="store_true", help="cycle by cycle, whatever the length")
+    replay.add_argument("--exact", action="store_true", help="cycle by cycle for any length")
     return result
 
 
@@ -207,7 +207,7 @@ def _common(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     made.add_argument("logs", nargs="+", type=Path, metavar="LOGS", help="logs, or directories of them")
-    made.add_argument("--out", type=Path, required=True, metavar="DIR", help="results; made if missing")
+    made.add_argument("--out", type=Path, required=True, metavar="DIR", help="results; created if missing")
     made.add_argument(
         "--group-by",
         choices=WAYS,

@@ -55,14 +55,14 @@ def parser() -> argparse.ArgumentParser:
     add = made.add_argument
     add("plan", metavar="PLAN", help="efficiency, excitation, validate, or a plan file (jtq.plan/1)")
     add("--bus", help="can0, unix:PATH, sim (the emulated bench), or sim:BUS (the same on that bus)")
-    add("--out", type=Path, metavar="DIR", help="the campaign's directory; made if missing")
+    add("--out", type=Path, metavar="DIR", help="the campaign's directory; created if missing")
     add("--dry-run", action="store_true", help="print the plan, its length and the bus load; move nothing")
     add(
         "--config",
         "--joint-config",
         type=Path,
         metavar="FILE",
-        help="configuration of jtqd: nodes and joint files (default: the bench that ships)",
+        help="configuration of jtqd: nodes and joint files (default: the shipped bench)",
     )
     add(
         "--limit",

@@ -142,7 +142,7 @@ def parser() -> argparse.ArgumentParser:
         help="joint file of all joints, or of joint N; may be given again (default: those that the column map names)",
     )
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="where the results go; made if missing"
+        "--out", type=Path, required=True, metavar="DIR", help="output directory; created if missing"
     )
     parser.add_argument(
         "--columns", type=Path, metavar="FILE", help="column map for other names, units and signs"

@@ -85,7 +85,7 @@ def parser() -> argparse.ArgumentParser:
         help="joint1.yaml, joint1.onnx (the paper's network), joint1.fused.onnx (ours), and so on for each joint",
     )
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="where the report goes; made if missing"
+        "--out", type=Path, required=True, metavar="DIR", help="directory of the report; created if missing"
     )
     parser.add_argument(
         "--joint",

@@ -228,7 +228,11 @@ def parser() -> argparse.ArgumentParser:
         help="paper: section III, absolute angles, 6-20-40-10-1; ours: correction to the fused physics, 7-16-16-4",
     )
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="where networks and cards go; made if missing"
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="directory of networks and cards; created if missing",
     )
     parser.add_argument(
         "--iterations", type=count, help="default 1000 for the paper's (as in the paper), 200 for ours"

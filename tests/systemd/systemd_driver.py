@@ -328,7 +328,7 @@ def bad_reload():
             assert done.returncode != 0, what
             joint.write_text(good)
             CONFIG.write_text(configuration)
-            reply = re.findall(r"not reloaded, the old files stay in force: (.*)", journal(40))
+            reply = re.findall(r"not reloaded, the old files remain in force: (.*)", journal(40))
             assert reply, journal(40)
             seen[what] = reply[-1]
     finally:

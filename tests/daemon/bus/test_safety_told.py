@@ -141,7 +141,7 @@ def test_the_summary_tells_stolen_time_where_there_was_any() -> None:
     us = (1.0, 2.0, 3.0)
     for stolen_s, lines in (
         (0.0, []),
-        (0.318, ["processors    taken away for 0.32 s by the hypervisor (stolen time)"]),
+        (0.318, ["processors    0.32 s stolen by the hypervisor"]),
     ):
         told = Summary(
             9, 0, 0, us, us, (0.1, 0.1), dict.fromkeys(COUNTERS, 0), (), None, None, {}, (), stolen_s

@@ -140,7 +140,7 @@ def test_stale_names_the_pdo_the_node_or_the_bus(bench: About) -> None:
     assert why(bench, stale) == "281h drive 1 TPDO2 not received in time"
     assert why(bench, stale._replace(input_flags=2)) == "181h drive 1 TPDO1 not received in time"
     assert why(bench, stale, bus_errors=3) == "the bus is down"
-    assert why(bench, stale, foreign_sync=3) == "another SYNC is on the bus"
+    assert why(bench, stale, foreign_sync=3) == "another SYNC producer is on the bus"
     assert why(bench, stale._replace(input_flags=3)).startswith("the inputs are back; held until")
     assert (
         why(bench, stale._replace(input_flags=3), overruns=1)
@@ -152,7 +152,7 @@ def test_stale_names_the_pdo_the_node_or_the_bus(bench: About) -> None:
     assert silent_s(silent._replace(sync_realtime_ns=1_200_000_000), 1, 100) is None
     assert silent_s(silent, 2, 100) is None, "one that has never been heard is not silent"
     unready = view(1000, stale, unconfigured=(1,))
-    assert joint_reason(bench, 1, unready, view(900)) == "node 1 is not configured as it was"
+    assert joint_reason(bench, 1, unready, view(900)) == "node 1 has a changed configuration"
     restarted = view(1000, stale, unconfigured=(1,), states={1: 127})
     assert joint_reason(bench, 1, restarted, view(900)).startswith("node 1 has restarted")
     assert (
@@ -191,6 +191,6 @@ def test_degraded_and_invalid(bench: About) -> None:
 
 def test_starting_and_standstill(bench: About) -> None:
     starting = WELL._replace(status=st.STARTING)
-    assert joint_reason(bench, 1, view(8, starting), view(0)) == "the first cycles"
+    assert joint_reason(bench, 1, view(8, starting), view(0)) == "first cycles after the start"
     assert joint_reason(bench, 1, view(800, starting), view(0)).startswith("the observer starts again")
     assert "half the interval" in why(bench, WELL._replace(status=st.STANDSTILL))

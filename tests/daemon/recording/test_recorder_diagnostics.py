@@ -137,13 +137,13 @@ def test_nodes(bench):
 
 def test_the_worst_condition_of_a_subject_is_its_level_and_text(bench):
     conditions = [
-        Condition("sensor_lost", "joint 1", WARNING, "torque sensor lost: node 3 is not there", 1),
+        Condition("sensor_lost", "joint 1", WARNING, "torque sensor lost: node 3 is absent", 1),
         Condition("temperature_lost", "joint 1", WARNING, "temperature lost", 2),
         Condition("joint_fault", "joint 2", ERROR, "no torque: x", 3),
         Condition("bus_off", "bus", ERROR, "bus-off, previously error passive", 4),
     ]
     found = bench.look(statuses=(2, 15), conditions=conditions)
-    assert found["joint 1"][:2] == (WARN, "VALID: torque sensor lost: node 3 is not there")
+    assert found["joint 1"][:2] == (WARN, "VALID: torque sensor lost: node 3 is absent")
     assert found["joint 2"][:2] == (FAULT, "INVALID: no torque: x")
     assert found["bus"][:2] == (FAULT, "bus-off, previously error passive")
 

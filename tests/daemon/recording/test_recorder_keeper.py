@@ -81,7 +81,7 @@ def test_one_that_dies_again_and_again_is_tried_again_after_a_long_pause_and_all
 ):
     for _ in range(2):
         kept.kill()
-        kept.until("jtqd: the recorder ended with exit status -9; started again, the loop goes on\n")
+        kept.until("jtqd: the recorder ended with exit status -9; restarted, the loop continues\n")
     kept.kill()
     kept.until("jtqd: the recorder ended with exit status -9; 3 times in a minute; the next try in 60 s\n")
     kept.feed(_SLOTS + 100)

@@ -252,7 +252,7 @@ def test_recording_ends_at_the_reserve_and_goes_on_when_there_is_room(tmp_path, 
     assert summary["lost"] == summary["lost_unwritten"] == missing
     assert [line.split(":")[0].split(" in part")[0] for line in said] == [
         "recording ends",
-        "recording goes on",
+        "recording continues",
     ]
     event = next(
         event
@@ -260,7 +260,7 @@ def test_recording_ends_at_the_reserve_and_goes_on_when_there_is_room(tmp_path, 
         if event["kind"] == EVENT["WRITE_FAILED"]
     )
     assert event["count"] == missing
-    assert (metadata_of(summary["paths"][1])["reason"]) == "recording goes on"
+    assert (metadata_of(summary["paths"][1])["reason"]) == "recording continues"
 
 
 def test_start_without_room(tmp_path, free):
@@ -359,7 +359,7 @@ def test_recorder_of_the_same_run_goes_on_with_the_numbers(tmp_path):
     told = metadata_of(summary["paths"][1])
     assert (told["previous"], told["reason"]) == (
         "test-20260102T030405Z-0001.mcap",
-        "the recorder was started again",
+        "recorder restarted",
     )
 
 
