@@ -58,7 +58,7 @@ def listen(path: str, backlog: int) -> socket.socket:
     except OSError as error:
         sock.close()
         require_directory(path)
-        raise BusError(f"{bus}: cannot make the bus: {error.strerror or error}") from None
+        raise BusError(f"{bus}: cannot create the bus: {error.strerror or error}") from None
     finally:
         os.umask(umask)
     return sock

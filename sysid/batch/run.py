@@ -125,7 +125,7 @@ def find_groups(
     active: list[Path] = []
     for path in named:
         if not path.exists():
-            raise GroupError(f"{path}: found nothing there, expected a log or a directory of logs")
+            raise GroupError(f"{path}: found nothing, expected a log or a directory of logs")
         inside = [each for each in path.rglob("*") if each.is_file()] if path.is_dir() else [path]
         unfinished = sorted(each for each in inside if each.name.endswith(_UNFINISHED))
         wanted = _first_kind(inside, kinds)
@@ -323,7 +323,7 @@ def run_batch(
         groups: of logs; those with the same content are worked on once.
         out: directory of the results.
         workers: run the tasks.
-        again: run also what is finished.
+        again: run finished groups again.
         progress: called with each row when it is complete.
 
     Raises:
@@ -393,7 +393,7 @@ def _outcome(future: Future[Outcome], here: str) -> Outcome:
     try:
         outcome = future.result()
     except CancelledError:
-        raise BatchError("the scheduler has gone, or has forgotten the tasks") from None
+        raise BatchError("the scheduler has ended or lost the tasks") from None
     except Exception as error:
         lines = str(error).strip().splitlines() or ["no reason given"]
         died = type(error).__name__ == "KilledWorker"

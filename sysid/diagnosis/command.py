@@ -101,7 +101,7 @@ def _with_channels(findings: Findings, checked: CheckedRuns, notes: tuple[str, .
             findings,
             verdict=INSUFFICIENT,
             reasons=(
-                f"{lost}: no run of {'it' if one else 'them'} can be used, the rest has no gap",
+                f"{lost}: no run of {'it' if one else 'them'} can be used, the others have no gap",
                 *checked.refused,
             ),
         )
@@ -114,8 +114,8 @@ def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq diagnose`."""
     parser = argparse.ArgumentParser(
         prog=BY,
-        description="Measure what a joint file's simulation gets wrong on recorded runs and name the cause, "
-        "or the causes that these runs cannot distinguish and the experiment that would.",
+        description="Measure the error of a joint file's simulation on recorded runs and name its cause.\n"
+        "If the runs cannot distinguish the possible causes, list them and plan the experiment that would.",
         epilog=(
             "examples:\n"
             "  jtq diagnose campaigns/validate --joint models/joint1.yaml --out diagnosis\n"
@@ -160,7 +160,7 @@ def _check_out(directory: Path, force: bool) -> None:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         reason = "it is a file" if isinstance(error, FileExistsError) else error.strerror
-        raise ConfigError(f"--out {directory}: cannot be made: {reason}") from None
+        raise ConfigError(f"--out {directory}: cannot be created: {reason}") from None
     there = [name for name in _OWN if (directory / name).exists()]
     if there and not force:
         raise ConfigError(

@@ -110,7 +110,7 @@ def usable_signals(
 ) -> tuple[list[list[JointSignals]], list[str]]:
     """Return the signals [run][joint] of the usable runs, none if they are too few, and why others cannot be used."""
     if not numbers:
-        return [], ["found no joint that both the runs and the joint files have"]
+        return [], ["found no joint that is in both the runs and the joint files"]
     out: list[list[JointSignals]] = []
     reasons: list[str] = []
     bases = {n: BaseLoss(joints[n]) for n in numbers}

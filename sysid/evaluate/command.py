@@ -60,13 +60,13 @@ def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq evaluate`."""
     parser = argparse.ArgumentParser(
         prog=BY,
-        description="Compare all methods with the torque sensor on runs that no model has seen (the paper's section IV).",
+        description="Compare all methods with the torque sensor on held-out runs (the paper's section IV).",
         epilog=(
             "examples:\n"
             "  jtq evaluate campaigns/validate --models models --out report\n"
             "  jtq evaluate campaigns/validate --models models --outside campaigns/outside --out report --json\n\n"
             "DIR/evaluation.html is the report, DIR/evaluation.json the same for programs. Exit status: 0 done; 1 failure,\n"
-            "or a run that a model was made from; 2 usage; 3 done, but something was left out or found."
+            "or a training run of a model was given; 2 usage; 3 done, but a run was left out or there are findings."
         ),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -102,7 +102,7 @@ def parser() -> argparse.ArgumentParser:
         type=Path,
         default=[],
         metavar="RUNS",
-        help="runs with more load or warmer than any training run, to judge ours outside its envelope",
+        help="runs with more load or warmer than the training runs, to score our method outside its envelope",
     )
     parser.add_argument(
         "--columns", type=Path, metavar="FILE", help="column map for other names, units and signs"
@@ -117,7 +117,7 @@ def _make(directory: Path) -> None:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         reason = "it is a file" if isinstance(error, FileExistsError) else error.strerror
-        raise ConfigError(f"--out {directory}: cannot be made: {reason}") from None
+        raise ConfigError(f"--out {directory}: cannot be created: {reason}") from None
 
 
 def _distinct(inputs: Inputs, outside: Inputs) -> tuple:  # type: ignore[type-arg]

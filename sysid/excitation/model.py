@@ -156,7 +156,7 @@ class Candidates:
         if not _between(low, torque, high).all():
             raise ConfigError(
                 f"limits: found joint_current_a {self.limits.joint_current_a:g} and torque_nm "
-                f"{self.limits.torque_nm:g}, expected more: turning the idle driving joint takes "
+                f"{self.limits.torque_nm:g}, expected more, because turning the idle driving joint takes "
                 f"{float(np.abs(torque).max()):.1f} Nm"
             )
 

@@ -128,7 +128,7 @@ def run_paths(arguments: Sequence[Path]) -> list[Path]:
     for argument in arguments:
         if not argument.is_dir():
             if not argument.exists():
-                raise RunError(f"{argument}: found nothing there, expected a run file or a directory of runs")
+                raise RunError(f"{argument}: found nothing, expected a run file or a directory of runs")
             paths.append(argument)
             continue
         names = sorted(p for p in argument.iterdir() if p.is_file() and not p.name.startswith("."))
@@ -446,7 +446,7 @@ def _read_log(path: Path) -> RunFile:
         by = ", ".join(f"{count} of {name}" for name, count in logged.incomplete_by.items() if count)
         notes.append(
             f"{counted(logged.missed, 'cycle')} missed and {logged.incomplete} incomplete{f' ({by})' if by else ''}: "
-            f"{logged.lost_share:.2%} of the slots are no rows"
+            f"{logged.lost_share:.2%} of the slots have no row"
         )
     values = {TIME: logged.table.time_s}
     for number, columns in logged.table.joints.items():

@@ -130,7 +130,9 @@ def train_fused(
             f"joint {joint.name}: found no section 'fused' with torsion; 'jtq fit losses' makes one"
         )
     if len(runs) < 8:
-        raise ValueError(f"found {len(runs)} runs, expected at least 8: standard deviations need unseen runs")
+        raise ValueError(
+            f"found {len(runs)} runs, expected at least 8: standard deviations need held-out runs"
+        )
     unseen: list[tuple[Seen, FloatArray]] = []
     for known, judged in folds(runs):
         loss, torsion = fit_loss(known, joint.friction).loss, fit_torsion(known)

@@ -242,7 +242,7 @@ def test_an_interrupted_batch_says_so_and_leaves_nothing_running(tmp_path):
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=120)
     assert process.returncode == 1
-    assert errors.splitlines()[-1] == "jtq batch: interrupted; the same command goes on from here"
+    assert errors.splitlines()[-1] == "jtq batch: interrupted; the same command continues from here"
     assert "Traceback" not in errors
 
 
