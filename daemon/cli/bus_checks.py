@@ -55,7 +55,7 @@ _BUS_OFF, _NO_ACKNOWLEDGE = 0x040, 0x020
 def check_bus(
     traffic: Traffic, config: Config, *, lost: int, error_frames: bool = True
 ) -> Iterator[CheckResult]:
-    """Judge everything that was heard.
+    """Evaluate everything that was received.
 
     Args:
         traffic: what was counted.
@@ -309,7 +309,7 @@ def _errors(traffic: Traffic) -> CheckResult:
 def check_own_timing(
     timing: Timing, period_ns: int, refused: Sequence[str], *, driven: bool
 ) -> Iterator[CheckResult]:
-    """Judge this process's own loop; `refused`: real-time settings that the system did not grant."""
+    """Evaluate this process's own loop; `refused`: real-time settings that the system did not grant."""
     granted = (
         "without real-time scheduling" if any("SCHED_FIFO" in line for line in refused) else "SCHED_FIFO"
     )
@@ -342,7 +342,7 @@ def check_own_timing(
 
 
 def check_conditions(conditions: Sequence[Condition]) -> Iterator[CheckResult]:
-    """Return one result for each condition that the daemon on this bus reports, else one that there is none."""
+    """Return one result per condition of the daemon on this bus, or one that says there is none."""
     for each in conditions:
         level = FAIL if each.severity >= ERROR else WARN
         yield CheckResult(
@@ -355,7 +355,7 @@ def check_conditions(conditions: Sequence[Condition]) -> Iterator[CheckResult]:
 def check_loop_timing(
     before: tuple[int, ...], after: tuple[int, ...], first: View, last: View
 ) -> CheckResult:
-    """Judge the running loop by its histogram of SYNC's lateness before and after."""
+    """Evaluate the running loop by its histogram of the lateness of SYNC before and after."""
     times = TimeHistogram()
     for n, (old, new) in enumerate(zip(before, after, strict=True)):
         for _ in range(new - old):
@@ -367,7 +367,7 @@ def check_loop_timing(
 
 
 def check_stolen_time(stolen_s: float, seconds: float) -> CheckResult:
-    """Judge the processor time that a hypervisor took in `seconds` (`daemon/loop/realtime.py`)."""
+    """Evaluate the processor time that a hypervisor used in `seconds` (`daemon/loop/realtime.py`)."""
     stolen = stolen_s / max(seconds, 1e-3)
     text = f"{share(stolen)} of a processor used by the hypervisor (stolen time)"
     return (

@@ -51,7 +51,7 @@ _BENCH_PRIORITY = 40
 
 
 class CheckError(Exception):
-    """The check cannot be made; the message is one line for the operator."""
+    """The check is not possible; the message is one line for the operator."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -80,7 +80,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(argv: list[str]) -> int:
-    """Measure and judge; returns the exit status."""
+    """Measure and evaluate; return the exit status."""
     arguments = parser().parse_args(argv)
     try:
         daemon = None if arguments.bus == "sim" else on_bus(find_daemons(), arguments.bus)
@@ -119,7 +119,7 @@ def _open(bus: str, *, receive_own: bool = False) -> FrameSocket:
 
 
 def _listen(bus: str, config: Config, for_s: float, daemon: Daemon | None) -> Iterator[CheckResult]:
-    """Listen only."""
+    """Listen without sending."""
     traffic, socket = Traffic(config), _open(bus)
     reader = _reader(daemon)
     refused = [] if reader else _become_real_time(config)
@@ -139,7 +139,7 @@ def _listen(bus: str, config: Config, for_s: float, daemon: Daemon | None) -> It
 
 
 def _drive(bus: str, config: Config, for_s: float, daemon: Daemon | None) -> Iterator[CheckResult]:
-    """Boot the nodes, send SYNC, and put them back."""
+    """Boot the nodes, send SYNC, and reset the nodes to pre-operational."""
     if daemon is not None:
         raise CheckError(
             f"jtqd runs on {bus} (process {daemon.about.pid}): without --drive-sync this check listens"
@@ -179,7 +179,7 @@ def _reader(daemon: Daemon | None) -> SnapshotReader | None:
 
 
 def _become_real_time(config: Config) -> list[str]:
-    """Run as jtqd's loop does. Returns what was refused."""
+    """Request the real-time settings of jtqd's loop; return the refused ones."""
     wanted = config.realtime
     refused = realtime.prepare(wanted.priority, wanted.cpu, wanted.lock_memory)
     gc.disable()
@@ -205,7 +205,7 @@ def _boot(bus: str, config: Config) -> CheckResult:
 
 @contextmanager
 def _bus(name: str, config: Config, daemon: Daemon | None) -> Iterator[str]:
-    """The name under which it can be opened; for "sim" the emulated bench is started for as long as it is used."""
+    """Return the name of the bus; for "sim" start the emulated bench while it is used."""
     if name != "sim":
         yield daemon.about.bus if daemon else name
         return

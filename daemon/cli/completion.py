@@ -79,7 +79,7 @@ def command_parser(commands: Mapping[str, tuple[str, str]]) -> argparse.Argument
 
 
 def complete_values(parser: argparse.ArgumentParser, **completions: object) -> None:
-    """Mark every argument whose value is a `file`, a `directory` or a `bus` with what completes it (shtab's `complete`)."""
+    """Mark every argument that takes a `file`, a `directory` or a `bus` with its completion (shtab's `complete`)."""
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for each in action.choices.values():
@@ -89,7 +89,7 @@ def complete_values(parser: argparse.ArgumentParser, **completions: object) -> N
 
 
 def _kind(action: argparse.Action) -> str | None:
-    """What the value of an argument is, by its name and type."""
+    """Return the kind of an argument's value, by its name and type."""
     metavar = (action.metavar if isinstance(action.metavar, str) else action.dest).upper()
     if action.dest == "bus":
         return "bus"

@@ -48,7 +48,7 @@ _USUAL_LOGS = Path("/var/log/jtqd")
 
 
 def check_files(config: Config) -> Iterator[CheckResult]:
-    """Configuration, joint files, models and their hashes; the configuration has been read already."""
+    """Check configuration, joint files, models and their hashes; the configuration has been read already."""
     load = bus_load_of(config)
     yield CheckResult(
         "configuration", GOOD, f"{config.path}, sha256 {config.sha256[:12]}, method {config.estimator.method}"
@@ -73,7 +73,7 @@ def check_files(config: Config) -> Iterator[CheckResult]:
 
 
 def check_directories(log: Path | None, roots: list[Path]) -> Iterator[CheckResult]:
-    """Where logs and shared memory go, for this user; `log` None: none is named and the usual one does not exist."""
+    """Check the directories of logs and shared memory for this user; `log` None: none is named."""
     if log is None:
         yield CheckResult(
             "log directory", SKIP, "jtqd writes to ./logs without --record DIR or $LOGS_DIRECTORY"
@@ -105,7 +105,7 @@ def _directory(item: str, path: Path, wanted: int, what: str) -> CheckResult:
 
 
 def check_packages() -> Iterator[CheckResult]:
-    """Installed versions against what jtqd's own package asks for."""
+    """Compare installed versions with the requirements of jtqd's package."""
     try:
         wanted = [each for each in requires("jtqd") or () if "extra ==" not in each]
     except PackageNotFoundError:
@@ -135,13 +135,13 @@ def check_packages() -> Iterator[CheckResult]:
 
 
 def requirement(line: str) -> tuple[str, list[tuple[str, str]]]:
-    """Name and limits of a requirement: "mcap>=1.3,<2" is ("mcap", [(">=", "1.3"), ("<", "2")])."""
+    """Split a requirement into name and limits: "mcap>=1.3,<2" is ("mcap", [(">=", "1.3"), ("<", "2")])."""
     name = re.split(r"[^A-Za-z0-9_.-]", line, maxsplit=1)[0]
     return name, re.findall(r"(>=|<=|==|<|>)\s*([0-9][0-9A-Za-z.]*)", line.partition(";")[0])
 
 
 def fits(version: str, operator: str, limit: str) -> bool:
-    """Compare the numbers of two versions; what is not a number ends them."""
+    """Compare the numbers of two versions; the first part that is not a number ends them."""
     have, want = _numbers(version), _numbers(limit)
     length = max(len(have), len(want))
     have, want = have + (0,) * (length - len(have)), want + (0,) * (length - len(want))
@@ -156,7 +156,7 @@ def _numbers(version: str) -> tuple[int, ...]:
 
 
 def check_unit() -> CheckResult:
-    """The systemd unit."""
+    """Check the systemd unit."""
     if not Path("/run/systemd/system").exists():
         return CheckResult("systemd unit", SKIP, "systemd does not run here")
     for directory in _UNITS:
@@ -172,7 +172,7 @@ def check_unit() -> CheckResult:
 
 
 def check_leftovers(log: Path | None, search: DaemonSearch) -> Iterator[CheckResult]:
-    """Logs without an end and runtime directories of daemons that were killed."""
+    """Check for unfinished logs and runtime directories of killed daemons."""
     running = [each.about for each in search.daemons]
     text = ", ".join(f"{each.instance} (process {each.pid})" for each in running) or "none"
     yield CheckResult("running jtqd", GOOD, text)
@@ -223,14 +223,14 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(argv: list[str]) -> int:
-    """Examine and report; returns the exit status."""
+    """Examine and report; return the exit status."""
     arguments = parser().parse_args(argv)
     results = list(examine(arguments.bus, arguments.config, arguments.record or _log_directory()))
     return report(results, SCHEMA if arguments.json else None, bus=arguments.bus)
 
 
 def examine(bus: str | None, path: Path | None, log: Path | None) -> Iterator[CheckResult]:
-    """Every item. A configuration that cannot be read is one, and the shipped one then stands in for it."""
+    """Run every check. An unreadable configuration is one failure; the shipped one is used instead."""
     broken = None
     try:
         config = load_config(path)
@@ -250,7 +250,7 @@ def examine(bus: str | None, path: Path | None, log: Path | None) -> Iterator[Ch
 
 
 def _log_directory() -> Path | None:
-    """Where jtqd would write, as far as that does not depend on the directory it is started in."""
+    """Return the directory that jtqd would write to, as far as it does not depend on the working directory."""
     named = os.environ.get("LOGS_DIRECTORY", "").split(":")[0]
     if named:
         return Path(named)

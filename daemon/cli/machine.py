@@ -38,7 +38,7 @@ _COUNTED = ("error_warning", "error_passive", "bus_off")
 
 
 def check_kernel(wanted: Realtime, *, can: bool) -> Iterator[CheckResult]:
-    """Every item about the kernel and the rights of this user; `can`: SocketCAN is wanted."""
+    """Check the kernel and the rights of this user; `can`: SocketCAN is required."""
     yield _kernel()
     yield _tick()
     yield _clock()
@@ -51,7 +51,7 @@ def check_kernel(wanted: Realtime, *, can: bool) -> Iterator[CheckResult]:
 
 
 def _text(path: str | Path) -> str:
-    """Content of a file, "" where it cannot be read."""
+    """Return the content of a file, "" if it cannot be read."""
     with suppress(OSError):
         return Path(path).read_text(errors="replace").strip()
     return ""
@@ -78,7 +78,7 @@ def _kernel() -> CheckResult:
 
 
 def build_options() -> dict[str, str]:
-    """What the running kernel was built with, e.g. {"CONFIG_HZ": "250"}; empty where that is not published."""
+    """Return the build options of the running kernel, e.g. {"CONFIG_HZ": "250"}; empty if not published."""
     with suppress(OSError, EOFError), gzip.open("/proc/config.gz", "rt") as file:
         return dict(re.findall(r"^(CONFIG_\w+)=(.*)$", file.read(), re.MULTILINE))
     return dict(re.findall(r"^(CONFIG_\w+)=(.*)$", _text(f"/boot/config-{platform.release()}"), re.MULTILINE))
@@ -200,7 +200,7 @@ def _memory(wanted: Realtime) -> CheckResult:
 
 
 def _cpus(text: str) -> set[int]:
-    """A CPU list of the kernel, "0-2,5"."""
+    """Parse a CPU list of the kernel, "0-2,5"."""
     cpus: set[int] = set()
     for part in filter(None, text.split(",")):
         first, _, last = part.partition("-")
@@ -240,12 +240,12 @@ def _governor() -> CheckResult:
 
 
 def interfaces() -> list[str]:
-    """Names of the CAN interfaces of this machine."""
+    """Return the names of the CAN interfaces of this machine."""
     return sorted(path.parent.name for path in _NET.glob("*/type") if _text(path) == _ARPHRD_CAN)
 
 
 def check_can(bus: str | None, config: Config) -> Iterator[CheckResult]:
-    """Every item about the bus; None: all CAN interfaces there are."""
+    """Check the bus; None: all CAN interfaces."""
     if bus is None:
         names = interfaces()
         if not names:
@@ -283,7 +283,7 @@ def _opened(bus: str) -> CheckResult:
 
 
 def link_of(name: str) -> dict[str, Any]:
-    """What `ip -details -statistics link` says of an interface; {} where there is no ip, or it does not know."""
+    """Return the output of `ip -details -statistics link` for an interface; {} without ip or interface."""
     if shutil.which("ip") is None:
         return {}
     with suppress(OSError, ValueError, subprocess.SubprocessError):

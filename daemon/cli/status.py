@@ -1,4 +1,4 @@
-"""`jtq status`: how a running jtqd is doing. It reads shared memory and can never slow the loop.
+"""`jtq status`: state of a running jtqd, read from shared memory without any effect on the loop.
 
 A reading is shown as a picture at the width of the terminal (`StatusView`), or as plain data for JSON (`content`).
 """
@@ -78,7 +78,7 @@ _BETWEEN_S = 0.3
 
 
 def content(reading: Reading) -> dict[str, Any]:
-    """Everything the picture shows; null where a number is not known."""
+    """Return everything the view shows; null for unknown numbers."""
     about, view = reading.daemon.about, reading.view
     result: dict[str, Any] = {
         "schema": SCHEMA,
@@ -203,13 +203,13 @@ def _number(value: float) -> float | None:
 
 
 class StatusView:
-    """Renderable of one reading."""
+    """Rich view of one reading."""
 
     def __init__(self, reading: Reading) -> None:
         self._reading = reading
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Called by rich with the width of the terminal."""
+        """Render for the width of the terminal (called by rich)."""
         reading, width = self._reading, options.max_width
         yield _title(reading)
         if reading.state != RUNNING:
@@ -260,11 +260,11 @@ class Columns:
         self._rows: list[dict[str, str | Text]] = []
 
     def add(self, *cells: str | Text) -> None:
-        """One row, a cell for each heading."""
+        """Add a row, one cell per heading."""
         self._rows.append(dict(zip(self._headings, cells, strict=True)))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Called by rich with the width of the terminal."""
+        """Render for the width of the terminal (called by rich)."""
         tables = [
             self._table([name for name in self._headings if name not in self._dispensable[:dropped]])
             for dropped in range(len(self._dispensable) + 1)
@@ -312,7 +312,7 @@ def _joints(about: About, view: View, *, still: bool) -> Columns:
 
 
 def _reasons(about: About, view: View, earlier: View) -> Iterator[Text]:
-    """Always a line for each joint, so that the picture does not jump."""
+    """Return one line per joint, so that the view keeps its height."""
     for joint, seen, since in zip(about.joints, view.joints, view.status_since, strict=True):
         why = joint_reason(about, joint.number, view, earlier)
         name = NAMES.get(seen.status, str(seen.status))
@@ -344,7 +344,7 @@ def _inputs(about: About, view: View) -> Columns:
 
 
 def _line(heading: str, text: str | Text) -> RenderableType:
-    """A heading of a fixed width, and text that wraps beside it."""
+    """Return a heading of fixed width and text that wraps beside it."""
     grid = Table.grid(padding=(0, 1))
     grid.add_column(width=_HEADING, no_wrap=True, style=_HEAD)
     grid.add_column(overflow="fold")
@@ -421,7 +421,7 @@ def _style_of(level: int) -> str:
 
 
 def _conditions(conditions: Sequence[Condition]) -> Iterator[RenderableType]:
-    """What is wrong now, and for how long."""
+    """Return the present conditions and their durations."""
     if conditions:
         yield ""
     now_ns = time.monotonic_ns()
@@ -444,7 +444,7 @@ def _notices(notices: Sequence[Notice]) -> Iterator[RenderableType]:
 
 
 def clock() -> RenderableType:
-    """The line below a live view."""
+    """Return the line below a live view."""
     return Padding(
         Text(time.strftime("%H:%M:%S  Ctrl-C ends this view; jtqd continues"), style="dim"), (1, 0, 0, 0)
     )
@@ -467,7 +467,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(argv: list[str]) -> int:
-    """Show it; returns the exit status."""
+    """Show the state; return the exit status."""
     arguments = parser().parse_args(argv)
     try:
         daemon = choose_daemon(arguments.bus)
@@ -500,7 +500,7 @@ def _once(daemon: Daemon, *, as_json: bool) -> int:
 
 
 def _live(console: Console, daemon: Daemon) -> int:
-    """Until Ctrl-C, or the daemon ends; one that is started again is found again."""
+    """Show the live view until Ctrl-C; a restarted daemon is found again."""
     watch = Watch(daemon)
     with Live(console=console, screen=True, auto_refresh=False) as live:
         while True:
@@ -517,7 +517,7 @@ def _live(console: Console, daemon: Daemon) -> int:
 
 
 def _lines(daemon: Daemon) -> int:
-    """Not a terminal: a line a second, until the daemon ends."""
+    """Print one line per second until the daemon ends, for output that is no terminal."""
     watch = Watch(daemon)
     while daemon.about.running():
         reading = watch.read()

@@ -147,8 +147,8 @@ def usable_signals(
     if len(out) < FEWEST_RUNS:
         return [], [
             *reasons,
-            f"found {counted(len(out), 'usable run')}, expected at least {FEWEST_RUNS}: a gain is measured on runs "
-            "left out",
+            f"found {counted(len(out), 'usable run')}, expected at least {FEWEST_RUNS}: a gain is measured on held-out "
+            "runs",
         ]
     moving = sum(float(s.moving.sum()) * float(np.median(np.diff(s.time_s))) for run in out for s in run)
     if moving < SHORTEST_MOVING_S:

@@ -348,7 +348,7 @@ EXPERIMENTS: Final = {
         ),
         Kind(
             "load_ramp",
-            "the joints at standstill under a load that oscillates with three amplitudes and three rates: torsion over torque",
+            "the joints at standstill, the load oscillating with three amplitudes and three rates: torsion over torque",
             _load_ramp,
         ),
         Kind(
@@ -543,7 +543,7 @@ def _text(
     parts += [f"{kind}: {EXPERIMENTS[kind].what}." for kind in kinds]
     if len(joints) == 1 and any(len(names) > 1 for names in classes):
         parts.append(
-            "Record both joints of the bench: a sensor fault is in the balances of both joints, a joint fault in those of one."
+            "Record both joints of the bench: a sensor fault is in the balances of both joints, a joint fault in one."
         )
     parts += [note for pair, note in _BY_HAND.items() if any(pair <= set(names) for names in classes)]
     parts.append(

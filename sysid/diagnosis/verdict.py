@@ -201,7 +201,7 @@ def _without_negligible(  # noqa: PLR0917
     noise: Noise,
     joints: Mapping[int, Joint],
 ) -> tuple[Hypothesis, Refined, list[dict[Channel, float]]]:
-    """Return hypothesis and refinement without causes that are too small to be relevant, and the rms of each in each channel."""
+    """Return hypothesis and refinement without irrelevant causes, and the rms of each in each channel."""
     rated = max(j.rated_torque_nm for j in joints.values())
     while True:
         rms = [_rms_at(dataset, p) for p in refined.present]

@@ -206,7 +206,10 @@ def _silent(samples: Samples) -> list[RunIssue]:
 def _why_nothing(samples: Samples) -> str:
     if samples.standing.any():
         share = 100.0 * float(samples.standing.mean())
-        return f"found it standing in {share:.0f} % of the samples and no moving sample with a value of every method: not scored"
+        return (
+            f"found standstill in {share:.0f} % of the samples and no moving sample with a value of every method: "
+            "not scored"
+        )
     return "found no sample at which every method has a value, expected most of them: not scored"
 
 

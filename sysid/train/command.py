@@ -30,7 +30,7 @@ from jtqd.sysid.train.paper import TrainedNetwork, paper_block, split_by_sample,
 
 _WHAT = {
     "paper": "The paper's network (section III): current, angles and velocities of both sides and the efficiency "
-    "estimate in, torque out; sigma(x) = tanh(x/2). Its absolute angles can identify single runs; it serves only for comparison.",
+    "estimate in, torque out; sigma(x) = tanh(x/2). Its absolute angles can identify single runs; for comparison only.",
     "ours": "Correction to the fused physics from speed, motor torque, torsion against current, and filtered ripple "
     "angles. Outside its envelope it fades to zero and the status is 3.",
 }

@@ -336,7 +336,7 @@ def test_restart_during_boot(bench):
         return [(0x702, b"\x00")]
 
     bench.extra = boot_up
-    assert str(bench.fails()).startswith("node 2: it restarted during boot")
+    assert str(bench.fails()).startswith("node 2: the node restarted during boot")
 
 
 def test_foreign_sync(bench):

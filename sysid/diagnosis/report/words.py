@@ -183,8 +183,8 @@ def _unexplained(gap: Gap | None) -> str:
     if gap is None:
         return "the residual is above the noise"
     text = (
-        f"{place(gap.joint)} is off by {number(gap.rmse_nm)}{SPACE}Nm "
-        f"with a noise floor of {number(gap.noise_floor_nm)}{SPACE}Nm"
+        f"{place(gap.joint)}, residual {number(gap.rmse_nm)}{SPACE}Nm, "
+        f"noise floor {number(gap.noise_floor_nm)}{SPACE}Nm"
     )
     if gap.localisation:
         top = gap.localisation[0]

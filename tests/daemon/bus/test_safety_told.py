@@ -34,7 +34,7 @@ def test_a_fault_is_told_when_it_begins_and_when_all_are_over() -> None:
     watch = Observer()
     assert watch.lines(reading(1), 0.0) == []
     assert watch.lines(reading(2, faulty(TORSION)), 1.0) == [
-        "joint 1: no torque: motor and link position are further apart than the gear can be twisted (torsion)"
+        "joint 1: no torque: the torsion exceeds the limit of the gear (torsion)"
     ]
     assert watch.lines(reading(3, faulty(TORSION)), 20.0) == [], "told once"
     assert watch.lines(reading(4), 22.5) == ["joint 1: fault cleared after 21.5 s"]

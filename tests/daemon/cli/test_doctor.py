@@ -108,7 +108,7 @@ def test_a_directory_that_does_not_exist_yet_and_a_disk_that_is_full(
     doctor: Doctor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, found = doctor("--bus", "sim", "--record", str(tmp_path / "a" / "b"))
-    assert "it will be made" in found["log directory"]["text"]
+    assert "it will be created" in found["log directory"]["text"]
     monkeypatch.setattr("jtqd.daemon.cli.doctor._LOG_FREE", 1 << 60)
     _, found = doctor("--bus", "sim", "--record", str(tmp_path))
     assert level(found, "log directory") == WARN

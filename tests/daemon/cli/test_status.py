@@ -114,7 +114,7 @@ def test_json_holds_what_the_picture_shows(tmp_path: Path, status: Status) -> No
 
 
 def test_none_one_and_several(tmp_path: Path, status: Status) -> None:
-    assert status("--once") == (1, "", "jtq status: no jtqd runs here\n")
+    assert status("--once") == (1, "", "jtq status: no jtqd runs on this machine\n")
     running(tmp_path, "vcan0")
     assert status("--once")[0] == 0
     assert "vcan1" in status("--once", "--bus", "vcan1")[2]

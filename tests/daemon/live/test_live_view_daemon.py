@@ -92,7 +92,7 @@ def test_a_port_in_use_is_said_once_and_that_is_all(tmp_path, capfd):
         taken.listen()
         port = taken.getsockname()[1]
         made = Kept(tmp_path, capfd, port)
-        made.until(rf"jtqd: no live view: 127\.0\.0\.1:{port}: Address already in use; the loop goes on\n")
+        made.until(rf"jtqd: no live view: 127\.0\.0\.1:{port}: Address already in use; the loop continues\n")
         for _ in range(5):
             made.keeper.watch()
         assert capfd.readouterr().err == ""

@@ -156,9 +156,9 @@ def test_node_that_was_never_heard(bench):
 def test_recorder_and_disk(bench):
     bench.look()
     bench.account.overwritten = 7
-    found = bench.look(free=150_000_000, mode="waiting", obstacle="recording ends: no room")
+    found = bench.look(free=150_000_000, mode="waiting", obstacle="recording pauses: no room")
     assert found["recorder"][:2] == (FAULT, "7 cycles lost since the last message")
-    assert found["disk"][:2] == (FAULT, "recording ends: no room")
+    assert found["disk"][:2] == (FAULT, "recording pauses: no room")
     found = bench.look(free=150_000_000, budget=5 * 10**9)
     assert found["recorder"][:2] == (WARN, "7 cycles lost so far")
     assert found["disk"][:2] == (WARN, "little room")

@@ -251,7 +251,7 @@ def test_recording_ends_at_the_reserve_and_goes_on_when_there_is_room(tmp_path, 
     assert found[len(held)] >= 4000 - 101, "110 MB are not enough to begin again: 125 are"
     assert summary["lost"] == summary["lost_unwritten"] == missing
     assert [line.split(":")[0].split(" in part")[0] for line in said] == [
-        "recording ends",
+        "recording pauses",
         "recording continues",
     ]
     event = next(

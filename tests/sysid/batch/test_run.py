@@ -90,7 +90,7 @@ def test_what_is_named_twice_counts_once_and_what_is_not_ended_is_left_out(tmp_p
 @pytest.mark.parametrize(
     ("named", "part"),
     [
-        ("nothing", "found nothing there"),
+        ("nothing", "found nothing"),
         ("empty", "found no log in it"),
         ("x.txt", "found a file ending in '.txt'"),
         ("active", "still being written"),
@@ -276,7 +276,7 @@ def test_a_task_that_takes_too_long_is_a_failed_one(tmp_path):
 @pytest.mark.parametrize(
     ("command", "expected"),
     [
-        (["diagnose", "nowhere", "--joint", str(JOINT_FILE)], (2, "nowhere: found nothing there")),
+        (["diagnose", "nowhere", "--joint", str(JOINT_FILE)], (2, "nowhere: found nothing")),
         (["diagnose", "logs"], (2, "--joint")),
         (["diagnose", "logs", "--joint", "none.yaml"], (1, "none.yaml: cannot be read: No such file")),
         (["replay", "logs", "--model", "none"], (1, "--model none: found no such directory")),

@@ -112,7 +112,7 @@ def test_every_number_of_a_plan_counts_for_its_hash() -> None:
         (lambda p: p.update(runs=[]), ["'runs'", "at least one run"]),
         (lambda p: p["limits"].update(curent_a=1.0), ["limits.curent_a", "did you mean 'current_a'"]),
         (lambda p: p["limits"].update(torque_nm=0.0), ["limits.torque_nm", "> 0"]),
-        (lambda p: p["runs"][1].update(name="one"), ["runs[1].name", "no other run"]),
+        (lambda p: p["runs"][1].update(name="one"), ["runs[1].name", "a unique name"]),
         (lambda p: p["runs"][1].update(name="../up"), ["runs[1].name", "letters"]),
         (lambda p: p["runs"][1].update(name="plan"), ["runs[1].name", "'plan'"]),
         (lambda p: p["runs"][1].update(velocity_joint=3), ["velocity_joint", "3"]),

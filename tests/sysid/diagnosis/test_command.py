@@ -365,7 +365,7 @@ def test_other_failures_are_one_line(tmp_path: Path, core: Core, capsys: pytest.
     (tmp_path / "twin.csv").write_bytes(paths[0].read_bytes())
     ready = ("--joint", JOINT_FILE, "--out", tmp_path / "o")
     for arguments, wanted in (
-        ((tmp_path / "absent.csv", *ready), "found nothing there"),
+        ((tmp_path / "absent.csv", *ready), "found nothing"),
         ((tmp_path / "void", *ready), "no run file in it"),
         ((tmp_path / "run.txt", *ready), "ending in '.txt'"),
         ((tmp_path / "bad.mcap", *ready), "not a readable MCAP file"),
@@ -406,7 +406,7 @@ def in_milliseconds(table: RunTable) -> RunTable:
 @pytest.mark.parametrize(
     ("change", "wanted"),
     [
-        (without_sensor, "no torque sensor channel"),
+        (without_sensor, "no valid torque sensor channel"),
         (in_millinewtonmetres, "mNm suspected"),
         (in_milliseconds, "milliseconds"),
     ],

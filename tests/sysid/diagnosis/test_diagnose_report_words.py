@@ -32,8 +32,8 @@ PLAIN_SPACE = str.maketrans("\u00a0\u202f", "  ")
         ),
         (
             examples.unexplained,
-            "The simulation has a gap that no effect of the library explains: joint 1 is off by 0.610 Nm where "
-            "noise leaves 0.200 Nm; 52 % of it at link angle 1.18 to 1.57 rad.",
+            "The simulation has a gap that no effect of the library explains: joint 1, residual 0.610 Nm, "
+            "noise floor 0.200 Nm; 52 % of it at link angle 1.18 to 1.57 rad.",
         ),
         (examples.insufficient, "These runs are not sufficient to assess the simulation."),
         (examples.sensor, "Cause of the simulation error: sensor gain."),

@@ -176,7 +176,7 @@ def test_bad_input_is_one_line(campaign: Path, tmp_path: Path, capsys: pytest.Ca
     moving = JointColumns(current_a=4 * swing, motor_velocity_rad_s=100 * swing, torque_nm=15 * swing)
     write_run(tmp_path / "swing.csv", RunTable(0.001 * np.arange(n), {1: moving}))
     cases = {
-        tmp_path / "absent.csv": "found nothing there",
+        tmp_path / "absent.csv": "found nothing",
         tmp_path / "empty": "found no run file in it",
         tmp_path / "nan.csv": "line 101, column",
         tmp_path / "swing.csv": "swing.csv: found no settled plateau",
