@@ -49,7 +49,7 @@ class LoopCounters:
         self._bits_complete = worst_case_bits(1) + worst_case_bits(8) + sum(self._bits_of)
 
     def cycle(self, flags: int, work_ns: int, late_ns: int, missed: int) -> None:
-        """One more cycle, with the flags of its record; times in ns, `missed` slots so far."""
+        """Count one cycle, with the flags of its record; times in ns, `missed` slots so far."""
         counters = self._counters
         counters[_CYCLES] += 1
         counters[_MISSED] = missed
@@ -69,13 +69,13 @@ class LoopCounters:
         self._late[min(max(late_ns, 0) // LATE_BIN_NS, LATE_BINS - 1)] += 1
 
     def statuses(self, one: int, two: int) -> None:
-        """What was published for joint 1 and 2 in one more cycle."""
+        """Count the published statuses of joints 1 and 2 in one cycle."""
         cycles = self._snapshot.status_cycles
         cycles[one] += 1
         cycles[STATUS_CODES + two] += 1
 
     def flush(self, missed: int, sync_ns: int) -> None:
-        """Copy what is counted elsewhere to where readers see it; `sync_ns` is the cycle's SYNC (CLOCK_MONOTONIC)."""
+        """Copy the counts of other objects to the snapshot; `sync_ns` is the cycle's SYNC (CLOCK_MONOTONIC)."""
         self._flush_inputs(sync_ns)
         counters, intake, socket = self._counters, self._intake, self._socket
         counters[_MISSED] = missed
@@ -136,7 +136,7 @@ class LoopCounters:
 
 
 def frame_counts(intake: Intake) -> dict[str, dict[str, int]]:
-    """Late, lost, duplicate and rejected frames by the PDO's name; of a temperature, how often it became unknown."""
+    """Return late, lost, duplicate and rejected frames by PDO name; for a temperature, how often it became unknown."""
     counts = {
         state.pdo.name: {
             "late": state.late,

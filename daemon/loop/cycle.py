@@ -33,7 +33,7 @@ from jtqd.estimator.methods import AnyEstimator
 
 
 class ConfiguredNodes:
-    """Nodes that restarted, are in doubt or were absent at the start: used (again) once the supervisor has configured them.
+    """Nodes that restarted, are in doubt or were absent at the start; they are used after the supervisor configured them.
 
     It looks at the snapshot's `configured` while a node waits. What counts is a configuration that was noted after the node
     had begun to wait: one that was only stopped is configured again without ever waiting, and that must not answer for its
@@ -47,7 +47,7 @@ class ConfiguredNodes:
         self._doubts = list(snapshot.doubts)
 
     def look(self) -> None:
-        """Between the inputs of a cycle and its estimate."""
+        """Check for configured nodes between the inputs of a cycle and its estimate."""
         intake, snapshot = self._intake, self._snapshot
         for node in intake.unconfigured:
             now = snapshot.configured[node]
@@ -65,7 +65,7 @@ class ConfiguredNodes:
                 joint.rescale(node, snapshot.factors(node))
 
     def doubt(self) -> None:
-        """Between two cycles: nothing more of the nodes that the supervisor has found to be configured otherwise."""
+        """Stop using, between two cycles, the nodes that the supervisor found differently configured."""
         doubts = self._snapshot.doubts
         for node, (before, now) in enumerate(zip(self._doubts, doubts, strict=True)):
             if now != before:
@@ -74,7 +74,7 @@ class ConfiguredNodes:
 
 
 class CycleFrames:
-    """Frames of a cycle, copied into its record as they came: 16 bytes each beside their stamps.
+    """Frames of a cycle, copied unchanged into its record: 16 bytes each beside their stamps.
 
     Attributes:
         slot: record of the current cycle in the ring.
@@ -89,7 +89,7 @@ class CycleFrames:
         self._stamps = [struct.Struct(f"<{n}q") for n in range(cr.FRAME_CAPACITY + 1)]
 
     def begin(self, slot: memoryview) -> None:
-        """The next frames belong to this record."""
+        """Store the next frames in this record."""
         self.slot = slot
         self.count = self.left_out = 0
         if self._held:
@@ -201,7 +201,7 @@ class Cycle:
         self.configured_nodes = ConfiguredNodes(snapshot, intake, self._joints)
 
     def begin(self) -> None:
-        """Drain what came after the last cycle was closed, then send SYNC."""
+        """Drain the frames received after the last cycle was closed, then send SYNC."""
         intake, socket = self.intake, self.socket
         self._frames.begin(self.ring.slot())
         self._flags, self._next_flags = self._next_flags, 0
@@ -257,7 +257,7 @@ class Cycle:
             self._sync_realtime_ns = self._sync_ns + self._realtime_offset_ns
 
     def observe(self) -> None:
-        """Estimate of both joints from the inputs of this cycle; without their networks when there is no time for them."""
+        """Estimate both joints from the inputs of this cycle; without their networks if there is no time for them."""
         sync_ns = self._sync_realtime_ns - self._realtime_offset_ns
         starting = self.index < STARTING_CYCLES
         one, two = self._joints
@@ -268,7 +268,7 @@ class Cycle:
         two.observe(sync_ns, starting, wanted)
 
     def publish(self) -> None:
-        """Send the estimate PDO, and the heartbeat when it is due. An estimate that is too late is none."""
+        """Send the estimate PDO, and the heartbeat when it is due. A late estimate is withdrawn."""
         one, two = self._joints
         now = time.monotonic_ns()
         self._budget.ended(now)
@@ -288,7 +288,7 @@ class Cycle:
             self._send(self._heartbeat)
 
     def record(self) -> None:
-        """Hand the cycle over to the ring, update counters and, every n-th cycle, the snapshot."""
+        """Write the cycle to the ring, update counters and, every n-th cycle, the snapshot."""
         intake, frames, (one, two) = self.intake, self._frames, self._joints
         slot = frames.slot
         stale, late, duplicate, rejected = self._before
@@ -323,7 +323,7 @@ class Cycle:
         self.index += 1
 
     def hold_back(self) -> bool:
-        """True when this slot must pass without SYNC, so that late frames can be told from lost ones (see intake)."""
+        """Return whether this slot must pass without SYNC, to distinguish late frames from lost ones (see intake)."""
         gaps = self.intake.gaps
         if not (gaps.wanted or gaps.open):
             return False
@@ -337,33 +337,33 @@ class Cycle:
         return True
 
     def between(self, frames: bytearray, stamps_ns: Sequence[int], own: Sequence[bool], count: int) -> None:
-        """Frames that came when no cycle was open; arguments as `Intake.drain`."""
+        """Take frames received while no cycle was open; arguments as `Intake.drain`."""
         self.intake.drain(frames, stamps_ns, own, count)
         self._frames.hold(frames, stamps_ns, count, self._temperature_ids)
 
     def skip(self, slots: int) -> None:
-        """Slots that were missed: the index follows the grid, so that a gap in the log shows where they were."""
+        """Skip missed slots: the index follows the grid, so that a gap in the log shows them."""
         self.index += slots
 
     @property
     def complete(self) -> bool:
-        """The last cycle had every input that it waited for."""
+        """Return whether the last cycle had every input that it waited for."""
         return bool(self._flags & cr.FLAG_COMPLETE)
 
     def reset_faults(self) -> None:
-        """Release latched faults before the next cycle's estimate (`jtq control reset`); the record says so."""
+        """Release latched faults before the next estimate (`jtq control reset`); the record says so."""
         for joint in self._joints:
             if joint.reset_latch():
                 self._next_flags = cr.FLAG_RESET
                 self._counters.latch_resets += 1
 
     def use_own(self) -> None:
-        """After another loop's state has been put in place: estimators and limits are those built here."""
+        """Use the estimators and limits built here, after the state of another loop was restored."""
         for joint in self._joints:
             joint.use(joint.estimator, joint.safety)
 
     def leave(self) -> None:
-        """Send a last estimate with status off, so that nobody holds on to the last number."""
+        """Send a last estimate with status off, so that no receiver keeps the last torque."""
         one, two = self._joints
         one.withdraw(st.OFF)
         two.withdraw(st.OFF)

@@ -33,7 +33,7 @@ class EstimatePdo(NamedTuple):
 
 
 def field(torque_nm: float, sigma_nm: float, status: int) -> tuple[int, int, int]:
-    """Integers (torque, sigma, status) of one joint; a torque or sigma that is none, or does not fit, is status 15."""
+    """Return the integers (torque, sigma, status) of one joint; an invalid torque or sigma becomes status 15."""
     if status not in PUBLISHED_STATUSES:
         return NO_TORQUE, SIGMA_UNKNOWN, status
     counts = torque_nm * 100.0
@@ -45,12 +45,12 @@ def field(torque_nm: float, sigma_nm: float, status: int) -> tuple[int, int, int
 
 
 def encode(one: tuple[int, int, int], two: tuple[int, int, int], sequence: int) -> bytes:
-    """Eight bytes from the `field`s of both joints and the SYNC counter of the inputs."""
+    """Encode eight bytes from the `field`s of both joints and the SYNC counter of the inputs."""
     return LAYOUT.pack(one[0], two[0], one[1], two[1], one[2] | two[2] << 4, sequence)
 
 
 def decode(data: bytes) -> EstimatePdo:
-    """Content of the eight bytes; raises struct.error on any other length."""
+    """Decode the eight bytes; raises struct.error on any other length."""
     torque_1, torque_2, sigma_1, sigma_2, status, sequence = LAYOUT.unpack(data)
 
     def torque(counts: int) -> float | None:

@@ -50,7 +50,7 @@ class InputPdo:
 
 
 class InputState:
-    """What the intake knows of one synchronous PDO: its frame of this cycle, its debt, and when it usually comes.
+    """State of one synchronous PDO in the intake: frame of this cycle, missing frames, usual arrival.
 
     With slots, because five of them are touched in every cycle.
     """
@@ -100,7 +100,7 @@ class InputState:
         """0 while its node is absent or not configured: nobody waits for it then."""
 
     def wrong_length(self, length: int) -> None:
-        """A frame of `length` bytes, which is not that of the mapping (CiA 301: 8210h shorter, 8220h longer)."""
+        """Count a frame of `length` bytes, which differs from the mapping (CiA 301: 8210h shorter, 8220h longer)."""
         self.rejected += 1
         if length < self.length:
             self.short += 1
@@ -108,7 +108,7 @@ class InputState:
             self.long += 1
 
     def usual(self, delay_ns: int) -> bool:
-        """One frame came while an earlier one is missing: does its delay tell that it is this cycle's own?"""
+        """Return whether the delay of a frame shows that it is this cycle's own, while an earlier one is missing."""
         low, high = self.band_low_ns, self.band_high_ns
         return (
             delay_ns >= 0
@@ -117,7 +117,7 @@ class InputState:
         )
 
     def learn(self, delay_ns: int) -> None:
-        """Follow the arrivals: at once outwards, slowly inwards."""
+        """Learn the arrival band: widen at once, narrow slowly."""
         if delay_ns < self.band_low_ns:
             self.band_low_ns = delay_ns
         else:
@@ -162,7 +162,7 @@ class JointTemperature:
         self.lost = self.rejected = 0
 
     def receive(self, frames: bytearray, offset: int) -> bool:
-        """Take the frame (`struct can_frame`) at `offset`; False for a wrong length."""
+        """Decode the frame (`struct can_frame`) at `offset`; return False for a wrong length."""
         if frames[offset + 4] != _FIELD.size:
             self.rejected += 1
             return False
@@ -172,7 +172,7 @@ class JointTemperature:
         return True
 
     def at(self, cycle: int) -> None:
-        """The inputs of slot number `cycle` have been taken: what is too old by then is not known any more."""
+        """Discard a value that is too old at slot number `cycle`."""
         if self._news:
             self._news = False
             self._until = cycle + self._life
@@ -187,7 +187,7 @@ UNKNOWN = JointTemperature(0, 0, "none", 0)
 
 
 def input_pdos(config: Config) -> list[InputPdo]:
-    """Expected PDOs: both TPDOs of each drive, then one per sensor channel in use."""
+    """Return the expected PDOs: both TPDOs of each drive, then one per sensor channel in use."""
 
     def pdo(pdo_map: PdoMap, node: int, what: str) -> InputPdo:
         return InputPdo(pdo_map.cob_id, pdo_map.length, pdo_map.layout, node, f"{pdo_map.cob_id:03X}h {what}")
@@ -205,14 +205,14 @@ def input_pdos(config: Config) -> list[InputPdo]:
 
 
 def sensor_index(config: Config, channel: int | None) -> int | None:
-    """Index of a sensor channel's PDO among them; None without channel or sensor."""
+    """Return the index of a sensor channel's PDO; None without channel or sensor."""
     if channel is None or config.sensor is None:
         return None
     return 2 * len(config.joints) + config.sensor.channels.index(channel)
 
 
 def joint_temperatures(config: Config) -> list[JointTemperature]:
-    """Temperature of each joint whose drive sends one, in the order of the joints; all unknown yet."""
+    """Return the temperatures of the joints whose drive sends one, in joint order; all unknown at first."""
     life = round(TEMPERATURE_LIFE_S * 1e9 / config.period_ns)
     return [
         JointTemperature(cob_id, node, f"{cob_id:03X}h drive {node} TPDO3", life)

@@ -65,7 +65,7 @@ class Gaps:
         self.wanted = self.open = False
 
     def pass_slot(self) -> None:
-        """This slot has no SYNC."""
+        """Pass a slot without SYNC."""
         self.count += 1
         self.wanted, self.open = False, True
         self.arrivals = 0
@@ -74,7 +74,7 @@ class Gaps:
 
     @property
     def may_go_on(self) -> bool:
-        """Late frames came in the slot that has just passed, and one slot more is not too many."""
+        """Return whether one more slot may pass, as late frames came in the last one."""
         return self.open and self.arrivals > 0 and self.length < _LONGEST
 
 
@@ -110,7 +110,7 @@ class NodeTrust:
         self.restarts: dict[int, int] = {}
 
     def heartbeat(self, node_id: int, state: int, stamp_ns: int) -> bool:
-        """A heartbeat of one byte; False for one with an impossible state: it is none."""
+        """Take a heartbeat of one byte; return False for an impossible state."""
         if state not in STATES:
             return False
         self.states[node_id] = state
@@ -122,17 +122,17 @@ class NodeTrust:
         return True
 
     def configured(self, node_id: int) -> None:
-        """The node's mapping has been written and read back: its PDOs count from the next cycle on."""
+        """Accept a configured node: its PDOs count from the next cycle on."""
         self.absent -= {node_id}
         self._set(node_id, self.unconfigured - {node_id}, wanted=1)
 
     def leave_out(self, node_id: int) -> None:
-        """An optional node that was not there at the start: like one that restarted, but its PDOs are not missed."""
+        """Leave out an optional node that is absent at the start; its PDOs are not counted as missing."""
         self.absent |= {node_id}
         self.doubt(node_id)
 
     def doubt(self, node_id: int) -> None:
-        """Nothing of this node is used from now on."""
+        """Stop using this node."""
         self._set(node_id, self.unconfigured | {node_id}, wanted=0)
 
     def _set(self, node_id: int, unconfigured: frozenset[int], *, wanted: int) -> None:
@@ -186,7 +186,7 @@ class Intake:
         self.late_frames = self.duplicate_frames = self.rejected_frames = self.stale_inputs = 0
 
     def begin(self, counter: int) -> None:
-        """SYNC number `counter` (1..240) has just been sent: nothing is fresh any more."""
+        """Begin a cycle after SYNC number `counter` (1..240) was sent: no input is fresh."""
         self._counter = counter
         gaps, indebted = self.gaps, False
         for state in self._states:
@@ -246,7 +246,7 @@ class Intake:
         return self._missing == 0
 
     def close(self) -> bool:
-        """The deadline has passed, or all are there: decide what may be used.
+        """Close the cycle at the deadline, or when all inputs are received: decide which are used.
 
         Returns:
             True when every PDO of the nodes that are configured is a valid input of this cycle.
@@ -293,7 +293,7 @@ class Intake:
             state.quarantine -= 1
 
     def drain(self, frames: bytearray, stamps_ns: Sequence[int], own: Sequence[bool], count: int) -> None:
-        """Frames that came after the cycle was closed: late for it, or a second copy of what was used."""
+        """Take frames received after the cycle was closed: late, or duplicates."""
         for n in range(count):
             can_id, length = _HEAD.unpack_from(frames, 16 * n)
             state = self._by_id.get(can_id)
@@ -326,19 +326,19 @@ class Intake:
 
     @property
     def unconfigured(self) -> frozenset[int]:
-        """Nodes that are not believed until they have been configured."""
+        """Return the nodes that are not used until they have been configured."""
         return self.nodes.unconfigured
 
     def fresh(self, index: int) -> bool:
-        """True when PDO `index` is an input of the cycle just closed."""
+        """Return whether PDO `index` is an input of the cycle just closed."""
         return self._states[index].fresh
 
     def values(self, index: int) -> tuple[int, ...]:
-        """Raw integers of PDO `index`, in the order of its mapping; meaningful only when fresh."""
+        """Return the raw integers of PDO `index`, in the order of its mapping; meaningful only when fresh."""
         return self._states[index].values
 
     def views(self) -> list[InputState]:
-        """The states themselves, for the loop's fast path: `.fresh` and `.values`."""
+        """Return the states for the loop's fast path: `.fresh` and `.values`."""
         return self._states
 
     def _late(self, state: InputState) -> None:

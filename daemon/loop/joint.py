@@ -35,7 +35,7 @@ class Unwrap:
         self._offset = offset
 
     def counts(self, raw: int) -> int:
-        """Continuous counts; right as long as two samples lie less than 2^31 counts apart."""
+        """Return continuous counts; correct if two samples are less than 2^31 counts apart."""
         step = raw - self._last
         if not -_HALF_RANGE <= step < _HALF_RANGE:
             self._offset += -_FULL_RANGE if step > 0 else _FULL_RANGE
@@ -50,7 +50,7 @@ _PUBLISHED, _STANDSTILL, _field = estimate_pdo.PUBLISHED_STATUSES, st.STANDSTILL
 
 @dataclass(frozen=True)
 class JointInputs:
-    """Where one joint's inputs stand among the intake's PDOs, and what one count of each is worth.
+    """Indices of one joint's inputs among the intake's PDOs, and their scaling.
 
     Attributes:
         position: index of TPDO1 (motor position, link position).
@@ -72,7 +72,7 @@ class JointInputs:
 
 
 class JointCycle:
-    """What the loop, or a replay of its log, keeps of one joint from cycle to cycle.
+    """State of one joint from cycle to cycle, in the loop or in a replay of its log.
 
     Args:
         number: 0 for joint 1, 1 for joint 2.
@@ -139,12 +139,12 @@ class JointCycle:
         self.published = estimate_pdo.field(nan, inf, st.STARTING)
 
     def use(self, estimator: AnyEstimator, safety: JointSafety) -> None:
-        """From now on this estimator with these limits; what is latched stays."""
+        """Use this estimator with these limits; latched faults stay latched."""
         self.estimator, self.safety = estimator, safety
         self._rules.use(safety, estimator.with_network)
 
     def begin_again(self) -> None:
-        """The drive restarted: its positions and the observer's past mean nothing any more."""
+        """Restart after a restart of the drive: earlier positions and the observer's state are invalid."""
         self._motor, self._link = Unwrap(), Unwrap()
         self._last_ns = 0
         self.estimator.reset()
@@ -152,22 +152,22 @@ class JointCycle:
 
     @property
     def latched(self) -> int:
-        """Bits of the faults that are latched (`daemon/shared/cycle_record.py`)."""
+        """Return the bits of the latched faults (`daemon/shared/cycle_record.py`)."""
         return self._rules.latched
 
     def reset_latch(self) -> bool:
-        """Release the latched faults and begin again, with the encoders as they are now. True if there was one."""
+        """Release the latched faults and restart with the present encoder positions; return whether there was one."""
         if not self._rules.reset_latch():
             return False
         self.begin_again()
         return True
 
     def resume(self, motor_offset: int, link_offset: int) -> None:
-        """A log goes on in the middle of a run: by so much the positions had rolled over by then [counts]."""
+        """Continue a log in the middle of a run, with the roll-over of the positions so far [counts]."""
         self._motor, self._link = Unwrap(motor_offset), Unwrap(link_offset)
 
     def rescale(self, node_id: int, factors: Sequence[float]) -> None:
-        """The node, absent at the start, is configured now: its scaling (`SnapshotReader.note_factors`); zeros: none."""
+        """Set the scaling of a node that was absent at the start (`SnapshotReader.note_factors`); zeros: none."""
         inputs, pdos = self.inputs, self._pdos
         if not any(factors):
             return
@@ -185,7 +185,7 @@ class JointCycle:
             self.inputs = replace(inputs, sensor_nm_per_unit=factors[inputs.sensor - first])
 
     def withdraw(self, status: int = st.STALE) -> None:
-        """Take the estimate back: nothing of it goes out or is logged as published. With status 4 it was too late."""
+        """Withdraw the estimate: it is neither sent nor logged as published. With status 4 it was too late."""
         if status == st.STALE:
             status = self._rules.late()
         self.published = estimate_pdo.field(nan, inf, status)
@@ -272,7 +272,7 @@ class JointCycle:
         )
 
     def _reference(self) -> tuple[float, int, int]:
-        """Sensor torque [Nm] of this cycle, its 6150h, and its bit of `input_flags`; NaN and zeros where there is none."""
+        """Return sensor torque [Nm], 6150h and the bit of `input_flags` of this cycle; NaN and zeros without a sensor."""
         sensor = self._sensor
         if sensor is None or not sensor.fresh:
             return nan, 0, 0
@@ -282,7 +282,7 @@ class JointCycle:
         return raw * self.inputs.sensor_nm_per_unit, status, FLAG_SENSOR
 
     def _since_last(self, sync_ns: int) -> float:
-        """Time step [s] from the last cycle with inputs, 0 at the first; the SYNC of this one becomes the last."""
+        """Return the time step [s] since the last cycle with inputs, 0 at the first; store this SYNC as the last."""
         dt_ns = sync_ns - self._last_ns if self._last_ns else 0
         # SYNC keeps an absolute grid: a deviation below the stamps' own accuracy is theirs, not time's.
         if -STAMP_ACCURACY_NS < dt_ns - self._period_ns < STAMP_ACCURACY_NS:
@@ -291,7 +291,7 @@ class JointCycle:
         return dt_ns * 1e-9
 
     def _stale(self, sensor_nm: float, temperature: float, sensor_status: int, flags: int) -> None:
-        """An input of this cycle is missing: the observer keeps its state (the next dt is longer), nothing is published."""
+        """Handle a missing input: the observer keeps its state (the next dt is longer), nothing is published."""
         status, found = self._rules.stale()
         flags |= found
         self.published = estimate_pdo.field(nan, inf, status)

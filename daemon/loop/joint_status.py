@@ -81,7 +81,7 @@ class JointSafety:
 
 
 def safety_of(config: Config) -> list[JointSafety]:
-    """Of joint 1 and 2, as configured."""
+    """Return the configured limits and checks of joints 1 and 2."""
     return [
         JointSafety(config.safety, config.estimator, joint.joint, config.period_ns) for joint in config.joints
     ]
@@ -154,11 +154,11 @@ class JointStatus:
         self.latched = self.latches = self.news = self.reasons = 0
 
     def use(self, settings: SafetySettings) -> None:
-        """From now on these faults are latched; what is held and latched stays."""
+        """Latch these faults from now on; held and latched states stay."""
         self._latching, self._stale_limit = settings.latch, settings.stale_latch_cycles
 
     def update(self, status: int, found: int = 0) -> int:
-        """Status to publish in a cycle that asks for `status` and has the faults `found` (`shared/cycle_record.py`)."""
+        """Return the status to publish for the requested `status` and the faults `found` (`shared/cycle_record.py`)."""
         self._since += 1
         if status == self._held and not found and not self.latched and _RANK[status] <= _WITH_NUMBER:
             self._calm = self._run = self._found = 0
@@ -177,20 +177,20 @@ class JointStatus:
         return self._publish(status, found)
 
     def pass_over(self, cycles: int) -> None:
-        """So many more cycles like the last, which asked for the status that it got: with a number or off, no fault."""
+        """Repeat the last cycle this many times: it got the requested status, and no fault."""
         self._since += cycles
 
     def late(self) -> int:
-        """The estimate of this cycle, whose status `update` has given, was not ready in time: status to publish."""
+        """Return the status to publish if the estimate of this cycle was not ready in time, after `update`."""
         return self._publish(st.STALE, self._another())
 
     def reset_latch(self) -> bool:
-        """Release what is latched; a fault that is still there latches again in the next cycle. True if anything was."""
+        """Release latched faults; an existing fault latches again in the next cycle. Return whether there was one."""
         was, self.latched = self.latched, 0
         return bool(was)
 
     def _another(self) -> int:
-        """One more cycle in a row without a number; the fault STALE when there have been too many."""
+        """Count a consecutive cycle without a torque; return the fault STALE when there were too many."""
         self._run += 1
         return faults.STALE if self._stale_limit is not None and self._run >= self._stale_limit else 0
 
@@ -216,13 +216,13 @@ class JointStatus:
         return self._asked
 
     def _fall(self, status: int) -> None:
-        """A worse status than the one that is held begins."""
+        """Change to a worse status."""
         if _RANK[self._held] <= _WITH_NUMBER < _RANK[status]:
             self._factor = min(2 * self._factor, MOST) if self._since < self._window else 1
         self._needed = self._cycles(status)
 
     def _rise(self, status: int) -> None:
-        """The held status is left for a better one."""
+        """Change to a better status after the hold time."""
         if _RANK[status] <= _WITH_NUMBER < _RANK[self._held]:
             self._since, self._window = 0, RELAPSE * self._needed
         if _RANK[status] <= _WITH_NUMBER:
@@ -231,7 +231,7 @@ class JointStatus:
         self._needed = self._cycles(status)
 
     def _cycles(self, status: int) -> int:
-        """How long a status is held."""
+        """Return the hold time of a status in cycles."""
         needed = NEEDED.get(status, 1)
         return needed if _RANK[status] <= _WITH_NUMBER else needed * self._factor
 
@@ -248,7 +248,7 @@ _FAULTS: Final = tuple((bit, COUNTERS.index(f"fault_{faults.NAMES[bit]}")) for b
 
 
 class JointCounts(Protocol):
-    """Where a joint counts: the loop's snapshot, or two lists in a replay.
+    """Target of a joint's counts: the loop's snapshot, or two lists in a replay.
 
     Attributes:
         counters: in the order of `jtqd.daemon.shared.snapshot.COUNTERS`.
@@ -269,7 +269,7 @@ class JointTally:
         self._number = number
 
     def faults(self, state: JointStatus) -> int:
-        """Count the faults that are new in this cycle; return the flags that tell why there is no number."""
+        """Count the faults that are new in this cycle; return the flags that explain the missing torque."""
         counters = self._counters
         new = state.news
         if new:
@@ -287,7 +287,7 @@ class JointTally:
     def network(
         self, status: int, wanted: bool, network_nm: float, physics_nm: float, limit_nm: float
     ) -> None:
-        """A cycle in which the network is not, or not alone, in charge (status 3), or gave no number."""
+        """Count a cycle in which the network is not fully used (status 3), or gave no torque."""
         counters = self._counters
         if status == st.DEGRADED:
             counters[_FALLBACKS] += 1
@@ -301,7 +301,7 @@ class JointTally:
             counters[_OUTSIDE] += 1
 
     def error(self, difference_nm: float) -> None:
-        """A published estimate minus the sensor's torque."""
+        """Add the error of a published estimate against the sensor."""
         number, errors = self._number, self._errors
         errors[2 * number] += difference_nm**2
         errors[2 * number + 1] += 1.0
@@ -316,7 +316,7 @@ _PUBLISHED, _INVALID, _STARTING = frozenset(st.PUBLISHED), st.INVALID, st.STARTI
 
 
 def drive_status(statusword: int) -> int | None:
-    """Status that a drive's statusword (6041h) puts in place of any other; None for a motor that carries current."""
+    """Return the status forced by a drive's statusword (6041h), or None if the motor carries current."""
     if statusword & 0x6F in _POWERED:
         return None
     return st.DRIVE_FAULT if statusword & 0x4F in _FAULT_STATES else st.OFF
@@ -357,7 +357,7 @@ class JointRules:
         self.use(safety, with_network)
 
     def use(self, safety: JointSafety, with_network: bool) -> None:
-        """From now on these limits; what is held and latched stays."""
+        """Use these limits; held and latched states stay."""
         self._safety, self._with_network = safety, with_network
         self._check = _no_check if safety.plausibility is None else safety.plausibility.step
         self._limit = safety.torque_limit_nm
@@ -367,7 +367,7 @@ class JointRules:
         self._deviates = 0
 
     def begin_again(self) -> None:
-        """The drive restarted: where its encoders stood means nothing any more."""
+        """Restart after a restart of the drive: earlier encoder positions are invalid."""
         self._deviates = 0
         if self._safety.plausibility is not None:
             self._safety.plausibility.reset()
@@ -385,7 +385,7 @@ class JointRules:
         starting: bool,
         network_wanted: bool,
     ) -> tuple[int, int]:
-        """Status to publish and bits of `input_flags`.
+        """Return the status to publish and the bits of `input_flags`.
 
         Time step to current: what the estimate was made of; `sensor_nm` NaN where unknown; while `starting`, an estimate
         with a number has status 1 instead.
@@ -414,13 +414,13 @@ class JointRules:
         return status, flags
 
     def stale(self) -> tuple[int, int]:
-        """An input of this cycle is missing: status to publish and bits of `input_flags`."""
+        """Return status and bits of `input_flags` for a missing input."""
         state = self._state
         status = state.update(st.STALE)
         return status, self._tally.faults(state) if state.reasons or state.latched else 0
 
     def late(self) -> int:
-        """The estimate that `judge` has seen, or the missing one, was not ready in time: status to publish."""
+        """Return the status to publish if the estimate was not ready in time."""
         return self._state.late()
 
     @property
@@ -429,11 +429,11 @@ class JointRules:
         return self._state.latched
 
     def reset_latch(self) -> bool:
-        """Release what is latched; True if anything was."""
+        """Release latched faults; return whether there was one."""
         return self._state.reset_latch()
 
     def _numbers(self, estimate: Estimate, sensor_nm: float, network_wanted: bool) -> int:
-        """Faults of numbers that the estimator takes for good."""
+        """Return the faults of numbers that the estimator marked as good."""
         torque, sigma, status, _, physics, network = estimate
         safety = self._safety
         limit = safety.torque_limit_nm

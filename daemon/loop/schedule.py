@@ -37,7 +37,7 @@ class Grid:
         return skipped
 
     def too_late(self, now_ns: int) -> bool:
-        """True when the current slot's time has passed by more than half a period (woken too late)."""
+        """Return whether the current slot's time has passed by more than half a period (late wake-up)."""
         return now_ns - self.slot_ns > self._half_ns
 
 
@@ -60,7 +60,7 @@ class WakeUp:
         self.wait_ns, self.deadline_ns = wait_ns, deadline_ns
 
     def follow(self, last_delay_ns: int) -> None:
-        """The last input of a complete cycle came so long after its SYNC."""
+        """Learn from a complete cycle: the last input arrived this long after its SYNC."""
         if last_delay_ns + _MARGIN_NS > self.wait_ns:
             self.wait_ns = min(self.wait_ns + 99 * _STEP_NS, self.deadline_ns - _MARGIN_NS)
         else:
@@ -85,7 +85,7 @@ class _Cost:
         self.wanted = True
 
     def took(self, spent_ns: int) -> None:
-        """The estimate of this cycle took so long."""
+        """Learn the duration of this cycle's estimate."""
         cost = self.cost_ns
         if not self.wanted:
             self.cost_ns = cost - cost // FORGET_CYCLES - 1 if cost > 0 else 0
@@ -97,7 +97,7 @@ class _Cost:
 
 
 class NetworkBudget:
-    """Is there time for the networks before the next SYNC? If not, this cycle is physics only.
+    """Time budget of the networks before the next SYNC; without time the cycle is physics only.
 
     Call `first`, `second` and `ended` in each cycle, around the estimates of joint 1 and joint 2. Joint 1 comes first and
     leaves time for joint 2.
@@ -115,14 +115,14 @@ class NetworkBudget:
         self._end_ns = self._since_ns = 0
 
     def first(self, now_ns: int, next_sync_ns: int) -> bool:
-        """The estimate of joint 1 begins now: may it use its network? `next_sync_ns`: when the next SYNC is due."""
+        """Return whether joint 1, whose estimate begins, may use its network; `next_sync_ns`: due time of the next SYNC."""
         self._since_ns, self._end_ns = now_ns, next_sync_ns - RESERVED_NS
         wanted = now_ns + self._one.cost_ns + self._two.cost_ns <= self._end_ns
         self._one.wanted = wanted
         return wanted
 
     def second(self, now_ns: int) -> bool:
-        """The estimate of joint 1 is there: may joint 2 use its network?"""
+        """Return whether joint 2 may use its network, after joint 1's estimate."""
         self._one.took(now_ns - self._since_ns)
         self._since_ns = now_ns
         wanted = now_ns + self._two.cost_ns <= self._end_ns
@@ -130,5 +130,5 @@ class NetworkBudget:
         return wanted
 
     def ended(self, now_ns: int) -> None:
-        """The estimate of joint 2 is there."""
+        """Note the end of joint 2's estimate."""
         self._two.took(now_ns - self._since_ns)

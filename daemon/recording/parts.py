@@ -48,12 +48,12 @@ class OwnFile(NamedTuple):
 
 
 def part_name(prefix: str, run: str, part: int) -> str:
-    """Name of a finished part."""
+    """Return the name of a finished part."""
     return f"{prefix}-{run}-{part:04d}.mcap"
 
 
 def parse(prefix: str, path: Path) -> OwnFile | None:
-    """What the name says; None for a file that is not ours."""
+    """Parse a name; None for a foreign file."""
     found = PART_PATTERN.fullmatch(path.name)
     if found is None or found["prefix"] != prefix:
         return None
@@ -62,7 +62,7 @@ def parse(prefix: str, path: Path) -> OwnFile | None:
 
 
 def own_files(directory: Path, prefix: str) -> list[OwnFile]:
-    """Our regular files in a directory, oldest first; empty where it cannot be read."""
+    """Return our regular files in a directory, oldest first; empty if it cannot be read."""
     try:
         found = [parse(prefix, path) for path in directory.iterdir()]
         return sorted(each for each in found if each and each.path.is_file() and not each.path.is_symlink())
@@ -71,7 +71,7 @@ def own_files(directory: Path, prefix: str) -> list[OwnFile]:
 
 
 def free_run(directory: Path, prefix: str, time_ns: int) -> str:
-    """Name for a run that begins at this time: one that no file there has."""
+    """Return an unused name for a run that begins at this time."""
     stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(time_ns // 1_000_000_000))
     taken = [each.again for each in own_files(directory, prefix) if each.stamp == stamp]
     return f"{stamp}_{max(taken) + 1}" if taken else stamp
@@ -90,7 +90,7 @@ class Sized(NamedTuple):
 
 
 def sized(files: Sequence[OwnFile]) -> list[Sized]:
-    """The files that are still there, with their lengths."""
+    """Return the existing files with their lengths."""
     found = []
     for file in files:
         with suppress(OSError):
@@ -99,7 +99,7 @@ def sized(files: Sequence[OwnFile]) -> list[Sized]:
 
 
 def to_remove(files: Sequence[Sized], budget: int, growing: int, run: str, *, keep_run: bool) -> list[Sized]:
-    """Files whose removal brings the rest within a budget; the budget may stay exceeded. Pure.
+    """Return the files to remove for a budget; the budget may stay exceeded. Pure.
 
     Only finished files, those of earlier runs first, the oldest first. Of the run being written finished parts go only where
     `keep_run` is false, after all others, and never the newest of them.
@@ -153,7 +153,7 @@ class Rules:
 
 
 class Parts:
-    """Takes sealed chunks and has them on the disk, or counts their cycles as lost.
+    """Writes sealed chunks, or counts their cycles as lost.
 
     Args:
         rules: of this run.
@@ -208,13 +208,13 @@ class Parts:
 
     @property
     def is_open(self) -> bool:
-        """There is a file."""
+        """Return whether a file is open."""
         return self._file is not None
 
     # ---- begin and end ----
 
     def open(self, why: str) -> bool:
-        """Begin the next part; False, reported once, where that is not possible."""
+        """Begin the next part; if that fails, report it once and return False."""
         rules = self._rules
         try:
             if free_bytes(rules.directory) < rules.reserve * (_ROOM_AGAIN if self.obstacle else 1.0):
@@ -264,7 +264,7 @@ class Parts:
             )
 
     def attach(self, attachments: Sequence[NamedData]) -> None:
-        """From the next part on these are attached."""
+        """Attach these files from the next part on."""
         self._head = self._head._replace(attachments=attachments)
 
     def rotate(self, why: str) -> None:
@@ -276,7 +276,7 @@ class Parts:
     # ---- chunks ----
 
     def write(self, chunk: SealedChunk, at_ns: int) -> None:
-        """Have a chunk on the disk, or count it; `at_ns` is the CLOCK_MONOTONIC time of its last cycle."""
+        """Write a chunk, or count it as lost; `at_ns` is the CLOCK_MONOTONIC time of its last cycle."""
         self._now_ns = at_ns
         if self._file is None and not self._try_again():
             self._miss(chunk.cycles)
@@ -302,7 +302,7 @@ class Parts:
             self.rotate("size")
 
     def _append(self, chunk: SealedChunk) -> bool:
-        """False when it did not go into the file, which then has been ended."""
+        """Append a chunk; return False if it failed and the file was ended."""
         file = self._file
         assert file is not None
         try:
@@ -324,7 +324,7 @@ class Parts:
         self._missed += cycles
 
     def _gone(self, file: McapFile) -> None:
-        """Somebody has removed the file: what was in it is lost."""
+        """Handle a removed file: its cycles are lost."""
         file.abandon()
         count, self._cycles = self._cycles, 0
         self._account.written -= count
@@ -335,7 +335,7 @@ class Parts:
     # ---- obstacles ----
 
     def _no_room(self) -> bool:
-        """Less is free than shall stay free. Always False."""
+        """Handle a disk below the reserve. Always False."""
         free, reserve = self.free_bytes / MEGABYTE, self._rules.reserve / MEGABYTE
         text = (
             f"recording pauses: {free:.4g} MB are free in {self._rules.directory}, {reserve:.4g} MB stay free"
@@ -371,7 +371,7 @@ class Parts:
     # ---- budget ----
 
     def _enforce_budget(self) -> None:
-        """Remove what the budget asks for, oldest first."""
+        """Remove files to meet the budget, oldest first."""
         rules = self._rules
         active = part_name(rules.prefix, rules.run, self._part) + ACTIVE
         files = [each for each in own_files(rules.directory, rules.prefix) if each.path.name != active]
