@@ -37,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    result.add_argument("verb", choices=VERBS, help="the order")
+    result.add_argument("verb", choices=VERBS, help="order")
     result.add_argument("--bus", help="daemon on this bus (default: the only running one)")
     result.add_argument("--json", action="store_true", help="print the reply as JSON")
     return result

@@ -1,4 +1,4 @@
-"""`jtq doctor`: is this machine fit for jtqd? Kernel, rights, CAN interface, files, directories, packages."""
+"""`jtq doctor`: examine whether this machine is suitable for jtqd: kernel, rights, CAN interface, files, packages."""
 
 from __future__ import annotations
 
@@ -206,7 +206,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq doctor`."""
     result = argparse.ArgumentParser(
         prog="jtq doctor",
-        description="Examine whether this machine is fit for jtqd: GOOD, WARN or FAIL for each item, and what to do. "
+        description="Examine whether this machine is suitable for jtqd: GOOD, WARN or FAIL for each item, with a remedy. "
         "Nothing is changed.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,

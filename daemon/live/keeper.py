@@ -21,7 +21,7 @@ _PAUSE_S = 1.0
 
 
 class LiveKeeper:
-    """The live view of one run of jtqd. Whatever happens to it, the loop goes on.
+    """Live view of one run of jtqd; its failures do not affect the loop.
 
     Args:
         start_child: (module, arguments, name) -> child; the supervisor ends what it has started.
@@ -36,7 +36,7 @@ class LiveKeeper:
         self._starts: list[float] = []
 
     def start(self, config: Config, directory: Path, bus: str) -> None:
-        """Begin to serve what the daemon leaves in its runtime directory.
+        """Start the live view of the daemon's runtime directory.
 
         Args:
             config: in force.
@@ -61,11 +61,11 @@ class LiveKeeper:
 
     @property
     def pid(self) -> int | None:
-        """Process-ID of the live view; None while there is none."""
+        """Return the process-ID of the live view, or None."""
         return self._child.pid if self._child is not None and self._child.alive() else None
 
     def watch(self) -> None:
-        """Pass on what it says; start it again when it died, at most once a second, and not for ever."""
+        """Report its output; restart it when it died, at most once a second and five times a minute."""
         if self._child is None:
             return
         ended = not self._child.alive()  # asked first: what it said before its end is then in the pipe

@@ -56,7 +56,7 @@ class RecoverError(LogError):
 
 @dataclass(frozen=True)
 class Recovery:
-    """What was found in a file and done to it.
+    """Result of a recovery.
 
     Attributes:
         path: the file as it is called now.
@@ -84,12 +84,12 @@ class Recovery:
     findings: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """For `json.dumps`."""
+        """Return the result for `json.dumps`."""
         return asdict(self) | {"path": str(self.path), "findings": list(self.findings)}
 
 
 def recover(path: Path, *, dry_run: bool = False, keep_free: int = 0) -> Recovery:
-    """Write a damaged file anew, as far as it is whole, and take `.active` off its name.
+    """Recover a damaged file as far as it is intact, and remove `.active` from its name.
 
     A file that is whole is not touched; recovering again changes nothing.
 
@@ -144,7 +144,7 @@ def recover(path: Path, *, dry_run: bool = False, keep_free: int = 0) -> Recover
 
 
 def _refuse(path: Path, found: Contents) -> None:
-    """Raise RecoverError for a file that has nothing to copy, or messages that would be lost by it."""
+    """Raise RecoverError for a file without readable content, or with messages that would be lost."""
     foreign = found.header is not None and not found.header.library.startswith("jtqd")
     if found.loose_messages and (foreign or not found.chunks):
         raise RecoverError(
@@ -168,7 +168,7 @@ class _Report:
 
 
 def _report(source: Source, found: Contents, own: Summary | None) -> _Report:
-    """Findings about a file that must be written anew."""
+    """Return the findings about a file that must be rewritten."""
     report = _Report()
     for gap in sorted(found.gaps, key=lambda each: each.start):
         size = gap.end - gap.start
@@ -250,7 +250,7 @@ class _Copy:
 
 
 def _replace(path: Path, source: Source, found: Contents, keep_free: int) -> int:
-    """Write what was found beside the file, check it and put it in its place; returns its descriptor, which is locked.
+    """Write the intact content beside the file, check it and replace the file; return its locked descriptor.
 
     Raises:
         RecoverError: the copy does not read back.
@@ -405,7 +405,7 @@ def _is_being_written(path: Path) -> bool:
 
 
 def _leftovers(arguments: list[str]) -> int:
-    """Recover all files that an earlier run left; exit status 0, or 2 for wrong use."""
+    """Recover all files of earlier runs; exit status 0, or 2 for wrong use."""
     if len(arguments) != 3 or not arguments[2].isdigit():
         print("usage: python -m jtqd.daemon.logs.recover DIRECTORY PREFIX RESERVE_BYTES", file=sys.stderr)
         return 2

@@ -81,7 +81,7 @@ def _files(paths: list[Path]) -> Iterator[Path]:
 
 
 def _has_footer(path: Path) -> bool:
-    """The file ends properly; also True for one that cannot be opened."""
+    """Return whether the file ends properly; also True if it cannot be opened."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except OSError:

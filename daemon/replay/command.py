@@ -30,12 +30,12 @@ from jtqd.estimator.settings import METHODS
 
 
 def number(count: int) -> str:
-    """Thousands by a narrow gap: 29 981."""
+    """Format a number with narrow gaps between thousands: 29 981."""
     return f"{count:,}".replace(",", " ")
 
 
 def text(result: Result, *, compared: bool) -> str:
-    """Everything about one run; `compared`: with the differences, although the models are those of the log."""
+    """Return the report of one run; `compared`: with the differences, although the models are those of the log."""
     lines = [*_head(result)]
     if result.identity is not None:
         lines += _identity(result, result.identity)
@@ -222,7 +222,7 @@ def _flush(file: McapFile, builder: ChunkBuilder) -> None:
 
 
 def _attachments(results: list[Result]) -> list[NamedData]:
-    """Those of the first log, and what was done."""
+    """Return the attachments of the first log and a description of the replay."""
     kept = read_attachments(results[0].run.parts[0].path)
     made = json.dumps({"schema": "jtq.replay/1", "runs": [each.to_mapping() for each in results]}).encode()
     return [
@@ -369,7 +369,7 @@ def _failed(bar: _Bar, line: str) -> int:
 
 
 class _Bar:
-    """Progress on a terminal; nothing elsewhere."""
+    """Progress bar on a terminal; nothing elsewhere."""
 
     def __init__(self) -> None:
         self._progress = None

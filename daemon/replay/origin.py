@@ -59,7 +59,7 @@ FRAMES: dict[str, np.dtype[Any]] = {
 def check_fields(
     records: npt.NDArray[np.void], needed: Mapping[str, np.dtype[Any]], path: Path, topic: str
 ) -> None:
-    """Raises LogError where a field is missing or is of another type."""
+    """Check the fields. Raises LogError for a missing field or another type."""
     for name, expected in needed.items():
         found: np.dtype[Any] = records.dtype
         for step in name.split("."):
@@ -75,7 +75,7 @@ CONFIGURATION, PROVENANCE = "configuration.yaml", "provenance.json"
 
 @dataclass(frozen=True)
 class Origin:
-    """What one log was recorded with.
+    """Configuration, models and scaling of one log.
 
     Attributes:
         config: as it was in force; its paths lead into the private directory.

@@ -49,8 +49,8 @@ def parser() -> argparse.ArgumentParser:
     """Options of `jtq excitation`."""
     made = argparse.ArgumentParser(
         prog="jtq excitation",
-        description="Design Fourier trajectories of velocity and driving current that determine the losses of a joint best "
-        "(differential evolution, D-optimality).",
+        description="Design Fourier trajectories of velocity and driving current to identify the losses of a joint\n"
+        "(D-optimality, differential evolution).",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

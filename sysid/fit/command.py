@@ -419,12 +419,12 @@ def _lines(joint: Joint, fit: FusedFit) -> list[str]:
 
 
 KINDS: Final = {
-    "efficiency": (efficiency_main, "Eq. (8) per quadrant, from plateaus: efficiency"),
+    "efficiency": (efficiency_main, "efficiency: Eq. (8) per quadrant, from plateaus"),
     "friction": (
         friction_main,
-        "Coulomb and viscous friction at no load, from plateaus: friction",
+        "Coulomb and viscous friction at no load, from plateaus",
     ),
-    "losses": (losses_main, "additive loss over load and velocity, from whole runs: losses"),
+    "losses": (losses_main, "additive loss over load and velocity, from whole runs"),
 }
 """Kind -> (its `main(argv) -> int`, one line of help)."""
 

@@ -225,7 +225,7 @@ def parser() -> argparse.ArgumentParser:
         "--network",
         choices=sorted(_ITERATIONS),
         required=True,
-        help="paper: section III, absolute angles, 6-20-40-10-1; ours: correction to the fused physics, 7-16-16-4",
+        help="paper: section III, absolute angles, 6-20-40-10-1; ours: correction to the fused physics, 3-16-16-4",
     )
     parser.add_argument(
         "--out",
