@@ -90,7 +90,7 @@ def _run(step: Step) -> int:
         if now <= done:
             return status
         done = now
-        print(f"jtq reproduce: {now} runs are done, the campaign continues", file=sys.stderr, flush=True)
+        print(f"jtq reproduce: runs done: {now}; the campaign continues", file=sys.stderr, flush=True)
 
 
 def _runs_done(campaign: Path) -> int:

@@ -181,9 +181,10 @@ class Diagnostics:
     def _recorder(self, account: Account, state: RecorderState) -> Status:
         level, text = OK, state.mode
         if account.lost:
-            level, text = WARN, f"{account.lost} cycles lost so far"
+            level, text = WARN, f"{account.lost} cycle{'s' if account.lost != 1 else ''} lost so far"
         if account.lost > self._lost:
-            level, text = ERROR, f"{account.lost - self._lost} cycles lost since the last message"
+            lost = account.lost - self._lost
+            level, text = ERROR, f"{lost} cycle{'s' if lost != 1 else ''} lost since the last message"
         values: dict[str, float | str] = {
             "mode": state.mode,
             "backlog": state.backlog,

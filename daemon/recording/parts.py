@@ -329,7 +329,7 @@ class Parts:
         count, self._cycles = self._cycles, 0
         self._account.written -= count
         self._account.unwritten += count
-        text = f"part {self._part} was removed while it was being written: {count} cycles are lost with it"
+        text = f"part {self._part} was removed while it was being written: cycles lost with it: {count}"
         self._journal.report(schemas.FILE_REMOVED, text, level=ERROR, count=count)
 
     # ---- obstacles ----
@@ -365,7 +365,7 @@ class Parts:
     def _went_on(self) -> None:
         self.obstacle = ""
         count, self._missed = self._missed, 0
-        text = f"recording continues in part {self._part}; {count} cycles could not be written"
+        text = f"recording continues in part {self._part}; cycles not written: {count}"
         self._journal.report(schemas.WRITE_FAILED, text, level=ERROR if count else WARN, count=count)
 
     # ---- budget ----

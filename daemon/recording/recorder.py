@@ -152,7 +152,7 @@ class Session:
     def finish(self) -> dict[str, Any]:
         """End everything; returns the summary of the run."""
         account = self.account
-        text = f"recorder stopped: {account.cycles} cycles seen, {account.lost} lost"
+        text = f"recorder stopped: cycles {account.cycles}, lost {account.lost}"
         self.journal.note(schemas.RECORDER_STOPPED, text, level=INFO, time_ns=time.time_ns())
         self._read_notices()
         self.recording.flush()

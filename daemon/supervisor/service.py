@@ -294,7 +294,8 @@ class Service:
             if change["rms_change_nm"] is not None
         )
         self._log(
-            f"reloaded {self._config.path}: in force from cycle {about['took_over']} on, {missed} cycles missed; "
+            f"reloaded {self._config.path}: in force from cycle {about['took_over']} on, "
+            f"{missed} cycle{'s' if missed != 1 else ''} missed; "
             f"on the last {about['cycles']} cycles the estimates change: {changes or 'nothing to compare'}",
             NOTICE,
         )

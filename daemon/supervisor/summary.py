@@ -137,7 +137,9 @@ class Summary:
             shown = path or f"none: {self.recording.get('error') or nothing}"
             parts = len(self.recording.get("paths", ()))
             shown += f" (the last of {parts} parts)" if parts > 1 else ""
-            lines.append(f"log           {shown}" + (f", {lost} cycles lost" if lost else ""))
+            lines.append(
+                f"log           {shown}" + (f", {lost} cycle{'s' if lost != 1 else ''} lost" if lost else "")
+            )
             lines += [
                 f"              {left} (left by a killed recorder)" for left in self.recording.get("left", [])
             ]

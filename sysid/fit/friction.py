@@ -78,7 +78,7 @@ class FrictionFit:
             lines.append(f"{term.name} = {term.value:.4g}  {how}")
         lines.append(
             f"residual in this run {self.rmse_before_nm:.3f} -> {self.rmse_after_nm:.3f} Nm "
-            f"over {self.rows} rows in motion, {self.effective_rows:.0f} effective samples; "
+            f"over {self.rows} rows in motion (effective samples: {self.effective_rows:.0f}); "
             f"condition number {self.condition:.1f}"
         )
         return lines + [f"warning: {text}" for text in self.warnings]

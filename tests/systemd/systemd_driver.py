@@ -288,7 +288,7 @@ def full_disk():
             file.write(bytes(65536))
             file.flush()
     said = journal()
-    matter = re.compile(r".*(?:recording ends|MB are free|No space left).*")
+    matter = re.compile(r".*(?:recording pauses|MB are free|No space left).*")
 
     def told():
         return [line for line in journal().splitlines() if line not in said and matter.match(line)]

@@ -61,7 +61,7 @@ def test_a_reply_is_one_line(
         (FileNotFoundError(), "jtqd accepts no orders now: it is starting or ending"),
         (TimeoutError(), "jtqd did not answer in time"),
         (PermissionError(13, "Permission denied"), "Permission denied"),
-        (NoDaemonError("no jtqd runs on this machine", 1), "no jtqd runs here"),
+        (NoDaemonError("no jtqd runs on this machine", 1), "no jtqd runs on this machine"),
     ],
 )
 def test_a_refusal_is_one_line_on_standard_error(

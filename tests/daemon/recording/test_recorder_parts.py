@@ -342,7 +342,7 @@ def test_file_that_is_removed_costs_what_was_in_it(tmp_path):
     summary = session.finish()
     assert cycles_of(*summary["paths"]) == list(range(before, 2000))
     assert (summary["written"], summary["lost"]) == (2000 - before, before)
-    assert said == [f"part 1 was removed while it was being written: {before} cycles are lost with it"]
+    assert said == [f"part 1 was removed while it was being written: cycles lost with it: {before}"]
     assert metadata_of(summary["paths"][0])["part"] == "2"
     events = [event for _, event in messages_of(*summary["paths"])["/events"]]
     assert [event["count"] for event in events if event["kind"] == EVENT["FILE_REMOVED"]] == [before]
