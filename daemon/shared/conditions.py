@@ -52,7 +52,7 @@ _COMMUNICATION, _MANUFACTURER = 0x10, 0x80
 
 
 class Emcy(NamedTuple):
-    """How a condition shows in EMCY messages of jtqd: error code, bits of 1001h, and bytes 5 to 7."""
+    """EMCY messages of a condition: error code, bits of 1001h, and bytes 5 to 7."""
 
     code: int
     register: int = _COMMUNICATION
@@ -250,7 +250,7 @@ CATALOGUE: Final = {row.name: row for row in _ROWS}
 
 
 class Subject(NamedTuple):
-    """What a condition is about: "joint 1", "node 3", "281h drive 1 TPDO2", "bus".
+    """Subject of a condition: "joint 1", "node 3", "281h drive 1 TPDO2", "bus".
 
     `number` is the drive's node-ID, the node-ID, the COB-ID or 0: the detail of EMCY messages. `joints`: bit 0 joint 1,
     bit 1 joint 2. `node`: node-ID of its events; 0 for none.
@@ -279,7 +279,7 @@ SHOWN_BY_COUNTERS: Final = {
 
 @dataclass(frozen=True)
 class Condition:
-    """One that is present; `since_ns` is CLOCK_MONOTONIC."""
+    """One present condition; `since_ns` is CLOCK_MONOTONIC."""
 
     name: str
     subject: str
@@ -289,7 +289,7 @@ class Condition:
 
     @property
     def line(self) -> str:
-        """Subject and text."""
+        """Return subject and text."""
         return f"{self.subject}: {self.text}"
 
 
@@ -311,7 +311,7 @@ class Line(NamedTuple):
 
 
 class Occurrences(NamedTuple):
-    """How often a condition was present, for how long altogether, and when first (CLOCK_MONOTONIC)."""
+    """Count, total duration and first occurrence (CLOCK_MONOTONIC) of a condition."""
 
     name: str
     subject: str
@@ -321,7 +321,7 @@ class Occurrences(NamedTuple):
 
 
 class _State:
-    """One condition of one subject: present or not, since when, and which lines about it are due.
+    """State of one condition of one subject, and the lines that are due.
 
     A begin sooner than QUIET_S after the last line about one is reported together with its end, or with those that
     follow: neither a flicker nor a flapping contact floods the log.
@@ -364,17 +364,17 @@ class _State:
         self.text = text
 
     def no_end_line(self) -> None:
-        """Leave out the line that its end would have: another one says so."""
+        """Suppress the line at its end, because another line reports it."""
         self._logged = self._again = False
         self._unlogged, self._unlogged_s = 0, 0.0
 
     def _may_repeat(self, now_s: float) -> bool:
-        """Another line about what is present: with details that no line had of late."""
+        """Return whether a present condition may have another line: with details that no recent line had."""
         self._texts = {text: at_s for text, at_s in self._texts.items() if now_s - at_s < QUIET_S}
         return self._again and self.text not in self._texts
 
     def line(self, now_s: float) -> Line | None:
-        """The line that is due, if any."""
+        """Return the line that is due, if any."""
         definition = self.definition
         if not definition.logged:
             return None
@@ -453,11 +453,11 @@ class Conditions:
             listener(Change(state.definition, subject, state.present))
 
     def lines(self, now_s: float) -> list[Line]:
-        """Lines for the operator that are due; each is returned once."""
+        """Return the lines for the operator that are due; each is returned once."""
         return [line for state in self._states.values() if (line := state.line(now_s)) is not None]
 
     def present(self) -> list[Condition]:
-        """Every condition that is present, the worst first, then the oldest."""
+        """Return every present condition, the worst first, then the oldest."""
         found = [
             Condition(
                 state.definition.name,
@@ -472,12 +472,12 @@ class Conditions:
         return sorted(found, key=lambda each: (-each.severity, each.since_ns))
 
     def is_present(self, name: str, subject: str) -> bool:
-        """True while this condition of this subject is present."""
+        """Return whether this condition of this subject is present."""
         state = self._states.get((name, subject))
         return state is not None and state.present
 
     def history(self, now_s: float) -> list[Occurrences]:
-        """Every condition that was present at any time, in the order of the first time."""
+        """Return every condition that was present at any time, in the order of the first time."""
         found = [
             Occurrences(
                 state.definition.name,
@@ -493,7 +493,7 @@ class Conditions:
 
 
 class ConditionsFile:
-    """Keeps `conditions.json` in `directory` up to date; what cannot be written is left out, as nothing depends on it."""
+    """Keeps `conditions.json` in `directory` up to date; write errors are ignored, as nothing depends on the file."""
 
     def __init__(self, directory: Path) -> None:
         self._path, self._new = directory / FILE, directory / (FILE + ".new")
@@ -513,7 +513,7 @@ class ConditionsFile:
 
 
 def read_conditions(directory: Path) -> list[Condition]:
-    """Conditions of the daemon with this runtime directory, the worst first; none where there is no file of this version.
+    """Read the conditions of the daemon with this runtime directory, the worst first; none without a valid file.
 
     They are as of the supervisor's last look: whether that still runs, `jtqd.daemon.shared.runtime_dir.About.running` tells.
     """
@@ -527,6 +527,6 @@ def read_conditions(directory: Path) -> list[Condition]:
 
 
 def worst(conditions: Iterable[Condition], subject: str) -> Condition | None:
-    """The worst condition of this subject, the oldest of them; None where there is none."""
+    """Return the worst condition of this subject, the oldest of them, or None."""
     own = [each for each in conditions if each.subject == subject]
     return max(own, key=lambda each: (each.severity, -each.since_ns), default=None)

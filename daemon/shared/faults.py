@@ -50,12 +50,12 @@ MEANINGS: Final = {
 
 
 def names_of(bits: int) -> tuple[str, ...]:
-    """Names of the faults in `bits`, in the order of their bits."""
+    """Return the names of the faults in `bits`, in the order of their bits."""
     return tuple(name for bit, name in NAMES.items() if bits & bit)
 
 
 def status_of(bits: int) -> int:
-    """Status that is published while these faults are latched; `bits` is not 0."""
+    """Return the status that is published while these faults are latched; `bits` is not 0."""
     if bits & DRIVE_FAULT:
         return st.DRIVE_FAULT
     return st.STALE if bits == STALE else st.INVALID

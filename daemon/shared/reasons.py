@@ -76,13 +76,13 @@ def joint_reason(about: About, number: int, view: View, earlier: View) -> str:
 
 
 def fault_meanings(faults: int, *, names: bool = False) -> str:
-    """Faults (`jtqd.daemon.shared.cycle_record`) in words, with their names where wanted."""
+    """Return faults (`jtqd.daemon.shared.cycle_record`) in words, optionally with their names."""
     each = (f"{MEANINGS[bit]} ({NAMES[bit]})" if names else MEANINGS[bit] for bit in NAMES if faults & bit)
     return ", ".join(each) or "an unknown fault"
 
 
 def drive_state(statusword: int) -> str:
-    """State of a CiA 402 drive by its statusword (6041h)."""
+    """Return the state of a CiA 402 drive by its statusword (6041h)."""
     return _DRIVE_STATES.get(_state_bits(statusword), f"statusword {statusword:04X}h")
 
 
@@ -102,7 +102,7 @@ def _state_bits(statusword: int) -> int:
 
 
 def degraded_reason(seen: JointView, network_limit_nm: float) -> str:
-    """Explain status 3 (degraded): why the network is not in charge; `network_limit_nm`: how far from physics it may be."""
+    """Explain status 3 (degraded): why the network is not fully used; `network_limit_nm`: limit against physics."""
     if seen.input_flags & FLAG_NETWORK_SKIPPED:
         return "no time for the network in this cycle: physics only"
     if not isfinite(seen.network_nm):
@@ -126,7 +126,7 @@ def _stale(about: About, joint: AboutJoint, seen: JointView, view: View, earlier
 def stale_reason(
     node: int, names: Sequence[str], seen: JointView, view: View, earlier: Mapping[str, int]
 ) -> str:
-    """Explain status 4 (stale). The likeliest cause first: what explains more comes before what explains less.
+    """Explain status 4 (stale), the likeliest cause first.
 
     Args:
         node: the joint's drive.
@@ -157,7 +157,7 @@ def stale_reason(
 
 
 def unready_reason(node: int, view: View) -> str:
-    """Explain why nothing of a node is used: it restarted, is configured otherwise, or is not there; "" for the others."""
+    """Explain why a node is not used: restarted, changed configuration, or absent; "" for the others."""
     if node not in view.unconfigured:
         return ""
     if not view.node_heard_ns[node] and not view.node_states[node]:
@@ -177,7 +177,7 @@ def sensor_reason(node: int | None, name: str, seen: JointView, view: View) -> s
 
 
 def silent_s(view: View, node: int, heartbeat_ms: int) -> float | None:
-    """For how long a node has been silent [s]; None while its heartbeats come, or none has ever come."""
+    """Return how long a node has been silent [s]; None while its heartbeats arrive, or if none ever arrived."""
     heard = view.node_heard_ns[node]
     age_s = (view.sync_realtime_ns - heard) * 1e-9
     return age_s if heard and age_s > SILENT_AFTER * heartbeat_ms * 1e-3 else None

@@ -55,7 +55,7 @@ class Ring:
         self.count: int = self._words[_COUNT_WORD]
 
     def slot(self) -> memoryview:
-        """Memory of the record that the next `commit` publishes."""
+        """Return the memory of the record that the next `commit` publishes."""
         return self._slots[self.count % self._size]
 
     def commit(self) -> None:
@@ -86,7 +86,7 @@ def _existing(path: Path, slots: int, record_size: int) -> mmap.mmap:
 
 
 class Batch(NamedTuple):
-    """What one `RingReader.read` found: whole records in order, and how many were overwritten unread."""
+    """Result of one `RingReader.read`: whole records in order, and the number overwritten unread."""
 
     records: list[bytes]
     lost: int
@@ -121,7 +121,7 @@ class RingReader:
 
     @property
     def backlog(self) -> int:
-        """Records written and not yet read."""
+        """Return the number of records written and not yet read."""
         return self._count() - self.position
 
     def read(self, limit: int = 1024) -> Batch:

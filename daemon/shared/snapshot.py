@@ -282,11 +282,11 @@ class Snapshot:
         os.replace(temporary, path)
 
     def own(self) -> None:
-        """From now on the loop is this process."""
+        """Make this process the loop."""
         _HEAD.pack_into(self._memory, 0, _MAGIC, os.getpid(), *self._head)
 
     def begin(self) -> None:
-        """From here to the end of `write` a reader knows that what it sees is half new (counters and inputs included)."""
+        """Mark the snapshot as inconsistent until the end of `write` (counters and inputs included)."""
         self._sequence[0] |= 1
 
     def write(
@@ -343,7 +343,7 @@ class SnapshotReader:
             raise SnapshotError(f"{path}: not a status snapshot of this version")
 
     def read(self) -> View:
-        """A consistent view; waits while the loop is writing.
+        """Return a consistent view; wait while the loop is writing.
 
         A loop that was killed in the midst of a write never ends it; after `_PATIENCE_S` the reading is of what it left.
         """
@@ -400,7 +400,7 @@ class SnapshotReader:
         )
 
     def work_us(self, *shares: float) -> list[float]:
-        """Quantiles of the work per cycle [us], upper edge of their bin (1.0: the true maximum); NaN without data."""
+        """Return quantiles of the work per cycle [us], upper edge of their bin (1.0: the true maximum); NaN without data."""
         largest = self.read().counters["work_max_ns"]
         return quantiles(self.work_bins(), WORK_BIN_NS, largest, shares)
 
@@ -410,11 +410,11 @@ class SnapshotReader:
         return quantiles(self.late_bins(), LATE_BIN_NS, largest, shares)
 
     def work_bins(self) -> tuple[int, ...]:
-        """Histogram of the work per cycle: cycles in each bin of `WORK_BIN_NS`; the last takes the rest."""
+        """Return the histogram of the work per cycle: cycles in each bin of `WORK_BIN_NS`; the last takes the rest."""
         return self._histogram(_WORK_OFFSET, WORK_BINS)
 
     def late_bins(self) -> tuple[int, ...]:
-        """Histogram of the SYNC's lateness: cycles in each bin of `LATE_BIN_NS`; the last takes the rest."""
+        """Return the histogram of the SYNC's lateness: cycles in each bin of `LATE_BIN_NS`; the last takes the rest."""
         return self._histogram(_LATE_OFFSET, LATE_BINS)
 
     def note_configured(self, node_id: int, restarts: int) -> None:
@@ -442,7 +442,7 @@ class SnapshotReader:
         self._ask(2)
 
     def ask_reset(self) -> int:
-        """Ask the loop to let go of latched faults (supervisor only); returns the number of the request."""
+        """Request the release of latched faults (supervisor only); return the number of the request."""
         return self._ask(0)
 
     def _ask(self, word: int) -> int:
@@ -452,7 +452,7 @@ class SnapshotReader:
 
     @property
     def resets_done(self) -> int:
-        """Number of the last reset request that the loop has carried out."""
+        """Return the number of the last reset request that the loop has executed."""
         return int(_WORD.unpack_from(self._memory, _ORDERS_OFFSET + 8)[0])
 
     def _histogram(self, offset: int, bins: int) -> tuple[int, ...]:

@@ -36,7 +36,7 @@ def metrics_text(
     recorder_lost: int,
     conditions: Sequence[Condition] = (),
 ) -> str:
-    """Text of the whole file; the label `bus` tells daemons apart."""
+    """Return the text of the metrics file; the label `bus` distinguishes daemons."""
     label = bus.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ")
     lines: list[str] = []
 
@@ -81,7 +81,7 @@ def metrics_text(
 
 
 def write_metrics(path: Path, text: str) -> None:
-    """Replace the file at once: a reader never sees half of it. Raises OSError."""
+    """Replace the file atomically. Raises OSError."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         temporary.write_text(text, encoding="utf-8")
@@ -108,7 +108,7 @@ others switch it on, and perhaps only when we are ready."""
 
 
 class Service:
-    """One per run.
+    """Services of one run: systemd, orders, reloads, metrics.
 
     Args:
         config: in force at the start.
@@ -143,7 +143,7 @@ class Service:
         self._status_due = self._metrics_due = 0.0
 
     def open(self, reader: SnapshotReader, reload: Reload) -> None:
-        """The loop runs: take orders. Raises OSError."""
+        """Accept orders when the loop runs. Raises OSError."""
         self._reader, self._reload = reader, reload
         handlers: dict[str, Callable[[Reply], Reply | Answer]] = {
             "ping": self._ping,
@@ -160,11 +160,11 @@ class Service:
         return [*control, *(self._reload.outputs if self._reload is not None else [])]
 
     def want_reload(self) -> None:
-        """SIGHUP. While a reload is under way, another one follows it: the files may have changed since it read them."""
+        """Request a reload (SIGHUP). During a reload another one follows, as the files may have changed."""
         self._reload_wanted = True
 
     def serve(self, loop: Child, view: View, recorder_lost: int) -> Child:
-        """All that is due; returns the loop that runs, which is another one after a reload."""
+        """Run the due services; return the running loop, which changes with a reload."""
         if self._reload_wanted and not self.reloading:
             self._reload_wanted = False
             try:
@@ -189,7 +189,7 @@ class Service:
 
     @property
     def reloading(self) -> bool:
-        """A hand-over may be under way: a loop that has ended may have a successor."""
+        """Return whether a hand-over may be running, so that an ended loop may have a successor."""
         return self._reload is not None and self._reload.running
 
     def not_handed_over(self, why: str) -> None:
@@ -198,17 +198,17 @@ class Service:
             self._reload_failed(self._reload.refused(why))
 
     def stopping(self, why: str = "") -> None:
-        """The daemon begins to end."""
+        """Report the begin of the shutdown."""
         self._notifier.send(
             "STOPPING=1", f"STATUS={why or 'ending: the nodes go to pre-operational, the log is finished'}"
         )
 
     def failed(self, why: str) -> None:
-        """The daemon ends because of this."""
+        """Report the failure that ends the daemon."""
         self._notifier.send(f"STATUS=failed: {why}")
 
     def close(self) -> None:
-        """No more orders."""
+        """Stop accepting orders."""
         if self._reload is not None:
             self._reload.abandon()
         if self._control is not None:
@@ -314,7 +314,7 @@ class Service:
     # State ---------------------------------------------------------------------------------------------------------------
 
     def _estimating(self, view: View) -> bool:
-        """The loop publishes, and every joint whose node must be there has inputs and an estimator that has settled."""
+        """Return whether the loop publishes and every mandatory joint has inputs and a settled estimator."""
         if not view.counters["published"]:
             return False
         mandatory = (joint.mandatory for joint in self._config.joints)

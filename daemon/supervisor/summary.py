@@ -42,13 +42,13 @@ class Summary:
 
     @property
     def exit_status(self) -> int:
-        """0 done, 1 the run ended by a failure, 3 done with cycles missing in the log."""
+        """Return the exit status: 0 done, 1 ended by a failure, 3 done with cycles missing in the log."""
         if self.error:
             return 1
         return 3 if self.recording is not None and self.recording.get("lost", 0) else 0
 
     def content(self) -> dict[str, Any]:
-        """The same as plain data for JSON."""
+        """Return the summary as plain data for JSON."""
         return {
             "cycles": self.cycles,
             "missed": self.missed,
@@ -77,7 +77,7 @@ class Summary:
         )
 
     def text(self) -> str:
-        """The same for people."""
+        """Return the summary as text."""
         counters = self.counters
         lines = [
             f"cycles        {self.cycles}, missed {self.missed}, stale inputs {self.stale_inputs}",
@@ -162,7 +162,7 @@ def summary_of(
     began_s: float,
     stolen_s: float,
 ) -> Summary:
-    """The summary of a run that has ended.
+    """Return the summary of a finished run.
 
     Args:
         reader: snapshot of its loop.
