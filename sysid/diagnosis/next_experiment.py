@@ -538,7 +538,7 @@ def _text(
     """Reason, what is to be separated, what is done, what it takes, what is left to do by hand."""
     parts = [why.strip().rstrip(".") + "."] if why.strip() else []
     aims = [f"to distinguish {', '.join(names[:-1])} from {names[-1]}" for names in classes if len(names) > 1]
-    aims += [f"to detect {names[0]} visible" for names in classes if len(names) == 1]
+    aims += [f"to detect {names[0]}" for names in classes if len(names) == 1]
     parts.append(f"Proposed{' ' if aims else ''}{' and '.join(aims)}:")
     parts += [f"{kind}: {EXPERIMENTS[kind].what}." for kind in kinds]
     if len(joints) == 1 and any(len(names) > 1 for names in classes):

@@ -179,7 +179,7 @@ def test_degraded_and_invalid(bench: About) -> None:
     degraded = WELL._replace(status=st.DEGRADED, physics_nm=10.0, network_nm=10.5)
     assert why(bench, degraded).startswith("outside the network's training range")
     assert "Nm from physics, limit" in why(bench, degraded._replace(network_nm=10.0 - far))
-    assert "not a number" in why(bench, degraded._replace(network_nm=NAN))
+    assert "not finite" in why(bench, degraded._replace(network_nm=NAN))
     assert "no time for the network" in why(bench, degraded._replace(input_flags=0x1F))
     invalid = WELL._replace(status=st.INVALID, torque_nm=NAN)
     found = why(bench, invalid._replace(input_flags=7 | (MOTOR_JUMP | LINK_JUMP) << 8))
