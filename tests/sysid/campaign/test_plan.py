@@ -232,8 +232,8 @@ def test_travel_is_the_largest_distance_and_directions_cancel() -> None:
         ([Plateau(0.1, -5.5, 1.0), Rest(0.5)], ["current", "5", "limit 5 A"]),
         ([Plateau(2.0, 0.0, 6.0), Rest(0.5)], ["travel", "limit 10 rad"]),
         ([Plateau(1.0, 0.0, 1.0, 0.0), Rest(0.5)], ["jump"]),
-        ([Plateau(1.0, 0.0, 1.0)], ["ends at rest"]),
-        ([Rest(0.0, 0.0)], ["no time"]),
+        ([Plateau(1.0, 0.0, 1.0)], ["end at rest"]),
+        ([Rest(0.0, 0.0)], ["no duration"]),
     ],
 )
 def test_a_run_beyond_its_limits_is_refused_before_anything_moves(

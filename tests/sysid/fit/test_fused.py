@@ -253,7 +253,7 @@ def test_runs_without_motion_are_left_out(runs: list[RunSignals]) -> None:
 
 def test_what_cannot_be_fitted_is_refused(runs: list[RunSignals]) -> None:
     with pytest.raises(
-        ValueError, match="found 5 runs, expected at least 6: standard deviations need unseen"
+        ValueError, match="found 5 runs, expected at least 6: standard deviations need held-out"
     ):
         fit_fused(runs[:5], FRICTION)
     with pytest.raises(ValueError, match="found no motion in negative direction"):

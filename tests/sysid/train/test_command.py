@@ -102,6 +102,6 @@ def test_dead_sensor_is_named_and_nothing_is_written(run, tmp_path, capsys, comm
 
 def test_missing_run_and_too_few_runs_of_the_loss_fit(run, tmp_path, capsys):
     assert loss_fit_command.losses_main([str(tmp_path / "no.csv"), "--joint", JOINT]) == 1
-    assert "no.csv: found nothing there" in capsys.readouterr().err
+    assert "no.csv: found nothing" in capsys.readouterr().err
     assert loss_fit_command.losses_main([run(), "--joint", JOINT]) == 1
     assert "found 1 runs, expected at least 6" in capsys.readouterr().err
