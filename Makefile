@@ -76,13 +76,17 @@ bench-kernel: $(VENV)/.installed ## build the kernel with SocketCAN into the cac
 clean: ## remove what make made here; the cached bench kernel stays
 	rm -rf $(VENV) build dist src/*.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+	find daemon drivers estimator models sim_can sysid -name '*.so' -delete
 
 # Three stages of one environment; each stamp is renewed when pyproject.toml changes.
 $(VENV)/.created:
 	@.ci/venv $(VENV)
 	@touch $@
 
-$(VENV)/.installed: pyproject.toml $(VENV)/.created
+# Every compiled module and what it is made of: a change installs, and so compiles, again.
+COMPILED := $(shell find daemon drivers estimator models sim_can sysid -name '*.pyx' -o -name '*.pxd')
+
+$(VENV)/.installed: pyproject.toml setup.py $(COMPILED) $(VENV)/.created
 	@echo "installing jtqd into $(VENV)"
 	@$(PIP) install -e .
 	@touch $@

@@ -17,8 +17,7 @@ from jtqd.daemon.shared import faults
 from jtqd.estimator.checked import ConfigError, Section, range_text
 from jtqd.estimator.decoder import FieldError, Text, check, choice, decode, limits
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.plausibility import PlausibilityLimits
-from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.settings import EstimatorSettings, PlausibilityLimits
 from jtqd.models.files import read_yaml, shipped
 
 DEFAULT_CONFIG: Final = "bench.yaml"

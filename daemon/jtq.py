@@ -88,10 +88,10 @@ def _help() -> str:
 
 def main(argv: list[str] | None = None) -> int:
     """Run a subcommand; returns its exit status (0 done, 1 failure, 2 usage, 3 done with findings or loss, 130 Ctrl-C)."""
+    _open_streams()
     arguments = sys.argv[1:] if argv is None else argv
     if not arguments or arguments[0] in ("-h", "--help", "help"):
-        print(_help(), end="")
-        return 0 if arguments else 2
+        return _run("--help", __name__, arguments)
     name = arguments[0]
     if name == "--version":
         print(f"jtqd {__version__}")
@@ -105,10 +105,27 @@ def main(argv: list[str] | None = None) -> int:
     return _run(name, command[0], arguments[1:])
 
 
+def _open_streams() -> None:
+    """Give what the caller has closed (`>&-`) to /dev/null: no file of a command may take its number, and print() fails."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            null = os.open(os.devnull, os.O_RDWR)
+            os.dup2(null, number)
+            if null != number:
+                os.close(null)
+            setattr(sys, name, open(number, "w" if number else "r", encoding="utf-8", closefd=False))  # noqa: SIM115
+
+
+def _print_help(arguments: list[str]) -> int:
+    print(_help(), end="")
+    return 0 if arguments else 2
+
+
 def _run(name: str, module: str, arguments: list[str]) -> int:
     """Run the command of a module; returns its exit status."""
     try:
-        status = importlib.import_module(module).main(arguments)
+        run = _print_help if module == __name__ else importlib.import_module(module).main
+        status = run(arguments)
         sys.stdout.flush()
     except KeyboardInterrupt:
         return 130

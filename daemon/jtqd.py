@@ -26,6 +26,9 @@ _EXAMPLES = """examples:
 
 exit status: 0 done, 1 failure, 2 usage, 3 done, but cycles are missing in the log"""
 
+_LONGEST_INTERFACE = 15
+"""IFNAMSIZ of Linux without its final zero."""
+
 
 def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtqd`."""
@@ -98,6 +101,10 @@ def _early_signals() -> Iterator[list[int]]:
 def _run(arguments: argparse.Namespace, stop_requests: list[int]) -> int:
     if not arguments.bus:
         parser().error("argument --bus: found '', expected an interface, unix:PATH or sim")
+    if len(arguments.bus) > _LONGEST_INTERFACE and not arguments.bus.startswith("unix:"):
+        parser().error(
+            f"argument --bus: found a name of {len(arguments.bus)} characters, expected at most {_LONGEST_INTERFACE}"
+        )
     if arguments.live is not None and not installed():
         print(f"jtqd: {NEEDED}", file=sys.stderr)
         return 1

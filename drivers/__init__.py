@@ -4,8 +4,9 @@ Frames come in and go out as 16 bytes (`struct can_frame`); numbers are those of
 It imports nothing else of jtqd. canopen and python-can are imported by `boot` (a process of its own) and `can_unix` alone,
 and canopen's EDS parser by `object_dictionary.read_eds` when it is called. Import the modules themselves:
 
-    frame, filters, receive     the 16 bytes, kernel filters, one system call for all frames that have come
-    frame_socket, hub, wire     SocketCAN or a unix socket, alike to use; hub of a unix bus, `python -m jtqd.drivers.hub`
+    frame, filters              the 16 bytes, kernel filters
+    frame_socket, bus_socket    SocketCAN or a unix socket, alike to use, all frames by one system call; opening them
+    hub, wire                   hub of a unix bus, `python -m jtqd.drivers.hub`
     object_dictionary, pdo      objects typed by an EDS, PDO mappings as `struct`, rules for changing them
     sdo, sdo_client, sdo_server the protocol and a queue; blocking clients; the server
     nmt, emcy                   NMT commands and states, EMCY codes

@@ -29,7 +29,7 @@ from jtqd.drivers.can_unix import UnixBus
 from jtqd.drivers.devices import Profile
 from jtqd.drivers.frame import CAN_RTR_FLAG, CAN_SFF_MASK
 from jtqd.drivers.object_dictionary import entries_to_json, read_eds
-from jtqd.drivers.sdo_client import NetworkChannel, SdoClient
+from jtqd.drivers.sdo_client import RESPONSE_ID, NetworkChannel, SdoClient
 
 SYNC_LISTEN_S = 0.12  # a little more than the longest period that jtqd itself may have
 NOTIFIER_S = 0.01  # canopen's default of 1 s is what closing the network would wait for
@@ -80,7 +80,7 @@ def _boot_nodes(
     heartbeats = Heartbeats()
     foreign = ForeignMaster(network, request)
     for profile in request.profiles:
-        network.subscribe(0x700 + profile.node_id, heartbeats.on_heartbeat)
+        network.subscribe(nmt.HEARTBEAT_BASE + profile.node_id, heartbeats.on_heartbeat)
     # Before anything is sent: a second daemon must not disturb the one that runs.
     foreign.require_none()
     foreign.announce()
@@ -135,7 +135,7 @@ def _configure(
 def _require_heartbeat(heartbeats: Heartbeats, node: int, wait_s: float) -> None:
     """Start error control: the node must be heard before it is started."""
     if heartbeats.wait(node, None, wait_s) is None:
-        detail = f"no heartbeat {0x700 + node:03X}h within {wait_s:g} s"
+        detail = f"no heartbeat {nmt.HEARTBEAT_BASE + node:03X}h within {wait_s:g} s"
         raise BootError(node, "1017h:0", expected="heartbeat", found="none", letter="K", detail=detail)
     if heartbeats.restarted(node):
         raise reset_during_boot(node)
@@ -161,9 +161,11 @@ def _require_operational(network: canopen.Network, heartbeats: Heartbeats, node:
 
 def open_bus(request: BootRequest) -> can.BusABC:
     """Open a bus that receives the nodes' answers and heartbeats, SYNC and our own node-ID. Raises BootError."""
-    identifiers = [base + profile.node_id for profile in request.profiles for base in (0x580, 0x700)]
+    identifiers = [
+        base + profile.node_id for profile in request.profiles for base in (RESPONSE_ID, nmt.HEARTBEAT_BASE)
+    ]
     if request.check_foreign_sync:
-        identifiers += [request.settings.sync_cob_id, 0x700 + request.settings.master_node]
+        identifiers += [request.settings.sync_cob_id, nmt.HEARTBEAT_BASE + request.settings.master_node]
     # "extended": False puts CAN_EFF_FLAG into the mask: canopen takes 29-bit frames for 11-bit ones
     mask = CAN_SFF_MASK | CAN_RTR_FLAG
     filters = [{"can_id": cob_id, "can_mask": mask, "extended": False} for cob_id in identifiers]
@@ -200,9 +202,9 @@ class Heartbeats:
         if len(data) != 1:
             return
         with self._changed:
-            self._state[can_id - 0x700] = data[0] & 0x7F
+            self._state[can_id - nmt.HEARTBEAT_BASE] = data[0] & 0x7F
             if data[0] == nmt.BOOT_UP:
-                self._restarted.add(can_id - 0x700)
+                self._restarted.add(can_id - nmt.HEARTBEAT_BASE)
             self._changed.notify_all()
 
     def forget(self, node: int) -> None:
@@ -237,7 +239,7 @@ class ForeignMaster:
         self._syncs = self._own_ids = 0
         if request.check_foreign_sync:
             network.subscribe(request.settings.sync_cob_id, self._on_sync)
-            network.subscribe(0x700 + request.settings.master_node, self._on_own_id)
+            network.subscribe(nmt.HEARTBEAT_BASE + request.settings.master_node, self._on_own_id)
 
     def _on_sync(self, *_: object) -> None:
         self._syncs += 1
@@ -248,7 +250,7 @@ class ForeignMaster:
     def announce(self) -> None:
         """Send jtqd's own boot-up message: another one that is booting too hears it, and neither goes on."""
         if self._request.check_foreign_sync:
-            self._network.send_message(0x700 + self._request.settings.master_node, [nmt.BOOT_UP])
+            self._network.send_message(nmt.HEARTBEAT_BASE + self._request.settings.master_node, [nmt.BOOT_UP])
 
     def require_none(self) -> None:
         """Wait until it has listened long enough. Raises BootError when somebody else is there."""
@@ -262,7 +264,7 @@ class ForeignMaster:
             raise BootError(None, where, expected="no SYNC", found=f"{self._syncs} frames", detail=detail)
         if self._own_ids:
             node = self._request.settings.master_node
-            where = f"COB-ID {0x700 + node:03X}h"
+            where = f"COB-ID {nmt.HEARTBEAT_BASE + node:03X}h"
             detail = (
                 f"another node {node:02X}h, jtqd's own node-ID, is on the bus (heartbeat or boot-up {where})"
             )

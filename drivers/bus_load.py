@@ -21,6 +21,7 @@ from jtqd.drivers.devices import (
     sensor_tpdo2,
 )
 from jtqd.drivers.frame import unstuffed_bits, worst_case_bits
+from jtqd.drivers.nmt import HEARTBEAT_BASE
 from jtqd.drivers.pdo import LAST_SYNC_TYPE, PdoMap
 
 LIMIT = 0.95
@@ -116,7 +117,7 @@ def heartbeat_row(who: str, node: int, heartbeat_ms: int, period_s: float = PERI
     """Return the row of one node's heartbeat."""
     if heartbeat_ms < 1:
         raise BusLoadError(f"heartbeat of {who}: {heartbeat_ms} ms, expected at least 1")
-    return Row(0x700 + node, f"heartbeat {who}", HEARTBEAT_BYTES, period_s * 1e3 / heartbeat_ms)
+    return Row(HEARTBEAT_BASE + node, f"heartbeat {who}", HEARTBEAT_BYTES, period_s * 1e3 / heartbeat_ms)
 
 
 def configured_load(

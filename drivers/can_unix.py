@@ -11,6 +11,7 @@ from typing import Any
 
 import can
 
+from jtqd.drivers.bus_socket import PREFIX
 from jtqd.drivers.filters import CanFilter
 from jtqd.drivers.frame import (
     CAN_EFF_FLAG,
@@ -22,7 +23,7 @@ from jtqd.drivers.frame import (
     FRAME_SIZE,
     MAX_LENGTH,
 )
-from jtqd.drivers.frame_socket import PREFIX, BusError, open_frame_socket
+from jtqd.drivers.frame_socket import BusError, open_frame_socket
 
 
 class UnixBus(can.BusABC):  # type: ignore[misc]

@@ -22,7 +22,7 @@ JOINT_FAULT, FAULT_LATCHED, NODE_CHANGED = 0xFF01, 0xFF02, 0xFF03
 """Of jtqd: a joint has no torque because of a fault; a latched fault waits for its reset; a node is not configured as at its
 boot. The detail is the node-ID."""
 PDO_SHORT, PDO_LONG, SYNC_LENGTH, PDO_TIMEOUT = 0x8210, 0x8220, 0x8240, 0x8250
-GENERIC, COMMUNICATION, MANUFACTURER = 0x01, 0x10, 0x80
+GENERIC, COMMUNICATION = 0x01, 0x10
 """Bits of 1001h."""
 
 _EXACT = {

@@ -22,14 +22,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from types import FrameType
 
+from jtqd.drivers.bus_socket import (
+    BUFFER_BYTES,
+    PREFIX,
+    SO_TIMESTAMPNS,
+    BusError,
+    reachable,
+    require_directory,
+)
 from jtqd.drivers.frame import (
     CAN_ERR_FLAG,
     ECHO_BIT,
     FRAME_SIZE,
     is_frame,
 )
-from jtqd.drivers.frame_socket import BUFFER_BYTES, PREFIX, BusError, reachable, require_directory
-from jtqd.drivers.receive import NOTHING_YET, SO_TIMESTAMPNS, FrameReceiver
+from jtqd.drivers.frame_socket import FrameReceiver
 from jtqd.drivers.wire import WireModel
 
 
@@ -292,9 +299,8 @@ class Hub:
     def _read(self, client: _Client) -> None:
         """Take one batch of frames of `client`; remove it when it has ended."""
         receiver = self._receiver
-        receiver.closed = False
         n = receiver.receive(client.fd)
-        ended = receiver.closed or (n < 0 and -n not in NOTHING_YET)
+        ended = receiver.closed or n < 0
         if n > 0:
             frames = bytes(receiver.frames[: FRAME_SIZE * n])
             lengths, stamps = receiver.lengths, receiver.stamps_ns

@@ -32,6 +32,9 @@ def label(index: int, subindex: int = 0) -> str:
 TOGGLE_NOT_ALTERNATED = 0x0503_0000
 PROTOCOL_TIMED_OUT = 0x0504_0000
 UNKNOWN_COMMAND = 0x0504_0001
+BLOCK_SIZE = 0x0504_0002
+BLOCK_SEQUENCE = 0x0504_0003
+BLOCK_CRC = 0x0504_0004
 OUT_OF_MEMORY = 0x0504_0005
 UNSUPPORTED_ACCESS = 0x0601_0000
 READ_OF_WRITE_ONLY = 0x0601_0001
@@ -39,19 +42,32 @@ WRITE_OF_READ_ONLY = 0x0601_0002
 NO_OBJECT = 0x0602_0000
 NOT_MAPPABLE = 0x0604_0041
 PDO_TOO_LONG = 0x0604_0042
+PARAMETER_INCOMPATIBLE = 0x0604_0043
+DEVICE_INCOMPATIBLE = 0x0604_0047
+HARDWARE_ERROR = 0x0606_0000
 LENGTH_MISMATCH = 0x0607_0010
 LENGTH_TOO_HIGH = 0x0607_0012
 LENGTH_TOO_LOW = 0x0607_0013
 NO_SUBINDEX = 0x0609_0011
 VALUE_RANGE = 0x0609_0030
+VALUE_TOO_HIGH = 0x0609_0031
+VALUE_TOO_LOW = 0x0609_0032
+MAXIMUM_BELOW_MINIMUM = 0x0609_0036
+NO_RESOURCE = 0x060A_0023
 GENERAL_ERROR = 0x0800_0000
+NOT_TRANSFERRED = 0x0800_0020
+LOCAL_CONTROL = 0x0800_0021
 DEVICE_STATE = 0x0800_0022
+NO_DICTIONARY = 0x0800_0023
 NO_DATA = 0x0800_0024
 
 _MEANING = {
     TOGGLE_NOT_ALTERNATED: "toggle bit not alternated",
     PROTOCOL_TIMED_OUT: "SDO protocol timed out",
     UNKNOWN_COMMAND: "unknown SDO command",
+    BLOCK_SIZE: "invalid block size",
+    BLOCK_SEQUENCE: "invalid sequence number",
+    BLOCK_CRC: "CRC error",
     OUT_OF_MEMORY: "out of memory",
     UNSUPPORTED_ACCESS: "unsupported access to an object",
     READ_OF_WRITE_ONLY: "object is write only",
@@ -59,13 +75,23 @@ _MEANING = {
     NO_OBJECT: "object does not exist",
     NOT_MAPPABLE: "object cannot be mapped",
     PDO_TOO_LONG: "mapped objects exceed the PDO",
+    PARAMETER_INCOMPATIBLE: "parameters are incompatible with each other",
+    DEVICE_INCOMPATIBLE: "incompatible within the device",
+    HARDWARE_ERROR: "access failed due to a hardware error",
     LENGTH_MISMATCH: "length does not match the data type",
     LENGTH_TOO_HIGH: "length too high for the data type",
     LENGTH_TOO_LOW: "length too low for the data type",
     NO_SUBINDEX: "sub-index does not exist",
     VALUE_RANGE: "value out of range",
+    VALUE_TOO_HIGH: "value too high",
+    VALUE_TOO_LOW: "value too low",
+    MAXIMUM_BELOW_MINIMUM: "maximum is below the minimum",
+    NO_RESOURCE: "resource not available: SDO connection",
     GENERAL_ERROR: "general error",
+    NOT_TRANSFERRED: "cannot be transferred or stored",
+    LOCAL_CONTROL: "cannot be transferred or stored: the device is under local control",
     DEVICE_STATE: "not in the present device state",
+    NO_DICTIONARY: "no object dictionary: it cannot be made, or is not there",
     NO_DATA: "no data available",
 }
 

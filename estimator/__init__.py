@@ -35,10 +35,9 @@ if TYPE_CHECKING:
     from jtqd.estimator.joint import Effect, Joint
     from jtqd.estimator.methods import estimate_columns, load_network, make_estimator
     from jtqd.estimator.onnx_graph import NetworkError
-    from jtqd.estimator.run import JointColumns, RunTable, RunTableError
+    from jtqd.estimator.run import EstimateRun, JointColumns, RunTable, RunTableError
     from jtqd.estimator.settings import METHODS, EstimatorSettings
     from jtqd.estimator.status import Estimate
-    from jtqd.estimator.whole_run import EstimateRun
 
 __all__ = [
     "METHODS",
@@ -62,7 +61,7 @@ _MODULES = {
     "ConfigError": "checked",
     "Effect": "joint",
     "Estimate": "status",
-    "EstimateRun": "whole_run",
+    "EstimateRun": "run",
     "EstimatorSettings": "settings",
     "Joint": "joint",
     "JointColumns": "run",

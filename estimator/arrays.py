@@ -7,6 +7,7 @@ FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 IntegerArray = npt.NDArray[np.int64]
 CodeArray = npt.NDArray[np.uint16]
+QuadrantArray = npt.NDArray[np.intp]
 StatusArray = npt.NDArray[np.uint8]
 RecordArray = npt.NDArray[np.void]
 """Rows of a structured type, such as the messages of a topic."""

@@ -7,8 +7,10 @@ Every message names the file, the key, what was found and what was expected. Who
 from __future__ import annotations
 
 import math
+import os
 import reprlib
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any, Final
 
 
@@ -269,7 +271,40 @@ def _whole(text: str, low: int) -> int:
     return value
 
 
-# Words of messages.
+# Where results go: looked at before the work for them.
+
+
+def check_output(path: Path) -> None:
+    """Refuse the name of a file that cannot be written. Raises ConfigError."""
+    parent = path.parent
+    if path.is_dir():
+        raise ConfigError(f"{path}: found a directory, expected the name of a file")
+    if not parent.is_dir():
+        what = "a file" if parent.exists() else "no such directory"
+        raise ConfigError(f"{parent}: found {what}, expected a directory for {path.name}")
+    if not os.access(parent if not path.exists() else path, os.W_OK):
+        raise ConfigError(f"{path}: cannot be written: no right to, or a read-only file system")
+
+
+def make_directory(path: Path) -> None:
+    """Make the directory of `--out`, and look whether files can be created in it. Raises ConfigError."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = "it is a file" if isinstance(error, FileExistsError) else error.strerror
+        raise ConfigError(f"--out {path}: cannot be created: {reason}") from None
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise ConfigError(
+            f"--out {path}: files cannot be created there: no right to, or a read-only file system"
+        )
+
+
+# Words of messages, and numbers of JSON.
+
+
+def finite(value: float) -> float | None:
+    """Return the number, or None for NaN and infinity, which JSON does not have."""
+    return value if math.isfinite(value) else None
 
 
 def counted(number: int, noun: str, plural: str = "") -> str:

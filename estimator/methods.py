@@ -7,25 +7,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.checked import ConfigError
-from jtqd.estimator.corrections import acting_effects, needs_torque, plain_joint
-from jtqd.estimator.estimator import (
-    ExtendedEstimator,
-    FusedEstimator,
-    JointEstimator,
-    checked_fused,
-    corrected_by_steps,
-)
+from jtqd.estimator.corrections import acting_effects, extended_run, needs_torque, plain_joint
+from jtqd.estimator.estimator import ExtendedEstimator, FusedEstimator, JointEstimator
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.network import FusedNetwork, TorqueNetwork
-from jtqd.estimator.run import JointColumns
+from jtqd.estimator.run import EstimateRun, JointColumns
+from jtqd.estimator.sample import Estimator
 from jtqd.estimator.settings import EstimatorSettings
-from jtqd.estimator.whole_run import EstimateRun, estimate_observed, estimate_run, extended_run, observe_run
 
-AnyEstimator = JointEstimator | FusedEstimator | ExtendedEstimator
+AnyEstimator = Estimator
 AnyNetwork = TorqueNetwork | FusedNetwork
-_Inputs = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 def load_network(method: str, source: bytes | str, sha256: str | None = None) -> AnyNetwork:
@@ -36,7 +29,7 @@ def load_network(method: str, source: bytes | str, sha256: str | None = None) ->
 def make_estimator(
     joint: Joint, settings: EstimatorSettings, network: AnyNetwork | None = None
 ) -> AnyEstimator:
-    """Return the step-by-step estimator of a joint. Raises ConfigError when joint, method and network do not fit."""
+    """Return the estimator of a joint. Raises ConfigError when joint, method and network do not fit."""
     plain = plain_joint(joint)
     inner: JointEstimator | FusedEstimator
     if settings.method == "fused":
@@ -60,45 +53,28 @@ def estimate_columns(
     return estimate_steps(joint, settings, network, np.diff(time_s, prepend=time_s[0]), columns)
 
 
-def estimate_steps(
+def estimate_steps(  # noqa: PLR0917 - as `estimate_columns`, and which samples have a network
     joint: Joint,
     settings: EstimatorSettings,
     network: AnyNetwork | None,
     dt_s: FloatArray,
     columns: JointColumns,
+    network_wanted: BoolArray | None = None,
 ) -> EstimateRun:
-    """Return the estimates as `estimate_columns`, by time steps: dt_s[k] is the time since sample k-1, 0 starts again."""
-    inputs = _corrected(joint, settings, network, dt_s, columns)
-    joint = plain_joint(joint)
-    if settings.method == "fused":
-        used = _fused(joint, network)
-        torsion = checked_fused(joint, settings, used).torsion
-        observed = observe_run(joint, settings, torsion, dt_s, *inputs, columns.temperature_c)
-        return estimate_observed(joint, settings, used, observed)
-    return estimate_run(joint, settings, _paper(joint, network), dt_s, *inputs)
+    """Return the estimates as `estimate_columns`, by time steps: dt_s[k] is the time since sample k-1, 0 starts again.
+
+    network_wanted [n]: False where there was no time for the network.
+    """
+    current, motor, velocity, link = _inputs(joint, columns)
+    temperature = columns.temperature_c
+    if acting_effects(joint) and not needs_torque(joint):  # all corrections at once
+        current, link = extended_run(joint, settings, dt_s, current, motor, velocity, link, temperature)
+        joint = plain_joint(joint)
+    estimator = make_estimator(joint, settings, network)
+    return estimator.run(dt_s, current, motor, velocity, link, temperature, network_wanted)
 
 
-def _corrected(
-    joint: Joint,
-    settings: EstimatorSettings,
-    network: AnyNetwork | None,
-    dt_s: FloatArray,
-    columns: JointColumns,
-) -> _Inputs:
-    """Return the inputs of the plain joint's estimator; ValueError for a missing column."""
-    inputs = _inputs(joint, columns)
-    if not acting_effects(joint):
-        return inputs
-    if needs_torque(joint):
-        estimator = make_estimator(joint, settings, network)
-        assert isinstance(estimator, ExtendedEstimator)
-        current, link = corrected_by_steps(estimator, dt_s, inputs, columns.temperature_c)
-    else:
-        current, link = extended_run(joint, settings, dt_s, *inputs, columns.temperature_c)
-    return current, inputs[1], inputs[2], link
-
-
-def _inputs(joint: Joint, columns: JointColumns) -> _Inputs:
+def _inputs(joint: Joint, columns: JointColumns) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return current, motor position, motor velocity and link position; ValueError for a missing column."""
     needed = {
         name: getattr(columns, name)

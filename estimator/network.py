@@ -14,10 +14,11 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
-from jtqd.estimator.joint import Joint
-from jtqd.estimator.onnx_graph import OnnxGraph, finite
+from jtqd.estimator.envelope import Envelope
+from jtqd.estimator.joint import Fused, Joint
+from jtqd.estimator.onnx_graph import NetworkError, OnnxGraph, finite
+from jtqd.estimator.perceptron import Perceptron
 from jtqd.estimator.settings import EstimatorSettings
-from jtqd.estimator.validity import Envelope, Trust
 
 
 class NetworkModel(Protocol):
@@ -76,10 +77,44 @@ def checked_network(
     return network
 
 
-def trust_of(joint: Joint, settings: EstimatorSettings, network: NetworkModel) -> Trust:
-    """Return the weight function of a network on a joint."""
-    limit = settings.network_limit * joint.rated_torque_nm
-    return Trust(network.envelope_low, network.envelope_high, settings.envelope_margin, limit)
+def checked_fused(joint: Joint, settings: EstimatorSettings, network: FusedNetworkModel | None) -> Fused:
+    """Return section `fused` of the joint; ConfigError when joint, method and network do not fit."""
+    if settings.method != "fused":
+        raise ConfigError(f"joint {joint.name}: found method '{settings.method}', expected 'fused'")
+    if joint.effects:
+        names = ", ".join(effect.name for effect in joint.effects)
+        raise ConfigError(
+            f"joint {joint.name}: found effects ({names}), which `make_estimator` applies, not this class"
+        )
+    if joint.fused is None:
+        raise ConfigError(
+            f"joint {joint.name}: found no section 'fused', which method 'fused' needs; "
+            "'jtq fit losses' makes one, methods 'tob' and 'efficiency' do not need it"
+        )
+    if network is not None and network.joint != joint.name:
+        raise ConfigError(
+            f"joint {joint.name}: found a network of joint '{network.joint}', expected one of '{joint.name}'"
+        )
+    return joint.fused
+
+
+NATIVE_LIMIT: Final = 1e-6
+"""Largest difference between native evaluation and ONNX Runtime, in rated torques."""
+
+
+def native_of(network: object, joint: Joint) -> Perceptron | None:
+    """Return what evaluates a network in the cycle; None: its `run_one` does, as for every graph that is not one of ours.
+
+    Raises NetworkError when it differs from ONNX Runtime by more than NATIVE_LIMIT of the joint's rated torque.
+    """
+    if not isinstance(network, TorqueNetwork | FusedNetwork) or network.perceptron is None:
+        return None
+    found, limit = network.native_error_nm(), NATIVE_LIMIT * joint.rated_torque_nm
+    if not found <= limit:  # NaN included
+        raise NetworkError(
+            f"{network.name}: found native evaluation and ONNX Runtime {found:.3g} Nm apart, expected at most {limit:.3g} Nm"
+        )
+    return network.perceptron
 
 
 FEATURES: Final = (
@@ -126,6 +161,8 @@ class TorqueNetwork:
         graph.prepare(np.array(self.envelope_low), np.array(self.envelope_high))
         self.bound: Final = graph.bound
         self.run_one: Final = graph.run_one
+        self.perceptron: Final = graph.perceptron
+        self.native_error_nm: Final = graph.native_error_nm
 
     def run_many(self, features: FloatArray) -> FloatArray:
         """Return torques [n] of samples [n, 6]; equal to run_one to rounding."""
@@ -204,6 +241,8 @@ class FusedNetwork:
         graph.prepare(np.array(lows), np.array(highs))
         self.bound: Final = graph.bound
         self.run_one: Final = graph.run_one
+        self.perceptron: Final = graph.perceptron
+        self.native_error_nm: Final = graph.native_error_nm
 
     def run_many(self, features: FloatArray) -> FloatArray:
         """Return the corrections [n] of samples [n, 7]; equal to run_one to rounding."""

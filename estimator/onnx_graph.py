@@ -21,9 +21,12 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.onnx_weights import read_perceptron
 
 _PROBES: Final = (0.25, -0.5)  # two different inputs: the binding must see the second one
 _WARM_UP: Final = 50
+_NATIVE_PROBES: Final = 256
+"""Inputs at which native evaluation is compared: in the range of the training data, and a quarter of it beyond."""
 
 
 class NetworkError(ValueError):
@@ -37,7 +40,7 @@ class OnnxGraph:
     None; features: names and order of the inputs, which the metadata must repeat; keys: metadata that must be
     there. Raises NetworkError for an unreadable or corrupt file, another hash, shape, type or missing
     metadata. Public: `name`, `sha256`, `metadata`, `run_one`, `bound` (after `prepare`: samples go through the
-    binding, not through run()).
+    binding, not through run()), `perceptron` (the same graph for native evaluation, None for a graph that is not ours).
     """
 
     def __init__(
@@ -54,6 +57,7 @@ class OnnxGraph:
             raise self.error(f"found SHA-256 {self.sha256}, expected {sha256}")
         self._width: Final = len(features)
         self._session: Final = self._open(data)
+        self.perceptron: Final = read_perceptron(data)
         self._output: Final = self._check_graph()
         self.metadata: Final = self._read_metadata(features, keys)
         self._x: Final = np.zeros((1, self._width))
@@ -78,10 +82,17 @@ class OnnxGraph:
         result: FloatArray = self._session.run(None, {"x": np.ascontiguousarray(features, np.float64)})[0]
         return result[:, 0]
 
+    def native_error_nm(self) -> float:
+        """Return the largest difference [Nm] between native evaluation and ONNX Runtime over the probes."""
+        assert self.perceptron is not None
+        return float(np.max(np.abs(self.perceptron.run_many(self._probes) - self.run_many(self._probes))))
+
     def prepare(self, low: FloatArray, high: FloatArray) -> None:
         """Bind and warm up between `low` and `high` [features], where the graph must give finite torques."""
         self._bind(low, high)
         self._warm_up((low + high) / 2)
+        share = np.random.default_rng(0).uniform(-0.25, 1.25, (_NATIVE_PROBES, self._width))
+        self._probes = low + share * (high - low)
 
     def error(self, text: str) -> NetworkError:
         """Return the error to raise, with the file's name."""

@@ -1,4 +1,6 @@
-"""Run table: one recorded run as arrays, checked once, read-only; columns that can be derived are derived on request.
+"""A run as arrays: the recorded one (`RunTable`), what the observer saw of it, and its estimates.
+
+A run table is checked once and read-only; columns that can be derived are derived on request.
 
 Column names in messages are those of the files: `time_s`, `j1.current_a`, `j1.motor_position_rad`, ...
 """
@@ -12,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.arrays import FloatArray, StatusArray
 
 
 class RunTableError(ValueError):
@@ -123,7 +125,7 @@ class RunTable:
 
     @property
     def dt_s(self) -> FloatArray:
-        """Steps [n] as estimate_run takes them; the first sample has none and gets 0."""
+        """Steps [n] as `Estimator.run` takes them; the first sample has none and gets 0."""
         return np.diff(self.time_s, prepend=self.time_s[0])
 
     def joint(self, number: int, gear_ratio: float) -> JointColumns:
@@ -146,6 +148,43 @@ class RunTable:
                 raise RunTableError(f"j{number}.{name}: missing, and no column to derive it from")
             inputs.append(column)
         return tuple(inputs)
+
+
+@dataclass(frozen=True, slots=True)
+class ObservedRun:
+    """Outputs of the fused observer over a run, arrays [n]; NaN where it was not running.
+
+    Torques [Nm, joint side], velocity [rad/s, joint side]; waves [n, 4]: filtered cos and sin of 2 and 4 times
+    the motor angle; temperature [n], NaN where unknown; direction [n], -1 to 1; dt_s [n], time since the sample before;
+    open_nm [n]: what the torsion's slip leaves open to either side.
+    """
+
+    status: StatusArray
+    raw_nm: FloatArray
+    velocity_rad_s: FloatArray
+    torsion_nm: FloatArray
+    waves: FloatArray
+    temperature_c: FloatArray
+    direction: FloatArray
+    dt_s: FloatArray
+    open_nm: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class EstimateRun:
+    """Fields of `Estimate` as read-only arrays [n], and the network's features [n, 6 or 7], NaN where not running."""
+
+    torque_nm: FloatArray
+    sigma_nm: FloatArray
+    status: StatusArray
+    tob_nm: FloatArray
+    physics_nm: FloatArray
+    network_nm: FloatArray
+    features: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in self.__slots__:
+            getattr(self, name).setflags(write=False)
 
 
 def _slope(position: FloatArray, time_s: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Settings of the estimator: one frozen value, read from section `estimator` of a configuration or built in code."""
+"""Settings of the estimator and of its plausibility checks: frozen values, read from a configuration or built in code."""
 
 from __future__ import annotations
 
@@ -38,3 +38,20 @@ class EstimatorSettings:
 
     def __post_init__(self) -> None:
         check(self, "estimator")
+
+
+@dataclass(frozen=True, slots=True)
+class PlausibilityLimits:
+    """Thresholds of the plausibility checks, see the table in `plausibility`. Values out of range raise ConfigError.
+
+    motor_jump_rad, mismatch_rad: motor side; twist_rad: joint side, for eccentric encoders and the like; frozen_s: of the
+    current. docs/safety.md says how far the runs of the bench stay below them.
+    """
+
+    motor_jump_rad: Annotated[float, limits("rad", ge=0.01, le=1e6)] = 1.0
+    mismatch_rad: Annotated[float, limits("rad", ge=0.01, le=1e6)] = 4.0
+    twist_rad: Annotated[float, limits("rad", ge=1e-4, le=1e3)] = 0.01
+    frozen_s: Annotated[float, limits("s", ge=0.01, le=1e6)] = 0.5
+
+    def __post_init__(self) -> None:
+        check(self, "plausibility")

@@ -57,5 +57,4 @@ class Estimate(NamedTuple):
 
 STARTING_ESTIMATE: Final = Estimate(nan, nan, STARTING, nan, nan, nan)
 INVALID_ESTIMATE: Final = Estimate(nan, nan, INVALID, nan, nan, nan)
-OFF_ESTIMATE: Final = Estimate(nan, nan, OFF, nan, nan, nan)
 """What a joint that is not estimated shows."""

@@ -33,6 +33,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError, count, natural, seconds
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.methods import estimate_columns
+from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import RunTable
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import VALID
@@ -41,7 +42,6 @@ from jtqd.sim_can.plant_file import plant_of_joint
 from jtqd.sysid.campaign.emulated import emulated
 from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Plan
 from jtqd.sysid.campaign.plans import variable_runs
-from jtqd.sysid.fit.friction import low_pass
 from jtqd.sysid.fit.joint_writer import write_joint
 from jtqd.sysid.measured.bus import published_torque, reference_torque, sync_time
 from jtqd.sysid.runs.files import RunError, read_run, write_run
@@ -87,7 +87,7 @@ def secrets(joint: Joint) -> Mapping[str, Effect]:
 def write_secret(directory: Path, name: str) -> Path:
     """Write the plant file of the secret bench and its joint files; returns its path. Raises ConfigError, OSError."""
     directory.mkdir(parents=True, exist_ok=True)
-    mapping: dict[str, Any] = load_yaml(shipped(_PLANT))[0]
+    mapping: dict[str, Any] = load_yaml(shipped(_PLANT))
     for number in NUMBERS:
         joint = load_joint(nominal_file(number))
         effects = (secrets(joint)[name],) if number == SECRET_JOINT else ()
@@ -109,7 +109,7 @@ def write_secret(directory: Path, name: str) -> Path:
 def write_config(path: Path, joint_files: Mapping[int, Path], method: str) -> Path:
     """Write a configuration of jtqd for the bench: these joint files, this method, no network. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    mapping: dict[str, Any] = load_yaml(shipped("bench.yaml"))[0]
+    mapping: dict[str, Any] = load_yaml(shipped("bench.yaml"))
     mapping["estimator"] = {**mapping["estimator"], "method": method}
     for number, file in joint_files.items():
         joint = mapping[f"joint_{number}"]

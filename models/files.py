@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from pathlib import Path
 from typing import Any, Final
@@ -48,10 +47,9 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def load_yaml(path: str | os.PathLike[str]) -> tuple[dict[str, Any], str]:
-    """Return the root mapping of a YAML file and the SHA-256 of its bytes (hex). Raises ConfigError."""
-    mapping, data = read_yaml(path)
-    return mapping, hashlib.sha256(data).hexdigest()
+def load_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Return the root mapping of a YAML file. Raises ConfigError."""
+    return read_yaml(path)[0]
 
 
 def read_yaml(path: str | os.PathLike[str]) -> tuple[dict[str, Any], bytes]:
@@ -69,9 +67,11 @@ def read_yaml(path: str | os.PathLike[str]) -> tuple[dict[str, Any], bytes]:
     try:
         content = yaml.load(data, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark
-        at = f" line {mark.line + 1}, column {mark.column + 1}" if mark else ""
-        raise ConfigError(f"{name}:{at} not YAML: {error.problem or error.context}") from None
+        raise ConfigError(f"{name}:{_marked(error)}") from None
+    except yaml.reader.ReaderError as error:
+        raise ConfigError(
+            f"{name}: not YAML: found {error.character:02X}h at offset {error.position}, expected a text file"
+        ) from None
     except (yaml.YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ConfigError(f"{name}: not YAML: {reason}") from None
@@ -81,9 +81,53 @@ def read_yaml(path: str | os.PathLike[str]) -> tuple[dict[str, Any], bytes]:
     return content, data
 
 
+_PLAIN: Final = (
+    ("but got '<stream end>'", "found the end of the file"),
+    ("but found '<stream end>'", "found the end of the file"),
+    ("found unexpected end of stream", "found the end of the file"),
+    ("but got ", "found "),
+    ("but found ", "found "),
+    ("'<block end>'", "a line that is indented less"),
+    ("<block end>", "a line that is indented less"),
+    ("'<block mapping start>'", "a line that is indented more"),
+    ("'<block sequence start>'", "a list"),
+    ("'<document start>'", "a second document ('---')"),
+    ("<document start>", "a new document"),
+    ("'<scalar>'", "a text"),
+    ("found '?'", "found a key"),
+    ("character '\\t' that cannot start any token", "a tab, expected spaces"),
+    ("that cannot start any token", "that must stand in quotes"),
+    (
+        "mapping values are not allowed here",
+        "found ': ', expected one key in a line, indented like its neighbours",
+    ),
+    ("could not determine a constructor for the tag", "found the tag"),
+    ("could not find expected ':'", "found no ': ' behind a key"),
+    ("a flow sequence", "a list in [ ]"),
+    ("a flow mapping", "a mapping in { }"),
+    ("a block mapping", "a mapping"),
+    ("a block collection", "a list"),
+    ("a quoted scalar", "a text in quotes"),
+    ("a simple key", "a key"),
+)
+"""Words of PyYAML's scanner -> words of this project, in the order in which they are replaced."""
+
+
+def _marked(error: yaml.MarkedYAMLError) -> str:
+    """Return place and problem of an error, in words of people who write YAML."""
+    mark, begin = error.problem_mark, error.context_mark
+    at = f" line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+    text = error.problem or error.context or "cannot be read"
+    if error.problem and error.context and begin and begin.line != (mark.line if mark else -1):
+        text += f" ({error.context} that begins in line {begin.line + 1})"
+    for theirs, ours in _PLAIN:
+        text = text.replace(theirs, ours)
+    return f"{at} not YAML: {' '.join(text.split())}"
+
+
 def load_joint(path: str | os.PathLike[str]) -> Joint:
     """Return the joint of a joint file. Raises ConfigError naming file, key, found and expected."""
-    mapping, _ = load_yaml(path)
+    mapping = load_yaml(path)
     return Joint.from_mapping(mapping, os.fspath(path))
 
 

@@ -1,7 +1,8 @@
 """Emulated bench: two harmonic-drive joints coupled by a torque sensor, and their CANopen nodes on a bus.
 
 Plant files and commands, or a measured run, in; frames on a bus (`jtq sim`, `python -m jtqd.sim_can`) or run tables out.
-Imports estimator, drivers, models and `jtqd.sysid.runs`; the plant itself (`plant`, `emulated_run`) only estimator.
+Imports estimator, drivers, models and, to play a run (`play`), `jtqd.sysid.runs`; the plant itself (`plant`,
+`emulated_run`) only estimator.
 
 | module | what it has |
 |---|---|

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from jtqd.drivers.devices import COMMANDER_NODE, JTQD_NODE, SYNC_COB_ID
 from jtqd.drivers.filters import CanFilter, exact
+from jtqd.drivers.nmt import HEARTBEAT_BASE
 from jtqd.sim_can.canopen_node import CanopenNode
 from jtqd.sim_can.drive_node import OPERATION_ENABLED, DriveNode
 from jtqd.sim_can.sensor_node import SENSOR_NODE, SensorNode
@@ -75,7 +76,7 @@ def bench_filters() -> tuple[CanFilter, ...]:
 
     NMT, SYNC, SDO requests, RPDOs 1 and 2 of the drives, heartbeats of jtqd and of the node that commands.
     """
-    ids = [0x000, SYNC_COB_ID, 0x700 + JTQD_NODE, 0x700 + COMMANDER_NODE]
+    ids = [0x000, SYNC_COB_ID, HEARTBEAT_BASE + JTQD_NODE, HEARTBEAT_BASE + COMMANDER_NODE]
     ids += [0x600 + node for node in (1, 2, SENSOR_NODE)]
     ids += [base + node for base in (0x200, 0x300) for node in (1, 2)]
     return tuple(exact(can_id) for can_id in ids)

@@ -11,8 +11,9 @@ from pathlib import Path
 from types import FrameType
 from typing import Protocol
 
+from jtqd.drivers.bus_socket import PREFIX
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, FRAME_SIZE, MAX_LENGTH
-from jtqd.drivers.frame_socket import PREFIX, BusDown, BusError, open_frame_socket
+from jtqd.drivers.frame_socket import BusDown, BusError, open_frame_socket
 from jtqd.drivers.hub import Hub
 from jtqd.sim_can.bench import Bench, bench_filters
 

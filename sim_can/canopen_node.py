@@ -286,8 +286,8 @@ class CanopenNode:
             return self._on_sdo(data, t_ns)
         if can_id == 0:
             return self._on_nmt(data, t_ns)
-        if 0x701 <= can_id <= 0x77F:
-            return self._on_heartbeat(can_id - 0x700, data, t_ns)
+        if nmt.HEARTBEAT_BASE < can_id <= nmt.HEARTBEAT_BASE + 127:
+            return self._on_heartbeat(can_id - nmt.HEARTBEAT_BASE, data, t_ns)
         if self.state == nmt.OPERATIONAL:
             self._pdo_maps()
             pdo = self._receive.get(can_id)

@@ -146,12 +146,8 @@ def _run(options: argparse.Namespace) -> int:
 
 def _played(options: argparse.Namespace) -> Source:
     from jtqd.sim_can.play import columns_beside, open_play
-    from jtqd.sysid.runs.files import RunError
 
-    try:
-        source = open_play(options.play, options.columns or columns_beside(options.play), options.joints)
-    except RunError as error:
-        raise ConfigError(str(error)) from None
+    source = open_play(options.play, options.columns or columns_beside(options.play), options.joints)
     for note in getattr(source, "notes", ()):
         print(f"jtq sim: {note}", file=sys.stderr)
     return source

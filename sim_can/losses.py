@@ -78,27 +78,16 @@ class LossTable:
         return [[float(x) for x in row] for row in rows]
 
     def magnitude(self, torque_nm: float, velocity_rad_s: float) -> float:
-        """Return F(τ, v) in Nm, never negative; the sign of v selects the direction (v = 0 counts as forward)."""
-        rows = self.forward
-        if velocity_rad_s < 0.0:
-            rows = self.reverse
-            velocity_rad_s = -velocity_rad_s
-        x = velocity_rad_s * self.per_velocity_step
-        k = int(x)
-        if k > self.last_row:
-            k = self.last_row
-            x = k + 1.0
-        y = (torque_nm + self.torque_limit) * self.per_torque_step
-        if y < 0.0:
-            y = 0.0
-        elif y >= TORQUE_STEPS:
-            y = TORQUE_STEPS - 1e-9
-        m = int(y)
-        y -= m
-        low = rows[k]
-        high = rows[k + 1]
-        low_value = low[m] + y * (low[m + 1] - low[m])
-        return low_value + (x - k) * (high[m] + y * (high[m + 1] - high[m]) - low_value)
+        """Return F(τ, v) in Nm, never negative; the sign of v selects the direction (v = 0 counts as forward).
+
+        The plain form of what `JointFriction` does fast. Beyond its range the table keeps its outermost values.
+        """
+        rows = self.reverse if velocity_rad_s < 0.0 else self.forward
+        x = min(abs(velocity_rad_s) * self.per_velocity_step, self.last_row + 1.0)
+        y = min(max((torque_nm + self.torque_limit) * self.per_torque_step, 0.0), TORQUE_STEPS - 1e-9)
+        k, m = min(int(x), self.last_row), int(y)
+        low, high = (row[m] + (y - m) * (row[m + 1] - row[m]) for row in rows[k : k + 2])
+        return low + (x - k) * (high - low)
 
 
 class JointFriction:
@@ -150,7 +139,7 @@ class JointFriction:
     def __call__(self, torque_nm: float, velocity_rad_s: float) -> float:
         """Return the magnitude in Nm at transmitted torque τ and joint velocity v (its sign gives the direction).
 
-        Called 16 times per millisecond: `LossTable.magnitude` is written out here.
+        Called 16 times per millisecond: `LossTable.magnitude` is written out here, without calls.
         """
         rows = self._forward
         speed = velocity_rad_s

@@ -231,7 +231,7 @@ def load_plant(path: Path) -> PlantParameters:
         ConfigError: unreadable file, unknown or missing key, value out of range; the message names file and
         key.
     """
-    mapping, _ = load_yaml(path)
+    mapping = load_yaml(path)
     where = str(path)
     if "gear_ratio" in mapping:
         return plant_of_joint(Joint.from_mapping(mapping, where))

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTableError
 from jtqd.models.files import load_joint, shipped
@@ -133,8 +134,20 @@ def open_play(
 
     Without `joints`: the two for which the column map names a joint file, else 1 and 2. The drives' ratings
     come from `joint_files`, else from the column map's `jN.joint_file`, else from the bench's nominal joints.
-    Raises RunError (run file) or ConfigError (column map, joint file).
+    Raises ConfigError: run file, column map or joint file cannot be used.
     """
+    try:
+        return _open(run_path, columns_path, joints, joint_files)
+    except RunError as error:
+        raise ConfigError(str(error)) from None
+
+
+def _open(
+    run_path: Path | str,
+    columns_path: Path | str | None,
+    joints: tuple[int, int] | None,
+    joint_files: tuple[Path, Path] | None,
+) -> PlaySource:
     columns = ColumnMap.load(Path(columns_path)) if columns_path is not None else None
     joints = joints or _joints_of(columns)
     if len(joints) != 2 or joints[0] == joints[1]:

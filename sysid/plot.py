@@ -12,7 +12,7 @@ import numpy as np
 
 from jtqd.daemon.logs import LogError, Records, read_topic
 from jtqd.estimator.status import DEGRADED, NAMES, STANDSTILL, VALID
-from jtqd.sysid.report.figures import shade
+from jtqd.sysid.report.figures import check_picture, shade
 
 _SHADES = {STANDSTILL: "#dcecf2", DEGRADED: "#fbe8c8"}
 _OTHER = "#f3d6d6"
@@ -39,6 +39,7 @@ def main(argv: list[str]) -> int:
     arguments = parser().parse_args(argv)
     joint = arguments.joint
     try:
+        check_picture(arguments.out)
         rmse = draw(read_topic(arguments.log, f"/joint/{joint}/state"), joint, arguments.out)
     except ImportError:
         print("jtq plot: matplotlib is not installed: pip install matplotlib", file=sys.stderr)

@@ -19,7 +19,7 @@ from typing import Final, NamedTuple
 
 import yaml
 
-from jtqd.estimator.checked import natural
+from jtqd.estimator.checked import ConfigError, make_directory, natural
 from jtqd.models.files import shipped
 from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Plan
 from jtqd.sysid.campaign.plans import outside_runs
@@ -56,6 +56,7 @@ def main(argv: list[str]) -> int:
     out: Path = options.out
     worst = 0
     try:
+        make_directory(out)
         (out / "models").mkdir(parents=True, exist_ok=True)
         _write_outside_plan(out / "outside.plan.yaml", options.seed, 2 if options.quick else 6)
         for step in steps(out, options.bus, options.quick, options.seed):
@@ -69,6 +70,9 @@ def main(argv: list[str]) -> int:
             if step.arguments[0] == "train" and "ours" in step.arguments:
                 for name in ("bench.yaml", "bench_paper.yaml"):
                     write_config(out / "models" / name, name)
+    except ConfigError as error:
+        print(f"jtq reproduce: {error}", file=sys.stderr)
+        return 1
     except OSError as error:
         print(f"jtq reproduce: {error.filename or out}: {error.strerror or error}", file=sys.stderr)
         return 1

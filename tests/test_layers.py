@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
 import sys
 from collections.abc import Iterator
 from functools import cache
@@ -107,6 +108,20 @@ def test_no_circles() -> None:
 
     for name in modules():
         follow(name, [])
+
+
+@pytest.mark.parametrize(
+    ("module", "unwanted"),
+    [
+        ("daemon.supervisor.process", {"numpy", "onnxruntime", "canopen", "can", "mcap.writer", "zstandard"}),
+        ("daemon.loop.process", {"canopen", "can", "mcap", "rich", "argparse", "importlib.metadata"}),
+        ("sim_can.bench_loop", {"onnxruntime", "canopen", "can", "hashlib"}),
+    ],
+)
+def test_a_process_loads_no_library_that_it_does_not_use(module: str, unwanted: set[str]) -> None:
+    """Each costs memory as long as jtqd runs: numpy 12 MB, OpenSSL (hashlib) 3.5 MB. The recorder has its own test."""
+    code = f"import sys, jtqd.{module}; print(*{unwanted!r} & set(sys.modules))"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True) == "\n"
 
 
 def test_one_import_name() -> None:

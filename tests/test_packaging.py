@@ -7,6 +7,7 @@ Environments are made without network, from the packages that are installed here
 import os
 import subprocess
 import sys
+import sysconfig
 import tarfile
 import tomllib
 import zipfile
@@ -21,6 +22,7 @@ from tests.paths import ROOT
 from tests.systemd.systemd_wheels import build_wheel, copy_sources, make_wheels
 
 PACKAGES = ("daemon", "drivers", "estimator", "models", "sim_can", "sysid")
+EXT_SUFFIX = sysconfig.get_config_var("EXT_SUFFIX")
 DIST_INFO = f"jtqd-{jtqd.__version__}.dist-info"
 _HOOK = "import sys, setuptools.build_meta as backend; getattr(backend, sys.argv[1])(sys.argv[2])"
 
@@ -48,9 +50,10 @@ def expected() -> set[str]:
         f"jtqd/{path.relative_to(ROOT).as_posix()}"
         for package in PACKAGES
         for path in (ROOT / package).rglob("*")
-        if path.is_file() and "__pycache__" not in path.parts
+        if path.is_file() and "__pycache__" not in path.parts and path.suffix != ".so"
     }
-    return files | {"jtqd/__init__.py", "jtqd/py.typed"}
+    compiled = {name.removesuffix(".pyx") + EXT_SUFFIX for name in files if name.endswith(".pyx")}
+    return files | compiled | {"jtqd/__init__.py", "jtqd/py.typed"}
 
 
 def content(wheel: Path) -> set[str]:
@@ -87,6 +90,7 @@ def test_the_wheel_holds_jtqd_alone_with_all_its_data(wheel: Path) -> None:
     assert f"Version: {jtqd.__version__}" in lines
 
 
+@pytest.mark.campaign
 def test_an_editable_install_puts_one_path_there(source: Path, tmp_path: Path) -> None:
     subprocess.run(
         [sys.executable, "-c", _HOOK, "build_editable", str(tmp_path)],

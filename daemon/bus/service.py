@@ -118,7 +118,7 @@ LogEvent = Callable[[str, int, str], None]
 
 def service_filters(config: Config) -> list[CanFilter]:
     """Return filters for SDO requests to jtqd, SDO traffic of the nodes, EMCY, heartbeats and NMT commands."""
-    heartbeats = CanFilter(0x700, 0x780 | CAN_EFF_FLAG | CAN_RTR_FLAG)
+    heartbeats = CanFilter(nmt.HEARTBEAT_BASE, 0x780 | CAN_EFF_FLAG | CAN_RTR_FLAG)
     nodes = [base + node for node in nodes_of(config) for base in (0x080, 0x580, 0x600)]
     return [exact(0x600 + config.node_id), exact(0x000), heartbeats, *(exact(cob_id) for cob_id in nodes)]
 
@@ -261,8 +261,8 @@ class BusService:
         self._bus_change(self.bus.alive(), now_s)
         if can_id == 0x600 + self._config.node_id:
             self._on_request(data)
-        elif can_id >= 0x700:
-            self._node_events(self.heartbeats.receive(can_id - 0x700, data, now_s), now_s)
+        elif can_id >= nmt.HEARTBEAT_BASE:
+            self._node_events(self.heartbeats.receive(can_id - nmt.HEARTBEAT_BASE, data, now_s), now_s)
         elif can_id >= 0x600:
             self.care.on_foreign_request(can_id - 0x600, now_s)
         elif can_id >= 0x580:

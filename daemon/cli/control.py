@@ -11,7 +11,7 @@ from typing import Any
 
 from jtqd.daemon.cli.reading import NoDaemonError, choose_daemon
 from jtqd.daemon.supervisor.control import FILE, REPLY_BYTES, VERBS
-from jtqd.drivers.frame_socket import reachable
+from jtqd.drivers.bus_socket import reachable
 
 _TIMEOUT_S = {"reload": 120.0}
 _EXAMPLES = """examples:

@@ -22,7 +22,8 @@ from typing import Any
 
 from jtqd.daemon.cli.checks import FAIL, GOOD, SKIP, WARN, CheckResult
 from jtqd.daemon.config import Config, Realtime
-from jtqd.drivers.frame_socket import AF_CAN, CAN_RAW, BusError, open_frame_socket
+from jtqd.drivers.bus_socket import AF_CAN, CAN_RAW
+from jtqd.drivers.frame_socket import BusError, open_frame_socket
 
 _CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
 _LOCKED_BYTES = 256 << 20

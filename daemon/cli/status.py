@@ -11,7 +11,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from math import isfinite, nan
+from math import nan
 from typing import Any
 
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
@@ -42,11 +42,12 @@ from jtqd.daemon.shared.snapshot import (
     NMT_STATES,
     OPERATIONAL,
     WORK_BIN_NS,
+    InputView,
     SnapshotReader,
     View,
 )
 from jtqd.daemon.supervisor.table import COLOURS, bus_load, first_that_fits, plain_line
-from jtqd.estimator.checked import counted
+from jtqd.estimator.checked import counted, finite
 from jtqd.estimator.status import NAMES, PUBLISHED
 
 SCHEMA = "jtq.status/1"
@@ -94,76 +95,22 @@ def content(reading: Reading) -> dict[str, Any]:
     }
     if view is None or reading.earlier is None:
         return result
-    result |= {
+    return result | {
         "cycle": view.cycle,
         "joints": [_joint(reading, number) for number in (1, 2)],
-        "inputs": [
-            {"name": name}
-            | {
-                "age_s": (view.sync_monotonic_ns - each.used_ns) * 1e-9 if each.used_ns else None,
-                "after_sync_us": each.delay_ns / 1000 if each.used_ns else None,
-                "usual_us": [each.low_ns / 1000, each.high_ns / 1000]
-                if each.low_ns <= each.high_ns
-                else None,
-                "late": each.late,
-                "lost": each.lost,
-                "duplicates": each.duplicates,
-                "rejected": each.rejected,
-            }
-            for name, each in zip(about.inputs, view.inputs, strict=False)
-        ],
+        "inputs": [_input(name, each, view) for name, each in zip(about.inputs, view.inputs, strict=False)],
         "work_us": _quantiles(reading.work_us),
         "late_us": _quantiles(reading.late_us),
         "bus_load": {
-            "now": _number(bus_load(reading.earlier, view, about.bitrate)),
+            "now": finite(bus_load(reading.earlier, view, about.bitrate)),
             "worst_case": view.worst_load,
         },
         "counters": view.counters,
-        "nodes": [
-            {
-                "node": node,
-                "what": what,
-                "state": NMT_STATES.get(view.node_states[node]) if view.node_heard_ns[node] else None,
-                "heartbeat_age_s": (view.sync_realtime_ns - view.node_heard_ns[node]) * 1e-9
-                if view.node_heard_ns[node]
-                else None,
-                "configured": node not in view.unconfigured,
-            }
-            for node, what in sorted(about.nodes.items())
-        ],
+        "nodes": [_node(node, what, view) for node, what in sorted(about.nodes.items())],
+        "notices": [_notice(each) for each in reading.notices],
+        "conditions": [_condition(each, time.monotonic_ns()) for each in reading.conditions],
+        "recorder": reading.log and _recorder(reading.log),
     }
-    result["notices"] = [
-        {
-            "realtime_ns": each.realtime_ns,
-            "level": each.level,
-            "node": each.node or None,
-            "topic": each.topic,
-            "text": each.text,
-        }
-        for each in reading.notices
-    ]
-    now_ns = time.monotonic_ns()
-    result["conditions"] = [
-        {
-            "name": each.name,
-            "subject": each.subject,
-            "severity": SEVERITIES[each.severity],
-            "text": each.text,
-            "for_s": (now_ns - each.since_ns) * 1e-9,
-        }
-        for each in reading.conditions
-    ]
-    log = reading.log
-    result["recorder"] = log and {
-        "path": str(log.path) if log.path else None,
-        "bytes": log.size,
-        "written": log.account.written,
-        "lost": log.account.lost,
-        "let_go": log.account.let_go,
-        "disk_free": log.disk_free,
-        "disk_size": log.disk_size,
-    }
-    return result
 
 
 def _joint(reading: Reading, number: int) -> dict[str, Any]:
@@ -179,14 +126,14 @@ def _joint(reading: Reading, number: int) -> dict[str, Any]:
         "status": NAMES.get(seen.status, str(seen.status)),
         "reason": joint_reason(about, number, view, earlier) or None,
         "since_s": (view.cycle - view.status_since[n]) * view.period_s,
-        "torque_nm": _number(seen.torque_nm if known else nan),
-        "sigma_nm": _number(seen.sigma_nm if known else nan),
-        "physics_nm": _number(seen.physics_nm),
-        "network_nm": _number(seen.network_nm),
-        "sensor_nm": _number(seen.sensor_nm),
-        "current_a": _number(measured.current_a),
-        "motor_velocity_rad_s": _number(measured.motor_velocity_rad_s),
-        "temperature_c": _number(measured.temperature_c),
+        "torque_nm": finite(seen.torque_nm if known else nan),
+        "sigma_nm": finite(seen.sigma_nm if known else nan),
+        "physics_nm": finite(seen.physics_nm),
+        "network_nm": finite(seen.network_nm),
+        "sensor_nm": finite(seen.sensor_nm),
+        "current_a": finite(measured.current_a),
+        "motor_velocity_rad_s": finite(measured.motor_velocity_rad_s),
+        "temperature_c": finite(measured.temperature_c),
         "drive": drive_state(seen.statusword),
         "cycles": {
             NAMES.get(code, str(code)): count for code, count in enumerate(view.status_cycles[n]) if count
@@ -194,12 +141,64 @@ def _joint(reading: Reading, number: int) -> dict[str, Any]:
     }
 
 
+def _input(name: str, each: InputView, view: View) -> dict[str, Any]:
+    return {
+        "name": name,
+        "age_s": (view.sync_monotonic_ns - each.used_ns) * 1e-9 if each.used_ns else None,
+        "after_sync_us": each.delay_ns / 1000 if each.used_ns else None,
+        "usual_us": [each.low_ns / 1000, each.high_ns / 1000] if each.low_ns <= each.high_ns else None,
+        "late": each.late,
+        "lost": each.lost,
+        "duplicates": each.duplicates,
+        "rejected": each.rejected,
+    }
+
+
+def _node(node: int, what: str, view: View) -> dict[str, Any]:
+    heard_ns = view.node_heard_ns[node]
+    return {
+        "node": node,
+        "what": what,
+        "state": NMT_STATES.get(view.node_states[node]) if heard_ns else None,
+        "heartbeat_age_s": (view.sync_realtime_ns - heard_ns) * 1e-9 if heard_ns else None,
+        "configured": node not in view.unconfigured,
+    }
+
+
+def _notice(each: Notice) -> dict[str, Any]:
+    return {
+        "realtime_ns": each.realtime_ns,
+        "level": each.level,
+        "node": each.node or None,
+        "topic": each.topic,
+        "text": each.text,
+    }
+
+
+def _condition(each: Condition, now_ns: int) -> dict[str, Any]:
+    return {
+        "name": each.name,
+        "subject": each.subject,
+        "severity": SEVERITIES[each.severity],
+        "text": each.text,
+        "for_s": (now_ns - each.since_ns) * 1e-9,
+    }
+
+
+def _recorder(log: CurrentLog) -> dict[str, Any]:
+    return {
+        "path": str(log.path) if log.path else None,
+        "bytes": log.size,
+        "written": log.account.written,
+        "lost": log.account.lost,
+        "let_go": log.account.let_go,
+        "disk_free": log.disk_free,
+        "disk_size": log.disk_size,
+    }
+
+
 def _quantiles(values: tuple[float, float, float]) -> dict[str, float | None]:
-    return dict(zip(("p50", "p99", "max"), map(_number, values), strict=True))
-
-
-def _number(value: float) -> float | None:
-    return value if isfinite(value) else None
+    return dict(zip(("p50", "p99", "max"), map(finite, values), strict=True))
 
 
 class StatusView:

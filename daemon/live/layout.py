@@ -13,6 +13,7 @@ import json
 import os
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -346,7 +347,8 @@ def main(argv: list[str] | None = None) -> int:
         temporary.write_text(text, encoding="utf-8")
         os.replace(temporary, arguments.out)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
         print(f"jtq layout: {arguments.out}: {error.strerror}", file=sys.stderr)
         return 1
     return 0

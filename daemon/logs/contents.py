@@ -60,6 +60,8 @@ _SMALL_KINDS: dict[int, type[McapRecord]] = {
     Opcode.MESSAGE_INDEX: MessageIndex,
 }
 """Records of the data section that no CRC covers."""
+_TIMELESS = (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT)
+"""Records that hold no messages."""
 _SUMMARY_KINDS: dict[int, type[McapRecord]] = {
     Opcode.STATISTICS: Statistics,
     Opcode.CHUNK_INDEX: ChunkIndex,
@@ -83,13 +85,16 @@ class WholeChunk(NamedTuple):
 
 @dataclass
 class Gap:
-    """Bytes that cannot be read. `chunks`: that begin there; `restored`: what stood there is made anew."""
+    """Bytes that cannot be read. `chunks`: that begin there; `restored`: what stood there is made anew.
+
+    `seconds`: the time for which they stand; None where nothing tells.
+    """
 
     start: int
     end: int
     chunks: int
     restored: bool = False
-    seconds: float = 0.0
+    seconds: float | None = None
 
 
 @dataclass
@@ -231,7 +236,8 @@ def _take_chunk(source: Source, at: int, end: int, found: Contents) -> int | Non
     )
     counts = Counter({channel: len(rows) for channel, rows in expected.items()})
     if counts and found.open_gap is not None:
-        found.open_gap.seconds = max(0, first - found.end_ns) * 1e-9 if found.chunks else 0.0
+        if any(chunk.counts for chunk in found.chunks):
+            found.open_gap.seconds = max(0, first - found.end_ns) * 1e-9
         found.open_gap = None
     found.chunks.append(WholeChunk(index, counts, (first, last) == (head.start_ns, head.end_ns), indexed))
     return index_end
@@ -332,11 +338,13 @@ def _leave_out(source: Source, start: int, end: int, found: Contents) -> None:
     # Message indexes are made anew; a definition is known elsewhere, or its chunks are left out.
     restored = opcode == Opcode.MESSAGE_INDEX and bool(found.chunks) and not found.chunks[-1].indexed
     restored |= opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and framed is not None and framed[1] == end
+    timeless = framed is not None and framed[1] == end and opcode in _TIMELESS
     last = found.gaps[-1] if found.gaps else None
     if last is not None and last.end == start and not last.restored and not restored:
         last.end, last.chunks = end, last.chunks + chunk
+        last.seconds = last.seconds if timeless else None
     else:
-        found.gaps.append(Gap(start, end, chunk, restored))
+        found.gaps.append(Gap(start, end, chunk, restored, 0.0 if timeless else None))
         found.open_gap = found.open_gap if restored else found.gaps[-1]
 
 

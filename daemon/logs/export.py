@@ -32,6 +32,7 @@ from jtqd.daemon.logs.read import (
     log_parts,
     read_attachments,
     read_messages,
+    topics_of,
 )
 
 _EXAMPLES = """examples:
@@ -93,15 +94,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     command = parser()
     options = command.parse_intermixed_args(argv)  # options may stand before the logs
-    of_config = options.what == "dbc" and options.config is not None
-    if of_config == bool(options.logs):
-        command.error("expected a log" + (" or --config" if options.what == "dbc" else "") + ", and not both")
-    if options.what in ("csv", "parquet") and options.out is None:
-        command.error("expected --out FILE")
-    if options.out is None and options.json:
-        command.error("--json needs --out FILE: standard output is used for one of them")
-    if options.out is not None and any(_same(options.out, log) for log in options.logs):
-        command.error(f"--out {options.out}: that is the log")
+    _check_usage(command, options)
     try:
         result = _export(options)
     except (LogError, OSError) as error:
@@ -110,6 +103,8 @@ def main(argv: list[str] | None = None) -> int:
         text = str(error)
         if isinstance(error, OSError) and error.filename is not None:
             text = f"{error.filename}: {error.strerror}"
+        elif isinstance(error, OSError):
+            text = f"output: {error.strerror or error}"
         print(f"jtq export: {text}", file=sys.stderr)
         return 1
     if options.json:
@@ -123,6 +118,29 @@ def main(argv: list[str] | None = None) -> int:
             file=sys.stderr,
         )
     return 3 if left_out else 0
+
+
+def _check_usage(command: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Exit with status 2 where the combination of options cannot be meant."""
+    of_config = options.what == "dbc" and options.config is not None
+    if of_config == bool(options.logs):
+        command.error("expected a log" + (" or --config" if options.what == "dbc" else "") + ", and not both")
+    if options.what in ("csv", "parquet") and options.out is None:
+        command.error("expected --out FILE")
+    if options.out is None and options.json:
+        command.error("--json needs --out FILE: standard output is used for one of them")
+    if options.out is not None and any(_same(options.out, log) for log in options.logs):
+        command.error(f"--out {options.out}: that is the log")
+    start = max(0.0, options.start or 0.0)
+    if options.end is not None and options.end <= start:
+        command.error(
+            f"--end: found {options.end:g}, expected a time above {start:g} s, where --start begins"
+        )
+    twice = next(
+        (one for n, one in enumerate(options.logs) for other in options.logs[:n] if _same(one, other)), None
+    )
+    if twice is not None:
+        command.error(f"found the log {twice} twice, expected every part once")
 
 
 def _same(out: Path, log: Path) -> bool:
@@ -139,6 +157,7 @@ def _export(options: argparse.Namespace) -> dict[str, Any]:
     write = write_csv if options.what == "csv" else write_parquet
     result: dict[str, int] = {}
     if options.topic is not None:
+        _require_topic(logs, options.topic)
         try:
             size = write(options.out, topic_blocks(logs, options.topic, **span))
         except ColumnsChangedError:
@@ -148,6 +167,19 @@ def _export(options: argparse.Namespace) -> dict[str, Any]:
         size = write(options.out, table.blocks())
         result = {"left_out": table.left_out}
     return {"path": str(options.out), "rows": size.rows, "columns": size.columns} | result
+
+
+def _require_topic(logs: Path | Sequence[Path], topic: str) -> None:
+    """Raise LogError for a topic that is not in the log."""
+    topics = topics_of(logs)
+    if topic not in topics:
+        raise LogError(
+            f"{_named(logs)}: found no topic {topic}, expected one of {', '.join(sorted(topics)) or 'none'}"
+        )
+
+
+def _named(path: Path | Sequence[Path]) -> str:
+    return str(path) if isinstance(path, Path) else ", ".join(map(str, path))
 
 
 def _span(logs: Path | Sequence[Path], start: float | None, end: float | None) -> dict[str, int | None]:
@@ -168,7 +200,7 @@ def _candump(
     topics = can_topics(logs)
     topic = options.topic or topics[0]
     if topic not in topics:
-        raise LogError(f"{logs}: found frames on {', '.join(topics)}, expected them on {topic}")
+        raise LogError(f"{_named(logs)}: found no frames on {topic}, expected one of {', '.join(topics)}")
     frames = 0
     if options.out is None:
         for part in iter_frames(logs, topic, **span):
@@ -282,9 +314,10 @@ class RunTable:
             if len(found) == len(wanted):
                 break
         if not count:
-            raise LogError(f"{path}: found no cycle of the joints in that time, expected one at least")
+            when = " in that time" if start_ns is not None or end_ns is not None else ""
+            raise LogError(f"{_named(path)}: found no cycle of the joints{when}, expected one at least")
         if not found:
-            raise LogError(f"{path}: found no measured value in {count} {_cycles(count)}")
+            raise LogError(f"{_named(path)}: found no measured value in {count} {_cycles(count)}")
         self._wanted = {name: where for name, where in wanted.items() if name in found}
         self.columns = tuple(self._wanted)
 
@@ -309,7 +342,8 @@ class RunTable:
         kept = self.cycles - self.left_out
         if kept < 2:
             raise LogError(
-                f"{self._path}: found {kept} {_cycles(kept)} with every column, expected at least 2 (--all-cycles keeps all)"
+                f"{_named(self._path)}: found {kept} {_cycles(kept)} with every column, expected at least 2 "
+                "(--all-cycles keeps all)"
             )
 
     def _rows(self) -> Iterator[dict[int, Records]]:
@@ -330,7 +364,7 @@ class RunTable:
     def _same_cycles(self, one: Records, two: Records) -> None:
         if not np.array_equal(one["cycle"], two["cycle"]):
             raise LogError(
-                f"{self._path}: found cycles of one joint that the other does not have, expected the same"
+                f"{_named(self._path)}: found cycles of one joint that the other does not have, expected the same"
             )
 
 
@@ -359,7 +393,8 @@ def topic_blocks(
             raise ColumnsChangedError
         yield columns
     if first is None:
-        raise LogError(f"{path}: found no message on {topic} in that time, expected one at least")
+        when = " in that time" if start_ns is not None or end_ns is not None else ""
+        raise LogError(f"{_named(path)}: found no message on {topic}{when}, expected one at least")
 
 
 def topic_table(

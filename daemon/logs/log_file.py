@@ -40,7 +40,7 @@ from jtqd.daemon.logs.container import (
     walk,
 )
 from jtqd.daemon.recording.mcap_file import MAGIC
-from jtqd.daemon.recording.parts import ACTIVE
+from jtqd.daemon.recording.own_files import ACTIVE
 
 _FLAT_PIECE = 8 << 20
 """[byte] messages outside chunks are read in pieces of this size."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from jtqd.daemon.logs.container import MESSAGE_HEAD, LogError, pieces
 from jtqd.daemon.logs.layout import PRIMITIVES, Layout, Types, VariableLayoutError, message_layout, types_of
 from jtqd.daemon.logs.log_file import Batch, LogFile
-from jtqd.daemon.recording.parts import ACTIVE, PART_PATTERN
+from jtqd.daemon.recording.own_files import ACTIVE, PART_PATTERN
 
 Records = NDArray[np.void]
 """Messages as rows of a structured array [n]."""

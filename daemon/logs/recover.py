@@ -41,7 +41,7 @@ from jtqd.daemon.logs.container import (
 )
 from jtqd.daemon.logs.contents import Contents, Gap, WholeChunk, chunk_content, index_entries, is_whole, scan
 from jtqd.daemon.recording.mcap_file import MAGIC, bytes_of
-from jtqd.daemon.recording.parts import ACTIVE, OwnFile, own_files
+from jtqd.daemon.recording.own_files import ACTIVE, OwnFile, own_files
 from jtqd.estimator.checked import counted
 
 _PARTIAL = ".recovering"
@@ -52,6 +52,18 @@ _LONGEST_TORN_CHUNK_S = 600.0
 
 class RecoverError(LogError):
     """The file cannot be recovered, and is as it was; one line."""
+
+
+class BeingWrittenError(RecoverError):
+    """Its writer holds a lock on it."""
+
+
+class OutsideChunksError(RecoverError):
+    """Its messages stand in no chunks, where nothing proves them; `ended`: the file has a proper end."""
+
+    def __init__(self, text: str, *, ended: bool) -> None:
+        super().__init__(text)
+        self.ended = ended
 
 
 @dataclass(frozen=True)
@@ -66,7 +78,7 @@ class Recovery:
         messages, chunks, attachments: what the file holds now.
         seconds: from the first message to the last [s].
         lost_bytes, lost_chunks: what could not be read.
-        lost_s: estimate of the time that stood there [s].
+        lost_s: estimate of the time that stood there [s]; None where nothing tells.
         findings: one line each.
     """
 
@@ -80,7 +92,7 @@ class Recovery:
     seconds: float
     lost_bytes: int
     lost_chunks: int
-    lost_s: float
+    lost_s: float | None
     findings: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
@@ -88,7 +100,9 @@ class Recovery:
         return asdict(self) | {"path": str(self.path), "findings": list(self.findings)}
 
 
-def recover(path: Path, *, dry_run: bool = False, keep_free: int = 0) -> Recovery:
+def recover(
+    path: Path, *, dry_run: bool = False, keep_free: int = 0, attachments_are_enough: bool = False
+) -> Recovery:
     """Recover a damaged file as far as it is intact, and remove `.active` from its name.
 
     A file that is whole is not touched; recovering again changes nothing.
@@ -97,9 +111,10 @@ def recover(path: Path, *, dry_run: bool = False, keep_free: int = 0) -> Recover
         path: `X.mcap.active` or `X.mcap`.
         dry_run: only report what would be done.
         keep_free: [byte] that must stay free on the disk beside the copy.
+        attachments_are_enough: write anew also what has lost every message, but not all attachments.
 
     Raises:
-        RecoverError: it is being written (its writer holds an flock on it), nothing in it can be read, its messages stand
+        RecoverError: it is being written (its writer holds an flock on it), nothing in it can be saved, its messages stand
             in no chunks, or the new name is taken.
         OSError: it cannot be read or written, or there is no room for the copy.
     """
@@ -111,13 +126,17 @@ def recover(path: Path, *, dry_run: bool = False, keep_free: int = 0) -> Recover
         source = Source(descriptor)
         own = read_summary(source)
         found = scan(source, own)
-        _refuse(path, found)
+        _refuse(path, found, own)
         now = os.fstat(descriptor)
         if (now.st_size, now.st_mtime_ns) != (before.st_size, before.st_mtime_ns):
             raise RecoverError(f"{path}: found that it is being written, expected a closed file")
         final = _final_name(path)
         changed = not is_whole(found, own)
         report = _report(source, found, own) if changed else _Report()
+        if report.lossy and not found.counts and not (attachments_are_enough and _has_attachments(found)):
+            raise RecoverError(
+                f"{path}: found no message that can be read ({report.findings[0]}), expected one at least: left as it is"
+            )
         if changed and not dry_run:
             copy = _replace(path, source, found, keep_free)
         if final != path and not dry_run:
@@ -138,21 +157,25 @@ def recover(path: Path, *, dry_run: bool = False, keep_free: int = 0) -> Recover
         seconds=(found.end_ns - found.start_ns) * 1e-9,
         lost_bytes=report.lost_bytes,
         lost_chunks=report.lost_chunks,
-        lost_s=round(report.lost_s, 3),
+        lost_s=None if report.lost_s is None else round(report.lost_s, 3),
         findings=tuple(report.findings),
     )
 
 
-def _refuse(path: Path, found: Contents) -> None:
+def _refuse(path: Path, found: Contents, own: Summary | None) -> None:
     """Raise RecoverError for a file without readable content, or with messages that would be lost."""
     foreign = found.header is not None and not found.header.library.startswith("jtqd")
     if found.loose_messages and (foreign or not found.chunks):
-        raise RecoverError(
-            f"{path}: found messages outside chunks, expected a log of jtqd: every message in a chunk"
+        raise OutsideChunksError(
+            f"{path}: found messages outside chunks, expected a log of jtqd: every message in a chunk",
+            ended=own is not None,
         )
-    summary = found.summary
-    if not (found.header or found.chunks or summary.attachments or summary.metadata):
+    if not (found.header or found.chunks or _has_attachments(found)):
         raise RecoverError(f"{path}: found no readable content, expected an MCAP file")
+
+
+def _has_attachments(found: Contents) -> bool:
+    return bool(found.summary.attachments or found.summary.metadata)
 
 
 # ---- what is lost ----
@@ -164,7 +187,7 @@ class _Report:
     lossy: bool = False
     lost_bytes: int = 0
     lost_chunks: int = 0
-    lost_s: float = 0.0
+    lost_s: float | None = 0.0
 
 
 def _report(source: Source, found: Contents, own: Summary | None) -> _Report:
@@ -185,13 +208,14 @@ def _report(source: Source, found: Contents, own: Summary | None) -> _Report:
         report.findings.append(what)
         report.lost_bytes += size
         report.lost_chunks += gap.chunks
-        report.lost_s += _torn_seconds(source, gap, found) if at_end else gap.seconds
+        seconds = _torn_seconds(source, gap, found) if at_end else _seconds(gap, found, own)
+        report.lost_s = None if report.lost_s is None or seconds is None else report.lost_s + seconds
         report.lossy = True
     if own is not None and not report.lossy and own.statistics is not None:
         missing = own.statistics.message_count - sum(found.counts.values())
         if missing > 0:
             report.findings.append(f"{counted(missing, 'message')} of the summary are not in the file")
-            report.lossy = True
+            report.lossy, report.lost_s = True, None
     if found.undefined:
         report.findings.append(f"{counted(found.undefined, 'chunk')} with an undefined channel")
     if found.unproven:
@@ -210,10 +234,21 @@ def _report(source: Source, found: Contents, own: Summary | None) -> _Report:
     return report
 
 
-def _torn_seconds(source: Source, gap: Gap, found: Contents) -> float:
+def _seconds(gap: Gap, found: Contents, own: Summary | None) -> float | None:
+    """Time for which a gap stands [s]: between its neighbours, else what the summary says of the first or last message."""
+    if gap.seconds is not None or own is None or own.statistics is None or not found.counts:
+        return gap.seconds
+    statistics = own.statistics
+    whole = [chunk.index.chunk_start_offset for chunk in found.chunks if chunk.counts]
+    if gap.start < min(whole):
+        return max(0, found.start_ns - int(statistics.message_start_time)) * 1e-9
+    return max(0, int(statistics.message_end_time) - found.end_ns) * 1e-9 if gap.start > max(whole) else None
+
+
+def _torn_seconds(source: Source, gap: Gap, found: Contents) -> float | None:
     """Time for which the torn end of a file stood [s]: by the head of its chunk, else by the rate so far."""
-    if not found.chunks:
-        return 0.0
+    if not found.counts:
+        return None
     head = chunk_head(source.read(gap.start, HEAD_SIZE))
     if gap.chunks and head is not None:
         seconds = (head.end_ns - found.end_ns) * 1e-9
@@ -348,7 +383,7 @@ def _lock(descriptor: int, path: Path, *, shared: bool) -> None:
         fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
     except OSError as error:
         if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
-            raise RecoverError(
+            raise BeingWrittenError(
                 f"{path}: found that a recorder is writing it, expected a closed file"
             ) from None
         # A file system without locks: what is left is the check that the file does not change meanwhile.
@@ -384,14 +419,15 @@ def recover_leftover(file: OwnFile, keep_free: int = 0) -> tuple[str, bool] | No
         if path.stat().st_size == 0:  # its recorder died before the first byte
             path.unlink()
             return f"{path.name} was empty: removed", False
-        found = recover(path, keep_free=keep_free)
+        found = recover(path, keep_free=keep_free, attachments_are_enough=True)
     except RecoverError as error:
         return str(error), True
     except OSError as error:
         return f"{path.name} cannot be repaired: {error.strerror}", True
     text = f"{found.path.name} repaired: {counted(found.chunks, 'chunk')} kept"
     if found.lost_bytes:
-        text += f", {found.lost_bytes} B ({found.lost_s:.1f} s) unreadable"
+        time = "unknown time" if found.lost_s is None else f"{found.lost_s:.1f} s"
+        text += f", {found.lost_bytes} B ({time}) unreadable"
     return text, found.lossy
 
 

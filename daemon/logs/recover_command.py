@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from jtqd.daemon.logs.container import LogError, Source, footer_of
-from jtqd.daemon.logs.recover import Recovery, recover
-from jtqd.daemon.recording.parts import ACTIVE
+from jtqd.daemon.logs.container import LogError
+from jtqd.daemon.logs.recover import BeingWrittenError, OutsideChunksError, Recovery, recover
+from jtqd.daemon.recording.own_files import ACTIVE
 from jtqd.estimator.checked import counted
 
 _ENDINGS = (".mcap", ".mcap" + ACTIVE)
 _EXAMPLES = """examples:
-  jtq recover /var/log/jtqd                       every unfinished file in the directory
+  jtq recover /var/log/jtqd                       every damaged or unfinished file in the directory
   jtq recover run.mcap.active                     becomes run.mcap
   jtq recover --dry-run --json run.mcap           check every byte, change nothing
 
-In a directory: every *.mcap.active, and every *.mcap without a proper end. A file named on the command line is
-checked completely. Files that a recorder is writing are refused (in a directory: left out).
+Every file is checked completely; intact files of a directory (*.mcap, *.mcap.active) are not listed. Files that a
+recorder is writing are refused (in a directory: left out). A file without a readable message stays as it is.
 The recovered file is written beside the old one and then replaces it: the free space must be at least the file's size.
 
 exit status: 0 nothing lost, 3 recovered with loss, 1 failure, 2 usage"""
@@ -49,13 +48,20 @@ def main(argv: list[str] | None = None) -> int:
             parser().error(f"found {path}, expected a directory or a file named *.mcap or *.mcap{ACTIVE}")
     results: list[Recovery] = []
     failures: list[dict[str, str]] = []
-    for path in _files(options.logs):
+    for path, in_directory in _files(options.logs):
         try:
-            results.append(recover(path, dry_run=options.dry_run))
+            found = recover(path, dry_run=in_directory or options.dry_run)
+            if in_directory and not (found.changed or found.renamed):
+                continue
+            results.append(found if options.dry_run or not in_directory else recover(path))
+        except (BeingWrittenError, OutsideChunksError) as error:
+            if not in_directory or (isinstance(error, OutsideChunksError) and not error.ended):
+                failures.append(_failure(path, error))
+            else:
+                print(f"jtq recover: left out: {error}", file=sys.stderr)
+            continue
         except (LogError, OSError) as error:
-            text = f"{path}: {error.strerror}" if isinstance(error, OSError) else str(error)
-            failures.append({"path": str(path), "error": text})
-            print(f"jtq recover: {text}", file=sys.stderr)
+            failures.append(_failure(path, error))
             continue
         if not options.json:
             print(_text(results[-1], options.dry_run), flush=True)
@@ -68,28 +74,22 @@ def main(argv: list[str] | None = None) -> int:
     return 3 if any(each.lossy for each in results) else 0
 
 
-def _files(paths: list[Path]) -> Iterator[Path]:
+def _failure(path: Path, error: LogError | OSError) -> dict[str, str]:
+    """Say it on standard error; returns it for the JSON."""
+    text = f"{path}: {error.strerror}" if isinstance(error, OSError) else str(error)
+    print(f"jtq recover: {text}", file=sys.stderr)
+    return {"path": str(path), "error": text}
+
+
+def _files(paths: list[Path]) -> Iterator[tuple[Path, bool]]:
+    """Every file, and whether it was named by its directory only."""
     for path in paths:
         if not path.is_dir():
-            yield path
+            yield path, False
             continue
         for each in sorted(path.iterdir()):
-            if each.is_file() and (
-                each.name.endswith(_ENDINGS[1]) or (each.suffix == ".mcap" and not _has_footer(each))
-            ):
-                yield each
-
-
-def _has_footer(path: Path) -> bool:
-    """Return whether the file ends properly; also True if it cannot be opened."""
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    except OSError:
-        return True
-    try:
-        return footer_of(Source(descriptor)) is not None
-    finally:
-        os.close(descriptor)
+            if each.is_file() and each.name.endswith(_ENDINGS):
+                yield each, True
 
 
 def _text(result: Recovery, dry_run: bool) -> str:
@@ -101,9 +101,9 @@ def _text(result: Recovery, dry_run: bool) -> str:
     ]
     lines += [f"  {finding}" for finding in result.findings]
     if result.lossy:
+        time = "unknown time" if result.lost_s is None else f"about {result.lost_s:.2f} s"
         lines.append(
-            f"  lost: {counted(result.lost_bytes, 'byte')}, {counted(result.lost_chunks, 'chunk')}, "
-            f"about {result.lost_s:.2f} s"
+            f"  lost: {counted(result.lost_bytes, 'byte')}, {counted(result.lost_chunks, 'chunk')}, {time}"
         )
     return "\n".join(lines)
 

@@ -38,6 +38,7 @@ from jtqd.daemon.shared.systemd import LoopWatchdog, Notifier, watchdog_seconds
 from jtqd.drivers.devices import SYNC_COB_ID
 from jtqd.drivers.filters import CanFilter, look_alikes
 from jtqd.drivers.frame_socket import BusError, BusGone, FrameSocket, open_frame_socket
+from jtqd.drivers.nmt import HEARTBEAT_BASE
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.methods import AnyEstimator, load_network, make_estimator
 from jtqd.estimator.onnx_graph import NetworkError
@@ -171,7 +172,9 @@ def loop_filters(config: Config) -> list[CanFilter]:
     inputs = input_pdos(config)
     pdos = [*(pdo.cob_id for pdo in inputs), *(each.cob_id for each in joint_temperatures(config))]
     nodes = dict.fromkeys(pdo.node_id for pdo in inputs)
-    return [look_alikes(cob_id) for cob_id in (SYNC_COB_ID, *pdos, *(0x700 + node for node in nodes))]
+    return [
+        look_alikes(cob_id) for cob_id in (SYNC_COB_ID, *pdos, *(HEARTBEAT_BASE + node for node in nodes))
+    ]
 
 
 def warm_up(estimators: list[AnyEstimator]) -> None:

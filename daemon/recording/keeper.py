@@ -13,15 +13,15 @@ import signal
 import sys
 import time
 from collections.abc import Callable
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from jtqd.daemon.config import Config
 from jtqd.daemon.recording.dbc import dbc_text
-from jtqd.daemon.recording.parts import free_run, own_files
+from jtqd.daemon.recording.own_files import free_run, own_files
 from jtqd.daemon.recording.progress import Account, ProgressFile
 from jtqd.daemon.shared.child_process import Child, ChildError
+from jtqd.daemon.shared.runtime_dir import versions
 from jtqd.daemon.shared.snapshot import SnapshotReader
 
 _STARTS = 5
@@ -166,7 +166,6 @@ class Keeper:
 # ---- request ----
 
 _EDS_DIRECTORY = Path(__file__).resolve().parents[2] / "drivers" / "eds"
-_PACKAGES = ("jtqd", "numpy", "onnxruntime", "python-can", "canopen", "mcap")
 
 
 def recording_request(
@@ -275,14 +274,7 @@ def _provenance(config: Config, report: dict[str, Any]) -> dict[str, Any]:
             for joint in config.joints
         },
         "nodes": report["nodes"],
-        "versions": {name: _version(name) for name in _PACKAGES} | {"python": platform.python_version()},
+        "versions": versions(),
         "kernel": platform.release(),
         "machine": platform.machine(),
     }
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except ImportError:
-        return "not installed"

@@ -1,8 +1,4 @@
-"""The files ("parts") of one run: their names, rotation, disk budget and reserve, and what happens when the disk is full.
-
-A file is named PREFIX-RUN-PART.mcap, with `.active` behind it while it is being written. RUN is the time at which the run
-began, `YYYYmmddTHHMMSSZ` (UTC), with `_2`, `_3` ... where another run of that prefix has it already; PART counts from 0001.
-Nothing else in a directory is ours: it is neither repaired nor removed.
+"""The files ("parts") of one run: rotation, disk budget and reserve, and what happens when the disk is full.
 
 A file that cannot go on is ended with its summary; its cycles from then on are counted as lost, the obstacle is reported
 once, and another part is begun as soon as that is possible. Nothing here raises for a disk that fails.
@@ -10,127 +6,25 @@ once, and another part is begun as soon as that is possible. Nothing here raises
 
 from __future__ import annotations
 
-import os
-import re
 import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.journal import ERROR, INFO, WARN, Journal
 from jtqd.daemon.recording.mcap_file import Head, McapFile, NamedData, SealedChunk
-from jtqd.daemon.recording.progress import Account
-
-# ---- names ----
-
-ACTIVE = ".active"
-_RUN = r"(?P<stamp>\d{8}T\d{6}Z)(?:_(?P<again>[1-9]\d*))?"
-RUN_PATTERN = re.compile(_RUN, re.ASCII)
-PART_PATTERN = re.compile(
-    rf"(?P<prefix>.+)-(?P<run>{_RUN})-(?P<part>\d{{4,}})\.mcap(?P<active>{re.escape(ACTIVE)})?", re.ASCII
+from jtqd.daemon.recording.own_files import (
+    ACTIVE,
+    MEGABYTE,
+    free_bytes,
+    own_files,
+    part_name,
+    sized,
+    to_remove,
 )
-"""Name of a part, of any prefix."""
-
-
-class OwnFile(NamedTuple):
-    """One of our files; they sort in the order of their writing, as long as no run began before the clock was set back."""
-
-    stamp: str
-    again: int
-    """Number of the run among those of the same second, 1 for the first."""
-    part: int
-    active: bool
-    path: Path
-    run: str
-
-
-def part_name(prefix: str, run: str, part: int) -> str:
-    """Return the name of a finished part."""
-    return f"{prefix}-{run}-{part:04d}.mcap"
-
-
-def parse(prefix: str, path: Path) -> OwnFile | None:
-    """Parse a name; None for a foreign file."""
-    found = PART_PATTERN.fullmatch(path.name)
-    if found is None or found["prefix"] != prefix:
-        return None
-    again = int(found["again"] or 1)
-    return OwnFile(found["stamp"], again, int(found["part"]), bool(found["active"]), path, found["run"])
-
-
-def own_files(directory: Path, prefix: str) -> list[OwnFile]:
-    """Return our regular files in a directory, oldest first; empty if it cannot be read."""
-    try:
-        found = [parse(prefix, path) for path in directory.iterdir()]
-        return sorted(each for each in found if each and each.path.is_file() and not each.path.is_symlink())
-    except OSError:
-        return []
-
-
-def free_run(directory: Path, prefix: str, time_ns: int) -> str:
-    """Return an unused name for a run that begins at this time."""
-    stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(time_ns // 1_000_000_000))
-    taken = [each.again for each in own_files(directory, prefix) if each.stamp == stamp]
-    return f"{stamp}_{max(taken) + 1}" if taken else stamp
-
-
-# ---- disk space ----
-
-MEGABYTE = 1_000_000
-
-
-class Sized(NamedTuple):
-    """One of our files with its length [byte]."""
-
-    file: OwnFile
-    size: int
-
-
-def sized(files: Sequence[OwnFile]) -> list[Sized]:
-    """Return the existing files with their lengths."""
-    found = []
-    for file in files:
-        with suppress(OSError):
-            found.append(Sized(file, file.path.stat().st_size))
-    return found
-
-
-def to_remove(files: Sequence[Sized], budget: int, growing: int, run: str, *, keep_run: bool) -> list[Sized]:
-    """Return the files to remove for a budget; the budget may stay exceeded. Pure.
-
-    Only finished files, those of earlier runs first, the oldest first. Of the run being written finished parts go only where
-    `keep_run` is false, after all others, and never the newest of them.
-
-    Args:
-        files: all of ours, oldest first, without the file being written.
-        budget: all together [byte].
-        growing: the file being written [byte].
-        run: the run being written.
-    """
-    excess = sum(each.size for each in files) + growing - budget
-    others = [each for each in files if each.file.run != run and not each.file.active]
-    own = [each for each in files if each.file.run == run and not each.file.active]
-    chosen = []
-    for each in [*others, *([] if keep_run else own[:-1])]:
-        if excess <= 0:
-            break
-        chosen.append(each)
-        excess -= each.size
-    return chosen
-
-
-def free_bytes(directory: Path) -> int:
-    """Free space where the directory is, or would be made, without what is for root only. Raises OSError."""
-    while not directory.exists() and directory != directory.parent:
-        directory = directory.parent
-    found = os.statvfs(directory)
-    return found.f_bavail * found.f_frsize
-
-
-# ---- the parts of a run ----
+from jtqd.daemon.recording.progress import Account
 
 _RETRY_NS = 900_000_000
 """An attempt to begin a file costs little: at most this, and what was being collected, is lost when the disk is back."""

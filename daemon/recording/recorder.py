@@ -26,7 +26,8 @@ from jtqd.daemon.recording.diagnostics import Diagnostics, RecorderState
 from jtqd.daemon.recording.journal import INFO, WARN, Journal
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head
 from jtqd.daemon.recording.messages import BLOCK_PARTS, JointStateMessage, diagnostics
-from jtqd.daemon.recording.parts import MEGABYTE, Parts, Rules, free_run, own_files, sized
+from jtqd.daemon.recording.own_files import MEGABYTE, free_run, own_files, sized
+from jtqd.daemon.recording.parts import Parts, Rules
 from jtqd.daemon.recording.progress import Account, ProgressFile
 from jtqd.daemon.recording.recording import FlightRecorder, Recording
 from jtqd.daemon.recording.request import RecorderRequest, RequestError

@@ -14,7 +14,7 @@ from typing import Any
 
 from jtqd.daemon.recording.diagnostics import Node
 from jtqd.daemon.recording.mcap_file import NamedData
-from jtqd.daemon.recording.parts import RUN_PATTERN
+from jtqd.daemon.recording.own_files import RUN_PATTERN
 
 _SOURCES = {"path", "text", "base64"}
 _PATHS = ("progress", "snapshot", "notices")

@@ -29,7 +29,7 @@ from typing import Any
 
 from jtqd.daemon.loop.cycle import Cycle
 from jtqd.daemon.reload.carry import CarryError, Changed, Fill, Walk
-from jtqd.drivers.frame_socket import reachable
+from jtqd.drivers.bus_socket import reachable
 
 MESSAGE_BYTES = 1 << 18
 TAKEN = b"taken"

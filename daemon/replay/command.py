@@ -16,13 +16,13 @@ from mcap.records import Channel, Schema
 from jtqd.daemon.logs import LogError, read_attachments
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData
 from jtqd.daemon.recording.messages import CDR_HEADER, JOINT_ESTIMATE_SIZE
-from jtqd.daemon.recording.parts import ACTIVE
+from jtqd.daemon.recording.own_files import ACTIVE
 from jtqd.daemon.recording.schemas import SCHEMAS
 from jtqd.daemon.replay.compare import Comparison, Difference, Identity, Unknown
 from jtqd.daemon.replay.origin import SAMPLE
 from jtqd.daemon.replay.session import SHORT_CYCLES, ReplayOptions, Result, replay_each
 from jtqd.estimator.arrays import RecordArray
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.checked import ConfigError, check_output
 from jtqd.estimator.onnx_graph import NetworkError
 from jtqd.estimator.settings import METHODS
 
@@ -76,6 +76,11 @@ def _identity(result: Result, same: Identity) -> list[str]:
         word = "equal" if same.explained else "NOT equal"
         lines = [
             f"  {word} to {same.tolerance_nm:g} Nm{from_on}; bit-identical: {verdict} (in arrays; --exact compares bits)"
+        ]
+    elif same.explained and since is not None and same.network_nm:
+        lines = [
+            f"  equal to {same.network_nm:.1g} Nm{from_on}; bit-identical: {verdict} (the networks were evaluated otherwise "
+            "when this log was recorded)"
         ]
     elif same.explained and since is not None:
         lines = [f"  bit-identical{from_on}: {verdict}"]
@@ -330,11 +335,13 @@ def main(argv: list[str]) -> int:
     )
     bar = _Bar()
     try:
+        if options.out is not None:
+            check_output(options.out)
         good = _replay(options, replay_options, bar)
     except (LogError, ConfigError, NetworkError) as error:
         return _failed(bar, str(error))
     except OSError as error:
-        return _failed(bar, f"{error.filename or 'log'}: {error.strerror or error}")
+        return _failed(bar, f"{error.filename or options.out or 'output'}: {error.strerror or error}")
     return 0 if good else 3
 
 

@@ -166,6 +166,7 @@ class Identity:
         differences: what has no reason.
         from_cycle: all cycles from this one on are identical; None where the last one is not.
         tolerance_nm: numbers that differ by no more count as identical in all of this but `identical`; 0: bits.
+        network_nm: the same for what a network adds, where it was evaluated otherwise when the log was recorded; 0: bits.
     """
 
     cycles: int
@@ -176,6 +177,7 @@ class Identity:
     differences: tuple[Difference, ...]
     from_cycle: int | None
     tolerance_nm: float = 0.0
+    network_nm: float = 0.0
 
     @property
     def whole(self) -> bool:
@@ -205,16 +207,24 @@ def identity(
     replayed: Sequence[RecordArray],
     steps: Sequence[Steps],
     estimate: tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8], BoolArray] | None = None,
+    *,
     tolerance_nm: float = 0.0,
+    network_nm: float = 0.0,
 ) -> Identity:
     """Compare n cycles of both joints, all fields of `replayed`.
 
     `estimate`: bytes of the estimate PDO [n, 8] in the frames and replayed, and whether the log has it [n]; None: the
-    frames were not read. `tolerance_nm`: what rounding may do to a replay in arrays.
+    frames were not read. `tolerance_nm`: what rounding may do to a replay in arrays; `network_nm`: what another evaluation
+    of the networks may do to their share, in cycles where that share itself differs.
     """
     cycle = logged[0]["cycle"].astype(np.int64)
     same = [_same(one, two, tolerance_nm) for one, two in zip(logged, replayed, strict=True)]
     bits = [_same(one, two, 0.0) for one, two in zip(logged, replayed, strict=True)] if tolerance_nm else same
+    if network_nm:
+        same = [
+            each | _same_network(one, two, network_nm)
+            for each, one, two in zip(same, logged, replayed, strict=True)
+        ]
     recorded = pdo = np.ones(len(cycle), np.bool_)
     if estimate is None:
         recorded = ~pdo
@@ -251,6 +261,7 @@ def identity(
         tuple(_first_of_each(differences)),
         int(cycle[start]) if start < len(cycle) else None,
         tolerance_nm,
+        network_nm,
     )
 
 
@@ -258,6 +269,17 @@ def _same(logged: RecordArray, replayed: RecordArray, tolerance: float) -> BoolA
     same = np.ones(len(logged), np.bool_)
     for name in replayed.dtype.names or ():
         same &= _equal(logged, replayed, name, tolerance)
+    return same
+
+
+def _same_network(logged: RecordArray, replayed: RecordArray, limit: float) -> BoolArray:
+    """Equal bit for bit but for the network's share, which differs by no more than `limit` [n]."""
+    same = ~bits_equal(logged["network_nm"], replayed["network_nm"])
+    for name in replayed.dtype.names or ():
+        if name in ("network_nm", "torque_nm", "sigma_nm"):
+            same &= _equal(logged, replayed, name, limit)
+        else:
+            same &= bits_equal(logged[name], replayed[name])
     return same
 
 

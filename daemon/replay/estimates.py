@@ -5,7 +5,7 @@ is what only the loop could know: which inputs counted, how long a step was, tha
 else (positions that roll over, temperatures and their age, estimate, status, the bytes of the estimate PDO) is computed from
 the raw frames again.
 
-In arrays (`replay_whole`), the vectorised twins of the estimators give the same numbers to rounding, much faster. Inputs are
+In arrays (`replay_whole`), one call of the estimator takes a whole run: the same numbers, much faster. Inputs are
 the SI values of the log. What the loop decides after the estimate (starting, drive off or in fault, too late, what fits the
 field of the PDO) is decided here again.
 """
@@ -13,7 +13,7 @@ field of the PDO) is decided here again.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from math import isnan
 from typing import NamedTuple
@@ -41,7 +41,6 @@ from jtqd.estimator.methods import AnyEstimator, AnyNetwork, estimate_steps
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import DEGRADED, INVALID, OFF, PUBLISHED, STALE, STANDSTILL, STARTING, VALID
-from jtqd.estimator.whole_run import EstimateRun
 
 # ---- cycle by cycle, through the loop's own code ----
 
@@ -252,7 +251,8 @@ def replay_whole(model: Model, safety: JointSafety, records: RecordArray, steps:
     found = np.zeros(len(records), np.int64)
     if len(flags):
         dt_s = steps.dt_ns[rows].astype(np.float64) * 1e-9
-        made = _estimates(model, dt_s, columns, (flags & FLAG_NETWORK_SKIPPED) != 0)
+        wanted = (flags & FLAG_NETWORK_SKIPPED) == 0
+        made = estimate_steps(model.joint, model.settings, model.network, dt_s, columns, wanted)
         for name in _STAGES:
             values[name][rows] = getattr(made, name)
         asked = made.status.astype(np.uint16)
@@ -275,31 +275,6 @@ class _Cycles(NamedTuple):
     flags: CodeArray
     statusword: CodeArray
     cycle: npt.NDArray[np.uint64]
-
-
-def _estimates(
-    model: Model, dt_s: FloatArray, columns: JointColumns, skipped: npt.NDArray[np.bool_]
-) -> EstimateRun:
-    """Estimates [n]; in the samples `skipped` there was no time for the network, and they are physics only."""
-    made = estimate_steps(model.joint, model.settings, model.network, dt_s, columns)
-    if model.network is None or not skipped.any():
-        return made
-    alone = model.settings
-    if alone.method == "network":
-        alone = replace(alone, method="tob" if model.joint.efficiency is None else "efficiency")
-    physics = estimate_steps(model.joint, alone, None, dt_s, columns)
-    status = np.where(
-        skipped & (physics.status == VALID), DEGRADED, np.where(skipped, physics.status, made.status)
-    )
-    return EstimateRun(
-        np.where(skipped, physics.torque_nm, made.torque_nm),
-        np.where(skipped, physics.sigma_nm, made.sigma_nm),
-        status.astype(np.uint8),
-        made.tob_nm,
-        made.physics_nm,
-        np.where(skipped, np.nan, made.network_nm),
-        made.features,
-    )
 
 
 def _asked(

@@ -105,7 +105,7 @@ def open_origin(log: Path, attachments: Mapping[str, bytes], directory: Path) ->
     original = directory / "as_logged.yaml"
     original.write_bytes(text)
     try:
-        mapping, _ = load_yaml(original)
+        mapping = load_yaml(original)
         files = [
             each
             for number in (1, 2)

@@ -37,6 +37,7 @@ from jtqd.estimator.arrays import RecordArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.methods import AnyEstimator, AnyNetwork, load_network, make_estimator
+from jtqd.estimator.network import NATIVE_LIMIT
 from jtqd.estimator.onnx_graph import NetworkError
 from jtqd.models.files import load_joint
 
@@ -328,7 +329,10 @@ def _replay_run(
     progress("replaying", run.cycles, run.cycles)
     same = None
     if not options.other:
-        same = identity(logged, found.joints, steps, estimate, 0.0 if exact else ROUNDING_NM)
+        same = identity(logged, found.joints, steps, estimate, tolerance_nm=0.0 if exact else ROUNDING_NM)
+        if exact and not same.explained and any(each.network is not None for each in models.joints):
+            limit = NATIVE_LIMIT * min(each.joint.rated_torque_nm for each in models.joints)
+            same = identity(logged, found.joints, steps, estimate, network_nm=limit)
     taken = [_known(run, same, n) for n in (1, 2)]
     first, second = (compare(n + 1, logged[n], found.joints[n], taken[n]) for n in (0, 1))
     return Result(

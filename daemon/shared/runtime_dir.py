@@ -13,6 +13,7 @@ import fcntl
 import hashlib
 import json
 import os
+import platform
 import re
 import time
 from contextlib import suppress
@@ -216,12 +217,22 @@ def start_ticks(pid: int) -> int | None:
     return None if fields[0] == "Z" else int(fields[19])
 
 
+_PACKAGES = ("jtqd", "numpy", "onnxruntime", "python-can", "canopen", "mcap")
+
+
 def installed(name: str) -> str | None:
     """Version of an installed package."""
     try:
         return version(name)
     except PackageNotFoundError:
         return None
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that an estimate and its log depend on, for `about.json` and the log."""
+    return {name: installed(name) or "not installed" for name in _PACKAGES} | {
+        "python": platform.python_version()
+    }
 
 
 def _plain(content: About) -> dict[str, Any]:

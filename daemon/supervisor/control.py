@@ -20,7 +20,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from jtqd.drivers.frame_socket import reachable
+from jtqd.drivers.bus_socket import reachable
 
 FILE = "control"
 """Name of the socket in the runtime directory."""

@@ -9,9 +9,7 @@ from pathlib import Path
 
 from jtqd.daemon.config import Config, JointConfig
 from jtqd.daemon.loop.input_pdos import input_pdos, sensor_index
-from jtqd.daemon.shared.runtime_dir import About, AboutJoint, installed, start_ticks
-
-_PACKAGES = ("jtqd", "numpy", "onnxruntime", "python-can", "canopen", "mcap")
+from jtqd.daemon.shared.runtime_dir import About, AboutJoint, start_ticks, versions
 
 
 def about(config: Config, *, bus: str, instance: str, log_directory: Path | None) -> About:
@@ -37,8 +35,7 @@ def about(config: Config, *, bus: str, instance: str, log_directory: Path | None
         inputs=names,
         log_directory=str(log_directory.resolve()) if log_directory else None,
         log_prefix=f"jtqd-{instance}-",
-        versions={name: installed(name) or "not installed" for name in _PACKAGES}
-        | {"python": platform.python_version(), "kernel": platform.release()},
+        versions=versions() | {"kernel": platform.release()},
     )
 
 

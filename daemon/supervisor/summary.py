@@ -10,6 +10,7 @@ from typing import Any
 from jtqd.daemon.shared.conditions import CATALOGUE, Occurrences
 from jtqd.daemon.shared.notices import INFO
 from jtqd.daemon.shared.snapshot import SnapshotReader
+from jtqd.estimator.checked import finite
 
 _AGES = (
     "              (estimate and sensor reading of the same cycle;\n"
@@ -53,9 +54,9 @@ class Summary:
             "cycles": self.cycles,
             "missed": self.missed,
             "stale_inputs": self.stale_inputs,
-            "work_us": dict(zip(("p50", "p99", "max"), map(_json, self.work_us), strict=True)),
-            "late_us": dict(zip(("p50", "p99", "max"), map(_json, self.late_us), strict=True)),
-            "rmse_nm": {"joint_1": _json(self.rmse_nm[0]), "joint_2": _json(self.rmse_nm[1])},
+            "work_us": dict(zip(("p50", "p99", "max"), map(finite, self.work_us), strict=True)),
+            "late_us": dict(zip(("p50", "p99", "max"), map(finite, self.late_us), strict=True)),
+            "rmse_nm": {"joint_1": finite(self.rmse_nm[0]), "joint_2": finite(self.rmse_nm[1])},
             "deviations": {"joint_1": self._deviations(1), "joint_2": self._deviations(2)},
             "conditions": [
                 each._asdict() | {"total_s": round(each.total_s, 3), "first_s": round(each.first_s, 3)}
@@ -146,10 +147,6 @@ class Summary:
         if self.error:
             lines.append(f"ended by      {self.error}")
         return "\n".join(lines)
-
-
-def _json(value: float) -> float | None:
-    return value if isfinite(value) else None
 
 
 def summary_of(

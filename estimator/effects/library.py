@@ -49,6 +49,10 @@ NAMES: Final = (
 """What joint files and findings may rely on; the library may hold more, never fewer."""
 
 
+_SHARED: Final = ("library", "effect", "functions", "regression")
+"""Files that hold no effect; `functions` is not loaded for them: it brings numpy, which the supervisor does without."""
+
+
 def discover() -> dict[str, Effect]:
     """Return the effects of this package by name, in alphabetical order.
 
@@ -57,7 +61,7 @@ def discover() -> dict[str, Effect]:
     """
     effects: dict[str, Effect] = {}
     for module in pkgutil.iter_modules(sys.modules[__package__].__path__):
-        if module.name == "library":
+        if module.name in _SHARED:
             continue
         effect = getattr(importlib.import_module(f"jtqd.estimator.effects.{module.name}"), "EFFECT", None)
         if effect is not None:

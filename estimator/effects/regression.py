@@ -1,6 +1,7 @@
 """Terms of the usual shapes: from coefficients of basis columns to parameters, exactly where the effect is linear.
 
-The combinations are small frozen values rather than closures, so that terms can be sent to another process.
+The combinations are small frozen values rather than closures, so that terms can be sent to another process. numpy is
+loaded where an array comes: the supervisor checks joint files with this library and has none.
 """
 
 from __future__ import annotations
@@ -9,8 +10,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
-
-import numpy as np
 
 from jtqd.estimator.effects.effect import JointValues, Term, Values
 
@@ -26,15 +25,21 @@ _FLAT: Final = 1e-9
 
 def full(value: float, like: Any) -> Any:
     """Return the value for a float, an array [n] of it for an array [n]."""
+    if isinstance(like, float):  # of the loop, in every cycle
+        return value
+    import numpy as np
+
     return np.full(like.shape, value) if isinstance(like, np.ndarray) else value
 
 
 def above(temperature_c: Any, reference_c: float) -> Any:
     """Return temperature less reference, 0 where the temperature is not known (not finite)."""
     difference = temperature_c - reference_c
-    if isinstance(difference, np.ndarray):
-        return np.where(np.isfinite(difference), difference, 0.0)
-    return difference if math.isfinite(difference) else 0.0
+    if isinstance(difference, float | int):
+        return difference if math.isfinite(difference) else 0.0
+    import numpy as np
+
+    return np.where(np.isfinite(difference), difference, 0.0)
 
 
 def reference_of(joint: JointValues) -> float:
@@ -60,8 +65,8 @@ class Linear:
 
     def term(self) -> Term:
         """Return the term: one column per parameter, the others at their base."""
-        units = np.eye(len(self.names)).tolist()
-        return Term(tuple(self(unit) for unit in units), self)
+        count = range(len(self.names))
+        return Term(tuple(self([float(row == column) for column in count]) for row in count), self)
 
 
 def linear(name: str, step: float, base: float = 0.0, **fixed: float) -> Term:

@@ -7,13 +7,15 @@ import datetime as dt
 import importlib.util
 import json
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from jtqd.estimator.checked import ConfigError, count, counted, seconds
+from jtqd.estimator.checked import ConfigError, count, counted, make_directory, seconds
+from jtqd.estimator.settings import METHODS
 from jtqd.sysid.batch.run import (
     BY_DIRECTORY,
     BY_RUN,
@@ -33,11 +35,12 @@ from jtqd.sysid.batch.run import (
 )
 from jtqd.sysid.batch.summary import DIAGNOSE, REPLAY, counts, render, to_mapping
 from jtqd.sysid.runs.files import LOGS, TABLES, ColumnMap, RunError
-from jtqd.sysid.runs.joints import UsageError, joint_files
+from jtqd.sysid.runs.joints import UsageError, check_joint_files, joint_files
 
 BY: Final = "jtq batch"
 PAGE, SUMMARY = "index.html", "summary.json"
 _KINDS: Final = {DIAGNOSE: (TABLES, LOGS), REPLAY: (LOGS,)}
+_SCHEDULER: Final = re.compile(r"(\w+://)?[^\s/]+:\d{1,5}")
 _GROUP_BY: Final = {DIAGNOSE: BY_DIRECTORY, REPLAY: BY_RUN}
 _EXAMPLES: Final = """examples:
   jtq batch diagnose fleet/ --joint models/joint1.yaml --out fleet_diagnosis
@@ -62,9 +65,10 @@ def main(argv: list[str]) -> int:
             options.logs, options.group_by or _GROUP_BY[options.command], _KINDS[options.command]
         )
         arguments, parameters = _diagnose(options) if options.command == DIAGNOSE else _replay(options)
-    except (UsageError, GroupError) as error:
+        make_directory(options.out)
+    except UsageError as error:
         return _error(error, 2)
-    except (ConfigError, RunError) as error:
+    except (GroupError, ConfigError, RunError) as error:
         return _error(error)
     for path in active:
         _error(f"{path}: left out, still being written (`jtq recover` ends it)")
@@ -107,9 +111,14 @@ def _run(options: argparse.Namespace, groups: Sequence[Group], task: Task, param
         )
         for row in rows:
             if row.error:
-                print(f"  {row.group.name}: {row.error}")
+                print(f"  {_failure(row)}")
     _error(f"wrote {options.out / PAGE}")
     return 3 if number["failed"] else 0
+
+
+def _failure(row: Row) -> str:
+    """Return group and error of a row; a file that is its own group is named once."""
+    return f"{row.group.name}: {row.error.removeprefix(f'{Path(row.group.name).name}: ')}"
 
 
 @contextmanager
@@ -125,7 +134,7 @@ def _progress(groups: int) -> Iterator[Callable[[Row], None]]:
         def finished(row: Row) -> None:
             bar.advance(task)
             if row.state == FAILED:
-                _error(f"{row.group.name}: {row.error}")
+                _error(_failure(row))
 
         yield finished
 
@@ -134,6 +143,7 @@ def _diagnose(options: argparse.Namespace) -> tuple[tuple[str, ...], dict[str, A
     """Return the arguments of `jtq diagnose`, and the same by content. Raises UsageError, ConfigError, RunError."""
     columns = None if options.columns is None else ColumnMap.load(options.columns)
     files = joint_files(options.joint, columns)
+    check_joint_files(files)
     arguments: list[str] = []
     for text in options.joint:
         number, equals, path = text.rpartition("=")
@@ -195,9 +205,16 @@ def parser() -> argparse.ArgumentParser:
     )
     replay = _common(commands, REPLAY, "replay the estimator over each run, and compare")
     replay.add_argument("--model", type=Path, metavar="DIR", help="other models; see jtq replay --help")
-    replay.add_argument("--method", metavar="NAME", help="another method of the estimator")
+    replay.add_argument("--method", choices=METHODS, help="another method of the estimator")
     replay.add_argument("--exact", action="store_true", help="cycle by cycle for any length")
     return result
+
+
+def _scheduler(text: str) -> str:
+    """Address of a scheduler. Raises argparse.ArgumentTypeError."""
+    if not _SCHEDULER.fullmatch(text):
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected tcp://HOST:PORT")
+    return text
 
 
 def _common(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
@@ -217,6 +234,7 @@ def _common(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
     )
     made.add_argument(
         "--scheduler",
+        type=_scheduler,
         metavar="tcp://HOST:PORT",
         help="dask scheduler (default: this machine; extra: cluster)",
     )

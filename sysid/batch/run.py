@@ -125,7 +125,9 @@ def find_groups(
     active: list[Path] = []
     for path in named:
         if not path.exists():
-            raise GroupError(f"{path}: found nothing, expected a log or a directory of logs")
+            raise GroupError(
+                f"{path}: found no such file or directory, expected a log or a directory of logs"
+            )
         inside = [each for each in path.rglob("*") if each.is_file()] if path.is_dir() else [path]
         unfinished = sorted(each for each in inside if each.name.endswith(_UNFINISHED))
         wanted = _first_kind(inside, kinds)
@@ -207,7 +209,10 @@ def run_task(task: Task) -> Outcome:
             return outcome(status, None, f"ended by {signal.Signals(-status).name}{reason}")
         if status not in (0, 3):
             lines = stderr.decode(errors="replace").strip().splitlines() or [f"exit status {status}"]
-            return outcome(status, None, lines[-1].removeprefix(f"jtq {task.command}: ")[:400])
+            text = lines[-1].removeprefix(f"jtq {task.command}: ")
+            for path in task.files:
+                text = text.replace(path, os.path.basename(path))
+            return outcome(status, None, text[:400])
         try:
             result = json.loads(stdout)
         except ValueError:
@@ -298,11 +303,15 @@ def store(out: Path, key: str, content: Mapping[str, Any], files: Mapping[str, b
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Put a file in place that is there whole or not at all. Raises OSError."""
+    """Put a file in place that is there whole or not at all; nothing is left of one that fails. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
 
 
 def run_batch(

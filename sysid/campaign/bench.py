@@ -49,7 +49,7 @@ class BenchConfig:
             ConfigError: naming file, key, found and expected; also for a period of SYNC other than 1 ms.
         """
         path = path if path is not None else shipped(DEFAULT_CONFIG)
-        mapping, _ = load_yaml(path)
+        mapping = load_yaml(path)
         top = Section(mapping, str(path))
         sync = top.section("sync", optional=True)
         if sync is not None:

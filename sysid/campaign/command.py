@@ -45,7 +45,7 @@ _EXAMPLES: Final = """examples:
 
 
 def parser() -> argparse.ArgumentParser:
-    """All options; `usage_error` checks their combination."""
+    """All options; `usage_error` and `missing_option` check their combination."""
     made = argparse.ArgumentParser(
         prog="jtq campaign",
         description="Drive both joints through a campaign of runs, record and check each; continue an interrupted campaign.",
@@ -97,6 +97,11 @@ def usage_error(options: argparse.Namespace) -> str:
             return f"--{given[0].removesuffix('_s')} belongs to {', '.join(KINDS)}, not for a plan file"
     if options.plant is not None and not emulated(options.bus):
         return "--plant requires --bus sim"
+    return ""
+
+
+def missing_option(options: argparse.Namespace) -> str:
+    """Return which option is missing, or an empty text. An unreadable plan file is reported before."""
     if not options.dry_run and (options.bus is None or options.out is None):
         missing = "--bus" if options.bus is None else "--out"
         return f"{missing} is missing, for example --bus sim --out campaigns/{Path(options.plan).stem}"
@@ -229,16 +234,22 @@ def main(argv: list[str]) -> int:
     """Plan and run; exit status 0 done, 1 failure or ended early, 2 usage, 3 done with findings."""
     options = parser().parse_args(argv)
     problem = usage_error(options)
-    if problem:
-        print(f"jtq campaign: {problem}", file=sys.stderr)
-        return 2
     try:
+        if not problem and options.plan not in KINDS:
+            load_plan(Path(options.plan))
+        problem = problem or missing_option(options)
+        if problem:
+            print(f"jtq campaign: {problem}", file=sys.stderr)
+            return 2
         return _dry_run(options) if options.dry_run else _campaign(options)
     except (ConfigError, StateError, ProcessError) as error:
         print(f"jtq campaign: {error}", file=sys.stderr)
         return 1
     except OSError as error:
-        print(f"jtq campaign: {error.filename or options.out}: {error.strerror or error}", file=sys.stderr)
+        print(
+            f"jtq campaign: {error.filename or options.out or 'output'}: {error.strerror or error}",
+            file=sys.stderr,
+        )
         return 1
 
 

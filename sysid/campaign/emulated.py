@@ -112,7 +112,11 @@ def _claim(out: Path, plan: Plan, plant: Path, seed: int) -> None:
     recipe = {"plan": plan.sha256, "plant": hashlib.sha256(plant.read_bytes()).hexdigest(), "seed": seed}
     file = out / _RECIPE
     if file.is_file():
-        if json.loads(file.read_text(encoding="utf-8")) != recipe:
+        try:
+            same = json.loads(file.read_bytes()) == recipe
+        except ValueError:
+            same = False
+        if not same:
             raise ConfigError(f"{out}: found runs of another plan, bench or seed, expected a new directory")
         return
     out.mkdir(parents=True)

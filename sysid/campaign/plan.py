@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import re
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -18,7 +17,7 @@ import numpy as np
 import yaml
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.checked import ConfigError, Section, finite
 from jtqd.estimator.decoder import decode, limits
 from jtqd.models.files import load_yaml
 from jtqd.sysid.excitation.fourier import FourierSeries, FourierTrajectory
@@ -189,7 +188,7 @@ class Plan:
         return {
             "schema": SCHEMA,
             "name": self.name,
-            "limits": {name: _finite(getattr(self.limits, name)) for name in _LIMIT_UNITS},
+            "limits": {name: finite(getattr(self.limits, name)) for name in _LIMIT_UNITS},
             "runs": [run.to_mapping() for run in self.runs],
         }
 
@@ -211,7 +210,7 @@ class Plan:
 
 def load_plan(path: Path) -> Plan:
     """Read a plan file. Raises ConfigError."""
-    mapping, _ = load_yaml(path)
+    mapping = load_yaml(path)
     return Plan.from_mapping(mapping, str(path))
 
 
@@ -227,10 +226,6 @@ def _limits(top: Section) -> Limits:
     }
     section.finish()
     return Limits(**values)
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def _run(section: Section) -> Run:

@@ -14,8 +14,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
+from jtqd.drivers.bus_socket import PREFIX
 from jtqd.drivers.filters import exact
-from jtqd.drivers.frame_socket import PREFIX, BusError, open_frame_socket
+from jtqd.drivers.frame_socket import BusError, open_frame_socket
 
 READY_S: Final = 60.0
 """Longest time until a process is at work; a small controller loads its libraries from a slow card."""

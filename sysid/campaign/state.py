@@ -153,11 +153,11 @@ class CampaignDirectory:
     def _load(self) -> None:
         path = self.path / STATE_FILE
         try:
-            text = path.read_text(encoding="utf-8")
+            data = path.read_bytes()
         except FileNotFoundError:
             return
         try:
-            top = Section(json.loads(text), str(path))
+            top = Section(json.loads(data), str(path))
             top.text("schema", (SCHEMA,))
             self.name, sha256 = top.text("name"), top.text("plan_sha256")
             self.recipe = top.raw("recipe")

@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from jtqd.estimator.checked import ConfigError, counted
+from jtqd.estimator.checked import ConfigError, counted, make_directory
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTableError
 from jtqd.sysid.campaign.plan import Plan
@@ -23,7 +23,7 @@ from jtqd.sysid.diagnosis.findings import INSUFFICIENT, NO_GAP, Findings, summar
 from jtqd.sysid.progress import waiting
 from jtqd.sysid.runs.checks import CheckedRuns, check_runs
 from jtqd.sysid.runs.files import ColumnMap, RunError, RunFile, read_runs
-from jtqd.sysid.runs.joints import UsageError, joint_files, joints_of
+from jtqd.sysid.runs.joints import UsageError, check_joint_files, joint_files, joints_of
 
 BY: Final = "jtq diagnose"
 _NEEDED: Final = ("matplotlib", "jinja2")
@@ -44,6 +44,7 @@ def main(argv: list[str]) -> int:
     try:
         columns = None if options.columns is None else ColumnMap.load(options.columns)
         files = joint_files(options.joint, columns)
+        check_joint_files(files)
         _check_out(options.out, options.force)
         runs = read_runs(options.runs, columns)
         joints = joints_of(files, runs)
@@ -156,11 +157,7 @@ def parser() -> argparse.ArgumentParser:
 
 def _check_out(directory: Path, force: bool) -> None:
     """Make DIR before minutes of work, and refuse to overwrite. Raises ConfigError."""
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        reason = "it is a file" if isinstance(error, FileExistsError) else error.strerror
-        raise ConfigError(f"--out {directory}: cannot be created: {reason}") from None
+    make_directory(directory)
     there = [name for name in _OWN if (directory / name).exists()]
     if there and not force:
         raise ConfigError(

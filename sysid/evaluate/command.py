@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.checked import ConfigError, make_directory
 from jtqd.estimator.onnx_graph import NetworkError
 from jtqd.sysid.evaluate.evaluation import Evaluation, evaluate
 from jtqd.sysid.evaluate.inputs import Inputs, read_inputs
@@ -36,8 +36,10 @@ def main(argv: list[str]) -> int:
         return 1
     try:
         models = load_models(options.models, options.joint)
-        _make(options.out)
+        make_directory(options.out)
         inputs = read_inputs(options.runs, models, options.columns)
+        if not inputs.runs and inputs.findings:
+            raise RunError("\n".join(finding.text for finding in inputs.findings))
         outside = Inputs((), (), ())
         if options.outside:
             outside = read_inputs(options.outside, models, options.columns)
@@ -109,15 +111,6 @@ def parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON instead of the table")
     return parser
-
-
-def _make(directory: Path) -> None:
-    """Make the directory before minutes of work. Raises ConfigError."""
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        reason = "it is a file" if isinstance(error, FileExistsError) else error.strerror
-        raise ConfigError(f"--out {directory}: cannot be created: {reason}") from None
 
 
 def _distinct(inputs: Inputs, outside: Inputs) -> tuple:  # type: ignore[type-arg]

@@ -15,10 +15,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jtqd.estimator.envelope import Envelope
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.status import DEGRADED
-from jtqd.estimator.validity import Envelope
 from jtqd.sysid.evaluate.methods import OURS, Samples
 from jtqd.sysid.evaluate.scores import Block, Score, score
 from jtqd.sysid.fit.plateaus import Plateau, PlateauError, find_plateaus

@@ -12,8 +12,8 @@ from typing import Final, NamedTuple, TypeVar
 import numpy as np
 
 from jtqd.estimator.checked import counted
+from jtqd.estimator.envelope import Envelope
 from jtqd.estimator.network import FusedNetwork
-from jtqd.estimator.validity import Envelope
 from jtqd.sysid.evaluate import constant, scores
 from jtqd.sysid.evaluate.constant import (
     Outside,

@@ -26,14 +26,14 @@ from numpy.typing import NDArray
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.estimator import FusedEstimator, observe_run, quadrants
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.methods import AnyNetwork, estimate_columns, load_network
-from jtqd.estimator.run import JointColumns
+from jtqd.estimator.observer import low_pass
+from jtqd.estimator.run import EstimateRun, JointColumns, ObservedRun
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
-from jtqd.estimator.whole_run import EstimateRun, ObservedRun, estimate_observed, observe_run, quadrant_many
 from jtqd.models.files import load_joint
-from jtqd.sysid.fit.signals import same_age
 
 KEY: Final = "runs"
 _COMPRESSION: Final = 6
@@ -162,7 +162,8 @@ class JointModels:
         for method in ("physics", OURS):  # one observer serves both
             if method in self.methods:
                 network = self.networks.get(method)
-                runs[method] = estimate_observed(self.joint, settings, network, seen)  # type: ignore[arg-type]
+                estimator = FusedEstimator(self.joint, settings, network)  # type: ignore[arg-type]
+                runs[method] = estimator.run_observed(seen)
         return runs, seen
 
 
@@ -272,7 +273,7 @@ def take_samples(run: str, models: JointModels, time_s: FloatArray, columns: Joi
     if columns.torque_nm is None:
         raise ValueError(f"{run}: j{models.number}.torque_nm: missing")
     dt = np.diff(time_s, prepend=time_s[0])
-    sensor = same_age(columns.torque_nm, dt, EstimatorSettings().bandwidth_rad_s)
+    sensor = low_pass(columns.torque_nm, dt, EstimatorSettings().bandwidth_rad_s)
     settled = time_s - time_s[0] >= SETTLE_S
     published = settled & np.logical_and.reduce([np.isfinite(each.torque_nm) for each in runs.values()])
     moving = np.logical_and.reduce([np.isin(each.status, (VALID, DEGRADED)) for each in runs.values()])
@@ -287,7 +288,7 @@ def take_samples(run: str, models: JointModels, time_s: FloatArray, columns: Joi
         raw_nm=seen.raw_nm,
         velocity_rad_s=seen.velocity_rad_s,
         temperature_c=seen.temperature_c,
-        quadrant=quadrant_many(seen.raw_nm, seen.velocity_rad_s),
+        quadrant=quadrants(seen.raw_nm, seen.velocity_rad_s),
         estimate_nm={method: each.torque_nm for method, each in runs.items()},
         sigma_nm={method: each.sigma_nm for method, each in runs.items()},
         status={method: each.status for method, each in runs.items()},

@@ -22,6 +22,8 @@ from jtqd.sysid.excitation.design import FINAL_RATE_HZ, STARTS, Design, design
 from jtqd.sysid.excitation.model import Bench, ExcitationLimits
 
 EVALUATIONS: Final = 2000
+_LARGEST: Final = 1e4
+"""Of any limit, in its unit: beyond it nothing is a limit of a joint, and the search loses its digits."""
 LIMIT_OPTIONS: Final = {
     "velocity_rad_s": ("--velocity", "rad/s", "peak velocity, joint side"),
     "acceleration_rad_s2": ("--acceleration", "rad/s2", "peak acceleration, joint side"),
@@ -40,8 +42,8 @@ def _positive(text: str) -> float:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not 0.0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected a number > 0")
+    if not 0.0 < value <= _LARGEST:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a number > 0 and <= {_LARGEST:g}")
     return value
 
 
@@ -116,7 +118,10 @@ def main(argv: list[str]) -> int:
     except ConfigError as error:
         print(f"jtq excitation: {error}", file=sys.stderr)
     except OSError as error:
-        print(f"jtq excitation: {error.filename or options.out}: {error.strerror or error}", file=sys.stderr)
+        print(
+            f"jtq excitation: {error.filename or options.out or 'output'}: {error.strerror or error}",
+            file=sys.stderr,
+        )
     return 1
 
 

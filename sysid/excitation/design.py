@@ -11,6 +11,7 @@ other, each for what it adds to those before it (sequential D-optimality): the f
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -33,6 +34,11 @@ MUTATION: Final = (0.3, 0.7)
 RECOMBINATION: Final = 0.9
 """Of the differential evolution (docs/excitation.md has the comparison). scipy's own settings take four times as many
 evaluations for a design as good."""
+POLISHING: Final = 0.1
+"""Share of the evaluations that is kept for walking downhill from the best genome: a design gains nothing more from it
+than from as much evolution, but where the criterion is smooth the minimum is reached, not only approached."""
+_SLOPE_STEP: Final = 1e-3
+"""Of the differences that the slope is made of: above the steps of a scale that bisection finds (1/4096)."""
 
 
 class Found(NamedTuple):
@@ -45,8 +51,8 @@ class Found(NamedTuple):
 def minimise(criterion: Criterion, dimension: int, *, evaluations: int, rng: np.random.Generator) -> Found:
     """Return the best genome of a search of at most `evaluations` (>= 1); the same generator state gives the same result.
 
-    Up to POPULATION evaluations the genomes are drawn uniformly, beyond it they evolve (scipy's differential evolution,
-    whole generations of POPULATION).
+    Below two populations the genomes are drawn uniformly, POPULATION at most; beyond it they evolve (scipy's
+    differential evolution, whole generations of POPULATION), and the last tenth polishes the best of them.
 
     Raises:
         ValueError: evaluations below 1.
@@ -55,8 +61,7 @@ def minimise(criterion: Criterion, dimension: int, *, evaluations: int, rng: np.
     if evaluations < 1:
         raise ValueError(f"found {evaluations} evaluations, expected at least 1")
     first = rng.uniform(-1.0, 1.0, (min(POPULATION, evaluations), dimension))
-    generations = evaluations // POPULATION - 1
-    if generations < 1:
+    if evaluations < 2 * POPULATION:
         values = criterion(first)
         best = int(np.argmin(values))
         return Found(first[best], float(values[best]))
@@ -64,21 +69,60 @@ def minimise(criterion: Criterion, dimension: int, *, evaluations: int, rng: np.
         from scipy.optimize import differential_evolution
     except ImportError:
         raise ConfigError("excitation design: scipy is not installed: pip install 'jtqd[train]'") from None
-    result = differential_evolution(
+    generations = max(2, int((1.0 - POLISHING) * evaluations) // POPULATION)
+    evolved = differential_evolution(
         lambda genomes: criterion(genomes.T),
         [(-1.0, 1.0)] * dimension,
         strategy=STRATEGY,
         mutation=MUTATION,
         recombination=RECOMBINATION,
         init=first,
-        maxiter=generations,
+        maxiter=generations - 1,  # the first is `init`
         tol=0.0,  # no early end
-        polish=False,
+        polish=False,  # scipy's own has no limit of evaluations
         updating="deferred",
         vectorized=True,
         rng=rng,
     )
-    return Found(np.asarray(result.x), float(result.fun))
+    found = Found(np.asarray(evolved.x), float(evolved.fun))
+    return _polished(criterion, found, evaluations - generations * POPULATION)
+
+
+class _SpentError(Exception):
+    """The evaluations are spent; scipy's own limit is looked at between two lines only."""
+
+
+def _polished(criterion: Criterion, found: Found, evaluations: int) -> Found:
+    """Return the best of a walk downhill from a genome (L-BFGS-B); a slope takes one evaluation per gene and one more."""
+    from scipy.optimize import minimize
+
+    best, left = found, evaluations
+
+    def value_and_slope(genome: FloatArray) -> tuple[float, FloatArray]:
+        nonlocal best, left
+        left -= len(genome) + 1
+        if left < 0:
+            raise _SpentError
+        step = np.where(genome > 0.0, -_SLOPE_STEP, _SLOPE_STEP)  # inwards: the box is kept
+        around = np.vstack([genome, genome + np.diag(step)])
+        values = criterion(around)
+        k = int(np.argmin(values))
+        if values[k] < best.value:
+            best = Found(around[k], float(values[k]))
+        with np.errstate(invalid="ignore"):  # infinite less infinite
+            slope = (values[1:] - values[0]) / step
+        return float(values[0]), np.where(np.isfinite(slope), slope, 0.0)
+
+    with suppress(_SpentError):
+        minimize(
+            value_and_slope,
+            found.genome,
+            jac=True,
+            method="L-BFGS-B",
+            bounds=[(-1.0, 1.0)] * len(found.genome),
+            options={"ftol": 0.0, "gtol": 0.0},  # only the evaluations end it, or no step that still improves
+        )
+    return best
 
 
 STRIBECK_VELOCITY_RAD_S: Final = 0.05
@@ -94,7 +138,7 @@ def loss_regressor(velocity_rad_s: FloatArray, torque_nm: FloatArray) -> FloatAr
 
         loss = s (c_d + f_d |v| + q_d v^2 + p_d exp(-(v/0.05)^2)) + s (k_dq |tau| + m_dq tau^2 + n_dq |tau| |v|)
 
-    The estimator's own loss (estimator/losses.py) is finer in the load: lines between nodes. For a design the few
+    The estimator's own loss (estimator/losses.pyx) is finer in the load: lines between nodes. For a design the few
     coefficients of a polynomial do better: they ask for the ends and the middle of every range. At the same instant the
     other joint has (-v, tau), which only changes places and signs of the columns: one determinant serves both joints.
 

@@ -75,7 +75,7 @@ class Motion(NamedTuple):
 class Bench:
     """Static model of two coupled joints: the first moves by velocity, the second drives it by current.
 
-    In steady state the second joint, at i_2 and v_2 = -v_1, gives tau = G Kt i_2 - loss_2(i_2, v_2) (estimator/losses.py);
+    In steady state the second joint, at i_2 and v_2 = -v_1, gives tau = G Kt i_2 - loss_2(i_2, v_2) (estimator/losses.pyx);
     rotor and link inertia are added, stiffness and control are left out.
     """
 

@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.checked import ConfigError, check_output
 from jtqd.estimator.joint import CONVENTIONS, Joint
 from jtqd.estimator.run import RunTableError
 from jtqd.estimator.settings import EstimatorSettings
@@ -39,6 +39,7 @@ from jtqd.sysid.fit.plateaus import Plateau, PlateauError, PlateauRules, plateau
 from jtqd.sysid.fit.signals import RunSignals, run_signals
 from jtqd.sysid.fit.torsion import TorsionError
 from jtqd.sysid.progress import progress
+from jtqd.sysid.report.figures import check_picture
 from jtqd.sysid.runs.checks import channel_findings
 from jtqd.sysid.runs.files import RunError, RunFile, read_runs
 from jtqd.sysid.runs.joints import joint_number
@@ -132,6 +133,10 @@ def efficiency_main(argv: list[str]) -> int:
         return 1
     try:
         joint = load_joint(options.joint)
+        if options.out is not None:
+            check_output(options.out)
+        if options.plot is not None:
+            check_picture(options.plot)
         runs = read_runs(options.runs, options.columns)
         number = joint_number(options.number, joint, runs)
         result = analyse(joint, runs, number, options)
@@ -273,6 +278,8 @@ def friction_main(argv: list[str]) -> int:
     options = parse_fit(friction_parser(), argv)
     try:
         joint = load_joint(options.joint)
+        if options.out is not None:
+            check_output(options.out)
         runs = read_runs(options.runs, options.columns)
         number = joint_number(options.number, joint, runs)
         found = channel_findings(runs, number, joint)
@@ -344,6 +351,8 @@ def losses_main(argv: list[str]) -> int:
     options = parse_fit(losses_parser(), argv)
     try:
         joint = load_joint(options.joint)
+        if options.out is not None:
+            check_output(options.out)
         runs = read_runs(options.runs, options.columns)
         number = joint_number(options.number, joint, runs)
         findings = channel_findings(runs, number, joint)

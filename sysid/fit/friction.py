@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from jtqd.estimator.joint import Friction, Joint
 from jtqd.estimator.losses import FrictionModel
-from jtqd.estimator.observer import first_order_hold
+from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns
 
 Array = NDArray[np.float64]
@@ -82,21 +82,6 @@ class FrictionFit:
             f"condition number {self.condition:.1f}"
         )
         return lines + [f"warning: {text}" for text in self.warnings]
-
-
-def low_pass(values: Array, dt_s: Array, bandwidth_rad_s: float) -> Array:
-    """The observer's low-pass g/(s+g): exact for values linear between samples, started at values[0].
-
-    values [n]; dt_s [n], dt_s[k] the step that ends at row k (dt_s[0] is not used); bandwidth g [rad/s].
-    """
-    last = state = float(values[0])
-    out = [state]
-    for value, step in zip(values[1:].tolist(), dt_s[1:].tolist(), strict=True):
-        a, b0, b1 = first_order_hold(bandwidth_rad_s, step)
-        state = a * state + b0 * value + b1 * last
-        last = value
-        out.append(state)
-    return np.array(out)
 
 
 def effective_samples(residual: Array) -> float:

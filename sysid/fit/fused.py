@@ -24,11 +24,12 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.optimize import nnls
 
-from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.fusion import Fusion, held_many
+from jtqd.estimator.arrays import FloatArray, QuadrantArray
+from jtqd.estimator.checked import counted
+from jtqd.estimator.estimator import quadrants
+from jtqd.estimator.fusion import Fusion, held
 from jtqd.estimator.joint import AdditiveLoss, Friction, Fused, FusedSigma, Torsion
 from jtqd.estimator.losses import AdditiveLossModel
-from jtqd.estimator.whole_run import QuadrantArray, quadrant_many
 from jtqd.sysid.fit.losses import LossFit, fit_loss
 from jtqd.sysid.fit.signals import RunSignals
 from jtqd.sysid.fit.torsion import fit_torsion, torsion_torque
@@ -166,7 +167,7 @@ def unbiased_level(parts: Sequence[FloatArray]) -> float:
 
 def quadrants_of(run: PathResiduals) -> QuadrantArray:
     """Return each sample's index into QUADRANTS [n]."""
-    return quadrant_many(run.raw_nm, run.velocity_rad_s)
+    return quadrants(run.raw_nm, run.velocity_rad_s)
 
 
 FOLDS: Final = 4
@@ -198,7 +199,7 @@ def fit_fused(runs: Sequence[RunSignals], friction: Friction) -> FusedFit:
     """
     if len(runs) < _LEAST_RUNS:
         raise ValueError(
-            f"found {len(runs)} runs, expected at least {_LEAST_RUNS}: standard deviations need held-out runs"
+            f"found {counted(len(runs), 'run')}, expected at least {_LEAST_RUNS}: standard deviations need held-out runs"
         )
     unseen = _unseen(runs, friction)
     sigma = fit_sigma(unseen)
@@ -234,7 +235,7 @@ def loss_and_width(run: RunSignals, loss: AdditiveLoss) -> tuple[FloatArray, Flo
     running = ~np.isnan(seen.raw_nm)
     raw, v, s = (np.where(running, x, 0.0) for x in (seen.raw_nm, seen.velocity_rad_s, seen.direction))
     value, half = AdditiveLossModel(loss).loss_many(raw, v, seen.temperature_c, s)
-    return value, held_many(half, seen.dt_s, running)
+    return value, held(half, seen.dt_s, running)
 
 
 def fused_error(run: PathResiduals, sigma: FusedSigma) -> tuple[FloatArray, FloatArray]:

@@ -8,12 +8,12 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
+from jtqd.estimator.estimator import observe_run
 from jtqd.estimator.joint import Joint, Torsion
-from jtqd.estimator.observer import RIPPLE_ORDERS, first_order_hold
-from jtqd.estimator.run import JointColumns
+from jtqd.estimator.observer import RIPPLE_ORDERS, low_pass
+from jtqd.estimator.run import JointColumns, ObservedRun
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import STANDSTILL, VALID
-from jtqd.estimator.whole_run import ObservedRun, observe_run
 
 UNIT_TORSION: Final = Torsion(1.0, 0.0, 0.0, tuple(map(float, RIPPLE_ORDERS)), (0.0, 0.0), (0.0, 0.0))
 """With it the observer's torsion torque is the filtered torsion angle theta_m/G - theta_l itself [rad]."""
@@ -52,26 +52,6 @@ class RunSignals:
         return float(known.mean()) if len(known) else float("nan")
 
 
-def same_age(sensor_nm: FloatArray, dt_s: FloatArray, bandwidth_rad_s: float) -> FloatArray:
-    """Return the sensor through g/(s+g), first-order hold with the measured steps: as old as the estimate.
-
-    sensor_nm, dt_s [n], n > 0; steps are taken to 0.1 us, a step <= 0 passes its sample on unfiltered.
-    """
-    steps, index = np.unique(np.round(dt_s[1:], 7), return_inverse=True)
-    table = [
-        first_order_hold(bandwidth_rad_s, float(step)) if step > 0 else (0.0, 1.0, 0.0) for step in steps
-    ]
-    out = np.empty_like(sensor_nm)
-    z = last = float(sensor_nm[0])
-    out[0] = z
-    for k, (x, n) in enumerate(zip(sensor_nm[1:].tolist(), index.tolist(), strict=True), 1):
-        a, b0, b1 = table[n]
-        z = a * z + b0 * x + b1 * last
-        last = x
-        out[k] = z
-    return out
-
-
 def run_signals(
     name: str, joint: Joint, settings: EstimatorSettings, time_s: FloatArray, columns: JointColumns
 ) -> RunSignals:
@@ -95,7 +75,7 @@ def run_signals(
     return RunSignals(
         name,
         seen,
-        same_age(sensor, dt, settings.bandwidth_rad_s),
+        low_pass(sensor, dt, settings.bandwidth_rad_s),
         settled & (seen.status == VALID),
         settled & (seen.status == STANDSTILL),
     )

@@ -23,14 +23,14 @@ from numpy.typing import NDArray
 from jtqd.daemon.logs import LogError, Records, read_topic
 from jtqd.estimator.checked import Section
 from jtqd.estimator.decoder import decode
+from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.joint import Joint
+from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import RunTable
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import DEGRADED, STALE, STANDSTILL, STARTING, VALID
-from jtqd.estimator.whole_run import estimate_run
 from jtqd.models.files import load_joint, load_yaml, shipped
 from jtqd.sim_can.bench import LONGEST_STEP_NS
-from jtqd.sysid.fit.friction import low_pass
 from jtqd.sysid.measured.offline import JOINTS, RUNS
 from jtqd.sysid.runs.files import ColumnMap, read_run
 
@@ -95,7 +95,7 @@ class Played:
 
 def configured(config: Path) -> tuple[tuple[Joint, Joint], EstimatorSettings]:
     """Joints and estimator of a configuration of jtqd. Raises ConfigError."""
-    mapping, _ = load_yaml(config)
+    mapping = load_yaml(config)
     top = Section(mapping, str(config))
     sections = [top.section(f"joint_{number}") for number in (1, 2)]
     one, two = (
@@ -179,8 +179,8 @@ def _played_row(time_s: Array, run_s: Array) -> NDArray[np.intp]:
 def _offline(played: Played) -> Array:
     """Whole-run estimate from the file, as `offline` makes it; NaN where none would be published."""
     table, joint = played.table, played.joint
-    inputs = table.estimator_inputs(played.number, joint.gear_ratio)
-    result = estimate_run(joint, played.settings, None, *inputs)
+    dt_s, current, motor, velocity, link = table.estimator_inputs(played.number, joint.gear_ratio)
+    result = JointEstimator(joint, played.settings).run(dt_s, current, motor, velocity, link)
     return np.where(np.isin(result.status, PUBLISHED), result.torque_nm, np.nan)
 
 
@@ -199,8 +199,8 @@ def _replay(state: Records, played: Played) -> float:
     """Return the largest difference between the logged torque and a whole-run estimate of the logged inputs [Nm]."""
     fed = np.isfinite(state["dt_s"])
     names = ("dt_s", "current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad")
-    again = estimate_run(
-        played.joint, played.settings, None, *(np.asarray(state[name][fed]) for name in names)
+    again = JointEstimator(played.joint, played.settings).run(
+        *(np.asarray(state[name][fed]) for name in names)
     )
     logged = state["torque_nm"][fed]
     # The loop keeps its first cycles back as "starting"; there is no torque of theirs in the log.

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from jtqd.daemon.logs import LogError
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.checked import ConfigError, make_directory
 from jtqd.estimator.run import RunTableError
 from jtqd.sysid.fit.friction import FitError
 from jtqd.sysid.measured import bus, offline
@@ -29,7 +29,7 @@ def main(arguments: list[str] | None = None) -> int:
     if options.bus is not None and options.joint_files is not None:
         parser().error("--joint-files: not possible with --bus, which does not fit")
     try:
-        options.out.mkdir(parents=True, exist_ok=True)
+        make_directory(options.out)
         if options.bus is None:
             _offline(options.out, options.joint_files or options.out, options.json)
         else:

@@ -16,13 +16,14 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.joint import Friction, Joint
-from jtqd.estimator.run import RunTable
+from jtqd.estimator.observer import low_pass
+from jtqd.estimator.run import EstimateRun, RunTable
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import STANDSTILL
-from jtqd.estimator.whole_run import EstimateRun, estimate_run
 from jtqd.models.files import load_joint, shipped
-from jtqd.sysid.fit.friction import FrictionFit, fit_friction, low_pass
+from jtqd.sysid.fit.friction import FrictionFit, fit_friction
 from jtqd.sysid.runs.files import ColumnMap, RunError, RunFile, read_run
 
 Array = NDArray[np.float64]
@@ -81,7 +82,7 @@ def score(estimate_nm: Array, sensor_nm: Array, dt_s: Array, bandwidth_rad_s: fl
 def estimate(joint: Joint, table: RunTable, number: int) -> EstimateRun:
     """Estimate joint `number` of a run; torque is NaN where none would be published. Raises RunTableError."""
     dt_s, current, position, velocity, link = table.estimator_inputs(number, joint.gear_ratio)
-    return estimate_run(joint, SETTINGS, None, dt_s, current, position, velocity, link)
+    return JointEstimator(joint, SETTINGS).run(dt_s, current, position, velocity, link)
 
 
 def fitted_joint(joint: Joint, fit: FrictionFit, file: RunFile, *, number: int, run: str, date: str) -> Joint:

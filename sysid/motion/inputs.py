@@ -24,7 +24,7 @@ from jtqd.drivers.devices import (
     sensor_tpdo2,
 )
 from jtqd.drivers.emcy import NO_ERROR, Emergency, parse
-from jtqd.drivers.nmt import BOOT_UP, OPERATIONAL, STATES
+from jtqd.drivers.nmt import BOOT_UP, HEARTBEAT_BASE, OPERATIONAL, STATES
 from jtqd.sysid.motion.cia402 import FAULTED, POWERED, State, describe, fast_state
 from jtqd.sysid.motion.setpoints import JointSample, Sample, Timing, Violation
 from jtqd.sysid.motion.setup import DriveUnits, SensorUnits
@@ -175,9 +175,9 @@ class Inputs:
         self.handlers = self._handlers(own_node)
 
     def _handlers(self, own_node: int) -> dict[int, Handler]:
-        handlers: dict[int, Handler] = {0x700 + own_node: self._on_own_node}
+        handlers: dict[int, Handler] = {HEARTBEAT_BASE + own_node: self._on_own_node}
         for node in self.nodes:
-            handlers[0x700 + node.node] = node.on_heartbeat
+            handlers[HEARTBEAT_BASE + node.node] = node.on_heartbeat
             handlers[0x080 + node.node] = node.on_emergency
         for drive in self.drives:
             handlers[0x180 + drive.node] = drive.on_position
@@ -260,7 +260,7 @@ class Supervision:
         inputs = self._inputs
         for node in inputs.nodes:
             if node.nmt_state < 0:
-                return f"{node.who}: no heartbeat {0x700 + node.node:03X}h"
+                return f"{node.who}: no heartbeat {HEARTBEAT_BASE + node.node:03X}h"
         for drive in inputs.drives:
             if not (drive.cycle_1 and drive.cycle_2):
                 return f"{drive.who}: no TPDO1 or TPDO2; start jtqd, which configures them"

@@ -277,7 +277,9 @@ class BenchSetup:
         timing: Timing,
     ) -> None:
         nodes = [profile.node_id for profile in (*drives, sensor) if profile is not None]
-        self._socket = open_frame_socket(bus, [exact(SYNC_COB_ID), exact(0x700 + COMMANDER_NODE)])
+        self._socket = open_frame_socket(
+            bus, [exact(SYNC_COB_ID), exact(nmt.HEARTBEAT_BASE + COMMANDER_NODE)]
+        )
         self._drives, self._sensor, self._timing = drives, sensor, timing
         self._beating = False
         self._access = {node: SdoClient(FrameChannel(self._socket, node)) for node in nodes}
@@ -308,7 +310,7 @@ class BenchSetup:
             time.sleep(left_s)
             while count := socket.receive():
                 heard |= {FRAME.unpack_from(frames, FRAME_SIZE * position)[0] for position in range(count)}
-        if 0x700 + COMMANDER_NODE in heard:
+        if nmt.HEARTBEAT_BASE + COMMANDER_NODE in heard:
             raise MotionError(f"another commander is on the bus (node {COMMANDER_NODE:02X}h): stop it first")
         if SYNC_COB_ID not in heard:
             raise MotionError(f"no SYNC on {socket.bus}: jtqd must run on this bus")

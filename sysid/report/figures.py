@@ -5,16 +5,20 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.checked import ConfigError, check_output
 from jtqd.sysid.report.page import LIGHT
 
 SENSOR, BEFORE, AFTER = LIGHT["ink"], LIGHT["before"], LIGHT["after"]
 STANDING, GRID = LIGHT["noise"], LIGHT["line"]
+PICTURES: Final = (".png", ".svg", ".pdf", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".eps", ".ps")
+"""Endings of the pictures that a command writes."""
 BUCKETS = 700
 """Of a curve over time: each keeps its lowest and highest sample, so that no spike is lost."""
 STANDING_LABEL = "standstill: the estimate is the middle of an interval"
@@ -39,6 +43,16 @@ STYLE: Final[dict[str, Any]] = {
     "legend.facecolor": LIGHT["paper"],
 }
 """matplotlib settings of the figures of a page."""
+
+
+def check_picture(path: Path) -> None:
+    """Refuse a picture that cannot be written before the work for it is done. Raises ConfigError."""
+    if path.suffix.lower() not in PICTURES:
+        raise ConfigError(
+            f"{path}: found {f'the ending {path.suffix!r}' if path.suffix else 'no ending'}, expected a picture: "
+            f"{', '.join(PICTURES)}"
+        )
+    check_output(path)
 
 
 def page_svg(draw: Callable[[], Any], name: str) -> str:

@@ -93,7 +93,7 @@ class ColumnMap:
     @classmethod
     def load(cls, path: Path) -> ColumnMap:
         """Read a column map file. Raises ConfigError."""
-        mapping, _ = load_yaml(path)
+        mapping = load_yaml(path)
         return cls.from_mapping(mapping, str(path), path.parent)
 
 
@@ -128,7 +128,9 @@ def run_paths(arguments: Sequence[Path]) -> list[Path]:
     for argument in arguments:
         if not argument.is_dir():
             if not argument.exists():
-                raise RunError(f"{argument}: found nothing, expected a run file or a directory of runs")
+                raise RunError(
+                    f"{argument}: found no such file or directory, expected a run file or a directory of runs"
+                )
             paths.append(argument)
             continue
         names = sorted(p for p in argument.iterdir() if p.is_file() and not p.name.startswith("."))
@@ -168,6 +170,10 @@ def read_run(path: Path | str, columns: ColumnMap | None = None) -> RunFile:
     columns: for tables; a log of jtqd has its own names. Raises RunError.
     """
     path = Path(path)
+    if not path.is_file():
+        found = "something that is no file" if path.exists() else "no such file"
+        found = "a directory" if path.is_dir() else found
+        raise RunError(f"{path}: found {found}, expected a run file ({', '.join(TABLES + LOGS)})")
     if path.name.endswith(LOGS):
         return _read_log(path)
     if path.name.endswith(".parquet"):

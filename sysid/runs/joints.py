@@ -33,6 +33,11 @@ def joint_files(arguments: Sequence[str], columns: ColumnMap | None) -> dict[int
     files: dict[int, Path] = {}
     for text in arguments:
         match = _JOINT.fullmatch(text)
+        name, equals, path = text.partition("=")
+        if not match and equals and "/" not in name and not Path(text).exists():
+            raise UsageError(
+                f"--joint {text}: found joint {name!r}, expected a number from 1 to 7 in N={path or 'FILE'}"
+            )
         number = int(match.group(1)) if match else ALL_JOINTS
         if number in files:
             which = "for all joints" if number == ALL_JOINTS else f"of joint {number}"
@@ -43,6 +48,12 @@ def joint_files(arguments: Sequence[str], columns: ColumnMap | None) -> dict[int
             "--joint: found a file for all joints beside one for a single joint, expected either"
         )
     return files
+
+
+def check_joint_files(files: Mapping[int, Path]) -> None:
+    """Refuse a file that is no joint file before runs are read, which takes its time. Raises ConfigError."""
+    for path in files.values():
+        load_joint(path)
 
 
 def joints_of(files: Mapping[int, Path], runs: Sequence[RunFile]) -> dict[int, Joint]:

@@ -8,13 +8,12 @@ import importlib.util
 import json
 import platform
 import sys
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jtqd.estimator.checked import ConfigError, count, natural
+from jtqd.estimator.checked import ConfigError, count, make_directory, natural
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTableError
 from jtqd.models.files import load_joint
@@ -149,7 +148,7 @@ def main(argv: list[str]) -> int:
     options = parser().parse_args(argv)
     try:
         joints = [load_joint(path) for path in options.joint]
-        _require_writable(options.out)
+        make_directory(options.out)  # training takes minutes, and its result must not be lost for it
         missing = [name for name in ("torch", "onnx", "matplotlib") if importlib.util.find_spec(name) is None]
         if missing:
             raise ConfigError(f"{', '.join(missing)}: not installed: pip install 'jtqd[train]'")
@@ -174,21 +173,6 @@ def main(argv: list[str]) -> int:
     if options.json:
         print(json.dumps(result, indent=1))
     return 0
-
-
-def _require_writable(directory: Path) -> None:
-    """Make the directory and a file in it now: training takes minutes, and its result must not be lost for it.
-
-    Raises:
-        ConfigError: files cannot be created there.
-    """
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=directory):
-            pass
-    except OSError as error:
-        reason = "it is a file" if isinstance(error, FileExistsError) else error.strerror
-        raise ConfigError(f"--out {directory}: files cannot be created there: {reason}") from None
 
 
 def parser() -> argparse.ArgumentParser:

@@ -18,11 +18,13 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.fusion import Fusion, turning_many
-from jtqd.estimator.joint import AdditiveLoss, FusedSigma, Joint, Torsion
+from jtqd.estimator.checked import counted
+from jtqd.estimator.envelope import Envelope
+from jtqd.estimator.estimator import FusedEstimator, quadrants
+from jtqd.estimator.fusion import Fusion, turning
+from jtqd.estimator.joint import AdditiveLoss, Fused, FusedSigma, Joint, Torsion
 from jtqd.estimator.network import FUSED_FEATURES
-from jtqd.estimator.validity import Envelope
-from jtqd.estimator.whole_run import network_features, quadrant_many
+from jtqd.estimator.settings import EstimatorSettings
 from jtqd.sysid.fit.fused import conformal_scale, folds, loss_and_width
 from jtqd.sysid.fit.losses import fit_loss
 from jtqd.sysid.fit.signals import RunSignals
@@ -81,6 +83,7 @@ def export_gated(trained: Trained, waves: int, metadata: Mapping[str, Any]) -> b
 
 Table = np.ndarray[tuple[int, int], np.dtype[np.bool_]]
 
+_SETTINGS: Final = EstimatorSettings(method="fused")
 HIDDEN: Final = (16, 16)
 _CORE: Final = 3
 """Features that set the gains (speed, motor torque, torsion less current); the others are the waves."""
@@ -97,7 +100,10 @@ _VISITS: Final = 20
 class Seen:
     """A run through physics with given parameters: features [n, 7], physics and sigma [n], all of moving samples."""
 
-    def __init__(self, run: RunSignals, loss: AdditiveLoss, torsion: Torsion, sigma: FusedSigma) -> None:
+    def __init__(
+        self, run: RunSignals, joint: Joint, loss: AdditiveLoss, torsion: Torsion, sigma: FusedSigma
+    ) -> None:
+        plain = replace(joint, effects=(), fused=Fused(loss, torsion, sigma))
         keep = run.moving
         torque, open_nm = torsion_torque(torsion, run)
         seen = replace(run.seen, torsion_nm=torque, open_nm=open_nm)
@@ -106,12 +112,11 @@ class Seen:
             seen.raw_nm, value, wide, seen.velocity_rad_s, seen.torsion_nm, seen.open_nm
         )
         self.name = run.name
-        self.features: FloatArray = network_features(seen, seen.raw_nm - value)[keep]
-        turning = turning_many(seen.velocity_rad_s[keep])
-        self.waves: FloatArray = self.features[:, _CORE:] * turning[:, None]
+        self.features: FloatArray = FusedEstimator(plain, _SETTINGS).run_observed(seen).features[keep]
+        self.waves: FloatArray = self.features[:, _CORE:] * turning(seen.velocity_rad_s[keep])[:, None]
         self.residual_nm: FloatArray = (run.sensor_nm - physics)[keep]
         self.sigma_nm: FloatArray = spread[keep]
-        self.quadrant = quadrant_many(seen.raw_nm[keep], seen.velocity_rad_s[keep])
+        self.quadrant = quadrants(seen.raw_nm[keep], seen.velocity_rad_s[keep])
 
 
 def train_fused(
@@ -131,14 +136,16 @@ def train_fused(
         )
     if len(runs) < 8:
         raise ValueError(
-            f"found {len(runs)} runs, expected at least 8: standard deviations need held-out runs"
+            f"found {counted(len(runs), 'run')}, expected at least 8: standard deviations need held-out runs"
         )
     unseen: list[tuple[Seen, FloatArray]] = []
     for known, judged in folds(runs):
         loss, torsion = fit_loss(known, joint.friction).loss, fit_torsion(known)
-        trained = _train([Seen(run, loss, torsion, fused.sigma) for run in known], iterations, seed, progress)
+        trained = _train(
+            [Seen(run, joint, loss, torsion, fused.sigma) for run in known], iterations, seed, progress
+        )
         for n in judged:
-            one = Seen(runs[n], loss, torsion, fused.sigma)
+            one = Seen(runs[n], joint, loss, torsion, fused.sigma)
             unseen.append((one, gated_output(trained, one.features[:, :_CORE], one.waves)))
     share = safe_share([(one.residual_nm, correction) for one, correction in unseen])
     errors = [one.residual_nm - share * correction for one, correction in unseen]
@@ -146,7 +153,7 @@ def train_fused(
         one.name: (float(np.mean(error**2)), float(np.mean(one.residual_nm**2)))
         for (one, _), error in zip(unseen, errors, strict=True)
     }
-    blocks = [Seen(run, fused.loss, fused.torsion, fused.sigma) for run in runs]
+    blocks = [Seen(run, joint, fused.loss, fused.torsion, fused.sigma) for run in runs]
     trained = _train(blocks, iterations, seed, progress)
     trained = scaled(trained, share)
     features = np.concatenate([block.features for block in blocks])

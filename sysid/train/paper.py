@@ -9,13 +9,14 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.network import FEATURES
+from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import VALID
-from jtqd.sysid.fit.signals import same_age
 from jtqd.sysid.train.network import Trained, export_network, forward, train
 
 SAMPLES: Final = 200_000
@@ -54,7 +55,7 @@ def paper_block(name: str, joint: Joint, time_s: FloatArray, columns: JointColum
     settings = EstimatorSettings(method="efficiency")
     run = estimate_columns(joint, settings, None, time_s, columns)
     dt = np.diff(time_s, prepend=time_s[0])
-    sensor = same_age(columns.torque_nm, dt, settings.bandwidth_rad_s)
+    sensor = low_pass(columns.torque_nm, dt, settings.bandwidth_rad_s)
     keep = (run.status == VALID) & (time_s - time_s[0] > 0.1)
     return PaperBlock(name, run.features[keep], sensor[keep], run.torque_nm[keep])
 
@@ -80,7 +81,7 @@ def train_paper(
     """
     if len(blocks) < _HELD_OUT:
         raise ValueError(
-            f"found {len(blocks)} runs, expected at least {_HELD_OUT}: a network is scored on whole runs"
+            f"found {counted(len(blocks), 'run')}, expected at least {_HELD_OUT}: a network is scored on whole runs"
         )
     held = blocks[_HELD_OUT - 1 :: _HELD_OUT]
     known = [block for n, block in enumerate(blocks) if n % _HELD_OUT != _HELD_OUT - 1]

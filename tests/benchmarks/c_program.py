@@ -12,9 +12,9 @@ from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.loop import joint as joint_cycle
 from jtqd.daemon.loop import joint_status
 from jtqd.daemon.shared import cycle_record
-from jtqd.estimator.guard import LINK_SPEED_LIMIT_RAD_S, RAW_LIMIT
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import BLEND_CURRENT_A, LossModel
+from jtqd.estimator.observer import LINK_SPEED_LIMIT_RAD_S, RAW_LIMIT
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import DEGRADED
 from jtqd.estimator.validity import FADE_START

@@ -10,11 +10,11 @@ import gc
 import time
 from collections.abc import Callable
 
+from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.losses import LossModel
 from jtqd.estimator.methods import load_network, make_estimator
 from jtqd.estimator.network import TorqueNetwork
 from jtqd.estimator.settings import METHODS, EstimatorSettings
-from jtqd.estimator.whole_run import estimate_run
 from tests.benchmarks.table import mark
 from tests.estimator.estimator_helpers import joint1, motion, small_network
 from tests.estimator.fused_configuration import joint_of, network_of
@@ -68,7 +68,7 @@ def costs_us() -> dict[str, float]:
     costs |= {f"step, {method}": cost for method, cost in step_costs_us().items()}
     run = motion(1, SAMPLES).arrays()
     began = time.process_time()
-    estimate_run(joint1(), EstimatorSettings(), network, *run)
+    JointEstimator(joint1(), EstimatorSettings(), network).run(*run)
     costs["whole run, per sample"] = (time.process_time() - began) / SAMPLES * 1e6
     return costs
 

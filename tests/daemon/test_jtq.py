@@ -84,3 +84,16 @@ def test_options_may_stand_before_the_log(tmp_path):
         assert process.communicate(timeout=30)[1] == b""
         assert process.returncode == 0
     assert out.stat().st_size > 1000
+
+
+@pytest.mark.parametrize(
+    "command", [["--help"], ["layout"], ["bus-load"], ["campaign", "validate", "--quick", "--dry-run"]]
+)
+def test_closed_or_full_output_is_no_traceback(command):
+    jtq = [sys.executable, "-m", "jtqd.daemon.jtq", *command]
+    for place, status in ((">&-", 0), ("> /dev/full", 1)):
+        done = subprocess.run(
+            ["sh", "-c", f'"$@" {place}', "sh", *jtq], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == status, done.stderr
+        assert done.stderr == ("" if status == 0 else f"jtq {command[0]}: output: No space left on device\n")

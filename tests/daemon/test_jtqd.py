@@ -333,7 +333,8 @@ def test_unknown_bus(environment: dict[str, str]) -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments", [[], ["--bus"], ["--bus", "sim", "--duration", "-1"], ["--bus", "sim", "--frob"]]
+    "arguments",
+    [[], ["--bus"], ["--bus", 300 * "a"], ["--bus", "sim", "--duration", "-1"], ["--bus", "sim", "--frob"]],
 )
 def test_usage(arguments: list[str], environment: dict[str, str]) -> None:
     result = run(*arguments, environment=environment)

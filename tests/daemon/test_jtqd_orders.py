@@ -14,8 +14,9 @@ import pytest
 
 from jtqd.daemon.shared.child_process import Child
 from jtqd.daemon.supervisor.process import wait_for
+from jtqd.drivers.bus_socket import reachable
 from jtqd.drivers.filters import exact
-from jtqd.drivers.frame_socket import open_frame_socket, reachable
+from jtqd.drivers.frame_socket import open_frame_socket
 from tests.daemon.slow_bench import slow_configuration
 
 pytestmark = pytest.mark.native

@@ -4,16 +4,23 @@ On AF_CAN the suite runs where JTQD_CAN_INTERFACE (default vcan0) exists; named 
 """
 
 import errno
+import json
+import math
 import os
 import random
+import signal
 import socket
+import subprocess
+import sys
+import threading
 import time
+from pathlib import Path
 
 import pytest
 
 from jtqd.drivers.filters import CanFilter, exact, look_alikes
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, pack
-from jtqd.drivers.frame_socket import BusDown, BusError, BusGone, open_frame_socket
+from jtqd.drivers.frame_socket import BusError, BusGone, open_frame_socket
 from jtqd.drivers.hub import Hub
 
 pytestmark = pytest.mark.native
@@ -227,7 +234,8 @@ def test_receive_overflow_is_counted(bench):
     a, b = bench.open(), bench.open()
     bench.open()  # a third one keeps the hub's other paths busy
     if bench.hub is None:
-        b._sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)  # the kernel's minimum, a few frames
+        with socket.socket(fileno=os.dup(b.fd)) as same:
+            same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)  # the kernel's minimum, a few frames
     sent = 0
     for _ in range(200):
         for _ in range(32):
@@ -269,40 +277,142 @@ def test_kernel_without_can_says_so(monkeypatch, number):
     )
 
 
-@pytest.mark.parametrize(
-    ("number", "kind"),
-    [
-        (errno.ENETDOWN, BusDown),
-        (errno.ENODEV, BusGone),
-        (errno.ENXIO, BusGone),
-        (errno.EPIPE, BusGone),
-        (errno.EINVAL, BusError),
-    ],
-)
-def test_errors_of_send_by_number(bench, number, kind):
-    sock = bench.open()
+@pytest.fixture(scope="module")
+def failing_calls(tmp_path_factory):
+    """Library to preload into a process whose system calls are to fail."""
+    library = tmp_path_factory.mktemp("calls") / "failing_calls.so"
+    source = Path(__file__).with_name("failing_calls.c")
+    subprocess.run(["gcc", "-O1", "-shared", "-fPIC", str(source), "-o", str(library)], check=True)
+    return library
 
-    def fail(_frame):
-        raise OSError(number, os.strerror(number))
 
-    sock._send = fail
-    with pytest.raises(BusError) as caught:
-        sock.send(SYNC)
-    assert type(caught.value) is kind
-    assert str(caught.value).startswith(bench.name)
-    if kind is BusGone:
-        with pytest.raises(BusGone):
-            sock.receive()
+FAILING = """
+import json, os, sys
+from jtqd.drivers.frame import pack
+from jtqd.drivers.frame_socket import BusError, open_frame_socket
+
+def outcome(call):
+    try:
+        return call()
+    except BusError as error:
+        return [type(error).__name__, str(error)]
+
+bus, call, number = sys.argv[1:]
+sock = open_frame_socket(bus, None)
+os.environ[call] = number
+found = [outcome(lambda: sock.send(pack(0x080)) if call == "send" else sock.receive()) for _ in range(3)]
+del os.environ[call]
+print(json.dumps([found, [outcome(sock.receive) for _ in range(2)], sock.tx_dropped]))
+"""
+
+
+def outcomes(bench, library, call, number):
+    """Three calls that fail, two of `receive` afterwards, dropped frames: as lists, errors as [class, text]."""
+    preload = os.pathsep.join(filter(None, [os.environ.get("LD_PRELOAD"), str(library)]))
+    result = subprocess.run(
+        [sys.executable, "-c", FAILING, bench.name, call, str(number)],
+        env={**os.environ, "LD_PRELOAD": preload},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    return json.loads(result.stdout)
+
+
+ERRORS = [
+    (errno.ENETDOWN, "BusDown"),
+    (errno.ENODEV, "BusGone"),
+    (errno.ENXIO, "BusGone"),
+    (errno.EPIPE, "BusGone"),
+    (errno.EINVAL, "BusError"),
+]
+
+
+@pytest.mark.parametrize("call", ["send", "recvmmsg"])
+@pytest.mark.parametrize(("number", "kind"), ERRORS)
+def test_errors_by_number(bench, failing_calls, call, number, kind):
+    """What has gone is said again at each call, also when the kernel says it once."""
+    failed, later, _ = outcomes(bench, failing_calls, call, number)
+    for found, text in failed:
+        assert found == kind
+        assert text.startswith(bench.name)
+    if kind == "BusGone":
+        assert [found for found, _ in later] == ["BusGone"] * 2
     else:
-        assert sock.receive() == 0
+        assert later == [0, 0]
 
 
-def test_enobufs_is_a_dropped_frame_not_an_error(bench):
+@pytest.mark.parametrize("number", [errno.EAGAIN, errno.EINTR, errno.ECONNRESET])
+def test_errors_after_which_more_comes_are_nothing_yet(bench, failing_calls, number):
+    assert outcomes(bench, failing_calls, "recvmmsg", number) == [[0, 0, 0], [0, 0], 0]
+
+
+@pytest.mark.parametrize("number", [errno.ENOBUFS, errno.EAGAIN, errno.ENOMEM])
+def test_enobufs_is_a_dropped_frame_not_an_error(bench, failing_calls, number):
+    assert outcomes(bench, failing_calls, "send", number) == [[False] * 3, [0, 0], 3]
+
+
+def test_a_message_that_is_no_frame_is_refused(bench):
     sock = bench.open()
+    for wrong in (b"", SYNC[:15], SYNC + b"x"):
+        with pytest.raises(BusError, match="Invalid argument"):
+            sock.send(wrong)
+    assert sock.receive() == 0
+    assert sock.tx_dropped == 0
 
-    def fail(_frame):
-        raise OSError(errno.ENOBUFS, os.strerror(errno.ENOBUFS))
 
-    sock._send = fail
-    assert [sock.send(SYNC) for _ in range(3)] == [False] * 3
-    assert sock.tx_dropped == 3
+def test_wait_lets_other_threads_run(bench):
+    a, b = bench.open(), bench.open()
+
+    def send():
+        time.sleep(0.02)
+        a.send(SYNC)
+        bench.settle()
+
+    thread = threading.Thread(target=send)
+    start = time.monotonic()
+    thread.start()
+    assert b.wait(None)
+    assert time.monotonic() - start < 5.0
+    thread.join()
+    assert received(b) == [(SYNC, False)]
+
+
+def test_wait_goes_on_after_a_signal_unless_its_handler_raises(bench):
+    sock = bench.open()
+    calls = []
+    before = signal.signal(signal.SIGALRM, lambda *_: calls.append(1))
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.005, 0.005)
+        start = time.monotonic()
+        assert not sock.wait(0.05)
+        assert 0.049 < time.monotonic() - start < 5.0
+        assert calls
+        signal.signal(signal.SIGALRM, signal.default_int_handler)
+        with pytest.raises(KeyboardInterrupt):
+            sock.wait(None)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def test_times_to_wait_that_are_no_times(bench):
+    a, b = bench.open(receive_own=True), bench.open()
+    with pytest.raises(ValueError, match="NaN"):
+        a.wait(math.nan)
+    assert not b.wait(-math.inf)
+    a.send(SYNC)
+    bench.settle()
+    assert a.wait(math.inf)
+    assert a.wait(1e300)
+
+
+def test_a_closed_socket_has_gone(bench):
+    sock = bench.open()
+    sock.close()
+    assert sock.fd == -1
+    assert sock.wait(None)
+    for call in (sock.receive, lambda: sock.send(SYNC), lambda: sock.set_filters([exact(0x80)])):
+        with pytest.raises(BusGone):
+            call()

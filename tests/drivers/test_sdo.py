@@ -15,6 +15,7 @@ from jtqd.drivers.sdo import (
     SdoResult,
     Transfer,
     TransferError,
+    describe_abort,
 )
 from jtqd.drivers.sdo_server import SdoServer
 from tests.drivers.canopen_nodes import drive_store
@@ -35,6 +36,48 @@ def talk(transfer: Transfer, server: SdoServer) -> list[str]:
         if transfer.done:
             return said
     raise AssertionError("endless")
+
+
+def test_every_abort_code_of_cia_301_has_words():
+    """CiA 301, 7.2.4.3.17, table 22: all 31 of them; another one shows its number."""
+    codes = (
+        0x05030000,
+        0x05040000,
+        0x05040001,
+        0x05040002,
+        0x05040003,
+        0x05040004,
+        0x05040005,
+        0x06010000,
+        0x06010001,
+        0x06010002,
+        0x06020000,
+        0x06040041,
+        0x06040042,
+        0x06040043,
+        0x06040047,
+        0x06060000,
+        0x06070010,
+        0x06070012,
+        0x06070013,
+        0x06090011,
+        0x06090030,
+        0x06090031,
+        0x06090032,
+        0x06090036,
+        0x060A0023,
+        0x08000000,
+        0x08000020,
+        0x08000021,
+        0x08000022,
+        0x08000023,
+        0x08000024,
+    )
+    words = [describe_abort(code) for code in codes]
+    assert len({text.partition(" (0")[0] for text in words}) == len(codes) == 31
+    assert not any(text.startswith("abort ") for text in words)
+    assert describe_abort(0x0609_0031) == "value too high (06090031h)"
+    assert describe_abort(0x0BAD_0000) == "abort (0BAD0000h)"
 
 
 def test_expedited_both_ways():

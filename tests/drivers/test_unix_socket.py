@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from jtqd.drivers.bus_socket import reachable
 from jtqd.drivers.frame import pack
-from jtqd.drivers.frame_socket import BusError, BusGone, open_frame_socket, reachable
+from jtqd.drivers.frame_socket import BusError, BusGone, open_frame_socket
 from jtqd.drivers.hub import Hub
 
 SYNC = pack(0x080, b"\x01")
@@ -112,6 +113,29 @@ def test_frames_sent_before_the_hub_ended_are_received_although_ours_were_unread
     assert a.receive() == 0
     assert received_until_gone(a) == [SYNC]
     a.close()
+
+
+def test_the_hubs_count_of_lost_frames_wraps(tmp_path):
+    """Bytes 6 and 7: modulo 65536; the echo bit beside it is no part of the count, and neither is left in the frame."""
+    path = str(tmp_path / "bus")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as hub:
+        hub.bind(path)
+        hub.listen()
+        a = open_frame_socket(f"unix:{path}", None, receive_own=True)
+        with hub.accept()[0] as other:
+            for lost, echo in ((0, 1), (65530, 0), (65530, 1), (65540, 1), (131072, 0), (131073, 0)):
+                other.send(SYNC[:5] + bytes([echo]) + (lost & 0xFFFF).to_bytes(2, "little") + SYNC[8:])
+                assert a.receive() == 1
+                assert a.rx_dropped == lost
+                assert list(a.own) == [bool(echo)]
+                assert bytes(a.frames[:16]) == SYNC
+            for lost in (131074, 131080):  # two in one call
+                other.send(SYNC[:6] + (lost & 0xFFFF).to_bytes(2, "little") + SYNC[8:])
+            assert a.receive() == 2
+            assert a.rx_dropped == 131080
+            a.send(SYNC)
+            assert other.recv(64) == SYNC[:5] + b"\x01" + SYNC[6:], "asks for the echo"
+        a.close()
 
 
 def test_repeated_opening_leaks_no_descriptor(tmp_path):

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.envelope import Envelope
 from jtqd.estimator.joint import AdditiveLoss, Fused, FusedSigma, Joint, LossSide, Torsion
 from jtqd.estimator.network import FUSED_FEATURES
-from jtqd.estimator.validity import Envelope
 from tests.estimator.estimator_helpers import Motion, SmallNetwork, joint1, motion
 
 NODES = (-30.0, -12.0, -4.0, 0.0, 3.0, 9.0, 21.0, 40.0)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jtqd.estimator.fusion import HOLD_S, Fusion, held, held_many
+from jtqd.estimator.fusion import HOLD_S, Fusion, held
 from jtqd.estimator.joint import FusedSigma
 from tests.estimator.fused_helpers import SIGMA
 
@@ -62,33 +62,38 @@ def test_sigma_is_the_scatter_of_the_result(raw: float, v: float, half: float, t
     assert np.std(a + alpha * (b - a)) == pytest.approx(best, rel=0.001)  # no other weights do better
 
 
-def test_the_vectorised_twin() -> None:
+def test_arrays_have_the_values_of_single_calls() -> None:
     rng = np.random.default_rng(3)
     columns = [rng.normal(0.0, scale, 500) for scale in (20.0, 5.0, 2.0, 2.0, 20.0)]
     columns[2] = np.abs(columns[2])
     for with_torsion in (True, False):
         fusion = Fusion(SIGMA, with_torsion)
         one = np.array([fusion.fuse(*row) for row in np.array(columns).T.tolist()]).T
-        assert np.max(np.abs(np.array(fusion.fuse_many(*columns)) - one)) < 1e-12
+        assert np.array_equal(np.array(fusion.fuse_many(*columns)), one)
 
 
 # ---- memory of the friction interval
 
 
+def after(half: float, before: float, dt: float) -> float:
+    """The second of two samples whose first left `before`."""
+    return float(held(np.array((before, half)), np.array((1.0, dt)), np.ones(2, np.bool_))[1])
+
+
 def test_what_friction_left_open_is_forgotten_over_50_ms() -> None:
     """A wider interval counts at once, a narrower one only as the memory fades: e^-1 after HOLD_S, in steps of any size."""
-    assert held(3.0, 1.0, 0.001) == 3.0
-    assert held(0.0, 3.0, 0.001) == pytest.approx(3.0 * (1.0 - 0.001 / HOLD_S), rel=1e-3)
+    assert after(3.0, 1.0, 0.001) == 3.0
+    assert after(0.0, 3.0, 0.001) == pytest.approx(3.0 * (1.0 - 0.001 / HOLD_S), rel=1e-3)
     for dt in (0.0002, 0.001, 0.003):
         memory = 3.0
         for _ in range(round(HOLD_S / dt)):
-            memory = held(0.0, memory, dt)
+            memory = after(0.0, memory, dt)
         assert memory == pytest.approx(3.0 * np.exp(-1.0), rel=0.04)
     rng = np.random.default_rng(5)
     for half, before, dt in rng.uniform((0.0, 0.0, 1e-4), (5.0, 5.0, 2e-3), (500, 3)).tolist():
-        now = held(half, before, dt)
+        now = after(half, before, dt)
         assert max(half, before * np.exp(-dt / HOLD_S)) <= now <= max(half, before)
-        assert held(half + 1e-9, before + 1e-9, dt) - now <= 1e-9 + 1e-15  # continuous
+        assert after(half + 1e-9, before + 1e-9, dt) - now <= 1e-9 + 1e-15  # continuous
 
 
 def test_the_memory_of_a_run() -> None:
@@ -96,14 +101,14 @@ def test_the_memory_of_a_run() -> None:
     rng = np.random.default_rng(6)
     half, dt = np.maximum(rng.normal(size=400), 0.0) * 5.0, rng.uniform(0.0005, 0.002, 400)
     running = rng.random(400) > 0.05
-    got = held_many(half, dt, running)
+    got = held(half, dt, running)
     memory = 0.0
     for k in range(400):
-        memory = held(half[k], memory, dt[k]) if running[k] else 0.0
+        memory = after(half[k], memory, dt[k]) if running[k] else 0.0
         assert got[k] == memory
-    after = np.flatnonzero(~running[:-1] & running[1:]) + 1
-    assert len(after) > 5
-    assert np.array_equal(got[after], half[after])
+    begins = np.flatnonzero(~running[:-1] & running[1:]) + 1
+    assert len(begins) > 5
+    assert np.array_equal(got[begins], half[begins])
     assert not got[~running].any()
 
 

@@ -14,7 +14,6 @@ from jtqd.estimator.methods import estimate_columns, load_network, make_estimato
 from jtqd.estimator.network import FusedNetwork, TorqueNetwork
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings
-from jtqd.estimator.whole_run import estimate_run
 from tests.estimator.estimator_helpers import joint1, small_network
 from tests.estimator.fused_helpers import fused_joint, fused_network
 
@@ -73,4 +72,4 @@ def test_the_papers_estimator_does_not_apply_ours() -> None:
     with pytest.raises(ConfigError, match=words):
         JointEstimator(JOINT, FUSED)
     with pytest.raises(ConfigError, match=words):
-        estimate_run(JOINT, FUSED, None, *[np.full(3, 0.001)] * 5)
+        JointEstimator(JOINT, FUSED, None).run(*[np.full(3, 0.001)] * 5)

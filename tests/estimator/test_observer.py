@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Torsion
 from jtqd.estimator.losses import FrictionModel
-from jtqd.estimator.observer import FusedObserved, FusedObserver, Observer, first_order_hold
+from jtqd.estimator.observer import FusedObservedSample, FusedObserver, Observer, first_order_hold
 from tests.estimator.estimator_helpers import joint1
 from tests.estimator.fused_helpers import TORSION, twisted
 
@@ -169,7 +169,7 @@ def fused_outputs(o: FusedObserver, rows: Iterable[tuple[float, ...]]) -> FloatA
 
 
 def column(found: FloatArray, name: str) -> FloatArray:
-    values: FloatArray = found[:, FusedObserved._fields.index(name)]
+    values: FloatArray = found[:, FusedObservedSample._fields.index(name)]
     return values
 
 

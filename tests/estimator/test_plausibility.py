@@ -13,7 +13,8 @@ from jtqd.daemon.config import load_config
 from jtqd.daemon.loop.joint_status import safety_of
 from jtqd.estimator.checked import ConfigError, Section
 from jtqd.estimator.decoder import decode
-from jtqd.estimator.plausibility import FROZEN_RAD, PlausibilityLimits
+from jtqd.estimator.plausibility import FROZEN_RAD
+from jtqd.estimator.settings import PlausibilityLimits
 from jtqd.estimator.status import CURRENT_FROZEN, LINK_JUMP, MOTOR_JUMP, TORSION, VELOCITY_MISMATCH
 from jtqd.models.files import shipped
 from jtqd.sim_can.play import columns_beside, open_play

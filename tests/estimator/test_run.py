@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.run import JointColumns, RunTable, RunTableError
 from jtqd.estimator.settings import EstimatorSettings
-from jtqd.estimator.whole_run import estimate_run
 from tests.estimator.estimator_helpers import joint1
 
 T = np.cumsum(np.random.default_rng(1).uniform(0.0005, 0.002, 400))
@@ -68,7 +68,7 @@ def test_inputs_for_the_estimator() -> None:
     dt_s, *rest = table.estimator_inputs(1, 100.0)
     assert dt_s[0] == 0.0
     assert np.cumsum(dt_s) + T[0] == pytest.approx(T)
-    run = estimate_run(joint1(), EstimatorSettings(method="tob"), None, dt_s, *rest)
+    run = JointEstimator(joint1(), EstimatorSettings(method="tob"), None).run(dt_s, *rest)
     assert run.status[0] == 1
     assert np.isfinite(run.torque_nm[1:]).all()
     with pytest.raises(RunTableError, match="j2: found no columns of this joint, the run has j1"):

@@ -9,15 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.interpolate import RegularGridInterpolator
 
 from jtqd.estimator.checked import ConfigError, Section
 from jtqd.estimator.decoder import decode
+from jtqd.estimator.envelope import Envelope
 from jtqd.estimator.losses import FrictionModel, LossModel
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.validity import (
     DISTANCE_MARGIN,
     TEMPERATURE_MARGIN_K,
-    Envelope,
     FusedTrust,
     Trust,
     Uncertainty,
@@ -68,20 +69,6 @@ def test_standstill_is_the_interval_that_friction_can_hold() -> None:
             assert value - sigma <= raw - losses.loss(i, v) <= value + sigma
 
 
-def test_uncertainty_twins() -> None:
-    rng = np.random.default_rng(12)
-    raw, v = 20 * rng.normal(size=3000), rng.normal(size=3000)
-    i = raw / 6.2
-    for method in ("tob", "efficiency"):
-        u = uncertainty(method)
-        rows = list(zip(raw.tolist(), i.tolist(), v.tolist(), strict=True))
-        assert u.moving_many(raw, i, v) == pytest.approx([u.moving(*row) for row in rows], abs=1e-12)
-        value, sigma = u.standing_many(raw, i)
-        assert np.column_stack((value, sigma)) == pytest.approx(
-            np.array([u.standing(a, b) for a, b, _ in rows]), abs=1e-12
-        )
-
-
 def test_weight_is_one_inside_and_zero_beyond_the_margin() -> None:
     t = trust()
     assert t.weight(*MIDDLE, 0.0) == 1.0
@@ -113,7 +100,7 @@ def test_a_feature_that_never_changed_in_training() -> None:
     assert t.weight(0.1, *[0.0] * 5, 0.0) == 0.0
 
 
-def test_weight_twin() -> None:
+def test_weight_against_its_formula_in_arrays() -> None:
     rng = np.random.default_rng(13)
     x = rng.normal(size=(4000, 6)) * np.array(HIGH) * 0.6
     difference = 8.0 * rng.normal(size=4000)
@@ -122,7 +109,12 @@ def test_weight_twin() -> None:
     t = trust()
     single = [t.weight(*row, d) for row, d in zip(x.tolist(), difference.tolist(), strict=True)]
     assert sum(0 < w < 1 for w in single) > 100
-    assert t.weight_many(x, difference) == pytest.approx(single, abs=1e-12)
+    low, high = np.array(LOW), np.array(HIGH)
+    with np.errstate(invalid="ignore"):
+        beyond = np.max(np.maximum(low - x, x - high) / (0.05 * (high - low)), axis=1)
+        far = (np.abs(difference) - 0.75 * LIMIT) / (0.25 * LIMIT)
+        expected = np.clip(1.0 - np.maximum(beyond, far), 0.0, 1.0)
+    assert single == pytest.approx(np.nan_to_num(expected), abs=1e-9)
 
 
 def test_settings_are_checked() -> None:
@@ -222,14 +214,27 @@ def test_fused_weight_has_no_jump(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", [71, 72])
 @pytest.mark.parametrize("temperature_c", [(20.0, 30.0), None])
-def test_fused_weight_twin(seed: int, temperature_c: tuple[float, float] | None) -> None:
-    trust = FusedTrust(patches(seed, temperature_c))
+def test_fused_weight_against_an_interpolator(seed: int, temperature_c: tuple[float, float] | None) -> None:
+    envelope = patches(seed, temperature_c)
+    trust = FusedTrust(envelope)
     rng = np.random.default_rng(seed)
     columns = rng.uniform((-5.0, -60.0, -20.0, 15.0), (5.0, 60.0, 20.0, 35.0), (3000, 4)).T
     columns[3, ::7] = rng.choice([NAN, math.inf, -math.inf, 1e300], len(columns[3, ::7]))
     columns[:3, ::11] = np.round(columns[:3, ::11])  # on cells and borders
+    known = np.pad(np.array(envelope.known, float), 1)
+    axes = [
+        step * (np.arange(n) - (n - 1) / 2)
+        for step, n in zip((envelope.velocity_step_rad_s, envelope.torque_step_nm), known.shape, strict=True)
+    ]
+    inside = RegularGridInterpolator(axes, known, bounds_error=False, fill_value=0.0)(columns[:2].T)
+    beyond = np.maximum(np.abs(columns[2]) / envelope.distance_nm - 1.0, 0.0) / DISTANCE_MARGIN
+    expected = inside * np.maximum(0.0, 1.0 - beyond)
+    if temperature_c is not None:
+        low, high = temperature_c
+        away = np.maximum(np.maximum(low - columns[3], columns[3] - high), 0.0) / TEMPERATURE_MARGIN_K
+        expected *= np.nan_to_num(np.maximum(0.0, 1.0 - away))
     one = [trust.weight(*row) for row in columns.T.tolist()]
-    assert np.max(np.abs(trust.weight_many(*columns) - one)) < 1e-12
+    assert one == pytest.approx(expected, abs=1e-9)
 
 
 # ---- metadata

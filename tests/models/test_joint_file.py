@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 import pickle
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +14,7 @@ import pytest
 from jtqd.daemon.config import load_config
 from jtqd.estimator.checked import ConfigError, Section
 from jtqd.estimator.joint import EFFECT_NAMES, Effect, Friction, Joint
-from jtqd.models.files import load_joint, load_yaml, shipped
+from jtqd.models.files import load_joint, load_yaml, read_yaml, shipped
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sysid.fit.efficiency import TABLE_I
 
@@ -32,7 +31,7 @@ RMSE 0.01963 0.01719 0.05599 0.05504
 
 
 def mapping() -> dict[str, Any]:
-    return load_yaml(shipped("joint1.yaml"))[0]
+    return load_yaml(shipped("joint1.yaml"))
 
 
 def refused(change: dict[str, Any]) -> str:
@@ -204,12 +203,20 @@ def test_section_reads_the_other_kinds() -> None:
 def test_files(tmp_path: Path) -> None:
     path = tmp_path / "a.yaml"
     path.write_bytes(b"a: 1\nb: {c: 2.5}\n")
-    content, digest = load_yaml(path)
-    assert content == {"a": 1, "b": {"c": 2.5}}
-    assert digest == hashlib.sha256(b"a: 1\nb: {c: 2.5}\n").hexdigest()
+    content, data = read_yaml(path)
+    assert content == load_yaml(path) == {"a": 1, "b": {"c": 2.5}}
+    assert data == path.read_bytes()
     for text, words in (
         (b"a: 1\na: 2\n", "line 2, column 1 not YAML: the key 'a' is given twice"),
-        (b"a: [1\n", "not YAML"),
+        (b"a: [1\n", "line 2, column 1 not YAML: expected ',' or ']', found the end of the file"),
+        (b'a: "b\n', "found the end of the file (while scanning a text in quotes that begins in line 1)"),
+        (
+            b"a: {b: 1\nc: 2\n",
+            "expected ',' or '}', found ':' (while parsing a mapping in { } that begins in line 1)",
+        ),
+        (b"a:\n\tb: 1\n", "line 2, column 1 not YAML: found a tab, expected spaces"),
+        (b"a: 1\nb\nc: 1\n", "found no ': ' behind a key"),
+        (b"\x89MCAP0\r\n", "not YAML: found 89h at offset 0, expected a text file"),
         (b"- 1\n", "found list"),
         (b"", "an empty file"),
         (b"\xff\xfe\x00", "not YAML"),
@@ -233,7 +240,7 @@ def test_a_file_too_large_for_anything_written_by_hand_is_refused_without_readin
 ) -> None:
     path = tmp_path / "large.yaml"
     path.write_bytes(b"a: 1\n#".ljust(1_000_000, b" "))
-    assert load_yaml(path)[0] == {"a": 1}
+    assert load_yaml(path) == {"a": 1}
     path.write_bytes(b"a: 1\n#".ljust(1_000_001, b" "))
     for load in (load_yaml, load_joint, load_config, load_plant):
         for large in (path, Path("/dev/zero")):

@@ -8,7 +8,6 @@ import pytest
 from jtqd.estimator.checked import ConfigError
 from jtqd.models.files import shipped
 from jtqd.sim_can.play import PlaySource, columns_beside, open_play
-from jtqd.sysid.runs.files import RunError
 
 KINOVA = shipped("kinova_gen3/columns.yaml").parent
 COLUMNS = KINOVA / "columns.yaml"
@@ -150,14 +149,14 @@ def test_a_dead_channel_is_invalid_and_the_other_is_not() -> None:
     ("joints", "said"), [((2, 9), "no joint 9"), ((2, 2), "two different"), ((2,), "two different")]
 )
 def test_wrong_joints_are_named(joints: tuple[int, int], said: str) -> None:
-    with pytest.raises(RunError, match=said):
+    with pytest.raises(ConfigError, match=said):
         open_play(KINOVA / "RunTrajectory1.csv.gz", COLUMNS, joints)
 
 
 def test_missing_columns_and_files_are_named(tmp_path: Path) -> None:
     path = tmp_path / "r.csv"
     path.write_text("time_s,j1.current_a,j2.current_a\n0,1,1\n1,1,1\n")
-    with pytest.raises(RunError, match=r"j1\.motor_position_rad: missing"):
+    with pytest.raises(ConfigError, match=r"j1\.motor_position_rad: missing"):
         open_play(path, None, (1, 2))
     with pytest.raises(ConfigError, match=r"none\.yaml"):
         open_play(path, tmp_path / "none.yaml", (1, 2))

@@ -60,6 +60,23 @@ def test_no_reference_at_all_is_null(log, tmp_path, capsys, monkeypatch):
     assert json.loads(capsys.readouterr().out)["rmse_nm"] == {"joint_1": None}
 
 
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("p.xyz", "found the ending '.xyz', expected a picture: .png, .svg, .pdf"),
+        ("p", "found no ending"),
+        ("", "found no ending"),
+        ("none/p.png", "none: found no such directory"),
+    ],
+)
+def test_a_picture_that_cannot_be_written_is_said_before_the_log_is_read(log, tmp_path, capsys, name, words):
+    assert plot_command.main(["run.mcap", "--out", str(tmp_path / name)]) == 1
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.count("\n") == 1
+    assert log == []
+
+
 def test_a_log_that_cannot_be_read_is_one_line(tmp_path, capsys, monkeypatch):
     def refuse(path: Path, topic: str) -> None:
         raise LogError(f"{path}: not a log")

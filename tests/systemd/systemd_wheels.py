@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+import sysconfig
 import zipfile
 from pathlib import Path
 
@@ -75,13 +76,20 @@ def _repack(distribution: importlib.metadata.Distribution, directory: Path) -> N
 def copy_sources(copy: Path) -> Path:
     """What the wheel is built from; setuptools leaves its traces beside the sources, so they are copied."""
     copy.mkdir(parents=True)
-    for item in ("pyproject.toml", "MANIFEST.in", "README.md", "CHANGELOG.md", "LICENSE"):
+    for item in ("pyproject.toml", "setup.py", "MANIFEST.in", "README.md", "CHANGELOG.md", "LICENSE"):
         shutil.copy2(ROOT / item, copy / item)
     unwanted = shutil.ignore_patterns("__pycache__", "*.egg-info")
     shutil.copytree(ROOT / "src", copy / "src", symlinks=True, ignore=unwanted)
     packages = [link.name for link in (ROOT / "src" / "jtqd").iterdir() if link.is_symlink()]
     for folder in (*packages, "systemd"):
         shutil.copytree(ROOT / folder, copy / folder, ignore=unwanted)
+    shutil.copytree(ROOT / "build" / "cython", copy / "build" / "cython")
+    library = f"lib.{sysconfig.get_platform()}-{sys.implementation.cache_tag}"
+    for folder in packages:  # what is compiled here need not be compiled again: setuptools looks for it there
+        for module in (copy / folder).rglob("*.so"):
+            target = copy / "build" / library / "jtqd" / module.relative_to(copy)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(module, target)
     return copy
 
 

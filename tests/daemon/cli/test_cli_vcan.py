@@ -156,7 +156,7 @@ until = time.monotonic() + 60
 while time.monotonic() < until:
     socket.send(pack(0x355, bytes(4)))                   # nobody's
     socket.send(pack(0x181 | 0x80000000, bytes(8)))      # an input's number in 29 bits
-    socket._sock.send(bytes.fromhex("40000020 08000000 0000000000000000"))  # the driver's message of a bus-off
+    socket.send(bytes.fromhex("40000020 08000000 0000000000000000"))  # the driver's message of a bus-off
     time.sleep(0.01)
 """
 

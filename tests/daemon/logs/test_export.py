@@ -301,6 +301,34 @@ def test_failures_are_one_line(tmp_path, capsys):
         assert stop.value.code == 2
 
 
+@pytest.mark.parametrize("what", ["csv", "candump"])
+def test_a_topic_that_is_not_there_is_said_with_those_that_are(log, tmp_path, capsys, what):
+    assert main([what, str(log), "--topic", "nonsense", "--out", str(tmp_path / "a")]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "nonsense, expected one of " in said
+    assert "/can/frames" in said
+    assert "in that time" not in said
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--start", "5", "--end", "2"], "--end: found 2, expected a time above 5 s"),
+        (["--end", "-1"], "--end: found -1, expected a time above 0 s"),
+        (["--start", "nan"], "found 'nan'"),
+        (["LOG"], "twice, expected every part once"),
+    ],
+)
+def test_what_cannot_be_meant_is_wrong_use(log, tmp_path, capsys, arguments, words):
+    given = [str(log) if each == "LOG" else each for each in arguments]
+    with pytest.raises(SystemExit) as stop:
+        main(["csv", str(log), "--out", str(tmp_path / "a.csv"), *given])
+    assert stop.value.code == 2
+    assert words in capsys.readouterr().err
+
+
 def test_nothing_is_left_of_a_table_that_could_not_be_written(log, tmp_path, monkeypatch):
     monkeypatch.setattr(
         os, "replace", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device"))

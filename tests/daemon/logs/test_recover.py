@@ -198,8 +198,52 @@ def test_first_chunk_and_all_definitions_before_it_gone(log, tmp_path):
 
 def test_torn_within_the_attachments(log, tmp_path):
     second, end = starts_of(log, ATTACHMENT)[1]
-    result, _ = repaired(tmp_path / "a.mcap.active", log[0][: end - 10])
+    path = tmp_path / "a.mcap.active"
+    path.write_bytes(log[0][: end - 10])
+    result = recover(path, attachments_are_enough=True)
+    assert by_index(result.path.read_bytes()) == (0, None)
     assert (result.attachments, result.messages, result.lost_bytes) == (1, 0, end - 10 - second)
+    assert result.lost_s is None
+
+
+def spoiled(log, chunks):
+    """The log with these of its chunks damaged, under its own footer."""
+    data = bytearray(log[0])
+    for at, end in starts_of(log, CHUNK)[chunks]:
+        data[(at + end) // 2] ^= 0x10
+    return bytes(data)
+
+
+def test_file_of_which_no_message_can_be_read_stays(log, tmp_path, capsys):
+    data = spoiled(log, slice(None))
+    path = tmp_path / "a.mcap"
+    path.write_bytes(data)
+    assert main([str(path)]) == main([str(tmp_path)]) == main(["--dry-run", str(path)]) == 1
+    out, error = capsys.readouterr()
+    assert out == ""
+    assert len(set(error.splitlines())) == 1
+    assert "found no message that can be read" in error
+    assert path.read_bytes() == data
+    assert os.listdir(tmp_path) == [path.name]
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param((slice(0, 1), True, "about 0.02 s"), id="first, by the summary"),
+        pytest.param((slice(-1, None), True, "about 0.01 s"), id="last, by the summary"),
+        pytest.param((slice(0, 1), False, "unknown time"), id="first, no summary"),
+    ],
+)
+def test_time_that_is_lost_is_told_or_unknown(log, tmp_path, capsys, case):
+    chunks, ended, lost = case
+    path = tmp_path / "a.mcap"
+    path.write_bytes(spoiled(log, chunks)[: None if ended else starts_of(log, DATA_END)[0][0]])
+    assert main(["--dry-run", str(path)]) == 3
+    assert lost in capsys.readouterr().out.splitlines()[-1]
+    assert main(["--json", str(path)]) == 3
+    seconds = json.loads(capsys.readouterr().out)["files"][0]["lost_s"]
+    assert seconds is None if lost.startswith("unknown") else seconds > 0
 
 
 def test_magic_and_header_are_written_again(log, tmp_path):
@@ -243,11 +287,11 @@ def test_taken_name_is_refused(log, tmp_path):
 
 def test_dry_run_changes_nothing(log, tmp_path, capsys):
     path = tmp_path / "a.mcap.active"
-    path.write_bytes(log[0][:-30000])
+    path.write_bytes(log[0][:-20000])
     assert main(["--dry-run", "--json", str(path)]) == 3
     result = json.loads(capsys.readouterr().out)["files"][0]
     assert result["lossy"]
-    assert path.read_bytes() == log[0][:-30000]
+    assert path.read_bytes() == log[0][:-20000]
     assert os.listdir(tmp_path) == [path.name]
 
 
@@ -382,18 +426,21 @@ def test_lies_about_sizes_take_no_memory(tmp_path):
 
 
 def test_command_on_a_directory(log, tmp_path, capsys):
-    """What a crash has left, and what has no end; a whole file is not even looked into."""
-    (tmp_path / "a.mcap.active").write_bytes(log[0][:-30000])
+    """What a crash has left, what has no end, and what is damaged in its middle; whole files are not listed."""
+    (tmp_path / "a.mcap.active").write_bytes(log[0][:-20000])
     (tmp_path / "b.mcap").write_bytes(log[0])
     (tmp_path / "c.mcap").write_bytes(log[0][:-3])
+    (tmp_path / "d.mcap").write_bytes(spoiled(log, slice(1, 2)))
+    (tmp_path / "e.mcap").write_bytes(foreign("", chunked=False))
     (tmp_path / "note.txt").write_text("x")
     assert main([str(tmp_path)]) == 3
     said = capsys.readouterr().out
     assert "a.mcap: repaired" in said
     assert "c.mcap: repaired" in said
+    assert "d.mcap: repaired" in said
     assert "b.mcap" not in said
     assert "lost: " in said
-    assert sorted(os.listdir(tmp_path)) == ["a.mcap", "b.mcap", "c.mcap", "note.txt"]
+    assert sorted(os.listdir(tmp_path)) == [*(f"{name}.mcap" for name in "abcde"), "note.txt"]
     assert main([str(tmp_path)]) == 0
     assert capsys.readouterr().out == "nothing to recover\n"
 
@@ -455,7 +502,9 @@ def test_cut_at_every_interesting_offset(whole, tmp_path):
     places = sorted(at for at in offsets if 8 <= at < len(whole))
     places = places[:: max(1, len(places) // 120)]
     found = Counter(judge(tmp_path / "a.mcap", whole, whole[:at], f"cut at {at}") for at in places)
-    assert found["repaired"] + found["lossy"] > 0.9 * len(places), found
+    empty = sum(in_order(whole[:at])[0] == 0 for at in places)  # a file without any message is not replaced
+    assert found["refused"] <= empty, found
+    assert found["repaired"] + found["lossy"] > 0.9 * (len(places) - empty), found
 
 
 @pytest.mark.parametrize("seed", [11, 12])

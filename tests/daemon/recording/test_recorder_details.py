@@ -15,7 +15,7 @@ from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.journal import ERROR, WARN, Journal
 from jtqd.daemon.recording.keeper import Keeper, recording_request
 from jtqd.daemon.recording.mcap_file import ChunkBuilder
-from jtqd.daemon.recording.parts import own_files, parse
+from jtqd.daemon.recording.own_files import own_files, parse
 from jtqd.daemon.recording.recorder import main
 from jtqd.daemon.recording.request import RecorderRequest
 from jtqd.daemon.recording.schemas import definitions

@@ -271,7 +271,7 @@ def test_in_arrays_rounding_is_no_finding(
     logged, made = whole.run.joints, tuple(each.copy() for each in whole.joints)
     row = int(np.flatnonzero(np.isfinite(made[0]["torque_nm"]))[-50])
     made[0]["torque_nm"][row] += 1e-6
-    same = difference.identity(logged, made, whole.run.steps(), None, 1e-9)
+    same = difference.identity(logged, made, whole.run.steps(), tolerance_nm=1e-9)
     (one,) = same.differences
     assert (one.joint, one.cycle, one.cycles) == (1, int(logged[0]["cycle"][row]), 1)
     assert not same.explained

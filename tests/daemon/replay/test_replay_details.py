@@ -94,7 +94,7 @@ def test_logs_that_tell_a_cycle_differently_are_refused(tmp_path: Path) -> None:
     (result,) = replay([first, second], ReplayOptions(exact=True))
     assert result.run.cycles == len(numbers)
     assert result.identity is not None
-    assert result.identity.whole
+    assert result.identity.explained
 
     def payload(topic: str, cycle: int, data: bytes) -> bytes:
         spoilt = topic == "/joint/2/state" and cycle == numbers[660]
@@ -103,6 +103,13 @@ def test_logs_that_tell_a_cycle_differently_are_refused(tmp_path: Path) -> None:
     other = cut(LOG, tmp_path / "3.mcap", lambda cycle: cycle >= numbers[650], payload=payload)
     with pytest.raises(LogError, match=f"found cycle {numbers[650]}, which .*1.mcap has too"):
         replay([first, other], ReplayOptions())
+
+
+def test_a_place_that_cannot_be_written_is_said_before_the_replay(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["absent.mcap", "--out", str(tmp_path / "none" / "a.mcap")]) == 1
+    assert "none: found no such directory" in capsys.readouterr().err
 
 
 def test_two_files_for_one_joint_are_one_too_many(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -90,7 +90,7 @@ def test_what_is_named_twice_counts_once_and_what_is_not_ended_is_left_out(tmp_p
 @pytest.mark.parametrize(
     ("named", "part"),
     [
-        ("nothing", "found nothing"),
+        ("nothing", "found no such file or directory"),
         ("empty", "found no log in it"),
         ("x.txt", "found a file ending in '.txt'"),
         ("active", "still being written"),
@@ -166,6 +166,11 @@ def test_a_result_is_there_whole_or_not_at_all(tmp_path):
     path.write_text(json.dumps(kept | {"key": "another"}))
     assert stored(tmp_path, "k") is None
     write_whole(tmp_path / "x", "1")
+    with pytest.raises(UnicodeEncodeError):  # fails in the middle, as on a full disk
+        write_whole(tmp_path / "x", "2\udc80")
+    with pytest.raises(IsADirectoryError):
+        write_whole(tmp_path / "results", "3")
+    assert (tmp_path / "x").read_text() == "1"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["results", "x"]
 
 
@@ -180,7 +185,7 @@ def test_a_fleet_with_one_broken_log(tmp_path, capsys):
     said = capsys.readouterr()
     assert states(out) == {"r1/left": "done", "r1/right": "done", "r2": "failed"}
     assert "3 groups: 2 done, 0 finished before, 1 failed" in said.out
-    assert f"jtq batch: r2: {logs}/r2/bad.csv: " in said.err
+    assert "jtq batch: r2: bad.csv: line 1: found no column" in said.err
     broken = next(group for group in summary(out)["groups"] if group["name"] == "r2")
     assert broken["key"] not in results(out), "what failed is tried again"
     assert broken["figures"] is None
@@ -276,9 +281,18 @@ def test_a_task_that_takes_too_long_is_a_failed_one(tmp_path):
 @pytest.mark.parametrize(
     ("command", "expected"),
     [
-        (["diagnose", "nowhere", "--joint", str(JOINT_FILE)], (2, "nowhere: found nothing")),
+        (
+            ["diagnose", "nowhere", "--joint", str(JOINT_FILE)],
+            (1, "nowhere: found no such file or directory"),
+        ),
         (["diagnose", "logs"], (2, "--joint")),
+        (["diagnose", "logs", "--joint", "x=a.yaml"], (2, "found joint 'x', expected a number from 1 to 7")),
+        (["replay", "nothere.mcap"], (1, "nothere.mcap: found no such file or directory")),
         (["diagnose", "logs", "--joint", "none.yaml"], (1, "none.yaml: cannot be read: No such file")),
+        (
+            ["replay", "logs", "--out", "logs/a.mcap"],
+            (1, "--out logs/a.mcap: cannot be created: it is a file"),
+        ),
         (["replay", "logs", "--model", "none"], (1, "--model none: found no such directory")),
     ],
 )
@@ -286,10 +300,30 @@ def test_wrong_usage_is_one_line(tmp_path, monkeypatch, capsys, command, expecte
     monkeypatch.chdir(tmp_path)
     touch(tmp_path, "logs/a.mcap")
     status, part = expected
-    assert jtq(["batch", *command, "--out", "out"]) == status
+    assert jtq(["batch", *command[:2], "--out", "out", *command[2:]]) == status
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("jtq batch: ")
     assert part in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_broken_log_is_named_once(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    touch(tmp_path, "a.mcap")
+    assert jtq(["batch", "replay", "a.mcap", "--out", "out"]) == 3
+    line = capsys.readouterr().err.splitlines()[0]
+    assert line.startswith("jtq batch: a.mcap: not a readable MCAP file")
+    assert line.count("a.mcap") == 1
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("--method", "bogus"), ("--scheduler", "bogus"), ("--jobs", "0")]
+)
+def test_a_value_that_cannot_be_meant_is_wrong_use(tmp_path, capsys, option, value):
+    with pytest.raises(SystemExit) as left:
+        jtq(["batch", "replay", "logs", "--out", str(tmp_path / "out"), option, value])
+    assert left.value.code == 2
+    assert f"'{value}'" in capsys.readouterr().err.splitlines()[-1]
     assert not (tmp_path / "out").exists()
 
 

@@ -40,6 +40,16 @@ def plan(tmp_path: Path) -> str:
     return str(path)
 
 
+@pytest.mark.parametrize("more", [[], ["--dry-run"], ["--bus", "sim", "--out", "x"]])
+def test_a_plan_that_is_not_there_is_said_before_a_missing_option(
+    more: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["nothere.yaml", *more]) == 1
+    assert (
+        capsys.readouterr().err == "jtq campaign: nothere.yaml: cannot be read: No such file or directory\n"
+    )
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -113,13 +113,14 @@ def test_somebody_s_own_files_are_not_taken_for_ours(tmp_path: Path) -> None:
     ("text", "word"),
     [
         ("", "not JSON"),
+        ("\x89\xe0", "not JSON"),
         ("[]", "expected a mapping"),
         ('{"schema": "other"}', "jtq.campaign/1"),
         ('{"schema": "jtq.campaign/1", "name": "p"}', "plan_sha256"),
     ],
 )
 def test_a_state_that_is_none_is_named(tmp_path: Path, text: str, word: str) -> None:
-    (tmp_path / "campaign.json").write_text(text)
+    (tmp_path / "campaign.json").write_bytes(text.encode("latin-1"))
     with pytest.raises(StateError) as caught:
         CampaignDirectory(tmp_path)
     assert "campaign.json" in str(caught.value)

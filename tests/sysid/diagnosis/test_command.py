@@ -356,6 +356,18 @@ def test_bad_joint_files(
     assert str(path) in err
 
 
+def test_joint_files_are_checked_before_runs_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def read(*_: object) -> None:
+        raise AssertionError("read before the joint files were checked")
+
+    monkeypatch.setattr("jtqd.sysid.diagnosis.command.read_runs", read)
+    for joint, status in (("x=a.yaml", 2), (f"9={JOINT_FILE}", 2), ("1=none.yaml", 1), ("none.yaml", 1)):
+        assert run("a.csv", "--joint", joint, "--out", tmp_path / "o") == status
+        assert joint.rpartition("=")[2] in said(capsys)
+
+
 def test_other_failures_are_one_line(tmp_path: Path, core: Core, capsys: pytest.CaptureFixture[str]) -> None:
     paths = write_runs(tmp_path, 2)
     (tmp_path / "void").mkdir()
@@ -365,7 +377,7 @@ def test_other_failures_are_one_line(tmp_path: Path, core: Core, capsys: pytest.
     (tmp_path / "twin.csv").write_bytes(paths[0].read_bytes())
     ready = ("--joint", JOINT_FILE, "--out", tmp_path / "o")
     for arguments, wanted in (
-        ((tmp_path / "absent.csv", *ready), "found nothing"),
+        ((tmp_path / "absent.csv", *ready), "found no such file or directory"),
         ((tmp_path / "void", *ready), "no run file in it"),
         ((tmp_path / "run.txt", *ready), "ending in '.txt'"),
         ((tmp_path / "bad.mcap", *ready), "not a readable MCAP file"),

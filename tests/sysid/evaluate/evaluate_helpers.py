@@ -11,11 +11,11 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.estimator import quadrants
 from jtqd.estimator.joint import AdditiveLoss, Fused, FusedSigma, Joint, LossSide, Torsion
 from jtqd.estimator.network import FUSED_FEATURES
 from jtqd.estimator.run import RunTable
 from jtqd.estimator.status import VALID
-from jtqd.estimator.whole_run import quadrant_many
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant
@@ -56,7 +56,7 @@ def samples(
         raw_nm=raw,
         velocity_rad_s=velocity,
         temperature_c=np.full(n, temperature_c),
-        quadrant=quadrant_many(raw, velocity),
+        quadrant=quadrants(raw, velocity),
         estimate_nm={method: sensor + error for method, error in errors_nm.items()},
         sigma_nm={method: np.full(n, sigma_nm) for method in errors_nm},
         status={method: np.full(n, status, np.uint8) for method in errors_nm},

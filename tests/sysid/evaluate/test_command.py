@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.methods import estimate_columns, load_network
+from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import RunTable
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import DEGRADED, VALID
 from jtqd.models.files import load_joint
 from jtqd.sysid.evaluate.command import main
-from jtqd.sysid.fit.friction import low_pass
 from jtqd.sysid.runs.files import read_run, write_run
 from tests.sysid.evaluate.evaluate_helpers import NO_PICTURES, evaluate, make_bench, report
 
@@ -267,3 +267,14 @@ def test_marks_of_the_campaign_say_which_joint_was_in_velocity_mode(bench: Path,
     (tmp_path / "variable.json").write_text("no JSON")
     assert evaluate(bench, [run], "--out", str(tmp_path / "out")) == 0
     assert report(tmp_path / "out")["runs"][0]["velocity_joint_by"] == "data"
+
+
+def test_the_only_run_that_cannot_be_read_is_said_with_its_reason(
+    bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "bad.csv").write_bytes(b"\xff\xfe")
+    models = ("--models", str(bench / "models"), "--out", str(tmp_path / "report"))
+    assert main([str(tmp_path / "bad.csv"), *models]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith(f"jtq evaluate: {tmp_path}/bad.csv: found byte 0 that is not UTF-8")
+    assert said.count("\n") == 1

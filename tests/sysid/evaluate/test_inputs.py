@@ -171,7 +171,7 @@ def test_nothing_left_is_a_failure(bench: Path, tmp_path: Path, capsys: pytest.C
     broken = tmp_path / "broken.csv"
     broken.write_text("time_s,j1.current_a\n0,1\n0.001,nan\n")
     assert evaluate(bench, [broken], "--out", str(tmp_path / "out")) == 1
-    assert "found no run with a moving sample" in capsys.readouterr().err
+    assert "line 3, column 'j1.current_a': found 'nan'" in capsys.readouterr().err
     assert evaluate(bench, [tmp_path / "absent.csv"], "--out", str(tmp_path / "out")) == 1
     assert "absent.csv" in capsys.readouterr().err
 

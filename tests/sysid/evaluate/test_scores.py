@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
+from jtqd.estimator.envelope import Envelope
 from jtqd.estimator.joint import QUADRANTS
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.estimator.status import DEGRADED, VALID
-from jtqd.estimator.validity import Envelope
 from jtqd.sysid.evaluate.constant import (
     PlateauScore,
     hardest,

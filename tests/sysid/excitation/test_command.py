@@ -88,7 +88,7 @@ def test_command_without_scipy_refuses_in_one_line(capsys, monkeypatch):
     assert said == "jtq excitation: excitation design: scipy is not installed: pip install 'jtqd[train]'\n"
 
 
-@pytest.mark.parametrize("value", ["nan", "0", "-1", "many"])
+@pytest.mark.parametrize("value", ["nan", "0", "-1", "many", "1e23"])
 def test_numbers_without_sense_are_usage_errors(value, capsys):
     with pytest.raises(SystemExit) as refused:
         excitation_command.main([f"--torque={value}"])

@@ -13,6 +13,7 @@ from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sysid.excitation.design import (
+    POLISHING,
     POPULATION,
     STARTS,
     Information,
@@ -245,7 +246,9 @@ def test_condition_is_that_of_the_regressor():
 # --- searches -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("evaluations", [1, 2, POPULATION - 1, POPULATION, POPULATION + 1, 1000])
+@pytest.mark.parametrize(
+    "evaluations", [1, 2, POPULATION - 1, POPULATION, POPULATION + 1, 2 * POPULATION, 1000]
+)
 def test_search_stays_within_its_evaluations_and_returns_the_best_of_them(evaluations):
     seen = []
 
@@ -256,7 +259,10 @@ def test_search_stays_within_its_evaluations_and_returns_the_best_of_them(evalua
         return values
 
     found = minimise(criterion, 6, evaluations=evaluations, rng=np.random.default_rng(0))
-    assert evaluations - POPULATION < len(seen) <= evaluations
+    if evaluations < 2 * POPULATION:
+        assert len(seen) == min(POPULATION, evaluations)
+    else:  # whole generations in the first nine tenths; the walk in the last one ends early where nothing is left to gain
+        assert (1.0 - POLISHING) * evaluations - POPULATION < len(seen) <= evaluations
     assert found.value == min(seen)
     assert np.sum((found.genome - 0.3) ** 2) == pytest.approx(found.value)
 
@@ -266,7 +272,7 @@ def test_search_closes_in_on_a_minimum():
     for seed in range(5):
         rng = np.random.default_rng(seed)
         found = minimise(lambda g: np.sum((g - 0.3) ** 2, axis=1), 12, evaluations=2000, rng=rng)
-        assert found.value < 5e-3, f"seed {seed}"
+        assert found.value < 5e-4, f"seed {seed}"
 
 
 def test_a_search_needs_scipy_and_a_draw_does_not(monkeypatch):
@@ -365,7 +371,8 @@ def test_velocity_and_current_never_repeat_together():
 def test_progress_counts_every_evaluation():
     seen = []
     design(LIMITS, **small(starts=2), on_progress=seen.append)
-    assert sum(seen) == 2 * 2 * 120
+    slope = 2 * 3 * 2 + 1 + 1  # evaluations that are left over are too few for one more: motions of 13 genes
+    assert 2 * 2 * (120 - slope) < sum(seen) <= 2 * 2 * 120
 
 
 @pytest.mark.parametrize(

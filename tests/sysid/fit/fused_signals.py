@@ -10,9 +10,9 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import AdditiveLoss, LossSide, Torsion
 from jtqd.estimator.losses import AdditiveLossModel
+from jtqd.estimator.run import ObservedRun
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import VALID
-from jtqd.estimator.whole_run import ObservedRun
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.days import Day
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run

@@ -176,7 +176,7 @@ def test_bad_input_is_one_line(campaign: Path, tmp_path: Path, capsys: pytest.Ca
     moving = JointColumns(current_a=4 * swing, motor_velocity_rad_s=100 * swing, torque_nm=15 * swing)
     write_run(tmp_path / "swing.csv", RunTable(0.001 * np.arange(n), {1: moving}))
     cases = {
-        tmp_path / "absent.csv": "found nothing",
+        tmp_path / "absent.csv": "found no such file or directory",
         tmp_path / "empty": "found no run file in it",
         tmp_path / "nan.csv": "line 101, column",
         tmp_path / "swing.csv": "swing.csv: found no settled plateau",
@@ -193,6 +193,26 @@ def test_bad_input_is_one_line(campaign: Path, tmp_path: Path, capsys: pytest.Ca
     assert "j5" in capsys.readouterr().err
     assert run("efficiency", good, "--joint", tmp_path / "none.yaml") == 1
     assert "none.yaml: cannot be read" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("kind", "option", "words"),
+    [
+        *(
+            (kind, "--out=none/a.yaml", "none: found no such directory")
+            for kind in ("efficiency", "friction", "losses")
+        ),
+        ("efficiency", "--plot=none/a.png", "none: found no such directory"),
+        ("efficiency", "--plot=a.xyz", "found the ending '.xyz', expected a picture: .png"),
+    ],
+)
+def test_where_results_cannot_go_is_said_before_runs_are_read(
+    capsys: pytest.CaptureFixture[str], kind: str, option: str, words: str
+) -> None:
+    assert run(kind, "absent.csv", "--joint", JOINT, option) == 1
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1
 
 
 def test_usage_errors(campaign: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 
 from jtqd.estimator.joint import Friction, Joint
 from jtqd.estimator.losses import FrictionModel
+from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns
 from jtqd.models.files import load_joint, shipped
-from jtqd.sysid.fit.friction import FitError, effective_samples, fit_friction, low_pass, student_975
+from jtqd.sysid.fit.friction import FitError, effective_samples, fit_friction, student_975
 from jtqd.sysid.runs.files import ColumnMap, read_run
 
 Array = NDArray[np.float64]

@@ -14,6 +14,7 @@ from jtqd.estimator.fusion import Fusion
 from jtqd.estimator.joint import AdditiveLoss, Friction, FusedSigma, Joint
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.methods import estimate_columns
+from jtqd.estimator.observer import low_pass
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.days import Day
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
@@ -33,7 +34,7 @@ from jtqd.sysid.fit.fused import (
     unbiased_level,
 )
 from jtqd.sysid.fit.losses import PER_K_PRIOR, fit_loss
-from jtqd.sysid.fit.signals import RunSignals, same_age
+from jtqd.sysid.fit.signals import RunSignals
 from jtqd.sysid.fit.torsion import fit_torsion
 from tests.estimator.fused_helpers import fused_joint
 from tests.sysid.fit.fused_signals import (
@@ -366,7 +367,7 @@ def test_runs_of_other_days_are_estimated_as_well_as_sigma_says(fit_of_days: Fus
         motion = harmonic(1.2 + 0.2 * day, 0.4 + 0.05 * day, (3.0, -3.0, 1.5, -1.5)[day % 4])
         table = emulate_run(campaign_plant(), motion, 4.0, 55 + day, day=day)
         run = estimate_columns(ours, FUSED, None, table.time_s, table.joints[1])
-        sensor = same_age(np.asarray(table.joints[1].torque_nm), table.dt_s, 200.0)
+        sensor = low_pass(np.asarray(table.joints[1].torque_nm), table.dt_s, 200.0)
         error = run.torque_nm - sensor
         moving = (run.status == st.VALID) & (table.time_s > 0.2)
         standing = (run.status == st.STANDSTILL) & (table.time_s > 0.2)
@@ -399,7 +400,7 @@ def test_no_jump_at_a_reversal(nominal_fit: FusedFit, speed: float, hz: float, c
     ours = replace(joint(1), fused=nominal_fit.fused)
     table = emulate_run(campaign_plant(), harmonic(speed, hz, current_a), 0.6 + 2.0 / hz, 77)
     run = estimate_columns(ours, FUSED, None, table.time_s, table.joints[1])
-    true = same_age(np.asarray(table.joints[1].torque_nm), table.dt_s, 200.0)
+    true = low_pass(np.asarray(table.joints[1].torque_nm), table.dt_s, 200.0)
     later = table.time_s > 0.6
     assert {st.VALID, st.STANDSTILL} == set(run.status[later].tolist())
     v = run.features[later, 0]

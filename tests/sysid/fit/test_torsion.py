@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from jtqd.estimator.estimator import observe_run
 from jtqd.estimator.joint import Torsion
-from jtqd.estimator.observer import first_order_hold
+from jtqd.estimator.observer import first_order_hold, low_pass
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.status import STANDSTILL
-from jtqd.estimator.whole_run import observe_run
-from jtqd.sysid.fit.signals import UNIT_TORSION, RunSignals, run_signals, same_age
+from jtqd.sysid.fit.signals import UNIT_TORSION, RunSignals, run_signals
 from jtqd.sysid.fit.torsion import TorsionError, fit_torsion, slipped, torsion_torque
 from tests.estimator.estimator_helpers import joint1
 from tests.estimator.fused_helpers import TORSION, twisted
@@ -89,13 +89,13 @@ def test_the_sensor_gets_the_age_of_the_estimate() -> None:
     time, one = columns(21)
     dt = np.diff(time, prepend=time[0])
     assert one.torque_nm is not None
-    got = same_age(one.torque_nm, dt, 200.0)
+    got = low_pass(one.torque_nm, dt, 200.0)
     z, last = one.torque_nm[0], one.torque_nm[0]
     for k in range(1, len(time)):
         a, b0, b1 = first_order_hold(200.0, dt[k])
         z, last = a * z + b0 * one.torque_nm[k] + b1 * last, one.torque_nm[k]
         assert got[k] == pytest.approx(z, abs=1e-3)  # steps count to 0.1 us
-    ramp = same_age(7.0 * time, dt, 200.0)
+    ramp = low_pass(7.0 * time, dt, 200.0)
     assert ramp[500:] == pytest.approx(7.0 * (time[500:] - 1 / 200.0), abs=2e-3)
 
 
@@ -110,7 +110,7 @@ def test_signals_of_a_run() -> None:
     assert one.motor_position_rad is not None
     assert one.link_position_rad is not None
     twist = one.motor_position_rad / 100.0 - one.link_position_rad
-    seen = same_age(twist, np.diff(time, prepend=time[0]), 200.0)
+    seen = low_pass(twist, np.diff(time, prepend=time[0]), 200.0)
     running = np.isfinite(run.seen.torsion_nm)
     assert run.seen.torsion_nm[running] == pytest.approx(seen[running], abs=2e-6)
     assert UNIT_TORSION.stiffness_nm_per_rad == 1.0

@@ -29,7 +29,7 @@ STARTING_CYCLES = 20
 def test_configurations_differ_in_friction_alone_and_never_judge_a_run_by_its_own_fit(run: str) -> None:
     before, after = config_file(run, False), config_file(run, True)
     other = measured.RUNS[1 - measured.RUNS.index(run)]
-    old, new = load_yaml(before)[0], load_yaml(after)[0]
+    old, new = load_yaml(before), load_yaml(after)
     for number, joint in zip((1, 2), measured.JOINTS, strict=True):
         assert old[f"joint_{number}"].pop("file") == f"joint{joint}.yaml"
         assert new[f"joint_{number}"].pop("file") == f"joint{joint}.fitted_on_{other}.yaml"

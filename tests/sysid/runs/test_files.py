@@ -141,8 +141,10 @@ def test_other_formats_missing_files_and_missing_columns_are_named(tmp_path: Pat
         read_run(_file(tmp_path, GOOD, "run.xlsx"))
     with pytest.raises(RunError, match="not a readable MCAP file"):
         read_run(_file(tmp_path, b"\x89MCAP", "run.mcap"))
-    with pytest.raises(RunError, match="No such file"):
+    with pytest.raises(RunError, match=r"none\.csv: found no such file"):
         read_run(tmp_path / "none.csv")
+    with pytest.raises(RunError, match="found a directory, expected a run file"):
+        read_run(tmp_path)
     with pytest.raises(RunError, match=r"no column 'Cur9', expected it for j2\.current_a"):
         read_run(_file(tmp_path, GOOD), _map(time_s="time_s", j2__current_a="Cur9"))
 

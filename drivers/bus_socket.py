@@ -1,0 +1,182 @@
+"""Sockets of a bus, opened with filters and time stamps: AF_CAN raw (`can0`) or a client of a unix bus (`unix:PATH`).
+
+What goes wrong is a BusError, in one of three classes that their user must treat differently. `jtqd.drivers.frame_socket`
+sends and receives on them.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import struct
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from jtqd.drivers import filters as bpf
+from jtqd.drivers.filters import CanFilter, can_raw_filter
+
+SO_TIMESTAMPNS = 35  # asm-generic/socket.h
+SO_RXQ_OVFL = 40
+
+
+class BusError(Exception):
+    """The bus cannot be used; the message is one line that names the bus and says what to do."""
+
+
+class BusDown(BusError):  # noqa: N818 - a state of the bus
+    """The interface is down (ENETDOWN): keep the socket, it works again after `ip link set up`."""
+
+
+class BusGone(BusError):  # noqa: N818
+    """The interface was removed (ENODEV) or the hub has ended: close the socket and open a new one."""
+
+
+_GONE = frozenset(
+    {errno.ENODEV, errno.ENXIO, errno.EPIPE, errno.ECONNRESET, errno.ENOTCONN, errno.ESHUTDOWN, errno.EBADF}
+)
+
+
+def from_errno(number: int, bus: str) -> BusError:
+    """Make the exception for error `number` of a system call on the socket of `bus`.
+
+    ENETDOWN leaves a CAN socket bound; ENODEV (receive) and ENXIO (send) unbind it for good
+    (net/can/raw.c, raw_notify and raw_sendmsg).
+    """
+    if number == errno.ENETDOWN:
+        return BusDown(f"{bus}: the interface is down")
+    if number in _GONE:
+        return BusGone(f"{bus}: bus lost ({os.strerror(number)})")
+    return BusError(f"{bus}: {os.strerror(number)} (errno {number})")
+
+
+# A unix bus: AF_UNIX SOCK_SEQPACKET, one 16-byte frame per message ----------------------------------------------
+
+PREFIX = "unix:"
+BUFFER_BYTES = 1 << 20  # the kernel cuts it to net.core.rmem_max, wmem_max
+_CONNECT_TIMEOUT = struct.Struct("@ll").pack(2, 0)  # struct timeval
+_LONGEST_ADDRESS = 107  # bytes of `sun_path` without its end (unix(7))
+
+
+@contextmanager
+def reachable(path: Path | str) -> Iterator[str]:
+    """Give the address to bind or connect to for the socket at `path`, in a directory of any depth.
+
+    A path too long for the kernel is reached through its directory, held open as a descriptor while the `with` lasts:
+    /proc/self/fd/N/NAME.
+
+    Raises:
+        OSError: a path is too long and its directory cannot be opened. A name that alone is too long stays as it is, and
+            `bind` says so.
+    """
+    text = os.fspath(path)
+    directory, name = os.path.split(text)
+    if len(os.fsencode(text)) <= _LONGEST_ADDRESS or not name:
+        yield text
+        return
+    descriptor = os.open(directory or ".", os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        yield f"/proc/self/fd/{descriptor}/{name}"
+    finally:
+        os.close(descriptor)
+
+
+def require_directory(path: str) -> None:
+    """Raise BusError when a bus cannot be at `path` for want of the directory, and name that."""
+    directory = os.path.dirname(path) or "."
+    if not os.path.isdir(directory):
+        what = "is not a directory" if os.path.lexists(directory) else "does not exist"
+        raise BusError(f"{PREFIX}{path}: the directory {directory} {what}")
+
+
+def open_unix(path: str, filters: Sequence[CanFilter], error_frames: bool) -> socket.socket:
+    """Return a non-blocking socket connected to the hub at `path`; its filters are on before it connects.
+
+    Raises BusError: nobody there, no such directory, something else than a hub there, a hub that does not answer within 2 s.
+    """
+    bus = PREFIX + path
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    try:
+        bpf.attach(sock, filters, error_frames)
+        sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
+        # Bounds connect() when the hub hangs with a full backlog; a non-blocking connect would fail at once.
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _CONNECT_TIMEOUT)
+        with reachable(path) as address:
+            sock.connect(address)
+        sock.setblocking(False)
+    except (FileNotFoundError, NotADirectoryError, ConnectionRefusedError):
+        sock.close()
+        require_directory(path)
+        raise BusError(f"no bus at {bus}: start one with `jtq sim --bus {bus}`") from None
+    except BlockingIOError:
+        sock.close()
+        raise BusError(f"{bus}: the hub does not answer") from None
+    except OSError as error:
+        sock.close()
+        raise BusError(f"{bus}: not a frame hub: {error.strerror or error}") from None
+    return sock
+
+
+# AF_CAN -------------------------------------------------------------------------------------------------------
+
+# linux/can.h and linux/can/raw.h; written out because a Python built without these headers lacks the names
+AF_CAN = 29
+CAN_RAW = 1
+SOL_CAN_RAW = 101
+CAN_RAW_FILTER = 1
+CAN_RAW_ERR_FILTER = 2
+CAN_RAW_RECV_OWN_MSGS = 4
+CAN_ERR_MASK = 0x1FFFFFFF
+
+_NO_CAN = frozenset({errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT})
+
+
+def open_socketcan(
+    interface: str, filters: Sequence[CanFilter], receive_own: bool, error_frames: bool
+) -> socket.socket:
+    """Return a non-blocking raw socket bound to `interface`; its filters are in force before it is bound.
+
+    Binding to an interface that is down succeeds, and the first receive then fails with ENETDOWN.
+    Raises BusError: no CAN in this kernel, no such interface, not a CAN interface, or another error of bind.
+    """
+    try:
+        sock = socket.socket(AF_CAN, socket.SOCK_RAW, CAN_RAW)
+    except OSError as error:
+        if error.errno in _NO_CAN:
+            raise BusError(
+                f"{interface}: this kernel has no CAN (AF_CAN, errno {error.errno}); use unix:PATH instead"
+            ) from None
+        raise BusError(f"{interface}: {error}") from None
+    try:
+        set_can_filters(sock, filters)
+        sock.setsockopt(SOL_CAN_RAW, CAN_RAW_RECV_OWN_MSGS, int(receive_own))
+        if error_frames:
+            sock.setsockopt(SOL_CAN_RAW, CAN_RAW_ERR_FILTER, CAN_ERR_MASK)
+        sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        sock.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
+        sock.setblocking(False)
+        sock.bind((interface,))
+    except OSError as error:
+        sock.close()
+        raise BusError(_bind_message(interface, error)) from None
+    return sock
+
+
+def set_can_filters(sock: socket.socket, filters: Sequence[CanFilter]) -> None:
+    """Replace the filters of `sock`; an empty list receives nothing."""
+    sock.setsockopt(SOL_CAN_RAW, CAN_RAW_FILTER, can_raw_filter(filters))
+
+
+def _bind_message(interface: str, error: OSError) -> str:
+    """Return in one line why `interface` could not be bound."""
+    try:
+        socket.if_nametoindex(interface)
+    except OSError:
+        return f"no such CAN interface: {interface}"
+    if error.errno == errno.ENODEV:
+        return f"not a CAN interface: {interface}"
+    return f"{interface}: {error}"

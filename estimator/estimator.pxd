@@ -1,0 +1,68 @@
+"""The estimators of a joint; the equations stand in estimator.pyx."""
+
+from jtqd.estimator.fusion cimport FusionLaw
+from jtqd.estimator.losses cimport AdditiveLaw, EfficiencyLaw
+from jtqd.estimator.observer cimport (
+    FusedObserved,
+    FusedObserverLaw,
+    FusedObserverState,
+    GuardLaw,
+    GuardState,
+    Observed,
+    ObserverLaw,
+    ObserverState,
+)
+from jtqd.estimator.perceptron cimport PerceptronLaw
+from jtqd.estimator.sample cimport Estimator, Sample, Values
+from jtqd.estimator.validity cimport FusedTrustLaw, TrustLaw, UncertaintyLaw
+
+cdef struct NetworkLaw:
+    bint used
+    bint native  # evaluated here; else by the file's runtime, or a stand-in
+    PerceptronLaw perceptron
+
+cdef struct JointLaw:
+    GuardLaw guard
+    ObserverLaw observer
+    EfficiencyLaw losses
+    UncertaintyLaw uncertainty
+    TrustLaw trust
+    NetworkLaw network
+    bint with_efficiency
+    double inverse_gain, limit, network_sigma
+
+cdef struct JointState:
+    GuardState guard
+    ObserverState observer
+
+cdef class JointEstimator(Estimator):
+    cdef JointLaw law
+    cdef JointState state
+
+cdef struct FusedLaw:
+    GuardLaw guard
+    FusedObserverLaw observer
+    AdditiveLaw loss
+    FusionLaw fusion
+    FusedTrustLaw trust
+    NetworkLaw network
+    double physics_scale[4]
+    double network_scale[4]
+    double stand_share, stand_floor, limit, network_limit, fade, inverse_fade
+
+cdef struct FusedState:
+    GuardState guard
+    FusedObserverState observer
+    double temperature, thermal
+    double half
+
+cdef class FusedEstimator(Estimator):
+    cdef FusedLaw law
+    cdef FusedState state
+    cdef void estimate(self, const FusedObserved *seen, const Sample *x, bint network_wanted, Values *out) noexcept nogil
+
+cdef class ExtendedEstimator(Estimator):
+    cdef Estimator inner
+    cdef object inputs
+    cdef double torque
+    cdef readonly tuple corrected

@@ -1,0 +1,39 @@
+from typing import Final
+
+from jtqd.estimator.arrays import FloatArray, QuadrantArray
+from jtqd.estimator.joint import Joint, Torsion
+from jtqd.estimator.network import FusedNetworkModel, NetworkModel
+from jtqd.estimator.run import EstimateRun, ObservedRun
+from jtqd.estimator.sample import Estimator
+from jtqd.estimator.settings import EstimatorSettings
+
+STANDSTILL_SIGMAS: Final = 3.0
+
+def quadrants(raw_nm: FloatArray, velocity_rad_s: FloatArray) -> QuadrantArray: ...
+
+class JointEstimator(Estimator):
+    def __init__(
+        self, joint: Joint, settings: EstimatorSettings, network: NetworkModel | None = None
+    ) -> None: ...
+
+class FusedEstimator(Estimator):
+    def __init__(
+        self, joint: Joint, settings: EstimatorSettings, network: FusedNetworkModel | None = None
+    ) -> None: ...
+    def run_observed(self, seen: ObservedRun) -> EstimateRun: ...
+
+class ExtendedEstimator(Estimator):
+    corrected: tuple[float, float]
+    def __init__(self, joint: Joint, settings: EstimatorSettings, inner: Estimator) -> None: ...
+
+def observe_run(
+    joint: Joint,
+    settings: EstimatorSettings,
+    torsion: Torsion | None,
+    dt_s: FloatArray,
+    current_a: FloatArray,
+    motor_position_rad: FloatArray,
+    motor_velocity_rad_s: FloatArray,
+    link_position_rad: FloatArray,
+    temperature_c: FloatArray | None = None,
+) -> ObservedRun: ...

@@ -1,0 +1,431 @@
+"""The estimate of one joint, sample by sample: observer, loss, network, uncertainty, in this order.
+
+| class | methods |
+|---|---|
+| `JointEstimator` | the paper's: `tob`, `efficiency`, `network` |
+| `FusedEstimator` | ours: `fused` |
+| `ExtendedEstimator` | either of them for a joint with effects: inputs corrected first (`corrections`) |
+
+`methods.make_estimator` chooses. Parameters and state of an estimator are one flat block each. Everything that enters the
+loss went through the same filter, so the physics estimate as a whole is 1/g old.
+"""
+
+from libc.math cimport NAN, fabs, fmin
+
+from jtqd.estimator.fusion cimport Fused, fill_fusion, fuse_paths, keep, share_by_speed
+from jtqd.estimator.losses cimport (
+    AdditiveLossModel,
+    Loss,
+    LossModel,
+    additive_loss,
+    efficiency_loss,
+    thermal_friction,
+)
+from jtqd.estimator.observer cimport (
+    FusedObserved,
+    Observed,
+    fill_fused_observer,
+    fill_guard,
+    fill_observer,
+    observe,
+    observe_fused,
+    restart_guard,
+)
+from jtqd.estimator.perceptron cimport Perceptron, evaluate
+from jtqd.estimator.sample cimport Estimator, Sample, Values, no_values
+from jtqd.estimator.validity cimport (
+    Spread,
+    fill_fused_trust,
+    fill_trust,
+    fill_uncertainty,
+    fused_trust,
+    sigma_moving,
+    standing,
+    trust,
+)
+
+from math import nan
+from typing import Final
+
+import numpy as np
+
+from jtqd.estimator import status as st
+from jtqd.estimator.corrections import ExtendedInputs
+from jtqd.estimator.network import FEATURES, FUSED_FEATURES, checked_fused, checked_network, native_of
+from jtqd.estimator.run import EstimateRun, ObservedRun
+from jtqd.estimator.sample import columns
+from jtqd.estimator.validity import FADE_START
+
+STANDSTILL_SIGMAS: Final = 3.0
+"""Half width of the standstill interval in standard deviations, where torsion narrows what friction leaves open."""
+
+cdef double STANDSTILL_WIDTH = STANDSTILL_SIGMAS
+cdef int STARTING = st.STARTING, VALID = st.VALID, DEGRADED = st.DEGRADED, STANDSTILL = st.STANDSTILL
+cdef int INVALID = st.INVALID
+
+
+cdef fill_network(NetworkLaw *law, network, joint):
+    """Set the block of a network; return what to call for one sample where it is not evaluated natively, or None."""
+    law.used = network is not None
+    law.native = False
+    if network is None:
+        return None
+    native = native_of(network, joint)
+    if native is None:
+        return network.run_one
+    law.native = True
+    law.perceptron = (<Perceptron>native).law
+    return None
+
+
+# The paper's estimator ------------------------------------------------------------------------------------------------
+
+
+cdef class JointEstimator(Estimator):
+    """The paper's estimator of one joint: methods `tob`, `efficiency` and `network`.
+
+        tau_raw, tau_tob, v, r  <-  observer (Eqs. 4, 7)
+        i_eff      = tau_raw/(G Kt)                current without the part that accelerates the rotor
+        efficiency = tau_raw - loss(i_eff, v)      inside a quadrant tau_raw eta(i_eff, v): Eq. (7) with Table I
+        network    = N(i, theta_m, omega_m, theta_l, omega_l, efficiency)
+
+    joint: parameters; settings: method and thresholds; network: needed by method "network" only. A joint without
+    efficiency may use methods "tob" and "network" (the loss is then its additive friction).
+
+    Raises ConfigError for effects (`make_estimator` applies them), a missing network or that of another joint; NetworkError
+    for a network whose native evaluation differs from its runtime's.
+    """
+
+    def __init__(self, joint, settings, network=None):
+        used = checked_network(joint, settings, network)
+        losses = LossModel(joint)
+        self.joint, self.settings = joint, settings
+        self.width = len(FEATURES)
+        fill_guard(&self.law.guard, joint, settings)
+        fill_observer(&self.law.observer, joint, settings.bandwidth_rad_s, settings.link_bandwidth_rad_s)
+        self.law.losses = (<LossModel>losses).law
+        fill_uncertainty(&self.law.uncertainty, joint, settings, losses.has_efficiency)
+        self.law.with_efficiency = settings.method != "tob"
+        self.law.inverse_gain = 1.0 / losses.torque_per_ampere
+        self.law.limit = settings.torque_limit * joint.rated_torque_nm
+        self.law.network_sigma = 0.0 if used is None else used.sigma_nm
+        self.run_one = fill_network(&self.law.network, used, joint)
+        if used is not None:
+            limit_nm = settings.network_limit * joint.rated_torque_nm
+            fill_trust(
+                &self.law.trust, used.envelope_low, used.envelope_high, settings.envelope_margin, limit_nm
+            )
+        self.reset()
+
+    @property
+    def with_network(self):
+        """Whether a network is used."""
+        return bool(self.law.network.used)
+
+    def reset(self):
+        """Forget the past: the next step starts."""
+        restart_guard(&self.state.guard)
+
+    cdef void advance(self, const Sample *x, bint network_wanted, Values *out) noexcept nogil:
+        """Set `out` to the estimate at this sample."""
+        cdef const JointLaw *law = &self.law
+        cdef Observed seen
+        self.observed = observe(&law.guard, &self.state.guard, &law.observer, &self.state.observer, x, &seen)
+        no_values(out, self.state.guard.status)
+        if not self.observed:
+            return
+        cdef double raw = seen.raw_nm, v = seen.joint_velocity_rad_s
+        cdef double i = raw * law.inverse_gain
+        cdef double physics = seen.tob_nm, weight = 0.0, network = NAN, sigma
+        cdef Spread still
+        out.tob_nm = seen.tob_nm
+        if law.with_efficiency:
+            physics = out.physics_nm = raw - efficiency_loss(&law.losses, i, v)
+        self.features[0], self.features[1] = x.current_a, x.motor_position_rad
+        self.features[2], self.features[3] = x.motor_velocity_rad_s, x.link_position_rad
+        self.features[4], self.features[5] = seen.link_velocity_rad_s, out.physics_nm
+        if law.network.used and network_wanted:
+            network = out.network_nm = (
+                evaluate(&law.network.perceptron, self.features) if law.network.native else self.ask()
+            )
+            weight = trust(&law.trust, self.features, network - physics)
+        if out.status == STANDSTILL:
+            still = standing(&law.uncertainty, &law.losses, raw, i)
+            out.torque_nm, out.sigma_nm = still.value, still.sigma
+        elif weight == 1.0:
+            out.torque_nm, out.sigma_nm = network, law.network_sigma
+        else:
+            sigma = sigma_moving(&law.uncertainty, &law.losses, raw, i, v)
+            out.torque_nm, out.sigma_nm = physics, sigma
+            if weight > 0.0:
+                out.torque_nm = physics + weight * (network - physics)
+                out.sigma_nm = sigma + weight * (law.network_sigma - sigma)
+            elif law.network.used:
+                out.status = DEGRADED
+        publish_within(out, law.limit)
+
+
+cdef void publish_within(Values *out, double limit) noexcept nogil:
+    """Withhold a torque that nobody would believe; NaN included."""
+    if not -limit <= out.torque_nm <= limit:
+        out.torque_nm = out.sigma_nm = NAN
+        out.status = INVALID
+
+
+# Our estimator --------------------------------------------------------------------------------------------------------
+
+
+cdef int quadrant_of(double raw, double v) noexcept nogil:
+    """Return the index into QUADRANTS by the signs of motor torque and velocity."""
+    if v >= 0.0:
+        return 0 if raw >= 0.0 else 2
+    return 3 if raw >= 0.0 else 1
+
+
+def quadrants(raw_nm, velocity_rad_s):
+    """Return the indices into QUADRANTS [n] by the signs of motor torque and velocity."""
+    cdef const double[::1] raw = np.ascontiguousarray(raw_nm, np.float64)
+    cdef const double[::1] v = np.ascontiguousarray(velocity_rad_s, np.float64)
+    out = np.empty(len(raw), np.intp)
+    cdef Py_ssize_t[::1] to = out
+    cdef Py_ssize_t k
+    for k in range(raw.shape[0]):
+        to[k] = quadrant_of(raw[k], v[k])
+    return out
+
+
+cdef class FusedEstimator(Estimator):
+    """Our estimator of one joint, method `fused`; without a network its physics alone, status valid.
+
+        tau_raw, v, tau_t, waves, s, open  <-  FusedObserver    s: direction, -1 to 1; open: of the torsion's slip
+        physics = fusion of tau_raw - loss(tau_raw, v, s, T) and tau_t
+        torque  = physics + w turning(v) N(features)            w: trust of the network; turning: 0 at rest, 1 from 0.2 rad/s
+
+    w is 1 inside the network's envelope, falls continuously to 0 outside of it, and falls from 1 to 0 while |N| goes
+    from 75 % to 100 % of the limit. Status 2 where w = 1, 3 where it is less (at w = 0 the value is the physics alone),
+    6 at standstill.
+
+    Raises ConfigError for a joint without section `fused`, effects (`make_estimator` applies them), another joint's
+    network, or settings of another method; NetworkError for a network whose native evaluation differs from its runtime's.
+    """
+
+    def __init__(self, joint, settings, network=None):
+        fused = checked_fused(joint, settings, network)
+        self.joint, self.settings = joint, settings
+        self.width = len(FUSED_FEATURES)
+        fill_guard(&self.law.guard, joint, settings)
+        fill_fused_observer(
+            &self.law.observer, joint, fused.torsion, settings.bandwidth_rad_s, settings.link_bandwidth_rad_s
+        )
+        self.law.loss = (<AdditiveLossModel>AdditiveLossModel(fused.loss)).law
+        fill_fusion(&self.law.fusion, fused.sigma, fused.torsion is not None)
+        network_scale = fused.sigma.scale if network is None else network.sigma_scale
+        for k in range(4):
+            self.law.physics_scale[k], self.law.network_scale[k] = fused.sigma.scale[k], network_scale[k]
+        self.law.stand_share = 1.0 + settings.friction_uncertainty
+        self.law.stand_floor = settings.sigma_floor * joint.rated_torque_nm
+        self.law.limit = settings.torque_limit * joint.rated_torque_nm
+        self.law.network_limit = settings.network_limit * joint.rated_torque_nm
+        self.law.fade = FADE_START * self.law.network_limit
+        self.law.inverse_fade = 1.0 / max(self.law.network_limit - self.law.fade, 1e-12)
+        self.run_one = fill_network(&self.law.network, network, joint)
+        if network is not None:
+            fill_fused_trust(&self.law.trust, network.envelope)
+        self.state.temperature, self.state.thermal = NAN, 0.0
+        self.reset()
+
+    @property
+    def with_network(self):
+        """Whether a network is used."""
+        return bool(self.law.network.used)
+
+    def reset(self):
+        """Forget the past: the next step starts."""
+        restart_guard(&self.state.guard)
+        self.state.half = 0.0
+
+    cdef void advance(self, const Sample *x, bint network_wanted, Values *out) noexcept nogil:
+        """Set `out` to the estimate at this sample."""
+        cdef FusedObserved seen
+        self.observed = observe_fused(
+            &self.law.guard, &self.state.guard, &self.law.observer, &self.state.observer, x, &seen
+        )
+        no_values(out, self.state.guard.status)
+        if self.observed:
+            self.estimate(&seen, x, network_wanted, out)
+        else:
+            self.state.half = 0.0
+
+    cdef void estimate(self, const FusedObserved *seen, const Sample *x, bint network_wanted, Values *out) noexcept nogil:
+        """Set `out`, whose status is the guard's, to the estimate of an observed sample."""
+        cdef const FusedLaw *law = &self.law
+        cdef FusedState *s = &self.state
+        cdef double raw = seen.raw_nm, v = seen.joint_velocity_rad_s
+        cdef double scale, weight = 0.0, correction, size
+        cdef int quadrant = quadrant_of(raw, v)
+        cdef Loss loss
+        cdef Fused physics
+        if x.temperature_c != s.temperature:  # a joint reports it twice a second
+            s.temperature = x.temperature_c
+            s.thermal = thermal_friction(&law.loss, x.temperature_c)
+        loss = additive_loss(&law.loss, raw, v, s.thermal, seen.direction)
+        s.half = keep(loss.half, s.half, x.dt_s)
+        physics = fuse_paths(&law.fusion, raw, loss.nm, s.half, v, seen.torsion_nm, seen.open_nm)
+        out.torque_nm = out.physics_nm = physics.value
+        scale = law.physics_scale[quadrant]
+        self.features[0], self.features[1], self.features[2] = v, raw, seen.torsion_nm - (raw - loss.nm)
+        self.features[3], self.features[4] = seen.cos2, seen.sin2
+        self.features[5], self.features[6] = seen.cos4, seen.sin4
+        if law.network.used:
+            if network_wanted:
+                correction = (
+                    evaluate(&law.network.perceptron, self.features) if law.network.native else self.ask()
+                )
+                out.network_nm = physics.value + correction
+                size = fabs(correction)
+                if size <= law.network_limit:  # not so for NaN
+                    weight = fused_trust(&law.trust, v, raw, self.features[2], x.temperature_c)
+                    if size > law.fade:
+                        weight = fmin(weight, (law.network_limit - size) * law.inverse_fade)
+                    out.torque_nm += weight * share_by_speed(v) * correction
+                    scale += weight * (law.network_scale[quadrant] - scale)
+            if weight < 1.0 and out.status != STANDSTILL:
+                out.status = DEGRADED
+        out.sigma_nm = scale * physics.sigma
+        if out.status == STANDSTILL:
+            out.sigma_nm = fmin(
+                law.stand_share * loss.half + law.stand_floor, STANDSTILL_WIDTH * scale * physics.sigma
+            )
+        publish_within(out, law.limit)
+
+    def run_observed(self, seen):
+        """Return the estimates of an `ObservedRun` (observed with the joint's own torsion) as an `EstimateRun`."""
+        n = len(seen.raw_nm)
+        values, features, status = np.full((5, n), NAN), np.full((n, self.width), NAN), seen.status.copy()
+        rows = np.column_stack(
+            (seen.raw_nm, seen.velocity_rad_s, seen.torsion_nm, seen.waves, seen.direction, seen.open_nm)
+        )
+        cdef const double[:, ::1] row = np.ascontiguousarray(rows)
+        cdef const double[::1] dt = np.ascontiguousarray(seen.dt_s)
+        cdef const double[::1] temperature = np.ascontiguousarray(seen.temperature_c)
+        cdef double[:, ::1] to = values
+        cdef double[:, ::1] f = features
+        cdef unsigned char[::1] asked = status
+        cdef FusedObserved one
+        cdef Sample sample
+        cdef Values out
+        cdef Py_ssize_t k
+        cdef int m
+        sample = Sample(NAN, NAN, NAN, NAN, NAN, NAN)
+        self.state.half = 0.0
+        with nogil:
+            for k in range(row.shape[0]):
+                if asked[k] != VALID and asked[k] != STANDSTILL:
+                    self.state.half = 0.0
+                    continue
+                one.raw_nm, one.joint_velocity_rad_s, one.torsion_nm = row[k, 0], row[k, 1], row[k, 2]
+                one.cos2, one.sin2, one.cos4, one.sin4 = row[k, 3], row[k, 4], row[k, 5], row[k, 6]
+                one.direction, one.open_nm = row[k, 7], row[k, 8]
+                sample.dt_s, sample.temperature_c = dt[k], temperature[k]
+                no_values(&out, asked[k])
+                self.estimate(&one, &sample, True, &out)
+                to[0, k], to[1, k] = out.torque_nm, out.sigma_nm
+                to[2, k], to[3, k], to[4, k] = out.tob_nm, out.physics_nm, out.network_nm
+                asked[k] = out.status
+                for m in range(self.width):
+                    f[k, m] = self.features[m]
+        torque, sigma, tob, physics, network = values
+        return EstimateRun(torque, sigma, status, tob, physics, network, features)
+
+
+def observe_run(
+    joint,
+    settings,
+    torsion,
+    dt_s,
+    current_a,
+    motor_position_rad,
+    motor_velocity_rad_s,
+    link_position_rad,
+    temperature_c=None,
+):
+    """Return what `FusedObserver` and its guard make of a run, an `ObservedRun`; arrays [n], dt_s[k] since sample k-1.
+
+    torsion: instead of the joint's own, None for none. Raises ValueError for arrays of different length.
+    """
+    inputs = columns(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, temperature_c)
+    cdef FusedLaw law
+    cdef GuardState guard
+    cdef FusedObserverState state
+    cdef FusedObserved out
+    cdef Sample sample
+    cdef Py_ssize_t k
+    fill_guard(&law.guard, joint, settings)
+    fill_fused_observer(&law.observer, joint, torsion, settings.bandwidth_rad_s, settings.link_bandwidth_rad_s)
+    restart_guard(&guard)
+    n = inputs.shape[1]
+    rows, waves, status = np.full((5, n), NAN), np.full((n, 4), NAN), np.empty(n, np.uint8)
+    cdef const double[:, ::1] x = inputs
+    cdef double[:, ::1] to = rows
+    cdef double[:, ::1] w = waves
+    cdef unsigned char[::1] s = status
+    with nogil:
+        for k in range(x.shape[1]):
+            sample = Sample(x[0, k], x[1, k], x[2, k], x[3, k], x[4, k], x[5, k])
+            if observe_fused(&law.guard, &guard, &law.observer, &state, &sample, &out):
+                to[0, k], to[1, k], to[2, k] = out.raw_nm, out.joint_velocity_rad_s, out.torsion_nm
+                to[3, k], to[4, k] = out.direction, out.open_nm
+                w[k, 0], w[k, 1], w[k, 2], w[k, 3] = out.cos2, out.sin2, out.cos4, out.sin4
+            s[k] = guard.status
+    raw, v, torsion_nm, direction, open_nm = rows
+    return ObservedRun(status, raw, v, torsion_nm, waves, inputs[5], direction, inputs[0], open_nm)
+
+
+# Joints with effects --------------------------------------------------------------------------------------------------
+
+
+cdef class ExtendedEstimator(Estimator):
+    """Estimator of a joint with effects: corrected inputs (`ExtendedInputs`) into the estimator of the plain joint.
+
+    joint: with its effects; inner: estimator of `plain_joint(joint)`. `corrected`: current [A] and link position [rad]
+    that the inner one was given last.
+    """
+
+    def __init__(self, joint, settings, Estimator inner):
+        self.joint, self.settings, self.inner = joint, settings, inner
+        self.width = inner.width
+        self.inputs = ExtendedInputs(joint, settings)
+        self.corrected = (nan, nan)
+        self.torque = NAN
+
+    @property
+    def with_network(self):
+        """Whether a network is used."""
+        return self.inner.with_network
+
+    def reset(self):
+        """Forget the past: the next step starts."""
+        self.inner.reset()
+        self.inputs.restart()
+        self.torque = NAN
+
+    cdef void advance(self, const Sample *x, bint network_wanted, Values *out) noexcept nogil:
+        """Set `out` to the estimate at this sample; the corrections are Python."""
+        cdef Sample corrected = x[0]
+        cdef int n
+        with gil:
+            self.corrected = self.inputs.step(
+                x.dt_s,
+                x.current_a,
+                x.motor_position_rad,
+                x.motor_velocity_rad_s,
+                x.link_position_rad,
+                x.temperature_c,
+                self.torque,
+            )
+            corrected.current_a, corrected.link_position_rad = self.corrected
+        self.inner.advance(&corrected, network_wanted, out)
+        self.observed = self.inner.observed
+        for n in range(self.width):
+            self.features[n] = self.inner.features[n]
+        self.torque = out.torque_nm

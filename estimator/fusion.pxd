@@ -1,0 +1,18 @@
+"""Fusion of the current path and the torsion path as a flat block; the equations stand in fusion.pyx."""
+
+cdef struct FusionLaw:
+    double current, viscous, load, torsion, torsion_load, reference  # squares
+    bint with_torsion
+
+cdef struct Fused:
+    double alpha, value, sigma
+
+cdef int fill_fusion(FusionLaw *law, sigma, bint with_torsion) except -1
+cdef double share_by_speed(double velocity) noexcept nogil
+cdef double keep(double half, double before, double dt) noexcept nogil
+cdef Fused fuse_paths(
+    const FusionLaw *law, double raw, double loss, double half, double velocity, double torsion, double open_nm
+) noexcept nogil
+
+cdef class Fusion:
+    cdef FusionLaw law

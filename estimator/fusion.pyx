@@ -1,0 +1,143 @@
+"""Fusion of two independent measurements of one torque by their variances: motor current less loss, and torsion.
+
+    tau_c = tau_raw - loss                 knows fast changes and any load; fails with friction
+    tau_t = K d + K3 d^3 + D d' + H z      knows nothing of friction; fails with hysteresis and encoder errors
+    alpha = s_c^2/(s_c^2 + s_t^2)          physics = tau_c + alpha (tau_t - tau_c)
+    s_c^2 = a^2 + (b v)^2 + (c tau_raw)^2 + half^2        half: what friction leaves open near v = 0
+    s_t^2 = e^2 + (f tau_t)^2 + open^2     open: what the slip leaves open until its bounds have met
+    sigma^2 = s_c^2 s_t^2/(s_c^2 + s_t^2) + reference^2
+
+Towards standstill `half` grows to the half width of the friction interval and the torsion takes over: continuous,
+and the value there no longer depends on which way friction happens to point.
+"""
+
+from libc.math cimport fabs, sqrt
+
+from typing import Final
+
+import numpy as np
+
+SLOW_RAD_S: Final = 0.05
+FAST_RAD_S: Final = 0.2
+"""The network fades in between these speeds: slower, a wave of the motor angle looks like an offset."""
+
+HOLD_S: Final = 0.05
+"""Time constant with which the friction interval is forgotten after a reversal."""
+
+cdef double SLOW = SLOW_RAD_S, FAST = FAST_RAD_S, HOLD = HOLD_S
+cdef double INVERSE_RANGE = 1.0 / (FAST_RAD_S - SLOW_RAD_S)
+
+
+cdef double share_by_speed(double v) noexcept nogil:
+    """Return the network's share at this speed, 0 to 1."""
+    cdef double a = fabs(v)
+    if a >= FAST:
+        return 1.0
+    return (a - SLOW) * INVERSE_RANGE if a > SLOW else 0.0
+
+
+def turning(velocity_rad_s):
+    """Return the network's share at these speeds [n], 0 to 1."""
+    cdef const double[::1] v = np.ascontiguousarray(velocity_rad_s, np.float64)
+    out = np.empty(len(v))
+    cdef double[::1] to = out
+    cdef Py_ssize_t k
+    for k in range(v.shape[0]):
+        to[k] = share_by_speed(v[k])
+    return out
+
+
+cdef double keep(double half, double before, double dt) noexcept nogil:
+    """Return `half` [Nm] with the memory of the sample before, dt [s] ago.
+
+    Between rest and motion the weight moves from one path to the other. Their errors differ, so it must not move within
+    a few milliseconds: what friction left open at a reversal counts for HOLD_S longer.
+    """
+    cdef double faded = before * (HOLD / (HOLD + dt))
+    return half if half >= faded else faded
+
+
+def held(half_nm, dt_s, running):
+    """Return `half_nm` [n] with its memory (`keep`), which starts again after every sample that is not `running`."""
+    cdef const double[::1] half = np.ascontiguousarray(half_nm, np.float64)
+    cdef const double[::1] dt = np.ascontiguousarray(dt_s, np.float64)
+    cdef const unsigned char[::1] on = np.ascontiguousarray(running, np.bool_).view(np.uint8)
+    out = np.empty(len(half))
+    cdef double[::1] to = out
+    cdef double memory = 0.0
+    cdef Py_ssize_t k
+    for k in range(half.shape[0]):
+        memory = keep(half[k], memory, dt[k]) if on[k] else 0.0
+        to[k] = memory
+    return out
+
+
+cdef int fill_fusion(FusionLaw *law, sigma, bint with_torsion) except -1:
+    """Set the variances from section `fused.sigma` of a joint file."""
+    law.current = sigma.current_nm**2
+    law.viscous = sigma.viscous_nms_per_rad**2
+    law.load = sigma.load**2
+    law.torsion = sigma.torsion_nm**2
+    law.torsion_load = sigma.torsion_load**2
+    law.reference = sigma.reference_nm**2
+    law.with_torsion = with_torsion
+    return 0
+
+
+cdef Fused fuse_paths(
+    const FusionLaw *law, double raw, double loss, double half, double v, double torsion, double open_nm
+) noexcept nogil:
+    """Return share of the torsion, value and standard deviation [Nm] of the fused physics."""
+    cdef double c = law.current + law.viscous * v * v + law.load * raw * raw + half * half
+    cdef double value = raw - loss
+    cdef double t, alpha
+    if not law.with_torsion:
+        return Fused(0.0, value, sqrt(c + law.reference))
+    t = law.torsion + law.torsion_load * torsion * torsion + open_nm * open_nm
+    alpha = c / (c + t)
+    return Fused(alpha, value + alpha * (torsion - value), sqrt(alpha * t + law.reference))
+
+
+cdef class Fusion:
+    """Value and standard deviation of the fused physics [Nm, joint side].
+
+    with_torsion False: the current path alone, whatever the torsion.
+    """
+
+    def __init__(self, sigma, bint with_torsion):
+        fill_fusion(&self.law, sigma, with_torsion)
+
+    def fuse(
+        self,
+        double raw_nm,
+        double loss_nm,
+        double half_nm,
+        double velocity_rad_s,
+        double torsion_nm,
+        double open_nm=0.0,
+    ):
+        """Return (physics, sigma) [Nm]; half_nm: `AdditiveLossModel.loss`; open_nm: `FusedObservedSample`."""
+        cdef Fused fused = fuse_paths(&self.law, raw_nm, loss_nm, half_nm, velocity_rad_s, torsion_nm, open_nm)
+        return fused.value, fused.sigma
+
+    def fuse_many(self, raw_nm, loss_nm, half_nm, velocity_rad_s, torsion_nm, open_nm=0.0):
+        """Return the same for arrays [n]."""
+        _, value, sigma = self._run(raw_nm, loss_nm, half_nm, velocity_rad_s, torsion_nm, open_nm)
+        return value, sigma
+
+    def weigh_many(self, raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm=0.0):
+        """Return (alpha, sigma), arrays [n]: share of the torsion, and standard deviation of the fused value [Nm]."""
+        alpha, _, sigma = self._run(raw_nm, 0.0, half_nm, velocity_rad_s, torsion_nm, open_nm)
+        return alpha, sigma
+
+    def _run(self, *columns):
+        laid = np.ascontiguousarray(np.broadcast_arrays(*columns), np.float64)
+        out = np.empty((3, laid.shape[1]))
+        cdef const double[:, ::1] x = laid
+        cdef double[:, ::1] to = out
+        cdef Fused fused
+        cdef Py_ssize_t k
+        for k in range(x.shape[1]):
+            fused = fuse_paths(&self.law, x[0, k], x[1, k], x[2, k], x[3, k], x[4, k], x[5, k])
+            to[0, k], to[1, k], to[2, k] = fused.alpha, fused.value, fused.sigma
+        return out

@@ -1,0 +1,71 @@
+"""Observers and their guard as flat blocks: parameters, state, outputs; the equations stand in observer.pyx."""
+
+from jtqd.estimator.losses cimport MOST_NODES, FrictionLaw
+from jtqd.estimator.sample cimport Sample
+
+cdef struct Observed:  # torques [Nm, joint side], velocities [rad/s, joint side]
+    double raw_nm, tob_nm, joint_velocity_rad_s, link_velocity_rad_s
+
+cdef struct ObserverLaw:
+    double gear, inverse_gear, kt, inertia_rate, rate, link_rate
+    FrictionLaw friction
+
+cdef struct ObserverState:
+    double u, v, friction  # inputs of the sample before
+    double z, z_v, z_friction  # filtered
+    double link, link_velocity
+
+cdef struct Inputs:  # of the filter: u = i Kt + J g w, v, deflection d, waves, direction
+    double u, v, d, cos2, sin2, cos4, sin4, direction
+
+cdef struct FusedObserved:  # as Observed, and the filtered waves; open: what the torsion's slip leaves open
+    double raw_nm, joint_velocity_rad_s, link_velocity_rad_s, torsion_nm
+    double cos2, sin2, cos4, sin4, direction, open_nm
+
+cdef struct Wave:
+    double order, cos, sin
+
+cdef struct FusedObserverLaw:
+    double gear, inverse_gear, kt, inertia_rate, rate, link_rate
+    double stiffness, cubic, zero, damping, hysteresis, inverse_travel, torsion_limit
+    Wave two, four  # kinematic error at the ripple orders, which costs no further cos and sin
+    int others
+    Wave other[MOST_NODES]
+
+cdef struct FusedObserverState:
+    Inputs last, z
+    double d, low, high
+    double link, link_velocity
+
+cdef struct GuardLaw:
+    double max_gap, stop, leave, raw_limit
+
+cdef struct GuardState:
+    bint running, standing
+    int status
+
+cdef int fill_observer(ObserverLaw *law, joint, double bandwidth, double link_bandwidth) except -1
+cdef int fill_fused_observer(
+    FusedObserverLaw *law, joint, torsion, double bandwidth, double link_bandwidth
+) except -1
+cdef int fill_guard(GuardLaw *law, joint, settings) except -1
+cdef void restart_guard(GuardState *g) noexcept nogil
+cdef bint observe(
+    const GuardLaw *guard, GuardState *g, const ObserverLaw *law, ObserverState *s, const Sample *x, Observed *out
+) noexcept nogil
+cdef bint observe_fused(
+    const GuardLaw *guard,
+    GuardState *g,
+    const FusedObserverLaw *law,
+    FusedObserverState *s,
+    const Sample *x,
+    FusedObserved *out,
+) noexcept nogil
+
+cdef class Observer:
+    cdef ObserverLaw law
+    cdef ObserverState state
+
+cdef class FusedObserver:
+    cdef FusedObserverLaw law
+    cdef FusedObserverState state

@@ -1,0 +1,67 @@
+from typing import Final, NamedTuple
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.joint import Joint, Torsion
+
+RAW_LIMIT: Final = 10.0
+LINK_SPEED_LIMIT_RAD_S: Final = 1e3
+RIPPLE_ORDERS: Final = (2, 4)
+
+def first_order_hold(rate_rad_s: float, dt_s: float) -> tuple[float, float, float]: ...
+def low_pass(values: FloatArray, dt_s: FloatArray, bandwidth_rad_s: float) -> FloatArray: ...
+
+class ObservedSample(NamedTuple):
+    raw_nm: float
+    tob_nm: float
+    joint_velocity_rad_s: float
+    link_velocity_rad_s: float
+
+class Observer:
+    def __init__(self, joint: Joint, bandwidth_rad_s: float, link_bandwidth_rad_s: float) -> None: ...
+    def start(
+        self,
+        current_a: float,
+        motor_position_rad: float,
+        motor_velocity_rad_s: float,
+        link_position_rad: float,
+    ) -> ObservedSample: ...
+    def step(
+        self,
+        dt_s: float,
+        current_a: float,
+        motor_position_rad: float,
+        motor_velocity_rad_s: float,
+        link_position_rad: float,
+    ) -> ObservedSample: ...
+
+class FusedObservedSample(NamedTuple):
+    raw_nm: float
+    joint_velocity_rad_s: float
+    link_velocity_rad_s: float
+    torsion_nm: float
+    cos2: float
+    sin2: float
+    cos4: float
+    sin4: float
+    direction: float
+    open_nm: float = 0.0
+
+class FusedObserver:
+    def __init__(
+        self, joint: Joint, torsion: Torsion | None, bandwidth_rad_s: float, link_bandwidth_rad_s: float
+    ) -> None: ...
+    def start(
+        self,
+        current_a: float,
+        motor_position_rad: float,
+        motor_velocity_rad_s: float,
+        link_position_rad: float,
+    ) -> FusedObservedSample: ...
+    def step(
+        self,
+        dt_s: float,
+        current_a: float,
+        motor_position_rad: float,
+        motor_velocity_rad_s: float,
+        link_position_rad: float,
+    ) -> FusedObservedSample: ...

@@ -1,0 +1,495 @@
+"""Torque observers in exact discrete form: the paper's (Eqs. 4 and 7), that of method `fused`, and the guard around both.
+
+Symbols: i current [A], w motor velocity [rad/s], Kt torque constant, J rotor inertia (motor side), G gear ratio,
+g bandwidth [rad/s], theta_m and theta_l motor and link position [rad].
+
+    tau_raw = [ g/(s+g) (i Kt + J g w) - J g w ] G            = G LPF(i Kt - J dw/dt), without any loss
+    v       = g/(s+g) w/G                                     velocity of the same age as tau_raw
+
+Discretisation: z' = g (u - z) is integrated exactly for an input that is linear between samples (first-order hold),
+with the measured step dt:
+
+    z_k = a z_(k-1) + b0 u_k + b1 u_(k-1),   a = exp(-g dt),  b0 = 1 - (1-a)/(g dt),  b1 = (1-a)/(g dt) - a
+
+The state starts at the first input, so a joint at rest or at constant speed has no start transient. A ramp is followed
+with a lag of exactly 1/g: the group delay at DC (5 ms at 200 rad/s).
+
+The link velocity is the derivative of the link position through p/(s+p), exact for a position that is linear between
+samples: r_k = exp(-p dt) r_(k-1) + (1 - exp(-p dt)) (q_k - q_(k-1))/dt.
+
+The guard decides about starts, gaps, garbage and standstill, sample by sample:
+
+| sample | status and what follows |
+|---|---|
+| not finite | INVALID, and the next good sample starts again |
+| the first, dt <= 0, dt too long | STARTING: the observer is set to this sample, nothing is published |
+| implausible motor torque or speed | INVALID and start again: one absurd sample must not decay into the next |
+| abs(v) below the threshold | STANDSTILL, until it is above twice the threshold |
+| else | VALID |
+"""
+
+from libc.math cimport NAN, cos, expm1, fabs, fmax, fmin, isfinite, isinf, sin
+
+from jtqd.estimator.losses cimport FrictionModel, direction_of, friction_torque
+from jtqd.estimator.sample cimport Sample
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from jtqd.estimator import status as st
+
+RAW_LIMIT: Final = 10.0
+"""Largest |tau_raw| in rated torques: no motor of the joint can give it, friction cannot hide it."""
+
+LINK_SPEED_LIMIT_RAD_S: Final = 1e3
+"""Largest link speed of a joint-side encoder that still means anything."""
+
+RIPPLE_ORDERS: Final = (2, 4)
+"""Per motor revolution: twice the wave generator's turn, and its first harmonic."""
+
+cdef double LINK_SPEED_LIMIT = LINK_SPEED_LIMIT_RAD_S
+cdef int STARTING = st.STARTING, VALID = st.VALID, STANDSTILL = st.STANDSTILL, INVALID = st.INVALID
+
+
+# First-order hold -----------------------------------------------------------------------------------------------------
+
+
+cdef struct Hold:
+    double a, b0, b1, gone  # gone: 1 - a
+
+
+cdef Hold _hold(double rate, double dt) noexcept nogil:
+    """Return the coefficients of one step dt > 0; expm1 keeps tiny steps exact."""
+    cdef double x = rate * dt
+    cdef double gone = -expm1(-x)
+    cdef double share = gone / x
+    cdef double a = 1.0 - gone
+    return Hold(a, 1.0 - share, share - a, gone)
+
+
+cdef inline double _filtered(const Hold *h, double z, double now, double last) noexcept nogil:
+    return h.a * z + h.b0 * now + h.b1 * last
+
+
+def first_order_hold(double rate_rad_s, double dt_s):
+    """Return (a, b0, b1) of the recursion for one step dt_s > 0."""
+    cdef Hold h = _hold(rate_rad_s, dt_s)
+    return h.a, h.b0, h.b1
+
+
+def low_pass(values, dt_s, double bandwidth_rad_s):
+    """Return values [n] through g/(s+g), exact for values linear between samples: as old as an estimate of bandwidth g.
+
+    dt_s [n], dt_s[k] the step that ends at sample k (dt_s[0] is not used); a step <= 0 passes its sample on unfiltered.
+    """
+    out = np.array(values, np.float64)
+    cdef const double[::1] x = np.array(values, np.float64)
+    cdef const double[::1] dt = np.ascontiguousarray(dt_s, np.float64)
+    cdef double[::1] z = out
+    cdef Hold h
+    cdef Py_ssize_t k
+    if x.shape[0] != dt.shape[0]:
+        raise ValueError(f"found {x.shape[0]} values and {dt.shape[0]} steps, expected as many")
+    for k in range(1, x.shape[0]):
+        if dt[k] > 0.0:
+            h = _hold(bandwidth_rad_s, dt[k])
+            z[k] = _filtered(&h, z[k - 1], x[k], x[k - 1])
+    return out
+
+
+# The paper's observer -------------------------------------------------------------------------------------------------
+
+
+class ObservedSample(NamedTuple):
+    """Outputs of one step of `Observer`; torques [Nm, joint side], velocities [rad/s, joint side]."""
+
+    raw_nm: float
+    tob_nm: float
+    joint_velocity_rad_s: float
+    link_velocity_rad_s: float
+
+
+cdef void _start(const ObserverLaw *law, ObserverState *s, const Sample *x, Observed *out) noexcept nogil:
+    """Set the states of a joint that has always moved at this speed, without acceleration."""
+    cdef double spin = law.inertia_rate * x.motor_velocity_rad_s
+    s.u = s.z = x.current_a * law.kt + spin
+    s.v = s.z_v = x.motor_velocity_rad_s * law.inverse_gear
+    s.friction = s.z_friction = friction_torque(&law.friction, s.v)
+    s.link = x.link_position_rad
+    s.link_velocity = s.v
+    out.raw_nm = (s.z - spin) * law.gear
+    out.tob_nm = out.raw_nm - s.z_friction
+    out.joint_velocity_rad_s = out.link_velocity_rad_s = s.v
+
+
+cdef void _step(const ObserverLaw *law, ObserverState *s, const Sample *x, Observed *out) noexcept nogil:
+    """Advance by dt > 0 to the sample."""
+    cdef Hold h = _hold(law.rate, x.dt_s)
+    cdef double spin = law.inertia_rate * x.motor_velocity_rad_s
+    cdef double u = x.current_a * law.kt + spin
+    cdef double v = x.motor_velocity_rad_s * law.inverse_gear
+    cdef double friction = friction_torque(&law.friction, v)
+    s.z = _filtered(&h, s.z, u, s.u)
+    s.z_v = _filtered(&h, s.z_v, v, s.v)
+    s.z_friction = _filtered(&h, s.z_friction, friction, s.friction)
+    s.u, s.v, s.friction = u, v, friction
+    cdef double gone = h.gone if law.link_rate == law.rate else -expm1(-law.link_rate * x.dt_s)
+    s.link_velocity += gone * ((x.link_position_rad - s.link) / x.dt_s - s.link_velocity)
+    s.link = x.link_position_rad
+    out.raw_nm = (s.z - spin) * law.gear
+    out.tob_nm = out.raw_nm - s.z_friction
+    out.joint_velocity_rad_s = s.z_v
+    out.link_velocity_rad_s = s.link_velocity
+
+
+cdef int fill_observer(ObserverLaw *law, joint, double bandwidth, double link_bandwidth) except -1:
+    """Set the parameters from a joint file."""
+    law.gear = joint.gear_ratio
+    law.inverse_gear = 1.0 / joint.gear_ratio
+    law.kt = joint.torque_constant_nm_per_a
+    law.inertia_rate = joint.rotor_inertia_kgm2 * bandwidth
+    law.rate, law.link_rate = bandwidth, link_bandwidth
+    law.friction = (<FrictionModel>FrictionModel(joint.friction)).law
+    return 0
+
+
+cdef class Observer:
+    """The paper's observer of one joint, sample by sample.
+
+        tau_tob = tau_raw - g/(s+g) tau_f                         Eq. (4), tau_f = G f_m [Nm, joint side]
+
+    joint: parameters; bandwidth_rad_s: g; link_bandwidth_rad_s: p of the link velocity.
+    """
+
+    def __init__(self, joint, double bandwidth_rad_s, double link_bandwidth_rad_s):
+        fill_observer(&self.law, joint, bandwidth_rad_s, link_bandwidth_rad_s)
+
+    def start(
+        self, double current_a, double motor_position_rad, double motor_velocity_rad_s, double link_position_rad
+    ):
+        """Set the states of a joint that has always moved at this speed, without acceleration."""
+        cdef Sample x = Sample(0.0, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, NAN)
+        cdef Observed out
+        _start(&self.law, &self.state, &x, &out)
+        return ObservedSample(out.raw_nm, out.tob_nm, out.joint_velocity_rad_s, out.link_velocity_rad_s)
+
+    def step(
+        self,
+        double dt_s,
+        double current_a,
+        double motor_position_rad,
+        double motor_velocity_rad_s,
+        double link_position_rad,
+    ):
+        """Advance by dt_s > 0 to the sample given and return the outputs at that sample."""
+        cdef Sample x = Sample(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, NAN)
+        cdef Observed out
+        _step(&self.law, &self.state, &x, &out)
+        return ObservedSample(out.raw_nm, out.tob_nm, out.joint_velocity_rad_s, out.link_velocity_rad_s)
+
+
+# The observer of method fused -----------------------------------------------------------------------------------------
+
+
+class FusedObservedSample(NamedTuple):
+    """Outputs of one step of `FusedObserver`; torques [Nm, joint side], velocities [rad/s, joint side], filtered waves.
+
+    raw_nm is NaN where the torsion is impossible: the guard then starts again, as for an impossible motor torque.
+    open_nm: half width of what the torsion's slip leaves open, 0 once the slip is known and where there is none.
+    """
+
+    raw_nm: float
+    joint_velocity_rad_s: float
+    link_velocity_rad_s: float
+    torsion_nm: float
+    cos2: float
+    sin2: float
+    cos4: float
+    sin4: float
+    direction: float
+    open_nm: float = 0.0
+
+
+cdef double _other_waves(const FusedObserverLaw *law, double angle) noexcept nogil:
+    """Return the part [rad] of the kinematic error whose orders are not RIPPLE_ORDERS."""
+    cdef double error = 0.0, a
+    cdef int n
+    for n in range(law.others):
+        a = law.other[n].order * angle
+        if isinf(a):
+            return NAN
+        error += law.other[n].cos * cos(a) + law.other[n].sin * sin(a)
+    return error
+
+
+cdef Inputs _inputs(const FusedObserverLaw *law, const Sample *x) noexcept nogil:
+    """Return what the filter takes from a sample."""
+    cdef Inputs to
+    cdef double c = cos(x.motor_position_rad)  # of the angle itself: a multiple of a finite angle need not be finite
+    cdef double s = sin(x.motor_position_rad)
+    to.cos2 = c * c - s * s
+    to.sin2 = 2.0 * c * s
+    to.cos4 = to.cos2 * to.cos2 - to.sin2 * to.sin2
+    to.sin4 = 2.0 * to.cos2 * to.sin2
+    to.d = (
+        x.motor_position_rad * law.inverse_gear
+        - x.link_position_rad
+        - law.zero
+        - law.two.cos * to.cos2
+        - law.two.sin * to.sin2
+        - law.four.cos * to.cos4
+        - law.four.sin * to.sin4
+    )
+    if law.others:
+        to.d -= _other_waves(law, x.motor_position_rad)
+    to.u = x.current_a * law.kt + law.inertia_rate * x.motor_velocity_rad_s
+    to.v = x.motor_velocity_rad_s * law.inverse_gear
+    to.direction = direction_of(to.v)
+    return to
+
+
+cdef void _torsion(const FusedObserverLaw *law, FusedObserverState *s, double d, double dt, FusedObserved *out) noexcept nogil:
+    """Move the slip to the filtered deflection d [rad], dt after the last one, and set the torsion's outputs there."""
+    cdef double step = d - s.d, half
+    s.d = d
+    out.torsion_nm = d * (law.stiffness + law.cubic * d * d) + law.damping * step / dt
+    out.open_nm = 0.0
+    if law.hysteresis == 0.0:
+        return
+    step *= law.inverse_travel
+    s.low += step
+    s.high += step
+    if s.high > 1.0:
+        s.high = 1.0
+        s.low = fmin(s.low, 1.0)
+    elif s.low < -1.0:
+        s.low = -1.0
+        s.high = fmax(s.high, -1.0)
+    half = 0.5 * law.hysteresis
+    out.torsion_nm += half * (s.low + s.high)
+    out.open_nm = half * (s.high - s.low)
+
+
+cdef void _set_outputs(const FusedObserverLaw *law, const FusedObserverState *s, FusedObserved *out) noexcept nogil:
+    """Set what comes out of the filter as it is."""
+    out.joint_velocity_rad_s = s.z.v
+    out.link_velocity_rad_s = s.link_velocity
+    out.cos2, out.sin2, out.cos4, out.sin4 = s.z.cos2, s.z.sin2, s.z.cos4, s.z.sin4
+    out.direction = s.z.direction
+
+
+cdef void _start_fused(const FusedObserverLaw *law, FusedObserverState *s, const Sample *x, FusedObserved *out) noexcept nogil:
+    """Set the states of a joint that has always moved at this speed with this torsion; the slip is unknown."""
+    s.low, s.high = -1.0, 1.0
+    s.last = s.z = _inputs(law, x)
+    s.link = x.link_position_rad
+    s.link_velocity = s.z.v
+    s.d = s.z.d
+    _torsion(law, s, s.z.d, 1.0, out)
+    _set_outputs(law, s, out)
+    out.raw_nm = (s.z.u - law.inertia_rate * x.motor_velocity_rad_s) * law.gear
+
+
+cdef void _step_fused(const FusedObserverLaw *law, FusedObserverState *s, const Sample *x, FusedObserved *out) noexcept nogil:
+    """Advance by dt > 0 to the sample."""
+    cdef Hold h = _hold(law.rate, x.dt_s)
+    cdef Inputs now = _inputs(law, x)
+    s.z.u = _filtered(&h, s.z.u, now.u, s.last.u)
+    s.z.v = _filtered(&h, s.z.v, now.v, s.last.v)
+    s.z.d = _filtered(&h, s.z.d, now.d, s.last.d)
+    s.z.cos2 = _filtered(&h, s.z.cos2, now.cos2, s.last.cos2)
+    s.z.sin2 = _filtered(&h, s.z.sin2, now.sin2, s.last.sin2)
+    s.z.cos4 = _filtered(&h, s.z.cos4, now.cos4, s.last.cos4)
+    s.z.sin4 = _filtered(&h, s.z.sin4, now.sin4, s.last.sin4)
+    s.z.direction = _filtered(&h, s.z.direction, now.direction, s.last.direction)
+    s.last = now
+    cdef double gone = h.gone if law.link_rate == law.rate else -expm1(-law.link_rate * x.dt_s)
+    s.link_velocity += gone * ((x.link_position_rad - s.link) / x.dt_s - s.link_velocity)
+    s.link = x.link_position_rad
+    _torsion(law, s, s.z.d, x.dt_s, out)
+    _set_outputs(law, s, out)
+    out.raw_nm = (s.z.u - law.inertia_rate * x.motor_velocity_rad_s) * law.gear
+    if not -law.torsion_limit <= out.torsion_nm <= law.torsion_limit:  # NaN included
+        out.raw_nm = NAN
+
+
+cdef int fill_fused_observer(FusedObserverLaw *law, joint, torsion, double bandwidth, double link_bandwidth) except -1:
+    """Set the parameters from a joint file; torsion None: its torque is always 0."""
+    law.gear = joint.gear_ratio
+    law.inverse_gear = 1.0 / joint.gear_ratio
+    law.kt = joint.torque_constant_nm_per_a
+    law.inertia_rate = joint.rotor_inertia_kgm2 * bandwidth
+    law.rate, law.link_rate = bandwidth, link_bandwidth
+    law.torsion_limit = RAW_LIMIT * joint.rated_torque_nm
+    law.stiffness = law.cubic = law.zero = law.damping = law.hysteresis = law.inverse_travel = 0.0
+    law.two = law.four = Wave(0.0, 0.0, 0.0)
+    law.others = 0
+    if torsion is None:
+        return 0
+    law.stiffness = torsion.stiffness_nm_per_rad
+    law.cubic = torsion.cubic_nm_per_rad3
+    law.zero = torsion.zero_rad
+    law.damping = torsion.damping_nms_per_rad
+    law.hysteresis = torsion.hysteresis_nm
+    law.inverse_travel = 1.0 / torsion.hysteresis_travel_rad
+    for order, c, s in zip(torsion.orders_per_motor_rev, torsion.cos_rad, torsion.sin_rad, strict=True):
+        if order == RIPPLE_ORDERS[0]:
+            law.two = Wave(order, law.two.cos + c, law.two.sin + s)
+        elif order == RIPPLE_ORDERS[1]:
+            law.four = Wave(order, law.four.cos + c, law.four.sin + s)
+        else:
+            if law.others == MOST_NODES:
+                raise ValueError(f"found more than {MOST_NODES} orders of the kinematic error")
+            law.other[law.others] = Wave(order, c, s)
+            law.others += 1
+    return 0
+
+
+cdef _python(const FusedObserved *out):
+    return FusedObservedSample(
+        out.raw_nm,
+        out.joint_velocity_rad_s,
+        out.link_velocity_rad_s,
+        out.torsion_nm,
+        out.cos2,
+        out.sin2,
+        out.cos4,
+        out.sin4,
+        out.direction,
+        out.open_nm,
+    )
+
+
+cdef class FusedObserver:
+    """Observer of method `fused` for one joint: motor torque, velocity, torsion torque and ripple angles of one age.
+
+        d       = g/(s+g) (theta_m/G - theta_l - zero - e(theta_m))          e: kinematic error
+        tau_t   = K d + K3 d^3 + D d' + H z,   z = (lo + hi)/2,   open = H (hi - lo)/2
+        dlo = dhi = dd/travel, each held in [-1, 1]          Maxwell slip, between bounds: -1 and 1 at each start
+        c_n, s_n = g/(s+g) cos(n theta_m), g/(s+g) sin(n theta_m)     n = RIPPLE_ORDERS
+        direction = g/(s+g) tanh(w/(G w0))                   of friction, as tau_raw knows it
+
+    All pass the same filter, so a torque ripple A cos(n theta_m + phi), which reaches tau_raw through that filter, is
+    exactly linear in c_n and s_n at every speed, and friction that turns with the motion is linear in `direction`,
+    however fast the reversal. The slip follows the filtered deflection: an element that slips would rectify the
+    encoder's noise. Where it was when the observer started is not known: its bounds meet after twice its travel in one
+    direction, and until then `open` is what it may hold to either side of the middle.
+
+    torsion None: its torque is always 0.
+    """
+
+    def __init__(self, joint, torsion, double bandwidth_rad_s, double link_bandwidth_rad_s):
+        fill_fused_observer(&self.law, joint, torsion, bandwidth_rad_s, link_bandwidth_rad_s)
+
+    def start(
+        self, double current_a, double motor_position_rad, double motor_velocity_rad_s, double link_position_rad
+    ):
+        """Set the states of a joint that has always moved at this speed with this torsion; the slip is unknown."""
+        cdef Sample x = Sample(0.0, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, NAN)
+        cdef FusedObserved out
+        _start_fused(&self.law, &self.state, &x, &out)
+        return _python(&out)
+
+    def step(
+        self,
+        double dt_s,
+        double current_a,
+        double motor_position_rad,
+        double motor_velocity_rad_s,
+        double link_position_rad,
+    ):
+        """Advance by dt_s > 0 to the sample given and return the outputs at that sample."""
+        cdef Sample x = Sample(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, NAN)
+        cdef FusedObserved out
+        _step_fused(&self.law, &self.state, &x, &out)
+        return _python(&out)
+
+
+# Guard ----------------------------------------------------------------------------------------------------------------
+
+
+cdef int fill_guard(GuardLaw *law, joint, settings) except -1:
+    """Set the limits from joint and settings."""
+    law.max_gap = settings.max_gap_s
+    law.stop = settings.standstill_velocity_rad_s
+    law.leave = 2.0 * settings.standstill_velocity_rad_s
+    law.raw_limit = RAW_LIMIT * joint.rated_torque_nm
+    return 0
+
+
+cdef void restart_guard(GuardState *g) noexcept nogil:
+    """Forget everything: the next sample starts."""
+    g.running = g.standing = False
+    g.status = STARTING
+
+
+cdef bint _garbage(GuardState *g, const Sample *x) noexcept nogil:
+    """Return whether a sample is not finite; the next good one then starts again."""
+    if isfinite(x.current_a + x.motor_position_rad + x.motor_velocity_rad_s + x.link_position_rad):
+        return False
+    g.running = False
+    g.status = INVALID
+    return True
+
+
+cdef bint _begins(const GuardLaw *law, const GuardState *g, const Sample *x) noexcept nogil:
+    """Return whether the observer is to be set to this sample."""
+    return not g.running or not 0.0 < x.dt_s <= law.max_gap
+
+
+cdef void _begun(const GuardLaw *law, GuardState *g, double v) noexcept nogil:
+    g.running = True
+    g.standing = fabs(v) < law.stop
+    g.status = STARTING
+
+
+cdef bint _judge(const GuardLaw *law, GuardState *g, double raw, double v, double link_velocity) noexcept nogil:
+    """Set the status of a sample that the observer has taken; False when it is implausible."""
+    # written so that NaN fails too
+    if not (
+        -law.raw_limit <= raw <= law.raw_limit and -LINK_SPEED_LIMIT <= link_velocity <= LINK_SPEED_LIMIT
+    ):
+        g.running = False
+        g.status = INVALID
+        return False
+    if -law.leave <= v <= law.leave:
+        if -law.stop < v < law.stop:
+            g.standing = True
+    else:
+        g.standing = False
+    g.status = STANDSTILL if g.standing else VALID
+    return True
+
+
+cdef bint observe(
+    const GuardLaw *guard, GuardState *g, const ObserverLaw *law, ObserverState *s, const Sample *x, Observed *out
+) noexcept nogil:
+    """Take a sample; False when there is no output and the guard's status, STARTING or INVALID, says why."""
+    if _garbage(g, x):
+        return False
+    if _begins(guard, g, x):
+        _start(law, s, x, out)
+        _begun(guard, g, out.joint_velocity_rad_s)
+        return False
+    _step(law, s, x, out)
+    return _judge(guard, g, out.raw_nm, out.joint_velocity_rad_s, out.link_velocity_rad_s)
+
+
+cdef bint observe_fused(
+    const GuardLaw *guard,
+    GuardState *g,
+    const FusedObserverLaw *law,
+    FusedObserverState *s,
+    const Sample *x,
+    FusedObserved *out,
+) noexcept nogil:
+    """Take a sample as `observe`."""
+    if _garbage(g, x):
+        return False
+    if _begins(guard, g, x):
+        _start_fused(law, s, x, out)
+        _begun(guard, g, out.joint_velocity_rad_s)
+        return False
+    _step_fused(law, s, x, out)
+    return _judge(guard, g, out.raw_nm, out.joint_velocity_rad_s, out.link_velocity_rad_s)

@@ -1,0 +1,50 @@
+"""Uncertainty of the physics and trust in a network as flat blocks; the equations stand in validity.pyx."""
+
+from jtqd.estimator.losses cimport EfficiencyLaw
+
+cdef enum:
+    FEATURES = 6  # of the paper's network (jtqd.estimator.network.FEATURES)
+    MOST_CELLS = 129  # of an envelope's map in each direction, with its frame
+
+cdef struct Spread:
+    double value, sigma
+
+cdef struct UncertaintyLaw:
+    double floor, u_friction, widened, load
+    bint with_efficiency
+
+cdef struct TrustLaw:
+    double low[FEATURES]
+    double high[FEATURES]
+    double inverse_margin[FEATURES]
+    double limit, fade, inverse_fade
+
+cdef struct FusedTrustLaw:
+    double inverse_velocity, inverse_torque, velocity_0, torque_0
+    int velocity_last, torque_last
+    double distance, inverse_fade
+    bint with_temperature
+    double low, high
+    unsigned char known[MOST_CELLS][MOST_CELLS]
+
+cdef int fill_uncertainty(UncertaintyLaw *law, joint, settings, bint has_efficiency) except -1
+cdef int fill_trust(TrustLaw *law, low, high, double margin, double limit) except -1
+cdef int fill_fused_trust(FusedTrustLaw *law, envelope) except -1
+cdef double sigma_moving(
+    const UncertaintyLaw *law, const EfficiencyLaw *losses, double raw, double current, double velocity
+) noexcept nogil
+cdef Spread standing(const UncertaintyLaw *law, const EfficiencyLaw *losses, double raw, double current) noexcept nogil
+cdef double trust(const TrustLaw *law, const double *features, double difference) noexcept nogil
+cdef double fused_trust(
+    const FusedTrustLaw *law, double velocity, double raw, double distance, double temperature
+) noexcept nogil
+
+cdef class Uncertainty:
+    cdef UncertaintyLaw law
+    cdef EfficiencyLaw losses
+
+cdef class Trust:
+    cdef TrustLaw law
+
+cdef class FusedTrust:
+    cdef FusedTrustLaw law

@@ -1,0 +1,93 @@
+"""Compile the extension modules: every .pyx of the packages. All else about the project stands in pyproject.toml.
+
+JTQD_BUILD=checked compiles with bounds checks and assertions, JTQD_BUILD=sanitized with AddressSanitizer and UBSan.
+"""
+
+import os
+import shutil
+import sysconfig
+from pathlib import Path
+
+from Cython.Build import cythonize
+from setuptools import Extension, setup
+from setuptools.command.build_ext import build_ext
+from setuptools.errors import CompileError, LinkError
+
+SOURCES = Path("src") / "jtqd"
+BUILD = os.environ.get("JTQD_BUILD", "release")
+
+# -ffp-contract=off: no fused multiply-add, so that every machine computes the same bits
+FLAGS = {
+    "release": ["-O2", "-ffp-contract=off"],
+    "checked": ["-O1", "-g", "-ffp-contract=off"],
+    "sanitized": [
+        "-O1",
+        "-g",
+        "-ffp-contract=off",
+        "-fsanitize=address,undefined",
+        "-fno-omit-frame-pointer",
+    ],
+}
+CHECKS = BUILD != "release"
+
+
+class BuildExtensions(build_ext):
+    """Compile, or say in one line what is missing."""
+
+    def run(self) -> None:
+        """Refuse before the first line of the compiler's own messages where a part of it is missing."""
+        compiler = (os.environ.get("CC") or sysconfig.get_config_var("CC") or "cc").split()[0]
+        header = Path(sysconfig.get_path("include")) / "Python.h"
+        missing = [
+            text
+            for text, there in (
+                (f"a C compiler ({compiler})", shutil.which(compiler) is not None),
+                (f"Python's headers ({header})", header.is_file()),
+            )
+            if not there
+        ]
+        if missing:
+            raise SystemExit(_needs(" and ".join(missing)))
+        try:
+            super().run()
+        except (CompileError, LinkError) as error:
+            raise SystemExit(_needs(f"a C compiler that works ({error})")) from None
+
+
+def _needs(what: str) -> str:
+    packages = "sudo apt-get install gcc libc6-dev python3-dev"
+    return f"error: jtqd is compiled when it is installed and needs {what}; on Debian: {packages}"
+
+
+def extensions() -> list[Extension]:
+    """One extension module per .pyx, by its place in the packages."""
+    flags = FLAGS[BUILD]
+    return [
+        Extension(
+            ".".join(source.relative_to("src").with_suffix("").parts),
+            [str(source)],
+            extra_compile_args=flags,
+            extra_link_args=[flag for flag in flags if flag.startswith("-fsanitize")],
+        )
+        for package in sorted(each for each in SOURCES.iterdir() if each.is_dir())
+        for source in sorted(package.rglob("*.pyx"))
+    ]
+
+
+if __name__ == "__main__":
+    setup(
+        ext_modules=cythonize(
+            extensions(),
+            include_path=["src"],
+            build_dir=str(Path("build") / "cython" / BUILD),
+            compiler_directives={
+                "language_level": 3,
+                "boundscheck": CHECKS,
+                "initializedcheck": CHECKS,
+                "cdivision": True,  # as C and IEEE 754: 1/0 is infinite
+                "embedsignature": True,
+            },
+        ),
+        cmdclass={"build_ext": BuildExtensions},
+        options={"build_ext": {"parallel": os.cpu_count()}},
+    )
