@@ -16,7 +16,7 @@ SAID = {
     "killed_everything": [],
     "torn_chunk": [],
     "zeros_at_the_end": [],
-    "full_disk": ["recording ends", "recording continues"],
+    "full_disk": ["recording pauses", "recording continues"],
     "full_to_the_last_byte": ["recording fails", "recording continues"],
     "read_only": ["cannot record", "recording continues"],
     "removed_directory": ["was removed"],
