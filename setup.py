@@ -18,7 +18,7 @@ BUILD = os.environ.get("JTQD_BUILD", "release")
 
 # -ffp-contract=off: no fused multiply-add, so that every machine computes the same bits
 FLAGS = {
-    "release": ["-O2", "-ffp-contract=off"],
+    "release": ["-O3", "-g0", "-ffp-contract=off"],
     "checked": ["-O1", "-g", "-ffp-contract=off"],
     "sanitized": [
         "-O1",

@@ -6,7 +6,7 @@ and canopen's EDS parser by `object_dictionary.read_eds` when it is called. Impo
 
     frame, filters              the 16 bytes, kernel filters
     frame_socket, bus_socket    SocketCAN or a unix socket, alike to use, all frames by one system call; opening them
-    hub, wire                   hub of a unix bus, `python -m jtqd.drivers.hub`
+    hub, relay, wire            hub of a unix bus, `python -m jtqd.drivers.hub`; its members; a wire's times
     object_dictionary, pdo      objects typed by an EDS, PDO mappings as `struct`, rules for changing them
     sdo, sdo_client, sdo_server the protocol and a queue; blocking clients; the server
     nmt, emcy                   NMT commands and states, EMCY codes

@@ -44,13 +44,6 @@ def is_valid_id(can_id: int) -> bool:
     return bool(can_id & (CAN_EFF_FLAG | CAN_ERR_FLAG)) or not can_id & CAN_EFF_MASK & ~CAN_SFF_MASK
 
 
-def is_frame(frame16: bytes) -> bool:
-    """Return whether these bytes are a frame that a CAN controller could send, or an error message."""
-    if len(frame16) != FRAME_SIZE or frame16[4] > MAX_LENGTH:
-        return False
-    return is_valid_id(int.from_bytes(frame16[:4], "little"))
-
-
 def arbitration_key(can_id: int) -> int:
     """Return the arbitration field as 32 bits on the wire: the smaller key wins the bus.
 

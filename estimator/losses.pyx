@@ -212,6 +212,17 @@ cdef class LossModel:
         """Whether the joint file has an efficiency, not friction alone."""
         return bool(self.law.has_efficiency)
 
+    @property
+    def quadrants(self):
+        """Parameters of Eq. (8) as evaluated, in |i| and |v|: c00, c10, c01, c20, c11, c02, eta low and high, |i| max, rmse.
+
+        Four of them: i > 0, v > 0; i < 0, v > 0; i > 0, v < 0; i < 0, v < 0.
+        """
+        return tuple(
+            (q.c00, q.c10, q.c01, q.c20, q.c11, q.c02, q.low, q.high, q.current_max, q.rmse)
+            for q in self.law.quadrants
+        )
+
     def eta(self, double current_a, double joint_velocity_rad_s):
         """Return the bounded eta = tau_j/(G Kt i) of the quadrant, whatever the file's convention.
 

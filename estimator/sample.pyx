@@ -120,12 +120,13 @@ def columns(*arrays):
 
 
 cdef class PythonEstimator(Estimator):
-    """Estimator written in Python, for the compiled loop: `inner` has `step`, `reset`, `with_network`, `joint`, `settings`."""
+    """Estimator written in Python, for the compiled loop: `inner` has `step` and `reset`, and perhaps the rest."""
 
     cdef readonly object inner
 
     def __init__(self, inner):
-        self.inner, self.joint, self.settings = inner, inner.joint, inner.settings
+        self.inner = inner
+        self.joint, self.settings = getattr(inner, "joint", None), getattr(inner, "settings", None)
 
     cdef void advance(self, const Sample *sample, bint network_wanted, Values *out) noexcept nogil:
         with gil:

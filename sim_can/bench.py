@@ -1,68 +1,18 @@
 """The emulated bench: two drives and a torque sensor around one source. Frames and times in, frames out.
 
-While no master commands the drives the bench moves them itself. Its built-in motion "demo" fills all four quadrants: joint 1
-follows a velocity trajectory of two smooth bursts with rests between them, joint 2 a torque that varies on its own,
-non-commensurate periods. Everything starts from rest with zero slope. No socket, no clock.
+While no master commands the drives the bench moves them itself (`jtqd.sim_can.demo`). No socket, no clock.
 """
 
 from __future__ import annotations
-
-import math
-from typing import NamedTuple
 
 from jtqd.drivers.devices import COMMANDER_NODE, JTQD_NODE, SYNC_COB_ID
 from jtqd.drivers.filters import CanFilter, exact
 from jtqd.drivers.nmt import HEARTBEAT_BASE
 from jtqd.sim_can.canopen_node import CanopenNode
+from jtqd.sim_can.demo import demo_current, demo_velocity
 from jtqd.sim_can.drive_node import OPERATION_ENABLED, DriveNode
 from jtqd.sim_can.sensor_node import SENSOR_NODE, SensorNode
 from jtqd.sim_can.source import CURRENT, OFF, VELOCITY, Source
-
-PERIOD_S = 20.0
-# (start, length in s, amplitudes in rad/s of sin(2πk x), k = 1, 2, ..., x = -1/2..1/2 over the burst)
-BURSTS = (
-    (1.0, 8.4, (0.66, 1.38, -0.90, 0.66)),
-    (10.9, 7.6, (-0.42, -1.14, 0.54, 1.26)),
-)
-# (amplitude in A, period in s)
-LOADS = ((2.7, 7.3), (0.7, 2.9), (0.4, 1.7))
-LOAD_RISE_S = 2.0
-
-
-class Targets(NamedTuple):
-    """Mode and target of one drive; VELOCITY targets are joint side here, in rad/s."""
-
-    mode: int
-    target: float
-
-
-def demo_velocity(time_s: float) -> float:
-    """Return the velocity of joint 1 in rad/s, joint side.
-
-    Each burst is odd about its middle, so the joint comes back to where it began; the window cos² makes
-    velocity and acceleration zero at both ends.
-    """
-    t = time_s % PERIOD_S
-    for start, length, amplitudes in BURSTS:
-        x = (t - start) / length - 0.5
-        if -0.5 < x < 0.5:
-            window = math.cos(math.pi * x) ** 2
-            return window * sum(a * math.sin(2.0 * math.pi * k * x) for k, a in enumerate(amplitudes, 1))
-    return 0.0
-
-
-def demo_current(time_s: float) -> float:
-    """Return the motor current of joint 2 in A: a sum of sines that rises smoothly from zero within LOAD_RISE_S."""
-    rise = 1.0 if time_s >= LOAD_RISE_S else 0.5 - 0.5 * math.cos(math.pi * time_s / LOAD_RISE_S)
-    return rise * sum(a * math.sin(2.0 * math.pi * time_s / period) for a, period in LOADS)
-
-
-def targets(profile: str, time_s: float) -> tuple[Targets, Targets] | None:
-    """Return the targets of both joints, or None when the profile leaves the drives alone ("rest")."""
-    if profile != "demo":
-        return None
-    return Targets(VELOCITY, demo_velocity(time_s)), Targets(CURRENT, demo_current(time_s))
-
 
 CLOCK_STEP_NS = 100_000_000  # stamps and steady clock never differ by this from SYNC to SYNC, unless CLOCK_REALTIME was set
 LONGEST_STEP_NS = 50_000_000  # a source never jumps further than this, however long SYNC was away
@@ -102,7 +52,7 @@ class Bench:
         self.sync_count = 0
         self._profile = profile
         self._profile_s = 0.0
-        self._gear = [rating.gear_ratio for rating in source.ratings]
+        self._gear = source.ratings[0].gear_ratio
         self._first_stamp_ns = 0
         self._last_time_ns = 0  # of the last SYNC, since the first one
         self._last_steady_ns = 0  # steady clock at the last step, for idle steps
@@ -112,7 +62,8 @@ class Bench:
     @property
     def due_ns(self) -> int:
         """Steady time at which `tick` has something to do next."""
-        due = min(node.due_ns for node in self.nodes)
+        one, two, three = self.nodes
+        due = min(one.due_ns, two.due_ns, three.due_ns)
         return min(due, self._idle_due_ns()) if self._moving() else due
 
     def on_frame(self, can_id: int, data: bytes, stamp_ns: int, now_ns: int) -> list[bytes]:
@@ -185,14 +136,10 @@ class Bench:
             self._profile_s += dt_s
         else:
             self._profile_s = 0.0  # start, or start again after a stop, from rest
-        wanted = targets(self._profile, self._profile_s)
-        if wanted is None:
+        if self._profile != "demo":
             return []
-        frames = []
-        for drive, gear, target in zip(self.drives, self._gear, wanted, strict=True):
-            value = target.target * gear if target.mode == VELOCITY else target.target
-            frames += drive.run_by_itself(target.mode, value)
-        return frames
+        velocity, current = demo_velocity(self._profile_s), demo_current(self._profile_s)
+        return one.run_by_itself(VELOCITY, velocity * self._gear) + two.run_by_itself(CURRENT, current)
 
     def _hand_over(self) -> None:
         for drive in self.drives:

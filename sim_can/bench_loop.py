@@ -58,10 +58,9 @@ class _EmbeddedHub:
     def __init__(self, path: str, bitrate: int | None, bench: Bench) -> None:
         self._hub = Hub(path, bitrate)
         self._bench = bench
-        self._wanted = frozenset(each.can_id for each in bench_filters())
-        self._port = self._hub.attach(self._on_frame)
+        self._port = self._hub.attach(self._on_frame, [each.can_id for each in bench_filters()])
         self.send = self._port.send
-        self.serve = self._hub.run_once
+        self.serve = self._hub.serve
         self.close = self._hub.close
 
     def linger(self, end_ns: int | None) -> None:
@@ -74,9 +73,8 @@ class _EmbeddedHub:
 
     def _on_frame(self, frame16: bytes, stamp_ns: int) -> None:
         can_id, length, data = FRAME.unpack(frame16)
-        if can_id in self._wanted:
-            for frame in self._bench.on_frame(can_id, data[:length], stamp_ns, time.monotonic_ns()):
-                self.send(frame)
+        for frame in self._bench.on_frame(can_id, data[:length], stamp_ns, time.monotonic_ns()):
+            self.send(frame)
 
 
 class _Socket:

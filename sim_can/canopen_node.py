@@ -1,7 +1,7 @@
 """One emulated CANopen device: NMT, heartbeat, EMCY, SDO, PDOs (CiA 301). Frames and times in, frames out: no socket,
 no clock.
 
-`CanopenNode` is the device; `TransmitPdo`, `HeartbeatConsumer` and `Emergency` are its services. Times are integer
+`CanopenNode` is the device; `HeartbeatConsumer`, `Emergency` and `transmit.TransmitPdo` are its services. Times are integer
 nanoseconds of one steady clock. Every method that may send returns a list of 16-byte frames. Frames of wrong length and
 foreign identifiers are ignored or answered as CiA 301 requires; nothing is raised for them.
 """
@@ -14,53 +14,16 @@ from functools import partial
 
 from jtqd.drivers import nmt
 from jtqd.drivers.emcy import ErrorHistory
-from jtqd.drivers.frame import FRAME, pack
+from jtqd.drivers.frame import pack
 from jtqd.drivers.object_dictionary import ObjectStore
 from jtqd.drivers.pdo import LAST_SYNC_TYPE, PdoMap, PdoParameters
 from jtqd.drivers.sdo import SdoAbort
 from jtqd.drivers.sdo_server import SdoServer
+from jtqd.sim_can.transmit import NEVER_NS, TransmitPdo
 
-NEVER_NS = 1 << 62
 _NS_PER_MS = 1_000_000
 
 Getter = Callable[[], int]
-
-
-class TransmitPdo:
-    """One TPDO compiled from its mapping: packing it is a few getters and one `struct` call."""
-
-    __slots__ = (
-        "cob_id",
-        "count",
-        "due_ns",
-        "getters",
-        "last",
-        "length",
-        "pack",
-        "period_ns",
-        "start",
-        "timed_only",
-        "type",
-    )
-
-    def __init__(
-        self, pdo: PdoMap, getters: tuple[Getter, ...], start: int, period_ms: int, timed_only: bool
-    ) -> None:
-        self.cob_id = pdo.cob_id
-        self.type = pdo.transmission_type
-        self.length = pdo.length
-        self.pack = pdo.layout.pack
-        self.getters = getters
-        self.start = start  # wait for this SYNC counter first (18xxh:6); 0: no waiting
-        self.count = 0
-        self.last = b""
-        self.period_ns = period_ms * _NS_PER_MS  # event timer, types 254 and 255
-        self.timed_only = timed_only  # no change of its values is an event
-        self.due_ns = NEVER_NS
-
-    def frame(self) -> bytes:
-        """The PDO with its present values."""
-        return FRAME.pack(self.cob_id, self.length, self.pack(*[get() for get in self.getters]))
 
 
 def compile_tpdos(
@@ -309,22 +272,9 @@ class CanopenNode:
             self._apply_waiting()
             frames += self.after_command()
         for transmit in transmits:
-            kind = transmit.type
-            if kind > LAST_SYNC_TYPE:
-                continue
-            if transmit.start and counter:
-                if counter != transmit.start:
-                    continue
-                transmit.start = 0
-                transmit.count = kind - 1
-            transmit.count += 1
-            if transmit.count < kind:
-                continue
-            transmit.count = 0
-            frame = transmit.frame()
-            if kind or frame != transmit.last:  # type 0: synchronous, but only after a change
+            frame = transmit.on_sync(counter)
+            if frame is not None:
                 frames.append(frame)
-            transmit.last = frame
         return frames
 
     def tick(self, t_ns: int) -> list[bytes]:

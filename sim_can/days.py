@@ -1,4 +1,4 @@
-"""Temperature of the emulated joints, and what differs from one day to the next: friction, temperature, zeros. Pure.
+"""Thermal behaviour of the emulated joints, and what differs from one day to the next: friction, temperature, zeros. Pure.
 
 A fit that is tested on the day it was made on looks better than it is. So the emulated bench has days: the
 values of day n come from a Kronecker sequence, frac(s_j + n α_j), which is uniform and spreads evenly even
@@ -17,8 +17,6 @@ from jtqd.estimator.checked import Section
 from jtqd.estimator.decoder import decode, limits
 
 REFERENCE_C: Final = 25.0
-UPDATE_S: Final = 0.1
-"""Of the temperature; with time constants of at least 10 s a step is below 1 % of any change."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,49 +40,6 @@ class Thermal:
         if section.has("ambient_c"):
             return thermal
         return replace(thermal, ambient_c=thermal.reference_c)
-
-
-class JointTemperature:
-    """Temperature T of one joint: warmed by its own losses, cooled by its surroundings, felt by its friction.
-
-        T' = (T_ambient + R P - T) / tau          P: power of the losses [W]
-        viscous share of the losses times exp(-b (T - T_ref)), Coulomb share times exp(-c (T - T_ref))
-
-    One thermal mass, as the grease that carries the viscous friction has no thermometer of its own either: the measured
-    temperature is this one. `viscous` and `coulomb` are the factors of the two shares at the present temperature.
-    """
-
-    __slots__ = ("_ambient", "_heat_j", "_thermal", "_time_s", "celsius", "coulomb", "viscous")
-
-    def __init__(self, thermal: Thermal) -> None:
-        self._thermal = thermal
-        self.start(0.0)
-
-    def start(self, difference_k: float) -> None:
-        """Begin a day in surroundings of `difference_k` above the usual ones, with the joint as warm as
-        these.
-        """
-        self._ambient = self.celsius = self._thermal.ambient_c + difference_k
-        self._heat_j = self._time_s = 0.0
-        self._factors()
-
-    def add(self, power_w: float, dt_s: float) -> bool:
-        """The losses were power_w for dt_s. True when temperature and factors are new: each UPDATE_S."""
-        self._heat_j += power_w * dt_s
-        self._time_s += dt_s
-        if self._time_s < UPDATE_S:
-            return False
-        thermal = self._thermal
-        final = self._ambient + thermal.kelvin_per_w * self._heat_j / self._time_s
-        self.celsius = final + (self.celsius - final) * math.exp(-self._time_s / thermal.time_constant_s)
-        self._heat_j = self._time_s = 0.0
-        self._factors()
-        return True
-
-    def _factors(self) -> None:
-        above = self.celsius - self._thermal.reference_c
-        self.viscous = math.exp(-self._thermal.viscous_per_k * above)
-        self.coulomb = math.exp(-self._thermal.coulomb_per_k * above)
 
 
 # α_j = frac(sqrt(prime)), in the order of `Day`'s values: viscous, temperature and link zero of both joints, sensor zero.

@@ -11,12 +11,14 @@ from collections.abc import Callable
 from fractions import Fraction
 from typing import Final
 
+from jtqd.drivers.devices import TEMPERATURE_C_PER_UNIT
 from jtqd.drivers.object_dictionary import ObjectStore
 from jtqd.drivers.sdo import VALUE_RANGE, SdoAbort
 from jtqd.sim_can.canopen_node import CURRENT as CURRENT_ERROR
 from jtqd.sim_can.canopen_node import HEARTBEAT_LOST, CanopenNode
 from jtqd.sim_can.eds_entries import entries_of
 from jtqd.sim_can.source import CURRENT, OFF, VELOCITY, DriveRatings, DriveSignals, Source
+from jtqd.sim_can.transmit import DriveValue
 
 NOT_READY: Final = 0
 SWITCH_ON_DISABLED: Final = 1
@@ -137,21 +139,8 @@ class StateMachine:
 OVERCURRENT = 0x2310
 STANDSTILL_RAD_S = 0.01  # joint side: a quick stop has ended below this
 HALT = 0x0100
-NOT_MEASURED = -0x8000  # 3001h of a source without temperature
 _INTERPOLATION_S = 0.001  # 60C2h after power-on
 _INTERPOLATION_UNITS = (-6, 0)  # 60C2h:2: microseconds to seconds
-_I16 = 0x7FFF
-_I32 = 0x7FFF_FFFF
-
-
-def wrapped(value: int) -> int:
-    """Return a position as a counter of 32 bits, which wraps around."""
-    return (value + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000
-
-
-def limited(value: int, limit: int) -> int:
-    """Return the value held within its range: anything but a position saturates."""
-    return -limit if value < -limit else limit if value > limit else value
 
 
 class DriveNode(CanopenNode):
@@ -179,17 +168,19 @@ class DriveNode(CanopenNode):
         self._still_rad_s = STANDSTILL_RAD_S * ratings.gear_ratio
         self._current_units = 0.0
         self._store_ratings()
+        signals = self._signals
+        current = DriveValue(signals, "current_a", self._current_units)
         self.getters = {
-            (0x3001, 0): self._temperature,
+            (0x3001, 0): DriveValue(signals, "temperature_c", 1.0 / TEMPERATURE_C_PER_UNIT),
             (0x603F, 0): lambda: self._error_code,
             (0x6041, 0): self._statusword,
             (0x6061, 0): lambda: self._mode,
-            (0x6064, 0): self._motor_position,
-            (0x606C, 0): self._motor_velocity,
+            (0x6064, 0): DriveValue(signals, "motor_position_rad", self._motor_units),
+            (0x606C, 0): DriveValue(signals, "motor_velocity_rad_s", self._motor_units),
             # torque in 1/1000 of rated torque = current in 1/1000 of rated current
-            (0x6077, 0): self._current,
-            (0x6078, 0): self._current,
-            (0x60E4, 1): self._link_position,
+            (0x6077, 0): current,
+            (0x6078, 0): current,
+            (0x60E4, 1): DriveValue(signals, "link_position_rad", self._link_units),
         }
         self.quiet = frozenset({(0x3001, 0)})  # sent every 500 ms
         self.handlers = {
@@ -223,22 +214,6 @@ class DriveNode(CanopenNode):
         self._current_units = 1000.0 / (self.store.number(0x6075) * 1e-3)
 
     # Process objects ----------------------------------------------------------------------------------------
-
-    def _motor_position(self) -> int:
-        return wrapped(round(self._signals.motor_position_rad * self._motor_units))
-
-    def _motor_velocity(self) -> int:
-        return limited(round(self._signals.motor_velocity_rad_s * self._motor_units), _I32)
-
-    def _link_position(self) -> int:
-        return wrapped(round(self._signals.link_position_rad * self._link_units))
-
-    def _current(self) -> int:
-        return limited(round(self._signals.current_a * self._current_units), _I16)
-
-    def _temperature(self) -> int:
-        celsius = self._signals.temperature_c
-        return NOT_MEASURED if math.isnan(celsius) else limited(round(10.0 * celsius), _I16)
 
     def _statusword(self) -> int:
         return self.machine.statusword

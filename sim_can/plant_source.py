@@ -7,7 +7,6 @@ There is one sensor: its effects are those of joint 1's file, and joint 2's only
 
 from __future__ import annotations
 
-import math
 import random
 from collections import deque
 from collections.abc import Callable
@@ -18,15 +17,14 @@ from jtqd.estimator.effects.functions import Scalar
 from jtqd.estimator.joint import Joint
 from jtqd.sim_can.days import NOMINAL_DAY, Day, day
 from jtqd.sim_can.effect_plant import EffectPlant
+from jtqd.sim_can.instruments import Instruments, Noise
 from jtqd.sim_can.joint_effects import effects_of
 from jtqd.sim_can.plant import Plant
 from jtqd.sim_can.plant_file import JointPlant, PlantParameters
-from jtqd.sim_can.source import OFF, ChannelSignal, DriveRatings, DriveSignals
+from jtqd.sim_can.source import OFF, DriveRatings
 
 Errors = tuple[float, float, float]
 """What motor encoder [rad, motor side], link encoder [rad] and current [A] read above the truth."""
-
-_TWO_PI = 2.0 * math.pi
 
 
 class _Truth(NamedTuple):
@@ -208,45 +206,6 @@ def ratings_of(side: JointPlant) -> DriveRatings:
     )
 
 
-class _Encoders:
-    """Motor encoder, velocity from it, link encoder and current of one drive.
-
-    The motor angle is rounded to counts. Its velocity is the difference of two samples through a first-order
-    low pass of `velocity_filter_s`, so it lags by half a sample period plus that time. Noise is added to link
-    angle and current. `link_zero_rad` is the link encoder's zero error.
-    """
-
-    def __init__(self, side: JointPlant, normal: Callable[[], float]) -> None:
-        measurement = side.measurement
-        self._count_rad = _TWO_PI / measurement.motor_counts_per_rev
-        self._filter_s = measurement.velocity_filter_s
-        self._link_noise = measurement.link_noise_rad
-        self._current_noise = measurement.current_noise_a
-        self._current_offset = measurement.current_offset_a
-        self._normal = normal
-        self._count = 0
-        self._share_dt = -1.0
-        self._share = 1.0
-        self.link_zero_rad = 0.0
-
-    def sample(
-        self, signals: DriveSignals, dt_s: float, motor_rad: float, link_rad: float, current_a: float
-    ) -> None:
-        count = round(motor_rad / self._count_rad)
-        signals.motor_position_rad = count * self._count_rad
-        if dt_s > 0.0:
-            if dt_s != self._share_dt:
-                self._share_dt = dt_s
-                self._share = 1.0 - math.exp(-dt_s / self._filter_s) if self._filter_s > 0.0 else 1.0
-            difference = (count - self._count) * self._count_rad / dt_s
-            signals.motor_velocity_rad_s += self._share * (difference - signals.motor_velocity_rad_s)
-        self._count = count
-        signals.link_position_rad = link_rad + self._link_noise * self._normal()
-        if self.link_zero_rad:
-            signals.link_position_rad += self.link_zero_rad
-        signals.current_a = current_a + self._current_offset + self._current_noise * self._normal()
-
-
 def _plant_of(parameters: PlantParameters) -> tuple[Plant, Readings | None]:
     """Return the plant of these joints and, with effects, the errors of its instruments.
 
@@ -268,15 +227,11 @@ class PlantSource:
     def __init__(self, parameters: PlantParameters, seed: int = 0, noise_seed: str | None = None) -> None:
         self.plant, self._readings = _plant_of(parameters)
         self.ratings = tuple(ratings_of(side) for side in parameters.joints)
-        self.drives = (DriveSignals(), DriveSignals())
-        self.channels = (ChannelSignal(),)
-        # random, not numpy.random: five numbers per step cost 1 us, numpy.random 7 MB in a process that has
-        # to stay small
-        normal = random.Random(seed if noise_seed is None else noise_seed).gauss
-        self._normal = normal
-        self._encoders = tuple(_Encoders(side, normal) for side in parameters.joints)
-        self._sensor = parameters.sensor
-        self._offset_nm = 0.0
+        noise = Noise(random.Random(seed if noise_seed is None else noise_seed).random)
+        self._instruments = Instruments(parameters, noise)
+        self.drives = self._instruments.drives
+        self.channels = (self._instruments.channel,)
+        self._zero_nm = parameters.sensor.offset_nm
         self._widths = parameters.run_to_run
         self._seed = seed
         self._modes = [OFF, OFF]
@@ -287,33 +242,18 @@ class PlantSource:
     def begin_day(self, values: Day = NOMINAL_DAY) -> None:
         """Set friction, temperature and zeros of another day. The joints stay where they are."""
         self.plant.begin_day(values)
-        for encoders, zero in zip(self._encoders, values.link_zero_rad, strict=True):
+        for encoders, zero in zip(self._instruments.encoders, values.link_zero_rad, strict=True):
             encoders.link_zero_rad = zero
-        self._offset_nm = self._sensor.offset_nm + values.sensor_zero_nm
+        self._instruments.sensor.offset_nm = self._zero_nm + values.sensor_zero_nm
 
     def advance(self, dt_s: float) -> bool:
         """Integrate by dt_s and sample everything. An emulated run has no end: always True."""
         plant = self.plant
         plant.step(dt_s)
-        one, two = plant.drives
-        link = plant.link_position
-        motor_1, motor_2 = plant.motor_position
-        drive_1, drive_2 = self.drives
-        link_1, link_2, current_1, current_2 = link, -link, one.current_a, two.current_a
-        torque_nm = plant.sensor_torque()
+        torque_nm, errors = plant.sensor_torque(), None
         if self._readings is not None:
-            (more_1, more_2), torque_nm = self._readings.read(torque_nm, dt_s)
-            motor_1, link_1, current_1 = motor_1 + more_1[0], link_1 + more_1[1], current_1 + more_1[2]
-            motor_2, link_2, current_2 = motor_2 + more_2[0], link_2 + more_2[1], current_2 + more_2[2]
-        self._encoders[0].sample(drive_1, dt_s, motor_1, link_1, current_1)
-        self._encoders[1].sample(drive_2, dt_s, motor_2, link_2, current_2)
-        warmth_1, warmth_2 = plant.temperatures
-        drive_1.temperature_c = warmth_1.celsius
-        drive_2.temperature_c = warmth_2.celsius
-        sensor = self._sensor
-        self.channels[0].torque_nm = (
-            sensor.gain * torque_nm + self._offset_nm + sensor.noise_nm * self._normal()
-        )
+            errors, torque_nm = self._readings.read(torque_nm, dt_s)
+        self._instruments.read(plant, dt_s, torque_nm, errors)
         return True
 
     def command(self, drive: int, mode: int, target: float) -> None:

@@ -13,10 +13,13 @@ drive 1.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
+
+from jtqd.sim_can.signals import ChannelSignal, DriveSignals
+
+__all__ = ["CURRENT", "OFF", "VELOCITY", "ChannelSignal", "DriveRatings", "DriveSignals", "Source"]
 
 # Modes of operation a source is commanded with (CiA 402 object 6061h; OFF: power stage off).
 OFF = 0
@@ -34,42 +37,6 @@ class DriveRatings:
     trip_current_a: float  # overcurrent fault above this magnitude; math.inf: never
     motor_counts_per_rev: int = 65536  # 608Fh, 6090h
     link_counts_per_rev: int = 524288  # 60E6h/60EBh
-
-
-class DriveSignals:
-    """Measured quantities of one drive; mutable, read once per SYNC.
-
-    `enabled`: the source itself has the drive in operation (a recorded run); the node then reports "operation enabled"
-    although no master sent a controlword. The plant leaves it False: its drives are enabled by a master or by the demo
-    profile.
-    """
-
-    __slots__ = (
-        "current_a",
-        "enabled",
-        "link_position_rad",
-        "motor_position_rad",
-        "motor_velocity_rad_s",
-        "temperature_c",
-    )
-
-    def __init__(self) -> None:
-        self.motor_position_rad = 0.0  # motor side, multi-turn
-        self.motor_velocity_rad_s = 0.0  # motor side
-        self.link_position_rad = 0.0  # joint side
-        self.current_a = 0.0
-        self.temperature_c = math.nan  # of the joint; nan: not measured
-        self.enabled = False
-
-
-class ChannelSignal:
-    """Measured torque of one sensor channel; `valid` False sets bit 0 of 6150h."""
-
-    __slots__ = ("torque_nm", "valid")
-
-    def __init__(self) -> None:
-        self.torque_nm = 0.0
-        self.valid = True
 
 
 class Source(Protocol):

@@ -1,6 +1,7 @@
 """Which room may import which: the rules are the table of docs/architecture.md, the imports are read from the sources.
 
-Imports inside of functions and under TYPE_CHECKING count like all others.
+Imports inside of functions and under TYPE_CHECKING count like all others, and so does what a compiled module or its .pxd
+imports and cimports.
 """
 
 from __future__ import annotations
@@ -41,13 +42,42 @@ def name_of(path: Path) -> str:
 
 @cache
 def modules() -> dict[str, Path]:
-    """Every module of the product, by its name without `jtqd.`."""
-    return {name_of(path): path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))}
+    """Every module of the product, by its name without `jtqd.`; a .pxd alone is one as well."""
+    return {
+        name_of(path): path
+        for package in PACKAGES
+        for ending in ("*.pxd", "*.pyx", "*.py")
+        for path in sorted((ROOT / package).rglob(ending))
+    }
+
+
+COMPILED = re.compile(
+    r"^ *(?:from ([\w.]+) (?:import|cimport) (\([^)]*\)|[^\n]+)|(?:import|cimport) ([\w.]+))", re.MULTILINE
+)
+C_LIBRARIES = {"cython", "libc", "cpython", "posix"}
+"""What comes with Cython itself."""
+
+
+def compiled_imports(path: Path) -> Iterator[str]:
+    """Full names of all that a compiled module imports, its .pxd included."""
+    for source in {path.with_suffix(".pyx"), path.with_suffix(".pxd")}:
+        if not source.exists():
+            continue
+        for module, names, whole in COMPILED.findall(source.read_text()):
+            if whole:
+                yield whole
+            for name in re.findall(r"(\w+)(?: as \w+)?", names.partition("#")[0]):
+                full = f"{module}.{name}"
+                yield full if full.removeprefix("jtqd.") in modules() else module
 
 
 @cache
 def imports(name: str) -> frozenset[str]:
     """Full names of all that a module imports, wherever in it."""
+    if modules()[name].suffix != ".py":
+        return frozenset(
+            each for each in compiled_imports(modules()[name]) if each.partition(".")[0] not in C_LIBRARIES
+        )
     found: set[str] = set()
     for node in ast.walk(ast.parse(modules()[name].read_text())):
         if isinstance(node, ast.Import):

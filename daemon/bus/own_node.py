@@ -12,7 +12,7 @@ from functools import partial
 from math import inf, isfinite, nan
 
 from jtqd.daemon.config import Config
-from jtqd.daemon.loop.estimate_pdo import field
+from jtqd.daemon.core.estimate_pdo import field
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.drivers.boot_procedure import signature
 from jtqd.drivers.eds.own_objects import BUS_FIELDS, COUNTERS, JOINT_PARAMETERS, NODES, VERSION

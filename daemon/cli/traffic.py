@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 from jtqd.daemon.bus.boot import bus_load_of
 from jtqd.daemon.bus.service import nodes_of
 from jtqd.daemon.config import Config
-from jtqd.daemon.loop import estimate_pdo
+from jtqd.daemon.core import estimate_pdo
+from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.loop.input_pdos import input_pdos
-from jtqd.daemon.loop.schedule import Grid
 from jtqd.drivers import nmt
 from jtqd.drivers.frame import (
     CAN_EFF_FLAG,

@@ -1,5 +1,5 @@
-"""The loop process: SYNC, inputs, estimates and their status, the estimate PDO; one cycle a millisecond.
+"""The loop process: what is built at the start, one cycle (`daemon.core`) after the other, and the duties between them.
 
-In: frames of the bus. Out: one estimate PDO, one cycle record and every 8th cycle a snapshot (`cycle` is one cycle,
-`process` the shell). May import `drivers`, `estimator`, `daemon.config`, `daemon.shared` and `daemon.reload.handover`.
+In: frames of the bus. Out: one estimate PDO, one cycle record and every 8th cycle a snapshot. May import `drivers`,
+`estimator`, `daemon.config`, `daemon.core`, `daemon.shared` and `daemon.reload.handover`.
 """

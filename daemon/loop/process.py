@@ -22,14 +22,13 @@ from types import FrameType
 from typing import Any
 
 from jtqd.daemon.config import Config, JointConfig, load_config
+from jtqd.daemon.core.counters import frame_counts
+from jtqd.daemon.core.cycle import Cycle
+from jtqd.daemon.core.intake import Intake
+from jtqd.daemon.core.joint_safety import safety_of
+from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.loop import realtime
-from jtqd.daemon.loop.counters import frame_counts
-from jtqd.daemon.loop.cycle import Cycle
-from jtqd.daemon.loop.input_pdos import input_pdos, joint_temperatures, sensor_index
-from jtqd.daemon.loop.intake import Intake
-from jtqd.daemon.loop.joint import JointInputs
-from jtqd.daemon.loop.joint_status import safety_of
-from jtqd.daemon.loop.schedule import Grid
+from jtqd.daemon.loop.input_pdos import JointInputs, input_pdos, joint_temperatures, sensor_index
 from jtqd.daemon.reload.handover import Giver
 from jtqd.daemon.shared.cycle_record import RECORD_SIZE
 from jtqd.daemon.shared.ring import Ring

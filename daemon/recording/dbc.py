@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from jtqd.daemon.loop.estimate_pdo import NO_TORQUE, SIGMA_UNIT_NM, SIGMA_UNKNOWN, TORQUE_UNIT_NM
+from jtqd.daemon.core.estimate_pdo import NO_TORQUE, SIGMA_UNIT_NM, SIGMA_UNKNOWN, TORQUE_UNIT_NM
 from jtqd.daemon.recording.schemas import STATUS_NAMES
 from jtqd.drivers.devices import (
     NOT_MEASURED,
@@ -137,7 +137,7 @@ def _pdo_signals(pdo: PdoMap, quantities: Mapping[Key, Quantity]) -> list[_Signa
 
 
 def estimate_quantities(cob_id: int) -> dict[Key, Quantity]:
-    """The estimate PDO; see `jtqd.daemon.loop.estimate_pdo`."""
+    """The estimate PDO; see `jtqd.daemon.core.estimate_pdo`."""
     torque = Quantity(TORQUE_UNIT_NM, "Nm", {NO_TORQUE: "no_torque"})
     sigma = Quantity(SIGMA_UNIT_NM, "Nm", {SIGMA_UNKNOWN: "unknown"})
     names = {code: name.lower() for code, name in STATUS_NAMES.items()}

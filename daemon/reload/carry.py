@@ -2,6 +2,7 @@
 
 Everything plain (numbers, text, bytes, tuples, lists, sets and mappings of them) that hangs on an object of this package
 is carried, at any depth; what the other loop has built for itself (estimators, sockets, memory, precomputed layouts) is not.
+A compiled class names what is carried (`carried`); its `state` is one flat block as bytes.
 Lists, sets and mappings are filled in place, because others may hold them too. No pickle: JSON, whose floats are exact.
 
     walk = Walk(cycle)                        # finds the objects a few at a time: there is little time between two cycles
@@ -25,6 +26,8 @@ from typing import Any
 _SCALARS = frozenset((int, float, bool, str, type(None)))
 _LONGEST = 128
 """Longer ones are tables made at the start, not something learned."""
+_LONGEST_BLOCK = 4096
+"""Bytes."""
 _PACKAGE = "jtqd.daemon."
 _CONFIGURED = "jtqd.daemon.config"
 _CONFIGURED_CLASS = "JointSafety"
@@ -74,7 +77,7 @@ class _Part:
         news: list[Any] = []
         told = self._told_others
         for number, value in enumerate(self._get_others(self.thing)):
-            if value is told[number]:
+            if value is told[number] or (type(value) is bytes and value == told[number]):
                 continue
             inside = _inside(value)
             if inside is not None and type(told[number]) is tuple and _same(inside, told[number]):
@@ -190,7 +193,7 @@ class Fill:
                     setattr(thing, names[scalars[n]], scalars[n + 1])
                 for n in range(0, len(others), 2):
                     _put(thing, part.others[others[n]], others[n + 1])
-            except IndexError:
+            except (IndexError, ValueError):
                 raise CarryError(
                     f"values of object {number} are not those of {type(thing).__name__}"
                 ) from None
@@ -242,6 +245,9 @@ def _frozen(value: Any) -> bool:
 
 
 def _attributes(thing: Any) -> list[str]:
+    carried = getattr(thing, "carried", None)
+    if carried is not None:
+        return [*carried]
     slots = [name for base in type(thing).__mro__ for name in getattr(base, "__slots__", ())]
     return [name for name in (*slots, *getattr(thing, "__dict__", ())) if not name.startswith("__")]
 
@@ -251,7 +257,7 @@ def _content(value: Any) -> Any:  # noqa: PLR0911 - a line for each kind
     if kind in _SCALARS:
         return value
     if kind is bytes:
-        return ["b", value.hex()] if len(value) <= _LONGEST else _SKIP
+        return ["b", value.hex()] if len(value) <= _LONGEST_BLOCK else _SKIP
     if kind is tuple or kind is list:
         return _plain("t" if kind is tuple else "l", value)
     if kind is set or kind is frozenset:

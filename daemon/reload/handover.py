@@ -27,7 +27,7 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
-from jtqd.daemon.loop.cycle import Cycle
+from jtqd.daemon.core.cycle import Cycle
 from jtqd.daemon.reload.carry import CarryError, Changed, Fill, Walk
 from jtqd.drivers.bus_socket import reachable
 

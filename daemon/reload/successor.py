@@ -23,9 +23,9 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
+from jtqd.daemon.core.cycle import Cycle
+from jtqd.daemon.core.estimate_pdo import PUBLISHED_STATUSES
 from jtqd.daemon.loop import realtime
-from jtqd.daemon.loop.cycle import Cycle
-from jtqd.daemon.loop.estimate_pdo import PUBLISHED_STATUSES
 from jtqd.daemon.loop.process import (
     Stop,
     answer,

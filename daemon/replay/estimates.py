@@ -12,6 +12,7 @@ field of the PDO) is decided here again.
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -22,12 +23,13 @@ import numpy as np
 import numpy.typing as npt
 
 from jtqd.daemon.config import SafetySettings
-from jtqd.daemon.loop import estimate_pdo
-from jtqd.daemon.loop.cycle import STARTING_CYCLES
-from jtqd.daemon.loop.input_pdos import JointTemperature, input_pdos, joint_temperatures
-from jtqd.daemon.loop.intake import Intake
-from jtqd.daemon.loop.joint import JointCycle
-from jtqd.daemon.loop.joint_status import JointSafety, JointStatus, drive_status
+from jtqd.daemon.core import estimate_pdo
+from jtqd.daemon.core.cycle import STARTING_CYCLES
+from jtqd.daemon.core.intake import Intake, JointTemperature
+from jtqd.daemon.core.joint import JointCycle
+from jtqd.daemon.core.joint_safety import JointSafety
+from jtqd.daemon.core.status import JointStatus, drive_status
+from jtqd.daemon.loop.input_pdos import input_pdos, joint_temperatures
 from jtqd.daemon.replay.frames import Frames, Pdo, offsets
 from jtqd.daemon.replay.origin import SAMPLE, Origin
 from jtqd.daemon.replay.runs import Steps
@@ -49,8 +51,8 @@ from jtqd.estimator.status import DEGRADED, INVALID, OFF, PUBLISHED, STALE, STAN
 class _Counters:
     """Counters of the loop in shared memory; not read here."""
 
-    counters: list[int] = field(default_factory=lambda: [0] * len(COUNTERS))
-    errors: list[float] = field(default_factory=lambda: [0.0] * 4)
+    counters: array[int] = field(default_factory=lambda: array("Q", [0] * len(COUNTERS)))
+    errors: array[float] = field(default_factory=lambda: array("d", [0.0] * 4))
 
 
 @dataclass(frozen=True)

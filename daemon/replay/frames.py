@@ -2,7 +2,7 @@
 the estimate PDO that went out. Pure, in arrays.
 
 The frames of a record are in order of arrival, late ones of the cycle before first. Of an input that counted, the last frame
-with its identifier and length is therefore the one that was used (see `loop.intake`); whether it counted is what the
+with its identifier and length is therefore the one that was used (see `core.intake`); whether it counted is what the
 log's `input_flags` say. Where a record had no room for all frames, the integers come from the SI values beside it.
 """
 
@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from jtqd.daemon.loop.input_pdos import InputPdo, input_pdos, joint_temperatures
-from jtqd.daemon.loop.joint import JointInputs
+from jtqd.daemon.loop.input_pdos import InputPdo, JointInputs, input_pdos, joint_temperatures
 from jtqd.daemon.replay.origin import Origin
 from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_POSITION, FLAG_SENSOR
 from jtqd.estimator.arrays import BoolArray, FloatArray, IntegerArray, RecordArray

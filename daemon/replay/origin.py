@@ -19,7 +19,7 @@ import yaml
 
 from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.logs import LogError
-from jtqd.daemon.loop.joint import JointInputs
+from jtqd.daemon.loop.input_pdos import JointInputs
 from jtqd.daemon.loop.process import joint_inputs
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.estimator.checked import ConfigError

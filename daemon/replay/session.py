@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from jtqd.daemon.config import Config
+from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.logs import LogError, log_parts
-from jtqd.daemon.loop.joint_status import JointSafety
 from jtqd.daemon.replay.compare import Comparison, Identity, compare, identity
 from jtqd.daemon.replay.estimates import ExactReplay, Model, replay_whole
 from jtqd.daemon.replay.frames import decode

@@ -15,7 +15,7 @@ SILENT_AFTER = 3.0
 """Heartbeat periods without a heartbeat after which a node is silent."""
 _FIRST_CYCLES = 20
 _HELD = "waiting for enough consecutive good cycles"
-"""Hysteresis of `jtqd.daemon.loop.joint_status`."""
+"""Hysteresis of `jtqd.daemon.core.status`."""
 _DRIVE_STATES = {
     0x00: "not ready to switch on",
     0x40: "switch on disabled",
@@ -27,7 +27,7 @@ _DRIVE_STATES = {
     0x08: "fault",
 }
 _STATUS_OF_STATE = {0x27: None, 0x07: None, 0x0F: st.DRIVE_FAULT, 0x08: st.DRIVE_FAULT}
-"""As `jtqd.daemon.loop.joint_status.drive_status`: None where the motor carries current; every other state is off."""
+"""As `jtqd.daemon.core.status.drive_status`: None where the motor carries current; every other state is off."""
 _ON_THE_BUS = (
     ("bus_errors", "the bus is down"),
     ("foreign_sync", "another SYNC producer is on the bus"),

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 _MAGIC = 0x4A54_5144_5249_4E47  # "JTQDRING"
 _HEADER_SIZE = 4096
-_COUNT_WORD = 8
+COUNT_WORD = 8
 """64-bit word of the count, on a cache line of its own: the reader polls it while records are written."""
 _LAYOUT = struct.Struct("<QQQ")
 
@@ -32,11 +32,18 @@ class RingError(Exception):
 class Ring:
     """Writer's side. `slot()` gives the next record's memory, `commit()` publishes it.
 
+    The loop writes by the same rules without going through Python (`daemon/core/record.pyx`).
+
     Args:
         path: file on a tmpfs, created anew (an older one is replaced: its reader keeps the old memory).
         slots: number of records kept.
         record_size: bytes of one record.
-        attach: go on with the ring that another writer has made; `count` is read once.
+        attach: go on with the ring that another writer has made.
+
+    Attributes:
+        words: 64-bit words of the header page.
+        records: memory of all records.
+        size: number of records kept.
 
     Raises:
         RingError: `attach`, and there is no ring of these numbers.
@@ -44,24 +51,25 @@ class Ring:
 
     def __init__(self, path: Path, slots: int, record_size: int, *, attach: bool = False) -> None:
         self._memory = _existing(path, slots, record_size) if attach else _created(path, slots, record_size)
-        self._view = memoryview(self._memory)
-        self._slots = [
-            self._view[_HEADER_SIZE + n * record_size : _HEADER_SIZE + (n + 1) * record_size]
-            for n in range(slots)
-        ]
+        view = memoryview(self._memory)
         # One 8-byte store. `struct.pack_into` writes zeros first: the reader would at times see a count of 0.
-        self._words = self._view[:_HEADER_SIZE].cast("Q")
-        self._size = slots
-        self.count: int = self._words[_COUNT_WORD]
+        self.words = view[:_HEADER_SIZE].cast("Q")
+        self.records = view[_HEADER_SIZE:]
+        self.size, self._record_size = slots, record_size
+
+    @property
+    def count(self) -> int:
+        """Records written so far."""
+        return self.words[COUNT_WORD]
 
     def slot(self) -> memoryview:
         """Return the memory of the record that the next `commit` publishes."""
-        return self._slots[self.count % self._size]
+        start = self.count % self.size * self._record_size
+        return self.records[start : start + self._record_size]
 
     def commit(self) -> None:
         """Publish the record written into `slot()`."""
-        self.count += 1
-        self._words[_COUNT_WORD] = self.count
+        self.words[COUNT_WORD] += 1
 
 
 def _created(path: Path, slots: int, record_size: int) -> mmap.mmap:
@@ -117,7 +125,7 @@ class RingReader:
         self.position: int = max(0, self._count() - slots)
 
     def _count(self) -> int:
-        return self._words[_COUNT_WORD]
+        return self._words[COUNT_WORD]
 
     @property
     def backlog(self) -> int:

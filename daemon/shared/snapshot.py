@@ -187,7 +187,7 @@ MAX_INPUTS = 8
 
 _MAGIC = 0x4A54_5144_5354_4105  # "JTQDSTA", layout 5
 _HEAD = struct.Struct("<QQdd")
-_JOINT = struct.Struct("<6dHBBHH")
+JOINT = struct.Struct("<6dHBBHH")
 _ESTIMATE = struct.Struct("<qQqq2q")
 _MEASURED = struct.Struct("<12d")
 INPUT = struct.Struct("<12q")
@@ -196,7 +196,8 @@ _ORDERS_OFFSET = 32
 _COUNTERS_OFFSET = 64
 _SEQUENCE_OFFSET = _COUNTERS_OFFSET + 8 * len(COUNTERS)
 _ESTIMATE_OFFSET = _SEQUENCE_OFFSET + 8
-_MEASURED_OFFSET = _ESTIMATE_OFFSET + _ESTIMATE.size + 2 * _JOINT.size
+ESTIMATE_SIZE = _ESTIMATE.size + 2 * JOINT.size + _MEASURED.size
+_MEASURED_OFFSET = _ESTIMATE_OFFSET + _ESTIMATE.size + 2 * JOINT.size
 _ERRORS_OFFSET = _MEASURED_OFFSET + _MEASURED.size
 _WORK_OFFSET = _ERRORS_OFFSET + 4 * 8
 _LATE_OFFSET = _WORK_OFFSET + 8 * WORK_BINS
@@ -223,7 +224,7 @@ class SnapshotError(Exception):
 
 
 class Snapshot:
-    """Writer's side, one per loop.
+    """Writer's side, one per loop: the memory that `daemon/core/counters.pyx` writes into.
 
     With `attach` it takes over the memory that another loop has made, as it is; from `own` on it is this process's.
 
@@ -242,6 +243,8 @@ class Snapshot:
         restarts: boot-up messages of each node-ID.
         configured_for: of each node-ID, the `restarts` after which it was last configured; written by the supervisor.
         doubts: number of times each node-ID was found to be configured otherwise; written by the supervisor.
+        sequence: odd while the snapshot is being written.
+        estimate: the last estimate: times, status, `JointView` and `Measured` of both joints.
     """
 
     def __init__(self, path: Path, period_s: float, worst_load: float, *, attach: bool = False) -> None:
@@ -268,9 +271,8 @@ class Snapshot:
         self.restarts = view[_RESTARTS_OFFSET:_CONFIGURED_FOR_OFFSET].cast("Q")
         self.configured_for = view[_CONFIGURED_FOR_OFFSET:_DOUBTS_OFFSET].cast("Q")
         self.doubts = view[_DOUBTS_OFFSET:SIZE]
-        self._sequence = view[_SEQUENCE_OFFSET:_ESTIMATE_OFFSET].cast("Q")
-        self._status = [-1, -1]
-        self._since = [0, 0]
+        self.sequence = view[_SEQUENCE_OFFSET:_ESTIMATE_OFFSET].cast("Q")
+        self.estimate = view[_ESTIMATE_OFFSET:_ERRORS_OFFSET]
 
     def _create(self, path: Path) -> None:
         temporary = path.with_name(path.name + ".new")
@@ -284,41 +286,6 @@ class Snapshot:
     def own(self) -> None:
         """Make this process the loop."""
         _HEAD.pack_into(self._memory, 0, _MAGIC, os.getpid(), *self._head)
-
-    def begin(self) -> None:
-        """Mark the snapshot as inconsistent until the end of `write` (counters and inputs included)."""
-        self._sequence[0] |= 1
-
-    def write(
-        self,
-        index: int,
-        sync_counter: int,
-        sync_realtime_ns: int,
-        joints: tuple[tuple[float, ...], tuple[float, ...]],
-        *,
-        sync_monotonic_ns: int = 0,
-        measured: tuple[Sequence[float], Sequence[float]] = (NOT_MEASURED, NOT_MEASURED),
-    ) -> None:
-        """Publish the last estimate; `joints` are `JointView` tuples, `measured` begin with the fields of `Measured`."""
-        for n, joint in enumerate(joints):
-            if joint[7] != self._status[n]:
-                self._status[n], self._since[n] = int(joint[7]), index
-        self._sequence[0] |= 1
-        memory = self._memory
-        _ESTIMATE.pack_into(
-            memory,
-            _ESTIMATE_OFFSET,
-            index,
-            sync_counter,
-            sync_realtime_ns,
-            sync_monotonic_ns,
-            *self._since,
-        )
-        _MEASURED.pack_into(memory, _MEASURED_OFFSET, *measured[0][:6], *measured[1][:6])
-        offset = _ESTIMATE_OFFSET + _ESTIMATE.size
-        _JOINT.pack_into(memory, offset, *joints[0])
-        _JOINT.pack_into(memory, offset + _JOINT.size, *joints[1])
-        self._sequence[0] += 1
 
     def factors(self, node_id: int) -> tuple[float, ...]:
         """Four scaling factors that the supervisor has noted for a node (`note_factors`); zeros where none."""
@@ -366,7 +333,7 @@ class SnapshotReader:
         index, sync_counter, realtime_ns, monotonic_ns, *since = _ESTIMATE.unpack_from(block, 0)
         measured = _MEASURED.unpack_from(block, _MEASURED_OFFSET - _ESTIMATE_OFFSET)
         joints = tuple(
-            JointView._make(_JOINT.unpack_from(block, _ESTIMATE.size + n * _JOINT.size)) for n in range(2)
+            JointView._make(JOINT.unpack_from(block, _ESTIMATE.size + n * JOINT.size)) for n in range(2)
         )
         words = struct.unpack_from(f"<{len(COUNTERS)}Q", memory, _COUNTERS_OFFSET)
         cycles = struct.unpack_from(f"<{2 * STATUS_CODES}Q", memory, _STATUS_OFFSET)

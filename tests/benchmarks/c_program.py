@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from jtqd.daemon.config import Config, load_config
-from jtqd.daemon.loop import joint as joint_cycle
-from jtqd.daemon.loop import joint_status
+from jtqd.daemon.core import joint as joint_cycle
+from jtqd.daemon.core.status import NEEDED
 from jtqd.daemon.shared import cycle_record
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import BLEND_CURRENT_A, LossModel
@@ -47,7 +47,7 @@ def _header(config: Config) -> str:
         "FRAME_CAPACITY": cycle_record.FRAME_CAPACITY,
         "RING_SLOTS": config.ring_cycles,
         "STAMP_ACCURACY_NS": joint_cycle.STAMP_ACCURACY_NS,
-        "DEGRADED_CYCLES": joint_status.NEEDED[DEGRADED],
+        "DEGRADED_CYCLES": NEEDED[DEGRADED],
         "WAIT_NS": config.input_wait_ns,
         "DEADLINE_NS": config.input_deadline_ns,
         "MOTOR_RAD_PER_COUNT": SCALING["motor_rad_per_count"],
@@ -63,7 +63,7 @@ def _header(config: Config) -> str:
 
 def _joint(joint: Joint, settings: EstimatorSettings, network: SmallNetwork) -> str:
     friction, losses = joint.friction, LossModel(joint)
-    assert losses._quadrants is not None
+    assert losses.has_efficiency
     margin = settings.envelope_margin
     limit = settings.network_limit * joint.rated_torque_nm
     values: dict[str, object] = {
@@ -79,7 +79,7 @@ def _joint(joint: Joint, settings: EstimatorSettings, network: SmallNetwork) -> 
         "inverse_stribeck": 1.0 / friction.stribeck_velocity_rad_s,
         "inverse_w0": 50.0,
         "static_friction": friction.coulomb_nm + friction.stribeck_nm,
-        "quadrants": losses._quadrants,
+        "quadrants": losses.quadrants,
         "torque_per_ampere": losses.torque_per_ampere,
         "inverse_gain": 1.0 / losses.torque_per_ampere,
         "inverse_blend": 1.0 / BLEND_CURRENT_A,

@@ -17,9 +17,9 @@ from typing import Any
 import canopen
 
 from jtqd.daemon.config import load_config
-from jtqd.daemon.loop import estimate_pdo
+from jtqd.daemon.core import estimate_pdo
+from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.loop import process as loop
-from jtqd.daemon.loop.schedule import Grid
 from jtqd.drivers.can_unix import UnixBus
 from jtqd.drivers.devices import drive_tpdo1, drive_tpdo2, sensor_tpdo1
 from jtqd.drivers.pdo import PdoMap

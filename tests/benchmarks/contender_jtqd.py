@@ -1,4 +1,4 @@
-"""Contender: jtqd's own loop, the code of jtqd.daemon.loop.process and jtqd.daemon.loop.cycle as it ships."""
+"""Contender: jtqd's own loop, the code of jtqd.daemon.loop.process and jtqd.daemon.core.cycle as it ships."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import time
 from typing import Any
 
 from jtqd.daemon.config import Config, load_config
+from jtqd.daemon.core.cycle import Cycle
+from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.loop import process as loop
 from jtqd.daemon.loop import realtime
-from jtqd.daemon.loop.cycle import Cycle
-from jtqd.daemon.loop.schedule import Grid
 from jtqd.daemon.shared.cycle_record import FLAG_PUBLISHED
 from jtqd.drivers.frame_socket import FrameSocket, open_frame_socket
 from jtqd.estimator.methods import AnyEstimator
@@ -53,9 +53,9 @@ class JtqdLoop:
         """One round of `cycles` slots."""
         cycle, grid, socket = self.connect()
         meter = CycleMeter()
-        measured(cycle, meter)
         loop_start(grid)
-        loop.run(cycle, grid, _never, grid.slot_ns + cycles * grid.period_ns)
+        measured = Measured(cycle, meter)
+        loop.run(measured, grid, _never, grid.slot_ns + cycles * grid.period_ns)  # type: ignore[arg-type]
         socket.close()
         return meter.result(grid.missed)
 
@@ -65,22 +65,29 @@ def loop_start(grid: Grid) -> None:
     grid.slot_ns = time.monotonic_ns() + 2 * grid.period_ns
 
 
-def measured(cycle: Cycle, meter: CycleMeter) -> None:
-    """Read the clocks after `publish` and `record`, from outside."""
-    publish, record, states = cycle.publish, cycle.record, cycle._joints
+class Measured:
+    """A cycle beside which the clocks are read after `publish` and `record`."""
 
-    def timed_publish() -> None:
-        publish()
-        meter.sent(cycle._sync_ns)
-        if cycle._flags & FLAG_PUBLISHED and states[0].status in PUBLISHED and states[1].status in PUBLISHED:
+    def __init__(self, cycle: Cycle, meter: CycleMeter) -> None:
+        self.cycle, self._meter = cycle, meter
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.cycle, name)
+
+    def publish(self) -> None:
+        """Read the clock after it."""
+        cycle, meter = self.cycle, self._meter
+        cycle.publish()
+        meter.sent(cycle.sync_ns)
+        one, two = cycle.joints
+        if cycle.flags & FLAG_PUBLISHED and one.status in PUBLISHED and two.status in PUBLISHED:
             meter.published += 1
 
-    def timed_record() -> None:
-        record()
-        meter.late_ns.append(cycle.late_ns)
-        meter.cycle_done()
-
-    cycle.publish, cycle.record = timed_publish, timed_record  # type: ignore[method-assign]
+    def record(self) -> None:
+        """Read the clock after it."""
+        self.cycle.record()
+        self._meter.late_ns.append(self.cycle.late_ns)
+        self._meter.cycle_done()
 
 
 def _never() -> bool:

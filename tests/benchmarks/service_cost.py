@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from jtqd.daemon.loop.cycle import Cycle
+from jtqd.daemon.core.cycle import Cycle
 from jtqd.daemon.loop.process import Duties
 from jtqd.daemon.reload import handover
 from jtqd.daemon.reload.carry import Fill, Walk

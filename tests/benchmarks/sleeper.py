@@ -7,7 +7,7 @@ import sys
 import time
 from typing import Any
 
-from jtqd.daemon.loop.schedule import Grid
+from jtqd.daemon.core.schedule import Grid
 from tests.benchmarks.contender import Task, serve
 from tests.benchmarks.measure import CycleMeter, punctual
 

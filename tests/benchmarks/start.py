@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from jtqd.daemon.loop.estimate_pdo import LAYOUT
+from jtqd.daemon.core.estimate_pdo import LAYOUT
 from jtqd.daemon.shared.runtime_dir import instance_name
 from jtqd.drivers.filters import exact
 from jtqd.drivers.frame_socket import BusError, FrameSocket, open_frame_socket

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from jtqd.daemon.config import load_config
-from jtqd.daemon.loop.counters import LoopCounters
+from jtqd.daemon.core.counters import LoopCounters
+from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.loop.input_pdos import input_pdos
-from jtqd.daemon.loop.intake import Intake
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.snapshot import STATUS_CODES, Snapshot
 
@@ -32,14 +32,14 @@ def run(directory: Path, *, rounds: int = 9, cycles: int = 20_000) -> dict[str, 
         state.fresh, state.stamp_ns = True, _REALTIME_NS + 300_000
     intake.sync_stamp_ns = _REALTIME_NS
     for node in (1, 2, 3):
-        intake.nodes.states[node], intake.nodes.heard_ns[node] = 5, _REALTIME_NS
+        intake.nodes.heartbeat(node, 5, _REALTIME_NS)
     snapshot = Snapshot(directory / "snapshot", 1e-3, 0.8)
     counters = LoopCounters(snapshot, intake, _Socket())  # type: ignore[arg-type]
     view, sample = (1.0,) * 6 + (0x27, 2, 0, 7, 0), (1.0,) * 12 + (0x27, 2, 0, 7)
 
     def write(n: int) -> None:
         counters.flush(0, n)
-        snapshot.write(n, 1, _REALTIME_NS, (view, view), sync_monotonic_ns=n, measured=(sample, sample))
+        counters.last.write(n, 1, _REALTIME_NS, (view, view), sync_monotonic_ns=n, measured=(sample, sample))
 
     def statuses(n: int) -> None:
         spent = snapshot.status_cycles

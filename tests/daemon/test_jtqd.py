@@ -16,8 +16,8 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 
+from jtqd.daemon.core.estimate_pdo import decode
 from jtqd.daemon.logs import read_topic
-from jtqd.daemon.loop.estimate_pdo import decode
 from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_NETWORK_SKIPPED, FLAG_POSITION
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.drivers.can_unix import UnixBus

@@ -96,7 +96,7 @@ def test_told_to_end_while_it_starts(
 ) -> None:
     """While its modules are loaded, and while the nodes are booted: one line, status 0, no child left."""
     process = started("--bus", bench, "--config", str(configuration), directory=run_directory)
-    until(lambda: loaded(process, "numpy") if moment == "loading" else booting(process))
+    until(lambda: loaded(process, "msgspec") if moment == "loading" else booting(process))
     os.killpg(process.pid, number)
     assert ended(process, run_directory) == (0, "jtqd: stopped before it ran\n")
 
@@ -105,7 +105,7 @@ def test_sighup_before_it_runs_is_no_reason_to_end(
     bench: str, run_directory: Path, configuration: Path
 ) -> None:
     process = started("--bus", bench, "--config", str(configuration), directory=run_directory)
-    until(lambda: loaded(process, "numpy"))
+    until(lambda: loaded(process, "msgspec"))
     process.send_signal(signal.SIGHUP)
     until(lambda: list(run_directory.glob("*/control")))
     process.terminate()

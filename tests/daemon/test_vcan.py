@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
+from jtqd.daemon.core.estimate_pdo import decode
 from jtqd.daemon.logs import read_topic
-from jtqd.daemon.loop.estimate_pdo import decode
 
 INTERFACE = os.environ.get("JTQD_CAN_INTERFACE", "vcan0")
 CYCLES = 10_000

@@ -12,7 +12,7 @@ import time
 import pytest
 
 from jtqd.drivers.filters import exact
-from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, FRAME, pack, stuffed_bits
+from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, pack, stuffed_bits
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
 from jtqd.drivers.hub import MAX_CLIENTS, Hub
 from tests.paths import ROOT
@@ -108,6 +108,25 @@ def test_answer_from_a_callback_comes_after_its_question_for_everybody(hub, path
     a.send(SYNC)
     hub.run_once(0)
     assert order[3:] == [("second", SYNC)]
+
+
+def test_a_port_hears_the_identifiers_that_it_wants_and_no_others(hub, path):
+    sock, heard = connect(path), []
+    hub.attach(lambda frame, _stamp: heard.append(frame), [0x080, 0x7FF])
+    hub.run_once(0)
+    wanted = [pack(0x080), pack(0x7FF, b"\1")]
+    others = [
+        pack(0x081),
+        pack(0x080 | CAN_RTR_FLAG),
+        pack(0x080 | CAN_EFF_FLAG),
+        pack(0x1FFF_FFFF | CAN_EFF_FLAG),
+    ]
+    for frame in (wanted[0], *others, wanted[1]):
+        sock.send(frame)
+    hub.run_once(0)
+    assert heard == wanted
+    with pytest.raises(IndexError):
+        hub.attach(heard.append, [0x800])
 
 
 def test_garbage_reaches_nobody_and_is_counted(hub, path):

@@ -10,7 +10,7 @@ import can
 import pytest
 
 from examples import receive_estimate
-from jtqd.daemon.loop import estimate_pdo
+from jtqd.daemon.core import estimate_pdo
 from jtqd.drivers.can_unix import UnixBus
 from jtqd.drivers.frame import pack
 from jtqd.drivers.hub import Hub

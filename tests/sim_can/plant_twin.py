@@ -3,30 +3,51 @@ what a plant file without these sections must still do, bit by bit."""
 
 import math
 
-from jtqd.sim_can.drive_control import DriveControl
 from jtqd.sim_can.plant import loss_table
 from jtqd.sim_can.plant_file import substep_limit
-from jtqd.sim_can.source import CURRENT, VELOCITY
+from jtqd.sim_can.source import CURRENT, OFF, VELOCITY
 
 
-class TwinDrive(DriveControl):
-    """Velocity targets are reached within one control cycle."""
+class TwinDrive:
+    """Loops of a drive whose velocity targets are reached within one control cycle."""
 
-    __slots__ = ()
+    def __init__(self, side):
+        joint, drive = side.joint, side.drive
+        kt, inertia = joint.torque_constant_nm_per_a, joint.rotor_inertia_kgm2
+        self.drive = drive
+        self.kp = drive.velocity_bandwidth_rad_s * inertia / kt
+        self.inertia_a = drive.acceleration_feedforward * inertia / kt
+        self.smooth = 0.01 * joint.gear_ratio
+        self.slope_limit = drive.acceleration_limit_rad_s2 * joint.gear_ratio
+        self.mode, self.target = OFF, 0.0
+        self.current_a = self.integral_a = self.reference_rad_s = self.feedforward = self.slope = 0.0
+
+    def command(self, mode, target, motor_velocity):
+        if mode != self.mode:
+            self.mode, self.reference_rad_s, self.integral_a = mode, motor_velocity, self.current_a
+        self.target = target
 
     def plan(self, dt_s):
-        limit = self._slope_limit
         if self.mode == VELOCITY:
             slope = (self.target - self.reference_rad_s) / dt_s
-            self.slope_rad_s2 = slope = min(max(slope, -limit), limit)
+            self.slope = slope = min(max(slope, -self.slope_limit), self.slope_limit)
             middle = self.reference_rad_s + 0.5 * slope * dt_s
-            self._feedforward = self._inertia_a * slope + self._friction * middle / (
-                abs(middle) + self._smooth
+            self.feedforward = self.inertia_a * slope + self.drive.friction_feedforward_a * middle / (
+                abs(middle) + self.smooth
             )
-        elif self.mode == CURRENT:
-            self._base = min(max(self.target, -self._limit), self._limit)
-        else:
-            self._base = 0.0
+
+    def step(self, h, motor_velocity):
+        limit = self.drive.current_limit_a
+        wanted = self.target if self.mode == CURRENT else 0.0
+        if self.mode == VELOCITY:
+            self.reference_rad_s += h * self.slope
+            error = self.reference_rad_s - motor_velocity
+            wanted = self.kp * error + self.integral_a + self.feedforward
+            if abs(wanted) <= limit or wanted * error < 0.0:
+                self.integral_a += h * (self.kp / self.drive.velocity_integral_time_s) * error
+        decay = 1.0 - math.exp(-2.0 * math.pi * self.drive.current_bandwidth_hz * h)
+        self.current_a += decay * (min(max(wanted, -limit), limit) - self.current_a)
+        return self.current_a
 
 
 class TwinPlant:

@@ -11,8 +11,8 @@ from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.joint import Effect
 from jtqd.models.files import load_joint, shipped
-from jtqd.sim_can.bench import demo_current, demo_velocity
 from jtqd.sim_can.days import Day, Thermal
+from jtqd.sim_can.demo import demo_current, demo_velocity
 from jtqd.sim_can.effect_plant import EffectPlant
 from jtqd.sim_can.joint_effects import EffectFriction, JointEffects
 from jtqd.sim_can.plant import Plant, joint_friction

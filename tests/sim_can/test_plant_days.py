@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from jtqd.models.files import shipped
-from jtqd.sim_can.days import NOMINAL_DAY, Day, JointTemperature, RunToRun, Thermal, day
+from jtqd.sim_can.days import NOMINAL_DAY, Day, RunToRun, Thermal, day
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant import Plant, joint_friction
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sim_can.plant_source import PlantSource
 from jtqd.sim_can.source import CURRENT, OFF, VELOCITY
+from jtqd.sim_can.temperature import JointTemperature
 
 WIDTHS = RunToRun(viscous=0.15, sensor_zero_nm=0.3, temperature_k=4.0, link_zero_rad=1e-5)
 CAMPAIGN = load_plant(shipped("campaign_plant.yaml"))
@@ -199,7 +200,7 @@ def test_another_day_begins_when_a_drive_is_enabled_after_both_were_off():
     source = PlantSource(CAMPAIGN, seed=9)
 
     def zero():
-        return source._offset_nm
+        return source._instruments.sensor.offset_nm
 
     days = [day(CAMPAIGN.run_to_run, 9, n).sensor_zero_nm for n in range(4)]
     source.advance(0.0)

@@ -10,8 +10,8 @@ import yaml
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Effect
 from jtqd.models.files import load_joint, shipped
-from jtqd.sim_can.bench import PERIOD_S, demo_current, demo_velocity, targets
 from jtqd.sim_can.cost import measure
+from jtqd.sim_can.demo import PERIOD_S, demo_current, demo_velocity
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import (
     JointPlant,
@@ -99,12 +99,12 @@ def test_motor_velocity_is_the_filtered_difference_of_counts():
     count = 2 * math.pi / 65536
     for k in range(1000):
         plant.motor_position[0] = 12.34 * 0.001 * k
-        source._encoders[0].sample(source.drives[0], 0.001, plant.motor_position[0], 0.0, 0.0)
+        source._instruments.encoders[0].sample(source.drives[0], 0.001, plant.motor_position[0], 0.0, 0.0)
         if k > 20:
             assert abs(source.drives[0].motor_velocity_rad_s - 12.34) <= count / 0.001
     for k in range(1000):
         t = 0.001 * k
-        source._encoders[0].sample(source.drives[0], 0.001, 500.0 * t * t, 0.0, 0.0)
+        source._instruments.encoders[0].sample(source.drives[0], 0.001, 500.0 * t * t, 0.0, 0.0)
     late = (1000.0 * t - source.drives[0].motor_velocity_rad_s) / 1000.0
     # backward difference 0.5 ms; discrete low pass of 1 ms: h e/(1-e), e = exp(-h/tau)
     assert late == pytest.approx(0.0005 + 0.001 * math.exp(-1) / (1 - math.exp(-1)), abs=0.0002)
@@ -125,7 +125,6 @@ def test_demo_starts_from_rest_stays_in_travel_rests_and_fills_four_quadrants():
     assert 3.0 < np.max(np.abs(i)) < 4.0
     resting = np.flatnonzero(np.diff(np.concatenate([[0], (v == 0).astype(int), [0]])))
     assert max(resting[1::2] - resting[::2]) >= 1000
-    assert targets("rest", 3.0) is None
 
 
 def demo_run(seconds=20.0, seed=1):

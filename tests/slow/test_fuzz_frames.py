@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import random
+import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as hst
 
-from jtqd.daemon.loop.intake import Intake
+from jtqd.daemon.core.cycle import Cycle
+from tests.slow.fuzz.bus_in_time import BusInTime, Script
 from tests.slow.fuzz.frames import FrameReport, Oracle, fuzz_frames, make_cycle
 from tests.slow.fuzz.service import fuzz_service
 from tests.slow.fuzz.traffic import INPUT_IDS, STRICT, frame, genuine
@@ -44,17 +47,44 @@ def test_the_same_seed_is_the_same_traffic(tmp_path: Path) -> None:
     assert one == two
 
 
+def broken(monkeypatch: pytest.MonkeyPatch, fault: Callable[[Cycle, BusInTime], None]) -> None:
+    """The next campaigns run with this fault between cycle and bus."""
+
+    def make(directory: Path, script: Script) -> tuple[Cycle, BusInTime]:
+        cycle, bus = make_cycle(directory, script)
+        fault(cycle, bus)
+        return cycle, bus
+
+    monkeypatch.setattr("tests.slow.fuzz.frames.make_cycle", make)
+
+
 def test_the_oracle_finds_an_intake_that_believes_what_comes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Intake, "_doubt", lambda self, state, delay_ns: None)
+    def forget_debts(cycle: Cycle, bus: BusInTime) -> None:
+        def receive() -> int:
+            for state in cycle.intake.views():
+                state.debt = state.quarantine = 0
+            return whole()
+
+        whole, bus.receive = bus.receive, receive  # type: ignore[method-assign]
+
+    broken(monkeypatch, forget_debts)
     assert fuzz_frames(tmp_path, 1, 50_000, kinds=("stall", "lossy")).oracle.believed > 0
 
 
 def test_the_oracle_finds_a_torque_beside_a_status_without_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("jtqd.daemon.loop.estimate_pdo.field", lambda torque, sigma, status: (7, 1, status))
+    def leak(_cycle: Cycle, bus: BusInTime) -> None:
+        def send(data: bytes) -> bool:
+            sent = whole(data)
+            bus.estimate = struct.pack("<h", 7) + bus.estimate[2:]
+            return sent
+
+        whole, bus.send = bus.send, send  # type: ignore[method-assign]
+
+    broken(monkeypatch, leak)
     assert fuzz_frames(tmp_path, 1, 5_000).oracle.leaked > 0
 
 
@@ -105,7 +135,7 @@ def test_minimal_examples(tmp_path_factory: pytest.TempPathFactory, cycles: list
 
     from jtqd.daemon.loop.process import run
 
-    with bus.installed(), bus.installed_in_loop():
+    with bus.installed_in_loop():
         run(cycle, cycle.grid, lambda: False, after=after)
     assert not oracle.findings, oracle
     assert oracle.valid > 150

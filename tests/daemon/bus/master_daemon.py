@@ -18,7 +18,7 @@ from typing import Any
 
 import yaml
 
-from jtqd.daemon.loop.estimate_pdo import decode
+from jtqd.daemon.core.estimate_pdo import decode
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import FRAME, pack

@@ -10,6 +10,7 @@ from rich.console import Console
 from jtqd.daemon.cli.reading import Daemon, Watch
 from jtqd.daemon.cli.status import StatusView
 from jtqd.daemon.config import load_config
+from jtqd.daemon.core.counters import LastEstimate
 from jtqd.daemon.shared.runtime_dir import About, write_about
 from jtqd.daemon.shared.snapshot import COUNTERS, INPUT, Snapshot
 from jtqd.daemon.supervisor.description import about
@@ -31,9 +32,10 @@ def running(root: Path, bus: str = "vcan0", log: Path | None = None, *, cycling:
     content = described(bus, log)
     write_about(directory, content)
     snapshot = Snapshot(directory / "snapshot", 1e-3, 0.848)
+    told = LastEstimate(snapshot)
     for index in (0, 8):
         monotonic = time.monotonic_ns() + (60_000_000_000 if cycling else -10_000_000_000)
-        snapshot.write(
+        told.write(
             7992 + index,
             17,
             time.time_ns(),

@@ -11,13 +11,13 @@ from typing import Any
 
 import pytest
 
-from jtqd.daemon.loop import cycle as cycle_module
-from jtqd.daemon.loop.cycle import Cycle
-from jtqd.daemon.loop.input_pdos import InputPdo, JointTemperature
-from jtqd.daemon.loop.intake import Intake
-from jtqd.daemon.loop.joint import JointInputs
-from jtqd.daemon.loop.joint_status import JointSafety
-from jtqd.daemon.loop.schedule import Grid
+from jtqd.daemon.core import cycle as cycle_module
+from jtqd.daemon.core.clock import PythonClock
+from jtqd.daemon.core.cycle import Cycle
+from jtqd.daemon.core.intake import Intake, JointTemperature
+from jtqd.daemon.core.joint_safety import JointSafety
+from jtqd.daemon.core.schedule import Grid
+from jtqd.daemon.loop.input_pdos import InputPdo, JointInputs
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import Ring, RingReader
 from jtqd.daemon.shared.snapshot import Snapshot
@@ -67,8 +67,8 @@ class ExactTime:
         self.now_ns += round(seconds * 1e9)
 
     def install(self, monkeypatch: pytest.MonkeyPatch) -> ExactTime:
-        """Take the place of module `time` in the cycle and in this file."""
-        monkeypatch.setattr(cycle_module, "time", self)
+        """Take the place of the clocks of cycles that are made from now on, and of module `time` in this file."""
+        monkeypatch.setattr(cycle_module, "clock", PythonClock(self))
         monkeypatch.setattr(sys.modules[__name__], "time", self)
         return self
 

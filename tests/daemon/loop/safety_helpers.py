@@ -8,11 +8,11 @@ from math import pi, sin
 from typing import NamedTuple
 
 from jtqd.daemon.config import SafetySettings
-from jtqd.daemon.loop.joint_status import JointSafety
+from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.estimator.plausibility import Plausibility
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import load_joint, shipped
-from jtqd.sim_can.bench import demo_current, demo_velocity
+from jtqd.sim_can.demo import demo_current, demo_velocity
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant
 

@@ -12,9 +12,10 @@ import pytest
 
 from jtqd.daemon.bus.boot import ReturningNodes
 from jtqd.daemon.config import load_config
-from jtqd.daemon.loop.counters import LoopCounters
-from jtqd.daemon.loop.cycle import ConfiguredNodes, Cycle
-from jtqd.daemon.loop.intake import Intake
+from jtqd.daemon.core.configured_nodes import ConfiguredNodes
+from jtqd.daemon.core.counters import LoopCounters
+from jtqd.daemon.core.cycle import Cycle
+from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.loop.process import Duties
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
 from tests.daemon.loop.cycle_helpers import I32, PDOS, ExactTime, ScriptedSocket, frame, inputs, make, turn
@@ -91,13 +92,13 @@ def test_each_node_by_itself(loop: Loop) -> None:
 
 def test_the_joint_of_a_drive_begins_again_and_no_other_one(loop: Loop) -> None:
     """Its encoders may stand elsewhere: no step is made from where they stood."""
-    one, two = loop.cycle._joints
+    one, two = loop.cycle.joints
     assert one.sample[11] > 0 < two.sample[11], "time step [s]"
     loop.restart()
     loop.answers[0] = frame(0x181, I32.pack(90_000, 2000))
     loop.supervisor.note_configured(1, 1)
     turn(loop.cycle)
-    assert one._last_ns == 0
+    assert one.last_ns == 0
     turn(loop.cycle)
     assert (one.sample[11], two.sample[11] > 0) == (0.0, True)
     assert one.latched == 0, "no jump"
@@ -108,7 +109,7 @@ def test_a_sensor_that_restarts_leaves_the_joints_alone(loop: Loop) -> None:
     turn(loop.cycle, 2)
     loop.supervisor.note_configured(3, 1)
     turn(loop.cycle, 2)
-    assert all(joint.sample[11] > 0 for joint in loop.cycle._joints)
+    assert all(joint.sample[11] > 0 for joint in loop.cycle.joints)
     assert waits(loop.cycle) == set()
 
 
@@ -116,7 +117,7 @@ def test_the_scaling_of_a_node_that_was_absent_comes_with_its_configuration(loop
     loop.cycle.intake.absent(3)
     loop.supervisor.note_factors(3, (0.5,))
     turn(loop.cycle, 2)
-    (one, _), before = loop.cycle._joints, 0.001
+    (one, _), before = loop.cycle.joints, 0.001
     assert one.inputs.sensor_nm_per_unit == before
     loop.supervisor.note_configured(3, 0)
     turn(loop.cycle)
@@ -127,7 +128,7 @@ def test_the_scaling_of_a_node_that_was_absent_comes_with_its_configuration(loop
     loop.supervisor.note_configured(1, 1)
     turn(loop.cycle)
     assert (one.inputs.motor_rad_per_count, one.inputs.ampere_per_unit) == (1.0, 4.0)
-    assert loop.cycle._joints[1].inputs.ampere_per_unit == 0.01
+    assert loop.cycle.joints[1].inputs.ampere_per_unit == 0.01
 
 
 def test_a_node_in_doubt_is_not_used_until_it_is_configured_again(loop: Loop) -> None:
@@ -140,7 +141,7 @@ def test_a_node_in_doubt_is_not_used_until_it_is_configured_again(loop: Loop) ->
     assert waits(loop.cycle) == {1}
     turn(loop.cycle, 9)
     assert loop.supervisor.read().unconfigured == (1,)
-    assert [joint.status for joint in loop.cycle._joints] == [4, 2]
+    assert [joint.status for joint in loop.cycle.joints] == [4, 2]
     assert loop.supervisor.read().counters["boot_ups"] == 0
     for _ in range(32):
         turn(loop.cycle)
@@ -152,7 +153,7 @@ def test_a_node_in_doubt_is_not_used_until_it_is_configured_again(loop: Loop) ->
         turn(loop.cycle)
         duties()
     assert waits(loop.cycle) == set(), "told once"
-    assert [joint.status for joint in loop.cycle._joints] == [2, 2]
+    assert [joint.status for joint in loop.cycle.joints] == [2, 2]
     loop.supervisor.note_doubt(3)
     loop.supervisor.note_doubt(2)
     for _ in range(16):

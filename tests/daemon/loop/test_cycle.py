@@ -8,9 +8,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from jtqd.daemon.loop.estimate_pdo import decode
-from jtqd.daemon.loop.joint import Unwrap
-from jtqd.daemon.loop.schedule import WakeUp
+from jtqd.daemon.core.estimate_pdo import decode
+from jtqd.daemon.core.joint import Unwrap
+from jtqd.daemon.core.schedule import WakeUp
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from tests.daemon.loop.cycle_helpers import I32, SENSOR, ExactTime, estimates, frame, inputs, make, turn
@@ -200,7 +200,7 @@ def test_a_stall_of_minutes_is_recorded_and_not_fatal(tmp_path: Path) -> None:
 
     def stall() -> None:
         cycle.late_ns = 600_000_000_000
-        cycle._work_start_ns -= 600_000_000_000
+        cycle.work_start_ns -= 600_000_000_000
 
     turn(cycle, record=stall)
     header = cr.header_of(reader.read().records[-1])
@@ -212,11 +212,11 @@ def test_log_and_bus_agree_on_a_torque_that_does_not_fit_the_field(tmp_path: Pat
     cycle, socket, reader = make(tmp_path, lambda n: inputs())
     turn(cycle, 25)
     huge = (
-        cycle._joints[0]
+        cycle.joints[0]
         .estimator.step(1e-3, 1.0, 1.0, 1.0, 1.0)
         ._replace(torque_nm=400.0, sigma_nm=1.0, status=2)
     )
-    cycle._joints[0].estimator = SimpleNamespace(step=lambda *_: huge)  # type: ignore[assignment]
+    cycle.joints[0].estimator = SimpleNamespace(step=lambda *_: huge)  # type: ignore[assignment]
     turn(cycle, 1)
     assert decode(estimates(socket)[-1]).status[0] == 15
     joint = cr.joint_of(reader.read().records[-1], 1)

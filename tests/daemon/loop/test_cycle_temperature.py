@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from jtqd.daemon.loop.estimate_pdo import decode
-from jtqd.daemon.loop.input_pdos import JointTemperature
+from jtqd.daemon.core.estimate_pdo import decode
+from jtqd.daemon.core.intake import JointTemperature
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.cycle_record import FLAG_TEMPERATURE
 from jtqd.daemon.shared.snapshot import SnapshotReader

@@ -5,7 +5,7 @@ from math import inf, nan
 import numpy as np
 import pytest
 
-from jtqd.daemon.loop.estimate_pdo import decode, encode, field
+from jtqd.daemon.core.estimate_pdo import decode, encode, field
 
 
 def test_transcript() -> None:

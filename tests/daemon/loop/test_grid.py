@@ -1,6 +1,6 @@
 """The grid skips missed slots and never bursts."""
 
-from jtqd.daemon.loop.schedule import Grid
+from jtqd.daemon.core.schedule import Grid
 
 MS = 1_000_000
 

@@ -11,9 +11,9 @@ import yaml
 
 from jtqd.daemon.bus.boot import bus_load_of
 from jtqd.daemon.config import load_config
-from jtqd.daemon.loop.counters import frame_counts
-from jtqd.daemon.loop.input_pdos import InputPdo, JointTemperature, joint_temperatures
-from jtqd.daemon.loop.intake import Intake
+from jtqd.daemon.core.counters import frame_counts
+from jtqd.daemon.core.intake import Intake, JointTemperature
+from jtqd.daemon.loop.input_pdos import InputPdo, joint_temperatures
 from jtqd.daemon.loop.process import joint_inputs
 from jtqd.models.files import shipped
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,11 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jtqd.daemon.loop.estimate_pdo import decode
-from jtqd.daemon.loop.intake import Intake
-from jtqd.daemon.loop.joint import JointCycle, JointInputs
-from jtqd.daemon.loop.joint_status import JointSafety
-from jtqd.daemon.loop.schedule import RESERVED_NS, NetworkBudget
+from jtqd.daemon.core.estimate_pdo import decode
+from jtqd.daemon.core.intake import Intake
+from jtqd.daemon.core.joint import JointCycle
+from jtqd.daemon.core.joint_safety import JointSafety
+from jtqd.daemon.core.schedule import RESERVED_NS, NetworkBudget
+from jtqd.daemon.loop.input_pdos import JointInputs
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.cycle_record import FLAG_NETWORK_SKIPPED
 from jtqd.daemon.shared.snapshot import COUNTERS, SnapshotReader
@@ -153,7 +155,7 @@ def test_too_late_for_either_network_is_physics_for_both(tmp_path: Path, clock: 
     assert statuses(socket)[-1] == (DEGRADED, DEGRADED)
     pdo = decode(estimates(socket)[-1])
     assert None not in pdo.torque_nm
-    joint = [cr.joint_of(cycle._frames.slot, n) for n in (1, 2)]
+    joint = [cr.joint_of(cycle.frames.slot, n) for n in (1, 2)]
     assert [math.isnan(each.network_nm) for each in joint] == [True, True]
     assert [each.torque_nm for each in joint] == [each.physics_nm for each in joint]
     clock.turn(cycle, 8)
@@ -244,8 +246,8 @@ def replay(records: list[bytes], clock: ExactTime) -> Iterator[tuple[float, ...]
     intake = Intake(PDOS)
 
     class Tally:
-        counters = [0] * len(COUNTERS)
-        errors = [0.0] * 4
+        counters = array("Q", [0] * len(COUNTERS))
+        errors = array("d", [0.0] * 4)
 
     joint = JointCycle(
         0,

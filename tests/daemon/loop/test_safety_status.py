@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as some
 
 from jtqd.daemon.config import LATCHED_BY_DEFAULT, SafetySettings
-from jtqd.daemon.loop.joint_status import NEEDED, JointStatus
+from jtqd.daemon.core.status import NEEDED, JointStatus
 from jtqd.daemon.shared import faults
 from jtqd.estimator.checked import ConfigError, Section
 from jtqd.estimator.status import (

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import cantools
 import pytest
 
-from jtqd.daemon.loop.estimate_pdo import encode
+from jtqd.daemon.core.estimate_pdo import encode
 from jtqd.daemon.recording.dbc import Quantity, dbc_of, dbc_text
 from jtqd.drivers.pdo import MappedObject, PdoMap
 

@@ -4,6 +4,7 @@ import math
 
 import pytest
 
+from jtqd.daemon.core.counters import LastEstimate
 from jtqd.daemon.recording import messages, schemas
 from jtqd.daemon.recording.diagnostics import Diagnostics, Node, RecorderState
 from jtqd.daemon.recording.progress import Account
@@ -22,6 +23,7 @@ class Bench:
 
     def __init__(self, directory):
         self.snapshot = Snapshot(directory / "snapshot", 1e-3, 0.85)
+        self.told = LastEstimate(self.snapshot)
         self.reader = SnapshotReader(directory / "snapshot")
         self.diagnostics = Diagnostics("can0", ("a", "b"), [Node(1, "drive 1"), Node(3, "torque sensor")])
         self.account = Account()
@@ -40,7 +42,7 @@ class Bench:
         self.cycle += 1000
         joint = JointView(*[0] * len(JointView._fields))._replace(torque_nm=1.0, sensor_nm=1.1)
         joints = [joint._replace(network_nm=math.nan, status=status) for status in statuses]
-        self.snapshot.write(self.cycle, 1, NOW, tuple(joints))
+        self.told.write(self.cycle, 1, NOW, tuple(joints))
         state = {"mode": "recording", "obstacle": "", "backlog": 50, "cpu_percent": 1.5, "events_left_out": 0}
         state |= {"part": 1, "part_bytes": 10**6, "total_bytes": 10**7, "free": 10**9, "reserve": 10**8}
         state |= {"budget": -1, "memory_bytes": 0, "memory_s": 0.0}

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from jtqd.daemon.loop.cycle import Cycle
+from jtqd.daemon.core.cycle import Cycle
 from jtqd.daemon.reload.carry import CarryError, Changed, Fill, Walk
 from jtqd.daemon.reload.handover import install, state_of
 from jtqd.daemon.shared.ring import Ring, RingError
@@ -40,7 +40,7 @@ def carry(one: Cycle, other: Cycle) -> None:
 
 def estimators_of(cycle: Cycle) -> Any:
     """Their state is not carried; in place of a shadow, the other loop simply gets the same ones."""
-    return [joint.estimator for joint in cycle._joints]
+    return [joint.estimator for joint in cycle.joints]
 
 
 @pytest.mark.parametrize("before", [1, 30, 260, 1000])
@@ -159,7 +159,7 @@ def test_a_replaced_object_is_noticed(tmp_path: Path) -> None:
     turn(cycle, 5)
     walk = _listed(cycle)
     walk.changes()
-    cycle._joints[0].begin_again()
+    cycle.joints[0].begin_again()
     with pytest.raises(Changed):
         walk.changes()
 
@@ -170,9 +170,9 @@ def test_estimators_limits_and_sockets_stay_those_of_the_new_loop(tmp_path: Path
     one, _, _ = make(tmp_path / "a", moving)
     other, other_socket, _ = make(tmp_path / "b", moving)
     turn(one, 20)
-    kept = [(joint.estimator, joint.safety, joint.safety.torque_limit_nm) for joint in other._joints]
+    kept = [(joint.estimator, joint.safety, joint.safety.torque_limit_nm) for joint in other.joints]
     carry(one, other)
-    assert [(j.estimator, j.safety, j.safety.torque_limit_nm) for j in other._joints] == kept
+    assert [(j.estimator, j.safety, j.safety.torque_limit_nm) for j in other.joints] == kept
     assert other.socket is other_socket
 
 
@@ -181,7 +181,7 @@ def test_estimators_limits_and_sockets_stay_those_of_the_new_loop(tmp_path: Path
     [
         ([[["no_such_part"], ["x"], []]], "there is no no_such_part"),
         ([[["intake"], ["no_such_thing"], []]], "Intake has no no_such_thing"),
-        ([[["intake", "_states", 99], ["fresh"], []]], "there is no intake._states.99"),
+        ([[["intake", "states", 99], ["fresh"], []]], "there is no intake.states.99"),
     ],
 )
 def test_a_loop_of_another_version_is_refused(tmp_path: Path, found: Any, error: str) -> None:

@@ -79,7 +79,7 @@ def run_with_gaps(
         return frames[1:] if sync % 50 == 7 else frames
 
     cycle, _, _ = make(tmp_path, script, slots=4096)
-    for n, joint in enumerate(cycle._joints):
+    for n, joint in enumerate(cycle.joints):
         step = joint.estimator.step
 
         def watched(*values: float, n: int = n, step: object = step) -> Estimate:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.daemon.loop.cycle import Cycle
+from jtqd.daemon.core.cycle import Cycle
 from jtqd.daemon.reload import handover
 from jtqd.daemon.reload.handover import Giver, Refused, Taker
 from tests.daemon.loop.cycle_helpers import inputs, make, turn
@@ -29,7 +29,7 @@ def pair(tmp_path: Path) -> tuple[Cycle, Cycle]:
 
 def with_time(cycle: Cycle) -> None:
     """The next SYNC is far away: there is all the time of the world for a step."""
-    cycle.grid.period_ns, cycle.grid._half_ns = PAUSE_NS, PAUSE_NS // 2
+    cycle.grid.period_ns = PAUSE_NS
     cycle.grid.slot_ns = time.monotonic_ns()
 
 
@@ -218,7 +218,7 @@ def test_a_successor_of_another_version_refuses_and_says_why(
     tmp_path: Path, pair: tuple[Cycle, Cycle]
 ) -> None:
     one, other = pair
-    one.intake.something_new = 5  # type: ignore[attr-defined]
+    one.configured_nodes.something_new = 5  # type: ignore[attr-defined]
     taker = Taker(other, tmp_path / "handover")
     giver = Giver(one, tmp_path / "handover")
     giver.begin()
@@ -235,7 +235,7 @@ def test_a_successor_of_another_version_refuses_and_says_why(
     assert giver.refused is not None
     assert giver.refused in refused
     assert "the program has changed since jtqd started" in refused
-    assert "Intake has no something_new" in refused
+    assert "ConfiguredNodes has no something_new" in refused
 
 
 def test_messages_are_small_against_the_sockets_buffer(pair: tuple[Cycle, Cycle]) -> None:
@@ -263,7 +263,7 @@ def test_a_node_that_begins_again_meanwhile_refuses_and_the_loop_goes_on(
         with_time(one)
         if giver._stage == stage and not began:
             began = True
-            one._joints[0].begin_again()
+            one.joints[0].begin_again()
             turn(one, 1)
         assert began or giver._stage != giver._hand_over, f"there is no moment to {moment}"
         done = giver.step()  # type: ignore[assignment]

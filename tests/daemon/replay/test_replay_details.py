@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.logs import LogError
-from jtqd.daemon.loop.joint_status import JointSafety
 from jtqd.daemon.replay.command import main
 from jtqd.daemon.replay.estimates import _asked, _Cycles
 from jtqd.daemon.replay.frames import decode

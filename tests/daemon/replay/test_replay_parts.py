@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from jtqd.daemon.config import SafetySettings, load_config
-from jtqd.daemon.loop import estimate_pdo
-from jtqd.daemon.loop.joint import JointInputs, Unwrap
-from jtqd.daemon.loop.joint_status import JointStatus
+from jtqd.daemon.core import estimate_pdo
+from jtqd.daemon.core.joint import Unwrap
+from jtqd.daemon.core.status import JointStatus
+from jtqd.daemon.loop.input_pdos import JointInputs
 from jtqd.daemon.replay.compare import SETTLED_CYCLES, bits_equal, identity
 from jtqd.daemon.replay.estimates import fields, status_many
 from jtqd.daemon.replay.frames import Pdo, offsets

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from jtqd.daemon.loop.estimate_pdo import LAYOUT, NO_TORQUE, PUBLISHED_STATUSES
+from jtqd.daemon.core.estimate_pdo import LAYOUT, NO_TORQUE, PUBLISHED_STATUSES
 
 GOOD = frozenset({2, 3, 6})
 RECOVERED_FROM_BUS_OFF = 0x8140

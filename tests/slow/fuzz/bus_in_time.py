@@ -1,6 +1,6 @@
 """A bus with a clock of its own: frames arrive at their time, calls take some, and nothing depends on the machine.
 
-It is a frame socket and the module `time` for `jtqd.daemon.loop.cycle` and `jtqd.daemon.loop.process` at once.
+It is a frame socket, the clock of `jtqd.daemon.core.cycle` and the module `time` of `jtqd.daemon.loop.process` at once.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from unittest.mock import patch
 
-from jtqd.daemon.loop import cycle as cycle_module
+from jtqd.daemon.core import cycle as cycle_module
+from jtqd.daemon.core.clock import PythonClock
 from jtqd.daemon.loop import process as loop_module
 from jtqd.drivers.frame_socket import CAPACITY, BusDown
 
@@ -54,11 +55,11 @@ class BusInTime:
         self._order = 0
 
     def installed(self) -> AbstractContextManager[object]:
-        """The clock takes the place of module `time` in cycle and loop."""
-        return patch.multiple(cycle_module, time=self)
+        """The clock is that of the cycles that are made meanwhile."""
+        return patch.multiple(cycle_module, clock=PythonClock(self))
 
     def installed_in_loop(self) -> AbstractContextManager[object]:
-        """The same for the loop."""
+        """It takes the place of module `time` in the loop."""
         return patch.multiple(loop_module, time=self)
 
     # Module `time` -------------------------------------------------------------------------------------------------------

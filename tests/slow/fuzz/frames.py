@@ -8,13 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from jtqd.daemon.loop import estimate_pdo
-from jtqd.daemon.loop.cycle import Cycle
-from jtqd.daemon.loop.input_pdos import InputPdo, JointTemperature
-from jtqd.daemon.loop.intake import Intake
-from jtqd.daemon.loop.joint import JointInputs
+from jtqd.daemon.core import estimate_pdo
+from jtqd.daemon.core.cycle import Cycle
+from jtqd.daemon.core.intake import Intake, JointTemperature
+from jtqd.daemon.core.schedule import Grid
+from jtqd.daemon.loop.input_pdos import InputPdo, JointInputs
 from jtqd.daemon.loop.process import run
-from jtqd.daemon.loop.schedule import Grid
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import Ring
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
@@ -142,19 +141,20 @@ def make_cycle(directory: Path, script: Script) -> tuple[Cycle, BusInTime]:
         )
         for n in range(2)
     ]
-    cycle = Cycle(
-        bus,  # type: ignore[arg-type]
-        Intake(_PDOS, temperatures),
-        joints,
-        Ring(directory / "ring", 64, cr.RECORD_SIZE),
-        Snapshot(directory / "snapshot", 1e-3, 0.8),
-        node_id=0x20,
-        counter_overflow=240,
-        wait_ns=400_000,
-        deadline_ns=850_000,
-        heartbeat_cycles=100,
-        grid=Grid(bus.now_ns + 2 * MS, MS),
-    )
+    with bus.installed():
+        cycle = Cycle(
+            bus,  # type: ignore[arg-type]
+            Intake(_PDOS, temperatures),
+            joints,
+            Ring(directory / "ring", 64, cr.RECORD_SIZE),
+            Snapshot(directory / "snapshot", 1e-3, 0.8),
+            node_id=0x20,
+            counter_overflow=240,
+            wait_ns=400_000,
+            deadline_ns=850_000,
+            heartbeat_cycles=100,
+            grid=Grid(bus.now_ns + 2 * MS, MS),
+        )
     return cycle, bus
 
 
@@ -186,7 +186,7 @@ def fuzz_frames(
             base_kb = rss_kb()
         return bus.given >= end
 
-    with bus.installed(), bus.installed_in_loop():
+    with bus.installed_in_loop():
         while bus.given < end:
             try:
                 run(cycle, cycle.grid, lambda: False, after=after)

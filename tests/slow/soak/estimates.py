@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from jtqd.daemon.loop.estimate_pdo import PUBLISHED_STATUSES
+from jtqd.daemon.core.estimate_pdo import PUBLISHED_STATUSES
 from tests.slow.faults.ears import Heard
 
 ESTIMATE = 0x1A0
 _LAYOUT = np.dtype(
     [("torque", "<i2", 2), ("sigma", "u1", 2), ("status", "u1"), ("sequence", "u1")]
-)  # as jtqd.daemon.loop.estimate_pdo.LAYOUT
+)  # as jtqd.daemon.core.estimate_pdo.LAYOUT
 _NO_TORQUE = -0x8000
 _ROUND = 240
 

@@ -107,7 +107,7 @@ def test_a_stretch_without_power_is_no_new_day_of_the_emulated_bench() -> None:
     lock.commander(check_run(RUN, WIDE))
     while not lock.motion.over:
         lock.cycle()
-        zeros.add((lock.source.day_number, lock.source._offset_nm))
+        zeros.add((lock.source.day_number, lock.source._instruments.sensor.offset_nm))
     assert lock.motion.result.status == "done"
     assert len(zeros) == 1
     lock.commander(plateau(0.2, 0.0))

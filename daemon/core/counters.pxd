@@ -1,0 +1,78 @@
+"""What the loop counts and tells; counters.pyx."""
+
+from libc.stdint cimport int64_t, uint8_t, uint16_t, uint64_t
+
+from jtqd.daemon.core.bus cimport Bus
+from jtqd.daemon.core.intake cimport MOST_INPUTS, Intake
+from jtqd.daemon.core.joint cimport JointState
+
+cdef struct CounterState:
+    int64_t bus_errors, overruns, latch_resets
+    int64_t bits
+    int64_t used_ns[MOST_INPUTS]
+    int64_t delay_ns[MOST_INPUTS]
+
+cdef struct InputBlock:  # `INPUT` of the snapshot
+    int64_t used_ns, delay_ns, low_ns, high_ns
+    int64_t late, lost, duplicates, rejected, missed, in_a_row, too_short, too_long
+
+cdef struct ViewBlock:  # a `JointView`
+    double torque_nm, sigma_nm, tob_nm, physics_nm, network_nm, sensor_nm
+    uint16_t statusword
+    uint8_t status, sensor_status
+    uint16_t input_flags, latched
+
+cdef struct MeasuredBlock:  # a `Measured`
+    double current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, sensor_nm, temperature_c
+
+cdef struct EstimateBlock:
+    int64_t cycle
+    uint64_t sync_counter
+    int64_t sync_realtime_ns, sync_monotonic_ns
+    int64_t status_since[2]
+    ViewBlock joints[2]
+    MeasuredBlock measured[2]
+
+cdef struct ToldState:
+    int status[2]
+    int64_t since[2]
+
+cdef class LastEstimate:
+    cdef uint64_t[::1] sequence
+    cdef uint8_t[::1] memory
+    cdef ToldState now
+    cdef void begin_telling(self) noexcept nogil
+    cdef void tell(
+        self,
+        int64_t cycle,
+        int sync_counter,
+        int64_t sync_realtime_ns,
+        int64_t sync_monotonic_ns,
+        const ViewBlock *joints,
+        const MeasuredBlock *measured,
+    ) noexcept nogil
+
+cdef class LoopCounters:
+    cdef readonly LastEstimate last
+    cdef CounterState now
+    cdef Intake intake
+    cdef Bus bus
+    cdef uint64_t[::1] counters, work, late, status_cycles, restarts
+    cdef int64_t[::1] node_heard
+    cdef uint8_t[::1] inputs, node_states, unconfigured
+    cdef int64_t bits_of[MOST_INPUTS]
+    cdef int64_t bits_complete
+    cdef void count(self, int flags, int64_t work_ns, int64_t late_ns, int64_t missed) noexcept nogil
+    cdef void count_statuses(self, int one, int two) noexcept nogil
+    cdef int flush_all(self, int64_t missed, int64_t sync_ns) except -1
+    cdef void flush_nodes(self) noexcept nogil
+    cdef void flush_inputs(self, int64_t sync_ns) noexcept nogil
+    cdef void tell(
+        self,
+        int64_t cycle,
+        int sync_counter,
+        int64_t sync_realtime_ns,
+        int64_t sync_monotonic_ns,
+        const JointState *one,
+        const JointState *two,
+    ) noexcept nogil

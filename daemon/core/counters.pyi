@@ -1,0 +1,39 @@
+from collections.abc import Sequence
+
+from jtqd.daemon.core.intake import Intake
+from jtqd.daemon.shared.snapshot import Snapshot
+from jtqd.drivers.frame_socket import FrameSocket
+
+class LastEstimate:
+    carried: tuple[str, ...]
+    state: bytes
+    def __init__(self, snapshot: Snapshot) -> None: ...
+    def begin(self) -> None: ...
+    def write(
+        self,
+        index: int,
+        sync_counter: int,
+        sync_realtime_ns: int,
+        joints: tuple[tuple[float, ...], tuple[float, ...]],
+        *,
+        sync_monotonic_ns: int = 0,
+        measured: tuple[Sequence[float], Sequence[float]] = ...,
+    ) -> None: ...
+
+class LoopCounters:
+    carried: tuple[str, ...]
+    state: bytes
+    @property
+    def last(self) -> LastEstimate: ...
+    def __init__(self, snapshot: Snapshot, intake: Intake, socket: FrameSocket) -> None: ...
+    @property
+    def bus_errors(self) -> int: ...
+    @property
+    def overruns(self) -> int: ...
+    @property
+    def latch_resets(self) -> int: ...
+    def cycle(self, flags: int, work_ns: int, late_ns: int, missed: int) -> None: ...
+    def statuses(self, one: int, two: int) -> None: ...
+    def flush(self, missed: int, sync_ns: int) -> None: ...
+
+def frame_counts(intake: Intake) -> dict[str, dict[str, int]]: ...

@@ -1,0 +1,394 @@
+"""One cycle of the loop, stage by stage. The stages are methods of `Cycle`, so that a benchmark can time each of them.
+
+    begin    take what came late, send SYNC
+    gather   one wake-up for all inputs, then wait for stragglers until the deadline
+    observe  scale, estimate, decide the status of both joints
+    publish  send the estimate PDO, and every n-th cycle the heartbeat
+    record   hand the cycle to the ring, and every n-th cycle the snapshot
+
+No stage raises because of what is on the bus; a bus that is down is a counter and a stale estimate.
+"""
+
+from libc.stdint cimport int64_t, uint8_t, uint32_t
+from libc.string cimport memcpy, memset
+
+from typing import Final
+
+from jtqd.daemon.core.block cimport copied, put_back
+from jtqd.daemon.core.bus cimport Bus, bus_of
+from jtqd.daemon.core.clock cimport Clock
+from jtqd.daemon.core.configured_nodes import ConfiguredNodes
+from jtqd.daemon.core.counters cimport LoopCounters
+from jtqd.daemon.core.estimate_pdo cimport encode_into
+from jtqd.drivers.frame_socket cimport Frame
+from jtqd.daemon.core.intake cimport Intake, temperature_at
+from jtqd.daemon.core.joint cimport JointCycle
+from jtqd.daemon.core.joint_safety import JointSafety
+from jtqd.daemon.core.record cimport CycleFrames, Header, Record, RecordRing
+from jtqd.daemon.core.schedule cimport Grid, NetworkBudget, WakeUp
+from jtqd.daemon.shared import cycle_record as cr
+from jtqd.drivers import devices, nmt
+from jtqd.drivers.frame_socket import BusDown
+from jtqd.estimator import status as st
+
+STARTING_CYCLES: Final = 20
+"""Cycles at the start that are published as "starting": the arrival bands and the filters see their first inputs."""
+_SNAPSHOT_EVERY: Final = 8
+_CLOCK_READING_NS: Final = 20_000
+"""Both clocks are read within this, or their difference is not taken."""
+_LAST_CALL_NS: Final = 100_000
+"""Before the next SYNC; nobody waits for inputs from here on."""
+
+cdef int64_t FIRST_CYCLES = STARTING_CYCLES, SNAPSHOT_EVERY = _SNAPSHOT_EVERY
+cdef int64_t CLOCK_READING_NS = _CLOCK_READING_NS, LAST_CALL_NS = _LAST_CALL_NS
+cdef uint32_t COMPLETE = cr.FLAG_COMPLETE, PUBLISHED = cr.FLAG_PUBLISHED, WITHDRAWN = cr.FLAG_WITHDRAWN
+cdef uint32_t BEFORE_NEXT_SYNC = cr.FLAG_BEFORE_NEXT_SYNC, SYNC_CONFIRMED = cr.FLAG_SYNC_CONFIRMED
+cdef uint32_t RESET = cr.FLAG_RESET
+cdef uint32_t SYNC = devices.SYNC_COB_ID, HEARTBEAT = nmt.HEARTBEAT_BASE, ESTIMATE = 0x180
+cdef uint8_t OPERATIONAL = nmt.OPERATIONAL
+cdef int STALE = st.STALE, OFF = st.OFF
+cdef int64_t BYTE = 255, MOST_WORK_NS = 0xFFFF_FFFF, MOST_LATE_NS = 0x7FFF_FFFF
+
+clock = Clock()
+"""Of all cycles that are made from here on; tests put another one in its place."""
+
+
+cdef Frame _frame(uint32_t can_id, int length) noexcept nogil:
+    """Return a frame without data."""
+    cdef Frame frame
+    memset(&frame, 0, sizeof(Frame))
+    frame.id, frame.length = can_id, length
+    return frame
+
+
+cdef class Cycle:
+    """State of the loop and its stages.
+
+    Args:
+        socket: frame socket with filters for SYNC, the inputs and the nodes' heartbeats, own echo on.
+        intake: the rule that says which frame belongs to which cycle.
+        joints: inputs and estimator of joint 1 and 2.
+        ring, snapshot: shared memory towards recorder and viewers.
+        safety: limits and checks of joint 1 and 2; None for those that need no joint file.
+        node_id: own node-ID; the estimate PDO is 180h + node_id, the heartbeat 700h + node_id.
+        counter_overflow: SYNC counter runs 1..overflow (1019h).
+        wait_ns, deadline_ns: from SYNC to the wake-up for the inputs (it follows their arrival) and to the end of the wait.
+        heartbeat_cycles: cycles between two heartbeats.
+        grid: time grid; its slot is the current cycle's.
+
+    Attributes:
+        joints: what is kept of joint 1 and 2.
+        configured_nodes: nodes that restarted or are in doubt, until they are configured.
+        flags: of the cycle's record.
+        sync_ns: when its SYNC was sent, CLOCK_MONOTONIC.
+        work_start_ns: when it woke up for its inputs.
+        late_ns: by how much its SYNC was late.
+    """
+
+    carried = (
+        "state",
+        "intake",
+        "grid",
+        "joints",
+        "budget",
+        "wake_up",
+        "frames",
+        "counters",
+        "configured_nodes",
+    )
+
+    def __init__(
+        self,
+        socket,
+        Intake intake,
+        joints,
+        ring,
+        snapshot,
+        *,
+        safety=None,
+        int node_id,
+        int counter_overflow,
+        int64_t wait_ns,
+        int64_t deadline_ns,
+        int64_t heartbeat_cycles,
+        Grid grid,
+    ):
+        limits = safety or (JointSafety(), JointSafety())
+        self.socket, self.intake, self.ring, self.snapshot, self.grid = socket, intake, ring, snapshot, grid
+        self.one, self.two = [
+            JointCycle(
+                n, inputs, estimator, intake=intake, snapshot=snapshot, period_ns=grid.now.period_ns, safety=limits[n]
+            )
+            for n, (inputs, estimator) in enumerate(joints)
+        ]
+        self.joints = (self.one, self.two)
+        self.clock, self.bus = clock, bus_of(socket)
+        self.records, self.frames = RecordRing(ring), CycleFrames()
+        self.frames.begin(self.records.slot())
+        self.budget, self.wake_up = NetworkBudget(), WakeUp(wait_ns, deadline_ns)
+        self.counters = LoopCounters(snapshot, intake, self.bus)
+        self.counter_overflow, self.heartbeat_cycles = counter_overflow, heartbeat_cycles
+        self.estimate_frame = _frame(ESTIMATE + node_id, 8)
+        self.heartbeat_frame = _frame(HEARTBEAT + node_id, 1)
+        self.heartbeat_frame.data[0] = OPERATIONAL
+        self.configured_nodes = ConfiguredNodes(snapshot, intake, self.joints)
+
+    @property
+    def state(self):
+        """What it knows besides its parts, as one block."""
+        return copied(&self.now, sizeof(CycleState))
+
+    @state.setter
+    def state(self, bytes block):
+        put_back(&self.now, sizeof(CycleState), block)
+
+    @property
+    def index(self):
+        """Number of the next cycle, or of the one that is open; missed slots count."""
+        return self.now.index
+
+    @property
+    def counter(self):
+        """SYNC counter of the last cycle."""
+        return self.now.counter
+
+    @property
+    def flags(self):
+        return self.now.flags
+
+    @property
+    def sync_ns(self):
+        return self.now.sync_ns
+
+    @property
+    def late_ns(self):
+        return self.now.late_ns
+
+    @late_ns.setter
+    def late_ns(self, int64_t late_ns):
+        self.now.late_ns = late_ns
+
+    @property
+    def work_start_ns(self):
+        return self.now.work_start_ns
+
+    @work_start_ns.setter
+    def work_start_ns(self, int64_t work_start_ns):
+        self.now.work_start_ns = work_start_ns
+
+    def begin(self):
+        """Drain the frames received after the last cycle was closed, then send SYNC."""
+        cdef CycleState *now = &self.now
+        cdef Intake intake = self.intake
+        cdef Frame sync
+        cdef int64_t before_ns, realtime_ns, at_ns
+        cdef int count, n
+        self.frames.begin(self.records.slot())
+        now.flags, now.next_flags = now.next_flags, 0
+        now.stale_before, now.late_before = intake.now.stale_inputs, intake.now.late_frames
+        now.duplicate_before, now.rejected_before = intake.now.duplicate_frames, intake.now.rejected_frames
+        count = self.receive()
+        if count:
+            for n in range(count):
+                intake.drain_frame(&self.bus.frames[n], self.bus.stamps_ns[n], self.bus.own[n])
+            intake.drained()
+            self.frames.keep(self.bus.frames, self.bus.stamps_ns, count)
+        now.counter = now.counter % self.counter_overflow + 1
+        intake.begin_cycle(now.counter)
+        before_ns = self.clock.monotonic()
+        realtime_ns = self.clock.realtime()
+        at_ns = self.clock.monotonic()
+        if at_ns - before_ns < CLOCK_READING_NS or not now.realtime_offset_ns:
+            now.realtime_offset_ns = realtime_ns - at_ns  # else something came between: the last one is better
+        sync = _frame(SYNC, 1)
+        sync.data[0] = now.counter
+        self.send(&sync)
+        now.sync_ns = at_ns
+        now.late_ns = at_ns - self.grid.now.slot_ns
+
+    def gather(self):
+        """Take the inputs: one wake-up for all that have come, then wait for the missing ones until the deadline."""
+        cdef CycleState *now = &self.now
+        cdef Intake intake = self.intake
+        cdef int64_t due_ns = now.sync_ns + self.wake_up.now.wait_ns, deadline_ns, left_ns
+        cdef int count, n
+        if due_ns > self.clock.monotonic():
+            self.clock.sleep_until(due_ns)
+        now.work_start_ns = self.clock.monotonic()
+        deadline_ns = min(now.sync_ns + self.wake_up.now.deadline_ns, self.grid.end_ns() - LAST_CALL_NS)
+        while True:
+            count = self.receive()
+            if count:
+                for n in range(count):
+                    intake.take_frame(&self.bus.frames[n], self.bus.stamps_ns[n], self.bus.own[n])
+                self.frames.keep(self.bus.frames, self.bus.stamps_ns, count)
+                if intake.now.missing == 0:
+                    break
+            left_ns = deadline_ns - self.clock.monotonic()
+            if left_ns <= 0 or not self.bus.wait(left_ns):
+                break
+        if intake.close_cycle():
+            now.flags |= COMPLETE
+            self.wake_up.follow(intake.now.last_delay_ns)
+        for n in range(intake.temperature_count):
+            temperature_at(intake.celsius[n], now.index)
+        if intake.nodes.now.waiting:
+            self.configured_nodes.look()
+        if intake.now.sync_stamp_ns:
+            now.flags |= SYNC_CONFIRMED
+            now.sync_realtime_ns = intake.now.sync_stamp_ns
+        else:
+            now.sync_realtime_ns = now.sync_ns + now.realtime_offset_ns
+
+    def observe(self):
+        """Estimate both joints from the inputs of this cycle; without their networks if there is no time for them."""
+        cdef int64_t sync_ns = self.now.sync_realtime_ns - self.now.realtime_offset_ns
+        cdef bint starting = self.now.index < FIRST_CYCLES
+        cdef bint wanted = self.budget.first(self.clock.monotonic(), self.grid.end_ns())
+        self.one.observe_at(sync_ns, starting, wanted)
+        wanted = self.budget.second(self.clock.monotonic())
+        self.two.observe_at(sync_ns, starting, wanted)
+
+    def publish(self):
+        """Send the estimate PDO, and the heartbeat when it is due. A late estimate is withdrawn."""
+        cdef CycleState *now = &self.now
+        cdef int64_t at_ns = self.clock.monotonic()
+        self.budget.ended(at_ns)
+        if at_ns >= self.grid.end_ns():
+            self.one.take_back(STALE)
+            self.two.take_back(STALE)
+            now.flags |= WITHDRAWN
+            self.counters.now.overruns += 1
+        if self.send_estimate():
+            now.flags |= PUBLISHED
+            if self.clock.monotonic() < self.grid.end_ns():
+                now.flags |= BEFORE_NEXT_SYNC
+        self.frames.keep_one(&self.estimate_frame, self.clock.monotonic() + now.realtime_offset_ns)
+        if now.index >= now.heartbeat_due:
+            now.heartbeat_due = now.index + self.heartbeat_cycles
+            self.send(&self.heartbeat_frame)
+
+    def record(self):
+        """Write the cycle to the ring, update counters and, every n-th cycle, the snapshot."""
+        cdef CycleState *now = &self.now
+        cdef Intake intake = self.intake
+        cdef Record *record = self.frames.record
+        cdef int64_t work_ns = self.clock.monotonic() - now.work_start_ns, missed = self.grid.now.missed
+        record.header = Header(
+            now.index,
+            now.sync_ns,
+            now.sync_realtime_ns,
+            now.flags,
+            min(work_ns, MOST_WORK_NS),
+            min(now.late_ns, MOST_LATE_NS),
+            missed,
+            now.counter,
+            self.frames.count,
+            min(self.frames.left_out, BYTE),
+            min(intake.now.stale_inputs - now.stale_before, BYTE),
+            min(intake.now.late_frames - now.late_before, BYTE),
+            min(intake.now.duplicate_frames - now.duplicate_before, BYTE),
+            min(intake.now.rejected_frames - now.rejected_before, BYTE),
+            0,
+        )
+        record.joints[0], record.joints[1] = self.one.now.sample, self.two.now.sample
+        record.tail = now.index
+        self.records.commit()
+        self.counters.count(now.flags, work_ns, now.late_ns, missed)
+        self.counters.count_statuses(self.one.now.status, self.two.now.status)
+        if now.index % SNAPSHOT_EVERY == 0:
+            self.write_snapshot()
+        now.index += 1
+
+    def hold_back(self):
+        """Return whether this slot must pass without SYNC, to distinguish late frames from lost ones (see intake)."""
+        cdef Intake intake = self.intake
+        cdef int count, n
+        if not (intake.gaps.now.wanted or intake.gaps.now.open):
+            return False
+        count = self.receive()
+        if count:
+            for n in range(count):
+                intake.drain_frame(&self.bus.frames[n], self.bus.stamps_ns[n], self.bus.own[n])
+                self.hold(&self.bus.frames[n], self.bus.stamps_ns[n])
+            intake.drained()
+        if not intake.gaps.now.wanted:
+            return False
+        intake.gaps.pass_slot()
+        self.now.index += 1
+        return True
+
+    def between(self, const uint8_t[::1] frames, stamps_ns, own, int count):
+        """Take frames received while no cycle was open; arguments as `Intake.drain`."""
+        cdef Frame frame
+        cdef int n
+        self.intake.drain(frames, stamps_ns, own, count)
+        for n in range(count):
+            memcpy(&frame, &frames[16 * n], sizeof(Frame))
+            self.hold(&frame, stamps_ns[n])
+
+    def skip(self, int64_t slots):
+        """Skip missed slots: the index follows the grid, so that a gap in the log shows them."""
+        self.now.index += slots
+
+    @property
+    def complete(self):
+        """Return whether the last cycle had every input that it waited for."""
+        return bool(self.now.flags & COMPLETE)
+
+    def reset_faults(self):
+        """Release latched faults before the next estimate (`jtq control reset`); the record says so."""
+        for joint in self.joints:
+            if joint.reset_latch():
+                self.now.next_flags = RESET
+                self.counters.now.latch_resets += 1
+
+    def use_own(self):
+        """Use the estimators and limits built here, after the state of another loop was restored."""
+        for joint in self.joints:
+            joint.use(joint.estimator, joint.safety)
+
+    def leave(self):
+        """Send a last estimate with status off, so that no receiver keeps the last torque."""
+        self.one.take_back(OFF)
+        self.two.take_back(OFF)
+        self.send_estimate()
+        self.write_snapshot()
+
+    cdef void hold(self, const Frame *frame, int64_t stamp_ns) noexcept nogil:
+        """Of a slot without a record, temperatures go into the next one that there is."""
+        if self.intake.temperature_with(frame.id) != NULL:
+            self.frames.hold(frame, stamp_ns)
+
+    cdef int write_snapshot(self) except -1:
+        """Copy counters, inputs and the last estimate into the snapshot."""
+        cdef CycleState *now = &self.now
+        self.counters.last.begin_telling()
+        self.counters.flush_all(self.grid.now.missed, now.sync_ns)
+        self.counters.tell(
+            now.index, now.counter, now.sync_realtime_ns, now.sync_ns, &self.one.now, &self.two.now
+        )
+        return 0
+
+    cdef bint send_estimate(self) except -1:
+        """Send the estimate PDO of both joints."""
+        encode_into(
+            self.estimate_frame.data, &self.one.now.published, &self.two.now.published, self.now.counter
+        )
+        return self.send(&self.estimate_frame)
+
+    cdef int receive(self) except -1:
+        """Take what has come; a bus that is down gives nothing and is counted."""
+        try:
+            return self.bus.take()
+        except BusDown:
+            self.counters.now.bus_errors += 1
+            return 0
+
+    cdef bint send(self, const Frame *frame) except -1:
+        """Send a frame; a bus that is down takes none and is counted."""
+        try:
+            return self.bus.put(frame)
+        except BusDown:
+            self.counters.now.bus_errors += 1
+            return False

@@ -1,0 +1,45 @@
+"""One joint in the loop; joint.pyx."""
+
+from libc.stdint cimport int64_t
+
+from jtqd.daemon.core.estimate_pdo cimport Published
+from jtqd.daemon.core.intake cimport Input, Intake, Temperature
+from jtqd.daemon.core.record cimport JointBlock
+from jtqd.daemon.core.status cimport JointRules
+from jtqd.estimator.sample cimport Estimator
+
+cdef struct UnwrapState:
+    int64_t last, offset
+
+cdef class Unwrap:
+    cdef UnwrapState now
+
+cdef struct Scale:  # SI per count or unit
+    double motor_rad, motor_rad_s, link_rad, ampere, sensor_nm
+
+cdef struct JointState:
+    int64_t last_ns
+    int status, latched  # as published, and at the last estimate
+    Published published
+    JointBlock sample
+
+cdef class JointCycle:
+    cdef object given, given_inputs, limits
+    cdef tuple pdos
+    cdef Intake intake
+    cdef Estimator core
+    cdef readonly JointRules rules
+    cdef readonly Unwrap motor, link
+    cdef Input *position
+    cdef Input *motion
+    cdef Input *sensor  # NULL without reference
+    cdef Temperature *temperature
+    cdef int64_t period_ns
+    cdef Scale scale
+    cdef JointState now
+    cdef void observe_at(self, int64_t sync_ns, bint starting, bint network_wanted) noexcept nogil
+    cdef void estimate(self, int64_t sync_ns, bint starting, bint network_wanted, int flags) noexcept nogil
+    cdef void miss(self, int flags) noexcept nogil
+    cdef int reference(self) noexcept nogil
+    cdef double since_last(self, int64_t sync_ns) noexcept nogil
+    cdef void take_back(self, int status) noexcept nogil

@@ -1,0 +1,319 @@
+"""One joint in the loop: counts of this cycle into SI units, the estimate, its status, and what goes out and is recorded."""
+
+from libc.math cimport INFINITY, NAN, isnan
+from libc.stdint cimport int64_t
+
+from dataclasses import replace
+from typing import Final
+
+from jtqd.daemon.core.block cimport copied, put_back
+from jtqd.daemon.core.estimate_pdo cimport Published, field_of, has_torque
+from jtqd.daemon.core.intake cimport Input, InputState, Intake, JointTemperature
+from jtqd.daemon.core.intake import UNKNOWN
+from jtqd.daemon.core.joint_safety import JointSafety
+from jtqd.daemon.core.record cimport JointBlock
+from jtqd.daemon.core.status cimport JointRules
+from jtqd.daemon.shared import cycle_record as cr
+from jtqd.estimator import status as st
+from jtqd.estimator.sample cimport Estimator, Sample, Values
+from jtqd.estimator.sample import PythonEstimator
+
+STAMP_ACCURACY_NS: Final = 5_000
+"""Kernel software stamps differ by a few us from the time on the wire."""
+
+cdef int64_t HALF_RANGE = <int64_t> 1 << 31, FULL_RANGE = <int64_t> 1 << 32
+cdef int64_t ACCURACY_NS = STAMP_ACCURACY_NS
+cdef int POSITION = cr.FLAG_POSITION, MOTION = cr.FLAG_MOTION
+cdef int SENSOR = cr.FLAG_SENSOR, TEMPERATURE = cr.FLAG_TEMPERATURE
+cdef int STARTING = st.STARTING, STALE = st.STALE, STANDSTILL = st.STANDSTILL, INVALID = st.INVALID
+cdef int NOT_A_REFERENCE = 0x07  # of 6150h: not valid, positive or negative overload
+
+
+cdef class Unwrap:
+    """Counts of a 32-bit position without its wrap at 2^31 (object 6064h is an INTEGER32 that rolls over).
+
+    offset: whole ranges that it had rolled over before the first sample [counts].
+    """
+
+    carried = ("state",)
+
+    def __init__(self, int64_t offset=0):
+        self.now.offset = offset
+
+    @property
+    def state(self):
+        """All of it as one block."""
+        return copied(&self.now, sizeof(UnwrapState))
+
+    @state.setter
+    def state(self, bytes block):
+        put_back(&self.now, sizeof(UnwrapState), block)
+
+    def counts(self, int64_t raw):
+        """Return continuous counts; correct if two samples are less than 2^31 counts apart."""
+        return _counts(&self.now, raw)
+
+
+cdef int64_t _counts(UnwrapState *unwrap, int64_t raw) noexcept nogil:
+    """As `Unwrap.counts`."""
+    cdef int64_t step = raw - unwrap.last
+    if not -HALF_RANGE <= step < HALF_RANGE:
+        unwrap.offset += -FULL_RANGE if step > 0 else FULL_RANGE
+    unwrap.last = raw
+    return raw + unwrap.offset
+
+
+cdef class JointCycle:
+    """State of one joint from cycle to cycle, in the loop or in a replay of its log.
+
+    Args:
+        number: 0 for joint 1, 1 for joint 2.
+        inputs: which PDOs are its inputs, and their scaling (`jtqd.daemon.loop.input_pdos.JointInputs`).
+        estimator: its estimator; one that is written in Python is called through the interpreter.
+        intake: decides which PDOs are fresh.
+        snapshot: counts fallbacks and squared errors.
+        period_ns: of the SYNC.
+        safety: limits and checks; None for those that need no joint file.
+
+    Attributes:
+        published: its fields of the estimate PDO, see `estimate_pdo.field`.
+        status: as published.
+        safety: its limits and checks.
+        sample: its block of the cycle record, a `JointRecord`.
+        view: its block of the snapshot, a `JointView`.
+    """
+
+    carried = ("state", "inputs", "motor", "link", "rules")
+
+    def __init__(self, int number, inputs, estimator, *, Intake intake, snapshot, int64_t period_ns, safety=None):
+        cdef JointTemperature temperature
+        cdef JointBlock nothing = JointBlock(
+            NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, 0, 0, 0, 0
+        )
+        self.limits = safety or JointSafety()
+        self.rules = JointRules(number, snapshot, self.limits, estimator.with_network)
+        self.estimator = estimator
+        self.intake, self.pdos, self.period_ns = intake, intake.pdos, period_ns
+        self.inputs = inputs
+        self.position = _input(intake, inputs.position, 2)
+        self.motion = _input(intake, inputs.motion, 3)
+        self.sensor = NULL if inputs.sensor is None else _input(intake, inputs.sensor, 2)
+        temperature = UNKNOWN if inputs.temperature is None else intake.temperatures[inputs.temperature]
+        self.temperature = &temperature.known  # the intake, or the module, keeps it
+        self.motor, self.link = Unwrap(), Unwrap()
+        self.now.status = STARTING
+        self.now.sample = nothing
+        self.now.published = field_of(NAN, INFINITY, STARTING)
+
+    @property
+    def state(self):
+        """What it knows besides its parts, as one block."""
+        return copied(&self.now, sizeof(JointState))
+
+    @state.setter
+    def state(self, bytes block):
+        put_back(&self.now, sizeof(JointState), block)
+
+    @property
+    def inputs(self):
+        return self.given_inputs
+
+    @inputs.setter
+    def inputs(self, inputs):
+        self.scale = Scale(
+            inputs.motor_rad_per_count,
+            inputs.motor_rad_s_per_unit,
+            inputs.link_rad_per_count,
+            inputs.ampere_per_unit,
+            inputs.sensor_nm_per_unit,
+        )
+        self.given_inputs = inputs
+
+    @property
+    def estimator(self):
+        return self.given
+
+    @estimator.setter
+    def estimator(self, estimator):
+        self.core = estimator if isinstance(estimator, Estimator) else PythonEstimator(estimator)
+        self.given = estimator
+
+    @property
+    def safety(self):
+        return self.limits
+
+    @property
+    def status(self):
+        return self.now.status
+
+    @property
+    def published(self):
+        return self.now.published.torque, self.now.published.sigma, self.now.published.status
+
+    @property
+    def sample(self):
+        return cr.JOINT.unpack(copied(&self.now.sample, sizeof(JointBlock)))
+
+    @property
+    def view(self):
+        cdef JointBlock *s = &self.now.sample
+        values = s.torque_nm, s.sigma_nm, s.tob_nm, s.physics_nm, s.network_nm, s.sensor_torque_nm
+        return *values, s.statusword, s.status, s.sensor_status, s.input_flags, self.now.latched
+
+    @property
+    def last_ns(self):
+        """SYNC of the last cycle with inputs, CLOCK_MONOTONIC; 0 where there was none."""
+        return self.now.last_ns
+
+    def use(self, estimator, safety):
+        """Use this estimator with these limits; latched faults stay latched."""
+        self.estimator, self.limits = estimator, safety
+        self.rules.use(safety, estimator.with_network)
+
+    def begin_again(self):
+        """Restart after a restart of the drive: earlier positions and the observer's state are invalid."""
+        self.motor, self.link = Unwrap(), Unwrap()
+        self.now.last_ns = 0
+        self.given.reset()
+        self.rules.begin_again()
+
+    @property
+    def latched(self):
+        """Return the bits of the latched faults (`daemon/shared/cycle_record.py`)."""
+        return self.rules.status.now.latched
+
+    def reset_latch(self):
+        """Release the latched faults and restart with the present encoder positions; return whether there was one."""
+        if not self.rules.status.reset_latch():
+            return False
+        self.begin_again()
+        return True
+
+    def resume(self, motor_offset, link_offset):
+        """Continue a log in the middle of a run, with the roll-over of the positions so far [counts]."""
+        self.motor, self.link = Unwrap(motor_offset), Unwrap(link_offset)
+
+    def rescale(self, node_id, factors):
+        """Set the scaling of a node that was absent at the start (`SnapshotReader.note_factors`); zeros: none."""
+        inputs, pdos = self.inputs, self.pdos
+        if not any(factors):
+            return
+        if pdos[inputs.position].node_id == node_id:
+            motor, speed, link, ampere = factors
+            self.inputs = replace(
+                inputs,
+                motor_rad_per_count=motor,
+                motor_rad_s_per_unit=speed,
+                link_rad_per_count=link,
+                ampere_per_unit=ampere,
+            )
+        elif inputs.sensor is not None and pdos[inputs.sensor].node_id == node_id:
+            first = min([n for n, pdo in enumerate(pdos) if pdo.node_id == node_id])
+            self.inputs = replace(inputs, sensor_nm_per_unit=factors[inputs.sensor - first])
+
+    def withdraw(self, int status=st.STALE):
+        """Withdraw the estimate: it is neither sent nor logged as published. With status 4 it was too late."""
+        self.take_back(status)
+
+    def observe(self, int64_t sync_ns, bint starting, bint network_wanted=True):
+        """Estimate from the inputs of the cycle whose SYNC went out at `sync_ns` (CLOCK_MONOTONIC).
+
+        While `starting`, an estimate that would be published has status 1 instead. Without `network_wanted` there is no time
+        for the network in this cycle, and it is physics only.
+        """
+        self.observe_at(sync_ns, starting, network_wanted)
+
+    cdef void take_back(self, int status) noexcept nogil:
+        """As `withdraw`."""
+        if status == STALE:
+            status = self.rules.status.withdrawn()
+        self.now.published = field_of(NAN, INFINITY, status)
+        self.now.status = self.now.sample.status = status
+        self.now.sample.torque_nm = self.now.sample.sigma_nm = NAN
+
+    cdef void observe_at(self, int64_t sync_ns, bint starting, bint network_wanted) noexcept nogil:
+        """As `observe`."""
+        cdef int flags = self.reference()
+        self.now.sample.temperature_c = self.temperature.celsius
+        if not isnan(self.temperature.celsius):
+            flags |= TEMPERATURE
+        if self.position.fresh:
+            flags |= POSITION
+        if self.motion.fresh:
+            flags |= MOTION
+        if self.position.fresh and self.motion.fresh:
+            self.estimate(sync_ns, starting, network_wanted, flags)
+        else:
+            self.miss(flags)
+
+    cdef void estimate(self, int64_t sync_ns, bint starting, bint network_wanted, int flags) noexcept nogil:
+        """All inputs of this cycle are there."""
+        cdef Scale *scale = &self.scale
+        cdef JointBlock *record = &self.now.sample
+        cdef Sample sample
+        cdef Values e = Values(NAN, NAN, NAN, NAN, NAN, INVALID)
+        cdef int status, statusword = <int> self.motion.values[2]
+        sample.dt_s = self.since_last(sync_ns)
+        sample.current_a = self.motion.values[1] * scale.ampere
+        sample.motor_position_rad = _counts(&self.motor.now, self.position.values[0]) * scale.motor_rad
+        sample.motor_velocity_rad_s = self.motion.values[0] * scale.motor_rad_s
+        sample.link_position_rad = _counts(&self.link.now, self.position.values[1]) * scale.link_rad
+        sample.temperature_c = record.temperature_c
+        self.core.advance(&sample, network_wanted, &e)
+        status = self.rules.judge(
+            &e, &sample, record.sensor_torque_nm, statusword, starting, network_wanted, &flags
+        )
+        self.now.published = field_of(e.torque_nm, e.sigma_nm, status)
+        if not has_torque(status):
+            e.torque_nm = e.sigma_nm = NAN
+        elif status != STANDSTILL and not isnan(record.sensor_torque_nm):
+            self.rules.tally.error(e.torque_nm - record.sensor_torque_nm)
+        record.current_a = sample.current_a
+        record.motor_position_rad, record.link_position_rad = sample.motor_position_rad, sample.link_position_rad
+        record.motor_velocity_rad_s = sample.motor_velocity_rad_s
+        record.torque_nm, record.sigma_nm, record.tob_nm = e.torque_nm, e.sigma_nm, e.tob_nm
+        record.physics_nm, record.network_nm = e.physics_nm, e.network_nm
+        record.dt_s = sample.dt_s
+        record.statusword, record.input_flags = statusword, flags
+        self.now.status = record.status = status
+        self.now.latched = self.rules.status.now.latched
+
+    cdef void miss(self, int flags) noexcept nogil:
+        """Handle a missing input: the observer keeps its state (the next dt is longer), nothing is published."""
+        cdef JointBlock *record = &self.now.sample
+        cdef int status = self.rules.stale(&flags)
+        self.now.published = field_of(NAN, INFINITY, status)
+        record.current_a = record.motor_position_rad = record.motor_velocity_rad_s = record.link_position_rad = NAN
+        record.torque_nm = record.sigma_nm = record.tob_nm = record.physics_nm = record.network_nm = NAN
+        record.dt_s = NAN
+        record.statusword, record.input_flags = 0, flags
+        self.now.status = record.status = status
+        self.now.latched = self.rules.status.now.latched
+
+    cdef int reference(self) noexcept nogil:
+        """Record the sensor's torque and its 6150h in this cycle, NaN and 0 where there is none; return its flag."""
+        cdef JointBlock *record = &self.now.sample
+        record.sensor_torque_nm, record.sensor_status = NAN, 0
+        if self.sensor == NULL or not self.sensor.fresh:
+            return 0
+        record.sensor_status = self.sensor.values[1]
+        if not record.sensor_status & NOT_A_REFERENCE:
+            record.sensor_torque_nm = self.sensor.values[0] * self.scale.sensor_nm
+        return SENSOR
+
+    cdef double since_last(self, int64_t sync_ns) noexcept nogil:
+        """Return the time step [s] from the last cycle with inputs, 0 at the first; the SYNC of this one becomes the last."""
+        cdef int64_t dt_ns = sync_ns - self.now.last_ns if self.now.last_ns else 0
+        # SYNC keeps an absolute grid: a deviation below the stamps' own accuracy is theirs, not time's.
+        if -ACCURACY_NS < dt_ns - self.period_ns < ACCURACY_NS:
+            dt_ns = self.period_ns
+        self.now.last_ns = sync_ns
+        return dt_ns * 1e-9
+
+
+cdef Input *_input(Intake intake, int index, int count) except NULL:
+    """Return the PDO of this index; raises ValueError when it does not hold `count` objects."""
+    cdef InputState state = intake.states[index]
+    if state.input.field_count != count:
+        raise ValueError(f"{state.pdo.name}: found {state.input.field_count} objects, expected {count}")
+    return &state.input

@@ -1,0 +1,60 @@
+"""Limits and checks of a joint: what `daemon/core/status.pyx` judges its estimates by. Pure."""
+
+from __future__ import annotations
+
+from math import inf
+from typing import Final
+
+from jtqd.daemon.config import Config, SafetySettings
+from jtqd.daemon.shared import faults
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.plausibility import Plausibility
+from jtqd.estimator.settings import EstimatorSettings
+
+TORQUE_RANGE_NM: Final = 327.67
+"""Of the field of the estimate PDO."""
+
+
+class JointSafety:
+    """Limits and checks of one joint, for the loop or a replay of its log; made once.
+
+    Without a joint there is no check that needs its parameters.
+
+    Attributes:
+        settings: as configured.
+        plausibility: checks of its inputs, None for none.
+        torque_limit_nm: a torque beyond it is never published.
+        network_limit_nm: a network further from physics than this has been dropped by the estimator.
+        deviation_cycles: length of the fault `deviation`, 0 where it is not latched.
+    """
+
+    __slots__ = ("deviation_cycles", "network_limit_nm", "plausibility", "settings", "torque_limit_nm")
+
+    def __init__(
+        self,
+        settings: SafetySettings | None = None,
+        estimator: EstimatorSettings | None = None,
+        joint: Joint | None = None,
+        period_ns: int = 1_000_000,
+    ) -> None:
+        self.settings: Final = settings or SafetySettings()
+        self.plausibility: Plausibility | None = None
+        self.torque_limit_nm, self.network_limit_nm = TORQUE_RANGE_NM, inf
+        self.deviation_cycles = 0
+        if self.settings.latch & faults.DEVIATION:
+            self.deviation_cycles = max(1, round(self.settings.deviation_s * 1e9 / period_ns))
+        if joint is None or estimator is None:
+            return
+        self.torque_limit_nm = min(TORQUE_RANGE_NM, estimator.torque_limit * joint.rated_torque_nm)
+        self.network_limit_nm = estimator.network_limit * joint.rated_torque_nm
+        if self.settings.plausibility is not None:
+            self.plausibility = Plausibility(
+                joint, estimator.torque_limit, self.settings.plausibility, period_ns * 1e-9
+            )
+
+
+def safety_of(config: Config) -> list[JointSafety]:
+    """Return the configured limits and checks of joints 1 and 2."""
+    return [
+        JointSafety(config.safety, config.estimator, joint.joint, config.period_ns) for joint in config.joints
+    ]

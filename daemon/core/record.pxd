@@ -1,0 +1,53 @@
+"""The record of one cycle as C sees it: the layout of `jtqd.daemon.shared.cycle_record`, whose names these are."""
+
+from libc.stdint cimport int32_t, int64_t, uint8_t, uint16_t, uint32_t, uint64_t
+
+from jtqd.drivers.frame_socket cimport Frame
+
+cdef enum:
+    FRAME_CAPACITY = 16
+
+cdef struct Header:
+    uint64_t cycle
+    int64_t sync_monotonic_ns, sync_realtime_ns
+    uint32_t flags, work_ns
+    int32_t late_ns
+    uint32_t missed
+    uint8_t sync_counter, frame_count, frames_left_out
+    uint8_t stale_inputs, late_frames, duplicate_frames, rejected_frames
+    uint8_t spare
+
+cdef struct JointBlock:
+    double current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, sensor_torque_nm, temperature_c
+    double torque_nm, sigma_nm, tob_nm, physics_nm, network_nm, dt_s
+    uint16_t statusword, status, sensor_status, input_flags
+
+cdef struct Record:
+    Header header
+    JointBlock joints[2]
+    Frame frames[FRAME_CAPACITY]
+    int64_t stamps_ns[FRAME_CAPACITY]
+    uint64_t tail
+
+cdef class RecordRing:
+    cdef object memory
+    cdef uint64_t[::1] head
+    cdef uint8_t[::1] records
+    cdef uint64_t *written
+    cdef uint64_t slots
+    cdef Record *slot(self) noexcept nogil
+    cdef void commit(self) noexcept nogil
+
+cdef struct HeldFrames:  # of slots without a record
+    int64_t count
+    Frame frames[FRAME_CAPACITY]
+    int64_t stamps_ns[FRAME_CAPACITY]
+
+cdef class CycleFrames:
+    cdef Record *record
+    cdef readonly int count, left_out
+    cdef HeldFrames held
+    cdef void begin(self, Record *record) noexcept nogil
+    cdef void hold(self, const Frame *frame, int64_t stamp_ns) noexcept nogil
+    cdef void keep(self, const Frame *frames, const int64_t *stamps_ns, int count) noexcept nogil
+    cdef void keep_one(self, const Frame *frame, int64_t stamp_ns) noexcept nogil

@@ -1,0 +1,137 @@
+"""The record of one cycle, written straight into the ring's memory.
+
+The layout is that of `jtqd.daemon.shared.cycle_record`, little endian; where the structs of record.pxd differ from it, this
+module cannot be imported.
+"""
+
+from libc.stdint cimport int64_t, uint8_t, uint64_t
+from libc.string cimport memcpy
+
+import sys
+
+from jtqd.daemon.core.block cimport copied, put_back
+from jtqd.drivers.frame_socket cimport Frame
+from jtqd.daemon.shared import cycle_record as cr
+from jtqd.daemon.shared import ring as shared_ring
+
+cdef extern from *:
+    """
+    static inline void publish(uint64_t *word, uint64_t value) {
+        __atomic_store_n(word, value, __ATOMIC_RELEASE);
+    }
+    """
+    void publish(uint64_t *word, uint64_t value) noexcept nogil
+
+if sys.byteorder != "little":
+    raise ImportError("the cycle record is little endian, this machine is not")
+
+
+def _check_layout():
+    """Raise ImportError where C lays the record out in another way than `cycle_record` does."""
+    cdef Record record
+    cdef const char *start = <const char *> &record
+    found = (
+        sizeof(Record),
+        sizeof(Header),
+        sizeof(JointBlock),
+        <const char *> &record.joints[0] - start,
+        <const char *> &record.frames[0] - start,
+        <const char *> &record.stamps_ns[0] - start,
+        <const char *> &record.tail - start,
+        FRAME_CAPACITY,
+    )
+    expected = (
+        cr.RECORD_SIZE,
+        cr.HEADER.size,
+        cr.JOINT.size,
+        cr.HEADER.size,
+        cr.FRAMES_OFFSET,
+        cr.STAMPS_OFFSET,
+        cr.TAIL_OFFSET,
+        cr.FRAME_CAPACITY,
+    )
+    if found != expected:
+        raise ImportError(f"found a cycle record with {found}, expected {expected}")
+    fields = Header(1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15), JointBlock(
+        1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13, 14, 15, 16
+    )
+    named = cr.Header(**fields[0]), cr.JointRecord(**fields[1])
+    if named != (tuple(range(1, 16)), tuple(range(1, 17))):
+        raise ImportError(f"found a cycle record with the fields {named}")
+
+
+_check_layout()
+
+
+cdef class RecordRing:
+    """The ring's memory (`jtqd.daemon.shared.ring.Ring`): the count of records lies in it, and nowhere else."""
+
+    def __init__(self, ring):
+        cdef Py_ssize_t word = shared_ring.COUNT_WORD
+        self.memory = ring
+        self.head, self.records, self.slots = ring.words, ring.records, ring.size
+        self.written = &self.head[word]
+        if <uint64_t> self.records.shape[0] != self.slots * sizeof(Record):
+            raise ValueError(f"found a ring of {self.records.shape[0]} bytes for {self.slots} cycles")
+
+    cdef Record *slot(self) noexcept nogil:
+        """Return the memory of the record that the next `commit` publishes."""
+        cdef Py_ssize_t start = (self.written[0] % self.slots) * sizeof(Record)
+        return <Record *> &self.records[start]
+
+    cdef void commit(self) noexcept nogil:
+        """Publish the record: one 8-byte store, after all others."""
+        publish(self.written, self.written[0] + 1)
+
+
+cdef class CycleFrames:
+    """Frames of a cycle, copied unchanged into its record: 16 bytes each beside their stamps.
+
+    Attributes:
+        count: frames stored in it.
+        left_out: frames of the cycle that found no room.
+    """
+
+    carried = ("state",)
+
+    @property
+    def state(self):
+        """Frames of slots without a record, as one block."""
+        return copied(&self.held, sizeof(HeldFrames))
+
+    @state.setter
+    def state(self, bytes block):
+        put_back(&self.held, sizeof(HeldFrames), block)
+
+    @property
+    def slot(self):
+        """The record of the current cycle as it is now."""
+        return copied(self.record, sizeof(Record))
+
+    cdef void begin(self, Record *record) noexcept nogil:
+        """Store the next frames in this record."""
+        cdef int stored = min(self.held.count, FRAME_CAPACITY)
+        self.record = record
+        self.count = self.left_out = 0
+        self.keep(self.held.frames, self.held.stamps_ns, stored)
+        self.left_out = self.held.count - stored
+        self.held.count = 0
+
+    cdef void hold(self, const Frame *frame, int64_t stamp_ns) noexcept nogil:
+        """Keep a frame of a slot without a record for the next one that has one."""
+        if self.held.count < FRAME_CAPACITY:
+            self.held.frames[self.held.count] = frame[0]
+            self.held.stamps_ns[self.held.count] = stamp_ns
+        self.held.count += 1
+
+    cdef void keep(self, const Frame *frames, const int64_t *stamps_ns, int count) noexcept nogil:
+        """Copy `count` received frames; `stamps_ns` are CLOCK_REALTIME."""
+        cdef int stored = min(count, FRAME_CAPACITY - self.count)
+        memcpy(&self.record.frames[self.count], frames, stored * sizeof(Frame))
+        memcpy(&self.record.stamps_ns[self.count], stamps_ns, stored * sizeof(int64_t))
+        self.count += stored
+        self.left_out += count - stored
+
+    cdef void keep_one(self, const Frame *frame, int64_t stamp_ns) noexcept nogil:
+        """Copy one frame; of our own, `stamp_ns` (CLOCK_REALTIME) is when it was handed to the socket."""
+        self.keep(frame, &stamp_ns, 1)

@@ -1,0 +1,54 @@
+"""Status of a joint; the rules stand in status.pyx."""
+
+from libc.stdint cimport int64_t, uint64_t
+
+from jtqd.estimator.plausibility cimport Plausibility
+from jtqd.estimator.sample cimport Sample, Values
+
+cdef struct StatusState:
+    int held, asked
+    int found, news, reasons, latched  # bits of faults
+    int64_t latches
+    int64_t needed, calm, run
+    int64_t since, window, factor
+
+cdef class JointStatus:
+    cdef StatusState now
+    cdef int latching
+    cdef int64_t stale_limit  # -1: none
+    cdef int following(self, int status, int found) noexcept nogil
+    cdef int withdrawn(self) noexcept nogil
+    cdef int another(self) noexcept nogil
+    cdef int published(self, int status, int found) noexcept nogil
+    cdef void fall(self, int status) noexcept nogil
+    cdef void rise(self, int status) noexcept nogil
+    cdef int64_t cycles(self, int status) noexcept nogil
+
+cdef class JointTally:
+    cdef uint64_t[::1] counters
+    cdef double[::1] errors
+    cdef int number
+    cdef int faults(self, StatusState *state) noexcept nogil
+    cdef void network(self, const Values *estimate, bint wanted, double limit_nm) noexcept nogil
+    cdef void error(self, double difference_nm) noexcept nogil
+
+cdef class JointRules:
+    cdef JointTally tally
+    cdef readonly JointStatus status
+    cdef Plausibility plausibility
+    cdef bint is_checked, with_network
+    cdef double torque_limit_nm, network_limit_nm, deviation_sigmas
+    cdef int64_t deviation_cycles, deviates
+    cdef int judge(
+        self,
+        const Values *estimate,
+        const Sample *sample,
+        double sensor_nm,
+        int statusword,
+        bint starting,
+        bint network_wanted,
+        int *flags,
+    ) noexcept nogil
+    cdef int stale(self, int *flags) noexcept nogil
+    cdef int told(self) noexcept nogil
+    cdef int faults_of(self, const Values *estimate, double sensor_nm, bint network_wanted) noexcept nogil

@@ -1,0 +1,422 @@
+"""Status of a joint, from the estimate and inputs of each cycle: worse at once, better only after a while. Pure.
+
+    estimate and inputs  ->  faults of this cycle  ->  status with hysteresis and latches  ->  status and flags
+
+`JointSafety` (`joint_safety.py`) holds limits and checks, `JointStatus` the hysteresis, `JointTally` counts, and `JointRules` applies the rules
+of docs/safety.md to one cycle after the other: a number leaves only through `JointRules.judge`. What it needs beside the
+estimate comes from the log again: the inputs, `cr.FLAG_WITHDRAWN` (`late`), `cr.FLAG_RESET` (`reset_latch`),
+`FLAG_NETWORK_SKIPPED`. So a replay gives the same.
+
+The statuses have an order, from good to bad:
+
+    2 valid, 6 standstill  <  3 degraded  <  1 starting  <  0 off  <  4 stale  <  15 invalid  <  5 drive fault
+
+- A worse one is published in the cycle in which it arises. A better one only when some cycles in a row (`NEEDED`: of the
+  status that is left) have asked for one; the worst that they asked for is then published.
+- Standstill has a hysteresis of its own (speed) and is published at once in place of valid and degraded.
+- A joint that falls back into a status without a number soon after it had left one (within RELAPSE times the cycles that it
+  had to wait) waits twice as long each time, at most MOST times as long: an input that comes and goes makes a joint that is
+  stale, not one that flickers. A single lost frame costs little.
+- A fault that is latched (`safety.latch`) stays until `reset_latch()`: its status, or a worse one, is published whatever
+  the inputs say. Status 5, 4 or 15, see `jtqd.daemon.shared.faults.status_of`.
+
+No clock and no randomness: the same statuses and faults give the same answer again, in the loop and from a log.
+"""
+
+from libc.math cimport INFINITY, fabs, isnan
+from libc.stdint cimport int64_t, uint64_t
+
+from typing import Final
+
+from jtqd.daemon.core.block cimport copied, put_back
+from jtqd.daemon.core.estimate_pdo cimport has_torque
+from jtqd.daemon.shared import cycle_record as cr
+from jtqd.daemon.shared import faults
+from jtqd.daemon.shared.snapshot import COUNTERS
+from jtqd.estimator import status as st
+from jtqd.estimator.plausibility cimport Plausibility
+from jtqd.estimator.sample cimport Sample, Values
+
+NEEDED: Final = {
+    st.DEGRADED: 100,
+    st.STARTING: 1,
+    st.OFF: 20,
+    st.STALE: 5,
+    st.INVALID: 50,
+    st.DRIVE_FAULT: 100,
+}
+"""Cycles in a row that must be better before this status is left; the last of them is published already."""
+RELAPSE: Final = 10
+MOST: Final = 4
+
+_ORDER: Final = (
+    st.VALID,
+    st.STANDSTILL,
+    st.DEGRADED,
+    st.STARTING,
+    st.OFF,
+    st.STALE,
+    st.INVALID,
+    st.DRIVE_FAULT,
+)
+
+cdef enum:
+    CODES = 16
+cdef int VALID = st.VALID, STANDSTILL = st.STANDSTILL, DEGRADED = st.DEGRADED, STARTING = st.STARTING
+cdef int OFF = st.OFF, STALE = st.STALE, INVALID = st.INVALID, DRIVE_FAULT = st.DRIVE_FAULT
+cdef int RANKS[CODES]
+cdef int64_t WAITS[CODES]
+cdef int _code
+for _code in range(CODES):
+    RANKS[_code] = _ORDER.index(_code) if _code in _ORDER else len(_ORDER)
+    WAITS[_code] = NEEDED.get(_code, 1)
+cdef int WORST = len(_ORDER)
+cdef int STANDS = RANKS[st.STANDSTILL]
+cdef int WITH_NUMBER = RANKS[st.DEGRADED]  # up to this rank a torque is published
+cdef int RANK_INVALID = RANKS[st.INVALID]
+cdef int64_t RELAPSE_TIMES = RELAPSE, MOST_TIMES = MOST
+
+cdef int FAULT_NOT_FINITE = faults.NOT_FINITE, FAULT_OUT_OF_RANGE = faults.OUT_OF_RANGE
+cdef int FAULT_DEVIATION = faults.DEVIATION, FAULT_DRIVE = faults.DRIVE_FAULT, FAULT_STALE = faults.STALE
+cdef int FLAG_LATCHED = cr.FLAG_LATCHED, FLAG_NETWORK_SKIPPED = cr.FLAG_NETWORK_SKIPPED
+
+
+cdef int _rank(int status) noexcept nogil:
+    """Return the place of a status in the order from good to bad."""
+    return RANKS[status] if 0 <= status < CODES else WORST
+
+
+cdef int64_t _wait(int status) noexcept nogil:
+    """Return the cycles after which a status may be left."""
+    return WAITS[status] if 0 <= status < CODES else 1
+
+
+cdef int _worse(int a, int b) noexcept nogil:
+    return a if _rank(a) >= _rank(b) else b
+
+
+cdef int _status_of(int latched) noexcept nogil:
+    """As `faults.status_of`."""
+    if latched & FAULT_DRIVE:
+        return DRIVE_FAULT
+    return STALE if latched == FAULT_STALE else INVALID
+
+
+# What is held and what is latched -------------------------------------------------------------------------------------
+
+
+cdef class JointStatus:
+    """State of one joint.
+
+    Attributes:
+        latched: bits of the faults that are latched (`daemon/shared/cycle_record.py`).
+        reasons: faults since a number was last published; 0 while one is.
+        news, latches: faults that began, and how often one was latched, since whoever counts them set these to 0.
+    """
+
+    carried = ("state",)
+
+    def __init__(self, settings):
+        self.use(settings)
+        self.now.held = STARTING
+        self.now.asked = VALID
+        self.now.needed = WAITS[STARTING]
+        self.now.factor = 1
+
+    @property
+    def state(self):
+        """All of it as one block."""
+        return copied(&self.now, sizeof(StatusState))
+
+    @state.setter
+    def state(self, bytes block):
+        put_back(&self.now, sizeof(StatusState), block)
+
+    @property
+    def latched(self):
+        return self.now.latched
+
+    @property
+    def reasons(self):
+        return self.now.reasons
+
+    @property
+    def news(self):
+        return self.now.news
+
+    @property
+    def latches(self):
+        return self.now.latches
+
+    def use(self, settings):
+        """Latch these faults from now on; held and latched states stay."""
+        limit = settings.stale_latch_cycles
+        self.latching, self.stale_limit = settings.latch, -1 if limit is None else limit
+
+    def update(self, int status, int found=0):
+        """Return the status to publish for the requested `status` and the faults `found` (`shared/cycle_record.py`)."""
+        return self.following(status, found)
+
+    def pass_over(self, int64_t cycles):
+        """Repeat the last cycle this many times: it got the requested status, and no fault."""
+        self.now.since += cycles
+
+    def late(self):
+        """Return the status to publish if the estimate of this cycle was not ready in time, after `update`."""
+        return self.withdrawn()
+
+    def reset_latch(self):
+        """Release latched faults; an existing fault latches again in the next cycle. Return whether there was one."""
+        was, self.now.latched = self.now.latched, 0
+        return bool(was)
+
+    cdef int following(self, int status, int found) noexcept nogil:
+        """As `update`."""
+        self.now.since += 1
+        if status == self.now.held and not found and not self.now.latched and _rank(status) <= WITH_NUMBER:
+            self.now.calm = self.now.run = self.now.found = 0
+            return status
+        if found:
+            self.now.news |= found & ~self.now.found
+            self.now.reasons |= found
+        self.now.found = found
+        if found and _rank(status) < RANK_INVALID:
+            status = INVALID
+        if status == STALE:
+            found |= self.another()
+        else:
+            self.now.run = 0
+            found |= FAULT_DRIVE if status == DRIVE_FAULT else 0
+        return self.published(status, found)
+
+    cdef int withdrawn(self) noexcept nogil:
+        """As `late`."""
+        return self.published(STALE, self.another())
+
+    cdef int another(self) noexcept nogil:
+        """Count a consecutive cycle without a torque; return the fault STALE when there were too many."""
+        self.now.run += 1
+        return FAULT_STALE if 0 <= self.stale_limit <= self.now.run else 0
+
+    cdef int published(self, int status, int found) noexcept nogil:
+        """Latch what is to be latched, and hold what is to be held."""
+        cdef int fresh = found & self.latching & ~self.now.latched
+        cdef int held, rank, worst
+        if fresh:
+            self.now.latched |= fresh
+            self.now.latches += 1
+        if self.now.latched:
+            status = _worse(status, _status_of(self.now.latched))
+        held = self.now.held
+        rank, worst = _rank(status), _rank(held)
+        if rank > worst:
+            self.fall(status)
+        if rank >= worst or worst <= STANDS:
+            self.now.held, self.now.calm = status, 0
+            return status
+        self.now.asked = _worse(status, self.now.asked) if self.now.calm else status
+        self.now.calm += 1
+        if self.now.calm < self.now.needed:
+            return status if status == STANDSTILL and worst <= WITH_NUMBER else held
+        self.rise(self.now.asked)
+        return self.now.asked
+
+    cdef void fall(self, int status) noexcept nogil:
+        """Change to a worse status."""
+        if _rank(self.now.held) <= WITH_NUMBER < _rank(status):
+            self.now.factor = min(2 * self.now.factor, MOST_TIMES) if self.now.since < self.now.window else 1
+        self.now.needed = self.cycles(status)
+
+    cdef void rise(self, int status) noexcept nogil:
+        """Change to a better status after the hold time."""
+        if _rank(status) <= WITH_NUMBER < _rank(self.now.held):
+            self.now.since, self.now.window = 0, RELAPSE_TIMES * self.now.needed
+        if _rank(status) <= WITH_NUMBER:
+            self.now.reasons = 0
+        self.now.held, self.now.calm = status, 0
+        self.now.needed = self.cycles(status)
+
+    cdef int64_t cycles(self, int status) noexcept nogil:
+        """Return the hold time of a status in cycles."""
+        return _wait(status) if _rank(status) <= WITH_NUMBER else _wait(status) * self.now.factor
+
+
+# Counts ---------------------------------------------------------------------------------------------------------------
+
+cdef int FALLBACKS = COUNTERS.index("network_fallbacks"), LATCHES = COUNTERS.index("latches")
+cdef int NETWORK_NOT_FINITE = COUNTERS.index("network_not_finite"), NETWORK_FAR = COUNTERS.index("network_far")
+cdef int NETWORK_OUTSIDE = COUNTERS.index("network_outside"), NETWORK_NO_TIME = COUNTERS.index("network_no_time")
+cdef enum:
+    LOW_BYTE = 8  # bits of the faults that a cycle can have besides its status
+cdef int COUNTER_OF[LOW_BYTE]
+cdef int _bit
+for _bit in range(LOW_BYTE):
+    COUNTER_OF[_bit] = COUNTERS.index(f"fault_{faults.NAMES[1 << _bit]}")
+if faults.COUNTED != tuple([1 << _bit for _bit in range(LOW_BYTE)]):
+    raise ImportError("the faults that are counted are not those of the low byte")
+
+
+cdef class JointTally:
+    """Counts of joint `number` (0 or 1): why its network was dropped, its faults, its squared errors against the sensor.
+
+    tally: where it counts: `counters` and `errors` of a `Snapshot`, or arrays of their layout.
+    """
+
+    def __init__(self, int number, tally):
+        self.counters, self.errors = tally.counters, tally.errors
+        self.number = number
+        if self.counters.shape[0] != len(COUNTERS) or self.errors.shape[0] < 2 * number + 2:
+            raise ValueError("not the counters and errors of a snapshot")
+
+    cdef int faults(self, StatusState *state) noexcept nogil:
+        """Count the faults that are new in this cycle; return the flags that explain the missing torque."""
+        cdef int flags, bit
+        if state.news:
+            for bit in range(LOW_BYTE):
+                if state.news >> bit & 1:
+                    self.counters[COUNTER_OF[bit]] += 1
+            state.news = 0
+        flags = (state.reasons & 0xFF) << 8
+        if state.latched:
+            self.counters[LATCHES] += state.latches
+            state.latches = 0
+            flags |= FLAG_LATCHED | (state.latched & 0xFF) << 8
+        return flags
+
+    cdef void network(self, const Values *estimate, bint wanted, double limit_nm) noexcept nogil:
+        """Count a cycle in which the network is not fully used (status 3), or gave no torque."""
+        cdef double network_nm = estimate.network_nm
+        if estimate.status == DEGRADED:
+            self.counters[FALLBACKS] += 1
+        if not wanted:
+            self.counters[NETWORK_NO_TIME] += 1
+        elif network_nm - network_nm != 0.0:
+            self.counters[NETWORK_NOT_FINITE] += 1
+        elif fabs(network_nm - estimate.physics_nm) > limit_nm:
+            self.counters[NETWORK_FAR] += 1
+        else:
+            self.counters[NETWORK_OUTSIDE] += 1
+
+    cdef void error(self, double difference_nm) noexcept nogil:
+        """Add the error of a published estimate against the sensor."""
+        self.errors[2 * self.number] += difference_nm * difference_nm
+        self.errors[2 * self.number + 1] += 1.0
+
+
+# The rules of docs/safety.md ------------------------------------------------------------------------------------------
+
+
+cdef bint _powered(int statusword) noexcept nogil:
+    """Operation enabled and quick stop active (6041h masked with 6Fh): in these states the motor carries current."""
+    return statusword & 0x6F == 0x27 or statusword & 0x6F == 0x07
+
+
+cdef int _unpowered(int statusword) noexcept nogil:
+    """Status of a drive whose motor carries none: fault reaction active and fault (6041h masked with 4Fh), or off."""
+    return DRIVE_FAULT if statusword & 0x4F == 0x0F or statusword & 0x4F == 0x08 else OFF
+
+
+def drive_status(int statusword):
+    """Return the status forced by a drive's statusword (6041h), or None if the motor carries current."""
+    return None if _powered(statusword) else _unpowered(statusword)
+
+
+cdef class JointRules:
+    """The rules for joint `number` (0 or 1), one cycle after the other.
+
+    number, tally: where it counts; safety: limits and checks (`JointSafety`); with_network: the estimator uses one.
+
+    Attributes:
+        status: what is held and what is latched.
+    """
+
+    carried = ("status",)
+
+    def __init__(self, int number, tally, safety, bint with_network):
+        self.tally = JointTally(number, tally)
+        self.status = JointStatus(safety.settings)
+        self.use(safety, with_network)
+
+    def use(self, safety, bint with_network):
+        """Use these limits; held and latched states stay."""
+        self.with_network = with_network
+        self.plausibility, self.is_checked = safety.plausibility, safety.plausibility is not None
+        self.torque_limit_nm, self.network_limit_nm = safety.torque_limit_nm, safety.network_limit_nm
+        self.deviation_cycles, self.deviation_sigmas = safety.deviation_cycles, safety.settings.deviation_sigmas
+        self.deviates = 0
+        self.status.use(safety.settings)
+
+    def begin_again(self):
+        """Restart after a restart of the drive: earlier encoder positions are invalid."""
+        self.deviates = 0
+        if self.is_checked:
+            self.plausibility.reset()
+
+    cdef int judge(
+        self,
+        const Values *estimate,
+        const Sample *sample,
+        double sensor_nm,
+        int statusword,
+        bint starting,
+        bint network_wanted,
+        int *flags,
+    ) noexcept nogil:
+        """Return the status to publish and set its bits of `input_flags`.
+
+        sample: what the estimate was made of; sensor_nm: NaN where unknown; while `starting`, an estimate with a number has
+        status 1 instead.
+        """
+        cdef int found = 0, status = estimate.status
+        if self.is_checked:
+            found = self.plausibility.check(
+                sample.dt_s,
+                sample.motor_position_rad,
+                sample.motor_velocity_rad_s,
+                sample.link_position_rad,
+                sample.current_a,
+            )
+        if self.with_network and not network_wanted:
+            flags[0] |= FLAG_NETWORK_SKIPPED
+        if not _powered(statusword):
+            status = _unpowered(statusword)
+        elif has_torque(status):
+            found |= self.faults_of(estimate, sensor_nm, network_wanted)
+            if starting:
+                status = STARTING
+        elif status == INVALID:
+            found |= FAULT_OUT_OF_RANGE
+        status = self.status.following(status, found)
+        flags[0] |= self.told()
+        return status
+
+    cdef int stale(self, int *flags) noexcept nogil:
+        """An input of this cycle is missing: return the status to publish and set its bits of `input_flags`."""
+        cdef int status = self.status.following(STALE, 0)
+        flags[0] |= self.told()
+        return status
+
+    cdef int told(self) noexcept nogil:
+        """Bits of `input_flags` that say why there is no number."""
+        if self.status.now.reasons or self.status.now.latched:
+            return self.tally.faults(&self.status.now)
+        return 0
+
+    cdef int faults_of(self, const Values *estimate, double sensor_nm, bint network_wanted) noexcept nogil:
+        """Return the faults of numbers that the estimator marked as good."""
+        cdef double torque = estimate.torque_nm, sigma = estimate.sigma_nm, network = estimate.network_nm
+        cdef double limit = self.torque_limit_nm
+        cdef bint is_sigma = 0.0 <= sigma < INFINITY
+        cdef int found = 0
+        if not (-limit <= torque <= limit and is_sigma):  # so that NaN fails too
+            found = FAULT_OUT_OF_RANGE if torque - torque == 0.0 and is_sigma else FAULT_NOT_FINITE
+        if self.with_network and (estimate.status == DEGRADED or network - network != 0.0):
+            self.tally.network(estimate, network_wanted, self.network_limit_nm)
+        if self.deviation_cycles:
+            if fabs(torque - sensor_nm) <= self.deviation_sigmas * sigma:
+                self.deviates = 0
+            elif not isnan(sensor_nm):
+                self.deviates += 1
+            if self.deviates >= self.deviation_cycles:
+                found |= FAULT_DEVIATION
+        return found

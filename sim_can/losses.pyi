@@ -1,0 +1,37 @@
+from collections.abc import Callable
+from typing import Final
+
+from jtqd.estimator.arrays import FloatArray
+
+LOWEST_TABLE_VELOCITY_RAD_S: Final = 0.2
+VELOCITY_STEP_RAD_S: Final = 0.1
+HIGHEST_TABLE_VELOCITY_RAD_S: Final = 3.6
+TORQUE_STEPS: Final = 400
+
+class LossTable:
+    torque_limit: float
+    per_torque_step: float
+    per_velocity_step: float
+    last_row: int
+    forward: FloatArray
+    reverse: FloatArray
+    def __init__(
+        self,
+        loss: Callable[[FloatArray, FloatArray], FloatArray],
+        gear_ratio: float,
+        torque_constant_nm_per_a: float,
+        highest_current_a: float,
+    ) -> None: ...
+    def magnitude(self, torque_nm: float, velocity_rad_s: float) -> float: ...
+
+class JointFriction:
+    def __init__(
+        self,
+        table: LossTable,
+        scale: float = 1.0,
+        viscous_nms_per_rad: float = 0.0,
+        stribeck_nm: float = 0.0,
+        stribeck_velocity_rad_s: float = 0.05,
+    ) -> None: ...
+    def differ(self, constant_nm: float, viscous_nms_per_rad: float) -> None: ...
+    def __call__(self, torque_nm: float, velocity_rad_s: float) -> float: ...

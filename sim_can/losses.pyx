@@ -1,0 +1,141 @@
+"""Transmission losses of a true joint: friction magnitude over transmitted torque and velocity.
+
+A gear's losses depend on what it transmits, F(τ, v), not on the motor's current: `LossTable` turns the joint file's law of
+current and velocity into a table of that, `JointFriction` adds what the true joint differs from its file. Pure.
+"""
+
+from libc.math cimport exp, fabs
+
+from typing import Final
+
+import numpy as np
+
+LOWEST_TABLE_VELOCITY_RAD_S: Final = 0.2
+"""Table I holds for 0.2 to 3 rad/s and up to 5 A. Below 0.2 rad/s an estimator's loss law may be smoothed through zero
+velocity; a real joint sticks there. So the table is taken from 0.2 rad/s on and continued below as a straight line.
+"""
+VELOCITY_STEP_RAD_S: Final = 0.1
+HIGHEST_TABLE_VELOCITY_RAD_S: Final = 3.6
+TORQUE_STEPS: Final = 400
+
+cdef double COLUMNS = TORQUE_STEPS
+cdef double LAST_COLUMN = TORQUE_STEPS - 1e-9
+
+
+cdef class LossTable:
+    """F(τ, v) >= 0 [Nm]: loss of a joint that transmits τ at joint velocity v, by bilinear interpolation.
+
+    A law given over current (Table I: τ = η(i, v) G Kt i) is inverted once: at constant velocity the motor
+    must carry both, so G Kt i = τ + loss(i, v) for every i; where i moves, (τ, loss) is a curve, and this
+    table holds its points. Friction then depends on what the gear transmits, not on the motor current: the
+    same at standstill of the motor's inertia term, different when the rotor accelerates (τ, not i, loads the
+    teeth). In steady state both are the same and η is Table I's.
+
+    Args:
+        loss: loss(currents [A], joint velocities [rad/s]) -> Nm, arrays of one shape, signed like the
+        velocity.
+        gear_ratio: G. torque_constant_nm_per_a: Kt of the law (the nominal one, also where the plant's true
+        Kt deviates).
+        highest_current_a: the law is tabulated for |i| up to this; beyond, the loss stays what it is there.
+
+    Attributes:
+        forward, reverse: magnitudes for either direction of motion; rows by velocity k * 0.1 rad/s, columns by torque.
+    """
+
+    def __init__(self, loss, double gear_ratio, double torque_constant_nm_per_a, double highest_current_a):
+        nm_per_a = gear_ratio * torque_constant_nm_per_a
+        self.torque_limit = nm_per_a * highest_current_a
+        self.per_torque_step = TORQUE_STEPS / (2.0 * self.torque_limit)
+        self.per_velocity_step = 1.0 / VELOCITY_STEP_RAD_S
+        self.last_row = round(HIGHEST_TABLE_VELOCITY_RAD_S / VELOCITY_STEP_RAD_S) - 1
+        self.columns = TORQUE_STEPS + 1
+        grid = np.linspace(-self.torque_limit, self.torque_limit, TORQUE_STEPS + 1)
+        self.forward = self.forward_rows = _rows(loss, nm_per_a, grid, highest_current_a, +1.0)
+        self.reverse = self.reverse_rows = _rows(loss, nm_per_a, grid, highest_current_a, -1.0)
+
+    def magnitude(self, double torque_nm, double velocity_rad_s):
+        """Return F(τ, v) in Nm, never negative; the sign of v selects the direction (v = 0 counts as forward)."""
+        return self.at(torque_nm, velocity_rad_s)
+
+    cdef double at(self, double torque, double velocity) noexcept nogil:
+        """As `magnitude`, for the plant. Whatever is not a number lies at the table's end."""
+        cdef const double *low = &self.reverse_rows[0, 0] if velocity < 0.0 else &self.forward_rows[0, 0]
+        cdef const double *high
+        cdef double x = fabs(velocity) * self.per_velocity_step
+        cdef double y = (torque + self.torque_limit) * self.per_torque_step
+        cdef double low_value
+        cdef int k = self.last_row, m
+        if x < k + 1.0:
+            k = <int>x
+        else:
+            x = k + 1.0
+        if y < 0.0:
+            y = 0.0
+        elif not y < COLUMNS:
+            y = LAST_COLUMN
+        m = <int>y
+        y -= m
+        low += k * self.columns + m
+        high = low + self.columns
+        low_value = low[0] + y * (low[1] - low[0])
+        return low_value + (x - k) * (high[0] + y * (high[1] - high[0]) - low_value)
+
+
+def _rows(loss, double nm_per_a, grid, double highest, double sign):
+    """Return the magnitudes of the loss for one direction of motion."""
+    count = round(HIGHEST_TABLE_VELOCITY_RAD_S / VELOCITY_STEP_RAD_S) + 1
+    first = round(LOWEST_TABLE_VELOCITY_RAD_S / VELOCITY_STEP_RAD_S)
+    # three times the range in current, so that the curve covers the torque grid where η is small, too
+    currents = np.linspace(-3.0 * highest, 3.0 * highest, 6 * TORQUE_STEPS + 1)
+    clipped = np.clip(currents, -highest, highest)
+    rows = np.empty((count, len(grid)))
+    for k in range(first, count):
+        values = loss(clipped, np.full_like(clipped, sign * k * VELOCITY_STEP_RAD_S))
+        # A law may bend back where it is extrapolated; the inverse needs a rising curve.
+        torque = np.maximum.accumulate(nm_per_a * currents - values)
+        rows[k] = np.maximum(sign * np.interp(grid, torque, values), 0.0)
+    for k in range(first):
+        rows[k] = np.maximum(rows[first] - (first - k) * (rows[first + 1] - rows[first]), 0.0)
+    return rows
+
+
+cdef class JointFriction:
+    """Friction magnitude of one true joint: scaled loss table, constant and viscous parts, Stribeck peak.
+
+    F(τ, v) = scale * table(τ, v) + c0 + c1 |v| + Fs exp(-(v / vs)²), never below zero. c0 and c1 are what the
+    joint's Coulomb and viscous friction differ from its file's (`differ`), with temperature and from day to
+    day. The Stribeck term is below 1e-6 Fs at 0.2 rad/s for vs <= 0.05 rad/s.
+    """
+
+    def __init__(
+        self,
+        LossTable table not None,
+        double scale=1.0,
+        double viscous_nms_per_rad=0.0,
+        double stribeck_nm=0.0,
+        double stribeck_velocity_rad_s=0.05,
+    ):
+        self.table = table
+        self.scale = scale
+        self.stribeck = stribeck_nm
+        self.inverse_vs = 1.0 / stribeck_velocity_rad_s
+        self.reach = 4.0 * stribeck_velocity_rad_s if stribeck_nm > 0.0 else -1.0
+        self.differ(0.0, viscous_nms_per_rad)
+
+    cpdef void differ(self, double constant_nm, double viscous_nms_per_rad) noexcept:
+        """Set how much more (or less) Coulomb and viscous friction there is than in the table."""
+        self.constant = constant_nm
+        self.viscous = viscous_nms_per_rad
+
+    def __call__(self, double torque_nm, double velocity_rad_s):
+        """Return the magnitude in Nm at transmitted torque τ and joint velocity v (its sign gives the direction)."""
+        return self.at(torque_nm, velocity_rad_s)
+
+    cdef double at(self, double torque, double velocity) noexcept nogil:
+        """As `__call__`, for the plant."""
+        cdef double speed = fabs(velocity), x
+        cdef double force = self.scale * self.table.at(torque, velocity) + self.viscous * speed + self.constant
+        if speed < self.reach:
+            x = speed * self.inverse_vs
+            force += self.stribeck * exp(-x * x)
+        return force if force > 0.0 else 0.0

@@ -1,0 +1,36 @@
+"""Instructions of a step against the stored ones: a step that has become dearer is seen on any machine."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+
+import pytest
+
+from tests.benchmarks.instructions import METHODS, STORED, count
+
+WITHIN = 0.05
+
+
+def compiler() -> str:
+    found = shutil.which("cc")
+    if found is None:
+        return "none"
+    return subprocess.run(
+        [found, "--version"], capture_output=True, text=True, check=True
+    ).stdout.splitlines()[0]
+
+
+@pytest.mark.parametrize(
+    "method", [pytest.param(each, marks=() if each == "fused" else pytest.mark.campaign) for each in METHODS]
+)
+def test_a_step_costs_what_it_did(method: str) -> None:
+    stored = json.loads(STORED.read_text())
+    if shutil.which("valgrind") is None:
+        pytest.skip("found no valgrind: instructions cannot be counted here")
+    if compiler() != stored["compiler"]:
+        pytest.skip(f"found the compiler {compiler()}, the stored counts are of {stored['compiler']}")
+    assert count(method) == pytest.approx(stored["per_step"][method], rel=WITHIN), (
+        "on purpose: python -m tests.benchmarks.instructions --store WHY"
+    )

@@ -1,0 +1,170 @@
+"""What the compiled classes take and refuse: blocks of state, layouts of PDOs, identifiers, sizes of shared memory."""
+
+from __future__ import annotations
+
+import math
+import struct
+from array import array
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from jtqd.daemon.config import SafetySettings
+from jtqd.daemon.core.intake import Intake, JointTemperature
+from jtqd.daemon.core.joint import JointCycle, Unwrap
+from jtqd.daemon.core.joint_safety import JointSafety
+from jtqd.daemon.core.record import RecordRing
+from jtqd.daemon.core.schedule import Grid, NetworkBudget, WakeUp
+from jtqd.daemon.core.status import JointRules, JointStatus
+from jtqd.daemon.loop.input_pdos import InputPdo
+from jtqd.daemon.shared import cycle_record as cr
+from jtqd.daemon.shared.ring import Ring
+from jtqd.daemon.shared.snapshot import COUNTERS
+from jtqd.estimator.status import INVALID
+from tests.daemon.loop.cycle_helpers import I32, SENSOR, ExactTime, frame, inputs, make, turn
+
+PDO = InputPdo(0x181, 8, I32, 1, "181h")
+
+
+def one(can_id: int, layout: str) -> InputPdo:
+    form = struct.Struct(layout)
+    return InputPdo(can_id, form.size, form, 1, f"{can_id:03X}h")
+
+
+@pytest.mark.parametrize(
+    ("layout", "values"),
+    [
+        ("<ii", (-(2**31), 2**31 - 1)),
+        ("<ihH", (-5, -(2**15), 2**16 - 1)),
+        ("<iB", (7, 255)),
+        ("<q", (-(2**63),)),
+        ("<bBhHI", (-1, 200, -300, 60_000, 0)),
+        ("<I", (2**32 - 1,)),
+    ],
+)
+def test_integers_of_every_width_and_sign(layout: str, values: tuple[int, ...]) -> None:
+    form = struct.Struct(layout)
+    if form.size > 8:
+        form, values = struct.Struct("<bBhH"), values[:4]
+    intake = Intake([one(0x181, form.format)])
+    intake.begin(1)
+    data = form.pack(*values)
+    intake.take(bytearray(struct.pack("<IB3x8s", 0x181, form.size, data)), [5], [False], 1)
+    assert intake.values(0) == values == intake.views()[0].unpack(data)
+
+
+@pytest.mark.parametrize("layout", ["<Q", "<f", "<d", "<4s", "<bbbbbbbbb"])
+def test_a_layout_that_cannot_be_decoded_is_refused(layout: str) -> None:
+    with pytest.raises(ValueError, match="cannot decode the layout"):
+        Intake([one(0x181, layout)])
+
+
+def test_more_inputs_than_there_is_room_for_are_refused() -> None:
+    Intake([one(0x181 + n, "<i") for n in range(16)])
+    with pytest.raises(ValueError, match="found 17 inputs, expected at most 16"):
+        Intake([one(0x181 + n, "<i") for n in range(17)])
+    with pytest.raises(ValueError, match="has more than 11 bits"):
+        Intake([one(0x18000, "<i")])
+    with pytest.raises(ValueError, match="200 is no node-ID"):
+        Intake([PDO], [JointTemperature(0x381, 200, "x", 5)])
+    with pytest.raises(ValueError, match="128 is no node-ID"):
+        Intake([PDO]).configured(128)
+
+
+def test_a_joint_refuses_a_pdo_with_other_objects(tmp_path: Path) -> None:
+    cycle, _, _ = make(tmp_path, lambda n: inputs())
+    given = cycle.joints[0].inputs
+    intake = Intake([one(0x181, "<i"), *cycle.intake.pdos[1:]])
+    with pytest.raises(ValueError, match="found 1 objects, expected 2"):
+        JointCycle(0, given, cycle.joints[0].estimator, intake=intake, snapshot=cycle.snapshot, period_ns=1)
+
+
+def test_counters_of_another_length_are_refused() -> None:
+    class Tally:
+        counters, errors = array("Q", [0] * (len(COUNTERS) - 1)), array("d", [0.0] * 4)
+
+    with pytest.raises(ValueError, match="not the counters and errors of a snapshot"):
+        JointRules(0, Tally(), JointSafety(), False)
+
+
+def test_a_ring_of_other_records_is_refused(tmp_path: Path) -> None:
+    RecordRing(Ring(tmp_path / "ring", 8, cr.RECORD_SIZE))
+    with pytest.raises(ValueError, match="found a ring of 512 bytes for 8 cycles"):
+        RecordRing(Ring(tmp_path / "other", 8, 64))
+
+
+def parts() -> list[Any]:
+    intake = Intake([PDO], [JointTemperature(0x381, 1, "381h", 5)])
+    return [
+        intake,
+        intake.states[0],
+        intake.temperatures[0],
+        intake.nodes,
+        intake.gaps,
+        Unwrap(3 << 32),
+        JointStatus(SafetySettings()),
+        Grid(5, 7),
+        WakeUp(1, 2),
+        NetworkBudget(),
+    ]
+
+
+@pytest.mark.parametrize("number", range(len(parts())), ids=[type(each).__name__ for each in parts()])
+def test_a_block_goes_back_as_it_came_and_another_one_is_refused(number: int) -> None:
+    first, second = parts()[number], parts()[number]
+    block = bytes(n % 251 for n in range(len(first.state)))
+    before = first.state
+    second.state = before
+    assert second.state == before
+    first.state = block
+    assert first.state == block
+    with pytest.raises(ValueError, match=f"found a block of {len(block) - 1} bytes, expected {len(block)}"):
+        first.state = block[1:]
+
+
+def test_all_that_a_cycle_knows_goes_over_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every class under a cycle says what is carried, and a copy of it all goes on alike."""
+    ExactTime().install(monkeypatch)
+    cycle, _, _ = make(tmp_path, lambda n: inputs() if n % 7 else inputs()[1:])
+    turn(cycle, 50)
+    for thing in (
+        cycle,
+        cycle.intake,
+        *cycle.joints,
+        cycle.grid,
+        cycle.budget,
+        cycle.wake_up,
+        cycle.counters,
+    ):
+        for name in thing.carried:
+            assert hasattr(thing, name), f"{type(thing).__name__}.{name}"
+        assert isinstance(thing.state, bytes)
+
+
+def test_an_estimator_that_raises_is_invalid_and_the_loop_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Broken:
+        with_network = False
+
+        def step(self, *_: float) -> Any:
+            raise ZeroDivisionError
+
+    seen: list[Any] = []
+    monkeypatch.setattr("sys.unraisablehook", seen.append)
+    cycle, _, reader = make(tmp_path, lambda n: inputs())
+    turn(cycle, 30)
+    cycle.joints[0].estimator = Broken()  # type: ignore[assignment]
+    turn(cycle, 5)
+    assert [joint.status for joint in cycle.joints] == [INVALID, 2]
+    assert len(seen) == 5
+    joint = cr.joint_of(reader.read(limit=64).records[-1], 1)
+    assert math.isnan(joint.torque_nm)
+
+
+def test_a_sensor_state_beyond_its_field_is_no_reference(tmp_path: Path) -> None:
+    cycle, _, reader = make(tmp_path, lambda n: [*inputs()[:4], frame(0x183, SENSOR.pack(5, 255))])
+    turn(cycle, 3)
+    joint = cr.joint_of(reader.read().records[-1], 1)
+    assert (math.isnan(joint.sensor_torque_nm), joint.sensor_status) == (True, 255)
