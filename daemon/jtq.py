@@ -14,18 +14,18 @@ from jtqd import __version__
 
 GROUPS = {
     "run: the bus, the daemon and this machine": {
-        "sim": ("jtqd.sim_can.command", "emulate the bench on a bus, or play a measured run on it"),
-        "status": ("jtqd.daemon.cli.status", "show how a running jtqd is doing, live"),
+        "sim": ("jtqd.sim_can.command", "emulate the bench on a bus, or play a measured run"),
+        "status": ("jtqd.daemon.cli.status", "show the state of a running jtqd, live"),
         "control": ("jtqd.daemon.cli.control", "send an order to a running jtqd: ping, reload, reset, save"),
-        "check": ("jtqd.daemon.cli.check", "measure a bus and the timing of this machine, and judge them"),
+        "check": ("jtqd.daemon.cli.check", "measure and rate a bus and the timing of this machine"),
         "doctor": (
             "jtqd.daemon.cli.doctor",
             "examine kernel, rights, CAN interface and files of this machine",
         ),
         "bus-load": ("jtqd.daemon.cli.bus_load", "compute the worst-case bus load of a configuration"),
     },
-    "look: pictures of the estimate": {
-        "plot": ("jtqd.sysid.plot", "draw the estimate of a log beside the torque sensor"),
+    "look: figures and layouts": {
+        "plot": ("jtqd.sysid.plot", "draw the estimate of a log and the torque sensor"),
         "layout": ("jtqd.daemon.live.layout", "write a layout file for Foxglove and Lichtblick"),
     },
     "log: recorded cycles": {
@@ -35,9 +35,9 @@ GROUPS = {
         ),
         "recover": (
             "jtqd.daemon.logs.recover_command",
-            "repair logs that a crash has left, or that are damaged",
+            "repair unfinished or damaged logs",
         ),
-        "replay": ("jtqd.daemon.replay.command", "run the estimator over a log again, and compare"),
+        "replay": ("jtqd.daemon.replay.command", "run the estimator again over a log, and compare"),
         "batch": ("jtqd.sysid.batch.command", "diagnose or replay many logs, here or on a dask cluster"),
     },
     "identify: parameters and networks from measured runs": {
@@ -50,16 +50,16 @@ GROUPS = {
         "train": ("jtqd.sysid.train.command", "train a network per joint on runs (extra: train)"),
         "evaluate": (
             "jtqd.sysid.evaluate.command",
-            "score all methods against the torque sensor on other runs",
+            "score all methods against the torque sensor on held-out runs",
         ),
         "diagnose": (
             "jtqd.sysid.diagnosis.command",
-            "find what the simulation gets wrong on runs, and extend the joint file",
+            "find the cause of the simulation error on runs, and extend the joint file",
         ),
-        "reproduce": ("jtqd.sysid.reproduce", "repeat campaigns, fits, training and evaluation from nothing"),
+        "reproduce": ("jtqd.sysid.reproduce", "repeat all campaigns, fits, training and evaluation"),
         "measured": (
             "jtqd.sysid.measured.command",
-            "score the observer on the measured Kinova runs that ship",
+            "score the observer on the shipped measured runs of a Kinova arm",
         ),
     },
     "shell: this terminal": {
@@ -81,7 +81,7 @@ def _help() -> str:
         f"usage: jtq COMMAND ...\n       jtq --version\n\nToolbox around jtqd.\n\n{groups}\n"
         "examples:\n"
         "  jtq sim --bus vcan0               emulated bench on a CAN interface\n"
-        "  jtq status                        how the daemon on this machine is doing\n"
+        "  jtq status                        state of the daemon on this machine\n"
         "  jtq COMMAND --help                options and examples of a command\n"
     )
 

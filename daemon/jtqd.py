@@ -42,7 +42,7 @@ def parser() -> argparse.ArgumentParser:
         "--bus", required=True, help="SocketCAN interface, unix:PATH, or sim for the emulated bench"
     )
     result.add_argument(
-        "--config", type=Path, metavar="FILE", help="configuration (default: the bench that ships)"
+        "--config", type=Path, metavar="FILE", help="configuration (default: the shipped bench)"
     )
     result.add_argument(
         "--record",

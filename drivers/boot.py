@@ -127,7 +127,7 @@ def _configure(
     heartbeats.forget(node)  # a boot-up message up to its first answer is its own start
     booted = procedure.run(device_type)
     if was_operational and request.check_foreign_sync:
-        note = "it was already operational (status L): stopped, and configured anew"
+        note = "it was already operational (status L): stopped and configured again"
         return replace(booted, notes=(note, *booted.notes))
     return booted
 

@@ -172,7 +172,7 @@ class NodeBoot:
             and profile.temperature
             and self._objects.read(TEMPERATURE) is None
         ):
-            expected = "a value (the configuration asks for it)"
+            expected = "a value (required by the configuration)"
             what = "joint temperature"
             raise mismatch(
                 self._node, TEMPERATURE, what, expected=expected, found="no such object", letter="J"
@@ -251,7 +251,7 @@ class NodeBoot:
             option = self._objects.read(_ABORT_OPTION)
             if option is not None and not any(option):
                 self._notes.append(
-                    "6007h abort connection option is 0: it does not stop when jtqd's heartbeat ends"
+                    "6007h abort connection option is 0: the drive does not stop when jtqd's heartbeat ends"
                 )
 
     def sign(self, sha256: str) -> bool:
@@ -281,7 +281,7 @@ class NodeBoot:
 
 def reset_during_boot(node: int) -> BootError:
     """Return the error for a boot-up message after the configuration: the mapping is the default one again."""
-    detail = "it restarted during boot (boot-up message): its configuration is lost"
+    detail = "the node restarted during boot (boot-up message): its configuration is lost"
     return BootError(node, "1000h:0", expected="no restart", found="boot-up message", detail=detail)
 
 

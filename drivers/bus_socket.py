@@ -47,7 +47,7 @@ def from_errno(number: int, bus: str) -> BusError:
     if number == errno.ENETDOWN:
         return BusDown(f"{bus}: the interface is down")
     if number in _GONE:
-        return BusGone(f"{bus}: the bus has gone ({os.strerror(number)})")
+        return BusGone(f"{bus}: bus lost ({os.strerror(number)})")
     return BusError(f"{bus}: {os.strerror(number)} (errno {number})")
 
 

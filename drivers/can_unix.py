@@ -43,7 +43,7 @@ class UnixBus(can.BusABC):  # type: ignore[misc]
         **kwargs: Any,
     ) -> None:
         if kwargs.pop("fd", False):
-            raise can.CanInitializationError("a unix bus carries no CAN FD")
+            raise can.CanInitializationError("a unix bus does not support CAN FD")
         path = str(channel).removeprefix(PREFIX)
         try:
             self._frames = open_frame_socket(
@@ -138,7 +138,7 @@ def _filters(filters: Sequence[Mapping[str, Any]] | None) -> list[CanFilter] | N
 def _pack(msg: can.Message) -> bytes:
     """Return the 16 bytes of `msg`. Raises ValueError for what a classic CAN frame cannot hold."""
     if msg.is_fd:
-        raise ValueError("a unix bus carries no CAN FD")
+        raise ValueError("a unix bus does not support CAN FD")
     limit = CAN_EFF_MASK if msg.is_extended_id or msg.is_error_frame else CAN_SFF_MASK
     if not 0 <= msg.arbitration_id <= limit:
         raise ValueError(f"arbitration_id {msg.arbitration_id:#x} is above {limit:#x}")

@@ -48,7 +48,7 @@ def listen(path: str, backlog: int) -> socket.socket:
     except OSError as error:
         sock.close()
         require_directory(path)
-        raise BusError(f"{bus}: cannot make the bus: {error.strerror or error}") from None
+        raise BusError(f"{bus}: cannot create the bus: {error.strerror or error}") from None
     finally:
         os.umask(umask)
     return sock
@@ -57,7 +57,7 @@ def listen(path: str, backlog: int) -> socket.socket:
 def _remove_dead(path: str, address: str) -> None:
     """Remove the socket file of a hub that no longer listens. Raises BusError for anything else."""
     if not stat.S_ISSOCK(os.lstat(path).st_mode):
-        raise BusError(f"{PREFIX}{path}: a file that is no socket is there")
+        raise BusError(f"{PREFIX}{path}: a file exists there that is no socket")
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
         probe.setblocking(False)
         try:
@@ -115,7 +115,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("bus", help="unix:PATH")
     parser.add_argument(
-        "--bitrate", type=int, help="model the wire at this many bit/s; default: pass at once"
+        "--bitrate", type=int, help="model a wire with this bit rate [bit/s] (default: pass frames at once)"
     )
     options = parser.parse_args(arguments)
     if not options.bus.startswith(PREFIX) or options.bus == PREFIX:

@@ -210,7 +210,7 @@ class ObjectStore:
             return value
         if entry.layout is None:
             raise ValueError(
-                f"{label(entry.index, entry.subindex)} {entry.name}: hook gave a number for a string"
+                f"{label(entry.index, entry.subindex)} {entry.name}: hook returned a number for a string"
             )
         return entry.layout.pack(value)
 
@@ -231,7 +231,7 @@ def read_eds(eds: Path | str, node_id: int) -> list[Entry]:
         return [_entry(variable) for variable in _variables(import_od(str(eds), node_id))]
     except Exception as error:  # the parser has no exception class of its own
         reason = " ".join(str(error).split())[:200]
-        raise EdsError(f"{eds}: not an EDS that can be read: {type(error).__name__}: {reason}") from None
+        raise EdsError(f"{eds}: not a readable EDS: {type(error).__name__}: {reason}") from None
 
 
 _JSON_FIELDS = ("index", "subindex", "name", "data_type", "access", "mappable", "low", "high")

@@ -47,7 +47,7 @@ class MappedObject:
             raise PdoError(f"{self.label}: no such object can be mapped")
         if self.bits not in _SIGNED_LETTERS:
             raise PdoError(
-                f"{self.label}: {self.bits} bits mapped, only whole objects of 8, 16, 32 or 64 bits are"
+                f"{self.label}: {self.bits} bits mapped, expected whole objects of 8, 16, 32 or 64 bits"
             )
 
     @property

@@ -287,15 +287,15 @@ def check_output(path: Path) -> None:
 
 
 def make_directory(path: Path) -> None:
-    """Make the directory of `--out`, and look whether files can be made in it. Raises ConfigError."""
+    """Make the directory of `--out`, and look whether files can be created in it. Raises ConfigError."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         reason = "it is a file" if isinstance(error, FileExistsError) else error.strerror
-        raise ConfigError(f"--out {path}: cannot be made: {reason}") from None
+        raise ConfigError(f"--out {path}: cannot be created: {reason}") from None
     if not os.access(path, os.W_OK | os.X_OK):
         raise ConfigError(
-            f"--out {path}: files cannot be made there: no right to, or a read-only file system"
+            f"--out {path}: files cannot be created there: no right to, or a read-only file system"
         )
 
 

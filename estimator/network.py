@@ -64,7 +64,7 @@ def checked_network(
         )
     if settings.method == "efficiency" and joint.efficiency is None:
         raise ConfigError(
-            f"joint {joint.name}: found no efficiency, which method 'efficiency' needs; 'tob' works without"
+            f"joint {joint.name}: found no efficiency, which method 'efficiency' needs; 'tob' does not need it"
         )
     if settings.method != "network":
         return None
@@ -89,7 +89,7 @@ def checked_fused(joint: Joint, settings: EstimatorSettings, network: FusedNetwo
     if joint.fused is None:
         raise ConfigError(
             f"joint {joint.name}: found no section 'fused', which method 'fused' needs; "
-            "'jtq fit losses' makes one, methods 'tob' and 'efficiency' work without"
+            "'jtq fit losses' makes one, methods 'tob' and 'efficiency' do not need it"
         )
     if network is not None and network.joint != joint.name:
         raise ConfigError(

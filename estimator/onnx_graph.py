@@ -212,7 +212,7 @@ class OnnxGraph:
         except Exception as error:  # as in _open
             raise self.error(f"does not run: {str(error).strip().splitlines()[0][:160]}") from None
         if not math.isfinite(values[-1]):
-            raise self.error(f"found {values[-1]} in the middle of its envelope, expected a finite torque")
+            raise self.error(f"found {values[-1]} at the centre of its envelope, expected a finite torque")
 
 
 def finite(value: object) -> bool:

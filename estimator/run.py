@@ -145,7 +145,7 @@ class RunTable:
         for name in ("current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad"):
             column = getattr(columns, name)
             if column is None:
-                raise RunTableError(f"j{number}.{name}: missing, and nothing it could be derived from")
+                raise RunTableError(f"j{number}.{name}: missing, and no column to derive it from")
             inputs.append(column)
         return tuple(inputs)
 

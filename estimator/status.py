@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 OFF: Final = 0
 STARTING: Final = 1
 VALID: Final = 2
-# the network is not alone in charge: outside its envelope, far from physics, or no time for it
+# the network is not fully used: outside its envelope, far from physics, or no time for it
 DEGRADED: Final = 3
 STALE: Final = 4  # an input of this cycle is missing (set by the loop, never by the estimator)
 DRIVE_FAULT: Final = 5  # set by the loop, never by the estimator

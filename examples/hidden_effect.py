@@ -321,12 +321,12 @@ def _reduction(before: float, after: float) -> str:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m examples.hidden_effect",
-        description="Hide an effect in the emulated bench, find it from a campaign, and measure what jtqd gains by it.",
+        description="Hide an effect in the emulated bench, diagnose it from a campaign, and measure the gain in jtqd.",
         epilog="example: python -m examples.hidden_effect --effect torque_ripple --out hidden",
     )
     add = parser.add_argument
-    add("--effect", choices=NAMES, required=True, help="what is hidden in joint 1")
-    add("--out", type=Path, required=True, metavar="DIR", help="everything goes there; made if missing")
+    add("--effect", choices=NAMES, required=True, help="effect hidden in joint 1")
+    add("--out", type=Path, required=True, metavar="DIR", help="output directory; created if missing")
     add("--bus", default="sim", help=f"sim, sim:BUS, or {NO_BUS}: the bench without a bus (default sim)")
     add("--method", choices=_METHODS, default=_METHODS[0], help="of jtqd (default efficiency)")
     add("--runs", type=count, default=6, metavar="N", help="runs to diagnose (default 6)")

@@ -91,7 +91,7 @@ def table_lines(results: Sequence[Diagnosed]) -> list[str]:
     """Return the results as the rows of a Markdown table."""
     lines = [
         "| joint | verdict | gap: RMSE, noise floor [Nm] | causes (and effects indistinguishable from them) | "
-        "RMSE on runs left out before, after [Nm] |",
+        "RMSE on held-out runs before, after [Nm] |",
         "|---|---|---|---|---|",
     ]
     for one in results:
@@ -101,7 +101,7 @@ def table_lines(results: Sequence[Diagnosed]) -> list[str]:
 
 
 def run_lines(results: Sequence[Diagnosed]) -> list[str]:
-    """Return the error on each run left out, with and without the causes, as rows of a Markdown table."""
+    """Return the error on each held-out run, with and without the causes, as rows of a Markdown table."""
     lines = ["| joint | left out | joint file [Nm rms] | with the causes |", "|---|---|---|---|"]
     for one in results:
         lines += [
@@ -181,7 +181,9 @@ def main(arguments: list[str] | None = None) -> int:
         epilog=f"example:\n  python -m examples.{BY} --out kinova_diagnosis",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where reports and figures go")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="directory of reports and figures"
+    )
     parser.add_argument("--json", action="store_true", help="print the findings of all joints as JSON")
     options = parser.parse_args(arguments)
     try:

@@ -136,5 +136,5 @@ def shipped(name: str) -> Path:
     path = (_SHIPPED / name).resolve()
     if not path.is_relative_to(_SHIPPED) or not path.is_file():
         known = sorted(p.name for p in _SHIPPED.iterdir() if p.suffix in {".yaml", ".onnx"})
-        raise ConfigError(f"{name}: does not ship with jtqd, which has: {', '.join(known)}")
+        raise ConfigError(f"{name}: is not shipped with jtqd; shipped files: {', '.join(known)}")
     return path

@@ -67,7 +67,7 @@ class _EmbeddedHub:
         """Keep the hub for its other members, as a wire stays when a node goes silent."""
         self._port.detach()
         if self._hub.clients:
-            _log("the nodes are silent; the bus closes when its last client has disconnected")
+            _log("the nodes have stopped; the bus closes when its last client disconnects")
         while self._hub.clients and (end_ns is None or time.monotonic_ns() < end_ns):
             self._hub.run_once(_LONGEST_WAIT_S if end_ns is None else _LINGER_STEP_S)
 
@@ -125,7 +125,7 @@ class _Socket:
     def _log_down(self) -> None:
         if not self._down:
             self._down = True
-            _log("the interface is down, waiting until it is up")
+            _log("the interface is down, waiting for it")
 
 
 def _open(bus: str, bitrate: int | None, bench: Bench) -> _Bus:
@@ -140,7 +140,7 @@ def _open(bus: str, bitrate: int | None, bench: Bench) -> _Bus:
             raise
         return _EmbeddedHub(path, bitrate, bench)
     if bitrate is not None:
-        _log(f"{bus} has a hub already, --bitrate is ignored")
+        _log(f"{bus} already has a hub, --bitrate is ignored")
     return joined
 
 
@@ -191,5 +191,5 @@ def _loop(line: _Bus, bench: Bench, end_ns: int | None) -> None:
             due_ns = bench.due_ns
         wake_ns = due_ns if end_ns is None else min(due_ns, end_ns)
         line.serve(min(max(wake_ns - now_ns, 0) * 1e-9, _LONGEST_WAIT_S))
-    _log("the run is over")
+    _log("the run has ended")
     line.linger(end_ns)

@@ -23,7 +23,7 @@ PLANT = "campaign_plant.yaml"
 
 EXAMPLES = """examples:
   jtq sim --bus vcan0                              two joints and a sensor on SocketCAN
-  jtq sim --bus unix:/tmp/bench --bitrate 1000000  the same on a unix bus with the wire modelled
+  jtq sim --bus unix:/tmp/bench --bitrate 1000000  the same on a unix bus with a modelled wire
   jtq sim --bus vcan0 --play models/kinova_gen3/RunTrajectory1.csv.gz --joints 2,4
   jtq sim --cost                                   CPU time of one cycle on this machine
 """
@@ -60,7 +60,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         "--profile",
         choices=PROFILES,
-        help="motion while no master commands (default: the plant file's)",
+        help="motion until a master commands the drives (default: that of the plant file)",
     )
     made.add_argument("--play", type=Path, metavar="RUN", help="play a measured run instead of the plant")
     made.add_argument(
@@ -76,7 +76,7 @@ def parser() -> argparse.ArgumentParser:
         "--bitrate",
         type=count,
         metavar="B",
-        help="bit rate of the wire that the bench's own hub models, bit/s",
+        help="bit rate of the wire modelled by the bench's hub [bit/s]",
     )
     made.add_argument("--duration", type=seconds, metavar="S", help="end after S seconds")
     made.add_argument("--cost", action="store_true", help="print the CPU time of one cycle and exit")
@@ -114,9 +114,9 @@ def _usage(options: argparse.Namespace) -> str:
         return "--bus is missing, for example --bus vcan0 or --bus unix:/tmp/bench"
     if options.play is None:
         if options.columns is not None or options.joints is not None:
-            return "--columns and --joints belong to --play RUN"
+            return "--columns and --joints require --play RUN"
     elif options.plant is not None or options.profile is not None:
-        return "--plant and --profile belong to the emulated plant, not to --play RUN"
+        return "--plant and --profile cannot be used with --play RUN"
     return ""
 
 

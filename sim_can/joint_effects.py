@@ -131,7 +131,7 @@ class JointEffects:
             if not math.isfinite(value):
                 raise ConfigError(
                     f"joint {self.joint.name}: effect {name}: {call.__name__} is {value!r}, expected a finite number: "
-                    f"its parameters, or it needs what the plant's inner loop does not know"
+                    f"its parameters, or it needs a quantity that the plant's inner loop does not have"
                 )
 
     def bend_rad(self, motor_rad: float, link_rad: float = 0.0) -> float:

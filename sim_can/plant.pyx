@@ -200,9 +200,7 @@ cdef class Plant:
 
     def __init__(self, parameters):
         if parameters.has_effects and type(self) is Plant:
-            raise ValueError(
-                "found joints with effects, expected none: EffectPlant has the equations for these"
-            )
+            raise ValueError("found joints with effects, expected none: use EffectPlant")
         self.parameters = parameters
         one, two = parameters.joints
         table = loss_table(one)

@@ -22,13 +22,13 @@ def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq plot`."""
     parser = argparse.ArgumentParser(
         prog="jtq plot",
-        description="Draw the estimate of one joint beside the torque sensor from a log of jtqd.",
+        description="Draw the estimate of one joint and the torque sensor from a log of jtqd.",
         epilog="example: jtq plot logs/jtqd-sim-20261121T080000Z.mcap --joint 1 --out joint1.png",
     )
     parser.add_argument("log", type=Path, help="MCAP file of jtqd")
     parser.add_argument("--joint", type=int, choices=(1, 2), default=1)
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="FILE", help="picture to write (png, svg, pdf)"
+        "--out", type=Path, required=True, metavar="FILE", help="figure to write (png, svg, pdf)"
     )
     parser.add_argument("--json", action="store_true", help="print the path and the RMSE as JSON")
     return parser
@@ -85,7 +85,7 @@ def draw(log: Records, joint: int, path: Path) -> float:
     below.plot(time_s, error, color="#b4431f", linewidth=0.6)
     below.axhline(0.0, color="#222222", linewidth=0.6)
     rmse = float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else float("nan")
-    above.set_title(f"joint {joint}: estimate and sensor, RMSE {rmse:.2f} Nm where it moves", fontsize=10)
+    above.set_title(f"joint {joint}: estimate and sensor, RMSE {rmse:.2f} Nm in motion", fontsize=10)
     above.set_ylabel("joint torque [Nm]")
     below.set_ylabel("difference [Nm]")
     below.set_xlabel("time [s]")

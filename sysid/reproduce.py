@@ -32,8 +32,8 @@ _OTHER_DAYS: Final = 7
 TRAINED: Final = "trained"
 """Folder in models/ with what this command has made; beside the configuration in a directory of its own."""
 _EXAMPLES: Final = """examples:
-  jtq reproduce --out reproduction            everything, about 85 minutes of which the bench moves 41
-  jtq reproduce --out /tmp/quick --quick      the same steps in a few minutes; too few runs for good figures"""
+  jtq reproduce --out reproduction            everything, about 85 minutes, of which 41 are motion of the bench
+  jtq reproduce --out /tmp/quick --quick      the same steps in a few minutes, with too few runs for good figures"""
 
 
 class Step(NamedTuple):
@@ -94,7 +94,7 @@ def _run(step: Step) -> int:
         if now <= done:
             return status
         done = now
-        print(f"jtq reproduce: {now} runs are done, the campaign goes on", file=sys.stderr, flush=True)
+        print(f"jtq reproduce: runs done: {now}; the campaign continues", file=sys.stderr, flush=True)
 
 
 def _runs_done(campaign: Path) -> int:
@@ -110,12 +110,12 @@ def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq reproduce`."""
     parser = argparse.ArgumentParser(
         prog="jtq reproduce",
-        description="Campaigns, fits, training and evaluation on the emulated bench, over the bus, from nothing.",
+        description="Run all campaigns, fits, training and evaluation on the emulated bench, over the bus.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="everything goes there; made if missing"
+        "--out", type=Path, required=True, metavar="DIR", help="output directory; created if missing"
     )
     parser.add_argument(
         "--bus",
@@ -124,7 +124,7 @@ def parser() -> argparse.ArgumentParser:
         help="sim, or sim:vcan0: the emulated bench on SocketCAN (default sim)",
     )
     parser.add_argument(
-        "--quick", action="store_true", help="small campaigns and short training: a test of the steps"
+        "--quick", action="store_true", help="small campaigns and short training, to test the steps"
     )
     parser.add_argument(
         "--seed", type=natural, default=0, help="of trajectories, days and weights (default 0)"

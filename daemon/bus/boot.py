@@ -21,7 +21,7 @@ _OWN_EDS = Path(__file__).resolve().parents[2] / "drivers" / "eds" / "jtqd.eds"
 
 
 def boot_request(config: Config, bus: str, only: int | None = None) -> dict[str, Any]:
-    """Request to the boot process (`python -m jtqd.drivers.boot`, as JSON) for all nodes, or for `only` one in service."""
+    """Return the request to the boot process (`python -m jtqd.drivers.boot`, as JSON) for all nodes, or for `only` one."""
     nodes: list[dict[str, Any]] = [
         {
             "node": joint.node_id,
@@ -122,11 +122,11 @@ class ReturningNodes:
         self._limit = RateLimit(_SAY_AGAIN_S)
 
     def request(self, node: int, why: str) -> None:
-        """Boot this node again; `why` goes into the line about it."""
+        """Request a boot of this node; `why` goes into the line about it."""
         self._requested[node] = why
 
     def waiting(self, view: View, now_s: float) -> list[int]:
-        """Nodes that need a boot and may be tried now, the one that has waited longest first."""
+        """Return the nodes that need a boot and may be tried now, the longest waiting first."""
         idle = [int(node) for node in self._report["nodes"] if view.node_states[int(node)] in NOT_OPERATIONAL]
         wanted = dict.fromkeys((*view.unconfigured, *idle, *self._requested, *self.absent))
         due = [node for node in wanted if now_s >= self._not_before.get(node, 0.0)]
@@ -135,7 +135,7 @@ class ReturningNodes:
     def watch(
         self, view: View, present: Callable[[int], bool], reader: SnapshotReader, now_s: float
     ) -> dict[str, Any] | None:
-        """Call often. Returns the report of a node that has just been configured: {"node": number, ...}.
+        """Return the report of a node that has just been configured: {"node": number, ...}. Call often.
 
         Args:
             view: last reading of the snapshot.
@@ -153,7 +153,7 @@ class ReturningNodes:
             if view.restarts[node] != self._restarts:
                 self._refuse(
                     node,
-                    f"node {node} restarted while it was being configured: it is configured once more",
+                    f"node {node} restarted during its configuration: configuring again",
                     now_s,
                 )
                 booted = None
@@ -192,18 +192,18 @@ class ReturningNodes:
         why = self._requested.pop(node, None)
         if node in self.absent:
             self.absent.discard(node)
-            self._log("boot", node, f"node {node} has appeared and is configured")
+            self._log("boot", node, f"node {node} appeared and is configured")
         else:
-            text = f"node {node} was away and is configured again"
+            text = f"node {node} returned and is configured again"
             self._log("boot", node, text if why is None else f"node {node} is configured again: {why}")
         for note in booted.get("notes", ()):
             self._log("boot", node, f"node {node}: {note}")
 
     def _accepted(self, node: int, answer: dict[str, Any] | None, now_s: float) -> dict[str, Any] | None:
-        """The node's part of the report, if it may be used."""
+        """Return the node's part of the report, if it may be used."""
         if answer is None or not answer["ok"]:
             reason = (
-                "the boot process ended without an answer" if answer is None else answer["error"]["message"]
+                "the boot process ended without a report" if answer is None else answer["error"]["message"]
             )
             self._refuse(node, f"boot in service: {reason}", now_s)
             return None
@@ -222,7 +222,7 @@ class ReturningNodes:
         return now
 
     def _accepted_first(self, node: int, now: dict[str, Any], now_s: float) -> dict[str, Any] | None:
-        """Of a node that was absent at the start: what else would have been checked then."""
+        """Check a node that was absent at the start as the first boot would have done."""
         wrong = gear_ratio_error(self._config, node, now.get("gear_ratio"))
         if wrong is None:
             return now
@@ -235,7 +235,7 @@ class ReturningNodes:
 
 
 def gear_ratio_error(config: Config, node: int, found: float | None) -> str | None:
-    """Compare the gear ratio that a drive reports (6091h) with the joint file; returns what is wrong, or None."""
+    """Compare the drive's gear ratio (6091h) with the joint file; return the difference as text, or None."""
     for joint in config.joints:
         expected = joint.joint.gear_ratio
         if joint.node_id == node and found and abs(found - expected) > 0.005 * expected:

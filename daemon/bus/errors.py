@@ -55,11 +55,11 @@ class BusState:
         return self.counts["state"]
 
     def values(self) -> tuple[int, ...]:
-        """In the order of `BUS_FIELDS`."""
+        """Return the values in the order of `BUS_FIELDS`."""
         return tuple(self.counts.values())
 
     def error_frame(self, can_id: int, data: bytes) -> BusChange | None:
-        """Take one message of the driver; returns the change of state, if any. A short one is taken as far as it goes."""
+        """Take one message of the driver and return the change of state, if any; a short one is read as far as possible."""
         counts = self.counts
         data = data.ljust(8, b"\0")
         for bit, name in (
@@ -84,11 +84,11 @@ class BusState:
         return None
 
     def down(self) -> BusChange | None:
-        """The interface is down (ENETDOWN)."""
+        """Note that the interface is down (ENETDOWN)."""
         return self._become(DOWN)
 
     def alive(self) -> BusChange | None:
-        """A frame of somebody else has come: the interface is up, and its controller is not bus-off (any more).
+        """Note a received frame: the interface is up, and its controller is not bus-off.
 
         Some drivers report no restart, and an interface that was set up starts error active without a message.
         """
@@ -143,7 +143,7 @@ class EmcyLog:
         """Messages of all nodes."""
 
     def receive(self, node: int, data: bytes, now_s: float) -> str | None:
-        """Take a message; returns the line to be logged, if any."""
+        """Take a message and return the line to be logged, if any."""
         seen = self._nodes.get(node)
         if seen is None:
             return None
@@ -155,19 +155,19 @@ class EmcyLog:
         if refused is None:
             return None
         over = emergency.code == NO_ERROR and not emergency.register
-        what = "EMCY 0000h: no error any more" if over else describe(emergency)
+        what = "EMCY 0000h: error reset" if over else describe(emergency)
         return f"node {node}: {what}" + (f" ({refused} more before)" if refused else "")
 
     def history(self, node: int) -> list[Kept]:
-        """Messages of a node, the oldest first, `DEPTH` at most."""
+        """Return the messages of a node, the oldest first, at most `DEPTH`."""
         return list(self._nodes[node].history)
 
     def count_of(self, node: int) -> int:
-        """How many messages a node has sent."""
+        """Return the number of messages of a node."""
         return self._nodes[node].count
 
     def last(self, node: int) -> Emergency | None:
-        """Its last message; None: none yet."""
+        """Return its last message, or None."""
         history = self._nodes[node].history
         return history[-1].emergency if history else None
 
@@ -210,7 +210,7 @@ class OwnErrors:
         self._not_before = -inf
 
     def follow(self, change: Change) -> None:
-        """Let a condition's error come or go with it; conditions without an EMCY code are passed over."""
+        """Raise or clear the error of a condition; conditions without an EMCY code are ignored."""
         emcy, subject = change.definition.emcy, change.subject
         if emcy is None:
             return
@@ -222,11 +222,11 @@ class OwnErrors:
             self.gone(emcy.code, detail)
 
     def present(self, code: int, detail: int = 0) -> bool:
-        """It has come and not gone."""
+        """Return whether the error is present."""
         return (code, detail) in self._present
 
     def come(self, code: int, detail: int = 0, *, joints: int = 0, register: int = COMMUNICATION) -> bool:
-        """An error; False when it is known already."""
+        """Raise an error; return False if it is already present."""
         error = code, detail
         if error in self._present:
             return False
@@ -242,7 +242,7 @@ class OwnErrors:
         return True
 
     def gone(self, code: int, detail: int = 0) -> bool:
-        """It is over; False when it was not present."""
+        """Clear an error; return False if it was not present."""
         error = code, detail
         if error not in self._present:
             return False
@@ -255,13 +255,13 @@ class OwnErrors:
         return True
 
     def happened(self, code: int, detail: int = 0, *, joints: int = 0, register: int = COMMUNICATION) -> None:
-        """Something that does not last, as a recovery from bus-off: an error message and an entry in the history."""
+        """Report a single occurrence, such as a recovery from bus-off: an EMCY message and a history entry."""
         if self.come(code, detail, joints=joints, register=register):
             del self._present[code, detail]
             self._store.set_number(0x1001, 0, self.register)
 
     def tick(self, now_s: float) -> bytes | None:
-        """The message that is due: 8 bytes for COB-ID 080h + node-ID. It counts as sent."""
+        """Return the EMCY message that is due (8 bytes for COB-ID 080h + node-ID) and count it as sent."""
         if not self._queue or now_s < self._not_before:
             return None
         error, joints = next(iter(self._queue.items()))
@@ -276,12 +276,12 @@ class OwnErrors:
         return EMCY.pack(code, self.register | GENERIC, _FIELD.pack(0, detail & 0xFFFF, joints))
 
     def all_present(self) -> list[Error]:
-        """Every error that has come and not gone, in order."""
+        """Return every present error, in order."""
         return list(self._present)
 
     @property
     def register(self) -> int:
-        """1001h."""
+        """Return the error register 1001h."""
         register = 0
         for bits, _ in self._present.values():
             register |= bits

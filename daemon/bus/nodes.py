@@ -32,7 +32,7 @@ _OTHERS = 16
 
 
 class NodeEvent(NamedTuple):
-    """Something that has happened to a node.
+    """One event of a node.
 
     `kind`: lost, never, back, doubled and single begin and end conditions, with details in `text`; restarted, state,
     malformed and foreign are events with a whole line, or "" where there were too many of late. `since_s`: when.
@@ -85,7 +85,7 @@ class NodeWatch:
         self.lost_count = self.malformed = 0
 
     def watch(self, node: int, now_s: float) -> None:
-        """The node has been configured and started."""
+        """Start monitoring a node that has been configured and started."""
         watch = self._watches[node]
         if watch.state == NOT_WATCHED:
             watch.state = WAITING
@@ -93,28 +93,26 @@ class NodeWatch:
         watch.window.clear()
 
     def state(self, node: int) -> int:
-        """NOT_WATCHED, WAITING, ACTIVE or LOST."""
+        """Return NOT_WATCHED, WAITING, ACTIVE or LOST."""
         return self._watches[node].state
 
     def states(self) -> dict[int, int]:
-        """The same of all nodes."""
+        """Return the state of all nodes."""
         return {node: watch.state for node, watch in self._watches.items()}
 
     def heard_within(self, node: int, span_s: float, now_s: float) -> bool:
-        """A heartbeat or boot-up message came in the last `span_s` seconds."""
+        """Return whether a heartbeat or boot-up message was received in the last `span_s` seconds."""
         return now_s - self._watches[node].heard_s <= span_s
 
     def receive(self, node: int, data: bytes, now_s: float) -> list[NodeEvent]:
-        """A frame 700h + node; what it changes."""
+        """Take a frame 700h + node and return its events."""
         watch = self._watches.get(node)
         if watch is None:
             return self._foreign(node, data)
         if len(data) != 1 or data[0] not in STATES:
             self.malformed += 1
             found = f"{len(data)} bytes" if len(data) != 1 else f"state {data[0]:02X}h"
-            return [
-                self._event("malformed", node, watch, now_s, lambda: f"a heartbeat that is none ({found})")
-            ]
+            return [self._event("malformed", node, watch, now_s, lambda: f"invalid heartbeat ({found})")]
         events = []
         watch.heard_s = now_s
         if data[0] == 0:
@@ -135,7 +133,7 @@ class NodeWatch:
         return events
 
     def tick(self, now_s: float) -> list[NodeEvent]:
-        """Call after all frames that have arrived were given: a reader that was late must not miss what was there."""
+        """Return the timeouts. Call it after all received frames were taken, so that a late reader misses none."""
         self._ticked_s = now_s
         events = []
         for node, watch in self._watches.items():
@@ -169,11 +167,11 @@ class NodeWatch:
         return [NodeEvent("doubled" if doubled else "single", node, text, now_s)]
 
     def _foreign(self, node: int, data: bytes) -> list[NodeEvent]:
-        """CiA 302-2, status A: not in the network list. Said once."""
+        """Report a node that is not in the network list (CiA 302-2, status A), once."""
         if node in self._known or len(self._known) > _OTHERS or len(data) != 1:
             return []
         self._known.add(node)
-        line = f"node {node}: it is on the bus and not in the configuration (status A)"
+        line = f"node {node}: on the bus but not in the configuration (status A)"
         return [NodeEvent("foreign", node, line, 0.0)]
 
     @staticmethod
@@ -202,7 +200,7 @@ class Check:
     expected: int | None
 
     def text(self, value: int) -> str:
-        """A value as people know it: bit fields in hexadecimal digits, numbers of the profile in decimal ones."""
+        """Format a value: bit fields as hexadecimal digits, numbers of the profile as decimal digits."""
         return str(value) if self.index >= _PROFILE and self.index != _UNIT else f"0x{value:X}"
 
 
@@ -217,7 +215,7 @@ class ConfigurationMismatch(NamedTuple):
 
 
 def checks_of(node: Mapping[str, Any]) -> list[Check]:
-    """The objects of one node of a boot report that the meaning of its PDOs depends on, and a drive's mode."""
+    """Return the objects of a boot report that define the meaning of a node's PDOs, and a drive's mode."""
     checks = []
     for index, subindex, value in node["watched"]:
         mask = _ALL
@@ -255,13 +253,13 @@ class ConfigurationWatch:
         self._mode: int | None = None
 
     def next(self) -> Check:
-        """The object to be read now; the same until `result` is called."""
+        """Return the object to be read now; it is the same until `result` is called."""
         if self._signature is not None and self._turn % SIGNATURE_EVERY == 0:
             return self._signature
         return self._objects[self._position]
 
     def result(self, value: bytes | None, refusal: int | None = None) -> ConfigurationMismatch | None:
-        """What was read from the object that `next` named; None: as it should be.
+        """Take the value of the object named by `next`; return the mismatch, or None.
 
         Args:
             value: of the object; None where there was none.
@@ -286,7 +284,7 @@ class ConfigurationWatch:
         if check is not self._signature:
             return ConfigurationMismatch(True, f"{CHANGED}({text})")
         self._signature, self._position = None, 0
-        return ConfigurationMismatch(False, f"its configuration was written to by somebody else ({text})")
+        return ConfigurationMismatch(False, f"its configuration was written by another master ({text})")
 
     def _missing(self, check: Check) -> ConfigurationMismatch | None:
         if check.expected is not None:
@@ -347,40 +345,40 @@ class NodeCare:
 
     @property
     def busy(self) -> int:
-        """Node that is being booted; 0: none."""
+        """Return the node that is being booted, or 0."""
         return self._returning.busy
 
     @property
     def absent(self) -> set[int]:
-        """Optional nodes that have not been configured yet."""
+        """Return the optional nodes that have not been configured yet."""
         return self._returning.absent
 
     def is_booting(self, now_s: float) -> bool:
-        """A boot is under way, or has just ended: NMT commands may be its."""
+        """Return whether a boot is running or has just ended, so that NMT commands may belong to it."""
         return bool(self._returning.busy) or now_s < self._boot_ended
 
     def on_reply(self, node: int, data: bytes, now_s: float) -> None:
-        """A frame 580h + node. Whoever it was that asked: the node is there."""
+        """Take a frame 580h + node, which proves that the node is present."""
         self._present_until[node] = now_s + _PRESENT_S
         if node != self._returning.busy:
             self._out += [(node, request) for request in self._queues[node].on_reply(data, now_s)]
 
     def on_foreign_request(self, node: int, now_s: float) -> None:
-        """A frame 600h + node that is not ours."""
+        """Take a frame 600h + node that jtqd did not send."""
         self._others_until[node] = now_s + _OTHERS_S
 
     def configured(self, node: int, report: dict[str, Any], now_s: float) -> None:
-        """The node has been booted, with its part of the boot report."""
+        """Take a node that was booted, with its part of the boot report."""
         self.changed.pop(node, None)
         self._heartbeats.watch(node, now_s)
         self._checks[node] = ConfigurationWatch(report)
 
     def restarted(self, node: int) -> None:
-        """A boot-up message: there is no configuration to check."""
+        """Take a boot-up message: there is no configuration to check."""
         self._checks.pop(node, None)
 
     def turn(self, view: View, now_s: float) -> list[tuple[int, bytes]]:
-        """What is due; returns (node, SDO request) to be sent."""
+        """Return the SDO request that is due, as (node, request)."""
         self._watch_nodes(view, now_s)
         for node, queue in self._queues.items():
             if node != self._returning.busy:
@@ -389,12 +387,12 @@ class NodeCare:
         return out
 
     def state(self, node: int, view: View) -> tuple[int, int, int]:
-        """NMT state, heartbeat (`jtqd.daemon.bus.nodes`) and whether it is configured."""
+        """Return NMT state, heartbeat state (`jtqd.daemon.bus.nodes`) and whether the node is configured."""
         configured = node not in view.unconfigured and node not in self._returning.absent
         return view.node_states[node], self._heartbeats.state(node), int(configured)
 
     def sdo_counts(self, node: int) -> dict[str, int]:
-        """Requests to a node that were repeated, not answered, refused; answers to none of them."""
+        """Return the counts of SDO requests repeated, unanswered and refused, and of unrelated answers."""
         queue = self._queues[node]
         return {
             "repeats": queue.repeats,
@@ -404,7 +402,7 @@ class NodeCare:
         }
 
     def _watch_nodes(self, view: View, now_s: float) -> None:
-        """Boot what needs it, ask whether it is there, and check the configuration of the others."""
+        """Boot nodes that need it, poll their presence, and check the configuration of the others."""
         returning = self._returning
         was_busy = returning.busy
         booted = returning.watch(view, lambda node: self._present(node, now_s), self._reader, now_s)
@@ -433,7 +431,7 @@ class NodeCare:
         return now_s < self._others_until.get(node, 0.0)
 
     def _check_one(self, view: View, now_s: float) -> None:
-        """One object of one node that is operational and left alone."""
+        """Read one object of one operational, idle node."""
         waiting = {*self._returning.waiting(view, now_s), self._returning.busy, *view.unconfigured}
         nodes = [
             node

@@ -56,11 +56,11 @@ class OwnNode:
         self.set_parameters(config)
 
     def answer(self, request: bytes) -> bytes | None:
-        """SDO answer to what came under 600h + node-ID; None: none is due."""
+        """Return the SDO answer to a frame 600h + node-ID, or None."""
         return self._server.handle(request)
 
     def watch(self, cycle: int) -> None:
-        """Cycle number of each reading of the snapshot: values of a loop that stands still are not shown as new."""
+        """Take the cycle number of each reading of the snapshot, so that values of a stalled loop do not look new."""
         if cycle != self._last_cycle:
             self._last_cycle, self._last_change = cycle, time.monotonic()
 
@@ -85,7 +85,7 @@ class OwnNode:
             store.on_read(0x2207, position + 1, partial(self._emergency, node))
 
     def _field(self, joint: int, part: int) -> int:
-        """Torque (0), sigma (1) or status (2) of a joint as on the bus."""
+        """Return torque (0), sigma (1) or status (2) of a joint as on the bus."""
         view = self._reader.read()
         if view.cycle == self._last_cycle and time.monotonic() - self._last_change > _STANDSTILL_S:
             return field(nan, inf, STALE)[part]  # the loop stands still: its last estimate is old
@@ -93,11 +93,11 @@ class OwnNode:
         return field(last.torque_nm, last.sigma_nm, last.status)[part]
 
     def _latched(self, joint: int) -> int:
-        """Bits of `daemon/shared/cycle_record.py`."""
+        """Return the latched bits of `daemon/shared/cycle_record.py`."""
         return self._reader.read().joints[joint].latched
 
     def _reset(self, data: bytes) -> None:
-        """2110h: 1 releases latched faults, as `jtq control reset` does."""
+        """Release latched faults by 2110h = 1, as `jtq control reset` does."""
         if data == b"\x01":
             self._asked = self._reader.ask_reset()
 
@@ -121,7 +121,7 @@ class OwnNode:
         return min(count, 0xFF) << 24 | register << 16 | code
 
     def set_parameters(self, config: Config) -> None:
-        """Show a configuration in the objects that do; called again when another one has come into force."""
+        """Write a configuration to the objects that show it; call it again after a reload."""
         store = self._store
         store.set_text(0x100A, 0, VERSION)
         store.set_number(0x1006, 0, config.period_ns // 1000)

@@ -71,7 +71,7 @@ class BusReport:
 
 
 def content(service: BusService) -> dict[str, Any]:
-    """Content of `bus.json` as plain data."""
+    """Return the content of `bus.json` as plain data."""
     nodes = {}
     for node, state in service.heartbeats.states().items():
         last = service.emergencies.last(node)
@@ -117,14 +117,14 @@ LogEvent = Callable[[str, int, str], None]
 
 
 def service_filters(config: Config) -> list[CanFilter]:
-    """SDO requests to the own node, those of others to the nodes and the answers, EMCY, all heartbeats, NMT commands."""
+    """Return filters for SDO requests to jtqd, SDO traffic of the nodes, EMCY, heartbeats and NMT commands."""
     heartbeats = CanFilter(nmt.HEARTBEAT_BASE, 0x780 | CAN_EFF_FLAG | CAN_RTR_FLAG)
     nodes = [base + node for node in nodes_of(config) for base in (0x080, 0x580, 0x600)]
     return [exact(0x600 + config.node_id), exact(0x000), heartbeats, *(exact(cob_id) for cob_id in nodes)]
 
 
 def nodes_of(config: Config) -> list[int]:
-    """Node-IDs of the configuration: joint 1, joint 2, the sensor."""
+    """Return the node-IDs of the configuration: joint 1, joint 2, the sensor."""
     return [
         *(joint.node_id for joint in config.joints),
         *([config.sensor.node_id] if config.sensor is not None else []),
@@ -190,7 +190,7 @@ class BusService:
         self._first = report
 
     def begin(self, now_s: float) -> None:
-        """The nodes are operational: what was received during the boot is old, all but EMCY and requests to the own node."""
+        """Start the service when the nodes are operational; drop frames of the boot except EMCY and own requests."""
         with suppress(BusDown):
             while count := self.socket.receive():
                 for can_id, data in self._frames(count):
@@ -203,11 +203,11 @@ class BusService:
             for note in node.get("notes", ()):
                 self._log("boot", int(number), f"node {number}: {note}")
         for number, error in self._first.get("absent", {}).items():
-            text = f"{error['message']}: it is optional; jtqd goes on, and configures it when it appears"
+            text = f"{error['message']}: it is optional; jtqd continues, and configures it when it appears"
             self._log("boot", int(number), text)
 
     def turn(self, view: View, now_s: float) -> None:
-        """Take what has arrived and send what is due. Raises BusGone."""
+        """Process received frames and send the due ones. Raises BusGone."""
         self._view = view
         try:
             all_taken = self._receive(now_s)
@@ -238,7 +238,7 @@ class BusService:
     # Frames ---------------------------------------------------------------------------------------------------------------
 
     def _receive(self, now_s: float) -> bool:
-        """False: there is more than one turn takes."""
+        """Process received frames; return False if more are waiting."""
         self._heard = False
         for _ in range(_BATCHES):
             count = self.socket.receive()
@@ -288,7 +288,7 @@ class BusService:
             self._conditions.update("node_error", subject, error, now_s, describe(last))
 
     def _on_nmt(self, data: bytes, now_s: float) -> None:
-        """jtqd is the NMT master; a command that is not of its own boots comes from somebody else."""
+        """Report an NMT command that is not of jtqd's own boots."""
         if self.care.is_booting(now_s):
             return
         self.foreign_nmt += 1

@@ -33,10 +33,8 @@ MISSED_FAIL = 0.01
 ECHO_WARN = 0.3
 """Of the period, p99: at 1 Mbit/s SYNC and a frame that is just being sent take up to 200 us."""
 STOLEN_WARN = 0.001
-_STOLEN_HINT = (
-    "no setting in this machine helps: give it processors of its own, or a machine without a hypervisor"
-)
-_TIMING_HINT = "`jtq doctor` says what real time lacks on this machine"
+_STOLEN_HINT = "no setting on this machine helps: use dedicated processors or a machine without a hypervisor"
+_TIMING_HINT = "`jtq doctor` shows the missing real-time settings of this machine"
 _HEARTBEAT_GAP = 1.5
 _ERROR_CLASSES = {
     0x001: "transmit timeout",
@@ -57,7 +55,7 @@ _BUS_OFF, _NO_ACKNOWLEDGE = 0x040, 0x020
 def check_bus(
     traffic: Traffic, config: Config, *, lost: int, error_frames: bool = True
 ) -> Iterator[CheckResult]:
-    """Judge everything that was heard.
+    """Evaluate everything that was received.
 
     Args:
         traffic: what was counted.
@@ -74,12 +72,16 @@ def check_bus(
         yield _node(node, traffic, config)
     yield _load(traffic, config)
     yield _foreign(traffic)
-    yield _errors(traffic) if error_frames else CheckResult("error frames", SKIP, "a unix bus has none")
+    yield (
+        _errors(traffic)
+        if error_frames
+        else CheckResult("error frames", SKIP, "a unix bus has no error frames")
+    )
     if lost:
         yield CheckResult(
             "this check",
             WARN,
-            f"read too late and lost {counted(lost, 'frame')}: some of what is missing above may be due to that",
+            f"read too late and lost {counted(lost, 'frame')}: this may explain missing frames above",
             "run it on an idle machine, or give it real-time priority",
         )
 
@@ -105,7 +107,7 @@ def _sync(traffic: Traffic, config: Config) -> CheckResult:
             "SYNC",
             FAIL,
             f"{text}; {counted(traffic.counter_jumps, 'jump')} of its counter",
-            "is there a second SYNC producer, or has the one been restarted? (candump can0,080:7FF)",
+            "possibly a second SYNC producer, or a restarted one (candump can0,080:7FF)",
         )
     if too_many < 0:
         level = FAIL if -too_many > (1 - SUCCESS_GOOD) * traffic.slots else WARN
@@ -113,11 +115,11 @@ def _sync(traffic: Traffic, config: Config) -> CheckResult:
             "SYNC",
             level,
             f"{text}; {-too_many} of {traffic.slots} slots without one",
-            "the sender missed slots: see its timing, and `jtq doctor`",
+            "the sender missed slots: check its timing and `jtq doctor`",
         )
     if traffic.sync_jitter.quantile_us(0.99) > JITTER_WARN * period_us:
         return CheckResult(
-            "SYNC", WARN, text, "the sender is woken late: `jtq doctor` says what real time lacks"
+            "SYNC", WARN, text, "the sender wakes up late: `jtq doctor` shows the missing real-time settings"
         )
     return CheckResult("SYNC", GOOD, text)
 
@@ -141,7 +143,7 @@ def _input(pdo: PdoCount, traffic: Traffic, config: Config) -> CheckResult:
     ]
     text = f"{rate:.4g} per SYNC, expected 1; after SYNC: {_quantiles(pdo.delays)}"
     if not pdo.delays.count:
-        hint = "is the node on the bus, and operational? Its TPDO must be bound to SYNC (transmission type 1)"
+        hint = "check that the node is on the bus and operational, and that its TPDO has transmission type 1 (SYNC)"
         length = f", {pdo.wrong_length} of a wrong length" if pdo.wrong_length else ""
         return CheckResult(pdo.name, FAIL, f"none{length}", hint)
     if faults:
@@ -157,15 +159,15 @@ def _input(pdo: PdoCount, traffic: Traffic, config: Config) -> CheckResult:
 
 def _hint(pdo: PdoCount, config: Config) -> str:
     if pdo.wrong_length:
-        return f"its mapping is not the configured one ({pdo.length} bytes): jtqd configures it when it boots the node"
+        return f"its mapping differs from the configuration ({pdo.length} bytes): jtqd configures it when it boots the node"
     if pdo.twice:
-        return "two nodes with one number, or a node that sends by itself: transmission type must be 1"
+        return "two nodes with one node-ID, or an event-driven TPDO: transmission type must be 1"
     if pdo.late > pdo.missing:
         return (
             f"after the deadline of {config.input_deadline_ns / 1000:.0f} us: less load (`jtq bus-load`), or a "
             "higher priority (lower COB-ID)"
         )
-    return "frames are lost: look at error frames, termination and the interface's txqueuelen"
+    return "frames are lost: check error frames, termination and the interface's txqueuelen"
 
 
 def _estimate(traffic: Traffic, config: Config) -> CheckResult:
@@ -179,16 +181,16 @@ def _estimate(traffic: Traffic, config: Config) -> CheckResult:
         others = [(n, code) for code, n in count.items() if code not in PUBLISHED]
         worst = f" ({NAMES.get(max(others)[1], '?')} {max(others)[0]})" if others else ""
         per_joint.append((known, f"joint {number} {share(known)}{worst}"))
-    text = f"{pdo.counted / max(1, traffic.cycles):.4g} per SYNC; with a number: " + ", ".join(
+    text = f"{pdo.counted / max(1, traffic.cycles):.4g} per SYNC; with a torque: " + ", ".join(
         each for _, each in per_joint
     )
     late = pdo.delays.quantile_us(0.99) > config.period_ns / 1000
     if pdo.missing > (1 - SUCCESS_GOOD) * max(1, traffic.cycles) or late:
         return CheckResult(
-            pdo.name, WARN, f"{text}; missing in {pdo.missing} of {traffic.cycles} cycles", "see jtq status"
+            pdo.name, WARN, f"{text}; missing in {pdo.missing} of {traffic.cycles} cycles", "see `jtq status`"
         )
     if min(known for known, _ in per_joint) < SUCCESS_GOOD:
-        return CheckResult(pdo.name, WARN, text, "`jtq status` says why there is no number")
+        return CheckResult(pdo.name, WARN, text, "`jtq status` gives the reason for the missing torque")
     return CheckResult(pdo.name, GOOD, text)
 
 
@@ -196,7 +198,9 @@ def _success(traffic: Traffic) -> CheckResult:
     if not traffic.cycles:
         return CheckResult("success rate", SKIP, "no SYNC, no cycles")
     rate = traffic.complete / traffic.cycles
-    text = f"{rate:.4f}: {traffic.complete} of {traffic.cycles} cycles had every input once and in time"
+    text = (
+        f"{rate:.4f}: {traffic.complete} of {traffic.cycles} cycles had every input exactly once and in time"
+    )
     if rate >= SUCCESS_GOOD:
         return CheckResult("success rate", GOOD, text)
     word = "many cycles" if rate < SUCCESS_MANY else "some cycles"
@@ -204,7 +208,7 @@ def _success(traffic: Traffic) -> CheckResult:
     hint = (
         "not sufficient: do not use the estimate for control"
         if level == FAIL
-        else f"{word} without all inputs: see above which"
+        else f"{word} without all inputs: see above"
     )
     return CheckResult("success rate", level, text, hint)
 
@@ -215,9 +219,9 @@ def _node(node: NodeCount, traffic: Traffic, config: Config) -> CheckResult:
         if node.name == "jtqd":
             return CheckResult(item, SKIP, "no jtqd on the bus")
         if not traffic.syncs:
-            hint = "not there, or not booted: a node has none before jtqd has configured it"
+            hint = "absent or not booted: a node has no heartbeat before jtqd has configured it"
             return CheckResult(item, WARN, "none", hint)
-        return CheckResult(item, FAIL, "none", "is it powered, wired, and at the right bit rate?")
+        return CheckResult(item, FAIL, "none", "check power, wiring and bit rate")
     state = nmt.STATES.get(node.state if node.state is not None else -1, f"state {node.state}")
     text = f"{state}; longest silence {node.longest_gap_ns / 1e6:.0f} ms, expected {config.heartbeat_ms} ms"
     if node.emergencies:
@@ -225,11 +229,11 @@ def _node(node: NodeCount, traffic: Traffic, config: Config) -> CheckResult:
     hint = ""
     if node.boot_ups:
         text += f"; {counted(node.boot_ups, 'restart')}"
-        hint = "supply voltage? watchdog of the drive?"
+        hint = "check the supply voltage and the drive's watchdog"
     elif node.longest_gap_ns > _HEARTBEAT_GAP * config.heartbeat_ms * 1e6:
         hint = "heartbeats are late or lost"
     elif node.state != nmt.OPERATIONAL:
-        hint = "it sends no PDO in this state; jtqd starts it"
+        hint = "it sends no PDO in this state until jtqd starts it"
     elif node.emergencies:
         hint = "1003h of the node has its history"
     return CheckResult(item, WARN if hint else GOOD, text, hint)
@@ -243,10 +247,13 @@ def _load(traffic: Traffic, config: Config) -> CheckResult:
     bounds = f"{share(configured.unstuffed)} to {share(configured.worst)}"
     text = f"{share(seen)} by the bits of every frame; by configuration {bounds}"
     if seen > LIMIT:
-        return CheckResult("bus load", FAIL, text, f"above {LIMIT:.0%} there is no room for a retransmission")
+        return CheckResult("bus load", FAIL, text, f"above {LIMIT:.0%} no time remains for a retransmission")
     if seen > configured.worst * (1 + RATE_TOLERANCE):
         return CheckResult(
-            "bus load", WARN, text, "more is on the bus than the configuration knows: see foreign frames"
+            "bus load",
+            WARN,
+            text,
+            "the bus carries frames that are not in the configuration: see foreign frames",
         )
     return CheckResult("bus load", GOOD, text)
 
@@ -267,10 +274,10 @@ def _foreign(traffic: Traffic) -> CheckResult:
     ]
     if disguised:
         return CheckResult(
-            "foreign frames", FAIL, text, "remote or 29-bit frames under our identifiers: jtqd refuses them"
+            "foreign frames", FAIL, text, "remote or 29-bit frames with jtqd's identifiers: jtqd refuses them"
         )
     return CheckResult(
-        "foreign frames", WARN, text, "not in the configuration, and not in its bus load: who sends them?"
+        "foreign frames", WARN, text, "not in the configuration and not in its bus load: find the sender"
     )
 
 
@@ -289,7 +296,10 @@ def _errors(traffic: Traffic) -> CheckResult:
         )
     if _NO_ACKNOWLEDGE in traffic.errors:
         return CheckResult(
-            "error frames", FAIL, text, "nobody acknowledges: is any other node on the bus and powered?"
+            "error frames",
+            FAIL,
+            text,
+            "no node acknowledges: check that another node is on the bus and powered",
         )
     return CheckResult(
         "error frames", WARN, text, "wiring, termination (60 ohm between the lines), bit rate, sample point"
@@ -299,7 +309,7 @@ def _errors(traffic: Traffic) -> CheckResult:
 def check_own_timing(
     timing: Timing, period_ns: int, refused: Sequence[str], *, driven: bool
 ) -> Iterator[CheckResult]:
-    """Judge this process's own loop; `refused`: real-time settings that the system did not grant."""
+    """Evaluate this process's own loop; `refused`: real-time settings that the system did not grant."""
     granted = (
         "without real-time scheduling" if any("SCHED_FIFO" in line for line in refused) else "SCHED_FIFO"
     )
@@ -324,40 +334,42 @@ def check_own_timing(
         else:
             level = WARN if timing.echo.quantile_us(0.99) > ECHO_WARN * period_ns / 1000 else GOOD
             hint = (
-                "SYNC waits in the transmit queue: who else sends on this machine?" if level == WARN else ""
+                "SYNC waits in the transmit queue: check which other programs send on this machine"
+                if level == WARN
+                else ""
             )
             yield CheckResult("SYNC echo", level, text, hint)
 
 
 def check_conditions(conditions: Sequence[Condition]) -> Iterator[CheckResult]:
-    """Return one result for each condition that the daemon on this bus reports, else one that there is none."""
+    """Return one result per condition of the daemon on this bus, or one that says there is none."""
     for each in conditions:
         level = FAIL if each.severity >= ERROR else WARN
         yield CheckResult(
             each.name.replace("_", " "), level, f"jtqd reports: {each.line}", "see `jtq status`"
         )
     if not conditions:
-        yield CheckResult("conditions", GOOD, "jtqd reports nothing wrong")
+        yield CheckResult("conditions", GOOD, "jtqd reports no condition")
 
 
 def check_loop_timing(
     before: tuple[int, ...], after: tuple[int, ...], first: View, last: View
 ) -> CheckResult:
-    """Judge the running loop by its histogram of SYNC's lateness before and after."""
+    """Evaluate the running loop by its histogram of the lateness of SYNC before and after."""
     times = TimeHistogram()
     for n, (old, new) in enumerate(zip(before, after, strict=True)):
         for _ in range(new - old):
             times.add((n + 1) * LATE_BIN_NS)
     missed = last.counters["missed"] - first.counters["missed"]
     return _check_timing(
-        "jtqd's timing", times, missed, round(last.period_s * 1e9), "SYNC's lateness in the loop"
+        "jtqd's timing", times, missed, round(last.period_s * 1e9), "lateness of SYNC in the loop"
     )
 
 
 def check_stolen_time(stolen_s: float, seconds: float) -> CheckResult:
-    """Judge the processor time that a hypervisor took in `seconds` (`daemon/loop/realtime.py`)."""
+    """Evaluate the processor time that a hypervisor used in `seconds` (`daemon/loop/realtime.py`)."""
     stolen = stolen_s / max(seconds, 1e-3)
-    text = f"{share(stolen)} of a processor taken away by a hypervisor (stolen time)"
+    text = f"{share(stolen)} of a processor used by the hypervisor (stolen time)"
     return (
         CheckResult("processors", WARN, text, _STOLEN_HINT)
         if stolen >= STOLEN_WARN

@@ -13,11 +13,11 @@ from jtqd.drivers.bus_load import LIMIT
 from jtqd.estimator.checked import ConfigError
 
 _EXAMPLES = """examples:
-  jtq bus-load                                  of the bench that ships
-  jtq bus-load --config /etc/jtqd/can0.yaml     before it is run: jtqd refuses one above 95 %
+  jtq bus-load                                  of the shipped bench
+  jtq bus-load --config /etc/jtqd/can0.yaml     before use: jtqd refuses a load above 95 %
   jtq bus-load --json | jq '.rows[] | [.cob_id, .share]'
 
-The load that a bus really has is measured by `jtq check`.
+`jtq check` measures the real load of a bus.
 
 exit status: 0 it fits, 1 it does not or cannot be read, 2 usage"""
 
@@ -26,12 +26,12 @@ def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq bus-load`."""
     result = argparse.ArgumentParser(
         prog="jtq bus-load",
-        description="Compute the worst-case bus load of a configuration: every possible stuff bit, every PDO in its turn.",
+        description="Compute the worst-case bus load of a configuration: all PDOs, with the maximum number of stuff bits.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     result.add_argument(
-        "--config", type=Path, metavar="FILE", help="configuration (default: the bench that ships)"
+        "--config", type=Path, metavar="FILE", help="configuration (default: the shipped bench)"
     )
     result.add_argument("--json", action="store_true", help="print as JSON")
     return result

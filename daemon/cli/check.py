@@ -34,14 +34,14 @@ from jtqd.estimator.checked import ConfigError, seconds
 
 SCHEMA = "jtq.check/1"
 _EXAMPLES = """examples:
-  jtq check --bus can0                   listen for 10 s beside a running jtqd, or to whatever is there
+  jtq check --bus can0                   listen for 10 s, with or without a running jtqd
   jtq check 60 --bus can0 --config /etc/jtqd/can0.yaml
   jtq check --bus vcan0 --drive-sync     without jtqd: boot the nodes as it does, send SYNC, measure the answers
   jtq check 5 --bus sim                  this machine's timing, against the emulated bench
   jtq check --json | jq '.items[] | select(.level != "GOOD")'
 
 Without --drive-sync nothing is sent. With it the nodes are configured and started, and set to pre-operational at the
-end, exactly as by jtqd; no drive is commanded. It is refused where jtqd runs, or anybody else sends SYNC.
+end, as by jtqd; no drive is commanded. It is refused if jtqd runs, or if another node sends SYNC.
 
 exit status: 0 all good, 3 warnings, 1 failures, 2 usage"""
 _CAPACITY = 256
@@ -51,14 +51,14 @@ _BENCH_PRIORITY = 40
 
 
 class CheckError(Exception):
-    """The check cannot be made; the message is one line for the operator."""
+    """The check is not possible; the message is one line for the operator."""
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq check`."""
     result = argparse.ArgumentParser(
         prog="jtq check",
-        description="Measure a bus and the timing of this machine: GOOD, WARN or FAIL for each item, and what to do.",
+        description="Measure a bus and the timing of this machine: GOOD, WARN or FAIL for each item, with a remedy.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -72,7 +72,7 @@ def parser() -> argparse.ArgumentParser:
         "--config",
         type=Path,
         metavar="FILE",
-        help="configuration of the bus (default: that of the running jtqd, else the bench that ships)",
+        help="configuration of the bus (default: that of the running jtqd, else the shipped bench)",
     )
     result.add_argument("--drive-sync", action="store_true", help="boot the nodes and send SYNC")
     result.add_argument("--json", action="store_true", help="print as JSON")
@@ -80,7 +80,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(argv: list[str]) -> int:
-    """Measure and judge; returns the exit status."""
+    """Measure and evaluate; return the exit status."""
     arguments = parser().parse_args(argv)
     try:
         daemon = None if arguments.bus == "sim" else on_bus(find_daemons(), arguments.bus)
@@ -119,7 +119,7 @@ def _open(bus: str, *, receive_own: bool = False) -> FrameSocket:
 
 
 def _listen(bus: str, config: Config, for_s: float, daemon: Daemon | None) -> Iterator[CheckResult]:
-    """Listen only."""
+    """Listen without sending."""
     traffic, socket = Traffic(config), _open(bus)
     reader = _reader(daemon)
     refused = [] if reader else _become_real_time(config)
@@ -139,14 +139,14 @@ def _listen(bus: str, config: Config, for_s: float, daemon: Daemon | None) -> It
 
 
 def _drive(bus: str, config: Config, for_s: float, daemon: Daemon | None) -> Iterator[CheckResult]:
-    """Boot the nodes, send SYNC, and put them back."""
+    """Boot the nodes, send SYNC, and reset the nodes to pre-operational."""
     if daemon is not None:
         raise CheckError(
             f"jtqd runs on {bus} (process {daemon.about.pid}): without --drive-sync this check listens"
         )
     socket = _open(bus, receive_own=True)
     if not silent(socket, _QUIET_S):
-        raise CheckError(f"somebody sends SYNC on {bus}: without --drive-sync this check listens")
+        raise CheckError(f"another node sends SYNC on {bus}: without --drive-sync this check listens")
     _progress(f"booting the nodes on {bus}")
     booted = _boot(bus, config)
     yield booted
@@ -179,7 +179,7 @@ def _reader(daemon: Daemon | None) -> SnapshotReader | None:
 
 
 def _become_real_time(config: Config) -> list[str]:
-    """Run as jtqd's loop does. Returns what was refused."""
+    """Request the real-time settings of jtqd's loop; return the refused ones."""
     wanted = config.realtime
     refused = realtime.prepare(wanted.priority, wanted.cpu, wanted.lock_memory)
     gc.disable()
@@ -195,9 +195,7 @@ def _boot(bus: str, config: Config) -> CheckResult:
     finally:
         child.end()
     if not answer["ok"]:
-        hint = (
-            "identity, mapping or scaling of a node is not what the configuration says, or the node is silent"
-        )
+        hint = "identity, mapping or scaling of a node differs from the configuration, or the node is silent"
         return CheckResult("boot", FAIL, str(answer["error"]["message"]), hint)
     nodes = ", ".join(sorted(answer["nodes"]))
     return CheckResult(
@@ -207,7 +205,7 @@ def _boot(bus: str, config: Config) -> CheckResult:
 
 @contextmanager
 def _bus(name: str, config: Config, daemon: Daemon | None) -> Iterator[str]:
-    """The name under which it can be opened; for "sim" the emulated bench is started for as long as it is used."""
+    """Return the name of the bus; for "sim" start the emulated bench while it is used."""
     if name != "sim":
         yield daemon.about.bus if daemon else name
         return

@@ -27,7 +27,7 @@ NOTHING = "-"
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Judgement of one item. `hint` says what to do, and is empty where nothing is to be done."""
+    """Result of one item. `hint` is the remedy, empty if none is needed."""
 
     item: str
     level: str
@@ -51,13 +51,13 @@ def report(results: Sequence[CheckResult], schema: str | None, **more: Any) -> i
 
 
 def exit_status(results: Iterable[CheckResult]) -> int:
-    """0 nothing to do, 3 warnings, 1 failures."""
+    """Return the exit status: 0 all good, 3 warnings, 1 failures."""
     levels = {each.level for each in results}
     return 1 if FAIL in levels else 3 if WARN in levels else 0
 
 
 def as_json(schema: str, results: Sequence[CheckResult], **more: Any) -> dict[str, Any]:
-    """Plain data: worst level, exit status and every item."""
+    """Return plain data: worst level, exit status and every item."""
     status = exit_status(results)
     return {
         "schema": schema,
@@ -90,17 +90,17 @@ def show(console: Console, results: Sequence[CheckResult]) -> None:
 
 
 def number(value: float, digits: int = 2) -> str:
-    """Fixed digits; "-" where it is not known."""
+    """Format with fixed digits, or "-" if unknown."""
     return f"{value:.{digits}f}" if isfinite(value) else NOTHING
 
 
 def share(value: float) -> str:
-    """0.848 -> "84.8 %"."""
+    """Format a share: 0.848 -> "84.8 %"."""
     return f"{100 * value:.1f} %" if isfinite(value) else NOTHING
 
 
 def size(count: int | None) -> str:
-    """Bytes in decimal units, three digits."""
+    """Format bytes in decimal units with three digits."""
     if count is None:
         return NOTHING
     value = float(count)
@@ -112,7 +112,7 @@ def size(count: int | None) -> str:
 
 
 def duration(seconds: float) -> str:
-    """At most two units: "45 ms", "2.3 s", "12 min 31 s", "3 h 05 min", "2 d 04 h"."""
+    """Format a duration with at most two units: "45 ms", "2.3 s", "12 min 31 s", "3 h 05 min", "2 d 04 h"."""
     if not isfinite(seconds):
         return NOTHING
     if seconds < 0.9995:
@@ -128,7 +128,7 @@ def duration(seconds: float) -> str:
 
 
 def histogram(bins: Sequence[int], bin_us: float, columns: int) -> str:
-    """Bins as a line of at most `columns` blocks between its edges, e.g. "84 ▇█▂▁ 212 us"; "" without data.
+    """Format bins as a line of at most `columns` blocks between its edges, e.g. "84 ▇█▂▁ 212 us"; "" without data.
 
     From the first bin that holds something to the last, which takes everything above it. The height is logarithmic, so that
     one cycle in a million can be seen.

@@ -18,8 +18,8 @@ _EXAMPLES = """examples:
   jtq completion bash jtqd > /etc/bash_completion.d/jtqd          the daemon's own options
   jtq completion zsh > ~/.zfunc/_jtq                              with fpath+=~/.zfunc before compinit
 
-The script completes commands, options, their choices, files and directories. Make it again after an update of jtqd.
-A command whose extra is not installed is completed without its options."""
+The script completes commands, options, their choices, files and directories. Generate it again after an update of jtqd.
+Without its extra, a command is completed without its options."""
 _FILE_WORDS = ("FILE", "RUN", "LOG", "YAML", "PATH")
 _BUSES = "grep -lx 280 /sys/class/net/*/type 2>/dev/null | cut -d/ -f5; echo sim"
 """Shell command that lists the CAN interfaces (ARPHRD_CAN) and the emulated bench."""
@@ -29,7 +29,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq completion`."""
     result = argparse.ArgumentParser(
         prog="jtq completion",
-        description="Print a completion script, made from the options of the installed version's commands.",
+        description="Print a completion script for the commands and options of the installed version.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -79,7 +79,7 @@ def command_parser(commands: Mapping[str, tuple[str, str]]) -> argparse.Argument
 
 
 def complete_values(parser: argparse.ArgumentParser, **completions: object) -> None:
-    """Mark every argument whose value is a `file`, a `directory` or a `bus` with what completes it (shtab's `complete`)."""
+    """Mark every argument that takes a `file`, a `directory` or a `bus` with its completion (shtab's `complete`)."""
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for each in action.choices.values():
@@ -89,7 +89,7 @@ def complete_values(parser: argparse.ArgumentParser, **completions: object) -> N
 
 
 def _kind(action: argparse.Action) -> str | None:
-    """What the value of an argument is, by its name and type."""
+    """Return the kind of an argument's value, by its name and type."""
     metavar = (action.metavar if isinstance(action.metavar, str) else action.dest).upper()
     if action.dest == "bus":
         return "bus"

@@ -15,12 +15,12 @@ from jtqd.drivers.bus_socket import reachable
 
 _TIMEOUT_S = {"reload": 120.0}
 _EXAMPLES = """examples:
-  jtq control ping                     is it there, and does its supervisor answer?
-  jtq control reload --bus can0        joint files, networks and estimator settings anew, no cycle missed
+  jtq control ping                     check that the daemon and its supervisor answer
+  jtq control reload --bus can0        reload joint files, networks and estimator settings, no cycle missed
   jtq control reset                    release latched faults
   jtq control save --json              write the flight recording now
 
-exit status: 0 done, 1 refused or no daemon (the line on standard error says why), 2 usage"""
+exit status: 0 done, 1 refused or no daemon (reason on standard error), 2 usage"""
 _DONE = {
     "ping": "jtqd on {bus} answers, process {pid}, cycle {cycle}",
     "reload": "jtqd on {bus} has taken over the new files at cycle {cycle}, {cycles} missed",
@@ -33,12 +33,12 @@ def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq control`."""
     result = argparse.ArgumentParser(
         prog="jtq control",
-        description="Give an order to a running jtqd. Only its own user and root may.",
+        description="Send an order to a running jtqd. Only its own user and root are permitted.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    result.add_argument("verb", choices=VERBS, help="the order")
-    result.add_argument("--bus", help="which daemon, by its bus (default: the only one that runs)")
+    result.add_argument("verb", choices=VERBS, help="order")
+    result.add_argument("--bus", help="daemon on this bus (default: the only running one)")
     result.add_argument("--json", action="store_true", help="print the reply as JSON")
     return result
 
@@ -50,7 +50,7 @@ def main(argv: list[str]) -> int:
         daemon = choose_daemon(arguments.bus)
         reply = ask(daemon.directory / FILE, {"verb": arguments.verb}, _TIMEOUT_S.get(arguments.verb, 10.0))
     except (FileNotFoundError, ConnectionRefusedError):
-        reply = {"ok": False, "error": "jtqd takes no orders now: it is starting or ending"}
+        reply = {"ok": False, "error": "jtqd accepts no orders now: it is starting or ending"}
         daemon = None
     except TimeoutError:
         reply = {"ok": False, "error": "jtqd did not answer in time"}

@@ -1,4 +1,4 @@
-"""`jtq doctor`: is this machine fit for jtqd? Kernel, rights, CAN interface, files, directories, packages."""
+"""`jtq doctor`: examine whether this machine is suitable for jtqd: kernel, rights, CAN interface, files, packages."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ _SHM_FREE = 64 << 20
 _BYTES_AN_HOUR = 1.1e9
 SCHEMA = "jtq.doctor/1"
 _EXAMPLES = """examples:
-  jtq doctor                                          this machine, all its CAN interfaces, the shipped configuration
+  jtq doctor                                          all CAN interfaces of this machine, the shipped configuration
   jtq doctor --bus can0 --config /etc/jtqd/can0.yaml
-  sudo -u jtqd jtq doctor --bus can0                  as the user that jtqd runs as: rights are those of the caller
+  sudo -u jtqd jtq doctor --bus can0                  as jtqd's user: the rights of the caller are checked
   jtq doctor --json | jq '.items[] | select(.level == "FAIL")'
 
 exit status: 0 all good, 3 warnings, 1 failures, 2 usage"""
@@ -48,7 +48,7 @@ _USUAL_LOGS = Path("/var/log/jtqd")
 
 
 def check_files(config: Config) -> Iterator[CheckResult]:
-    """Configuration, joint files, models and their hashes; the configuration has been read already."""
+    """Check configuration, joint files, models and their hashes; the configuration has been read already."""
     load = bus_load_of(config)
     yield CheckResult(
         "configuration", GOOD, f"{config.path}, sha256 {config.sha256[:12]}, method {config.estimator.method}"
@@ -57,7 +57,7 @@ def check_files(config: Config) -> Iterator[CheckResult]:
         check_bus_load(load)
         yield CheckResult("bus load", GOOD, f"{share(load.worst)} in the worst case (`jtq bus-load`)")
     except BusLoadError as error:
-        yield CheckResult("bus load", FAIL, str(error), "`jtq bus-load` shows who takes how much")
+        yield CheckResult("bus load", FAIL, str(error), "`jtq bus-load` shows the share of each sender")
     for joint in config.joints:
         item = f"joint {joint.number}"
         shown = f"{joint.joint_path.name} {hashlib.sha256(joint.joint_path.read_bytes()).hexdigest()[:12]}"
@@ -73,7 +73,7 @@ def check_files(config: Config) -> Iterator[CheckResult]:
 
 
 def check_directories(log: Path | None, roots: list[Path]) -> Iterator[CheckResult]:
-    """Where logs and shared memory go, for this user; `log` None: none is named and the usual one does not exist."""
+    """Check the directories of logs and shared memory for this user; `log` None: none is named."""
     if log is None:
         yield CheckResult(
             "log directory", SKIP, "jtqd writes to ./logs without --record DIR or $LOGS_DIRECTORY"
@@ -93,19 +93,19 @@ def _directory(item: str, path: Path, wanted: int, what: str) -> CheckResult:
     text = f"{path}: {size(free)} free, {what}"
     if not os.access(existing, os.W_OK | os.X_OK):
         return CheckResult(
-            item, FAIL, f"{path}: this user may not write there", "owner and mode; LogsDirectory= in the unit"
+            item, FAIL, f"{path}: not writable for this user", "owner and mode; LogsDirectory= in the unit"
         )
     if existing != path:
-        text += "; it will be made"
+        text += "; it will be created"
     if free < wanted:
         return CheckResult(
-            item, WARN, text, f"less than {size(wanted)}: recording ends when the disk is full"
+            item, WARN, text, f"less than {size(wanted)}: recording pauses when the disk is full"
         )
     return CheckResult(item, GOOD, text)
 
 
 def check_packages() -> Iterator[CheckResult]:
-    """Installed versions against what jtqd's own package asks for."""
+    """Compare installed versions with the requirements of jtqd's package."""
     try:
         wanted = [each for each in requires("jtqd") or () if "extra ==" not in each]
     except PackageNotFoundError:
@@ -135,13 +135,13 @@ def check_packages() -> Iterator[CheckResult]:
 
 
 def requirement(line: str) -> tuple[str, list[tuple[str, str]]]:
-    """Name and limits of a requirement: "mcap>=1.3,<2" is ("mcap", [(">=", "1.3"), ("<", "2")])."""
+    """Split a requirement into name and limits: "mcap>=1.3,<2" is ("mcap", [(">=", "1.3"), ("<", "2")])."""
     name = re.split(r"[^A-Za-z0-9_.-]", line, maxsplit=1)[0]
     return name, re.findall(r"(>=|<=|==|<|>)\s*([0-9][0-9A-Za-z.]*)", line.partition(";")[0])
 
 
 def fits(version: str, operator: str, limit: str) -> bool:
-    """Compare the numbers of two versions; what is not a number ends them."""
+    """Compare the numbers of two versions; the first part that is not a number ends them."""
     have, want = _numbers(version), _numbers(limit)
     length = max(len(have), len(want))
     have, want = have + (0,) * (length - len(have)), want + (0,) * (length - len(want))
@@ -156,7 +156,7 @@ def _numbers(version: str) -> tuple[int, ...]:
 
 
 def check_unit() -> CheckResult:
-    """The systemd unit."""
+    """Check the systemd unit."""
     if not Path("/run/systemd/system").exists():
         return CheckResult("systemd unit", SKIP, "systemd does not run here")
     for directory in _UNITS:
@@ -164,12 +164,15 @@ def check_unit() -> CheckResult:
         if path.exists():
             return CheckResult("systemd unit", GOOD, str(path))
     return CheckResult(
-        "systemd unit", WARN, "not installed", "docs/deployment.md; jtqd then does not start with the machine"
+        "systemd unit",
+        WARN,
+        "not installed",
+        "see docs/deployment.md; without the unit jtqd does not start at boot",
     )
 
 
 def check_leftovers(log: Path | None, search: DaemonSearch) -> Iterator[CheckResult]:
-    """Logs without an end and runtime directories of daemons that were killed."""
+    """Check for unfinished logs and runtime directories of killed daemons."""
     running = [each.about for each in search.daemons]
     text = ", ".join(f"{each.instance} (process {each.pid})" for each in running) or "none"
     yield CheckResult("running jtqd", GOOD, text)
@@ -187,15 +190,15 @@ def check_leftovers(log: Path | None, search: DaemonSearch) -> Iterator[CheckRes
         names = ", ".join(str(path) for path in files[:3]) + (
             f" and {len(files) - 3} more" if len(files) > 3 else ""
         )
-        yield CheckResult("unended logs", WARN, names, "left by a crash: jtq recover FILE")
+        yield CheckResult("unfinished logs", WARN, names, "left by a crash: jtq recover FILE")
     else:
-        yield CheckResult("unended logs", GOOD, "none")
+        yield CheckResult("unfinished logs", GOOD, "none")
     if search.left_over:
         yield CheckResult(
             "left over",
             WARN,
             ", ".join(map(str, search.left_over)),
-            "of daemons that were killed; the next start on the same bus takes it over, or remove it",
+            "from killed daemons; removed by the next start, or remove it manually",
         )
 
 
@@ -203,31 +206,31 @@ def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq doctor`."""
     result = argparse.ArgumentParser(
         prog="jtq doctor",
-        description="Examine whether this machine is fit for jtqd: GOOD, WARN or FAIL for each item, and what to do. "
+        description="Examine whether this machine is suitable for jtqd: GOOD, WARN or FAIL for each item, with a remedy. "
         "Nothing is changed.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     result.add_argument("--bus", help="interface, unix:PATH or sim (default: every CAN interface)")
     result.add_argument(
-        "--config", type=Path, metavar="FILE", help="configuration (default: the bench that ships)"
+        "--config", type=Path, metavar="FILE", help="configuration (default: the shipped bench)"
     )
     result.add_argument(
-        "--record", type=Path, metavar="DIR", help="directory of the logs (default: as jtqd's)"
+        "--record", type=Path, metavar="DIR", help="directory of the logs (default: that of jtqd)"
     )
     result.add_argument("--json", action="store_true", help="print as JSON")
     return result
 
 
 def main(argv: list[str]) -> int:
-    """Examine and report; returns the exit status."""
+    """Examine and report; return the exit status."""
     arguments = parser().parse_args(argv)
     results = list(examine(arguments.bus, arguments.config, arguments.record or _log_directory()))
     return report(results, SCHEMA if arguments.json else None, bus=arguments.bus)
 
 
 def examine(bus: str | None, path: Path | None, log: Path | None) -> Iterator[CheckResult]:
-    """Every item. A configuration that cannot be read is one, and the shipped one then stands in for it."""
+    """Run every check. An unreadable configuration is one failure; the shipped one is used instead."""
     broken = None
     try:
         config = load_config(path)
@@ -247,7 +250,7 @@ def examine(bus: str | None, path: Path | None, log: Path | None) -> Iterator[Ch
 
 
 def _log_directory() -> Path | None:
-    """Where jtqd would write, as far as that does not depend on the directory it is started in."""
+    """Return the directory that jtqd would write to, as far as it does not depend on the working directory."""
     named = os.environ.get("LOGS_DIRECTORY", "").split(":")[0]
     if named:
         return Path(named)

@@ -39,7 +39,7 @@ _COUNTED = ("error_warning", "error_passive", "bus_off")
 
 
 def check_kernel(wanted: Realtime, *, can: bool) -> Iterator[CheckResult]:
-    """Every item about the kernel and the rights of this user; `can`: SocketCAN is wanted."""
+    """Check the kernel and the rights of this user; `can`: SocketCAN is required."""
     yield _kernel()
     yield _tick()
     yield _clock()
@@ -52,7 +52,7 @@ def check_kernel(wanted: Realtime, *, can: bool) -> Iterator[CheckResult]:
 
 
 def _text(path: str | Path) -> str:
-    """Content of a file, "" where it cannot be read."""
+    """Return the content of a file, "" if it cannot be read."""
     with suppress(OSError):
         return Path(path).read_text(errors="replace").strip()
     return ""
@@ -74,12 +74,12 @@ def _kernel() -> CheckResult:
         "kernel",
         WARN,
         f"{text}, {kind}",
-        "not a real-time kernel: a driver may hold the loop up for milliseconds; `jtq check` measures how often",
+        "not a real-time kernel: a driver may delay the loop by milliseconds; `jtq check` measures how often",
     )
 
 
 def build_options() -> dict[str, str]:
-    """What the running kernel was built with, e.g. {"CONFIG_HZ": "250"}; empty where that is not published."""
+    """Return the build options of the running kernel, e.g. {"CONFIG_HZ": "250"}; empty if not published."""
     with suppress(OSError, EOFError), gzip.open("/proc/config.gz", "rt") as file:
         return dict(re.findall(r"^(CONFIG_\w+)=(.*)$", file.read(), re.MULTILINE))
     return dict(re.findall(r"^(CONFIG_\w+)=(.*)$", _text(f"/boot/config-{platform.release()}"), re.MULTILINE))
@@ -117,7 +117,7 @@ def _clock() -> CheckResult:
         )
     if name not in _GOOD_CLOCKS and name != "unknown":
         return CheckResult(
-            "clocksource", WARN, text, "not known to be steady: see `clocksource` in the kernel log"
+            "clocksource", WARN, text, "stability unknown: see `clocksource` in the kernel log"
         )
     return CheckResult("clocksource", GOOD, text)
 
@@ -144,7 +144,10 @@ def _capability(number: int) -> bool:
 def _priority(wanted: Realtime) -> CheckResult:
     if not wanted.priority:
         return CheckResult(
-            "SCHED_FIFO", WARN, "the configuration asks for none (realtime.priority 0)", "80 is the default"
+            "SCHED_FIFO",
+            WARN,
+            "not requested by the configuration (realtime.priority 0)",
+            "80 is the default",
         )
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
     limit_text = "unlimited" if limit == resource.RLIM_INFINITY else str(limit)
@@ -166,22 +169,25 @@ def _priority(wanted: Realtime) -> CheckResult:
 def _throttling(wanted: Realtime) -> CheckResult:
     runtime, period = (_text(f"/proc/sys/kernel/sched_rt_{name}_us") for name in ("runtime", "period"))
     if not runtime or not period:
-        return CheckResult("RT throttling", SKIP, "the kernel does not report it")
+        return CheckResult("RT throttling", SKIP, "not reported by the kernel")
     if int(runtime) < 0:
         return CheckResult("RT throttling", GOOD, "off: a real-time process may take a whole CPU")
     part = int(runtime) / int(period)
     text = f"real-time processes get {int(runtime) / 1000:.0f} of {int(period) / 1000:.0f} ms"
     if wanted.priority and part < 0.9:
         return CheckResult(
-            "RT throttling", FAIL, text, "sysctl kernel.sched_rt_runtime_us=950000: the loop would be stopped"
+            "RT throttling",
+            FAIL,
+            text,
+            "sysctl kernel.sched_rt_runtime_us=950000: otherwise the loop is stopped",
         )
-    return CheckResult("RT throttling", GOOD, f"{text}: far more than the loop takes")
+    return CheckResult("RT throttling", GOOD, f"{text}: far more than the loop needs")
 
 
 def _memory(wanted: Realtime) -> CheckResult:
     if not wanted.lock_memory:
         return CheckResult(
-            "locked memory", WARN, "the configuration does not ask for it", "realtime: {lock_memory: true}"
+            "locked memory", WARN, "not requested by the configuration", "realtime: {lock_memory: true}"
         )
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
     if limit == resource.RLIM_INFINITY or _capability(_CAP_IPC_LOCK):
@@ -195,7 +201,7 @@ def _memory(wanted: Realtime) -> CheckResult:
 
 
 def _cpus(text: str) -> set[int]:
-    """A CPU list of the kernel, "0-2,5"."""
+    """Parse a CPU list of the kernel, "0-2,5"."""
     cpus: set[int] = set()
     for part in filter(None, text.split(",")):
         first, _, last = part.partition("-")
@@ -216,8 +222,8 @@ def _cpu(wanted: Realtime) -> CheckResult:
         return CheckResult(
             "CPU",
             WARN,
-            f"{wanted.cpu} by the configuration, shared with everybody (isolated: {isolated or 'none'})",
-            f"isolcpus={wanted.cpu} on the kernel's command line keeps others off it",
+            f"{wanted.cpu} by the configuration, shared with other processes (isolated: {isolated or 'none'})",
+            f"isolcpus={wanted.cpu} on the kernel command line reserves it",
         )
     return CheckResult("CPU", GOOD, f"{wanted.cpu}, isolated")
 
@@ -235,12 +241,12 @@ def _governor() -> CheckResult:
 
 
 def interfaces() -> list[str]:
-    """Names of the CAN interfaces of this machine."""
+    """Return the names of the CAN interfaces of this machine."""
     return sorted(path.parent.name for path in _NET.glob("*/type") if _text(path) == _ARPHRD_CAN)
 
 
 def check_can(bus: str | None, config: Config) -> Iterator[CheckResult]:
-    """Every item about the bus; None: all CAN interfaces there are."""
+    """Check the bus; None: all CAN interfaces."""
     if bus is None:
         names = interfaces()
         if not names:
@@ -259,7 +265,7 @@ def check_can(bus: str | None, config: Config) -> Iterator[CheckResult]:
     elif not (_NET / bus).exists():
         here = ", ".join(interfaces()) or "none"
         yield CheckResult(
-            bus, FAIL, f"no such interface; CAN interfaces here: {here}", "driver loaded? name correct?"
+            bus, FAIL, f"no such interface; CAN interfaces here: {here}", "check driver and name"
         )
     elif _text(_NET / bus / "type") != _ARPHRD_CAN:
         yield CheckResult(bus, FAIL, "not a CAN interface")
@@ -278,7 +284,7 @@ def _opened(bus: str) -> CheckResult:
 
 
 def link_of(name: str) -> dict[str, Any]:
-    """What `ip -details -statistics link` says of an interface; {} where there is no ip, or it does not know."""
+    """Return the output of `ip -details -statistics link` for an interface; {} without ip or interface."""
     if shutil.which("ip") is None:
         return {}
     with suppress(OSError, ValueError, subprocess.SubprocessError):
@@ -318,7 +324,7 @@ def _interface(name: str, config: Config) -> Iterator[CheckResult]:
     )
     if not link:
         yield CheckResult(
-            f"{name} wire", SKIP, "there is no `ip` to ask for bit rate and state", "install iproute2"
+            f"{name} wire", SKIP, "`ip` is missing, so bit rate and state are unknown", "install iproute2"
         )
     elif kind == "vcan":
         yield CheckResult(f"{name} wire", SKIP, "virtual: no bit rate, no arbitration, no errors")
@@ -332,7 +338,7 @@ def _interface(name: str, config: Config) -> Iterator[CheckResult]:
             f"{name} drops",
             WARN,
             f"{text} since the interface exists",
-            "queue too short, or a controller that overruns",
+            "queue too short, or controller overruns",
         )
 
 
@@ -346,7 +352,7 @@ def _wire(name: str, data: dict[str, Any], config: Config) -> CheckResult:
         )
         return CheckResult(f"{name} wire", FAIL, text, hint)
     if not restart:
-        hint = f"ip link set {name} type can restart-ms 100: else it stays off after a bus-off"
+        hint = f"ip link set {name} type can restart-ms 100: otherwise it stays off after a bus-off"
         return CheckResult(f"{name} wire", WARN, text, hint)
     return CheckResult(f"{name} wire", GOOD, text)
 
@@ -361,11 +367,14 @@ def _state(name: str, data: dict[str, Any], link: dict[str, Any]) -> CheckResult
     )
     if state in ("BUS-OFF", "ERROR-PASSIVE"):
         return CheckResult(
-            f"{name} state", FAIL, text, "wiring, termination, bit rate; is any other node powered?"
+            f"{name} state",
+            FAIL,
+            text,
+            "check wiring, termination, bit rate, and that another node is powered",
         )
     if state != "ERROR-ACTIVE" or seen:
         return CheckResult(
-            f"{name} state", WARN, text, "errors have happened: wiring, termination, sample point"
+            f"{name} state", WARN, text, "errors occurred: check wiring, termination, sample point"
         )
     return CheckResult(f"{name} state", GOOD, text)
 

@@ -36,7 +36,7 @@ _PROCESS = {
 
 
 class Daemon(NamedTuple):
-    """One daemon that runs."""
+    """One running daemon."""
 
     directory: Path
     about: About
@@ -53,7 +53,7 @@ class DaemonSearch(NamedTuple):
 
 
 def places() -> list[Path]:
-    """Where runtime directories may lie: this environment's, systemd's, those of the users, and /dev/shm."""
+    """Return the possible runtime directories: this environment's, systemd's, those of the users, and /dev/shm."""
     named = [os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0], os.environ.get("XDG_RUNTIME_DIR", "")]
     found = [Path(each) for each in named if each]
     for pattern in _SHARED:
@@ -62,7 +62,7 @@ def places() -> list[Path]:
 
 
 def find_daemons(roots: Iterable[Path] | None = None) -> DaemonSearch:
-    """Every daemon that runs, by the name of its bus; `roots`: where to look instead of `places()`."""
+    """Return every running daemon, by the name of its bus; `roots`: directories instead of `places()`."""
     daemons, closed, left_over = [], [], []
     for root in places() if roots is None else roots:
         for directory in _subdirectories(root):
@@ -84,7 +84,7 @@ def find_daemons(roots: Iterable[Path] | None = None) -> DaemonSearch:
 
 
 def on_bus(search: DaemonSearch, bus: str) -> Daemon | None:
-    """The daemon on `bus`: as its --bus was written, or as the name of its instance; "sim" is one that emulates."""
+    """Return the daemon on `bus` (its --bus or the name of its instance); "sim" is one that emulates."""
     for daemon in search.daemons:
         if bus in (daemon.about.bus, daemon.about.instance):
             return daemon
@@ -100,23 +100,25 @@ class NoDaemonError(Exception):
 
 
 def choose_daemon(bus: str | None) -> Daemon:
-    """Return the daemon on `bus`, or the only one that runs.
+    """Return the daemon on `bus`, or the only running one.
 
     Raises:
         NoDaemonError: none runs there (exit status 1), or several run and no bus is named (2).
     """
     search = find_daemons()
     others = "".join(f"\n  --bus {each.about.instance:<24} pid {each.about.pid}" for each in search.daemons)
-    closed = "".join(f"\n  {path} belongs to others: join its group to look at it" for path in search.closed)
+    closed = "".join(
+        f"\n  {path} belongs to another user: join its group to read it" for path in search.closed
+    )
     if bus is not None:
         daemon = on_bus(search, bus)
         if daemon is None:
             raise NoDaemonError(f"no jtqd runs on {bus}{others}{closed}", 1)
         return daemon
     if not search.daemons:
-        raise NoDaemonError(f"no jtqd runs here{closed}", 1)
+        raise NoDaemonError(f"no jtqd runs on this machine{closed}", 1)
     if len(search.daemons) > 1:
-        raise NoDaemonError(f"several daemons run: which one?{others}", 2)
+        raise NoDaemonError(f"several daemons run; select one with --bus:{others}", 2)
     return search.daemons[0]
 
 
@@ -129,7 +131,7 @@ def _subdirectories(root: Path) -> list[Path]:
 
 @dataclass(frozen=True)
 class CurrentLog:
-    """What the recorder has left so far."""
+    """Log files of the recorder so far."""
 
     account: Account
     path: Path | None
@@ -174,10 +176,10 @@ class Watch:
         self._notices: deque[Notice] = deque(maxlen=_NOTICES)
 
     def read(self) -> Reading:
-        """Read its state now."""
+        """Read the present state."""
         view = self._view()
         if view is None:
-            return Reading(self.daemon, STARTING, "its nodes are being booted", None, None)
+            return Reading(self.daemon, STARTING, "booting its nodes", None, None)
         assert self._reader is not None
         earlier, self._earlier = self._earlier or view, view
         state, why = _state(view)

@@ -1,4 +1,4 @@
-"""`jtq status`: how a running jtqd is doing. It reads shared memory and can never slow the loop.
+"""`jtq status`: state of a running jtqd, read from shared memory without any effect on the loop.
 
 A reading is shown as a picture at the width of the terminal (`StatusView`), or as plain data for JSON (`content`).
 """
@@ -65,13 +65,13 @@ _FAULTS = (
 """Counters shown when they are not zero."""
 _LAST_NOTICES = 4
 _EXAMPLES = """examples:
-  jtq status                     live view of the daemon that runs here; Ctrl-C ends the view
-  jtq status --bus can0          of the one on can0, where there are several
-  jtq status --once              one picture, also into a file or a mail
+  jtq status                     live view of the daemon on this machine; Ctrl-C ends the view
+  jtq status --bus can0          of the daemon on can0
+  jtq status --once              one text output, also for a file or a mail
   jtq status --json | jq '.joints[].torque_nm'
 
-exit status: 0 it runs, 1 no daemon runs (or none that you may look at), 2 usage, 3 it does not advance, or is still starting
-what you may look at: your own daemons, and those whose group you are in (usermod -a -G jtqd YOU)"""
+exit status: 0 running, 1 no daemon runs (or none that you may read), 2 usage, 3 stalled or still starting
+you may read your own daemons and those of your groups (usermod -a -G jtqd YOU)"""
 _PERIOD_S = 0.2
 _PLAIN_PERIOD_S = 1.0
 _BETWEEN_S = 0.3
@@ -79,7 +79,7 @@ _BETWEEN_S = 0.3
 
 
 def content(reading: Reading) -> dict[str, Any]:
-    """Everything the picture shows; null where a number is not known."""
+    """Return everything the view shows; null for unknown numbers."""
     about, view = reading.daemon.about, reading.view
     result: dict[str, Any] = {
         "schema": SCHEMA,
@@ -202,13 +202,13 @@ def _quantiles(values: tuple[float, float, float]) -> dict[str, float | None]:
 
 
 class StatusView:
-    """Renderable of one reading."""
+    """Rich view of one reading."""
 
     def __init__(self, reading: Reading) -> None:
         self._reading = reading
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Called by rich with the width of the terminal."""
+        """Render for the width of the terminal (called by rich)."""
         reading, width = self._reading, options.max_width
         yield _title(reading)
         if reading.state != RUNNING:
@@ -259,11 +259,11 @@ class Columns:
         self._rows: list[dict[str, str | Text]] = []
 
     def add(self, *cells: str | Text) -> None:
-        """One row, a cell for each heading."""
+        """Add a row, one cell per heading."""
         self._rows.append(dict(zip(self._headings, cells, strict=True)))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Called by rich with the width of the terminal."""
+        """Render for the width of the terminal (called by rich)."""
         tables = [
             self._table([name for name in self._headings if name not in self._dispensable[:dropped]])
             for dropped in range(len(self._dispensable) + 1)
@@ -289,9 +289,9 @@ def _quantity(value: float, unit: str, digits: int = 2) -> str:
 
 def _joints(about: About, view: View, *, still: bool) -> Columns:
     headings = {"joint": "left", "status": "left"} | dict.fromkeys(
-        ("torque", "sigma", "sensor", "current", "motor", "temp.", "with a number"), "right"
+        ("torque", "sigma", "sensor", "current", "motor", "temp.", "with a torque"), "right"
     )
-    table = Columns(headings, ("with a number", "motor", "temp.", "current", "sensor", "sigma"))
+    table = Columns(headings, ("with a torque", "motor", "temp.", "current", "sensor", "sigma"))
     for n, (joint, seen) in enumerate(zip(about.joints, view.joints, strict=True)):
         known = seen.status in PUBLISHED and not still
         measured, spent = view.measured[n], view.status_cycles[n]
@@ -311,7 +311,7 @@ def _joints(about: About, view: View, *, still: bool) -> Columns:
 
 
 def _reasons(about: About, view: View, earlier: View) -> Iterator[Text]:
-    """Always a line for each joint, so that the picture does not jump."""
+    """Return one line per joint, so that the view keeps its height."""
     for joint, seen, since in zip(about.joints, view.joints, view.status_since, strict=True):
         why = joint_reason(about, joint.number, view, earlier)
         name = NAMES.get(seen.status, str(seen.status))
@@ -343,7 +343,7 @@ def _inputs(about: About, view: View) -> Columns:
 
 
 def _line(heading: str, text: str | Text) -> RenderableType:
-    """A heading of a fixed width, and text that wraps beside it."""
+    """Return a heading of fixed width and text that wraps beside it."""
     grid = Table.grid(padding=(0, 1))
     grid.add_column(width=_HEADING, no_wrap=True, style=_HEAD)
     grid.add_column(overflow="fold")
@@ -376,7 +376,7 @@ def _bus(about: About, view: View, earlier: View) -> RenderableType:
     now = bus_load(earlier, view, about.bitrate)
     return _line(
         "bus load",
-        f"{share(now)} now, counted with every stuff bit; {share(view.worst_load)} by configuration",
+        f"{share(now)} now, with worst-case stuff bits; {share(view.worst_load)} by configuration",
     )
 
 
@@ -387,7 +387,7 @@ def _nodes(about: About, view: View) -> Columns:
         silence = silent_s(view, node, about.heartbeat_ms)
         state = Text(NMT_STATES.get(view.node_states[node], "?") if heard else "no heartbeat yet")
         if silence is not None:
-            state = Text(f"silent, was {state.plain}", style="bold red")
+            state = Text(f"silent, last {state.plain}", style="bold red")
         elif node in view.unconfigured:
             state = Text("restarted, not configured yet", style="bold red")
         elif heard and view.node_states[node] != OPERATIONAL:
@@ -420,7 +420,7 @@ def _style_of(level: int) -> str:
 
 
 def _conditions(conditions: Sequence[Condition]) -> Iterator[RenderableType]:
-    """What is wrong now, and for how long."""
+    """Return the present conditions and their durations."""
     if conditions:
         yield ""
     now_ns = time.monotonic_ns()
@@ -443,9 +443,9 @@ def _notices(notices: Sequence[Notice]) -> Iterator[RenderableType]:
 
 
 def clock() -> RenderableType:
-    """The line below a live view."""
+    """Return the line below a live view."""
     return Padding(
-        Text(time.strftime("%H:%M:%S  Ctrl-C ends this view; jtqd goes on"), style="dim"), (1, 0, 0, 0)
+        Text(time.strftime("%H:%M:%S  Ctrl-C ends this view; jtqd continues"), style="dim"), (1, 0, 0, 0)
     )
 
 
@@ -453,20 +453,20 @@ def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq status`."""
     result = argparse.ArgumentParser(
         prog="jtq status",
-        description="Show how a running jtqd is doing: torque, status with its reason, inputs, timing, bus, nodes, log.",
+        description="Show the state of a running jtqd: torque, status with its reason, inputs, timing, bus, nodes, log.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     result.add_argument(
-        "--bus", help="whose daemon: can0, unix:PATH or sim (default: the only one that runs)"
+        "--bus", help="bus of the daemon: can0, unix:PATH or sim (default: the only running one)"
     )
-    result.add_argument("--once", action="store_true", help="one picture, then end")
-    result.add_argument("--json", action="store_true", help="one reading as JSON, then end")
+    result.add_argument("--once", action="store_true", help="print once, then end")
+    result.add_argument("--json", action="store_true", help="print once as JSON, then end")
     return result
 
 
 def main(argv: list[str]) -> int:
-    """Show it; returns the exit status."""
+    """Show the state; return the exit status."""
     arguments = parser().parse_args(argv)
     try:
         daemon = choose_daemon(arguments.bus)
@@ -499,7 +499,7 @@ def _once(daemon: Daemon, *, as_json: bool) -> int:
 
 
 def _live(console: Console, daemon: Daemon) -> int:
-    """Until Ctrl-C, or the daemon ends; one that is started again is found again."""
+    """Show the live view until Ctrl-C; a restarted daemon is found again."""
     watch = Watch(daemon)
     with Live(console=console, screen=True, auto_refresh=False) as live:
         while True:
@@ -507,7 +507,7 @@ def _live(console: Console, daemon: Daemon) -> int:
                 live.update(Group(StatusView(watch.read()), clock()), refresh=True)
             else:
                 live.update(
-                    f"jtqd on {daemon.about.instance} has ended; waiting for its return", refresh=True
+                    f"jtqd on {daemon.about.instance} has ended; waiting for its restart", refresh=True
                 )
                 again = on_bus(find_daemons(), daemon.about.instance)
                 if again is not None:
@@ -516,7 +516,7 @@ def _live(console: Console, daemon: Daemon) -> int:
 
 
 def _lines(daemon: Daemon) -> int:
-    """Not a terminal: a line a second, until the daemon ends."""
+    """Print one line per second until the daemon ends, for output that is no terminal."""
     watch = Watch(daemon)
     while daemon.about.running():
         reading = watch.read()

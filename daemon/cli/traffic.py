@@ -46,13 +46,13 @@ class TimeHistogram:
         self.largest_ns = 0
 
     def add(self, ns: int) -> None:
-        """Count one time."""
+        """Count one value."""
         self.count += 1
         self.largest_ns = max(self.largest_ns, ns)
         self._bins[min(max(ns, 0) // _BIN_NS, _BINS - 1)] += 1
 
     def quantile_us(self, share: float) -> float:
-        """Upper edge of the bin that holds this share of them [us], at most the maximum; NaN without data."""
+        """Return the upper edge of this quantile's bin [us], at most the maximum; NaN without data."""
         target, seen = share * self.count, 0
         for n, count in enumerate(self._bins):
             seen += count
@@ -146,22 +146,22 @@ class Traffic:
 
     @property
     def seconds(self) -> float:
-        """From the first frame to the last."""
+        """Return the time from the first frame to the last."""
         return (self.last_ns - self.first_ns) * 1e-9
 
     @property
     def sync_rate(self) -> float:
-        """SYNCs per second."""
+        """Return the number of SYNCs per second."""
         span_ns = self._sync_ns - self._first_sync_ns
         return self.cycles / span_ns * 1e9 if span_ns else 0.0
 
     @property
     def slots(self) -> int:
-        """Periods from the first SYNC to the last: as many cycles should there be."""
+        """Return the number of periods from the first SYNC to the last: the expected number of cycles."""
         return round((self._sync_ns - self._first_sync_ns) / self._period_ns)
 
     def feed(self, can_id: int, data: bytes, stamp_ns: int) -> None:
-        """One frame in the order of arrival; `can_id` with its flags, the stamp is the kernel's."""
+        """Take one frame in the order of arrival; `can_id` with its flags, the stamp is the kernel's."""
         if can_id & CAN_ERR_FLAG:
             for bit in range(29):
                 if can_id >> bit & 1:
@@ -187,7 +187,7 @@ class Traffic:
             self._node(can_id, data, stamp_ns)
 
     def end(self, now_ns: int) -> None:
-        """Listening ended at this time (the clock of the stamps): silence since then counts."""
+        """End listening at this time (the clock of the stamps); silence until then counts."""
         for node in self.nodes.values():
             if node.last_ns:
                 node.longest_gap_ns = max(node.longest_gap_ns, now_ns - node.last_ns)
@@ -260,7 +260,7 @@ def described(can_id: int) -> str:
 
 @dataclass
 class Timing:
-    """How punctual this process was woken, and how long a SYNC took from the call to its echo."""
+    """Wake-up lateness of this process, and times from sending a SYNC to its echo."""
 
     lateness: TimeHistogram = field(default_factory=TimeHistogram)
     missed: int = 0
@@ -290,7 +290,7 @@ def listen(
 
 
 def drive(socket: FrameSocket, traffic: Traffic, seconds: float, config: Config) -> Timing:
-    """Send SYNC and the own heartbeat for `seconds` and hear the answers; the nodes have been booted. Raises BusError.
+    """Send SYNC and the own heartbeat for `seconds` and count the answers of booted nodes. Raises BusError.
 
     The socket must give back own frames, so that SYNC's own echo stands among the answers in the order of arrival.
     """
@@ -313,13 +313,13 @@ def drive(socket: FrameSocket, traffic: Traffic, seconds: float, config: Config)
 
 
 def leave(socket: FrameSocket, config: Config) -> None:
-    """Put the nodes back to pre-operational, as jtqd does at its end. Raises BusError."""
+    """Reset the nodes to pre-operational, as jtqd does at its end. Raises BusError."""
     for node in nodes_of(config):
         socket.send(nmt.command(nmt.ENTER_PRE_OPERATIONAL, node))
 
 
 def silent(socket: FrameSocket, seconds: float) -> bool:
-    """True when nobody sends SYNC for so long. Raises BusError."""
+    """Return whether no SYNC is received for this time. Raises BusError."""
     until = time.monotonic() + seconds
     while (left := until - time.monotonic()) > 0:
         if not socket.wait(left):
@@ -331,7 +331,7 @@ def silent(socket: FrameSocket, seconds: float) -> bool:
 
 
 def _slots(seconds: float, period_ns: int, timing: Timing) -> Iterator[int]:
-    """Yield the slots of an absolute grid, each when its time has come; those that are too late are counted and skipped."""
+    """Yield the slots of an absolute grid at their times; late ones are counted and skipped."""
     start_ns = time.monotonic_ns() + period_ns
     grid, end_ns, number = Grid(start_ns, period_ns), start_ns + round(seconds * 1e9), 0
     while grid.slot_ns < end_ns:
@@ -360,7 +360,7 @@ def _send(socket: FrameSocket, frame: bytes) -> bool:
 
 
 def _take(socket: FrameSocket, traffic: Traffic, echo: TimeHistogram | None = None, sent_ns: int = 0) -> None:
-    """Everything that has arrived."""
+    """Process all received frames."""
     while True:
         try:
             count = socket.receive()

@@ -10,7 +10,7 @@ from jtqd.daemon.shared.snapshot import Snapshot
 
 
 class ConfiguredNodes:
-    """Nodes that restarted, are in doubt or were absent at the start: used (again) once the supervisor has configured them.
+    """Nodes that restarted, are in doubt or were absent at the start; they are used after the supervisor configured them.
 
     It looks at the snapshot's `configured` while a node waits. What counts is a configuration that was noted after the node
     had begun to wait: one that was only stopped is configured again without ever waiting, and that must not answer for its
@@ -24,7 +24,7 @@ class ConfiguredNodes:
         self._doubts = list(snapshot.doubts)
 
     def look(self) -> None:
-        """Between the inputs of a cycle and its estimate."""
+        """Check for configured nodes between the inputs of a cycle and its estimate."""
         intake, snapshot = self._intake, self._snapshot
         for node in intake.unconfigured:
             now = snapshot.configured[node]
@@ -42,7 +42,7 @@ class ConfiguredNodes:
                 joint.rescale(node, snapshot.factors(node))
 
     def doubt(self) -> None:
-        """Between two cycles: nothing more of the nodes that the supervisor has found to be configured otherwise."""
+        """Stop using, between two cycles, the nodes that the supervisor found differently configured."""
         doubts = self._snapshot.doubts
         for node, (before, now) in enumerate(zip(self._doubts, doubts, strict=True)):
             if now != before:

@@ -76,7 +76,7 @@ cdef class LastEstimate:
         put_back(&self.now, sizeof(ToldState), block)
 
     def begin(self):
-        """From here to the end of `write` a reader knows that what it sees is half new (counters and inputs included)."""
+        """Mark the snapshot as inconsistent until the end of `write` (counters and inputs included)."""
         self.begin_telling()
 
     def write(
@@ -210,15 +210,15 @@ cdef class LoopCounters:
         return self.now.latch_resets
 
     def cycle(self, int flags, int64_t work_ns, int64_t late_ns, int64_t missed):
-        """One more cycle, with the flags of its record; times in ns, `missed` slots so far."""
+        """Count one cycle, with the flags of its record; times in ns, `missed` slots so far."""
         self.count(flags, work_ns, late_ns, missed)
 
     def statuses(self, int one, int two):
-        """What was published for joint 1 and 2 in one more cycle."""
+        """Count the published statuses of joints 1 and 2 in one cycle."""
         self.count_statuses(one, two)
 
     def flush(self, int64_t missed, int64_t sync_ns):
-        """Copy what is counted elsewhere to where readers see it; `sync_ns` is the cycle's SYNC (CLOCK_MONOTONIC)."""
+        """Copy the counts of other objects to the snapshot; `sync_ns` is the cycle's SYNC (CLOCK_MONOTONIC)."""
         self.flush_all(missed, sync_ns)
 
     cdef void count(self, int flags, int64_t work_ns, int64_t late_ns, int64_t missed) noexcept nogil:
@@ -333,7 +333,7 @@ cdef class LoopCounters:
 
 
 def frame_counts(intake):
-    """Late, lost, duplicate and rejected frames by the PDO's name; of a temperature, how often it became unknown."""
+    """Return late, lost, duplicate and rejected frames by PDO name; for a temperature, how often it became unknown."""
     counts = {
         state.pdo.name: {
             "late": state.late,

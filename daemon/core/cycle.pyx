@@ -224,7 +224,7 @@ cdef class Cycle:
         return outcome
 
     cpdef int begin(self) except -1:
-        """Drain what came after the last cycle was closed, then send SYNC."""
+        """Drain the frames received after the last cycle was closed, then send SYNC."""
         cdef CycleState *now = &self.now
         cdef Intake intake = self.intake
         cdef Frame sync
@@ -288,7 +288,7 @@ cdef class Cycle:
             now.sync_realtime_ns = now.sync_ns + now.realtime_offset_ns
 
     cpdef int observe(self) except -1:
-        """Estimate of both joints from the inputs of this cycle; without their networks when there is no time for them."""
+        """Estimate both joints from the inputs of this cycle; without their networks if there is no time for them."""
         cdef int64_t sync_ns = self.now.sync_realtime_ns - self.now.realtime_offset_ns
         cdef bint starting = self.now.index < FIRST_CYCLES
         cdef bint wanted = self.budget.first(self.clock.monotonic(), self.grid.end_ns())
@@ -297,7 +297,7 @@ cdef class Cycle:
         self.two.observe_at(sync_ns, starting, wanted)
 
     cpdef int publish(self) except -1:
-        """Send the estimate PDO, and the heartbeat when it is due. An estimate that is too late is none."""
+        """Send the estimate PDO, and the heartbeat when it is due. A late estimate is withdrawn."""
         cdef CycleState *now = &self.now
         cdef int64_t at_ns = self.clock.monotonic()
         self.budget.ended(at_ns)
@@ -317,7 +317,7 @@ cdef class Cycle:
             self.send(&self.heartbeat_frame)
 
     cpdef int record(self) except -1:
-        """Hand the cycle over to the ring, update counters and, every n-th cycle, the snapshot."""
+        """Write the cycle to the ring, update counters and, every n-th cycle, the snapshot."""
         cdef CycleState *now = &self.now
         cdef Intake intake = self.intake
         cdef Record *record = self.frames.record
@@ -349,7 +349,7 @@ cdef class Cycle:
         now.index += 1
 
     cpdef bint hold_back(self) except -1:
-        """True when this slot must pass without SYNC, so that late frames can be told from lost ones (see intake)."""
+        """Return whether this slot must pass without SYNC, to distinguish late frames from lost ones (see intake)."""
         cdef Intake intake = self.intake
         cdef int count, n
         if not (intake.gaps.now.wanted or intake.gaps.now.open):
@@ -367,7 +367,7 @@ cdef class Cycle:
         return True
 
     def between(self, const uint8_t[::1] frames, stamps_ns, own, int count):
-        """Frames that came when no cycle was open; arguments as `Intake.drain`."""
+        """Take frames received while no cycle was open; arguments as `Intake.drain`."""
         cdef Frame frame
         cdef int n
         self.intake.drain(frames, stamps_ns, own, count)
@@ -376,28 +376,28 @@ cdef class Cycle:
             self.hold(&frame, stamps_ns[n])
 
     def skip(self, int64_t slots):
-        """Slots that were missed: the index follows the grid, so that a gap in the log shows where they were."""
+        """Skip missed slots: the index follows the grid, so that a gap in the log shows them."""
         self.now.index += slots
 
     @property
     def complete(self):
-        """The last cycle had every input that it waited for."""
+        """Return whether the last cycle had every input that it waited for."""
         return bool(self.now.flags & COMPLETE)
 
     def reset_faults(self):
-        """Release latched faults before the next cycle's estimate (`jtq control reset`); the record says so."""
+        """Release latched faults before the next estimate (`jtq control reset`); the record says so."""
         for joint in self.joints:
             if joint.reset_latch():
                 self.now.next_flags = RESET
                 self.counters.now.latch_resets += 1
 
     def use_own(self):
-        """After another loop's state has been put in place: estimators and limits are those built here."""
+        """Use the estimators and limits built here, after the state of another loop was restored."""
         for joint in self.joints:
             joint.use(joint.estimator, joint.safety)
 
     def leave(self):
-        """Send a last estimate with status off, so that nobody holds on to the last number."""
+        """Send a last estimate with status off, so that no receiver keeps the last torque."""
         self.one.take_back(OFF)
         self.two.take_back(OFF)
         self.send_estimate()

@@ -72,13 +72,13 @@ cdef void encode_into(uint8_t *data, const Published *one, const Published *two,
 
 
 def field(double torque_nm, double sigma_nm, int status):
-    """Integers (torque, sigma, status) of one joint; a torque or sigma that is none, or does not fit, is status 15."""
+    """Return the integers (torque, sigma, status) of one joint; an invalid torque or sigma becomes status 15."""
     cdef Published made = field_of(torque_nm, sigma_nm, status)
     return made.torque, made.sigma, made.status
 
 
 def encode(one, two, int sequence):
-    """Eight bytes from the `field`s of both joints and the SYNC counter of the inputs."""
+    """Encode eight bytes from the `field`s of both joints and the SYNC counter of the inputs."""
     cdef Published first = Published(one[0], one[1], one[2])
     cdef Published second = Published(two[0], two[1], two[2])
     cdef uint8_t data[8]
@@ -87,7 +87,7 @@ def encode(one, two, int sequence):
 
 
 def decode(data):
-    """Content of the eight bytes; raises struct.error on any other length."""
+    """Decode the eight bytes; raises struct.error on any other length."""
     torque_1, torque_2, sigma_1, sigma_2, status, sequence = LAYOUT.unpack(data)
 
     def torque(counts):

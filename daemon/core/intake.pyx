@@ -82,7 +82,7 @@ _SIZES: Final = {"b": 1, "h": 2, "i": 4, "q": 8, "B": 1, "H": 2, "I": 4}
 
 
 cdef class InputState:
-    """What the intake knows of one synchronous PDO: its frame of this cycle, its debt, and when it usually comes.
+    """State of one synchronous PDO in the intake: frame of this cycle, missing frames, usual arrival.
 
     pdo: an `InputPdo` (`jtqd.daemon.loop.input_pdos`): `cob_id`, `length`, `layout`, `node_id`, `name`.
     """
@@ -246,7 +246,7 @@ cdef bint _differs(const Input *state, const Frame *frame) noexcept nogil:
 
 
 cdef bint _usual(const Input *state, int64_t delay_ns) noexcept nogil:
-    """One frame came while an earlier one is missing: does its delay tell that it is this cycle's own?"""
+    """Return whether the delay of a frame shows that it is this cycle's own, while an earlier one is missing."""
     cdef int64_t low = state.band_low_ns, high = state.band_high_ns
     return (
         delay_ns >= 0
@@ -256,7 +256,7 @@ cdef bint _usual(const Input *state, int64_t delay_ns) noexcept nogil:
 
 
 cdef void _learn(Input *state, int64_t delay_ns) noexcept nogil:
-    """Follow the arrivals: at once outwards, slowly inwards."""
+    """Learn the arrival band: widen at once, narrow slowly."""
     if delay_ns < state.band_low_ns:
         state.band_low_ns = delay_ns
     else:
@@ -331,13 +331,13 @@ cdef class JointTemperature:
         return self.known.rejected
 
     def receive(self, const uint8_t[::1] frames, int offset):
-        """Take the frame (`struct can_frame`) at `offset`; False for a wrong length."""
+        """Decode the frame (`struct can_frame`) at `offset`; return False for a wrong length."""
         cdef Frame frame
         memcpy(&frame, &frames[offset], sizeof(Frame))
         return _receive_temperature(&self.known, &frame)
 
     def at(self, int64_t cycle):
-        """The inputs of slot number `cycle` have been taken: what is too old by then is not known any more."""
+        """Discard a value that is too old at slot number `cycle`."""
         temperature_at(&self.known, cycle)
 
 
@@ -426,7 +426,7 @@ cdef class Gaps:
         return self.now.length
 
     def pass_slot(self):
-        """This slot has no SYNC."""
+        """Pass a slot without SYNC."""
         self.now.count += 1
         self.now.wanted, self.now.open = False, True
         self.now.arrivals = 0
@@ -435,7 +435,7 @@ cdef class Gaps:
 
 
 cdef bint _may_go_on(const GapState *gap) noexcept nogil:
-    """Late frames came in the slot that has just passed, and one slot more is not too many."""
+    """Return whether one more slot may pass, as late frames came in the last one."""
     return gap.open and gap.arrivals > 0 and gap.length < LONGEST
 
 
@@ -515,21 +515,21 @@ cdef class NodeTrust:
         return {node: self.now.restarts[node] for node in range(NODES) if self.now.restarts[node]}
 
     def heartbeat(self, int node_id, uint8_t state, int64_t stamp_ns):
-        """A heartbeat of one byte; False for one with an impossible state: it is none."""
+        """Take a heartbeat of one byte; return False for an impossible state."""
         return self.heard(_node(node_id), state, stamp_ns)
 
     def configured(self, int node_id):
-        """The node's mapping has been written and read back: its PDOs count from the next cycle on."""
+        """Accept a configured node: its PDOs count from the next cycle on."""
         self.now.absent[_node(node_id)] = False
         self.believe(node_id, True)
 
     def leave_out(self, int node_id):
-        """An optional node that was not there at the start: like one that restarted, but its PDOs are not missed."""
+        """Leave out an optional node that is absent at the start; its PDOs are not counted as missing."""
         self.now.absent[_node(node_id)] = True
         self.believe(node_id, False)
 
     def doubt(self, int node_id):
-        """Nothing of this node is used from now on."""
+        """Stop using this node."""
         self.believe(_node(node_id), False)
 
     cdef bint heard(self, int node_id, uint8_t state, int64_t stamp_ns) noexcept nogil:
@@ -671,7 +671,7 @@ cdef class Intake:
     # Python values ----------------------------------------------------------------------------------------------------
 
     def begin(self, int counter):
-        """SYNC number `counter` (1..240) has just been sent: nothing is fresh any more."""
+        """Begin a cycle after SYNC number `counter` (1..240) was sent: no input is fresh."""
         self.begin_cycle(counter)
 
     def take(self, const uint8_t[::1] frames, stamps_ns, own, int count):
@@ -694,7 +694,7 @@ cdef class Intake:
         return self.now.missing == 0
 
     def close(self):
-        """The deadline has passed, or all are there: decide what may be used.
+        """Close the cycle at the deadline, or when all inputs are received: decide which are used.
 
         Returns:
             True when every PDO of the nodes that are configured is a valid input of this cycle.
@@ -702,7 +702,7 @@ cdef class Intake:
         return self.close_cycle()
 
     def drain(self, const uint8_t[::1] frames, stamps_ns, own, int count):
-        """Frames that came after the cycle was closed: late for it, or a second copy of what was used."""
+        """Take frames received after the cycle was closed: late, or duplicates."""
         cdef Frame frame
         cdef int n
         for n in range(count):
@@ -720,15 +720,15 @@ cdef class Intake:
 
     @property
     def unconfigured(self):
-        """Nodes that are not believed until they have been configured."""
+        """Return the nodes that are not used until they have been configured."""
         return self.nodes.unconfigured
 
     def fresh(self, index):
-        """True when PDO `index` is an input of the cycle just closed."""
+        """Return whether PDO `index` is an input of the cycle just closed."""
         return self.states[index].fresh
 
     def values(self, index):
-        """Raw integers of PDO `index`, in the order of its mapping; meaningful only when fresh."""
+        """Return the raw integers of PDO `index`, in the order of its mapping; meaningful only when fresh."""
         return self.states[index].values
 
     def views(self):
@@ -863,7 +863,7 @@ cdef class Intake:
         return NULL if n < 0 else self.celsius[n]
 
     cdef void wrong_length(self, Input *state, int length) noexcept nogil:
-        """A frame of `length` bytes, which is not that of the mapping (CiA 301: 8210h shorter, 8220h longer)."""
+        """Count a frame of `length` bytes, which differs from the mapping (CiA 301: 8210h shorter, 8220h longer)."""
         state.rejected += 1
         self.now.rejected_frames += 1
         if length < state.length:

@@ -50,7 +50,7 @@ cdef class Unwrap:
         put_back(&self.now, sizeof(UnwrapState), block)
 
     def counts(self, int64_t raw):
-        """Continuous counts; right as long as two samples lie less than 2^31 counts apart."""
+        """Return continuous counts; correct if two samples are less than 2^31 counts apart."""
         return _counts(&self.now, raw)
 
 
@@ -64,7 +64,7 @@ cdef int64_t _counts(UnwrapState *unwrap, int64_t raw) noexcept nogil:
 
 
 cdef class JointCycle:
-    """What the loop, or a replay of its log, keeps of one joint from cycle to cycle.
+    """State of one joint from cycle to cycle, in the loop or in a replay of its log.
 
     Args:
         number: 0 for joint 1, 1 for joint 2.
@@ -166,12 +166,12 @@ cdef class JointCycle:
         return self.now.last_ns
 
     def use(self, estimator, safety):
-        """From now on this estimator with these limits; what is latched stays."""
+        """Use this estimator with these limits; latched faults stay latched."""
         self.estimator, self.limits = estimator, safety
         self.rules.use(safety, estimator.with_network)
 
     def begin_again(self):
-        """The drive restarted: its positions and the observer's past mean nothing any more."""
+        """Restart after a restart of the drive: earlier positions and the observer's state are invalid."""
         self.motor, self.link = Unwrap(), Unwrap()
         self.now.last_ns = 0
         self.given.reset()
@@ -179,22 +179,22 @@ cdef class JointCycle:
 
     @property
     def latched(self):
-        """Bits of the faults that are latched (`daemon/shared/cycle_record.py`)."""
+        """Return the bits of the latched faults (`daemon/shared/cycle_record.py`)."""
         return self.rules.status.now.latched
 
     def reset_latch(self):
-        """Release the latched faults and begin again, with the encoders as they are now. True if there was one."""
+        """Release the latched faults and restart with the present encoder positions; return whether there was one."""
         if not self.rules.status.reset_latch():
             return False
         self.begin_again()
         return True
 
     def resume(self, motor_offset, link_offset):
-        """A log goes on in the middle of a run: by so much the positions had rolled over by then [counts]."""
+        """Continue a log in the middle of a run, with the roll-over of the positions so far [counts]."""
         self.motor, self.link = Unwrap(motor_offset), Unwrap(link_offset)
 
     def rescale(self, node_id, factors):
-        """The node, absent at the start, is configured now: its scaling (`SnapshotReader.note_factors`); zeros: none."""
+        """Set the scaling of a node that was absent at the start (`SnapshotReader.note_factors`); zeros: none."""
         inputs, pdos = self.inputs, self.pdos
         if not any(factors):
             return
@@ -212,7 +212,7 @@ cdef class JointCycle:
             self.inputs = replace(inputs, sensor_nm_per_unit=factors[inputs.sensor - first])
 
     def withdraw(self, int status=st.STALE):
-        """Take the estimate back: nothing of it goes out or is logged as published. With status 4 it was too late."""
+        """Withdraw the estimate: it is neither sent nor logged as published. With status 4 it was too late."""
         self.take_back(status)
 
     def observe(self, int64_t sync_ns, bint starting, bint network_wanted=True):
@@ -279,7 +279,7 @@ cdef class JointCycle:
         self.now.latched = self.rules.status.now.latched
 
     cdef void miss(self, int flags) noexcept nogil:
-        """An input of this cycle is missing: the observer keeps its state (the next dt is longer), nothing is published."""
+        """Handle a missing input: the observer keeps its state (the next dt is longer), nothing is published."""
         cdef JointBlock *record = &self.now.sample
         cdef int status = self.rules.stale(&flags)
         self.now.published = field_of(NAN, INFINITY, status)

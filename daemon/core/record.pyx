@@ -85,7 +85,7 @@ cdef class RecordRing:
 
 
 cdef class CycleFrames:
-    """Frames of a cycle, copied into its record as they came: 16 bytes each beside their stamps.
+    """Frames of a cycle, copied unchanged into its record: 16 bytes each beside their stamps.
 
     Attributes:
         count: frames stored in it.
@@ -109,7 +109,7 @@ cdef class CycleFrames:
         return copied(self.record, sizeof(Record))
 
     cdef void begin(self, Record *record) noexcept nogil:
-        """The next frames belong to this record."""
+        """Store the next frames in this record."""
         cdef int stored = min(self.held.count, FRAME_CAPACITY)
         self.record = record
         self.count = self.left_out = 0

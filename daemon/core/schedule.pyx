@@ -85,7 +85,7 @@ cdef class Grid:
         return skipped
 
     cpdef bint too_late(self, int64_t now_ns) noexcept:
-        """True when the current slot's time has passed by more than half a period (woken too late)."""
+        """Return whether the current slot's time has passed by more than half a period (late wake-up)."""
         return now_ns - self.now.slot_ns > self.now.period_ns // 2
 
     cdef int64_t end_ns(self) noexcept:
@@ -124,7 +124,7 @@ cdef class WakeUp:
         return self.now.deadline_ns
 
     cpdef void follow(self, int64_t last_delay_ns) noexcept:
-        """The last input of a complete cycle came so long after its SYNC."""
+        """Learn from a complete cycle: the last input arrived this long after its SYNC."""
         if last_delay_ns + MARGIN_NS > self.now.wait_ns:
             self.now.wait_ns = min(self.now.wait_ns + 99 * STEP_NS, self.now.deadline_ns - MARGIN_NS)
         else:
@@ -132,7 +132,7 @@ cdef class WakeUp:
 
 
 cdef class NetworkBudget:
-    """Is there time for the networks before the next SYNC? If not, this cycle is physics only.
+    """Time budget of the networks before the next SYNC; without time the cycle is physics only.
 
     Call `first`, `second` and `ended` in each cycle, around the estimates of joint 1 and joint 2. Joint 1 comes first and
     leaves time for joint 2.
@@ -158,14 +158,14 @@ cdef class NetworkBudget:
         put_back(&self.now, sizeof(BudgetState), block)
 
     cpdef bint first(self, int64_t now_ns, int64_t next_sync_ns) noexcept:
-        """The estimate of joint 1 begins now: may it use its network? `next_sync_ns`: when the next SYNC is due."""
+        """Return whether joint 1, whose estimate begins, may use its network; `next_sync_ns`: due time of the next SYNC."""
         cdef BudgetState *budget = &self.now
         budget.since_ns, budget.end_ns = now_ns, next_sync_ns - RESERVE_NS
         budget.one.wanted = now_ns + budget.one.cost_ns + budget.two.cost_ns <= budget.end_ns
         return budget.one.wanted
 
     cpdef bint second(self, int64_t now_ns) noexcept:
-        """The estimate of joint 1 is there: may joint 2 use its network?"""
+        """Return whether joint 2 may use its network, after joint 1's estimate."""
         cdef BudgetState *budget = &self.now
         _took(&budget.one, now_ns - budget.since_ns)
         budget.since_ns = now_ns
@@ -173,12 +173,12 @@ cdef class NetworkBudget:
         return budget.two.wanted
 
     cpdef void ended(self, int64_t now_ns) noexcept:
-        """The estimate of joint 2 is there."""
+        """Note the end of joint 2's estimate."""
         _took(&self.now.two, now_ns - self.now.since_ns)
 
 
 cdef void _took(Cost *joint, int64_t spent_ns) noexcept nogil:
-    """The estimate of this cycle took so long."""
+    """Learn the duration of this cycle's estimate."""
     cdef int64_t cost_ns = joint.cost_ns, believed_ns
     if not joint.wanted:
         joint.cost_ns = cost_ns - cost_ns // FORGET - 1 if cost_ns > 0 else 0

@@ -149,24 +149,24 @@ cdef class JointStatus:
         return self.now.latches
 
     def use(self, settings):
-        """From now on these faults are latched; what is held and latched stays."""
+        """Latch these faults from now on; held and latched states stay."""
         limit = settings.stale_latch_cycles
         self.latching, self.stale_limit = settings.latch, -1 if limit is None else limit
 
     def update(self, int status, int found=0):
-        """Status to publish in a cycle that asks for `status` and has the faults `found` (`shared/cycle_record.py`)."""
+        """Return the status to publish for the requested `status` and the faults `found` (`shared/cycle_record.py`)."""
         return self.following(status, found)
 
     def pass_over(self, int64_t cycles):
-        """So many more cycles like the last, which asked for the status that it got: with a number or off, no fault."""
+        """Repeat the last cycle this many times: it got the requested status, and no fault."""
         self.now.since += cycles
 
     def late(self):
-        """The estimate of this cycle, whose status `update` has given, was not ready in time: status to publish."""
+        """Return the status to publish if the estimate of this cycle was not ready in time, after `update`."""
         return self.withdrawn()
 
     def reset_latch(self):
-        """Release what is latched; a fault that is still there latches again in the next cycle. True if anything was."""
+        """Release latched faults; an existing fault latches again in the next cycle. Return whether there was one."""
         was, self.now.latched = self.now.latched, 0
         return bool(was)
 
@@ -194,7 +194,7 @@ cdef class JointStatus:
         return self.published(STALE, self.another())
 
     cdef int another(self) noexcept nogil:
-        """One more cycle in a row without a number; the fault STALE when there have been too many."""
+        """Count a consecutive cycle without a torque; return the fault STALE when there were too many."""
         self.now.run += 1
         return FAULT_STALE if 0 <= self.stale_limit <= self.now.run else 0
 
@@ -222,13 +222,13 @@ cdef class JointStatus:
         return self.now.asked
 
     cdef void fall(self, int status) noexcept nogil:
-        """A worse status than the one that is held begins."""
+        """Change to a worse status."""
         if _rank(self.now.held) <= WITH_NUMBER < _rank(status):
             self.now.factor = min(2 * self.now.factor, MOST_TIMES) if self.now.since < self.now.window else 1
         self.now.needed = self.cycles(status)
 
     cdef void rise(self, int status) noexcept nogil:
-        """The held status is left for a better one."""
+        """Change to a better status after the hold time."""
         if _rank(status) <= WITH_NUMBER < _rank(self.now.held):
             self.now.since, self.now.window = 0, RELAPSE_TIMES * self.now.needed
         if _rank(status) <= WITH_NUMBER:
@@ -237,7 +237,7 @@ cdef class JointStatus:
         self.now.needed = self.cycles(status)
 
     cdef int64_t cycles(self, int status) noexcept nogil:
-        """How long a status is held."""
+        """Return the hold time of a status in cycles."""
         return _wait(status) if _rank(status) <= WITH_NUMBER else _wait(status) * self.now.factor
 
 
@@ -269,7 +269,7 @@ cdef class JointTally:
             raise ValueError("not the counters and errors of a snapshot")
 
     cdef int faults(self, StatusState *state) noexcept nogil:
-        """Count the faults that are new in this cycle; return the flags that tell why there is no number."""
+        """Count the faults that are new in this cycle; return the flags that explain the missing torque."""
         cdef int flags, bit
         if state.news:
             for bit in range(LOW_BYTE):
@@ -284,7 +284,7 @@ cdef class JointTally:
         return flags
 
     cdef void network(self, const Values *estimate, bint wanted, double limit_nm) noexcept nogil:
-        """A cycle in which the network is not, or not alone, in charge (status 3), or gave no number."""
+        """Count a cycle in which the network is not fully used (status 3), or gave no torque."""
         cdef double network_nm = estimate.network_nm
         if estimate.status == DEGRADED:
             self.counters[FALLBACKS] += 1
@@ -298,7 +298,7 @@ cdef class JointTally:
             self.counters[NETWORK_OUTSIDE] += 1
 
     cdef void error(self, double difference_nm) noexcept nogil:
-        """A published estimate minus the sensor's torque."""
+        """Add the error of a published estimate against the sensor."""
         self.errors[2 * self.number] += difference_nm * difference_nm
         self.errors[2 * self.number + 1] += 1.0
 
@@ -317,7 +317,7 @@ cdef int _unpowered(int statusword) noexcept nogil:
 
 
 def drive_status(int statusword):
-    """Status that a drive's statusword (6041h) puts in place of any other; None for a motor that carries current."""
+    """Return the status forced by a drive's statusword (6041h), or None if the motor carries current."""
     return None if _powered(statusword) else _unpowered(statusword)
 
 
@@ -338,7 +338,7 @@ cdef class JointRules:
         self.use(safety, with_network)
 
     def use(self, safety, bint with_network):
-        """From now on these limits; what is held and latched stays."""
+        """Use these limits; held and latched states stay."""
         self.with_network = with_network
         self.plausibility, self.is_checked = safety.plausibility, safety.plausibility is not None
         self.torque_limit_nm, self.network_limit_nm = safety.torque_limit_nm, safety.network_limit_nm
@@ -347,7 +347,7 @@ cdef class JointRules:
         self.status.use(safety.settings)
 
     def begin_again(self):
-        """The drive restarted: where its encoders stood means nothing any more."""
+        """Restart after a restart of the drive: earlier encoder positions are invalid."""
         self.deviates = 0
         if self.is_checked:
             self.plausibility.reset()
@@ -403,7 +403,7 @@ cdef class JointRules:
         return 0
 
     cdef int faults_of(self, const Values *estimate, double sensor_nm, bint network_wanted) noexcept nogil:
-        """Faults of numbers that the estimator takes for good."""
+        """Return the faults of numbers that the estimator marked as good."""
         cdef double torque = estimate.torque_nm, sigma = estimate.sigma_nm, network = estimate.network_nm
         cdef double limit = self.torque_limit_nm
         cdef bint is_sigma = 0.0 <= sigma < INFINITY

@@ -21,7 +21,7 @@ _PAUSE_S = 1.0
 
 
 class LiveKeeper:
-    """The live view of one run of jtqd. Whatever happens to it, the loop goes on.
+    """Live view of one run of jtqd; its failures do not affect the loop.
 
     Args:
         start_child: (module, arguments, name) -> child; the supervisor ends what it has started.
@@ -36,7 +36,7 @@ class LiveKeeper:
         self._starts: list[float] = []
 
     def start(self, config: Config, directory: Path, bus: str) -> None:
-        """Begin to serve what the daemon leaves in its runtime directory.
+        """Start the live view of the daemon's runtime directory.
 
         Args:
             config: in force.
@@ -54,16 +54,18 @@ class LiveKeeper:
             "gear_ratios": [joint.joint.gear_ratio for joint in config.joints],
         }
         if not self._address.loopback:
-            _say(f"the live view is open to everyone who can reach {self._address.host}; it can only be read")
+            _say(
+                f"the live view accepts connections from every host that can reach {self._address.host}; it is read-only"
+            )
         self._run()
 
     @property
     def pid(self) -> int | None:
-        """Process-ID of the live view; None while there is none."""
+        """Return the process-ID of the live view, or None."""
         return self._child.pid if self._child is not None and self._child.alive() else None
 
     def watch(self) -> None:
-        """Pass on what it says; start it again when it died, at most once a second, and not for ever."""
+        """Report its output; restart it when it died, at most once a second and five times a minute."""
         if self._child is None:
             return
         ended = not self._child.alive()  # asked first: what it said before its end is then in the pipe
@@ -74,15 +76,15 @@ class LiveKeeper:
         if "listening" in answer:
             _say(f"live view: {answer['listening']}")
         if "failed" in answer:
-            _say(f"no live view: {answer['failed']}; the loop goes on")
+            _say(f"no live view: {answer['failed']}; the loop continues")
             self._child = None
         elif ended and time.monotonic() - self._starts[-1] > _PAUSE_S:
             code = self._child.process.returncode
             if len(self._starts) > _STARTS:
-                _say(f"the live view ended with exit status {code}, too often; the loop goes on without it")
+                _say(f"the live view ended with exit status {code}, too often; the loop continues without it")
                 self._child = None
                 return
-            _say(f"the live view ended with exit status {code}; started again, the loop goes on")
+            _say(f"the live view ended with exit status {code}; restarted, the loop continues")
             self._run()
 
     def _run(self) -> None:

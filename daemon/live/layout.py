@@ -316,7 +316,7 @@ _EXAMPLES = """examples:
   jtq layout --out jtqd.layout.json     then "Import from file..." in the layouts menu of Foxglove or Lichtblick
   jtq layout --follow 10 > live.layout.json     plots that show the last 10 s, for the live view
 
-The layout fits a recorded file and the live view of `jtqd --live` alike."""
+The layout works for a recorded file and for the live view of `jtqd --live`."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -328,9 +328,9 @@ def parser() -> argparse.ArgumentParser:
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    result.add_argument("--out", type=Path, metavar="FILE", help="write it there (default: standard output)")
+    result.add_argument("--out", type=Path, metavar="FILE", help="output file (default: standard output)")
     result.add_argument(
-        "--follow", type=seconds, metavar="S", help="plots show the last S seconds (default: all there is)"
+        "--follow", type=seconds, metavar="S", help="plots show the last S seconds (default: everything)"
     )
     return result
 

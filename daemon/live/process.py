@@ -97,13 +97,13 @@ class LiveStream:
         self.forget()
 
     def forget(self) -> None:
-        """Nobody has looked for a while: what was before must not show as a change."""
+        """Forget the last state after a pause without viewers, so that old changes are not reported."""
         self._slot = -1
         self._statuses: tuple[int, int] | None = None
         self._missed: int | None = None
 
     def take(self, records: Iterable[bytes]) -> list[Message]:
-        """Messages that these cycle records give, in the order of time."""
+        """Return the messages of these cycle records, in the order of time."""
         made: list[Message] = []
         for record in records:
             index, monotonic, realtime, flags, missed, counter, count, *statuses = _SCAN.unpack_from(record)
@@ -144,7 +144,7 @@ class LiveStream:
         return made
 
     def notices(self, news: Iterable[Notice]) -> list[Message]:
-        """Messages of the supervisor's notices."""
+        """Return the messages of the supervisor's notices."""
         made: list[Message] = []
         for notice in news:
             made += self.note(
@@ -236,15 +236,15 @@ class LiveServer:
 
     @property
     def watched(self) -> bool:
-        """Somebody has subscribed to something."""
+        """Return whether a viewer has subscribed to a topic."""
         return any(channel.has_sinks() for channel in self._channels.values())
 
     def send(self, message: Message) -> None:
-        """To every viewer that has subscribed to the topic; a slow one loses its oldest messages."""
+        """Send to every subscribed viewer; a slow one loses its oldest messages."""
         self._channels[message.topic].log(message.payload, log_time=message.time_ns)
 
     def stop(self) -> None:
-        """End it."""
+        """Stop the server."""
         self._server.stop()
 
 
@@ -302,14 +302,14 @@ class Source:
         self.skip()
 
     def skip(self) -> None:
-        """Nobody looks: keep the place."""
+        """Skip to the newest record while there is no viewer."""
         self._ring.position += self._ring.backlog
         self._stream.forget()
         if self._notices is not None:
             self._notices.read()
 
     def read(self) -> list[Message]:
-        """What is new."""
+        """Return the new messages."""
         made = self._stream.take(self._ring.read().records)
         if self._notices is not None:
             made += self._stream.notices(self._notices.read()[0])
@@ -323,7 +323,7 @@ class Source:
 
 
 def serve(source: Source, server: LiveServer, stop: Stop) -> None:
-    """Send until told to stop. Without a viewer it only keeps its place."""
+    """Serve until stopped. Without a viewer it only follows the ring."""
     while not stop.requested:
         if server.watched:
             for message in source.read():

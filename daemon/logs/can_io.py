@@ -114,7 +114,7 @@ class McapCanWriter(SizedMessageWriter):  # type: ignore[misc]
         if msg.is_fd or len(msg.data) > 8:
             self.left_out += 1
             if self.left_out == 1:
-                _LOG.warning("frames of CAN FD are left out: a log of jtqd has no room for them")
+                _LOG.warning("CAN FD frames are left out: logs of jtqd cannot store them")
             return
         stamp = max(0, round(msg.timestamp * 1e9))
         if self._stamps and (len(self._stamps) == _CAPACITY or not 0 <= stamp - self._stamps[0] < _SPAN_NS):
@@ -177,4 +177,4 @@ class McapCanWriter(SizedMessageWriter):  # type: ignore[misc]
         self._writer.finish()
         self.file.close()
         if self.left_out:
-            _LOG.warning("%d frames of CAN FD were left out", self.left_out)
+            _LOG.warning("%d CAN FD frames were left out", self.left_out)

@@ -323,7 +323,7 @@ def _stepped(data: bytes, at: int, stop: int) -> tuple[NDArray[np.int64], list[t
     unpack_head = HEAD.unpack_from
     while at < stop:
         if stop - at < HEAD.size:
-            raise ChunkError("a record in it is cut")
+            raise ChunkError("a record in it is truncated")
         opcode, length = unpack_head(data, at)
         end = at + HEAD.size + length
         if end > stop:

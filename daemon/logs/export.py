@@ -44,7 +44,7 @@ _EXAMPLES = """examples:
   jtq export dbc run.mcap --out bus.dbc                 as attached to the log
   jtq export dbc --config arm.yaml --out bus.dbc        without a log: integers as the devices send them
 
-exit status: 0 done, 1 failure, 2 usage, 3 done, but cycles with a missing value were left out"""
+exit status: 0 done, 1 failure, 2 usage, 3 done, but cycles with missing values were left out"""
 _DBC = "bus.dbc"
 
 
@@ -67,7 +67,7 @@ def parser() -> argparse.ArgumentParser:
         "--topic", metavar="TOPIC", help="csv, parquet: this topic's fields; candump: its frames"
     )
     result.add_argument("--start", type=_seconds, metavar="S", help="seconds from the first message on")
-    result.add_argument("--end", type=_seconds, metavar="S", help="up to, but without, this time")
+    result.add_argument("--end", type=_seconds, metavar="S", help="up to this time (excluded)")
     result.add_argument(
         "--all-cycles", action="store_true", help="run table: keep cycles with missing values (NaN)"
     )
@@ -128,7 +128,7 @@ def _check_usage(command: argparse.ArgumentParser, options: argparse.Namespace) 
     if options.what in ("csv", "parquet") and options.out is None:
         command.error("expected --out FILE")
     if options.out is None and options.json:
-        command.error("--json needs --out FILE: standard output takes one of them")
+        command.error("--json needs --out FILE: standard output is used for one of them")
     if options.out is not None and any(_same(options.out, log) for log in options.logs):
         command.error(f"--out {options.out}: that is the log")
     start = max(0.0, options.start or 0.0)

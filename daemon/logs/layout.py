@@ -159,7 +159,7 @@ class _Builder:
         try:
             return np.dtype(made), at  # type: ignore[call-overload]
         except (ValueError, OverflowError) as error:
-            raise LogError(f"found a schema that makes no row: {error}") from None
+            raise LogError(f"found a schema without a fixed row: {error}") from None
 
     def _field(self, field: Field, at: int, depth: int) -> tuple[np.dtype[Any], int, int]:
         count = field.elements
@@ -191,7 +191,7 @@ class _Builder:
         if kind == "string":
             begin, length = self._length(at)  # with the closing zero
             if length == 0:
-                raise VariableLayoutError("found a text without its closing zero")
+                raise VariableLayoutError("found a string without its terminating zero")
             return np.dtype(f"S{length}"), begin, begin + length
         layout, end = self.of(kind, at, depth + 1)
         return layout, at, end

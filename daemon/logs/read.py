@@ -37,7 +37,7 @@ class Messages(NamedTuple):
 def read_topic(
     path: Path | Sequence[Path], topic: str, *, start_ns: int | None = None, end_ns: int | None = None
 ) -> Records:
-    """All messages of a topic in the order of the files, one field per field of the schema [n].
+    """Read all messages of a topic in the order of the files, one field per field of the schema [n].
 
     Nested messages are nested fields, `header.stamp.sec` is ["header"]["stamp"]["sec"]. See `read_topics`.
     """
@@ -74,7 +74,7 @@ def read_messages(
     start_ns: int | None = None,
     end_ns: int | None = None,
 ) -> dict[str, Messages]:
-    """As `read_topics`, with the log time of every message."""
+    """Read like `read_topics`, with the log time of every message."""
     parts = log_parts(path)
     collectors = {topic: _Collector(topic, parts[0]) for topic in topics}
     for part in _pieces(parts, topics, start_ns, end_ns):
@@ -91,7 +91,7 @@ def read_messages(
 def iter_messages(
     path: Path | Sequence[Path], topic: str, *, start_ns: int | None = None, end_ns: int | None = None
 ) -> Iterator[Messages]:
-    """Messages of one topic, chunk by chunk: for logs that are larger than the memory. Raises as `read_topics` does."""
+    """Read one topic chunk by chunk, for logs larger than memory. Raises as `read_topics` does."""
     for found in iter_topics(path, (topic,), start_ns=start_ns, end_ns=end_ns):
         yield found[topic]
 
@@ -149,7 +149,7 @@ def _pieces(
 
 
 def topics_of(path: Path | Sequence[Path]) -> dict[str, str]:
-    """Topics of a log and the names of their schemas. Raises LogError, OSError."""
+    """Return the topics of a log and the names of their schemas. Raises LogError, OSError."""
     found = {}
     for part in log_parts(path):
         with LogFile(part) as log:
@@ -171,7 +171,7 @@ def _schema(log: LogFile, path: Path, channel: Channel) -> Schema:
 
 
 def read_attachments(path: Path | Sequence[Path]) -> dict[str, bytes]:
-    """Attachments by name; of several parts the first one's, and of several of one name the last.
+    """Return attachments by name: those of the first part; of several with one name the last.
 
     Raises:
         LogError: the file, or an attachment, is damaged.
@@ -182,7 +182,7 @@ def read_attachments(path: Path | Sequence[Path]) -> dict[str, bytes]:
 
 
 def log_parts(path: Path | Sequence[Path]) -> list[Path]:
-    """Files of one run in the order of their writing.
+    """Return the files of one run in the order of writing.
 
     A directory may hold one run of jtqd, or any MCAP files that follow one another. Raises LogError for one with several
     runs, or none; OSError.

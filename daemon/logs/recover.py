@@ -68,7 +68,7 @@ class OutsideChunksError(RecoverError):
 
 @dataclass(frozen=True)
 class Recovery:
-    """What was found in a file and done to it.
+    """Result of a recovery.
 
     Attributes:
         path: the file as it is called now.
@@ -96,14 +96,14 @@ class Recovery:
     findings: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """For `json.dumps`."""
+        """Return the result for `json.dumps`."""
         return asdict(self) | {"path": str(self.path), "findings": list(self.findings)}
 
 
 def recover(
     path: Path, *, dry_run: bool = False, keep_free: int = 0, attachments_are_enough: bool = False
 ) -> Recovery:
-    """Write a damaged file anew, as far as it is whole, and take `.active` off its name.
+    """Recover a damaged file as far as it is intact, and remove `.active` from its name.
 
     A file that is whole is not touched; recovering again changes nothing.
 
@@ -129,7 +129,7 @@ def recover(
         _refuse(path, found, own)
         now = os.fstat(descriptor)
         if (now.st_size, now.st_mtime_ns) != (before.st_size, before.st_mtime_ns):
-            raise RecoverError(f"{path}: found that it is being written, expected a file at rest")
+            raise RecoverError(f"{path}: found that it is being written, expected a closed file")
         final = _final_name(path)
         changed = not is_whole(found, own)
         report = _report(source, found, own) if changed else _Report()
@@ -163,7 +163,7 @@ def recover(
 
 
 def _refuse(path: Path, found: Contents, own: Summary | None) -> None:
-    """Raise RecoverError for a file that has nothing to copy, or messages that would be lost by it."""
+    """Raise RecoverError for a file without readable content, or with messages that would be lost."""
     foreign = found.header is not None and not found.header.library.startswith("jtqd")
     if found.loose_messages and (foreign or not found.chunks):
         raise OutsideChunksError(
@@ -171,7 +171,7 @@ def _refuse(path: Path, found: Contents, own: Summary | None) -> None:
             ended=own is not None,
         )
     if not (found.header or found.chunks or _has_attachments(found)):
-        raise RecoverError(f"{path}: found nothing that can be read, expected an MCAP file")
+        raise RecoverError(f"{path}: found no readable content, expected an MCAP file")
 
 
 def _has_attachments(found: Contents) -> bool:
@@ -191,7 +191,7 @@ class _Report:
 
 
 def _report(source: Source, found: Contents, own: Summary | None) -> _Report:
-    """Findings about a file that must be written anew."""
+    """Return the findings about a file that must be rewritten."""
     report = _Report()
     for gap in sorted(found.gaps, key=lambda each: each.start):
         size = gap.end - gap.start
@@ -202,7 +202,7 @@ def _report(source: Source, found: Contents, own: Summary | None) -> _Report:
         if zeros:
             what = f"{counted(size, 'byte')} of zeros at the end"
         elif at_end:
-            what = f"torn at byte {gap.start}: the last {counted(size, 'byte')} cannot be read"
+            what = f"truncated at byte {gap.start}: the last {counted(size, 'byte')} cannot be read"
         else:
             what = f"bytes {gap.start} to {gap.end} cannot be read{' (a chunk)' if gap.chunks else ''}"
         report.findings.append(what)
@@ -217,22 +217,20 @@ def _report(source: Source, found: Contents, own: Summary | None) -> _Report:
             report.findings.append(f"{counted(missing, 'message')} of the summary are not in the file")
             report.lossy, report.lost_s = True, None
     if found.undefined:
-        report.findings.append(f"{counted(found.undefined, 'chunk')} with a channel that is defined nowhere")
+        report.findings.append(f"{counted(found.undefined, 'chunk')} with an undefined channel")
     if found.unproven:
-        report.findings.append(
-            "schemas and channels are in no chunk that can be read: taken from the head, unchecked"
-        )
+        report.findings.append("no readable chunk has schemas and channels: taken from the head, unchecked")
         report.lossy = True
     if found.contradicted:
         report.findings.append(
             "schemas or channels at the head are damaged: taken from a chunk or the summary"
         )
     if not found.magic or found.header is None:
-        report.findings.append("magic bytes or header damaged: written anew")
+        report.findings.append("magic bytes or header damaged: rewritten")
     anew = sum(not chunk.indexed for chunk in found.chunks)
     if anew:
-        report.findings.append(f"message indexes of {counted(anew, 'chunk')} written anew")
-    report.findings.append("no summary: written" if own is None else "summary written anew")
+        report.findings.append(f"message indexes of {counted(anew, 'chunk')} rewritten")
+    report.findings.append("no summary: written" if own is None else "summary rewritten")
     return report
 
 
@@ -287,7 +285,7 @@ class _Copy:
 
 
 def _replace(path: Path, source: Source, found: Contents, keep_free: int) -> int:
-    """Write what was found beside the file, check it and put it in its place; returns its descriptor, which is locked.
+    """Write the intact content beside the file, check it and replace the file; return its locked descriptor.
 
     Raises:
         RecoverError: the copy does not read back.
@@ -314,7 +312,9 @@ def _replace(path: Path, source: Source, found: Contents, keep_free: int) -> int
         own = read_summary(written)
         again = scan(written, own)
         if not is_whole(again, own) or again.counts != found.counts:
-            raise RecoverError(f"{path}: found a copy that does not read back, expected what was written")
+            raise RecoverError(
+                f"{path}: found a copy that reads back differently, expected the written content"
+            )
         os.replace(partial, target)
         _sync_directory(target.parent)
     except BaseException:
@@ -384,7 +384,7 @@ def _lock(descriptor: int, path: Path, *, shared: bool) -> None:
     except OSError as error:
         if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
             raise BeingWrittenError(
-                f"{path}: a recorder is writing it, expected a file that nobody writes"
+                f"{path}: found that a recorder is writing it, expected a closed file"
             ) from None
         # A file system without locks: what is left is the check that the file does not change meanwhile.
 
@@ -441,7 +441,7 @@ def _is_being_written(path: Path) -> bool:
 
 
 def _leftovers(arguments: list[str]) -> int:
-    """Recover all files that an earlier run left; exit status 0, or 2 for wrong use."""
+    """Recover all files of earlier runs; exit status 0, or 2 for wrong use."""
     if len(arguments) != 3 or not arguments[2].isdigit():
         print("usage: python -m jtqd.daemon.logs.recover DIRECTORY PREFIX RESERVE_BYTES", file=sys.stderr)
         return 2

@@ -15,14 +15,13 @@ from jtqd.estimator.checked import counted
 
 _ENDINGS = (".mcap", ".mcap" + ACTIVE)
 _EXAMPLES = """examples:
-  jtq recover /var/log/jtqd                       every file there that is damaged or that a crash has left
+  jtq recover /var/log/jtqd                       every damaged or unfinished file in the directory
   jtq recover run.mcap.active                     becomes run.mcap
   jtq recover --dry-run --json run.mcap           check every byte, change nothing
 
-Every file is checked from its first byte to its last; of a directory's files (*.mcap, *.mcap.active) those that are
-whole are not listed. Files that a recorder is writing are refused (in a directory: left out). A file of which no
-message can be read stays as it is. The recovered file is written beside the old one, which it then replaces: as much
-room as the file has must be free.
+Every file is checked completely; intact files of a directory (*.mcap, *.mcap.active) are not listed. Files that a
+recorder is writing are refused (in a directory: left out). A file without a readable message stays as it is.
+The recovered file is written beside the old one and then replaces it: the free space must be at least the file's size.
 
 exit status: 0 nothing lost, 3 recovered with loss, 1 failure, 2 usage"""
 
@@ -31,13 +30,13 @@ def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq recover`."""
     result = argparse.ArgumentParser(
         prog="jtq recover",
-        description="Recover logs of jtqd that were torn by a crash, cut short or damaged: every whole chunk is kept.",
+        description="Recover truncated or damaged logs of jtqd; every intact chunk is kept.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     result.add_argument("logs", nargs="+", type=Path, metavar="FILE|DIR")
     result.add_argument("--json", action="store_true", help="results as JSON on standard output")
-    result.add_argument("--dry-run", action="store_true", help="report what would be done, change nothing")
+    result.add_argument("--dry-run", action="store_true", help="report only, change nothing")
     return result
 
 

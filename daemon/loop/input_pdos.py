@@ -36,7 +36,7 @@ class InputPdo:
 
 @dataclass(frozen=True)
 class JointInputs:
-    """Where one joint's inputs stand among the intake's PDOs, and what one count of each is worth.
+    """Indices of one joint's inputs among the intake's PDOs, and their scaling.
 
     Attributes:
         position: index of TPDO1 (motor position, link position).
@@ -58,7 +58,7 @@ class JointInputs:
 
 
 def input_pdos(config: Config) -> list[InputPdo]:
-    """Expected PDOs: both TPDOs of each drive, then one per sensor channel in use."""
+    """Return the expected PDOs: both TPDOs of each drive, then one per sensor channel in use."""
 
     def pdo(pdo_map: PdoMap, node: int, what: str) -> InputPdo:
         return InputPdo(pdo_map.cob_id, pdo_map.length, pdo_map.layout, node, f"{pdo_map.cob_id:03X}h {what}")
@@ -76,14 +76,14 @@ def input_pdos(config: Config) -> list[InputPdo]:
 
 
 def sensor_index(config: Config, channel: int | None) -> int | None:
-    """Index of a sensor channel's PDO among them; None without channel or sensor."""
+    """Return the index of a sensor channel's PDO; None without channel or sensor."""
     if channel is None or config.sensor is None:
         return None
     return 2 * len(config.joints) + config.sensor.channels.index(channel)
 
 
 def joint_temperatures(config: Config) -> list[JointTemperature]:
-    """Temperature of each joint whose drive sends one, in the order of the joints; all unknown yet."""
+    """Return the temperatures of the joints whose drive sends one, in joint order; all unknown at first."""
     life = round(TEMPERATURE_LIFE_S * 1e9 / config.period_ns)
     return [
         JointTemperature(cob_id, node, f"{cob_id:03X}h drive {node} TPDO3", life)

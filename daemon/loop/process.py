@@ -125,7 +125,7 @@ class Stop:
 
 
 def build_estimator(config: Config, joint: JointConfig) -> AnyEstimator:
-    """Estimator of one joint as configured; raises ConfigError or NetworkError."""
+    """Build the estimator of one joint as configured; raises ConfigError or NetworkError."""
     method, network = config.estimator.method, None
     try:
         if joint.network is not None:
@@ -137,13 +137,13 @@ def build_estimator(config: Config, joint: JointConfig) -> AnyEstimator:
 
 
 def _scaling(report: dict[str, Any], node: int, names: tuple[str, ...]) -> dict[str, Any]:
-    """Factors of a node; zeros for one that is absent: they come with its configuration, before any of its data is used."""
+    """Return the factors of a node; zeros for an absent one, whose factors come with its configuration."""
     booted = report["nodes"].get(str(node))
     return dict.fromkeys(names, 0.0) if booted is None else booted["scaling"]
 
 
 def joint_inputs(config: Config, report: dict[str, Any]) -> list[JointInputs]:
-    """Indices into `input_pdos` and the scaling that the boot read from the devices."""
+    """Return indices into `input_pdos` and the scaling that the boot read from the devices."""
     result = []
     measured = [joint.number for joint in config.joints if joint.temperature]
     for number, joint in enumerate(config.joints):
@@ -166,7 +166,7 @@ def joint_inputs(config: Config, report: dict[str, Any]) -> list[JointInputs]:
 
 
 def loop_filters(config: Config) -> list[CanFilter]:
-    """SYNC (own echo and foreign ones), the inputs, temperatures, the nodes' heartbeats: nothing else wakes the loop.
+    """Return filters for SYNC (own echo and foreign), inputs, temperatures and the nodes' heartbeats.
 
     Each in every frame format, so that 29-bit and remote frames under our identifiers are seen and counted.
     """
@@ -239,7 +239,7 @@ def build_cycle(
     *,
     attach: bool = False,
 ) -> tuple[Cycle, Grid]:
-    """Cycle and grid from configuration and boot report; with `attach`, on the shared memory of the running loop."""
+    """Build cycle and grid from configuration and boot report; `attach`: on the running loop's shared memory."""
     grid = Grid(0, config.period_ns)
     snapshot = Snapshot(
         Path(request["snapshot"]), config.period_ns * 1e-9, float(request["worst_load"]), attach=attach
@@ -265,10 +265,10 @@ def build_cycle(
 
 
 def build_estimators(request: dict[str, Any]) -> tuple[Config, list[AnyEstimator]]:
-    """Configuration and warm estimators of both joints; raises ConfigError or NetworkError."""
+    """Load the configuration and warm up the estimators of both joints; raises ConfigError or NetworkError."""
     config = load_config(Path(request["config"]) if request["config"] else None)
     if config.files_sha256 != request["config_sha256"]:
-        raise ConfigError(f"{config.path}: it or one of its joint files changed while jtqd was reading it")
+        raise ConfigError(f"{config.path}: it or one of its joint files was changed during reading")
     estimators = [build_estimator(config, joint) for joint in config.joints]
     warm_up(estimators)
     return config, estimators
@@ -298,7 +298,7 @@ def serve(request: dict[str, Any]) -> int:
 
 
 def make_duties(cycle: Cycle, request: dict[str, Any]) -> tuple[Duties, Giver]:
-    """Watchdog, orders and hand-over of this loop."""
+    """Create watchdog, orders and hand-over of this loop."""
     watchdog = LoopWatchdog(Notifier(), cycle.grid.period_ns, watchdog_seconds())
     giver = Giver(cycle, Path(request["successor"]))
     return Duties(cycle, watchdog, giver, lambda why: answer(not_handed_over=why)), giver
@@ -313,13 +313,13 @@ def finish(cycle: Cycle, go: Callable[[], bool]) -> int:
             return 0
         cycle.leave()
     except BusGone as gone:
-        error = f"the bus went away: {gone}"
+        error = f"bus lost: {gone}"
     answer(done=True, error=error, counters=frame_counts(cycle.intake))
     return 1 if error else 0
 
 
 def read_line(stop: Stop) -> str | None:
-    """The boot report, or None when we are told to stop or the supervisor has gone."""
+    """Return the boot report, or None on a stop order or when the supervisor has ended."""
     while not stop.requested:
         if select.select([sys.stdin], [], [], 0.2)[0]:
             return sys.stdin.readline() or None
@@ -327,7 +327,7 @@ def read_line(stop: Stop) -> str | None:
 
 
 def main(argv: list[str], go: Callable[[dict[str, Any]], int] = serve) -> int:
-    """Entry of the process; every foreseeable failure is one JSON line and exit status 1."""
+    """Run the process; every foreseeable failure is one JSON line and exit status 1."""
     try:
         return go(json.loads(argv[0]))
     except (ConfigError, NetworkError, BusError) as error:

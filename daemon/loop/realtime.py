@@ -15,7 +15,7 @@ _PR_SET_TIMERSLACK = 29
 
 
 def prepare(priority: int, cpu: int | None, lock_memory: bool) -> list[str]:
-    """Make this process as punctual as it is allowed to be.
+    """Request the real-time settings of this process; return the refused ones.
 
     Args:
         priority: SCHED_FIFO priority, 0 leaves the default scheduling class.
@@ -51,7 +51,7 @@ def prepare(priority: int, cpu: int | None, lock_memory: bool) -> list[str]:
 
 
 def freeze() -> None:
-    """No garbage collection from here on: what exists stays, and the loop makes no cycles of references."""
+    """Disable garbage collection: existing objects stay, and the loop creates no reference cycles."""
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -61,7 +61,7 @@ _FIELD = 8  # cpu user nice system idle iowait irq softirq steal
 
 
 def stolen_s(stat: Path = Path("/proc/stat")) -> float:
-    """Read what a hypervisor took from all processors since the machine's start [s], in steps of 10 ms.
+    """Read the time that a hypervisor stole from all processors since the machine's start [s], in steps of 10 ms.
 
     From proc(5), /proc/stat; 0 where the kernel does not tell. No scheduling priority helps against it.
     """

@@ -54,7 +54,7 @@ class RecorderState(NamedTuple):
 
 
 class Diagnostics:
-    """Makes the statuses; remembers the counts of the last time.
+    """Builds the statuses; remembers the previous counts.
 
     Args:
         bus: name of the bus.
@@ -81,7 +81,7 @@ class Diagnostics:
         now_ns: int,
         conditions: Sequence[Condition] = (),
     ) -> list[Status]:
-        """All of them; those of the loop only where there is a snapshot.
+        """Return all statuses; those of the loop only if there is a snapshot.
 
         Args:
             view: of the loop.
@@ -107,7 +107,7 @@ class Diagnostics:
         now_ns: int,
         conditions: Sequence[Condition] = (),
     ) -> list[Status]:
-        """Those of loop, bus, joints and nodes; arguments as of `statuses`."""
+        """Return the statuses of loop, bus, joints and nodes; arguments as of `statuses`."""
         found = [*conditions, *self._risen(view)]
         result = [self._loop(view, work_us, late_us, found), self._bus_status(view, found)]
         result += [self._joint(view, number, found) for number in (1, 2)]
@@ -116,7 +116,7 @@ class Diagnostics:
         return result
 
     def _risen(self, view: View) -> list[Condition]:
-        """Conditions that show by a counter that has risen since the last message."""
+        """Return conditions whose counter has risen since the last message."""
         if not self._before:
             return []
         return [
@@ -133,7 +133,7 @@ class Diagnostics:
         if self._before and missed:
             text = f"{missed} {'slot' if missed == 1 else 'slots'} missed since the last message"
         if view.cycle == self._cycle:
-            level, text = STALE, "the loop stands still"
+            level, text = STALE, "the loop is stalled"
         values: dict[str, float | str] = {"cycle": view.cycle}
         values |= {name: count for name, count in view.counters.items() if name not in _OF_THE_BUS}
         for name, figures in (("work", work_us), ("late", late_us)):
@@ -181,9 +181,10 @@ class Diagnostics:
     def _recorder(self, account: Account, state: RecorderState) -> Status:
         level, text = OK, state.mode
         if account.lost:
-            level, text = WARN, f"{account.lost} cycles lost so far"
+            level, text = WARN, f"{account.lost} cycle{'s' if account.lost != 1 else ''} lost so far"
         if account.lost > self._lost:
-            level, text = ERROR, f"{account.lost - self._lost} cycles lost since the last message"
+            lost = account.lost - self._lost
+            level, text = ERROR, f"{lost} cycle{'s' if lost != 1 else ''} lost since the last message"
         values: dict[str, float | str] = {
             "mode": state.mode,
             "backlog": state.backlog,
@@ -217,6 +218,6 @@ class Diagnostics:
 
 
 def _level(found: Sequence[Condition], subject: str, otherwise: str) -> tuple[int, str]:
-    """Level and text of the worst condition of a subject; OK and `otherwise` where there is none."""
+    """Return level and text of the worst condition of a subject; OK and `otherwise` without one."""
     condition = worst(found, subject)
     return (OK, otherwise) if condition is None else (_LEVELS[condition.severity], condition.text)

@@ -34,7 +34,7 @@ class Journal:
         self._in_chunk = 0
 
     def new_chunk(self) -> None:
-        """The room for events is there again."""
+        """Reset the number of events for a new chunk."""
         self._in_chunk = 0
 
     def note(
@@ -60,6 +60,6 @@ class Journal:
         self.builder.add(schemas.LOG.number, when, log(when, level, text))
 
     def report(self, kind: int, text: str, *, level: int, count: int = 0) -> None:
-        """Note an event, and pass its text to the operator too."""
+        """Note an event and report its text to the operator."""
         self.warn(text)
         self.note(kind, text, level=level, count=count)

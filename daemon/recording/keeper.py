@@ -54,7 +54,7 @@ class Keeper:
         self._result: dict[str, Any] | None = None
 
     def start(self, request: dict[str, Any]) -> None:
-        """Begin to record what `recording_request` asks for. Raises OSError."""
+        """Start the recorder with the request of `recording_request`. Raises OSError."""
         self._directory, self._prefix = Path(request["directory"]), str(request["prefix"])
         self._run_name = free_run(self._directory, self._prefix, time.time_ns())
         request = request | {"run": self._run_name}
@@ -73,7 +73,7 @@ class Keeper:
         return self._settled().lost
 
     def save(self) -> bool:
-        """Have the flight recording written; False where there is no recorder."""
+        """Request the flight recording; return False without a recorder."""
         if self.pid is None:
             return False
         assert self._child is not None
@@ -81,7 +81,7 @@ class Keeper:
         return True
 
     def renew(self, request: dict[str, Any]) -> None:
-        """Other files are in force: a new part begins, with them attached. Raises OSError."""
+        """Begin a new part with the new files attached. Raises OSError."""
         if self._child is None:
             return
         temporary = self._request.with_name(self._request.name + ".new")
@@ -90,7 +90,7 @@ class Keeper:
         self._child.process.send_signal(signal.SIGHUP)
 
     def watch(self) -> None:
-        """Start a recorder that died again: it goes on where it was.
+        """Restart a recorder that died; it continues where it was.
 
         After a second; after a minute if it dies again and again. What the ring has overwritten by then is counted as lost.
         """
@@ -99,14 +99,14 @@ class Keeper:
         often = len(self._starts) > _STARTS
         if time.monotonic() - self._starts[-1] > (_LONG_PAUSE_S if often else _PAUSE_S):
             self._waits = False
-            self._warn("started again, the loop goes on")
+            self._warn("restarted, the loop continues")
             self._run()
         elif often and not self._waits:
             self._waits = True
             self._warn(f"{len(self._starts)} times in a minute; the next try in {_LONG_PAUSE_S:.0f} s")
 
     def end(self, *, failed: bool = False) -> dict[str, Any] | None:
-        """End the recorder; its account, or what is known of it. None where nothing was to be recorded.
+        """End the recorder and return its account as far as known; None if nothing was to be recorded.
 
         Args:
             failed: the loop ended in an error: a flight recorder saves what it has.
@@ -144,7 +144,7 @@ class Keeper:
         return ProgressFile(self.progress).load() if self.progress.exists() else Account()
 
     def _account(self, error: str) -> dict[str, Any]:
-        """The account of a recorder that gave none itself; cycles that nobody wrote count as lost."""
+        """Return the account of a recorder that gave none; cycles not written count as lost."""
         settled = self._settled()
         cycles = SnapshotReader(self._snapshot).read().counters["cycles"]
         return {
@@ -156,7 +156,7 @@ class Keeper:
         }
 
     def _leftovers(self) -> list[str]:
-        """Files of this run whose recorder died before it could end them."""
+        """Return unfinished files of this run left by killed recorders."""
         if self._directory is None:
             return []
         files = own_files(self._directory, self._prefix)
@@ -179,7 +179,7 @@ def recording_request(
     notices: Path,
     instance: str,
 ) -> dict[str, Any]:
-    """Request for the recorder process: configuration, joint files, EDS, DBC, networks and versions attached.
+    """Return the request for the recorder: configuration, joint files, EDS, DBC, networks and versions attached.
 
     Args:
         config: configuration in force.

@@ -48,7 +48,7 @@ MAGIC = b"\x89MCAP0\r\n"
 
 
 def bytes_of(*records: McapRecord) -> bytes:
-    """The records one after the other."""
+    """Return the records in sequence."""
     builder = RecordBuilder()
     for record in records:
         record.write(builder)
@@ -116,7 +116,7 @@ class Appender:
         self._can_reserve = True
 
     def append(self, data: bytes, room: int = 0) -> None:
-        """Have `data` on the disk, and blocks for `room` bytes more behind it."""
+        """Write and sync `data`, and allocate `room` bytes behind it."""
         if self.removed:
             raise FileNotFoundError(errno.ENOENT, "the file was removed while it was being written")
         end = self.offset + len(data)
@@ -145,7 +145,7 @@ class Appender:
         self._reserved += length
 
     def _take_back(self) -> None:
-        """Cut off a piece that was half written; this gives the room away, so take it again."""
+        """Cut off a partly written piece and allocate its blocks again."""
         with contextlib.suppress(OSError):
             os.ftruncate(self._file, self.offset)
             if self._can_reserve and self._reserved > self.offset:
@@ -153,7 +153,7 @@ class Appender:
 
     @property
     def removed(self) -> bool:
-        """It has no name any more: nothing of it will be found."""
+        """Return whether the file was removed."""
         return os.fstat(self._file).st_nlink == 0
 
     @property
@@ -163,7 +163,7 @@ class Appender:
         return found.f_bavail * found.f_frsize
 
     def close(self) -> None:
-        """Give back the room that was not used, and close."""
+        """Release unused blocks and close."""
         with contextlib.suppress(OSError):
             os.ftruncate(self._file, self.offset)
         os.close(self._file)
@@ -249,7 +249,7 @@ class ChunkBuilder:
         self._begin()
 
     def restart(self) -> None:
-        """A file begins: its next chunk repeats schemas and channels (the one after it, if this one has begun)."""
+        """Repeat schemas and channels in the next chunk of a new file (or in the one after it, if one has begun)."""
         if self._entries:
             self._sealed = 0 if self._repeats else -1
         else:
@@ -299,7 +299,7 @@ class ChunkBuilder:
         return flat, len(times)
 
     def seal(self) -> SealedChunk | None:
-        """What was added since the last time as one chunk; None when that is nothing."""
+        """Return the messages added since the last call as one chunk, or None."""
         if not self._entries:
             return None
         self._entries = _by_time(self._entries)
@@ -366,7 +366,7 @@ class NamedData(NamedTuple):
 
 
 class Head(NamedTuple):
-    """What every file of a run begins with; identifiers of schemas and channels are the caller's."""
+    """Beginning of every file of a run; identifiers of schemas and channels are the caller's."""
 
     schemas: Sequence[Schema]
     channels: Sequence[Channel]
@@ -442,7 +442,7 @@ class McapFile:
         return self._constant_room + len(self._chunk_index) + 10 * len(self.counts) + _ROOM_FOR_NEXT
 
     def _sync_directory(self) -> None:
-        """Have a new or changed name on the disk, where the file system can do that."""
+        """Sync a new or changed name, if the file system supports it."""
         with contextlib.suppress(OSError):
             os.fsync(self._directory)
 
@@ -453,7 +453,7 @@ class McapFile:
 
     @property
     def removed(self) -> bool:
-        """The file has no name any more: nothing of it will be found."""
+        """Return whether the file was removed."""
         return self._file.removed
 
     @property
@@ -462,7 +462,7 @@ class McapFile:
         return self._file.free_bytes
 
     def append(self, chunk: SealedChunk) -> None:
-        """Have a chunk on the disk.
+        """Write and sync a chunk.
 
         Raises:
             OSError: it is not in the file.
@@ -500,7 +500,7 @@ class McapFile:
         return tail_bytes(groups, self._file.offset)
 
     def finish(self, final_name: str) -> None:
-        """Write the summary of what has been appended, close, and give the file its final name.
+        """Write the summary, close, and give the file its final name.
 
         Raises:
             OSError: the file has no summary and keeps its name; its chunks are readable one after the other.
@@ -516,7 +516,7 @@ class McapFile:
             os.close(self._directory)
 
     def abandon(self, *, remove: bool = False) -> None:
-        """Close it as it is; with `remove` take it away, for one that holds nothing."""
+        """Close the file as it is; `remove` deletes it, for an empty one."""
         with contextlib.suppress(OSError):
             self._file.close()
         with contextlib.suppress(OSError):

@@ -37,12 +37,12 @@ class OwnFile(NamedTuple):
 
 
 def part_name(prefix: str, run: str, part: int) -> str:
-    """Name of a finished part."""
+    """Return the name of a finished part."""
     return f"{prefix}-{run}-{part:04d}.mcap"
 
 
 def parse(prefix: str, path: Path) -> OwnFile | None:
-    """What the name says; None for a file that is not ours."""
+    """Parse a name; None for a foreign file."""
     found = PART_PATTERN.fullmatch(path.name)
     if found is None or found["prefix"] != prefix:
         return None
@@ -51,7 +51,7 @@ def parse(prefix: str, path: Path) -> OwnFile | None:
 
 
 def own_files(directory: Path, prefix: str) -> list[OwnFile]:
-    """Our regular files in a directory, oldest first; empty where it cannot be read."""
+    """Return our regular files in a directory, oldest first; empty if it cannot be read."""
     try:
         found = [parse(prefix, path) for path in directory.iterdir()]
         return sorted(each for each in found if each and each.path.is_file() and not each.path.is_symlink())
@@ -60,7 +60,7 @@ def own_files(directory: Path, prefix: str) -> list[OwnFile]:
 
 
 def free_run(directory: Path, prefix: str, time_ns: int) -> str:
-    """Name for a run that begins at this time: one that no file there has."""
+    """Return an unused name for a run that begins at this time."""
     stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(time_ns // 1_000_000_000))
     taken = [each.again for each in own_files(directory, prefix) if each.stamp == stamp]
     return f"{stamp}_{max(taken) + 1}" if taken else stamp
@@ -79,7 +79,7 @@ class Sized(NamedTuple):
 
 
 def sized(files: Sequence[OwnFile]) -> list[Sized]:
-    """The files that are still there, with their lengths."""
+    """Return the existing files with their lengths."""
     found = []
     for file in files:
         with suppress(OSError):
@@ -88,7 +88,7 @@ def sized(files: Sequence[OwnFile]) -> list[Sized]:
 
 
 def to_remove(files: Sequence[Sized], budget: int, growing: int, run: str, *, keep_run: bool) -> list[Sized]:
-    """Files whose removal brings the rest within a budget; the budget may stay exceeded. Pure.
+    """Return the files to remove for a budget; the budget may stay exceeded. Pure.
 
     Only finished files, those of earlier runs first, the oldest first. Of the run being written finished parts go only where
     `keep_run` is false, after all others, and never the newest of them.

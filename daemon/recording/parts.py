@@ -47,7 +47,7 @@ class Rules:
 
 
 class Parts:
-    """Takes sealed chunks and has them on the disk, or counts their cycles as lost.
+    """Writes sealed chunks, or counts their cycles as lost.
 
     Args:
         rules: of this run.
@@ -102,13 +102,13 @@ class Parts:
 
     @property
     def is_open(self) -> bool:
-        """There is a file."""
+        """Return whether a file is open."""
         return self._file is not None
 
     # ---- begin and end ----
 
     def open(self, why: str) -> bool:
-        """Begin the next part; False, reported once, where that is not possible."""
+        """Begin the next part; if that fails, report it once and return False."""
         rules = self._rules
         try:
             if free_bytes(rules.directory) < rules.reserve * (_ROOM_AGAIN if self.obstacle else 1.0):
@@ -158,7 +158,7 @@ class Parts:
             )
 
     def attach(self, attachments: Sequence[NamedData]) -> None:
-        """From the next part on these are attached."""
+        """Attach these files from the next part on."""
         self._head = self._head._replace(attachments=attachments)
 
     def rotate(self, why: str) -> None:
@@ -170,14 +170,14 @@ class Parts:
     # ---- chunks ----
 
     def write(self, chunk: SealedChunk, at_ns: int) -> None:
-        """Have a chunk on the disk, or count it; `at_ns` is the CLOCK_MONOTONIC time of its last cycle."""
+        """Write a chunk, or count it as lost; `at_ns` is the CLOCK_MONOTONIC time of its last cycle."""
         self._now_ns = at_ns
         if self._file is None and not self._try_again():
             self._miss(chunk.cycles)
             return
         # A file that was removed, or must not grow: the next one may do.
         if not self._append(chunk) and not (
-            self.open("the part before could not go on") and self._append(chunk)
+            self.open("the previous part could not be continued") and self._append(chunk)
         ):
             self._miss(chunk.cycles)
         file = self._file
@@ -196,7 +196,7 @@ class Parts:
             self.rotate("size")
 
     def _append(self, chunk: SealedChunk) -> bool:
-        """False when it did not go into the file, which then has been ended."""
+        """Append a chunk; return False if it failed and the file was ended."""
         file = self._file
         assert file is not None
         try:
@@ -218,21 +218,21 @@ class Parts:
         self._missed += cycles
 
     def _gone(self, file: McapFile) -> None:
-        """Somebody has removed the file: what was in it is lost."""
+        """Handle a removed file: its cycles are lost."""
         file.abandon()
         count, self._cycles = self._cycles, 0
         self._account.written -= count
         self._account.unwritten += count
-        text = f"part {self._part} was removed while it was being written: {count} cycles are lost with it"
+        text = f"part {self._part} was removed while it was being written: cycles lost with it: {count}"
         self._journal.report(schemas.FILE_REMOVED, text, level=ERROR, count=count)
 
     # ---- obstacles ----
 
     def _no_room(self) -> bool:
-        """Less is free than shall stay free. Always False."""
+        """Handle a disk below the reserve. Always False."""
         free, reserve = self.free_bytes / MEGABYTE, self._rules.reserve / MEGABYTE
         text = (
-            f"recording ends: {free:.4g} MB are free in {self._rules.directory}, {reserve:.4g} MB stay free"
+            f"recording pauses: {free:.4g} MB are free in {self._rules.directory}, {reserve:.4g} MB stay free"
         )
         if not self.obstacle and self._file is not None:
             self._journal.note(schemas.SPACE_LOW, text, level=ERROR)
@@ -247,25 +247,25 @@ class Parts:
     def _stop_for(self, obstacle: str) -> None:
         """Report an obstacle once, and wait a little before the next attempt."""
         if not self.obstacle:
-            self._journal.warn(f"{obstacle}; cycles are counted as lost until it goes on")
+            self._journal.warn(f"{obstacle}; cycles are counted as lost until it continues")
         self.obstacle = obstacle
         self._retry_ns = self._now_ns + _RETRY_NS
 
     def _try_again(self) -> bool:
         if self.obstacle and self._now_ns < self._retry_ns:
             return False
-        return self.open("recording goes on" if self._part else "start")
+        return self.open("recording continues" if self._part else "start")
 
     def _went_on(self) -> None:
         self.obstacle = ""
         count, self._missed = self._missed, 0
-        text = f"recording goes on in part {self._part}; {count} cycles could not be written"
+        text = f"recording continues in part {self._part}; cycles not written: {count}"
         self._journal.report(schemas.WRITE_FAILED, text, level=ERROR if count else WARN, count=count)
 
     # ---- budget ----
 
     def _enforce_budget(self) -> None:
-        """Remove what the budget asks for, oldest first."""
+        """Remove files to meet the budget, oldest first."""
         rules = self._rules
         active = part_name(rules.prefix, rules.run, self._part) + ACTIVE
         files = [each for each in own_files(rules.directory, rules.prefix) if each.path.name != active]
@@ -283,6 +283,6 @@ class Parts:
         self._others = sum(each.size for each in found)
         over = rules.budget is not None and self.total_size > rules.budget
         if over and not self._over_budget:
-            text = "the budget is exceeded by files that are not removed; recording goes on"
+            text = "the budget is exceeded by files that are not removed; recording continues"
             self._journal.report(schemas.FILE_RETIRED, text, level=WARN)
         self._over_budget = over

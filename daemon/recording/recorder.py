@@ -86,7 +86,7 @@ class Session:
         self.journal.note(schemas.RECORDER_STARTED, "recorder started", level=INFO, time_ns=now_ns)
         if self._flight is None:
             earlier = any(each.run == self.run for each in own_files(request.directory, request.prefix))
-            self.parts.open("the recorder was started again" if earlier else "start")
+            self.parts.open("recorder restarted" if earlier else "start")
 
     def save(self, why: str) -> None:
         """Write the flight recording; without a flight recorder: begin the next part, so that this one can be had."""
@@ -104,7 +104,7 @@ class Session:
         self.recording.flush()
         self.parts.attach(attachments)
         if self._flight is None:
-            self.parts.rotate("other files in force")
+            self.parts.rotate("new files in force")
 
     def fault(self, why: str) -> None:
         """Something failed: a flight recorder saves."""
@@ -153,7 +153,7 @@ class Session:
     def finish(self) -> dict[str, Any]:
         """End everything; returns the summary of the run."""
         account = self.account
-        text = f"recorder stopped: {account.cycles} cycles seen, {account.lost} lost"
+        text = f"recorder stopped: cycles {account.cycles}, lost {account.lost}"
         self.journal.note(schemas.RECORDER_STOPPED, text, level=INFO, time_ns=time.time_ns())
         self._read_notices()
         self.recording.flush()
@@ -365,7 +365,7 @@ class Recorder:
             if asked is None and self._signals.stop:
                 asked = now
                 if self._signals.orphaned:
-                    self._session.fault("jtqd has gone")
+                    self._session.fault("jtqd has ended")
             if now - last_diagnosis >= 1.0:
                 used = time.process_time()
                 percent = round(100.0 * (used - cpu) / (now - last_diagnosis), 2)

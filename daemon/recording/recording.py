@@ -29,7 +29,7 @@ _STALE = next(code for code, name in schemas.STATUS_NAMES.items() if name == "ST
 
 
 class FaultTrigger:
-    """Decides when a joint's status is worth a recording: once, when it begins. Pure."""
+    """Trigger of the flight recorder by a joint's status, once per occurrence. Pure."""
 
     def __init__(self) -> None:
         self._statuses = (0, 0)
@@ -56,7 +56,7 @@ class FaultTrigger:
 
 
 class FlightRecorder:
-    """Keeps the last seconds in memory, as sealed chunks, and writes them to a file when something happens.
+    """Flight recorder: keeps the last seconds in memory, as sealed chunks, and writes them on a trigger.
 
     Around an occurrence: everything that memory holds before it, and `AFTER_S` behind it; another occurrence in that time
     prolongs it. What falls out of memory unwritten counts as let go, and so does what memory holds.
@@ -82,7 +82,7 @@ class FlightRecorder:
 
     @property
     def saving(self) -> bool:
-        """A file is being written."""
+        """Return whether a file is being written."""
         return self._until_ns is not None
 
     @property
@@ -96,7 +96,7 @@ class FlightRecorder:
         return (self._memory[-1][1] - self._memory[0][1]) / _NS if self._memory else 0.0
 
     def write(self, chunk: SealedChunk, at_ns: int) -> None:
-        """Keep a chunk, or have it on the disk while saving."""
+        """Keep a chunk in memory, or write it while saving."""
         self._newest_ns = max(self._newest_ns, at_ns)
         if self._until_ns is not None:
             self._parts.write(chunk, at_ns)
@@ -142,7 +142,7 @@ _SCAN = cycle.selection(
 
 
 class Sink(Protocol):
-    """Where sealed chunks go."""
+    """Target of sealed chunks."""
 
     def write(self, chunk: SealedChunk, at_ns: int) -> None:
         """Take a chunk whose last cycle is of CLOCK_MONOTONIC `at_ns`; count its cycles as written or lost."""
@@ -224,7 +224,7 @@ class Recording:
 
     @property
     def progress(self) -> Account:
-        """What is settled: cycles that wait for the end of their chunk are not."""
+        """Return the account of completed chunks; cycles of the open chunk are not included."""
         account = self.account
         settled = account.cycles - self._pending
         return Account(settled, account.written, account.overwritten, account.unwritten, account.let_go)

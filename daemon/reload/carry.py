@@ -58,7 +58,7 @@ class _Part:
         self._told_others: list[Any] = [_SKIP] * len(others)
 
     def changed_scalars(self) -> list[Any]:
-        """Number and value of each that is not what it was: [1, 0.5, 4, True]. Raises Changed."""
+        """Return number and value of each changed scalar: [1, 0.5, 4, True]. Raises Changed."""
         now, told = self._get(self.thing), self._told
         if all(map(is_, now, told)):
             return []
@@ -73,7 +73,7 @@ class _Part:
         return news
 
     def changed_others(self) -> list[Any]:
-        """Number and content of each that is not what it was. Raises Changed."""
+        """Return number and content of each other changed attribute. Raises Changed."""
         news: list[Any] = []
         told = self._told_others
         for number, value in enumerate(self._get_others(self.thing)):
@@ -100,7 +100,7 @@ class Walk:
         self._links: list[tuple[Any, str, Any]] = []
 
     def step(self, count: int) -> list[Found]:
-        """Look at no more than `count` objects; nothing when all have been looked at."""
+        """Examine at most `count` objects; do nothing when all have been examined."""
         found: list[Found] = []
         while self._todo and len(found) < count:
             path, thing = self._todo.popleft()
@@ -111,12 +111,12 @@ class Walk:
 
     @property
     def left(self) -> bool:
-        """There are objects that nobody has looked at yet."""
+        """Return whether objects remain to be examined."""
         return bool(self._todo)
 
     @property
     def count(self) -> int:
-        """Objects found so far."""
+        """Return the number of objects found so far."""
         return len(self._parts)
 
     def changes(self, first: int = 0, last: int | None = None) -> list[Change]:
@@ -167,7 +167,7 @@ class Fill:
         self._parts: list[_Part] = []
 
     def learn(self, found: list[Found]) -> None:
-        """Where the next values belong. Raises CarryError."""
+        """Learn the targets of the next values. Raises CarryError."""
         for path, scalars, others in found:
             thing = self._thing
             try:
@@ -182,7 +182,7 @@ class Fill:
             self._parts.append(_Part(thing, scalars, others))
 
     def put(self, changes: Sequence[Change]) -> None:
-        """Put them in place. Raises CarryError for values of another walk."""
+        """Set the values. Raises CarryError for values of another walk."""
         if changes and changes[-1][0] >= len(self._parts):
             raise CarryError(f"found object {changes[-1][0]}, expected {len(self._parts)} of them")
         for number, scalars, others in changes:
@@ -225,7 +225,7 @@ def _kept(value: Any, inside: tuple[Any, ...] | None) -> Any:
 
 
 def _still(value: Any) -> bool:
-    """It cannot change."""
+    """Return whether the value is immutable."""
     kind = type(value)
     if kind in (tuple, frozenset):
         return _SCALARS.issuperset(map(type, value)) or all(map(_still, value))
@@ -286,7 +286,7 @@ def _record(value: Any) -> Any:
 
 
 def _made(content: Any) -> Any:
-    """A plain value again."""
+    """Convert back to a plain value."""
     if type(content) in _SCALARS:
         return content
     kind, inner = content

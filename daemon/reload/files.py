@@ -28,11 +28,11 @@ _FREE_OF_JOINT = ("joint_path", "joint", "joint_data", "network")
 
 
 class ReloadError(Exception):
-    """The old files stay in force; the message is one line that says why."""
+    """The old files remain in force; the message is one line with the reason."""
 
 
 def needs_restart(old: Config, new: Config) -> list[str]:
-    """Keys that differ and cannot be changed in a running daemon."""
+    """Return the changed keys that need a restart."""
     keys = [
         field.name
         for field in fields(Config)
@@ -78,7 +78,7 @@ class Reload:
 
     @property
     def running(self) -> bool:
-        """One is under way."""
+        """Return whether a reload is running."""
         return self._child is not None
 
     def start(self, config: Config, path: Path | None) -> None:
@@ -103,11 +103,11 @@ class Reload:
 
     @property
     def outputs(self) -> list[int]:
-        """For select."""
+        """Return the descriptors for select."""
         return self._child.outputs if self._child is not None else []
 
     def poll(self, loop: Child) -> tuple[Child, Config, dict[str, Any]] | None:
-        """Carry on; the new loop, its configuration and what is known of the change once it has taken over.
+        """Continue the reload; return the new loop, its configuration and the change after the hand-over.
 
         Raises:
             ReloadError: nothing came of it, and `loop` goes on.
@@ -138,11 +138,11 @@ class Reload:
         return None
 
     def refused(self, why: str) -> ReloadError:
-        """The running loop could not hand over."""
+        """Handle a refusal of the running loop."""
         return self._failed(why)
 
     def abandon(self) -> None:
-        """The daemon ends."""
+        """Abandon the reload at the end of the daemon."""
         if self._child is not None:
             self._failed("jtqd is ending")
 

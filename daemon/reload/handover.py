@@ -51,13 +51,13 @@ class Refused(Exception):  # noqa: N818 - the successor's or the loop's no, not 
 
 
 def state_of(cycle: Cycle, walk: Walk) -> list[Any]:
-    """What the loop has learned, and the counters of its socket. Raises Changed."""
+    """Return the state of the loop and the counters of its socket. Raises Changed."""
     sock = cycle.socket
     return [walk.changes(), sock.tx_dropped, sock.rx_dropped]
 
 
 def install(cycle: Cycle, fill: Fill, state: list[Any]) -> None:
-    """Put another loop's state in place. Raises CarryError."""
+    """Restore another loop's state. Raises CarryError."""
     changes, tx_dropped, rx_dropped = state
     fill.put(changes)
     cycle.use_own()
@@ -93,7 +93,7 @@ class Giver:
         self._installs_ns: list[int] = []
 
     def begin(self) -> None:
-        """A successor waits: `step` from now on."""
+        """Begin the hand-over to a waiting successor; call `step` from now on."""
         self._drop()
         self._tries, self.refused = 0, None
 
@@ -105,7 +105,7 @@ class Giver:
                 raise Refused(self._why())
             return self._stage()
         except Changed:
-            self.refused = "a node came or began again meanwhile; order it once more"
+            self.refused = "a node appeared or restarted meanwhile; send the order again"
         except (OSError, Refused, ValueError) as error:
             self.refused = str(error)
         self._drop()
@@ -196,11 +196,11 @@ class Giver:
         self._tell(before_ns=before_ns)
         sock.setblocking(True)
         if sock.recv(64) != TAKEN:
-            raise Refused("the new loop ended while it took over")
+            raise Refused("the new loop ended during the hand-over")
         return True
 
     def _tell(self, **about: int) -> None:
-        """Send what has changed. Raises Changed."""
+        """Send the changes. Raises Changed."""
         began = time.monotonic_ns()
         state = state_of(self._cycle, self._walk)
         self._send({**about, "state": state, "end_ns": self.end_ns})
@@ -276,7 +276,7 @@ class Taker:
 
     @property
     def descriptors(self) -> list[int]:
-        """To wait on."""
+        """Return the descriptors to wait on."""
         return [(self._socket or self._listener).fileno()]
 
     def step(self) -> bool:
@@ -300,7 +300,7 @@ class Taker:
             except ConnectionError:
                 data = b""
             if not data:
-                raise Refused("the running loop has given up")
+                raise Refused("the running loop has cancelled the hand-over")
             if self._take(self._socket, data):
                 return True
 
@@ -327,13 +327,13 @@ class Taker:
         return False
 
     def taken(self) -> None:
-        """Tell the other loop that it is none any more."""
+        """Confirm the hand-over to the other loop."""
         assert self._socket is not None
         self._socket.send(TAKEN)
         self.close()
 
     def close(self) -> None:
-        """Nobody is waited for any more."""
+        """Close the socket."""
         if self._socket is not None:
             self._socket.close()
         self._listener.close()

@@ -116,12 +116,12 @@ class Shadow:
         return self._reader.backlog
 
     def catch_up(self) -> None:
-        """Step through all there is."""
+        """Step through all records."""
         while self.follow():
             pass
 
     def objection(self) -> str | None:
-        """Why these estimators must not take over: most of what is valid now would be invalid with them."""
+        """Return why these estimators must not take over: most estimates that are valid now would be invalid."""
         for number, joint in enumerate(self._joints, start=1):
             if joint.published and joint.invalid > _INVALID_SHARE * joint.published:
                 return (
@@ -131,7 +131,7 @@ class Shadow:
         return None
 
     def changes(self) -> dict[str, dict[str, Any]]:
-        """What the new estimators would have said otherwise: RMS and largest difference of each joint [Nm]."""
+        """Return the RMS and the largest difference of the new estimates of each joint [Nm]."""
         return {f"joint_{number}": joint.content() for number, joint in enumerate(self._joints, start=1)}
 
 
@@ -210,7 +210,7 @@ def _succeed(request: dict[str, Any]) -> int:
 
 
 class _Overheard:
-    """Frames that came while the other loop had the bus; it has taken all but the last ones."""
+    """Frames received while the other loop owned the bus; that loop has processed all but the last ones."""
 
     def __init__(self, cycle: Cycle) -> None:
         self._cycle = cycle
@@ -232,7 +232,7 @@ class _Overheard:
                 self._last.append((frame, socket.stamps_ns[n], socket.own[n]))
 
     def hand_in(self, from_ns: int) -> None:
-        """Give the cycle what is stamped from this time on (CLOCK_REALTIME), as frames between two cycles."""
+        """Give the cycle the frames stamped from this time on (CLOCK_REALTIME), as frames between two cycles."""
         self.listen()
         late = [each for each in self._last if each[1] >= from_ns]
         if late:

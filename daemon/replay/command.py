@@ -30,12 +30,12 @@ from jtqd.estimator.settings import METHODS
 
 
 def number(count: int) -> str:
-    """Thousands by a narrow gap: 29 981."""
+    """Format a number with narrow gaps between thousands: 29 981."""
     return f"{count:,}".replace(",", " ")
 
 
 def text(result: Result, *, compared: bool) -> str:
-    """Everything about one run; `compared`: with the differences, although the models are those of the log."""
+    """Return the report of one run; `compared`: with the differences, although the models are those of the log."""
     lines = [*_head(result)]
     if result.identity is not None:
         lines += _identity(result, result.identity)
@@ -46,7 +46,7 @@ def text(result: Result, *, compared: bool) -> str:
 
 def _head(result: Result) -> list[str]:
     logs = ", ".join(str(part.path) for part in result.run.parts)
-    way = "cycle by cycle, by the loop's own code" if result.exact else "whole run in arrays"
+    way = "cycle by cycle with the loop's code" if result.exact else "in arrays"
     speed = result.seconds / max(result.replay_s, 1e-9)
     lines = [
         logs,
@@ -59,11 +59,11 @@ def _head(result: Result) -> list[str]:
         lines.append(f"  {number(result.lost)} cycles are missing in the middle of the log")
     if result.from_si:
         lines.append(
-            f"  {number(result.from_si)} inputs have no frame in the log: taken from the SI values beside it"
+            f"  {number(result.from_si)} inputs have no frame in the log: taken from the recorded SI values"
         )
     if result.temperatures_from_log:
         lines.append(
-            f"  {number(result.temperatures_from_log)} times the frames do not tell the temperature: taken from the log"
+            f"  {number(result.temperatures_from_log)} times the temperature is not in the frames: taken from the log"
         )
     return lines
 
@@ -109,7 +109,7 @@ def _unknown(each: Unknown) -> str:
     if each.until_end:
         return (
             f"  joint {each.joint}: from cycle {number(each.first_cycle)} on the observer's state is not known "
-            f"({each.reason}), and {number(each.cycles)} cycles were too few to forget it"
+            f"({each.reason}), and {number(each.cycles)} cycles were not enough for convergence"
         )
     return (
         f"  joint {each.joint}: from cycle {number(each.first_cycle)} on the observer's state was not known "
@@ -227,7 +227,7 @@ def _flush(file: McapFile, builder: ChunkBuilder) -> None:
 
 
 def _attachments(results: list[Result]) -> list[NamedData]:
-    """Those of the first log, and what was done."""
+    """Return the attachments of the first log and a description of the replay."""
     kept = read_attachments(results[0].run.parts[0].path)
     made = json.dumps({"schema": "jtq.replay/1", "runs": [each.to_mapping() for each in results]}).encode()
     return [
@@ -280,22 +280,22 @@ def _messages(result: Result, number: int) -> RecordArray:
 
 
 _EXAMPLES = f"""examples:
-  jtq replay run.mcap                          does the log's own estimator give what was published?
+  jtq replay run.mcap                          check that the log's estimator reproduces the published values
   jtq replay part1.mcap part2.mcap             parts of one run, in any order; or their directory
-  jtq replay run.mcap --model trained/         with other joint files and networks: what changes
+  jtq replay run.mcap --model trained/         with other joint files and networks
   jtq replay run.mcap --method efficiency      with another method
-  jtq replay run.mcap --model new/ --out both.mcap   a log with both, for Foxglove
+  jtq replay run.mcap --model new/ --out both.mcap   a log with both results, for Foxglove
 
-Up to {SHORT_CYCLES:,} cycles with the logged models are replayed cycle by cycle by the loop's own code, longer logs
-and other models as a whole in arrays; --exact forces the first.
-exit status: 0 replayed (with the logged models: identical), 1 a log or model cannot be used, 2 usage, 3 it differs"""
+Up to {SHORT_CYCLES:,} cycles with the logged models are replayed cycle by cycle with the loop's code, longer logs
+and other models in arrays; --exact forces cycle by cycle.
+exit status: 0 replayed (with the logged models: identical), 1 a log or model cannot be used, 2 usage, 3 different"""
 
 
 def parser() -> argparse.ArgumentParser:
     """Options of `jtq replay`."""
     made = argparse.ArgumentParser(
         prog="jtq replay",
-        description="Run the estimator over the inputs of a log again, and compare with what was published.",
+        description="Run the estimator again over the inputs of a log, and compare with the published values.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -310,7 +310,7 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument("--method", choices=METHODS, help="another method of the estimator")
     made.add_argument("--compare", action="store_true", help="show differences also with the logged models")
-    made.add_argument("--exact", action="store_true", help="cycle by cycle, whatever the length")
+    made.add_argument("--exact", action="store_true", help="cycle by cycle for any length")
     made.add_argument("--json", action="store_true", help="results as JSON")
     made.add_argument(
         "--out",
@@ -376,7 +376,7 @@ def _failed(bar: _Bar, line: str) -> int:
 
 
 class _Bar:
-    """Progress on a terminal; nothing elsewhere."""
+    """Progress bar on a terminal; nothing elsewhere."""
 
     def __init__(self) -> None:
         self._progress = None

@@ -17,7 +17,7 @@ from jtqd.estimator.status import NAMES, STANDSTILL
 
 @dataclass(frozen=True)
 class StatusChange:
-    """So many cycles had status `logged` in the log and have `replayed` now."""
+    """Number of cycles with status `logged` in the log and `replayed` in the replay."""
 
     logged: str
     replayed: str
@@ -129,7 +129,7 @@ _FIELDS = ("torque_nm", "status", "sigma_nm", "physics_nm", "network_nm", "tob_n
 
 @dataclass(frozen=True)
 class Unknown:
-    """Cycles of one joint whose state no log tells: from `first_cycle` on, `cycles` of them, until it was forgotten.
+    """Cycles of one joint with unknown state: `cycles` of them from `first_cycle` on, until convergence.
 
     `until_end`: the replay did not become identical before the log or the next such place came.
     """
@@ -143,7 +143,7 @@ class Unknown:
 
 @dataclass(frozen=True)
 class Difference:
-    """First cycle of one joint that differs without a reason."""
+    """First unexplained difference of one joint."""
 
     joint: int
     cycle: int
@@ -156,7 +156,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Identity:
-    """How much of a log came out again.
+    """Identity of a log and its replay.
 
     Attributes:
         cycles: replayed.
@@ -181,12 +181,12 @@ class Identity:
 
     @property
     def whole(self) -> bool:
-        """Every cycle is identical."""
+        """Return whether every cycle is identical."""
         return self.identical == self.cycles
 
     @property
     def explained(self) -> bool:
-        """What differs was not known to begin with, and became identical."""
+        """Return whether all differences come from an unknown start state and then disappear."""
         return not self.differences and not any(each.until_end for each in self.unknown)
 
     def to_mapping(self) -> dict[str, Any]:
@@ -195,7 +195,7 @@ class Identity:
 
 
 def bits_equal(logged: npt.NDArray[Any], replayed: npt.NDArray[Any]) -> BoolArray:
-    """Equal bit for bit [n]; not a number is equal to itself, whatever its bits."""
+    """Return whether values are equal bit for bit [n]; NaN equals NaN."""
     if logged.dtype.kind != "f":
         return np.asarray(logged == replayed)
     same = np.ascontiguousarray(logged).view(np.int64) == np.ascontiguousarray(replayed).view(np.int64)

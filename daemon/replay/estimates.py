@@ -49,7 +49,7 @@ from jtqd.estimator.status import DEGRADED, INVALID, OFF, PUBLISHED, STALE, STAN
 
 @dataclass
 class _Counters:
-    """What the loop counts in shared memory; nobody reads it here."""
+    """Counters of the loop in shared memory; not read here."""
 
     counters: array[int] = field(default_factory=lambda: array("Q", [0] * len(COUNTERS)))
     errors: array[float] = field(default_factory=lambda: array("d", [0.0] * 4))
@@ -151,7 +151,7 @@ class ExactReplay:
     def _marks(
         self, number: int, records: RecordArray, frames: Frames, steps: Steps
     ) -> dict[int, list[Callable[[], object]]]:
-        """What happens to one joint before a row: faults are reset, it begins anew, the log goes on after a hole."""
+        """Apply the events of one joint before a row: reset of faults, restart, continuation after a gap in the log."""
         joint, each = self._joints[number], self._origin.inputs[number]
         marks: dict[int, list[Callable[[], object]]] = {}
         for row in np.flatnonzero(records["cycle_flags"] & cr.FLAG_RESET).tolist():
@@ -200,7 +200,7 @@ class _Temperatures:
             self._all.append((each, due, logged))
 
     def at(self, row: int, cycle: int) -> None:
-        """The inputs of this cycle have been taken."""
+        """Update after the inputs of this cycle."""
         for temperature, due, logged in self._all:
             if row in due:
                 for frame in due[row]:
@@ -227,7 +227,7 @@ _STEADY = frozenset((VALID, STANDSTILL, DEGRADED, OFF))
 
 @dataclass(frozen=True)
 class Model:
-    """What one joint is estimated with."""
+    """Estimator model of one joint."""
 
     joint: Joint
     settings: EstimatorSettings

@@ -33,7 +33,7 @@ class Pdo:
 
 @dataclass(frozen=True)
 class Frames:
-    """What the raw frames of n cycles say.
+    """Content of the raw frames of n cycles.
 
     Attributes:
         pdos: in the order of `input_pdos`.
@@ -148,7 +148,7 @@ def _whole(values: FloatArray, unit: float) -> IntegerArray:
 
 
 def _rolled(counts: IntegerArray) -> IntegerArray:
-    """As a 32-bit position that has rolled over."""
+    """Convert to a 32-bit position with roll-over."""
     return (counts + _HALF) % _FULL - _HALF
 
 

@@ -59,7 +59,7 @@ FRAMES: dict[str, np.dtype[Any]] = {
 def check_fields(
     records: npt.NDArray[np.void], needed: Mapping[str, np.dtype[Any]], path: Path, topic: str
 ) -> None:
-    """Raises LogError where a field is missing or is of another type."""
+    """Check the fields. Raises LogError for a missing field or another type."""
     for name, expected in needed.items():
         found: np.dtype[Any] = records.dtype
         for step in name.split("."):
@@ -75,7 +75,7 @@ CONFIGURATION, PROVENANCE = "configuration.yaml", "provenance.json"
 
 @dataclass(frozen=True)
 class Origin:
-    """What one log was recorded with.
+    """Configuration, models and scaling of one log.
 
     Attributes:
         config: as it was in force; its paths lead into the private directory.
@@ -142,7 +142,7 @@ def _without(text: str, directory: Path) -> str:
 def _attachment(log: Path, attachments: Mapping[str, bytes], name: str) -> bytes:
     if name not in attachments:
         raise LogError(
-            f"{log}: found no attachment {name}, expected one: not a log of jtqd, or its beginning is lost"
+            f"{log}: found no attachment {name}, expected one: not a log of jtqd, or its beginning is missing"
         )
     return attachments[name]
 
@@ -216,6 +216,6 @@ def _check_scaling(inputs: JointInputs) -> None:
     """ValueError unless all factors are numbers above 0 (the sensor's may be 0: there is none)."""
     for name in ("motor_rad_per_count", "motor_rad_s_per_unit", "link_rad_per_count", "ampere_per_unit"):
         if not getattr(inputs, name) > 0.0:
-            raise ValueError(f"{name} is 0: the drive was absent when the log began")
+            raise ValueError(f"{name} is 0: the drive was absent at the start of the log")
     if not inputs.sensor_nm_per_unit >= 0.0:
         raise ValueError("sensor_nm_per_unit is below 0")

@@ -97,7 +97,7 @@ def steps_of(records: RecordArray, config: Config) -> Steps:
 
 
 def _stamps(records: RecordArray) -> npt.NDArray[np.int64]:
-    """Send time of each SYNC [ns], CLOCK_REALTIME [n]."""
+    """Return the send time of each SYNC [ns], CLOCK_REALTIME [n]."""
     stamp = records["header"]["stamp"]
     seconds: npt.NDArray[np.int64] = stamp["sec"].astype(np.int64)
     return seconds * 1_000_000_000 + stamp["nanosec"].astype(np.int64)
@@ -189,12 +189,12 @@ class Run:
 
     @property
     def origin(self) -> Origin:
-        """Of the first part; the others' is the same."""
+        """Return the origin of the first part; the others have the same."""
         return self.parts[0].origin
 
     @property
     def cycles(self) -> int:
-        """Number of cycles in the logs."""
+        """Return the number of cycles in the logs."""
         return len(self.joints[0])
 
     def widened(self) -> tuple[tuple[RecordArray, RecordArray], tuple[Steps, Steps], int]:
@@ -309,14 +309,14 @@ def _first_ns(path: Path) -> int:
 
 @dataclass
 class _Open:
-    """A run whose parts still come."""
+    """Run under construction."""
 
     number: int
     parts: list[Part]
     before: tuple[RecordArray, RecordArray] | None = field(default=None)
 
     def close(self, *following: Part) -> Run:
-        """The stretch so far; the next one begins with `following`."""
+        """Return the stretch so far; the next one begins with `following`."""
         run = Run.of(self.parts, self.number, self.before)
         one, two = (records[-_KEPT_ROWS:].copy() for records in run.joints)
         self.before, self.parts = (one, two), list(following)
@@ -366,7 +366,9 @@ def _behind(before: Part, part: Part) -> Part:
     new = part.joints[0]["cycle"] > last
     for one, other in zip(before.joints, part.joints, strict=True):
         if not new.any() or _packed(one[one["cycle"] >= first]) != _packed(other[~new]):
-            raise LogError(f"{part.path}: found cycle {first}, which {before.path} has too: given twice?")
+            raise LogError(
+                f"{part.path}: found cycle {first}, which {before.path} has too: is it given twice?"
+            )
     return replace(part, joints=(part.joints[0][new], part.joints[1][new]))
 
 

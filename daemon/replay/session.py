@@ -62,12 +62,12 @@ class Models:
         ]
 
     def estimators(self) -> list[AnyEstimator]:
-        """New estimators, warmed up by nobody. Raises ConfigError."""
+        """Build new estimators without warm-up. Raises ConfigError."""
         return [make_estimator(each.joint, each.settings, each.network) for each in self.joints]
 
 
 def logged_models(origin: Origin) -> Models:
-    """What the log was recorded with. Raises ConfigError, NetworkError."""
+    """Return the models of the log. Raises ConfigError, NetworkError."""
     settings = origin.config.estimator
     made = []
     for each in origin.config.joints:
@@ -160,7 +160,7 @@ ROUNDING_NM = 1e-9
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """What to replay, and how.
+    """Options of a replay.
 
     Attributes:
         model: directory with other joint files and networks.
@@ -176,7 +176,7 @@ class ReplayOptions:
 
     @property
     def other(self) -> bool:
-        """Another model than the logged one."""
+        """Return whether a model differs from the logged one."""
         return self.model is not None or self.method is not None
 
 
@@ -188,7 +188,7 @@ class Result:
         run: its logs and states.
         files: of the models.
         method: of the estimator.
-        exact: cycle by cycle, by the loop's own code.
+        exact: cycle by cycle with the loop's code.
         seconds, read_s, replay_s: length of the run; wall time of reading and of estimating.
         lost: cycles that are missing in the middle of the logs.
         from_si: inputs whose frame was not in the log, from the SI values beside it (exact only).
@@ -214,7 +214,7 @@ class Result:
 
     @property
     def good(self) -> bool:
-        """Nothing differs without a reason."""
+        """Return whether there is no unexplained difference."""
         return self.identity is None or self.identity.explained
 
     def to_mapping(self) -> dict[str, Any]:

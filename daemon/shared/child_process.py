@@ -20,7 +20,7 @@ class ChildError(Exception):
 
 
 class ChildSilence(ChildError):  # noqa: N818  (not an error of this side)
-    """It runs and has not answered yet."""
+    """The child runs and has not answered yet."""
 
 
 _LIBC = ctypes.CDLL(None)
@@ -102,7 +102,7 @@ class Child:
             pass
 
     def poll_answer(self) -> dict[str, Any] | None:
-        """The next JSON line if one is there."""
+        """Return the next JSON line, if any."""
         assert self.process.stdout is not None
         chunk = self.process.stdout.read()
         if chunk:
@@ -138,7 +138,7 @@ class Child:
             self._rest(min(left, _LONGEST_WAIT_S))
 
     def _rest(self, longest_s: float) -> None:
-        """Until there is output, or, where none can come any more, until the process has ended."""
+        """Wait until there is output or, after the end of output, until the process has ended."""
         if not self._closed:
             select.select(self.outputs, [], [], longest_s)
             return

@@ -52,7 +52,7 @@ _COMMUNICATION, _MANUFACTURER = 0x10, 0x80
 
 
 class Emcy(NamedTuple):
-    """How a condition shows in EMCY messages of jtqd: error code, bits of 1001h, and bytes 5 to 7."""
+    """EMCY messages of a condition: error code, bits of 1001h, and bytes 5 to 7."""
 
     code: int
     register: int = _COMMUNICATION
@@ -102,7 +102,7 @@ _ROWS = (
         JOINT,
         ERROR,
         "no torque: {}",
-        "no fault any more",
+        "fault cleared",
         topic="fault",
         emcy=Emcy(0xFF01, _MANUFACTURER),
     ),
@@ -120,14 +120,12 @@ _ROWS = (
         JOINT,
         ERROR,
         "the drive reports {}",
-        "drive not in fault any more",
+        "drive fault cleared",
         topic="fault",
         hold_s=_HOLD_S,
     ),
     Definition("drive_off", JOINT, INFO, "the drive carries no current: {}", hold_s=_HOLD_S, logged=False),
-    Definition(
-        "degraded", JOINT, INFO, "the network is not alone in charge: {}", hold_s=_HOLD_S, logged=False
-    ),
+    Definition("degraded", JOINT, INFO, "the network is not fully used: {}", hold_s=_HOLD_S, logged=False),
     Definition(
         "deviation",
         JOINT,
@@ -150,8 +148,8 @@ _ROWS = (
         "node_doubled",
         NODE,
         WARNING,
-        "{}: are there two nodes with this node-ID?",
-        "one producer of heartbeats again",
+        "{}: possibly two nodes with this node-ID",
+        "one heartbeat producer again",
         topic="heartbeat",
         emcy=Emcy(0x8150, detail=0x700, names_joints=False),
     ),
@@ -163,9 +161,9 @@ _ROWS = (
         topic="boot",
         emcy=Emcy(0xFF03, _MANUFACTURER),
     ),
-    Definition("node_absent", NODE, WARNING, "optional node, not there", topic="boot", logged=False),
+    Definition("node_absent", NODE, WARNING, "optional node absent", topic="boot", logged=False),
     Definition("node_unconfigured", NODE, WARNING, "not used: {}", topic="boot", logged=False),
-    Definition("node_not_operational", NODE, WARNING, "its state is {}", topic="heartbeat", logged=False),
+    Definition("node_not_operational", NODE, WARNING, "NMT state {}", topic="heartbeat", logged=False),
     Definition("node_error", NODE, WARNING, "reports {}", topic="emcy", logged=False),
     Definition(
         "pdo_timeout",
@@ -180,8 +178,8 @@ _ROWS = (
         "pdo_short",
         PDO,
         WARNING,
-        "PDO not processed, too short (8210h): it is not used",
-        "length as mapped again",
+        "PDO not processed due to length error (8210h): too short",
+        "length correct again",
         topic="pdo",
         emcy=Emcy(0x8210),
     ),
@@ -189,30 +187,30 @@ _ROWS = (
         "pdo_long",
         PDO,
         WARNING,
-        "PDO too long (8220h): it is not used",
-        "length as mapped again",
+        "PDO length exceeded (8220h): not used",
+        "length correct again",
         topic="pdo",
         emcy=Emcy(0x8220),
     ),
     # Bus
-    Definition("bus_warning", BUS, WARNING, "error warning, before: {}", "error active", topic="bus"),
+    Definition("bus_warning", BUS, WARNING, "error warning, previously {}", "error active", topic="bus"),
     Definition(
         "bus_passive",
         BUS,
         WARNING,
-        "error passive, before: {}",
+        "error passive, previously {}",
         "error active",
         topic="bus",
         emcy=Emcy(0x8120, names_joints=False),
     ),
-    Definition("bus_off", BUS, ERROR, "bus-off, before: {}", "error active", topic="bus"),
-    Definition("bus_down", BUS, ERROR, "interface down, before: {}", "error active", topic="bus"),
+    Definition("bus_off", BUS, ERROR, "bus-off, previously {}", "error active", topic="bus"),
+    Definition("bus_down", BUS, ERROR, "interface down, previously {}", "error active", topic="bus"),
     Definition(
         "foreign_sync",
         BUS,
         ERROR,
-        "another SYNC producer: no input of its cycles is used",
-        "no other SYNC producer any more",
+        "another SYNC producer: inputs of these cycles are not used",
+        "no other SYNC producer",
         topic="sync",
         emcy=Emcy(0x8150, detail=0x080),
     ),
@@ -224,7 +222,7 @@ _ROWS = (
         BUS,
         WARNING,
         "received frames were lost: the loop's socket was read too late",
-        "no received frame lost any more",
+        "no further received frames lost",
         topic="bus",
         emcy=Emcy(0x8110, detail=1),
     ),
@@ -239,14 +237,12 @@ _ROWS = (
     ),
     # Loop, recorder, machine
     Definition("loop_stopped", LOOP, ERROR, "no cycle for {}", "cycles again", topic="loop"),
+    Definition("late_loop", LOOP, WARNING, "cycles are missed: the loop is late", topic="loop", logged=False),
     Definition(
-        "late_loop", LOOP, WARNING, "cycles are missed: the loop comes too late", topic="loop", logged=False
+        "cycles_lost", RECORDER, ERROR, "cycles are lost: not in the log", topic="recorder", logged=False
     ),
     Definition(
-        "cycles_lost", RECORDER, ERROR, "cycles are lost: they are in no log", topic="recorder", logged=False
-    ),
-    Definition(
-        "stolen_time", MACHINE, INFO, "a hypervisor takes processor time away", topic="machine", logged=False
+        "stolen_time", MACHINE, INFO, "the hypervisor takes processor time", topic="machine", logged=False
     ),
     Definition("not_granted", MACHINE, WARNING, "not granted: {}", topic="machine", logged=False),
 )
@@ -254,7 +250,7 @@ CATALOGUE: Final = {row.name: row for row in _ROWS}
 
 
 class Subject(NamedTuple):
-    """What a condition is about: "joint 1", "node 3", "281h drive 1 TPDO2", "bus".
+    """Subject of a condition: "joint 1", "node 3", "281h drive 1 TPDO2", "bus".
 
     `number` is the drive's node-ID, the node-ID, the COB-ID or 0: the detail of EMCY messages. `joints`: bit 0 joint 1,
     bit 1 joint 2. `node`: node-ID of its events; 0 for none.
@@ -283,7 +279,7 @@ SHOWN_BY_COUNTERS: Final = {
 
 @dataclass(frozen=True)
 class Condition:
-    """One that is present; `since_ns` is CLOCK_MONOTONIC."""
+    """One present condition; `since_ns` is CLOCK_MONOTONIC."""
 
     name: str
     subject: str
@@ -293,7 +289,7 @@ class Condition:
 
     @property
     def line(self) -> str:
-        """Subject and text."""
+        """Return subject and text."""
         return f"{self.subject}: {self.text}"
 
 
@@ -315,7 +311,7 @@ class Line(NamedTuple):
 
 
 class Occurrences(NamedTuple):
-    """How often a condition was present, for how long altogether, and when first (CLOCK_MONOTONIC)."""
+    """Count, total duration and first occurrence (CLOCK_MONOTONIC) of a condition."""
 
     name: str
     subject: str
@@ -325,7 +321,7 @@ class Occurrences(NamedTuple):
 
 
 class _State:
-    """One condition of one subject: present or not, since when, and which lines about it are due.
+    """State of one condition of one subject, and the lines that are due.
 
     A begin sooner than QUIET_S after the last line about one is reported together with its end, or with those that
     follow: neither a flicker nor a flapping contact floods the log.
@@ -368,17 +364,17 @@ class _State:
         self.text = text
 
     def no_end_line(self) -> None:
-        """Leave out the line that its end would have: another one says so."""
+        """Suppress the line at its end, because another line reports it."""
         self._logged = self._again = False
         self._unlogged, self._unlogged_s = 0, 0.0
 
     def _may_repeat(self, now_s: float) -> bool:
-        """Another line about what is present: with details that no line had of late."""
+        """Return whether a present condition may have another line: with details that no recent line had."""
         self._texts = {text: at_s for text, at_s in self._texts.items() if now_s - at_s < QUIET_S}
         return self._again and self.text not in self._texts
 
     def line(self, now_s: float) -> Line | None:
-        """The line that is due, if any."""
+        """Return the line that is due, if any."""
         definition = self.definition
         if not definition.logged:
             return None
@@ -457,11 +453,11 @@ class Conditions:
             listener(Change(state.definition, subject, state.present))
 
     def lines(self, now_s: float) -> list[Line]:
-        """Lines for the operator that are due; each is returned once."""
+        """Return the lines for the operator that are due; each is returned once."""
         return [line for state in self._states.values() if (line := state.line(now_s)) is not None]
 
     def present(self) -> list[Condition]:
-        """Every condition that is present, the worst first, then the oldest."""
+        """Return every present condition, the worst first, then the oldest."""
         found = [
             Condition(
                 state.definition.name,
@@ -476,12 +472,12 @@ class Conditions:
         return sorted(found, key=lambda each: (-each.severity, each.since_ns))
 
     def is_present(self, name: str, subject: str) -> bool:
-        """True while this condition of this subject is present."""
+        """Return whether this condition of this subject is present."""
         state = self._states.get((name, subject))
         return state is not None and state.present
 
     def history(self, now_s: float) -> list[Occurrences]:
-        """Every condition that was present at any time, in the order of the first time."""
+        """Return every condition that was present at any time, in the order of the first time."""
         found = [
             Occurrences(
                 state.definition.name,
@@ -497,7 +493,7 @@ class Conditions:
 
 
 class ConditionsFile:
-    """Keeps `conditions.json` in `directory` up to date; what cannot be written is left out, as nothing depends on it."""
+    """Keeps `conditions.json` in `directory` up to date; write errors are ignored, as nothing depends on the file."""
 
     def __init__(self, directory: Path) -> None:
         self._path, self._new = directory / FILE, directory / (FILE + ".new")
@@ -517,7 +513,7 @@ class ConditionsFile:
 
 
 def read_conditions(directory: Path) -> list[Condition]:
-    """Conditions of the daemon with this runtime directory, the worst first; none where there is no file of this version.
+    """Read the conditions of the daemon with this runtime directory, the worst first; none without a valid file.
 
     They are as of the supervisor's last look: whether that still runs, `jtqd.daemon.shared.runtime_dir.About.running` tells.
     """
@@ -531,6 +527,6 @@ def read_conditions(directory: Path) -> list[Condition]:
 
 
 def worst(conditions: Iterable[Condition], subject: str) -> Condition | None:
-    """The worst condition of this subject, the oldest of them; None where there is none."""
+    """Return the worst condition of this subject, the oldest of them, or None."""
     own = [each for each in conditions if each.subject == subject]
     return max(own, key=lambda each: (each.severity, -each.since_ns), default=None)

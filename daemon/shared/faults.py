@@ -36,26 +36,26 @@ COUNTED: Final = tuple(bit for bit in NAMES if bit <= DEVIATION)
 """Faults that a cycle can have besides its status: the low byte."""
 
 MEANINGS: Final = {
-    NOT_FINITE: "the estimator gave a number that is none",
-    OUT_OF_RANGE: "the torque is beyond what the joint can do",
+    NOT_FINITE: "the estimate is not finite",
+    OUT_OF_RANGE: "the torque is out of range",
     MOTOR_JUMP: "the motor position jumped",
     LINK_JUMP: "the link position jumped",
-    VELOCITY_MISMATCH: "motor position and motor velocity do not agree",
-    TORSION: "motor and link position are further apart than the gear can be twisted",
-    CURRENT_FROZEN: "the motor turns and its current does not change",
-    DEVIATION: "too far from the torque sensor for too long",
+    VELOCITY_MISMATCH: "motor position and motor velocity disagree",
+    TORSION: "the torsion exceeds the limit of the gear",
+    CURRENT_FROZEN: "the current is frozen while the motor turns",
+    DEVIATION: "the deviation from the torque sensor exceeded its limit",
     DRIVE_FAULT: "the drive was in fault",
-    STALE: "too many cycles in a row without a number",
+    STALE: "too many consecutive cycles without a torque",
 }
 
 
 def names_of(bits: int) -> tuple[str, ...]:
-    """Names of the faults in `bits`, in the order of their bits."""
+    """Return the names of the faults in `bits`, in the order of their bits."""
     return tuple(name for bit, name in NAMES.items() if bits & bit)
 
 
 def status_of(bits: int) -> int:
-    """Status that is published while these faults are latched; `bits` is not 0."""
+    """Return the status that is published while these faults are latched; `bits` is not 0."""
     if bits & DRIVE_FAULT:
         return st.DRIVE_FAULT
     return st.STALE if bits == STALE else st.INVALID

@@ -30,7 +30,7 @@ _PRIORITIES = {notices.INFO: NOTICE, notices.WARNING: WARNING, notices.ERROR: ER
 
 
 def in_journal(stream: TextIO, environment: Mapping[str, str] = os.environ) -> bool:
-    """True where `stream` goes to the journal itself: device and inode are those of JOURNAL_STREAM."""
+    """Return whether `stream` is the journal: device and inode are those of JOURNAL_STREAM."""
     device, _, inode = environment.get("JOURNAL_STREAM", "").partition(":")
     if not (device.isdigit() and inode.isdigit()):
         return False
@@ -76,8 +76,8 @@ class OperatorLog:
                 return False
             written.append(now)
             count = self._held_back.pop(kind, 0)
-            lines = "line like this one was" if count == 1 else "lines like this one were"
-            more = f" ({count} {lines} held back)" if count else ""
+            lines = "similar line was" if count == 1 else "similar lines were"
+            more = f" ({count} {lines} suppressed)" if count else ""
         for line in (text + more).splitlines():
             self._write(f"<{priority}>{line}" if self._journal else f"jtqd: {line}")
         return True
@@ -119,7 +119,7 @@ class RateLimit:
         self._refused = 0
 
     def admit(self, kind: object, now_s: float) -> int | None:
-        """None: not now. Otherwise how many have been refused since the last line."""
+        """Return None if refused, otherwise the number of refused lines since the last one."""
         window = self._admitted[0] if len(self._admitted) == self._burst else -inf
         if now_s < self._not_before.get(kind, -inf) or now_s < window + self._quiet_s:
             self._refused += 1

@@ -42,7 +42,7 @@ class NoticesError(Exception):
 
 
 class Notice(NamedTuple):
-    """One of them.
+    """One notice.
 
     Attributes:
         number: 1, 2, ... in the order of writing.
@@ -109,7 +109,7 @@ class NoticesReader:
         self._read = 0
 
     def read(self) -> tuple[list[Notice], int]:
-        """(notices since the last call, how many were overwritten before they could be read)."""
+        """Return (notices since the last call, number of notices overwritten before they could be read)."""
         news: list[Notice] = []
         (count,) = _WORD.unpack_from(self._memory, _COUNT_OFFSET)
         lost = max(0, count - self._capacity - self._read)

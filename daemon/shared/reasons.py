@@ -14,7 +14,7 @@ from jtqd.estimator import status as st
 SILENT_AFTER = 3.0
 """Heartbeat periods without a heartbeat after which a node is silent."""
 _FIRST_CYCLES = 20
-_HELD = "held until enough cycles in a row were good"
+_HELD = "waiting for enough consecutive good cycles"
 """Hysteresis of `jtqd.daemon.core.status`."""
 _DRIVE_STATES = {
     0x00: "not ready to switch on",
@@ -30,7 +30,7 @@ _STATUS_OF_STATE = {0x27: None, 0x07: None, 0x0F: st.DRIVE_FAULT, 0x08: st.DRIVE
 """As `jtqd.daemon.core.status.drive_status`: None where the motor carries current; every other state is off."""
 _ON_THE_BUS = (
     ("bus_errors", "the bus is down"),
-    ("foreign_sync", "another SYNC is on the bus"),
+    ("foreign_sync", "another SYNC producer is on the bus"),
     ("sync_errors", "the own SYNC waits in the transmit queue"),
 )
 """Counters whose rise makes every input of the bus doubtful, and what that means."""
@@ -60,31 +60,29 @@ def joint_reason(about: About, number: int, view: View, earlier: View) -> str:
         case st.OFF | st.DRIVE_FAULT:
             reason = f"drive {joint.node}: {drive_reason(seen)}"
         case st.STARTING if view.cycle <= _FIRST_CYCLES:
-            reason = "the first cycles"
+            reason = "first cycles after the start"
         case st.STARTING:
-            reason = "the observer starts again after a gap in the inputs"
+            reason = "the observer restarts after a gap in the inputs"
         case st.STANDSTILL:
-            reason = (
-                "slower than the standstill velocity: friction hides the torque, sigma is half the interval"
-            )
+            reason = "below the standstill velocity: the torque is known to an interval, sigma is half of it"
         case st.DEGRADED:
             reason = degraded_reason(seen, joint.network_limit_nm)
         case st.INVALID:
             faults = seen.input_flags >> 8
-            reason = fault_meanings(faults) if faults else f"a fault is over; {_HELD}"
+            reason = fault_meanings(faults) if faults else f"fault cleared; {_HELD}"
         case _:
             reason = ""
     return reason
 
 
 def fault_meanings(faults: int, *, names: bool = False) -> str:
-    """Faults (`jtqd.daemon.shared.cycle_record`) in words, with their names where wanted."""
+    """Return faults (`jtqd.daemon.shared.cycle_record`) in words, optionally with their names."""
     each = (f"{MEANINGS[bit]} ({NAMES[bit]})" if names else MEANINGS[bit] for bit in NAMES if faults & bit)
     return ", ".join(each) or "an unknown fault"
 
 
 def drive_state(statusword: int) -> str:
-    """State of a CiA 402 drive by its statusword (6041h)."""
+    """Return the state of a CiA 402 drive by its statusword (6041h)."""
     return _DRIVE_STATES.get(_state_bits(statusword), f"statusword {statusword:04X}h")
 
 
@@ -104,17 +102,15 @@ def _state_bits(statusword: int) -> int:
 
 
 def degraded_reason(seen: JointView, network_limit_nm: float) -> str:
-    """Explain status 3 (degraded): why the network is not in charge; `network_limit_nm`: how far from physics it may be."""
+    """Explain status 3 (degraded): why the network is not fully used; `network_limit_nm`: limit against physics."""
     if seen.input_flags & FLAG_NETWORK_SKIPPED:
         return "no time for the network in this cycle: physics only"
     if not isfinite(seen.network_nm):
-        return "the network's answer is not a number: physics only"
+        return "the network output is not finite: physics only"
     apart = abs(seen.network_nm - seen.physics_nm)
     if apart > network_limit_nm:
-        return (
-            f"the network is {apart:.1f} Nm from physics, trusted to {network_limit_nm:.1f} Nm: physics only"
-        )
-    return "outside what the network was trained on: physics, with less or nothing of the network"
+        return f"the network is {apart:.1f} Nm from physics, limit {network_limit_nm:.1f} Nm: physics only"
+    return "outside the network's training range: physics with a reduced share of the network"
 
 
 def _stale(about: About, joint: AboutJoint, seen: JointView, view: View, earlier: View) -> str:
@@ -130,7 +126,7 @@ def _stale(about: About, joint: AboutJoint, seen: JointView, view: View, earlier
 def stale_reason(
     node: int, names: Sequence[str], seen: JointView, view: View, earlier: Mapping[str, int]
 ) -> str:
-    """Explain status 4 (stale). The likeliest cause first: what explains more comes before what explains less.
+    """Explain status 4 (stale), the likeliest cause first.
 
     Args:
         node: the joint's drive.
@@ -161,13 +157,13 @@ def stale_reason(
 
 
 def unready_reason(node: int, view: View) -> str:
-    """Explain why nothing of a node is used: it restarted, is configured otherwise, or is not there; "" for the others."""
+    """Explain why a node is not used: restarted, changed configuration, or absent; "" for the others."""
     if node not in view.unconfigured:
         return ""
     if not view.node_heard_ns[node] and not view.node_states[node]:
-        return f"node {node} is not there"
+        return f"node {node} is absent"
     if view.node_states[node] == OPERATIONAL:
-        return f"node {node} is not configured as it was"
+        return f"node {node} has a changed configuration"
     return f"node {node} has restarted and is not configured yet"
 
 
@@ -181,7 +177,7 @@ def sensor_reason(node: int | None, name: str, seen: JointView, view: View) -> s
 
 
 def silent_s(view: View, node: int, heartbeat_ms: int) -> float | None:
-    """For how long a node has been silent [s]; None while its heartbeats come, or none has ever come."""
+    """Return how long a node has been silent [s]; None while its heartbeats arrive, or if none ever arrived."""
     heard = view.node_heard_ns[node]
     age_s = (view.sync_realtime_ns - heard) * 1e-9
     return age_s if heard and age_s > SILENT_AFTER * heartbeat_ms * 1e-3 else None

@@ -63,7 +63,7 @@ class Ring:
         return self.words[COUNT_WORD]
 
     def slot(self) -> memoryview:
-        """Memory of the record that the next `commit` publishes."""
+        """Return the memory of the record that the next `commit` publishes."""
         start = self.count % self.size * self._record_size
         return self.records[start : start + self._record_size]
 
@@ -94,7 +94,7 @@ def _existing(path: Path, slots: int, record_size: int) -> mmap.mmap:
 
 
 class Batch(NamedTuple):
-    """What one `RingReader.read` found: whole records in order, and how many were overwritten unread."""
+    """Result of one `RingReader.read`: whole records in order, and the number overwritten unread."""
 
     records: list[bytes]
     lost: int
@@ -129,7 +129,7 @@ class RingReader:
 
     @property
     def backlog(self) -> int:
-        """Records written and not yet read."""
+        """Return the number of records written and not yet read."""
         return self._count() - self.position
 
     def read(self, limit: int = 1024) -> Batch:

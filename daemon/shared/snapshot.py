@@ -284,7 +284,7 @@ class Snapshot:
         os.replace(temporary, path)
 
     def own(self) -> None:
-        """From now on the loop is this process."""
+        """Make this process the loop."""
         _HEAD.pack_into(self._memory, 0, _MAGIC, os.getpid(), *self._head)
 
     def factors(self, node_id: int) -> tuple[float, ...]:
@@ -310,7 +310,7 @@ class SnapshotReader:
             raise SnapshotError(f"{path}: not a status snapshot of this version")
 
     def read(self) -> View:
-        """A consistent view; waits while the loop is writing.
+        """Return a consistent view; wait while the loop is writing.
 
         A loop that was killed in the midst of a write never ends it; after `_PATIENCE_S` the reading is of what it left.
         """
@@ -367,7 +367,7 @@ class SnapshotReader:
         )
 
     def work_us(self, *shares: float) -> list[float]:
-        """Quantiles of the work per cycle [us], upper edge of their bin (1.0: the true maximum); NaN without data."""
+        """Return quantiles of the work per cycle [us], upper edge of their bin (1.0: the true maximum); NaN without data."""
         largest = self.read().counters["work_max_ns"]
         return quantiles(self.work_bins(), WORK_BIN_NS, largest, shares)
 
@@ -377,11 +377,11 @@ class SnapshotReader:
         return quantiles(self.late_bins(), LATE_BIN_NS, largest, shares)
 
     def work_bins(self) -> tuple[int, ...]:
-        """Histogram of the work per cycle: cycles in each bin of `WORK_BIN_NS`; the last takes the rest."""
+        """Return the histogram of the work per cycle: cycles in each bin of `WORK_BIN_NS`; the last takes the rest."""
         return self._histogram(_WORK_OFFSET, WORK_BINS)
 
     def late_bins(self) -> tuple[int, ...]:
-        """Histogram of the SYNC's lateness: cycles in each bin of `LATE_BIN_NS`; the last takes the rest."""
+        """Return the histogram of the SYNC's lateness: cycles in each bin of `LATE_BIN_NS`; the last takes the rest."""
         return self._histogram(_LATE_OFFSET, LATE_BINS)
 
     def note_configured(self, node_id: int, restarts: int) -> None:
@@ -403,13 +403,13 @@ class SnapshotReader:
         _FACTORS.pack_into(self._memory, _FACTORS_OFFSET + node_id * _FACTORS.size, *values)
 
     def note_doubt(self, node_id: int) -> None:
-        """Tell the loop that a node is not configured as it was: not to be used until it is again (supervisor only)."""
+        """Tell the loop that a node has a changed configuration: not to be used until it is again (supervisor only)."""
         offset = _DOUBTS_OFFSET + node_id
         self._memory[offset] = (self._memory[offset] + 1) % 256
         self._ask(2)
 
     def ask_reset(self) -> int:
-        """Ask the loop to let go of latched faults (supervisor only); returns the number of the request."""
+        """Request the release of latched faults (supervisor only); return the number of the request."""
         return self._ask(0)
 
     def _ask(self, word: int) -> int:
@@ -419,7 +419,7 @@ class SnapshotReader:
 
     @property
     def resets_done(self) -> int:
-        """Number of the last reset request that the loop has carried out."""
+        """Return the number of the last reset request that the loop has executed."""
         return int(_WORD.unpack_from(self._memory, _ORDERS_OFFSET + 8)[0])
 
     def _histogram(self, offset: int, bins: int) -> tuple[int, ...]:

@@ -84,7 +84,7 @@ class LoopWatchdog:
 
 
 def watchdog_seconds(environment: Mapping[str, str] = os.environ) -> float | None:
-    """Time of systemd's watchdog [s], None without one.
+    """Return the time of systemd's watchdog [s], None without one.
 
     WATCHDOG_PID names the main process; the loop is its child and feeds in its place (NotifyAccess=all).
     """

@@ -42,7 +42,7 @@ class ControlError(Exception):
 
 
 class _Connection:
-    """One that has connected: waits for its request, then for the reply."""
+    """One client: waits for its request, then for the reply."""
 
     def __init__(self, sock: socket.socket, until_s: float) -> None:
         self.socket = sock
@@ -86,7 +86,7 @@ class ControlServer:
         return waiting if full else [self._listener.fileno(), *waiting]
 
     def serve(self) -> None:
-        """Everything that can be done now; never blocks, never raises for what a client does."""
+        """Process all pending requests; never blocks, never raises for client errors."""
         self._accept()
         now = time.monotonic()
         for connection in list(self._connections):
@@ -99,7 +99,7 @@ class ControlServer:
                 self._connections.remove(connection)
 
     def close(self) -> None:
-        """No more orders."""
+        """Stop accepting orders."""
         for connection in self._connections:
             with suppress(OSError):
                 _send(connection.socket, _error("jtqd is ending"))
@@ -124,7 +124,7 @@ class ControlServer:
             self._connections.append(_Connection(sock, time.monotonic() + PATIENCE_S))
 
     def _attend(self, connection: _Connection, now_s: float) -> bool:
-        """True when the connection has its reply, or is not worth waiting for."""
+        """Return whether the connection is finished or timed out."""
         if connection.answer is None:
             reply = self._request(connection)
             if reply is None:
@@ -165,10 +165,10 @@ class ControlServer:
 
 
 def _objection(sock: socket.socket) -> str | None:
-    """The file's mode says who may connect; this is the second lock."""
+    """Return an objection to the peer; a second check beside the mode of the socket file."""
     raw = sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
     _, uid, _ = _CREDENTIALS.unpack(raw)
-    return None if uid in (0, os.getuid()) else f"user {uid} may give no orders"
+    return None if uid in (0, os.getuid()) else f"user {uid} may not give orders"
 
 
 def _error(text: str) -> Reply:

@@ -76,7 +76,7 @@ def node_subjects(config: Config) -> dict[int, Subject]:
 
 
 class Deviation:
-    """Whether one joint's estimate stays further from the torque sensor than its sigma allows: one of the two is wrong.
+    """Detects an estimate that stays further from the torque sensor than its sigma allows.
 
     It begins after DEVIATION_S beyond DEVIATION_SIGMAS and ends after as long within NEAR_SIGMAS: delays and friction at
     a reversal are over sooner.
@@ -126,7 +126,7 @@ class _PdoState:
 
 
 class PdoWatch:
-    """Errors 8250h, 8210h and 8220h of each input PDO by itself, from the loop's counts.
+    """Detects errors 8250h, 8210h and 8220h of each input PDO from the loop's counts.
 
     The loop decides per cycle; this reports what lasts. A PDO has timed out when it brought no valid input for
     `TIMEOUT_CYCLES` cycles in a row, and is back with the next valid one. A frame of a wrong length is never used: a short
@@ -174,7 +174,7 @@ _PDO_CONDITIONS = {PDO_TIMEOUT: "pdo_timeout", PDO_SHORT: "pdo_short", PDO_LONG:
 
 
 def pdo_subjects(config: Config) -> list[Subject]:
-    """Input PDOs in the order of the snapshot's inputs, with the joints that cannot do without."""
+    """Return the input PDOs in the order of the snapshot's inputs, with the joints that need them."""
     joints = {joint.node_id: 1 << n for n, joint in enumerate(config.joints)}
     return [
         Subject(pdo.name, pdo.cob_id, joints.get(pdo.node_id, 0), pdo.node_id) for pdo in input_pdos(config)

@@ -57,7 +57,7 @@ class SupervisorError(Exception):
 
 
 def checked_load(config: Config) -> BusLoad:
-    """Worst bus load of a configuration. Raises SupervisorError: it does not fit."""
+    """Return the worst-case bus load of a configuration. Raises SupervisorError if it is too high."""
     try:
         return check_bus_load(bus_load_of(config))
     except BusLoadError as error:
@@ -65,7 +65,7 @@ def checked_load(config: Config) -> BusLoad:
 
 
 def log_directory(record: str | None) -> Path | None:
-    """Where logs go, from the option `--record`, made where it is missing; None: nowhere.
+    """Return the log directory of the option `--record`, created if missing; None: no recording.
 
     A disk that is full, read-only or closed to us now may not be so later: the recorder reports it and waits for it.
 
@@ -86,14 +86,14 @@ def log_directory(record: str | None) -> Path | None:
             f"--record {record}: found a file there, expected a directory for logs"
         ) from None
     except FileNotFoundError:  # the way there exists, and takes none: /proc, a link that leads nowhere
-        raise SupervisorError(f"--record {record}: no directory can be made there") from None
+        raise SupervisorError(f"--record {record}: the directory cannot be created") from None
     except OSError:
         pass
     return directory
 
 
 def start_bench(config: Config, bus: str, start_child: StartChild) -> Child:
-    """The emulated bench on `bus` ("unix:PATH"). Raises SupervisorError."""
+    """Start the emulated bench on `bus` ("unix:PATH"). Raises SupervisorError."""
     path = Path(bus.removeprefix("unix:"))
     path.unlink(missing_ok=True)
     bench = start_child("jtqd.sim_can", ["--bus", bus], "the emulated bench")
@@ -112,7 +112,7 @@ def start_bench(config: Config, bus: str, start_child: StartChild) -> Child:
 
 
 def boot_nodes(config: Config, bus: str, start_child: StartChild, stopped: Stopped) -> dict[str, Any] | None:
-    """Boot all nodes; the report holds their scaling. None when we were told to stop. Raises SupervisorError."""
+    """Boot all nodes; the report holds their scaling. None after a stop order. Raises SupervisorError."""
     child = start_child("jtqd.drivers.boot", [], "the boot")
     child.tell(boot_request(config, bus))
     child.end_of_input()
@@ -134,7 +134,7 @@ def check_gears(config: Config, report: dict[str, Any]) -> str | None:
 
 
 def wait_for(child: Child, stopped: Stopped) -> dict[str, Any] | None:
-    """The child's next answer; None when we were told to stop.
+    """Return the child's next answer; None after a stop order.
 
     Raises:
         ChildError: it ended, or kept silent for too long.
@@ -155,7 +155,7 @@ def wait_for(child: Child, stopped: Stopped) -> dict[str, Any] | None:
 
 
 def put_back(config: Config, send: Callable[[bytes], bool]) -> None:
-    """The SYNC has ended, or never begun: the nodes that were started are pre-operational again."""
+    """Reset the started nodes to pre-operational, after the end of SYNC or a failed start."""
     for node in nodes_of(config):
         try:
             send(nmt.command(nmt.ENTER_PRE_OPERATIONAL, node))
@@ -168,7 +168,7 @@ _STOLEN_PERIOD_S = 1.0
 
 
 class StolenTime:
-    """Processor time that a hypervisor takes away, looked at once a second: the condition, and the sum since the start."""
+    """Stolen processor time, read once a second: the condition, and the sum since the start."""
 
     def __init__(self, conditions: Conditions) -> None:
         self._conditions = conditions
@@ -176,7 +176,7 @@ class StolenTime:
         self._due_s = 0.0
 
     def observe(self, now_s: float) -> None:
-        """Look when it is time (CLOCK_MONOTONIC)."""
+        """Read the stolen time when it is due (CLOCK_MONOTONIC)."""
         if now_s < self._due_s:
             return
         self._due_s = now_s + _STOLEN_PERIOD_S
@@ -184,7 +184,7 @@ class StolenTime:
         self._conditions.update("stolen_time", THE_MACHINE, self._last_s > before, now_s)
 
     def total_s(self) -> float:
-        """Taken since the start [s]."""
+        """Return the stolen time since the start [s]."""
         return stolen_s() - self._first_s
 
 
@@ -385,7 +385,7 @@ class Supervisor:
     def _watch(
         self, loop: Child, node: OwnNode, reader: SnapshotReader, bench: Child | None
     ) -> dict[str, Any]:
-        """Until the loop ends: table, SDO requests, recorder. Returns the loop's last answer."""
+        """Serve table, SDO requests and recorder until the loop ends; return the loop's last answer."""
         title = f"jtqd on {self._instance}, node {self._config.node_id:02X}h, {self._config.estimator.method}"
         stopping = 0.0
         with Display(reader, self._config.bitrate, title, self._log) as display:
@@ -434,7 +434,7 @@ class Supervisor:
         self._conditions_file.write(self._conditions.present())
 
     def _serve(self, view: View, now: float) -> None:
-        """The own node's duties, for as long as there is a bus; the loop reports its end."""
+        """Run the own node's duties while there is a bus; the loop reports its end."""
         if self._bus_gone:
             return
         known = len(self._report["nodes"])
@@ -448,7 +448,7 @@ class Supervisor:
             self._record(self._report, again=True)
 
     def _loop_now(self, loop: Child, view: View, recorder_lost: int, *, stopping: bool) -> Child:
-        """Systemd's, operators' and reloads' turn; the loop, or its successor."""
+        """Serve systemd, operators and reloads; return the loop, or its successor."""
         now = self._service.serve(loop, view, recorder_lost)
         if stopping and now is not loop:
             now.process.send_signal(signal.SIGTERM)  # it took over just when the order to end came
@@ -479,7 +479,7 @@ class Supervisor:
     # End -----------------------------------------------------------------------------------------------------------------
 
     def _leave(self) -> None:
-        """The SYNC has ended with the loop, or never begun: put the nodes that we started back to pre-operational."""
+        """Reset the started nodes to pre-operational after the end of SYNC."""
         send, self._send = self._send, None
         if send is None:
             return

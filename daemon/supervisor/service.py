@@ -36,7 +36,7 @@ def metrics_text(
     recorder_lost: int,
     conditions: Sequence[Condition] = (),
 ) -> str:
-    """Text of the whole file; the label `bus` tells daemons apart."""
+    """Return the text of the metrics file; the label `bus` distinguishes daemons."""
     label = bus.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ")
     lines: list[str] = []
 
@@ -63,7 +63,7 @@ def metrics_text(
     metric(
         "condition",
         "gauge",
-        "Joints, nodes, ... that have this condition now (docs/faults.md).",
+        "Number of joints, nodes, ... with this condition (docs/faults.md).",
         [(f',name="{name}"', present[name]) for name in CATALOGUE],
     )
     work = zip(_SHARES, reader.work_us(*_SHARES), strict=True)
@@ -81,7 +81,7 @@ def metrics_text(
 
 
 def write_metrics(path: Path, text: str) -> None:
-    """Replace the file at once: a reader never sees half of it. Raises OSError."""
+    """Replace the file atomically. Raises OSError."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         temporary.write_text(text, encoding="utf-8")
@@ -108,7 +108,7 @@ others switch it on, and perhaps only when we are ready."""
 
 
 class Service:
-    """One per run.
+    """Services of one run: systemd, orders, reloads, metrics.
 
     Args:
         config: in force at the start.
@@ -143,7 +143,7 @@ class Service:
         self._status_due = self._metrics_due = 0.0
 
     def open(self, reader: SnapshotReader, reload: Reload) -> None:
-        """The loop runs: take orders. Raises OSError."""
+        """Accept orders when the loop runs. Raises OSError."""
         self._reader, self._reload = reader, reload
         handlers: dict[str, Callable[[Reply], Reply | Answer]] = {
             "ping": self._ping,
@@ -160,11 +160,11 @@ class Service:
         return [*control, *(self._reload.outputs if self._reload is not None else [])]
 
     def want_reload(self) -> None:
-        """SIGHUP. While a reload is under way, another one follows it: the files may have changed since it read them."""
+        """Request a reload (SIGHUP). During a reload another one follows, as the files may have changed."""
         self._reload_wanted = True
 
     def serve(self, loop: Child, view: View, recorder_lost: int) -> Child:
-        """All that is due; returns the loop that runs, which is another one after a reload."""
+        """Run the due services; return the running loop, which changes with a reload."""
         if self._reload_wanted and not self.reloading:
             self._reload_wanted = False
             try:
@@ -189,7 +189,7 @@ class Service:
 
     @property
     def reloading(self) -> bool:
-        """A hand-over may be under way: a loop that has ended may have a successor."""
+        """Return whether a hand-over may be running, so that an ended loop may have a successor."""
         return self._reload is not None and self._reload.running
 
     def not_handed_over(self, why: str) -> None:
@@ -198,17 +198,17 @@ class Service:
             self._reload_failed(self._reload.refused(why))
 
     def stopping(self, why: str = "") -> None:
-        """The daemon begins to end."""
+        """Report the begin of the shutdown."""
         self._notifier.send(
             "STOPPING=1", f"STATUS={why or 'ending: the nodes go to pre-operational, the log is finished'}"
         )
 
     def failed(self, why: str) -> None:
-        """The daemon ends because of this."""
+        """Report the failure that ends the daemon."""
         self._notifier.send(f"STATUS=failed: {why}")
 
     def close(self) -> None:
-        """No more orders."""
+        """Stop accepting orders."""
         if self._reload is not None:
             self._reload.abandon()
         if self._control is not None:
@@ -224,8 +224,8 @@ class Service:
 
     def _ask_save(self, request: Reply) -> Reply:
         if not self._save():
-            raise ControlError("nothing is recorded")
-        self._log("the flight recording is written, as asked", NOTICE, "save")
+            raise ControlError("recording is off")
+        self._log("flight recording written on request", NOTICE, "save")
         return {"ok": True}
 
     def _reset(self, request: Reply) -> Answer:
@@ -233,7 +233,7 @@ class Service:
         assert reader is not None
         before = sum(each.latched for each in reader.read().joints)
         number, until = reader.ask_reset(), time.monotonic() + _RESET_S
-        self._log("reset of latched faults, as asked", NOTICE, "reset")
+        self._log("latched faults reset on request", NOTICE, "reset")
 
         def answer() -> Reply | None:
             if reader.resets_done >= number:
@@ -277,7 +277,7 @@ class Service:
         try:
             self._renew(self._config)
         except OSError as error:  # the loop has taken over all the same
-            self._log(f"reloaded, but the runtime directory cannot be written: {error.strerror}", ERROR)
+            self._log(f"reloaded, but the runtime directory is not writable: {error.strerror}", ERROR)
         missed = self._missed() - int(about["missed_before"])
         self._outcome.append(
             {
@@ -294,8 +294,9 @@ class Service:
             if change["rms_change_nm"] is not None
         )
         self._log(
-            f"reloaded {self._config.path}: in force from cycle {about['took_over']} on, {missed} cycles missed; "
-            f"on the last {about['cycles']} cycles the estimate changes: {changes or 'nothing to compare'}",
+            f"reloaded {self._config.path}: in force from cycle {about['took_over']} on, "
+            f"{missed} cycle{'s' if missed != 1 else ''} missed; "
+            f"on the last {about['cycles']} cycles the estimates change: {changes or 'nothing to compare'}",
             NOTICE,
         )
         self._notifier.send("READY=1")
@@ -307,13 +308,13 @@ class Service:
 
     def _reload_failed(self, error: ReloadError) -> None:
         self._outcome.append({"ok": False, "error": str(error)})
-        self._log(f"not reloaded, the old files stay in force: {error}", ERROR)
+        self._log(f"not reloaded, the old files remain in force: {error}", ERROR)
         self._notifier.send("READY=1")
 
     # State ---------------------------------------------------------------------------------------------------------------
 
     def _estimating(self, view: View) -> bool:
-        """The loop publishes, and every joint whose node must be there has inputs and an estimator that has settled."""
+        """Return whether the loop publishes and every mandatory joint has inputs and a settled estimator."""
         if not view.counters["published"]:
             return False
         mandatory = (joint.mandatory for joint in self._config.joints)

@@ -13,8 +13,8 @@ from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.estimator.checked import finite
 
 _AGES = (
-    "              (estimate and sensor reading of the same cycle; the estimate is filtered and about 5 ms old by then,\n"
-    "              which this RMSE includes)"
+    "              (estimate and sensor reading of the same cycle;\n"
+    "              the RMSE includes the delay of the estimate, about 5 ms)"
 )
 _REFUSED = ("overruns", "latches", "latch_resets")
 """Counters beside those of the faults (docs/safety.md)."""
@@ -43,13 +43,13 @@ class Summary:
 
     @property
     def exit_status(self) -> int:
-        """0 done, 1 the run ended by a failure, 3 done with cycles missing in the log."""
+        """Return the exit status: 0 done, 1 ended by a failure, 3 done with cycles missing in the log."""
         if self.error:
             return 1
         return 3 if self.recording is not None and self.recording.get("lost", 0) else 0
 
     def content(self) -> dict[str, Any]:
-        """The same as plain data for JSON."""
+        """Return the summary as plain data for JSON."""
         return {
             "cycles": self.cycles,
             "missed": self.missed,
@@ -78,21 +78,19 @@ class Summary:
         )
 
     def text(self) -> str:
-        """The same for people."""
+        """Return the summary as text."""
         counters = self.counters
         lines = [
             f"cycles        {self.cycles}, missed {self.missed}, stale inputs {self.stale_inputs}",
-            "cycle work    p50 {:.0f} us, p99 {:.0f} us, max {:.0f} us (wake-up for the inputs to hand-over)".format(
+            "cycle work    p50 {:.0f} us, p99 {:.0f} us, max {:.0f} us (from wake-up to hand-over)".format(
                 *self.work_us
             ),
             "SYNC lateness p50 {:.0f} us, p99 {:.0f} us, max {:.0f} us".format(*self.late_us),
         ]
         if self.stolen_s > 0.0:
-            lines.append(
-                f"processors    taken away for {self.stolen_s:.2f} s by the hypervisor (stolen time)"
-            )
+            lines.append(f"processors    {self.stolen_s:.2f} s stolen by the hypervisor")
         for joint, rmse in enumerate(self.rmse_nm, start=1):
-            shown = f"{rmse:.3f} Nm against the sensor while it moves" if isfinite(rmse) else "no reference"
+            shown = f"{rmse:.3f} Nm against the sensor in motion" if isfinite(rmse) else "no reference"
             lines.append(f"RMSE joint {joint}  {shown}")
         if any(map(isfinite, self.rmse_nm)):
             lines.append(_AGES)
@@ -135,17 +133,16 @@ class Summary:
         else:
             lost, path = self.recording.get("lost", 0), self.recording.get("path")
             nothing = (
-                "nothing happened"
-                if self.recording.get("flight_recordings") == 0
-                else "it could not be written"
+                "no trigger" if self.recording.get("flight_recordings") == 0 else "it could not be written"
             )
             shown = path or f"none: {self.recording.get('error') or nothing}"
             parts = len(self.recording.get("paths", ()))
             shown += f" (the last of {parts} parts)" if parts > 1 else ""
-            lines.append(f"log           {shown}" + (f", {lost} cycles lost" if lost else ""))
+            lines.append(
+                f"log           {shown}" + (f", {lost} cycle{'s' if lost != 1 else ''} lost" if lost else "")
+            )
             lines += [
-                f"              {left} (left by a recorder that died)"
-                for left in self.recording.get("left", [])
+                f"              {left} (left by a killed recorder)" for left in self.recording.get("left", [])
             ]
         if self.error:
             lines.append(f"ended by      {self.error}")
@@ -162,7 +159,7 @@ def summary_of(
     began_s: float,
     stolen_s: float,
 ) -> Summary:
-    """The summary of a run that has ended.
+    """Return the summary of a finished run.
 
     Args:
         reader: snapshot of its loop.

@@ -34,7 +34,7 @@ _DISPENSABLE = ("sensor [Nm]", "error [Nm]", "sigma [Nm]")
 
 
 def bus_load(previous: View, now: View, bitrate: int) -> float:
-    """Share of the bus that the frames between two views took with worst-case stuffing; NaN without time in between."""
+    """Return the bus load between two views with worst-case stuffing; NaN without time in between."""
     seconds = (now.sync_realtime_ns - previous.sync_realtime_ns) * 1e-9
     bits = now.counters["bits_worst_case"] - previous.counters["bits_worst_case"]
     return bits / seconds / bitrate if previous.sync_realtime_ns and seconds > 0 else float("nan")
@@ -50,7 +50,7 @@ def first_that_fits(tables: Iterable[Table], console: Console, options: ConsoleO
 
 
 class LiveTable:
-    """One picture of the running loop, as wide as the terminal allows: the status is there at any width.
+    """Live table of the loop, as wide as the terminal allows; the status is shown at any width.
 
     In a narrow terminal columns go in the order of `_DISPENSABLE`, then the frame, and in the end each joint is a line.
     """
@@ -61,7 +61,7 @@ class LiveTable:
         self._rows = [_cells(number, joint) for number, joint in enumerate(view.joints, start=1)]
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Called by rich with the width of the terminal."""
+        """Render for the width of the terminal (called by rich)."""
         yield self._widest_that_fits(console, options)
         yield Text(self._line)
 
@@ -75,7 +75,8 @@ class LiveTable:
         if table is not None:
             return table
         lines = (
-            Text.assemble(f"{row['joint']}: {row['torque [Nm]']} Nm ", row["status"]) for row in self._rows
+            Text.assemble(f"{row['joint']}: {_with_unit(row['torque [Nm]'])}", row["status"])
+            for row in self._rows
         )
         return Group(self._title, *lines)
 
@@ -91,7 +92,7 @@ class LiveTable:
 
 
 def _cells(number: int, joint: JointView) -> dict[str, str | Text]:
-    """What stands in the columns for one joint."""
+    """Return the cells of one joint."""
     name = NAMES.get(joint.status, str(joint.status))
     known = joint.status in PUBLISHED
     return {
@@ -105,7 +106,7 @@ def _cells(number: int, joint: JointView) -> dict[str, str | Text]:
 
 
 def loop_line(reader: SnapshotReader, previous: View, view: View, bitrate: int) -> str:
-    """Cycle time, missed cycles and bus load in one line."""
+    """Return cycle time, missed cycles and bus load in one line."""
     p50, p99, worst = reader.work_us(0.5, 0.99, 1.0)
     counters = view.counters
     load = bus_load(previous, view, bitrate)
@@ -117,7 +118,7 @@ def loop_line(reader: SnapshotReader, previous: View, view: View, bitrate: int) 
 
 
 def plain_line(reader: SnapshotReader, previous: View, view: View, bitrate: int) -> str:
-    """The same for a log: one line without control characters."""
+    """Return the state as one line without control characters, for a log."""
     joints = "  ".join(f"joint {n} {_plain(joint)}" for n, joint in enumerate(view.joints, start=1))
     return f"{joints}  {loop_line(reader, previous, view, bitrate)}"
 
@@ -127,6 +128,10 @@ def _plain(joint: JointView) -> str:
     if joint.status not in PUBLISHED:
         return name
     return f"{name} {_number(joint.torque_nm)} +- {_number(joint.sigma_nm)} Nm"
+
+
+def _with_unit(torque: str | Text) -> str:
+    return "" if str(torque) == "-" else f"{torque} Nm "
 
 
 def _number(value: float) -> str:

@@ -26,17 +26,17 @@ def parser() -> argparse.ArgumentParser:
     )
     commands = top.add_subparsers(dest="action", required=True)
     make = commands.add_parser("build", help="build the kernel unless it is cached, and print its path")
-    make.add_argument("--unless-vcan", action="store_true", help="do nothing where the host has vcan0")
+    make.add_argument("--unless-vcan", action="store_true", help="do nothing if the host has vcan0")
     commands.add_parser("path", help="print the cached kernel's path; status 1 when there is none")
-    run = commands.add_parser("run", help="boot it, run a command as root, return the command's exit status")
+    run = commands.add_parser("run", help="boot the kernel, run a command as root, return its exit status")
     run.add_argument(
-        "--time-travel", action="store_true", help="guest time moves only when every process sleeps"
+        "--time-travel", action="store_true", help="guest time advances only when every process sleeps"
     )
     run.add_argument("--mem", default="2G", help="RAM of the guest (default: %(default)s)")
     run.add_argument(
         "--timeout", type=float, metavar="S", help="kill the guest after S seconds of wall time, status 124"
     )
-    run.add_argument("--out", metavar="DIR", help="directory that the guest writes through to the host")
+    run.add_argument("--out", metavar="DIR", help="directory on the host that the guest can write")
     run.add_argument("command", nargs="+", metavar="COMMAND", help="after --: program and arguments")
     return top
 

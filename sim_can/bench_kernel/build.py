@@ -149,7 +149,7 @@ def ensure(*, install: bool = True) -> Path:
     require((*BUILD, *GUEST), install=install)
     version = _source_version()
     if version is None:
-        raise BuildError(f"{SOURCE_ARCHIVE} is there but dpkg knows no package {SOURCE_PACKAGE}")
+        raise BuildError(f"{SOURCE_ARCHIVE} exists but dpkg has no package {SOURCE_PACKAGE}")
     root = cache_root()
     root.mkdir(parents=True, exist_ok=True)
     with _only_builder(root):
@@ -244,7 +244,7 @@ def _configure(tree: Path, config: bytes, out: IO[str]) -> None:
     arrived = set(wanted_options((tree / ".config").read_text()))
     refused = [option for option in wanted_options(config.decode()) if option not in arrived]
     if refused:
-        raise BuildError(f"this kernel source refuses options of {CONFIG_FILE.name}: {' '.join(refused)}")
+        raise BuildError(f"this kernel source rejects options of {CONFIG_FILE.name}: {' '.join(refused)}")
 
 
 def _compile(tree: Path, log: Path, out: IO[str]) -> None:

@@ -75,7 +75,7 @@ class Guest:
     """One booted bench kernel that runs one command and goes down with it.
 
     command       program and arguments; runs as root in the guest
-    time_travel   guest time moves only when every process sleeps: timers are exact, computing takes no time.
+    time_travel   guest time advances only when every process sleeps: timers are exact, computing takes no time.
                   A loop that polls the clock without sleeping never ends in this mode.
     out_dir       directory of the host that the guest writes through to; everything else it writes is dropped
     env           set on top of the caller's environment (HOME is a fresh directory of the guest)
@@ -187,9 +187,7 @@ class Guest:
         try:
             status = int((self.job / "status").read_text())
         except (OSError, ValueError):
-            raise GuestError(
-                f"the guest went down without a result: {self.why()}{self._last_words()}"
-            ) from None
+            raise GuestError(f"the guest ended without a result: {self.why()}{self._last_words()}") from None
         return Result(status, _text(self.job / "stdout"), _text(self.job / "stderr"))
 
     def _last_words(self) -> str:
@@ -207,11 +205,11 @@ _CAUSES = (
     (r"Out of memory: (.+)", "out of memory: {}"),
     (
         r"(?:can't|cannot|couldn't|Failed to) (?:map|expand|create|write)[^\n]*(?:mem|physmem)[^\n]*",
-        "no room for the guest's memory",
+        "not enough space for the guest's memory",
     ),
     (
         r"No space left on device",
-        "no room for the guest's memory: /dev/shm or the temporary directory is full",
+        "not enough space for the guest's memory: /dev/shm or the temporary directory is full",
     ),
 )
 """What the console shows, and what it means; the first that is found is the cause."""

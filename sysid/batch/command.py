@@ -47,9 +47,9 @@ _EXAMPLES: Final = """examples:
   jtq batch replay /var/log/jtqd --out replayed --jobs 4
   jtq batch replay logs/ --model trained/ --out new_model --scheduler tcp://10.0.0.5:8786
 
-One group of logs is one task, and each task a process of its own, on this machine or on a worker of a dask cluster (which
-must have the same jtqd and see the logs under the same paths). A finished result is kept in DIR/results under a hash of
-the logs, the options, and version and code of jtqd: the same command again does only what is missing. DIR/index.html has
+One group of logs is one task. Each task is a separate process on this machine or on a worker of a dask cluster (which
+must have the same jtqd and the logs under the same paths). A finished result is stored in DIR/results under a hash of
+the logs, the options, and version and code of jtqd. The same command again runs only missing groups. DIR/index.html has
 the summary.
 
 exit status: 0 every group finished (whatever the result), 3 some failed, 1 the batch failed, 2 usage"""
@@ -78,7 +78,7 @@ def main(argv: list[str]) -> int:
     except BatchError as error:
         return _error(error)
     except KeyboardInterrupt:
-        return _error("interrupted; the same command goes on from here")
+        return _error("interrupted; the same command continues from here")
 
 
 def _error(text: object, status: int = 1) -> int:
@@ -190,7 +190,9 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     commands = result.add_subparsers(dest="command", required=True, metavar="diagnose|replay")
-    diagnose = _common(commands, DIAGNOSE, "errors of a joint file's simulation on each group of runs")
+    diagnose = _common(
+        commands, DIAGNOSE, "diagnose the simulation error of a joint file on each group of runs"
+    )
     diagnose.add_argument(
         "--joint",
         action="append",
@@ -201,10 +203,10 @@ def parser() -> argparse.ArgumentParser:
     diagnose.add_argument(
         "--columns", type=Path, metavar="FILE", help="column map for other names, units and signs"
     )
-    replay = _common(commands, REPLAY, "the estimator over each run again, and the difference")
+    replay = _common(commands, REPLAY, "replay the estimator over each run, and compare")
     replay.add_argument("--model", type=Path, metavar="DIR", help="other models; see jtq replay --help")
     replay.add_argument("--method", choices=METHODS, help="another method of the estimator")
-    replay.add_argument("--exact", action="store_true", help="cycle by cycle, whatever the length")
+    replay.add_argument("--exact", action="store_true", help="cycle by cycle for any length")
     return result
 
 
@@ -224,11 +226,11 @@ def _common(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     made.add_argument("logs", nargs="+", type=Path, metavar="LOGS", help="logs, or directories of them")
-    made.add_argument("--out", type=Path, required=True, metavar="DIR", help="results; made if missing")
+    made.add_argument("--out", type=Path, required=True, metavar="DIR", help="results; created if missing")
     made.add_argument(
         "--group-by",
         choices=WAYS,
-        help=f"what makes one task: the parts of one run, a directory, a file (default: {_GROUP_BY[name]})",
+        help=f"logs of one task: the parts of one run, a directory, a file (default: {_GROUP_BY[name]})",
     )
     made.add_argument(
         "--scheduler",
@@ -239,7 +241,7 @@ def _common(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
     made.add_argument(
         "--jobs", type=count, metavar="N", help="tasks at a time on this machine (default: CPUs)"
     )
-    made.add_argument("--timeout", type=seconds, metavar="S", help="a group that takes longer has failed")
-    made.add_argument("--again", action="store_true", help="run also what is finished")
+    made.add_argument("--timeout", type=seconds, metavar="S", help="time limit of a group [s]")
+    made.add_argument("--again", action="store_true", help="run finished groups again")
     made.add_argument("--json", action="store_true", help="print summary.json")
     return made

@@ -332,7 +332,7 @@ def run_batch(
         groups: of logs; those with the same content are worked on once.
         out: directory of the results.
         workers: run the tasks.
-        again: run also what is finished.
+        again: run finished groups again.
         progress: called with each row when it is complete.
 
     Raises:
@@ -402,7 +402,7 @@ def _outcome(future: Future[Outcome], here: str) -> Outcome:
     try:
         outcome = future.result()
     except CancelledError:
-        raise BatchError("the scheduler has gone, or has forgotten the tasks") from None
+        raise BatchError("the scheduler has ended or lost the tasks") from None
     except Exception as error:
         lines = str(error).strip().splitlines() or ["no reason given"]
         died = type(error).__name__ == "KilledWorker"

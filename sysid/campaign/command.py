@@ -48,21 +48,21 @@ def parser() -> argparse.ArgumentParser:
     """All options; `usage_error` and `missing_option` check their combination."""
     made = argparse.ArgumentParser(
         prog="jtq campaign",
-        description="Drive both joints through a campaign of runs, record and check each; go on where it was interrupted.",
+        description="Drive both joints through a campaign of runs, record and check each; continue an interrupted campaign.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = made.add_argument
     add("plan", metavar="PLAN", help="efficiency, excitation, validate, or a plan file (jtq.plan/1)")
     add("--bus", help="can0, unix:PATH, sim (the emulated bench), or sim:BUS (the same on that bus)")
-    add("--out", type=Path, metavar="DIR", help="the campaign's directory; made if missing")
-    add("--dry-run", action="store_true", help="print the plan, its length and the bus load; move nothing")
+    add("--out", type=Path, metavar="DIR", help="the campaign's directory; created if missing")
+    add("--dry-run", action="store_true", help="print the plan, its length and the bus load, without motion")
     add(
         "--config",
         "--joint-config",
         type=Path,
         metavar="FILE",
-        help="configuration of jtqd: nodes and joint files (default: the bench that ships)",
+        help="configuration of jtqd: nodes and joint files (default: the shipped bench)",
     )
     add(
         "--limit",
@@ -72,18 +72,18 @@ def parser() -> argparse.ArgumentParser:
         metavar="NAME=VALUE",
         help=f"another limit than the plan's: {', '.join(LIMIT_NAMES)} (temperature_c=none: not supervised)",
     )
-    add("--keep-going", action="store_true", help="go on with the next run after a limit was exceeded")
+    add("--keep-going", action="store_true", help="continue with the next run after a limit was exceeded")
     add("--json", action="store_true", help="print the result (or the plan) as JSON")
     add("--plant", type=Path, metavar="FILE", help=f"with --bus sim: bench to emulate (default {PLANT})")
-    size = made.add_argument_group("size of a campaign that is not a file").add_argument
-    size("--quick", action="store_true", help="a small one: every kind of run, few of each")
+    size = made.add_argument_group("size of a named campaign").add_argument
+    size("--quick", action="store_true", help="small campaign: every kind of run, few of each")
     size("--runs", type=count, metavar="N", help="Fourier runs (default 24)")
     size("--seconds", type=seconds, metavar="S", help="length of a Fourier run (default 24; validate 12)")
     size("--hold", dest="hold_s", type=seconds, metavar="S", help="hold of a constant point (default 2.1)")
     size(
         "--seed", type=natural, default=0, metavar="N", help="of trajectories and emulated bench (default 0)"
     )
-    size("--evaluations", type=count, metavar="N", help="motions that each search tries, per trajectory")
+    size("--evaluations", type=count, metavar="N", help="motions evaluated by each search, per trajectory")
     return made
 
 
@@ -94,14 +94,14 @@ def usage_error(options: argparse.Namespace) -> str:
             return f"found plan {options.plan!r}, expected {', '.join(KINDS)} or a .yaml file"
         given = [name for name in _SCALING if name != "seed" and getattr(options, name) not in (None, False)]
         if given:
-            return f"--{given[0].removesuffix('_s')} belongs to {', '.join(KINDS)}, not to a plan file"
+            return f"--{given[0].removesuffix('_s')} belongs to {', '.join(KINDS)}, not for a plan file"
     if options.plant is not None and not emulated(options.bus):
-        return "--plant belongs to --bus sim"
+        return "--plant requires --bus sim"
     return ""
 
 
 def missing_option(options: argparse.Namespace) -> str:
-    """Which option is missing; empty when none is. A plan file that cannot be read is said before."""
+    """Return which option is missing, or an empty text. An unreadable plan file is reported before."""
     if not options.dry_run and (options.bus is None or options.out is None):
         missing = "--bus" if options.bus is None else "--out"
         return f"{missing} is missing, for example --bus sim --out campaigns/{Path(options.plan).stem}"

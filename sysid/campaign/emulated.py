@@ -75,7 +75,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m jtqd.sysid.campaign.emulated", description=__doc__, epilog=_EXAMPLE
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="made, or gone on with")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="output directory; created or continued"
+    )
     parser.add_argument("--plant", type=Path, default=shipped(PLANT), help=f"bench (default {PLANT})")
     parser.add_argument("--runs", type=count, metavar="N", help="Fourier runs (default 24)")
     parser.add_argument("--seconds", type=seconds, metavar="S", help="length of a Fourier run (default 12)")

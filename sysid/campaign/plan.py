@@ -178,7 +178,7 @@ class Plan:
         seen: set[str] = set()
         for section, run in zip(sections, runs, strict=True):
             if run.name in seen:
-                raise section.error("name", run.name, "a name that no other run has")
+                raise section.error("name", run.name, "a unique name")
             seen.add(run.name)
         top.finish()
         return cls(name, limits, runs)
@@ -244,7 +244,7 @@ def _run(section: Section) -> Run:
     for before, one, each in zip((None, *segments), segments, inner, strict=False):
         if isinstance(one, Fourier | Off) and isinstance(before, Plateau) and before.moving:
             kind = one.to_mapping()["kind"]
-            raise each.error("kind", kind, "a rest before it: the plateau before it ends in motion")
+            raise each.error("kind", kind, "a rest before it, because the plateau before it ends in motion")
     section.finish()
     return Run(name, joint, segments)
 
@@ -349,10 +349,10 @@ def check_run(run: Run, limits: Limits) -> Setpoints:
     last = run.segments[-1]
     if isinstance(last, Plateau) and last.moving:
         raise ConfigError(
-            f"run '{run.name}': found a plateau as last segment, expected rest or fourier: a run ends at rest"
+            f"run '{run.name}': found a plateau as last segment, expected rest or fourier, because a run must end at rest"
         )
     if not any(samples(segment.duration_s) for segment in run.segments):
-        raise ConfigError(f"run '{run.name}': found no time in its segments, expected some")
+        raise ConfigError(f"run '{run.name}': found no duration in its segments, expected more than 0 s")
     setpoints = expand(run)
     try:
         check_setpoints(setpoints, limits)

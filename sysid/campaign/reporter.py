@@ -139,7 +139,7 @@ class Reporter:
 
     def attempt_failed(self, name: str, reason: str, attempt: int) -> None:
         """An attempt came to nothing and the run is tried again."""
-        self.write_line(f"{name}: attempt {attempt}: {reason}; once more")
+        self.write_line(f"{name}: attempt {attempt}: {reason}; repeated")
 
     def end(self, name: str, motion_s: float, state: RunState) -> None:
         """A run is over."""

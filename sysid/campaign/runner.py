@@ -310,9 +310,9 @@ class Outcome:
         for name, state in self.runs.items():
             if state.status in (STOPPED, FAILED):
                 lines.append(f"{state.status:<9} {name}: {state.reason}")
-            lines += [f"found     {name}: {finding}" for finding in state.findings]
+            lines += [f"finding   {name}: {finding}" for finding in state.findings]
         if self.ended:
-            lines.append(f"ended by  {self.ended}; the same command goes on with what is not done")
+            lines.append(f"ended by  {self.ended}; the same command continues with the remaining runs")
         return "\n".join(lines)
 
 

@@ -81,7 +81,7 @@ class CampaignDirectory:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             os.close(self._lock)
-            raise StateError(f"{path}: another campaign is at work in this directory") from None
+            raise StateError(f"{path}: another campaign is running in this directory") from None
         self.name = ""
         self.plan_sha256 = ""
         self.recipe: Mapping[str, Any] = {}

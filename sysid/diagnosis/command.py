@@ -102,7 +102,7 @@ def _with_channels(findings: Findings, checked: CheckedRuns, notes: tuple[str, .
             findings,
             verdict=INSUFFICIENT,
             reasons=(
-                f"{lost}: no run of {'it' if one else 'them'} can be used, the rest has no gap",
+                f"{lost}: no run of {'it' if one else 'them'} can be used, the others have no gap",
                 *checked.refused,
             ),
         )
@@ -115,8 +115,8 @@ def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq diagnose`."""
     parser = argparse.ArgumentParser(
         prog=BY,
-        description="Measure what a joint file's simulation gets wrong on recorded runs and name the cause, "
-        "or the causes that these runs cannot distinguish and the experiment that would.",
+        description="Measure the error of a joint file's simulation on recorded runs and name its cause.\n"
+        "If the runs cannot distinguish the possible causes, list them and plan the experiment that would.",
         epilog=(
             "examples:\n"
             "  jtq diagnose campaigns/validate --joint models/joint1.yaml --out diagnosis\n"
@@ -143,7 +143,7 @@ def parser() -> argparse.ArgumentParser:
         help="joint file of all joints, or of joint N; may be given again (default: those that the column map names)",
     )
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="where the results go; made if missing"
+        "--out", type=Path, required=True, metavar="DIR", help="output directory; created if missing"
     )
     parser.add_argument(
         "--columns", type=Path, metavar="FILE", help="column map for other names, units and signs"

@@ -110,7 +110,7 @@ def usable_signals(
 ) -> tuple[list[list[JointSignals]], list[str]]:
     """Return the signals [run][joint] of the usable runs, none if they are too few, and why others cannot be used."""
     if not numbers:
-        return [], ["found no joint that both the runs and the joint files have"]
+        return [], ["found no joint that is in both the runs and the joint files"]
     out: list[list[JointSignals]] = []
     reasons: list[str] = []
     bases = {n: BaseLoss(joints[n]) for n in numbers}
@@ -147,8 +147,8 @@ def usable_signals(
     if len(out) < FEWEST_RUNS:
         return [], [
             *reasons,
-            f"found {counted(len(out), 'usable run')}, expected at least {FEWEST_RUNS}: a gain is measured on runs "
-            "left out",
+            f"found {counted(len(out), 'usable run')}, expected at least {FEWEST_RUNS}: a gain is measured on held-out "
+            "runs",
         ]
     moving = sum(float(s.moving.sum()) * float(np.median(np.diff(s.time_s))) for run in out for s in run)
     if moving < SHORTEST_MOVING_S:

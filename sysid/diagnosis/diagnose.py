@@ -172,7 +172,7 @@ def _searched(dataset: Dataset, least_nm: float) -> tuple[Noise, Search, Hypothe
 
 
 def _without_unconfirmed(search: Search, best: Hypothesis) -> Hypothesis:
-    """Return the hypothesis without candidates that do not help on runs left out."""
+    """Return the hypothesis without candidates that do not help on held-out runs."""
     while best.chosen:
         weak = []
         for c in best.chosen:

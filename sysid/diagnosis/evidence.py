@@ -194,13 +194,13 @@ def _row(  # noqa: PLR0917
     elif delta < ENTER:
         reason = "below threshold"
     elif held < HELD_OUT:
-        reason = "does not help on runs left out"
+        reason = "does not help on held-out runs"
     elif search.size_nm(alone, candidate) < search.least_nm:
-        reason = "too small to matter"
+        reason = "too small to be relevant"
     elif not search.plausible(alone):
         reason = "implausible parameters"
     else:
-        reason = "explained by what was chosen"
+        reason = "explained by the chosen effects"
     return Evidence(
         candidate.effect.name,
         candidate.joint,

@@ -267,11 +267,11 @@ def _gain(gain: Gain) -> dict[str, Any]:
 
 
 _VERDICTS_IN_WORDS: Final = {
-    NO_GAP: "the simulation explains these runs down to their noise",
-    CAUSE: "the gap has a cause that these runs name",
-    AMBIGUOUS: "the gap has a cause, but these runs do not settle which",
+    NO_GAP: "the simulation agrees with these runs up to their noise",
+    CAUSE: "these runs identify the cause of the gap",
+    AMBIGUOUS: "these runs cannot distinguish the possible causes of the gap",
     UNEXPLAINED: "there is a gap that no effect of the library explains",
-    INSUFFICIENT: "these runs cannot be judged",
+    INSUFFICIENT: "these runs are not sufficient",
 }
 
 
@@ -291,7 +291,7 @@ def summary_lines(findings: Findings) -> list[str]:
     if gain is not None and math.isfinite(gain.rmse_before_nm):
         low, high = gain.ci95
         lines.append(
-            f"gain on runs left out: {gain.rmse_before_nm:.3g} -> {gain.rmse_after_nm:.3g} Nm rms "
+            f"gain on held-out runs: {gain.rmse_before_nm:.3g} -> {gain.rmse_after_nm:.3g} Nm rms "
             f"(reduced by {low:.3g} to {high:.3g} Nm, 95 % interval)"
         )
     if findings.next_experiment:

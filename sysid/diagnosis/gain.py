@@ -1,4 +1,4 @@
-"""Gain of the extended model on runs left out: error of its torque, and of a free run of the motor."""
+"""Gain of the extended model on held-out runs: error of its torque, and of a free run of the motor."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ Where: which condition explains most of what is left over, and which the rest. A
 explains a residual when the mean of a bin over the *other* runs predicts it in this run: the square error that goes
 away, summed over the runs left out one by one (`explained_by_bins`). Noise of another run is independent however coloured
 it is, so bins that only follow the noise explain nothing or less, and more bins are no advantage; nor is a condition that
-merely goes with the run (temperature, time), because other runs do not confirm it. Events and seconds that are off
+merely goes with the run (temperature, time), because other runs do not confirm it. Events and seconds with a deviating mean
 explain only what the best axis does not predict: a bump that makes a step on every pass is the angle's, not the moments'.
 The condition that explains most is the first location; what it explains is taken out, and the search is made again
 (`locate`). Energies in Nm^2.
@@ -126,9 +126,7 @@ def _floor(dataset: Dataset, refined: Refined, channel: Channel) -> tuple[float,
             part = part - part.mean()
         drift += float(part @ part)
         count += len(part)
-    return float(
-        np.sqrt(square + drift / max(count, 1))
-    ), "what no effect explains, and changes from run to run"
+    return float(np.sqrt(square + drift / max(count, 1))), "what no effect explains, and run-to-run variation"
 
 
 def _repeats(dataset: Dataset, channel: Channel) -> float | None:

@@ -1,11 +1,11 @@
-"""Leave-one-run-out confirmation: with fewer than four runs what is named must hold on each run left out.
+"""Leave-one-run-out confirmation: with fewer than four runs what is named must hold on each held-out run.
 
 With many runs the sum over runs left out says whether an effect is there. With two or three, one run can carry that sum,
 the runs' own changes are hardly known (their variance is little more than its prior), and what the models get wrong
 passes for an effect. So what the search found is put to a harder rule: with the coefficients of the other runs an
-effect must lower both the deviance and the plain squared error of the torque on each run left out. Where the set as
+effect must lower both the deviance and the plain squared error of the torque on each held-out run. Where the set as
 a whole does not pass, the search is made again by that error alone. An alternative is ruled out by being worse on
-each run left out, not by their sum.
+each held-out run, not by their sum.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from jtqd.sysid.diagnosis.signals import Channel
 ENOUGH_RUNS: Final = 4
 """From here on the sum over runs left out decides, as everywhere else."""
 FALL: Final = 0.05
-"""Part of the squared error of every run left out that an effect must take away."""
+"""Part of the squared error of every held-out run that an effect must take away."""
 ENOUGH_LEFT: Final = 0.2
-"""Part of the error that effects could explain at all which may be left over on runs left out without a word."""
+"""Part of the error that effects could explain at all which may be left over on held-out runs without a word."""
 _SCALES: Final = frozenset({"torque_constant", "sensor_gain"})
 
 Squares = Mapping[Channel, float]
 
 
 class LeaveOneOut:
-    """Sets of candidates, judged on each run left out."""
+    """Sets of candidates, judged on each held-out run."""
 
     def __init__(self, dataset: Dataset, search: Search) -> None:
         self.dataset = dataset
@@ -43,7 +43,7 @@ class LeaveOneOut:
         self._squares: dict[tuple[int, ...], list[Squares]] = {}
 
     def confirmed(self, found: Hypothesis) -> Hypothesis:
-        """Return the set that was found where it holds, else the best by the error on runs left out that does."""
+        """Return the set that was found where it holds, else the best by the error on held-out runs that does."""
         best = self.search.hypothesis(())
         if self._reached(found):
             return found
@@ -56,7 +56,7 @@ class LeaveOneOut:
         return best
 
     def holds(self, hypothesis: Hypothesis) -> bool:
-        """Return whether each candidate, and all together, help on every run left out."""
+        """Return whether each candidate, and all together, help on every held-out run."""
         nothing = self.search.hypothesis(())
         return self._helps(hypothesis, nothing, hypothesis.chosen) and not self._idle(hypothesis)
 
@@ -71,7 +71,7 @@ class LeaveOneOut:
         )
 
     def rivals(self, best: Hypothesis, cause: EffectCandidate) -> tuple[EffectCandidate, ...]:
-        """Return the candidates (one per effect and joint) that in the place of `cause` help on every run left out and on
+        """Return the candidates (one per effect and joint) that in the place of `cause` help on every held-out run and on
         at least one of them leave no more than FALL more than it, best first; with one joint, torque constant and
         sensor gain are never separated, whose difference is a factor on friction and inertia.
         """
@@ -120,12 +120,12 @@ class LeaveOneOut:
         """Return a sentence about what is unsure."""
         names = ", ".join(f"{n} of {'the sensor' if j == 'sensor' else f'joint {j}'}" for n, j in unsure)
         return (
-            f"indicated by all {self.search.mixed.runs} runs together, but not confirmed on every run left out: {names}; "
+            f"indicated by all {self.search.mixed.runs} runs together, but not confirmed on every held-out run: {names}; "
             f"expected {ENOUGH_RUNS} runs or more"
         )
 
     def left_share(self, best: Hypothesis) -> float:
-        """Return which part of the squared error that effects could explain at all is left on runs left out, 0 to 1."""
+        """Return which part of the squared error that effects could explain at all is left on held-out runs, 0 to 1."""
         floors = self.dataset.unexplained
         before, after = 0.0, 0.0
         pairs = zip(self.squares(self.search.hypothesis(())), self.squares(best), strict=True)
@@ -190,7 +190,7 @@ class LeaveOneOut:
         return out
 
     def _score(self, hypothesis: Hypothesis) -> float:
-        """Return the sum of the logarithms of the squared errors on runs left out."""
+        """Return the sum of the logarithms of the squared errors on held-out runs."""
         return sum(float(np.log(max(x, 1e-30))) for run in self.squares(hypothesis) for x in run.values())
 
     def squares(self, hypothesis: Hypothesis) -> list[Squares]:

@@ -95,18 +95,18 @@ class Leftover:
             run, t = b.times[0]
             many = len(b.times)
             what = (
-                f"{counted(many, 'event')} that cannot be noise"
+                f"{counted(many, 'event')} that noise does not explain"
                 if b.what == "events"
-                else "means over a second that cannot be noise"
+                else "means over a second that noise does not explain"
             )
             out.append(
                 f"joint {b.channel.joint}, {b.channel.balance} balance: {what}, the strongest in {run} at {t:.1f} s"
             )
         for line in self.lines[:2]:
             where = (
-                f"at {line.order:.3g} Hz, whatever the motion"
+                f"at {line.order:.3g} Hz, independent of the motion"
                 if line.unit == "Hz"
-                else f"at order {line.order:.2f} per motor revolution, an order of neither gear nor motor"
+                else f"at order {line.order:.2f} per motor revolution, which is no order of gear or motor"
             )
             out.append(
                 f"joint {line.channel.joint}, {line.channel.balance} balance: {line.amplitude_nm:.3g} Nm {where}"

@@ -328,7 +328,7 @@ EXPERIMENTS: Final = {
             "Fourier velocity against a Fourier load of another period: all quadrants of velocity and torque",
             _excitation,
         ),
-        Kind("repeat", "the same motion three times: what differs between its runs is noise", _repeat),
+        Kind("repeat", "the same motion three times: the difference between its runs is noise", _repeat),
         Kind(
             "speed_ladder",
             "constant velocities in both directions, without load and with a constant one: friction over velocity",
@@ -336,42 +336,42 @@ EXPERIMENTS: Final = {
         ),
         Kind(
             "slow_reversals",
-            "creeping back and forth, without load and with one: friction at low velocity, and what follows the travel",
+            "creeping back and forth, without load and with one: friction at low velocity against travel-dependent effects",
             _slow_reversals,
         ),
         Kind(
             "load_at_both_directions",
             "the same loads, up to 70 % of rated torque, at the same velocity in both directions, both joints recorded: "
-            "half the sum of both directions is gain or offset, half the difference friction; what one joint alone sees "
-            "is that joint's, what both see is the sensor's",
+            "half the sum of both directions is gain or offset, half the difference is friction; an error of one joint "
+            "alone belongs to that joint, an error of both to the sensor",
             _both_directions,
         ),
         Kind(
             "load_ramp",
-            "the joints held still while the load swings in three sizes and three rates: torsion over torque",
+            "the joints at standstill, the load oscillating with three amplitudes and three rates: torsion over torque",
             _load_ramp,
         ),
         Kind(
             "full_turns",
-            "more than a whole turn of the joint in both directions at two velocities and three loads: what repeats with "
-            "an angle, of which encoder, and whether it grows with the load",
+            "more than a whole turn of the joint in both directions at two velocities and three loads: effects of "
+            "each encoder's angle, and their dependence on the load",
             _full_turns,
         ),
         Kind(
             "quick_changes",
-            "velocity back and forth at three accelerations, and load back and forth at constant velocity: what follows the "
-            "acceleration, and what comes late",
+            "velocity back and forth at three accelerations, and load back and forth at constant velocity: inertia "
+            "against delay",
             _quick_changes,
         ),
         Kind(
             "warm_up",
-            "a long run that warms the joints, with the same slow, fast, loaded and resting check every minute and a half",
+            "a long run that warms the joints, with the same slow, fast, loaded and standstill check every 90 s",
             _warm_up,
         ),
         Kind(
             "zero_reading",
-            "rests with the drives switched off, reached from both directions: what current and torque read then is their "
-            "zero, whatever friction does",
+            "rests with the drives switched off, reached from both directions: the readings of current and torque are then "
+            "their zeros, independent of friction",
             _zero_reading,
         ),
     )
@@ -472,8 +472,8 @@ _OWN: Final = {name: kind for kind, names in _VISIBLE.items() for name in names.
 
 _BY_HAND: Final = {
     frozenset(("sensor_crosstalk", "unbalance")): (
-        "If they stay together, turn the coupling by a quarter and run it again: crosstalk turns with the sensor, unbalance "
-        "does not."
+        "If the class remains, turn the coupling by a quarter and repeat the campaign: crosstalk turns with the sensor, "
+        "unbalance does not."
     ),
 }
 
@@ -538,12 +538,12 @@ def _text(
     """Reason, what is to be separated, what is done, what it takes, what is left to do by hand."""
     parts = [why.strip().rstrip(".") + "."] if why.strip() else []
     aims = [f"to distinguish {', '.join(names[:-1])} from {names[-1]}" for names in classes if len(names) > 1]
-    aims += [f"to make {names[0]} visible" for names in classes if len(names) == 1]
+    aims += [f"to detect {names[0]}" for names in classes if len(names) == 1]
     parts.append(f"Proposed{' ' if aims else ''}{' and '.join(aims)}:")
     parts += [f"{kind}: {EXPERIMENTS[kind].what}." for kind in kinds]
     if len(joints) == 1 and any(len(names) > 1 for names in classes):
         parts.append(
-            "Record both joints of the bench: a fault of the sensor is in both balances, a fault of a joint in one."
+            "Record both joints of the bench: a sensor fault is in the balances of both joints, a joint fault in one."
         )
     parts += [note for pair, note in _BY_HAND.items() if any(pair <= set(names) for names in classes)]
     parts.append(

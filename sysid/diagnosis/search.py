@@ -22,7 +22,7 @@ from jtqd.sysid.diagnosis.regressors import EffectCandidate
 ENTER: Final = 10.0
 """BIC difference: very strong evidence on the scale of Kass and Raftery 1995, J. Am. Stat. Assoc. 90."""
 HELD_OUT: Final = 0.3
-"""Part of the evidence in sample that must be there on runs left out."""
+"""Part of the evidence in sample that must be there on held-out runs."""
 DEEPEST: Final = 6
 _BEAM: Final = 3
 _TRIED: Final = 8
@@ -197,12 +197,12 @@ class Search:
         return best
 
     def held_out(self, hypothesis: Hypothesis, candidate: EffectCandidate) -> float:
-        """Return the drop of the deviance on runs left out that the candidate brings, summed over the runs."""
+        """Return the drop of the deviance on held-out runs that the candidate brings, summed over the runs."""
         without = self.hypothesis([c for c in hypothesis.chosen if c is not candidate], hypothesis.model)
         return float(np.sum(self.held_out_deviances(without) - self.held_out_deviances(hypothesis)))
 
     def held_out_deviances(self, hypothesis: Hypothesis) -> FloatArray:
-        """Return the deviance of each run left out, coefficients from all others: what varies from run to run has its
+        """Return the deviance of each held-out run, coefficients from all others: what varies from run to run has its
         price.
         """
         grams, logs = self._per_run(hypothesis)

@@ -192,7 +192,7 @@ def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: Ba
     columns = table.joint(number, joint.gear_ratio)
     for name in ("current_a", "torque_nm", "motor_velocity_rad_s"):
         if getattr(columns, name) is None:
-            raise SignalsError(f"{run}: j{number}.{name}: missing, and nothing it could be derived from")
+            raise SignalsError(f"{run}: j{number}.{name}: missing, and no column to derive it from")
     assert columns.current_a is not None
     assert columns.torque_nm is not None
     assert columns.motor_position_rad is not None or columns.motor_velocity_rad_s is not None

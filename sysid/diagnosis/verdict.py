@@ -175,7 +175,7 @@ def _settling_experiment(
     dataset: Dataset,
 ) -> dict[str, Any] | None:
     """Return the experiment that would settle an ambiguous verdict, or one of too few runs; unsure: what does not hold on
-    every run left out.
+    every held-out run.
     """
     if verdict not in (AMBIGUOUS, INSUFFICIENT):
         return None
@@ -186,7 +186,7 @@ def _settling_experiment(
     alone = tuple(dict.fromkeys(name for name, _ in unsure))[:MOST_KINDS]
     if alone:
         reasons.append(
-            f"{', '.join(alone)}: indicated by all runs together, but not confirmed on every run left out"
+            f"{', '.join(alone)}: indicated by all runs together, but not confirmed on every held-out run"
         )
     text = "; ".join(reasons)
     classes += [(name,) for name in alone]
@@ -201,7 +201,7 @@ def _without_negligible(  # noqa: PLR0917
     noise: Noise,
     joints: Mapping[int, Joint],
 ) -> tuple[Hypothesis, Refined, list[dict[Channel, float]]]:
-    """Return hypothesis and refinement without causes that are too small to matter, and the rms of each in each channel."""
+    """Return hypothesis and refinement without irrelevant causes, and the rms of each in each channel."""
     rated = max(j.rated_torque_nm for j in joints.values())
     while True:
         rms = [_rms_at(dataset, p) for p in refined.present]
@@ -320,7 +320,7 @@ def _reason(verdict: str, causes: Sequence[Cause], gaps: Sequence[Gap]) -> str:
         worst = gaps[0]
         return (
             f"the simulation agrees with the runs: {worst.rmse_nm:.3g} Nm rms at joint {worst.joint} "
-            f"({worst.balance} balance), of which noise and changes from run to run are {worst.noise_floor_nm:.3g} Nm"
+            f"({worst.balance} balance), of which noise and run-to-run variation are {worst.noise_floor_nm:.3g} Nm"
         )
     parts = []
     for c in causes:

@@ -62,13 +62,13 @@ def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq evaluate`."""
     parser = argparse.ArgumentParser(
         prog=BY,
-        description="Compare all methods with the torque sensor on runs that no model has seen (the paper's section IV).",
+        description="Compare all methods with the torque sensor on held-out runs (the paper's section IV).",
         epilog=(
             "examples:\n"
             "  jtq evaluate campaigns/validate --models models --out report\n"
             "  jtq evaluate campaigns/validate --models models --outside campaigns/outside --out report --json\n\n"
             "DIR/evaluation.html is the report, DIR/evaluation.json the same for programs. Exit status: 0 done; 1 failure,\n"
-            "or a run that a model was made from; 2 usage; 3 done, but something was left out or found."
+            "or a training run of a model was given; 2 usage; 3 done, but a run was left out or there are findings."
         ),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -87,7 +87,7 @@ def parser() -> argparse.ArgumentParser:
         help="joint1.yaml, joint1.onnx (the paper's network), joint1.fused.onnx (ours), and so on for each joint",
     )
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="where the report goes; made if missing"
+        "--out", type=Path, required=True, metavar="DIR", help="directory of the report; created if missing"
     )
     parser.add_argument(
         "--joint",
@@ -104,7 +104,7 @@ def parser() -> argparse.ArgumentParser:
         type=Path,
         default=[],
         metavar="RUNS",
-        help="runs with more load or warmer than any training run, to judge ours outside its envelope",
+        help="runs with more load or warmer than the training runs, to score our method outside its envelope",
     )
     parser.add_argument(
         "--columns", type=Path, metavar="FILE", help="column map for other names, units and signs"

@@ -198,7 +198,7 @@ def _silent(samples: Samples) -> list[RunIssue]:
         RunIssue(
             "no_value",
             f"{samples.run}: j{samples.number}: found no value of {', '.join(silent)} in {100.0 * share:.1f} % of the "
-            "moving samples: these are scored for no method",
+            "moving samples: these samples are scored for no method",
         )
     ]
 
@@ -206,8 +206,11 @@ def _silent(samples: Samples) -> list[RunIssue]:
 def _why_nothing(samples: Samples) -> str:
     if samples.standing.any():
         share = 100.0 * float(samples.standing.mean())
-        return f"found it standing in {share:.0f} % of the samples and never moving with a value of every method: not judged"
-    return "found no sample at which every method has a value, expected most of them: not judged"
+        return (
+            f"found standstill in {share:.0f} % of the samples and no moving sample with a value of every method: "
+            "not scored"
+        )
+    return "found no sample at which every method has a value, expected most of them: not scored"
 
 
 def _samples(judged: Iterable[_Judged]) -> list[Samples]:
@@ -303,7 +306,7 @@ def _tob(tested: Row) -> Target:
         f"{low:g} to {high:g} Nm²",
         "not known" if found is None else f"{found:.2f} Nm²",
         None if found is None else low <= found <= high,
-        ("a property of the bench, not of the estimate",),
+        ("property of the bench, not of the estimate",),
     )
 
 

@@ -260,7 +260,7 @@ def calibration_figure(tables: Mapping[str, IntervalTables]) -> Any | None:
     if not tables:
         return None
     figure, (axis,) = new_figure(1, 3.6)
-    axis.plot([40, 100], [40, 100], color=LIGHT["soft"], linewidth=1.0, label="as it should be")
+    axis.plot([40, 100], [40, 100], color=LIGHT["soft"], linewidth=1.0, label="ideal")
     looks = {"variable": "-", "constant": ":"}
     colours = [LIGHT[f"series_{k}"] for k in (5, 1, 4, 3)]
     numbers = sorted({number for table in tables.values() for number in table.joints})

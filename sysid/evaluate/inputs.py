@@ -109,7 +109,7 @@ def read_inputs(
         twin = next((run.name for run in runs if run.sha256 == file.sha256), None)
         if twin is not None:
             findings.append(
-                RunIssue("twice", f"{name}: found the same data as in {twin}: left out, judged once")
+                RunIssue("twice", f"{name}: found the same data as in {twin}: left out, scored once")
             )
             continue
         judged, found = _judged(name, file, models, path)
@@ -133,9 +133,9 @@ def refuse_trained_on(paths: Sequence[Path], models: Sequence[JointModels]) -> N
             for name in each.training.sources.get(sha256, ())
         ]
         if sources:
-            leaks.append(f"{path}: found a run that {', '.join(dict.fromkeys(sources))} was made from")
+            leaks.append(f"{path}: found a run that {', '.join(dict.fromkeys(sources))} was trained on")
     if leaks:
-        raise LeakError("\n".join(leaks) + "\nexpected runs that no model has seen: nothing was judged")
+        raise LeakError("\n".join(leaks) + "\nexpected held-out runs: nothing was scored")
 
 
 def _judged(
@@ -158,16 +158,16 @@ def _check(name: str, file: RunFile, number: int, joint: Joint) -> list[RunIssue
     """Return the reasons to leave out a joint of a run."""
     where = f"{name}: j{number}"
     if number not in file.table.joints:
-        return [RunIssue("missing_joint", f"{where}: found no columns of this joint: not judged")]
+        return [RunIssue("missing_joint", f"{where}: found no columns of this joint: not scored")]
     columns = file.table.joints[number]
     dead = [note for note in file.notes if note.startswith(f"j{number}.")]
     missing = [key for key in _NEEDED if getattr(columns, key) is None]
     if dead:
-        return [RunIssue("dead_channel", f"{name}: {note}: j{number} not judged") for note in dead]
+        return [RunIssue("dead_channel", f"{name}: {note}: j{number} not scored") for note in dead]
     if missing:
-        return [RunIssue("missing_columns", f"{where}: found no {', '.join(missing)}: not judged")]
+        return [RunIssue("missing_columns", f"{where}: found no {', '.join(missing)}: not scored")]
     found = check_channels(file.table.time_s, columns, joint, where)
-    return [RunIssue(item.kind, f"{item.text}: j{number} not judged") for item in found]
+    return [RunIssue(item.kind, f"{item.text}: j{number} not scored") for item in found]
 
 
 def _marks(path: Path) -> object:

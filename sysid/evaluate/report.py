@@ -210,7 +210,7 @@ def text_lines(result: Evaluation, mapping: Mapping[str, Any]) -> list[str]:
         "B. variable velocity: mean square error in Nm²",
         *_variable(result),
         "",
-        "C. 90 % interval of ours: how often it contained the sensor value, in %",
+        "C. 90 % interval of our method: coverage of the sensor value, in %",
         *_text_intervals(result),
         "",
         "D. targets",

@@ -51,8 +51,8 @@ def parser() -> argparse.ArgumentParser:
     """Options of `jtq excitation`."""
     made = argparse.ArgumentParser(
         prog="jtq excitation",
-        description="Design Fourier trajectories of velocity and driving current that determine the losses of a joint best "
-        "(differential evolution, D-optimality).",
+        description="Design Fourier trajectories of velocity and driving current to identify the losses of a joint\n"
+        "(D-optimality, differential evolution).",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -67,17 +67,20 @@ def parser() -> argparse.ArgumentParser:
         type=count,
         metavar="N",
         default=EVALUATIONS,
-        help=f"motions a search tries (default {EVALUATIONS})",
+        help=f"motions evaluated by a search (default {EVALUATIONS})",
     )
     made.add_argument(
-        "--starts", type=count, metavar="N", help=f"searches per run, the best counts (default {STARTS})"
+        "--starts",
+        type=count,
+        metavar="N",
+        help=f"searches per run, of which the best is used (default {STARTS})",
     )
     made.add_argument(
         "--joints",
         type=Path,
         nargs=2,
         metavar="FILE",
-        help="joint files of velocity joint and driving joint (default: those that ship)",
+        help="joint files of velocity joint and driving joint (default: the shipped ones)",
     )
     made.add_argument(
         "--velocity-joint", type=int, choices=(1, 2), default=1, help="joint in velocity mode (default 1)"
@@ -162,7 +165,9 @@ def _design(options: argparse.Namespace, limits: ExcitationLimits, joints: tuple
         ]
         print(json.dumps({"schema": "jtq.excitation/1", "limits": asdict(limits), "runs": runs}))
         return 0
-    print("peaks by the joint files; -log det of the information of all runs so far, lower is better")
+    print(
+        "peaks computed from the joint files; -log det of the information of all runs so far (lower is better)"
+    )
     print("  run   rad/s  rad/s2     rad       A      Nm  -log det")
     for k, (one, peak) in enumerate(zip(designs, peaks, strict=True), 1):
         cells = "".join(f"{peak[name]:8.2f}" for name in peak)
@@ -178,7 +183,7 @@ def _require_within_campaign(limits: ExcitationLimits) -> None:
         if getattr(limits, name) > highest:
             raise ConfigError(
                 f"{LIMIT_OPTIONS[name][0]}: found {getattr(limits, name):g}, expected at most {highest:g} in a plan: "
-                "beyond it a campaign stops"
+                "a campaign stops beyond it"
             )
 
 

@@ -138,7 +138,7 @@ def loss_regressor(velocity_rad_s: FloatArray, torque_nm: FloatArray) -> FloatAr
 
         loss = s (c_d + f_d |v| + q_d v^2 + p_d exp(-(v/0.05)^2)) + s (k_dq |tau| + m_dq tau^2 + n_dq |tau| |v|)
 
-    The estimator's own loss (estimator/losses.py) is finer in the load: lines between nodes. For a design the few
+    The estimator's own loss (estimator/losses.pyx) is finer in the load: lines between nodes. For a design the few
     coefficients of a polynomial do better: they ask for the ends and the middle of every range. At the same instant the
     other joint has (-v, tau), which only changes places and signs of the columns: one determinant serves both joints.
 

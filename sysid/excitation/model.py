@@ -75,7 +75,7 @@ class Motion(NamedTuple):
 class Bench:
     """Static model of two coupled joints: the first moves by velocity, the second drives it by current.
 
-    In steady state the second joint, at i_2 and v_2 = -v_1, gives tau = G Kt i_2 - loss_2(i_2, v_2) (estimator/losses.py);
+    In steady state the second joint, at i_2 and v_2 = -v_1, gives tau = G Kt i_2 - loss_2(i_2, v_2) (estimator/losses.pyx);
     rotor and link inertia are added, stiffness and control are left out.
     """
 
@@ -156,7 +156,7 @@ class Candidates:
         if not _between(low, torque, high).all():
             raise ConfigError(
                 f"limits: found joint_current_a {self.limits.joint_current_a:g} and torque_nm "
-                f"{self.limits.torque_nm:g}, expected more: turning the idle driving joint takes "
+                f"{self.limits.torque_nm:g}, expected more, because turning the idle driving joint takes "
                 f"{float(np.abs(torque).max()):.1f} Nm"
             )
 

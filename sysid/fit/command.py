@@ -66,9 +66,11 @@ def fit_parser(kind: str, description: str, examples: str) -> argparse.ArgumentP
         type=int,
         choices=range(1, 8),
         metavar="N",
-        help="which joint of the runs it is (default: the number its name ends in)",
+        help="number of the joint in the runs (default: the last digit of its name)",
     )
-    parser.add_argument("--out", type=Path, metavar="FILE", help="joint file to write; none: only the report")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE", help="joint file to write (default: only the report)"
+    )
     parser.add_argument(
         "--columns", type=Path, metavar="FILE", help="column map for other names, units and signs"
     )
@@ -89,7 +91,7 @@ def add_plateau_options(parser: argparse.ArgumentParser) -> None:
         "--min-current",
         type=positive,
         metavar="A",
-        help="current below which eta is not formed (default: what overcomes the joint's own static friction)",
+        help="current below which eta is not computed (default: the current that overcomes the joint's own static friction)",
     )
 
 
@@ -202,9 +204,9 @@ def efficiency_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--allow-missing",
         action="store_true",
-        help="quadrants that cannot be fitted keep the joint file's own coefficients",
+        help="keep the joint file's coefficients for quadrants that cannot be fitted",
     )
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="picture like Fig. 6 (png, svg, pdf)")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="plot like Fig. 6 (png, svg, pdf)")
     return parser
 
 
@@ -264,7 +266,7 @@ def friction_parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq fit friction`."""
     parser = fit_parser(
         "friction",
-        "Fit Coulomb and viscous friction to the plateaus at no load: motor current or joint torque next to zero.",
+        "Fit Coulomb and viscous friction to the plateaus at no load (motor current or joint torque near zero).",
         "  jtq fit friction campaigns/efficiency --joint joint1.yaml --out joint1.friction.yaml",
     )
     add_plateau_options(parser)
@@ -333,7 +335,7 @@ def _friction_mapping(
 LOSSES_BY = "jtq fit losses"
 _EXAMPLE = (
     "  jtq fit losses campaigns/excitation --joint joint1.yaml --out joint1.fused.yaml\n"
-    "Runs that excite load, speed and both directions are needed: jtq campaign excitation records such."
+    "The runs must excite load, speed and both directions; `jtq campaign excitation` records them."
 )
 
 
@@ -408,7 +410,7 @@ def _losses_mapping(fit: FusedFit) -> dict[str, object]:
 def _lines(joint: Joint, fit: FusedFit) -> list[str]:
     sigma, torsion, loss = fit.fused.sigma, fit.fused.torsion, fit.fused.loss
     lines = [
-        f"{joint.name}: physics on runs the fit had not seen: RMSE {_unseen(fit):.3f} Nm "
+        f"{joint.name}: physics on held-out runs: RMSE {_unseen(fit):.3f} Nm "
         f"({100 * _unseen(fit) / joint.rated_torque_nm:.2f} % of rated), worst run {max(fit.unseen_rmse_nm):.3f} Nm",
         f"  loss: {fit.loss.samples} samples, viscous friction falls {100 * loss.viscous_per_k:.1f} "
         f"+- {196 * fit.loss.viscous_per_k_sigma:.1f} % per kelvin",
@@ -426,12 +428,12 @@ def _lines(joint: Joint, fit: FusedFit) -> list[str]:
 
 
 KINDS: Final = {
-    "efficiency": (efficiency_main, "Eq. (8) per quadrant, from plateaus: efficiency"),
+    "efficiency": (efficiency_main, "efficiency: Eq. (8) per quadrant, from plateaus"),
     "friction": (
         friction_main,
-        "Coulomb and viscous friction at no load, from plateaus: friction",
+        "Coulomb and viscous friction at no load, from plateaus",
     ),
-    "losses": (losses_main, "additive loss over load and velocity, from whole runs: losses"),
+    "losses": (losses_main, "additive loss over load and velocity, from whole runs"),
 }
 """Kind -> (its `main(argv) -> int`, one line of help)."""
 

@@ -366,7 +366,7 @@ def _against_current(points: Sequence[EtaPoint], of: Sequence[EtaPoint]) -> RunI
         math.copysign(1.0, p.plateau.velocity.value) * (p.motor_nm + p.plateau.torque.value) for p in points
     )
     swapped = "torque" if if_torque > 0.0 else "current"
-    cause = f"swapped sign of the {swapped} (then the joint loses energy, as it must)"
+    cause = f"swapped sign of the {swapped} (with the other sign the joint loses energy)"
     return _finding("torque_against_current", points, of, worst, expected="a positive eta", cause=cause)
 
 

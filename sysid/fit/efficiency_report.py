@@ -81,7 +81,7 @@ def report_lines(result: EfficiencyResult) -> list[str]:
         lines += [
             "",
             f"left out, {len(result.left_out)} plateaus with |i| < {result.current_min_a:.2f} A "
-            "(the motor does not overcome its own friction: sign and size of eta are open, 0/0 at i = 0):",
+            "(the motor does not overcome its own friction, so eta is undefined):",
             *(f"  {_place(plateau)}" for plateau in result.left_out),
         ]
     if result.findings:

@@ -10,7 +10,7 @@ differentiating: LP(dw/dt) = g (w - LP(w)). Rows at standstill are left out: the
 known to an interval only.
 
 A run does not always support every term. A term whose best value is negative (friction would drive the
-joint), or that cannot be told from the others in this run, keeps the joint file's value and the report says
+joint), or that cannot be distinguished from the others in this run, keeps the joint file's value and the report says
 so; "at its bound" is not identified. Intervals count independent samples only: n_eff = n / (1 + 2 sum
 rho_k), rho the residual's autocorrelation up to its first value below 0.05. At 1 kHz that is hundreds of
 times fewer than rows.
@@ -74,11 +74,11 @@ class FrictionFit:
         for term in self.terms:
             how = f"kept: {term.kept}" if term.kept else f"+- {term.ci95:.3g} (95 %)"
             if term.ci95 >= abs(term.value):
-                how += ", not told from zero"
+                how += ", not distinguished from zero"
             lines.append(f"{term.name} = {term.value:.4g}  {how}")
         lines.append(
             f"residual in this run {self.rmse_before_nm:.3f} -> {self.rmse_after_nm:.3f} Nm "
-            f"over {self.rows} rows in motion, worth {self.effective_rows:.0f} independent ones; "
+            f"over {self.rows} rows in motion (effective samples: {self.effective_rows:.0f}); "
             f"condition number {self.condition:.1f}"
         )
         return lines + [f"warning: {text}" for text in self.warnings]
@@ -183,7 +183,9 @@ def _unidentified(
         condition = _condition([column for name, column in columns.items() if name not in kept])
         free = [name for name in columns if name not in kept]
         if condition > HIGHEST_CONDITION and len(free) > 1:
-            kept[free[-1]] = f"cannot be told from {free[0]} in this run (condition number {condition:.0f})"
+            kept[free[-1]] = (
+                f"cannot be distinguished from {free[0]} in this run (condition number {condition:.0f})"
+            )
             continue
         values, half_widths, _ = _solve(columns, target, before, kept)
         negative = [name for name in free if values[name] < 0.0]
@@ -191,7 +193,7 @@ def _unidentified(
             return kept, condition
         worst = min(negative, key=lambda name: values[name] / max(half_widths[name], 1e-12))
         kept[worst] = (
-            f"best value {values[worst]:.3g} +- {half_widths[worst]:.2g} is negative, not a friction"
+            f"best value {values[worst]:.3g} +- {half_widths[worst]:.2g} is negative, which is impossible for friction"
         )
 
 

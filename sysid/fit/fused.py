@@ -64,13 +64,13 @@ def fit_sigma(runs: Sequence[PathResiduals]) -> FusedSigma:
     """
     runs = [run for run in runs if len(run.raw_nm)]
     if len(runs) < 3:
-        raise ValueError(f"found {len(runs)} unseen runs with motion, expected at least 3")
+        raise ValueError(f"found {len(runs)} held-out runs with motion, expected at least 3")
     current = np.array([run.current_error_nm.mean() for run in runs])
     torsion = np.array([run.torsion_error_nm.mean() for run in runs])
     shared = max(float(np.mean((current - current.mean()) * (torsion - torsion.mean()))), _FLOOR_NM**2)
     fast = [np.abs(run.velocity_rad_s) > _FAST_RAD_S for run in runs]
     if not any(map(np.any, fast)):
-        raise ValueError(f"found no unseen sample above {_FAST_RAD_S} rad/s, expected some")
+        raise ValueError(f"found no held-out sample above {_FAST_RAD_S} rad/s, expected some")
     raw, v, e_c, e_t, t, open_nm = (
         np.concatenate([getattr(run, name)[keep] for run, keep in zip(runs, fast, strict=True)])
         for name in (
@@ -199,7 +199,7 @@ def fit_fused(runs: Sequence[RunSignals], friction: Friction) -> FusedFit:
     """
     if len(runs) < _LEAST_RUNS:
         raise ValueError(
-            f"found {counted(len(runs), 'run')}, expected at least {_LEAST_RUNS}: standard deviations need unseen runs"
+            f"found {counted(len(runs), 'run')}, expected at least {_LEAST_RUNS}: standard deviations need held-out runs"
         )
     unseen = _unseen(runs, friction)
     sigma = fit_sigma(unseen)

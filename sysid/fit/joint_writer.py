@@ -97,7 +97,7 @@ def write_joint(path: Path | str, joint: Joint, title: str) -> None:
     try:
         temporary.write_text(joint_text(joint, title), encoding="utf-8")
         if load_joint(temporary) != joint:
-            raise ConfigError(f"{path}: what was written does not read back as the joint {joint.name}")
+            raise ConfigError(f"{path}: the written file reads back differently from the joint {joint.name}")
         os.replace(temporary, path)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror or error}") from None

@@ -66,7 +66,7 @@ def fit_no_load(plateaus: Sequence[Plateau], joint: Joint) -> NoLoadFit:
         raise FitError(
             f"found {counted(distinct, 'velocity', 'velocities')} at no load ({counted(len(plateaus), 'plateau')}), "
             f"expected at least {FEWEST_VELOCITIES}: "
-            "the joint driven round by the other one at zero current"
+            "the other joint drives this joint at zero current"
         )
     nm_per_a = joint.gear_ratio * joint.torque_constant_nm_per_a
     none = replace(joint.friction, coulomb_nm=0.0, viscous_nms_per_rad=0.0)
@@ -81,7 +81,7 @@ def fit_no_load(plateaus: Sequence[Plateau], joint: Joint) -> NoLoadFit:
         columns[ZERO] = np.ones_like(velocity)
     else:
         warnings.append(
-            "all motion is in one direction: Coulomb friction holds the zeros of current and sensor"
+            "all motion is in one direction: Coulomb friction includes the zeros of current and sensor"
         )
     matrix = np.column_stack(list(columns.values()))
     values = np.linalg.lstsq(matrix, loss, rcond=None)[0]

@@ -27,7 +27,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Command line; results on stdout, log on stderr. Exit status 0 done, 1 failure, 2 usage."""
     options = parser().parse_args(arguments)
     if options.bus is not None and options.joint_files is not None:
-        parser().error("--joint-files: nothing is fitted with --bus")
+        parser().error("--joint-files: not possible with --bus, which does not fit")
     try:
         make_directory(options.out)
         if options.bus is None:
@@ -52,17 +52,17 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     result.add_argument(
-        "--bus", help="play the runs on this bus (vcan0, unix:PATH) and score what jtqd publishes there"
+        "--bus", help="play the runs on this bus (vcan0, unix:PATH) and score the published estimates of jtqd"
     )
     result.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder for the figures and jtqd's logs"
+        "--out", type=Path, required=True, metavar="DIR", help="directory of the figures and jtqd's logs"
     )
     result.add_argument("--json", action="store_true", help="print the results as JSON")
     result.add_argument(
         "--joint-files",
         type=Path,
         metavar="DIR",
-        help="folder for the fitted joint files (default: the --out folder)",
+        help="directory of the fitted joint files (default: the --out directory)",
     )
     return result
 

@@ -90,7 +90,7 @@ def fitted_joint(joint: Joint, fit: FrictionFit, file: RunFile, *, number: int, 
     friction: dict[str, float] = {key: round(value, 4) for key, value in asdict(fit.friction).items()}
     temperature = file.table.joints[number].temperature_c
     origin: dict[str, object] = {
-        "friction": f"fitted on {run}.csv.gz by jtq measured; nothing else was fitted",
+        "friction": f"fitted on {run}.csv.gz by jtq measured; no other value was fitted",
         "friction_fit": fit.lines(),
         "log_sha256": file.sha256,
         "date": date,
@@ -158,7 +158,7 @@ def table_lines(cases: list[Case]) -> list[str]:
     """RMSE per joint and run in Nm and in percent of rated torque, with what the fit did to it."""
     lines = [
         f"{'joint':>5}  {'scored on':<20}{'fitted on':<20}"
-        f"{'no friction':>16}{'before':>16}{'after':>16}  the fit made it"
+        f"{'no friction':>16}{'before':>16}{'after':>16}  change by the fit"
     ]
     for case in cases:
         cells = "".join(

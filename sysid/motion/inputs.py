@@ -250,7 +250,9 @@ class Supervision:
             if channel.cycle < oldest:
                 return self._stale_channel(channel)
         if inputs.foreign:
-            return Violation("another commander is on the bus (its heartbeat has our node number)", True)
+            return Violation(
+                "another commander is on the bus (a heartbeat with this node-ID was received)", True
+            )
         return None
 
     def missing(self, now_ns: int) -> str | None:
@@ -261,9 +263,11 @@ class Supervision:
                 return f"{node.who}: no heartbeat {HEARTBEAT_BASE + node.node:03X}h"
         for drive in inputs.drives:
             if not (drive.cycle_1 and drive.cycle_2):
-                return f"{drive.who}: no TPDO1 or TPDO2; jtqd's boot configures them"
+                return f"{drive.who}: no TPDO1 or TPDO2; start jtqd, which configures them"
             if drive.units.temperature and drive.temperature_c != drive.temperature_c:
-                return f"{drive.who}: no temperature ({0x380 + drive.node:03X}h), which its limit needs"
+                return (
+                    f"{drive.who}: no temperature ({0x380 + drive.node:03X}h), which is required by its limit"
+                )
         for channel in inputs.channels:
             if not channel.cycle:
                 return f"sensor: no torque of channel {channel.channel}"

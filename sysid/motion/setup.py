@@ -250,7 +250,9 @@ def _switch_on_temperature(drive: NodeObjects) -> None:
     cob_id, count = drive.optional_number((0x1802, 1), 4), drive.optional_number((0x1A02, 0), 1)
     word = drive.optional_number((0x1A02, 1), 4) if count else None
     if cob_id is None or word is None or split_word(word)[2] != 16:
-        detail = "no TPDO3 with a temperature of 16 bits (1A02h:1): the limit of temperature cannot be kept"
+        detail = (
+            "no TPDO3 with a temperature of 16 bits (1A02h:1): the temperature limit cannot be supervised"
+        )
         raise BootError(drive.node, "1A02h:1", detail=detail)
     wanted = drive_tpdo3(drive.node).cob_id
     if cob_id & CAN_ID != wanted:
@@ -309,7 +311,7 @@ class BenchSetup:
             while count := socket.receive():
                 heard |= {FRAME.unpack_from(frames, FRAME_SIZE * position)[0] for position in range(count)}
         if nmt.HEARTBEAT_BASE + COMMANDER_NODE in heard:
-            raise MotionError(f"another commander is on the bus (node {COMMANDER_NODE:02X}h): end it first")
+            raise MotionError(f"another commander is on the bus (node {COMMANDER_NODE:02X}h): stop it first")
         if SYNC_COB_ID not in heard:
             raise MotionError(f"no SYNC on {socket.bus}: jtqd must run on this bus")
         socket.set_filters([exact(RESPONSE_ID + node) for node in self._access])

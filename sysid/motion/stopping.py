@@ -223,7 +223,9 @@ class PowerOff:
         if moving is not None:
             self._moved_ns = now_ns
             if self._elapsed_s(now_ns) > STAND_S:
-                self.violation = Violation(moving.replace("before the start", "before its power goes"), False)
+                self.violation = Violation(
+                    moving.replace("before the start", "before the power is switched off"), False
+                )
                 return None
         elif (now_ns - self._moved_ns) * 1e-9 >= self._timing.still_s:
             self._enter(_Step.OFF, now_ns)

@@ -118,9 +118,7 @@ def _dead(run: JointColumns, joint: Joint, where: str) -> list[RunIssue]:
     issues = []
     torque, current, velocity = run.torque_nm, run.current_a, run.motor_velocity_rad_s
     if torque is not None and not np.any(torque):
-        issues.append(
-            _exactly_zero("torque_nm", where, len(torque), "the torque that the motor's current makes")
-        )
+        issues.append(_exactly_zero("torque_nm", where, len(torque), "the torque of the motor's current"))
     loaded = torque is not None and float(np.max(np.abs(torque))) > 0.5 * joint.rated_torque_nm
     if current is not None and not np.any(current) and loaded:
         issues.append(
@@ -163,7 +161,7 @@ def _positions(time_s: FloatArray, run: JointColumns, joint: Joint, where: str) 
             issues.append(
                 RunIssue(
                     "motor_velocity_rad_s_scale",
-                    f"{where}.motor_velocity_rad_s: found next to no motion while motor_position_rad turned by "
+                    f"{where}.motor_velocity_rad_s: found almost no motion while motor_position_rad turned by "
                     f"{float(np.ptp(motor)):.3g} rad, expected its derivative: stuck, or of the joint side",
                 )
             )
@@ -210,7 +208,7 @@ def _slope_issue(slope: float, where: str) -> list[RunIssue]:
         return [
             RunIssue(
                 "motor_position_rad_stuck",
-                f"{where}.motor_position_rad: found it standing while motor_velocity_rad_s is not zero: stuck channel",
+                f"{where}.motor_position_rad: found no motion while motor_velocity_rad_s is not zero: stuck channel",
             )
         ]
     if abs(slope - 1.0) > VELOCITY_TOLERANCE:
@@ -290,7 +288,7 @@ def _signs(
         RunIssue(
             f"{swapped}_sign",
             f"{where}.{swapped}: found the opposite sign of {other} while the motor carries more than its friction, "
-            f"expected the same: swapped sign of {swapped} (with the other sign the joint loses energy, as it must)",
+            f"expected the same: swapped sign of {swapped} (with the other sign the joint loses energy)",
         )
     ]
 

@@ -185,7 +185,7 @@ def _missing(columns: JointColumns, where: str) -> list[RunIssue]:
         return [
             RunIssue(
                 "torque_nm_missing",
-                f"{where}.torque_nm: found no torque sensor channel (or a dead one), expected the reference of a diagnosis",
+                f"{where}.torque_nm: found no valid torque sensor channel, expected the reference of a diagnosis",
             )
         ]
     if columns.current_a is None:
@@ -224,6 +224,6 @@ def _opposite_sensors(usable: Mapping[int, JointColumns], name: str) -> list[Run
         RunIssue(
             "torque_nm_frame",
             f"{name}: j2.torque_nm: found the opposite of j1.torque_nm, expected the same (positive along each joint's own "
-            "positive current): one joint's columns are in the other's frame",
+            "positive current): the columns of one joint are in the frame of the other",
         )
     ]

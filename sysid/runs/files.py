@@ -452,7 +452,7 @@ def _read_log(path: Path) -> RunFile:
         by = ", ".join(f"{count} of {name}" for name, count in logged.incomplete_by.items() if count)
         notes.append(
             f"{counted(logged.missed, 'cycle')} missed and {logged.incomplete} incomplete{f' ({by})' if by else ''}: "
-            f"{logged.lost_share:.2%} of the slots are no rows"
+            f"{logged.lost_share:.2%} of the slots have no row"
         )
     values = {TIME: logged.table.time_s}
     for number, columns in logged.table.joints.items():

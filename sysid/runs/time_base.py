@@ -66,7 +66,7 @@ def on_even_steps(table: RunTable, where: str) -> tuple[RunTable, list[RunIssue]
     }
     note = (
         f"{where}: time_s: found {uneven} of {len(steps)} steps off the median of {median:.4g} s by more than "
-        f"{UNEVEN:.0%} (up to {float(np.max(steps)):.4g} s): brought to equal steps"
+        f"{UNEVEN:.0%} (up to {float(np.max(steps)):.4g} s): resampled to equal steps"
     )
     return RunTable(grid, joints), [RunIssue("time_uneven", note)]
 

@@ -96,7 +96,7 @@ def temperature_issue(time_s: FloatArray, run: JointColumns, where: str) -> RunI
     guess = "kelvin or tenths of a degree" if 200.0 < middle < 450.0 else "another unit, or a dead channel"
     return RunIssue(
         "temperature_c_unit",
-        f"{where}.temperature_c: found {middle:.4g} degC in the middle, expected -60 to {_HOTTEST_C:g}: {guess} suspected; "
+        f"{where}.temperature_c: found {middle:.4g} degC as median, expected -60 to {_HOTTEST_C:g}: {guess} suspected; "
         "not used",
     )
 

@@ -29,9 +29,9 @@ from jtqd.sysid.train.paper import TrainedNetwork, paper_block, split_by_sample,
 
 _WHAT = {
     "paper": "The paper's network (section III): current, angles and velocities of both sides and the efficiency "
-    "estimate in, torque out; sigma(x) = tanh(x/2). Its absolute angles can tell runs apart; a comparison is its only use.",
+    "estimate in, torque out; sigma(x) = tanh(x/2). Its absolute angles can identify single runs; for comparison only.",
     "ours": "Correction to the fused physics from speed, motor torque, torsion against current, and filtered ripple "
-    "angles. Outside its envelope it fades to nothing and the status says 3.",
+    "angles. Outside its envelope it fades to zero and the status is 3.",
 }
 
 
@@ -56,7 +56,7 @@ def write_card(path: Path, joint: Joint, kind: str, result: TrainedNetwork, dige
         "",
         "## On runs it was not trained on",
         "",
-        "| run | network, MSE Nm^2 | physics it builds on, MSE Nm^2 |",
+        "| run | network, MSE Nm^2 | physics without network, MSE Nm^2 |",
         "|---|---|---|",
         *(f"| {name} | {net:.3f} | {physics:.3f} |" for name, (net, physics) in result.held_out.items()),
         f"| mean | {_mean(result, 0):.3f} | {_mean(result, 1):.3f} |",
@@ -80,8 +80,8 @@ def _share(result: TrainedNetwork) -> list[str]:
     share = float(result.metadata.get("share", 1.0))
     if share >= 1.0:
         return []
-    nothing = "" if share else ": none of it, the estimate is the physics alone"
-    return [f"- Share of the correction that helps on unseen runs and harms none: {share:.2f}{nothing}"]
+    nothing = "" if share else ": the estimate is the physics alone"
+    return [f"- Share of the correction that improves held-out runs and worsens none: {share:.2f}{nothing}"]
 
 
 def _mean(result: TrainedNetwork, which: int) -> float:
@@ -122,7 +122,7 @@ def _draw(picture: Path, joint: Joint, kind: str, result: TrainedNetwork) -> Non
     top = 1.05 * float(scores.max())
     axes[1].plot([0, top], [0, top], color="0.6", lw=0.8)
     axes[1].plot(scores[:, 1], scores[:, 0], "o", ms=4)
-    axes[1].set(xlabel="physics, MSE Nm²", ylabel="network, MSE Nm²", title="runs not trained on")
+    axes[1].set(xlabel="physics, MSE Nm²", ylabel="network, MSE Nm²", title="held-out runs")
     if kind == "ours":
         envelope = result.metadata["envelope"]
         known = np.array(envelope["known"], float)
@@ -179,7 +179,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq train`."""
     parser = argparse.ArgumentParser(
         prog="jtq train",
-        description="Train a network per joint on recorded runs; split by run, never by sample.",
+        description="Train one network per joint on recorded runs, with a split by run.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -203,16 +203,20 @@ def parser() -> argparse.ArgumentParser:
         type=int,
         choices=range(1, 8),
         metavar="N",
-        help="which joint of the runs it is (default: the number its name ends in)",
+        help="number of the joint in the runs (default: the last digit of its name)",
     )
     parser.add_argument(
         "--network",
         choices=sorted(_ITERATIONS),
         required=True,
-        help="paper: section III, absolute angles, 6-20-40-10-1; ours: correction to the fused physics, 7-16-16-4",
+        help="paper: section III, absolute angles, 6-20-40-10-1; ours: correction to the fused physics, 3-16-16-4",
     )
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="where networks and cards go; made if missing"
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="directory of networks and cards; created if missing",
     )
     parser.add_argument(
         "--iterations", type=count, help="default 1000 for the paper's (as in the paper), 200 for ours"
@@ -220,7 +224,7 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--show-leakage",
         action="store_true",
-        help="paper's network: also print what a split by sample would have claimed",
+        help="paper's network: also print the MSE of a split by sample",
     )
     parser.add_argument("--seed", type=natural, default=0, help="of weights and batches (default 0)")
     parser.add_argument(
@@ -260,20 +264,20 @@ def _train_joint(
     write_card(path, joint, options.network, result, digest)
     network, physics = (_mean_of(result, k) for k in (0, 1))
     print(
-        f"{path}  sha256 {digest}\n  on {len(result.held_out)} runs it was not trained on: MSE {network:.3f} Nm^2, "
-        f"the physics it builds on {physics:.3f} Nm^2",
+        f"{path}  sha256 {digest}\n  on {len(result.held_out)} held-out runs: MSE {network:.3f} Nm^2, "
+        f"the physics without network {physics:.3f} Nm^2",
         file=sys.stderr if options.json else sys.stdout,
     )
     share = result.metadata.get("share", 1.0)
     if share < 1.0:
-        nothing = "" if share else ": it harms some of them, and what is estimated is the physics"
+        nothing = "" if share else ": it worsens some of them, so the estimate is the physics alone"
         print(
-            f"  share of its correction that helps on them and harms none: {share:.2f}{nothing}",
+            f"  share of its correction that improves them and worsens none: {share:.2f}{nothing}",
             file=sys.stderr if options.json else sys.stdout,
         )
     if claimed is not None:
         print(
-            f"  split by sample, the same data would claim an MSE of {claimed:.3f} Nm^2",
+            f"  split by sample, the same data gives an MSE of {claimed:.3f} Nm^2",
             file=sys.stderr if options.json else sys.stdout,
         )
     return {

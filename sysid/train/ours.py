@@ -136,7 +136,7 @@ def train_fused(
         )
     if len(runs) < 8:
         raise ValueError(
-            f"found {counted(len(runs), 'run')}, expected at least 8: standard deviations need unseen runs"
+            f"found {counted(len(runs), 'run')}, expected at least 8: standard deviations need held-out runs"
         )
     unseen: list[tuple[Seen, FloatArray]] = []
     for known, judged in folds(runs):

@@ -81,7 +81,7 @@ def train_paper(
     """
     if len(blocks) < _HELD_OUT:
         raise ValueError(
-            f"found {counted(len(blocks), 'run')}, expected at least {_HELD_OUT}: a network is judged on whole runs"
+            f"found {counted(len(blocks), 'run')}, expected at least {_HELD_OUT}: a network is scored on whole runs"
         )
     held = blocks[_HELD_OUT - 1 :: _HELD_OUT]
     known = [block for n, block in enumerate(blocks) if n % _HELD_OUT != _HELD_OUT - 1]

@@ -87,7 +87,7 @@ def _first_estimates(
                 if status & 0x0F in PUBLISHED and status >> 4 in PUBLISHED:
                     return bus_s, first_s, time.monotonic() - started
     except BusError as error:
-        raise RuntimeError(f"the bus went away: {error}") from None
+        raise RuntimeError(f"bus lost: {error}") from None
     finally:
         socket.close()
     raise RuntimeError(f"no estimate with a torque within {_TIMEOUT_S:g} s")

@@ -302,7 +302,7 @@ def test_a_node_that_restarts_is_configured_again_before_it_is_believed(
     process.send_signal(signal.SIGTERM)
     _, err = process.communicate(timeout=15)
     assert back, err
-    assert "node 1 was away and is configured again" in err
+    assert "node 1 returned and is configured again" in err
     assert "jtqd: joint 1: inputs lost: " in err
     assert process.returncode == 0
 

@@ -154,7 +154,7 @@ def test_an_order_while_it_starts_is_refused_in_plain_words(
     process.send_signal(signal.SIGSTOP)  # it stays where it is
     _, err = control("reload", bench, run_directory).communicate(timeout=30)
     process.send_signal(signal.SIGCONT)
-    assert err == "jtq control: reload: jtqd takes no orders now: it is starting or ending\n"
+    assert err == "jtq control: reload: jtqd accepts no orders now: it is starting or ending\n"
     process.terminate()
     assert ended(process, run_directory)[0] == 0
 

@@ -249,7 +249,7 @@ def test_a_drive_without_the_temperature_that_is_asked_for(bench):
     bench.drive2.store._indices.discard(0x3001)
     error = bench.fails(nodes=[{"node": 2, "kind": "drive", "temperature": True}])
     assert str(error) == (
-        "node 2: 3001h:0 joint temperature: expected a value (the configuration asks for it), "
+        "node 2: 3001h:0 joint temperature: expected a value (required by the configuration), "
         "found no such object (status J)"
     )
     assert bench.drive2.store.number(0x1A00, 1) != drive_tpdo1(2).words[0], "found before anything is written"
@@ -336,7 +336,7 @@ def test_restart_during_boot(bench):
         return [(0x702, b"\x00")]
 
     bench.extra = boot_up
-    assert str(bench.fails()).startswith("node 2: it restarted during boot")
+    assert str(bench.fails()).startswith("node 2: the node restarted during boot")
 
 
 def test_foreign_sync(bench):

@@ -262,7 +262,7 @@ def test_stale_file_is_replaced_live_hub_and_other_files_are_not(path, tmp_path)
     with pytest.raises(BusError, match="no socket"):
         Hub(str(plain))
     assert plain.read_text() == "keep"
-    with pytest.raises(BusError, match="cannot make the bus: AF_UNIX path too long"):
+    with pytest.raises(BusError, match="cannot create the bus: AF_UNIX path too long"):
         Hub(str(tmp_path / ("x" * 200)))
 
 

@@ -38,7 +38,7 @@ def test_what_has_no_right_to_write_is_refused(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(os, "access", lambda *_: False)  # root may write anywhere
     with pytest.raises(ConfigError, match=r"a\.csv: cannot be written"):
         check_output(tmp_path / "a.csv")
-    with pytest.raises(ConfigError, match="files cannot be made there"):
+    with pytest.raises(ConfigError, match="files cannot be created there"):
         make_directory(tmp_path)
 
 
@@ -46,5 +46,5 @@ def test_a_directory_is_made_where_it_can_be(tmp_path: Path) -> None:
     make_directory(tmp_path / "a" / "b")
     assert (tmp_path / "a" / "b").is_dir()
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match="file: cannot be made: it is a file"):
+    with pytest.raises(ConfigError, match="file: cannot be created: it is a file"):
         make_directory(tmp_path / "file")

@@ -187,7 +187,7 @@ def test_a_network_that_gives_nan_is_refused() -> None:
     small = small_network()
     w, b = small.layers[-1]
     nan = SmallNetwork((*small.layers[:-1], (w * np.nan, b)), small.mean, small.std, 0.0, 1.0, small.metadata)
-    assert "found nan in the middle of its envelope" in refused(nan.data)
+    assert "found nan at the centre of its envelope" in refused(nan.data)
 
 
 def test_the_writer_refuses_what_does_not_fit() -> None:
@@ -294,7 +294,7 @@ def test_wrong_graphs_of_a_fused_network() -> None:
     small = fused_network()
     w, b = small.layers[-1]
     nan = SmallNetwork((*small.layers[:-1], (w * np.nan, b)), small.mean, small.std, 0.0, 1.0, small.metadata)
-    assert "found nan in the middle of its envelope" in fused_refused(nan.data)
+    assert "found nan at the centre of its envelope" in fused_refused(nan.data)
 
 
 def test_the_two_kinds_are_not_mistaken_for_each_other() -> None:

@@ -265,7 +265,7 @@ def test_whole_limits_are_told_as_whole_numbers() -> None:
 
 
 def test_shipped_lists_what_ships() -> None:
-    with pytest.raises(ConfigError, match=r"which has: .*joint1\.yaml.*joint2\.yaml"):
+    with pytest.raises(ConfigError, match=r"shipped files: .*joint1\.yaml.*joint2\.yaml"):
         shipped("joint3.yaml")
     with pytest.raises(ConfigError):
         shipped("../pyproject.toml")

@@ -88,7 +88,7 @@ def test_out_that_cannot_be_made_is_one_line(tmp_path, capsys):
     file = tmp_path / "file"
     file.touch()
     assert reproduce_command.main(["--out", str(file)]) == 1
-    assert capsys.readouterr().err == f"jtq reproduce: --out {file}: cannot be made: it is a file\n"
+    assert capsys.readouterr().err == f"jtq reproduce: --out {file}: cannot be created: it is a file\n"
     assert reproduce_command.main(["--out", str(file / "below")]) == 1
     assert capsys.readouterr().err.count("\n") == 1
 

@@ -288,7 +288,7 @@ def full_disk():
             file.write(bytes(65536))
             file.flush()
     said = journal()
-    matter = re.compile(r".*(?:recording ends|MB are free|No space left).*")
+    matter = re.compile(r".*(?:recording pauses|MB are free|No space left).*")
 
     def told():
         return [line for line in journal().splitlines() if line not in said and matter.match(line)]
@@ -328,7 +328,7 @@ def bad_reload():
             assert done.returncode != 0, what
             joint.write_text(good)
             CONFIG.write_text(configuration)
-            reply = re.findall(r"not reloaded, the old files stay in force: (.*)", journal(40))
+            reply = re.findall(r"not reloaded, the old files remain in force: (.*)", journal(40))
             assert reply, journal(40)
             seen[what] = reply[-1]
     finally:

@@ -44,7 +44,7 @@ AXES: Final = {
     "time": "time in the run",
     "frequency": "frequency",
 }
-MOMENTS: Final = {"events": "events that noise does not make", "seconds": "seconds that are off"}
+MOMENTS: Final = {"events": "events that noise does not explain", "seconds": "seconds with a deviating mean"}
 """Lists of moments among the places, by their first word."""
 _PROPER: Final = {"coulomb": "Coulomb", "stribeck": "Stribeck"}
 _UNIT_ENDINGS: Final = (
@@ -126,19 +126,19 @@ def verdict_sentence(findings: Findings) -> str:
     if findings.verdict == NO_GAP:
         return f"The simulation explains these runs{_left(worst, '; ')}."
     if findings.verdict == INSUFFICIENT:
-        return "These runs cannot tell what the simulation gets wrong, or whether it does."
+        return "These runs are not sufficient to assess the simulation."
     if findings.verdict == UNEXPLAINED:
-        return f"The simulation is wrong, and no effect of the library explains it: {_unexplained(worst)}."
+        return f"The simulation has a gap that no effect of the library explains: {_unexplained(worst)}."
     known = _known_phrases([c for c in findings.causes if len(c.names) <= 1])
     classes = [cause_phrase(c) for c in findings.causes if len(c.names) > 1]
     if not known and not classes:
         return "The simulation has a gap."
-    text = f"What the simulation gets wrong: {listed(known + classes)}"
-    return f"{text}; these runs cannot tell which." if classes else f"{text}."
+    text = f"Cause of the simulation error: {listed(known + classes)}"
+    return f"{text}; these runs cannot distinguish the alternatives." if classes else f"{text}."
 
 
 def gain_sentence(findings: Findings) -> str:
-    """Return what the extended model is worth on runs left out, "" where that was not measured."""
+    """Return what the extended model is worth on held-out runs, "" where that was not measured."""
     gain = findings.gain
     if gain is None or not findings.causes:
         return ""
@@ -146,7 +146,7 @@ def gain_sentence(findings: Findings) -> str:
     if not before > 0.0:
         return ""
     return (
-        f"With {'it' if len(findings.causes) == 1 else 'them'}, the error on runs left out falls from "
+        f"With {'it' if len(findings.causes) == 1 else 'them'}, the error on held-out runs falls from "
         f"{number(before)} to {number(gain.rmse_after_nm)}{SPACE}Nm, by {gain_interval(gain)}."
     )
 
@@ -183,8 +183,8 @@ def _unexplained(gap: Gap | None) -> str:
     if gap is None:
         return "the residual is above the noise"
     text = (
-        f"{place(gap.joint)} is off by {number(gap.rmse_nm)}{SPACE}Nm "
-        f"where noise leaves {number(gap.noise_floor_nm)}{SPACE}Nm"
+        f"{place(gap.joint)}, residual {number(gap.rmse_nm)}{SPACE}Nm, "
+        f"noise floor {number(gap.noise_floor_nm)}{SPACE}Nm"
     )
     if gap.localisation:
         top = gap.localisation[0]

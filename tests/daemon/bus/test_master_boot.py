@@ -198,7 +198,7 @@ def test_l_a_node_that_was_operational_is_named_and_configured(bus: Bus) -> None
     bus.one.state = 5
     bus.one.store.set_number(0x1017, 0, 20)  # its heartbeat is heard before anything is sent
     report = bus.boot()
-    assert report.nodes[1].notes == ("it was already operational (status L): stopped, and configured anew",)
+    assert report.nodes[1].notes == ("it was already operational (status L): stopped and configured again",)
     assert bus.one.parameters.tpdos()[0] == drive_tpdo1(1)
     assert report.nodes[2].notes == ()
 

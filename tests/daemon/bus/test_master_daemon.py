@@ -129,7 +129,7 @@ def test_a_node_reset_in_the_middle_of_a_run_is_configured_before_it_is_believed
     assert daemon.statuses[first : first + 50].count((STALE, STALE)) < 25, "joint 2 goes on"
     assert daemon.process.poll() is None
     assert daemon.reader.read().counters["published"] > before
-    assert "node 1 was away and is configured again" in daemon.said()
+    assert "node 1 returned and is configured again" in daemon.said()
     (notices,) = (daemon.directory / "run").glob("*/notices")
     texts = [each.text for each in NoticesReader(notices).read()[0]]
-    assert "node 1 was away and is configured again" in texts, "for the log"
+    assert "node 1 returned and is configured again" in texts, "for the log"

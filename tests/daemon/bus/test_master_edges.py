@@ -110,7 +110,7 @@ def test_a_fault_that_is_joined_by_another_has_lasted_from_the_first_on() -> Non
     for now, bits in flags.items():
         lines += watch.lines(view(int(now), WELL._replace(input_flags=bits << 8)), now)
     assert [line.split(" (")[-1] for line in lines[:2]] == ["motor_jump)", "link_jump)"]
-    assert lines[2:] == ["joint 1: no fault any more after 9.0 s"]
+    assert lines[2:] == ["joint 1: fault cleared after 9.0 s"]
 
 
 def test_a_fault_that_is_latched_later_says_so() -> None:

@@ -62,7 +62,7 @@ def test_error_frames_become_states_emcys_and_objects(bench: MasterBench) -> Non
     bench.send(CAN_ERR_FLAG | 0x204, frame("00 20 0000 0000 82 02"))
     assert bench.run(lambda: bool(bench.own(EMCY)))
     assert bench.own(EMCY) == [frame("2081 11 0000 0000 00")]
-    assert "bus: error passive, before: error active (TEC 130, REC 2)" in bench.lines
+    assert "bus: error passive, previously error active (TEC 130, REC 2)" in bench.lines
     assert [bench.sdo(0x2205, sub) for sub in (1, 2, 3, 5)] == [2, 130, 2, 1]
     bench.send(CAN_ERR_FLAG | 0x004, frame("00 40 0000 0000 0000"))
     assert bench.run(lambda: bool(bench.own(EMCY)))
@@ -102,7 +102,7 @@ def test_nmt_commands_and_nodes_of_somebody_else_are_told(bench: MasterBench) ->
     bench.send(0x705, b"\x00")
     assert bench.run(lambda: len(bench.lines) >= 2)
     assert "NMT command 'stop' to all nodes from another master" in bench.lines
-    assert "node 5: it is on the bus and not in the configuration (status A)" in bench.lines
+    assert "node 5: on the bus but not in the configuration (status A)" in bench.lines
     assert bench.service.foreign_nmt == 1
 
 
@@ -111,7 +111,7 @@ def test_a_stopped_node_is_booted_and_its_boot_is_nobodys_foreign_command(bench:
     bench.snapshot.node_states[1] = 4
     assert bench.run(lambda: bench.drives[0].state == 5)
     bench.snapshot.node_states[1] = 5
-    assert bench.run(lambda: bench.said("node 1 was away and is configured again"))
+    assert bench.run(lambda: bench.said("node 1 returned and is configured again"))
     bench.pause(0.3)
     assert not bench.said("another master")
     assert bench.snapshot.configured[1] == 1
@@ -156,12 +156,12 @@ def test_an_absent_optional_sensor_is_said_and_configured_when_it_appears(tmp_pa
         assert bench.said("it is optional")
         assert 3 in bench.service.care.absent
         bench.pause(1.0)
-        assert not bench.children, "nobody is booted that is not there"
+        assert not bench.children, "nobody is booted that is absent"
         probes = [data for can_id, data in bench.heard if can_id == 0x603]
         assert frame("40 00 10 00 00 00 00 00") in probes, "but it is asked for (1000h:0)"
         bench.appear()
         assert bench.run(lambda: bench.snapshot.configured[3] == 1), bench.lines
-        assert bench.said("node 3 has appeared and is configured")
+        assert bench.said("node 3 appeared and is configured")
         assert bench.sensor.parameters.tpdos() == [sensor_tpdo1(3)]
         assert bench.sensor.state == 5
         assert bench.snapshot.factors(3) == (0.001, 0.0, 0.0, 0.0)

@@ -93,7 +93,7 @@ def test_a_restart_and_a_node_that_is_not_in_the_configuration() -> None:
     watch = make_watch()
     assert kinds(watch.receive(1, b"\x00", 0.1)) == [("restarted", 1)]
     (foreign,) = watch.receive(9, b"\x00", 0.1)
-    assert foreign.text == "node 9: it is on the bus and not in the configuration (status A)"
+    assert foreign.text == "node 9: on the bus but not in the configuration (status A)"
     assert watch.receive(9, b"\x7f", 0.2) == [], "once"
     assert watch.receive(0x20, b"\x05", 0.2) == watch.receive(0x21, b"\x05", 0.2) == []
     for node in range(40, 127):  # somebody tries them all: bounded
@@ -183,7 +183,7 @@ def test_a_signature_that_is_gone_leads_to_the_objects() -> None:
     finding = watch.result(bytes(4))  # 0: somebody has written to the configuration
     assert finding == (
         False,
-        "its configuration was written to by somebody else (1020h:1: expected 0x1234567, found 0x0)",
+        "its configuration was written by another master (1020h:1: expected 0x1234567, found 0x0)",
     )
     asked = []
     for expected in checks_of(REPORT):

@@ -126,7 +126,7 @@ def test_an_absent_node_is_booted_when_it_is_there_and_only_then(case: Case) -> 
     assert case.starts == []
     case.now[3] = {**NODE, "scaling": {"nm_per_unit": {"1": 0.25}}, "gear_ratio": None}
     case.run(0.5, present=(3,))
-    assert case.lines == ["node 3 has appeared and is configured"]
+    assert case.lines == ["node 3 appeared and is configured"]
     assert case.nodes.absent == set()
     assert case.snapshot.factors(3) == (0.25, 0.0, 0.0, 0.0)
     case.run(3.0, present=(3,))

@@ -35,10 +35,10 @@ def test_a_fault_is_told_when_it_begins_and_when_all_are_over() -> None:
     watch = Observer()
     assert watch.lines(reading(1), 0.0) == []
     assert watch.lines(reading(2, faulty(TORSION)), 1.0) == [
-        "joint 1: no torque: motor and link position are further apart than the gear can be twisted (torsion)"
+        "joint 1: no torque: the torsion exceeds the limit of the gear (torsion)"
     ]
     assert watch.lines(reading(3, faulty(TORSION)), 20.0) == [], "told once"
-    assert watch.lines(reading(4), 22.5) == ["joint 1: no fault any more after 21.5 s"]
+    assert watch.lines(reading(4), 22.5) == ["joint 1: fault cleared after 21.5 s"]
 
 
 def test_a_latched_fault_says_how_it_is_released() -> None:
@@ -49,7 +49,7 @@ def test_a_latched_fault_says_how_it_is_released() -> None:
     ]
     assert watch.lines(reading(2, WELL, WELL._replace(latched=JUMP)), 1.0) == []
     assert watch.lines(reading(3), 2.0) == [
-        "joint 2: no fault any more after 2.0 s",
+        "joint 2: fault cleared after 2.0 s",
         "joint 2: latched faults released after 2.0 s",
     ]
 
@@ -142,7 +142,7 @@ def test_the_summary_tells_stolen_time_where_there_was_any() -> None:
     us = (1.0, 2.0, 3.0)
     for stolen_s, lines in (
         (0.0, []),
-        (0.318, ["processors    taken away for 0.32 s by the hypervisor (stolen time)"]),
+        (0.318, ["processors    0.32 s stolen by the hypervisor"]),
     ):
         told = Summary(
             9, 0, 0, us, us, (0.1, 0.1), dict.fromkeys(COUNTERS, 0), (), None, None, {}, (), stolen_s

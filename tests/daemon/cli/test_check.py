@@ -77,7 +77,7 @@ def test_a_bus_as_configured_is_good_in_every_item(config: Config) -> None:
         found["181h drive 1 TPDO1"].text == "1 per SYNC, expected 1; after SYNC: p50 335, p99 335, max 335 us"
     )
     assert found["success rate"].text.startswith("1.0000: 1000 of 1000 cycles")
-    assert found["1A0h jtqd estimate"].text == "1 per SYNC; with a number: joint 1 100.0 %, joint 2 100.0 %"
+    assert found["1A0h jtqd estimate"].text == "1 per SYNC; with a torque: joint 1 100.0 %, joint 2 100.0 %"
     bits = sum(stuffed_bits(can_id, data) for can_id, data, _ in bus(1000)) / 1.0 / 1e6
     assert found["bus load"].text.startswith(
         f"{100 * bits:.1f} % by the bits of every frame; by configuration 69.9 %"

@@ -188,7 +188,7 @@ def test_check_drives_the_bus_where_nobody_else_does(tmp_path: Path, bench: None
         time.sleep(0.5)
         code, _, said = jtq("check", "1", "--bus", INTERFACE, "--drive-sync", runtime=tmp_path)
     assert code == 1
-    assert said.startswith(f"jtq check: somebody sends SYNC on {INTERFACE}")
+    assert said.startswith(f"jtq check: another node sends SYNC on {INTERFACE}")
 
 
 FOREIGN_SYNC = """

@@ -58,10 +58,10 @@ def test_a_reply_is_one_line(
     ("reply", "reason"),
     [
         ({"ok": False, "error": "the gear ratio differs"}, "the gear ratio differs"),
-        (FileNotFoundError(), "jtqd takes no orders now: it is starting or ending"),
+        (FileNotFoundError(), "jtqd accepts no orders now: it is starting or ending"),
         (TimeoutError(), "jtqd did not answer in time"),
         (PermissionError(13, "Permission denied"), "Permission denied"),
-        (NoDaemonError("no jtqd runs here", 1), "no jtqd runs here"),
+        (NoDaemonError("no jtqd runs on this machine", 1), "no jtqd runs on this machine"),
     ],
 )
 def test_a_refusal_is_one_line_on_standard_error(

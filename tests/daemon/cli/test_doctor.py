@@ -53,7 +53,7 @@ def test_files_and_packages_of_this_installation_are_good(doctor: Doctor, tmp_pa
         "joint 1",
         "joint 2",
         "packages",
-        "unended logs",
+        "unfinished logs",
         "shared memory",
     ):
         assert level(found, item) == GOOD, found[item]
@@ -98,8 +98,8 @@ def test_what_a_crash_has_left(doctor: Doctor, tmp_path: Path) -> None:
     (logs / "jtqd-can0-20260101T000000Z.mcap.active").touch()
     (tmp_path / "run" / "jtqd-0-can0").mkdir()
     _, found = doctor("--bus", "sim", "--record", str(logs))
-    assert level(found, "unended logs") == WARN
-    assert "jtq recover" in found["unended logs"]["hint"]
+    assert level(found, "unfinished logs") == WARN
+    assert "jtq recover" in found["unfinished logs"]["hint"]
     assert level(found, "left over") == WARN
     assert "jtqd-0-can0" in found["left over"]["text"]
 
@@ -108,7 +108,7 @@ def test_a_directory_that_does_not_exist_yet_and_a_disk_that_is_full(
     doctor: Doctor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, found = doctor("--bus", "sim", "--record", str(tmp_path / "a" / "b"))
-    assert "it will be made" in found["log directory"]["text"]
+    assert "it will be created" in found["log directory"]["text"]
     monkeypatch.setattr("jtqd.daemon.cli.doctor._LOG_FREE", 1 << 60)
     _, found = doctor("--bus", "sim", "--record", str(tmp_path))
     assert level(found, "log directory") == WARN

@@ -140,8 +140,8 @@ def test_stale_names_the_pdo_the_node_or_the_bus(bench: About) -> None:
     assert why(bench, stale) == "281h drive 1 TPDO2 not received in time"
     assert why(bench, stale._replace(input_flags=2)) == "181h drive 1 TPDO1 not received in time"
     assert why(bench, stale, bus_errors=3) == "the bus is down"
-    assert why(bench, stale, foreign_sync=3) == "another SYNC is on the bus"
-    assert why(bench, stale._replace(input_flags=3)).startswith("the inputs are back; held until")
+    assert why(bench, stale, foreign_sync=3) == "another SYNC producer is on the bus"
+    assert why(bench, stale._replace(input_flags=3)).startswith("the inputs are back; waiting for")
     assert (
         why(bench, stale._replace(input_flags=3), overruns=1)
         == "the estimate is not ready before the next SYNC"
@@ -152,7 +152,7 @@ def test_stale_names_the_pdo_the_node_or_the_bus(bench: About) -> None:
     assert silent_s(silent._replace(sync_realtime_ns=1_200_000_000), 1, 100) is None
     assert silent_s(silent, 2, 100) is None, "one that has never been heard is not silent"
     unready = view(1000, stale, unconfigured=(1,))
-    assert joint_reason(bench, 1, unready, view(900)) == "node 1 is not configured as it was"
+    assert joint_reason(bench, 1, unready, view(900)) == "node 1 has a changed configuration"
     restarted = view(1000, stale, unconfigured=(1,), states={1: 127})
     assert joint_reason(bench, 1, restarted, view(900)).startswith("node 1 has restarted")
     assert (
@@ -166,7 +166,7 @@ def test_drive_states(bench: About) -> None:
     )
     assert why(bench, WELL._replace(status=st.DRIVE_FAULT, statusword=0x18)) == "drive 1: fault (6041h 0018h)"
     back = why(bench, WELL._replace(status=st.DRIVE_FAULT, statusword=0x27))
-    assert back.startswith("drive 1: operation enabled (6041h 0027h); held until")
+    assert back.startswith("drive 1: operation enabled (6041h 0027h); waiting for")
     assert drive_state(0x1637) == "operation enabled"
     assert drive_state(0x0031) == "ready to switch on"
     assert drive_state(0x0023) == "switched on, not enabled"
@@ -177,20 +177,20 @@ def test_drive_states(bench: About) -> None:
 def test_degraded_and_invalid(bench: About) -> None:
     far = 1.01 * bench.joints[0].network_limit_nm
     degraded = WELL._replace(status=st.DEGRADED, physics_nm=10.0, network_nm=10.5)
-    assert why(bench, degraded).startswith("outside what the network was trained on")
-    assert "Nm from physics, trusted to" in why(bench, degraded._replace(network_nm=10.0 - far))
-    assert "not a number" in why(bench, degraded._replace(network_nm=NAN))
+    assert why(bench, degraded).startswith("outside the network's training range")
+    assert "Nm from physics, limit" in why(bench, degraded._replace(network_nm=10.0 - far))
+    assert "not finite" in why(bench, degraded._replace(network_nm=NAN))
     assert "no time for the network" in why(bench, degraded._replace(input_flags=0x1F))
     invalid = WELL._replace(status=st.INVALID, torque_nm=NAN)
     found = why(bench, invalid._replace(input_flags=7 | (MOTOR_JUMP | LINK_JUMP) << 8))
     assert found == "the motor position jumped, the link position jumped"
-    assert why(bench, invalid).startswith("a fault is over; held until")
+    assert why(bench, invalid).startswith("fault cleared; waiting for")
     latched = why(bench, invalid._replace(latched=DRIVE_FAULT))
     assert latched == "latched: the drive was in fault; `jtq control reset` releases it"
 
 
 def test_starting_and_standstill(bench: About) -> None:
     starting = WELL._replace(status=st.STARTING)
-    assert joint_reason(bench, 1, view(8, starting), view(0)) == "the first cycles"
-    assert joint_reason(bench, 1, view(800, starting), view(0)).startswith("the observer starts again")
-    assert "half the interval" in why(bench, WELL._replace(status=st.STANDSTILL))
+    assert joint_reason(bench, 1, view(8, starting), view(0)) == "first cycles after the start"
+    assert joint_reason(bench, 1, view(800, starting), view(0)).startswith("the observer restarts")
+    assert "sigma is half of it" in why(bench, WELL._replace(status=st.STANDSTILL))

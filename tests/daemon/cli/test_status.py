@@ -114,14 +114,14 @@ def test_json_holds_what_the_picture_shows(tmp_path: Path, status: Status) -> No
 
 
 def test_none_one_and_several(tmp_path: Path, status: Status) -> None:
-    assert status("--once") == (1, "", "jtq status: no jtqd runs here\n")
+    assert status("--once") == (1, "", "jtq status: no jtqd runs on this machine\n")
     running(tmp_path, "vcan0")
     assert status("--once")[0] == 0
     assert "vcan1" in status("--once", "--bus", "vcan1")[2]
     running(tmp_path, "vcan1")
     code, _, said = status("--once")
     assert code == 2
-    assert said.splitlines()[0] == "jtq status: several daemons run: which one?"
+    assert said.splitlines()[0] == "jtq status: several daemons run; select one with --bus:"
     assert [line.split()[:2] for line in said.splitlines()[1:]] == [["--bus", "vcan0"], ["--bus", "vcan1"]]
     assert status("--once", "--bus", "vcan1")[0] == 0
 
@@ -131,7 +131,7 @@ def test_a_daemon_that_is_booting_and_one_that_was_killed(tmp_path: Path, status
     (daemon.directory / "snapshot").unlink()
     code, out, _ = status("--once")
     assert code == 3
-    assert "its nodes are being booted" in out
+    assert "booting its nodes" in out
     content = json.loads((daemon.directory / "about.json").read_text())
     content["pid"] = subprocess.run(["true"], check=True).returncode + 2**22 - 3  # nobody's
     (daemon.directory / "about.json").write_text(json.dumps(content))
@@ -174,7 +174,7 @@ def test_the_live_view_on_a_terminal_outlives_its_daemon_and_ends_by_ctrl_c(tmp_
     assert "Ctrl-C ends this view" in shown or "Ctrl-C ends this view" in until(terminal, "Ctrl-C")
     sleeper.kill()
     sleeper.wait()
-    until(terminal, "jtqd on vcan0 has ended; waiting for its return")
+    until(terminal, "jtqd on vcan0 has ended; waiting for its restart")
     write_about(daemon.directory, daemon.about)
     until(terminal, "-117.94 Nm")
     os.write(terminal, b"\x03")

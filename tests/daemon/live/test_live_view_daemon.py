@@ -68,7 +68,7 @@ def test_where_it_listens_is_said_and_a_viewer_finds_it(kept):
 def test_one_that_is_killed_is_started_again(kept):
     kept.until(_LISTENING)
     os.kill(kept.keeper.pid, signal.SIGKILL)
-    kept.until("jtqd: the live view ended with exit status -9; started again, the loop goes on\n")
+    kept.until("jtqd: the live view ended with exit status -9; restarted, the loop continues\n")
     Viewer(kept.until(_LISTENING)[1]).leave()
 
 
@@ -77,9 +77,9 @@ def test_one_that_dies_again_and_again_is_left(kept, monkeypatch):
     for _ in range(5):
         kept.until(_LISTENING)
         os.kill(kept.keeper.pid, signal.SIGKILL)
-        kept.until("started again, the loop goes on\n")
+        kept.until("restarted, the loop continues\n")
     os.kill(kept.keeper.pid, signal.SIGKILL)
-    kept.until("exit status -9, too often; the loop goes on without it\n")
+    kept.until("exit status -9, too often; the loop continues without it\n")
     assert kept.keeper.pid is None
     started = len(kept.children)
     kept.keeper.watch()
@@ -92,7 +92,7 @@ def test_a_port_in_use_is_said_once_and_that_is_all(tmp_path, capfd):
         taken.listen()
         port = taken.getsockname()[1]
         made = Kept(tmp_path, capfd, port)
-        made.until(rf"jtqd: no live view: 127\.0\.0\.1:{port}: Address already in use; the loop goes on\n")
+        made.until(rf"jtqd: no live view: 127\.0\.0\.1:{port}: Address already in use; the loop continues\n")
         for _ in range(5):
             made.keeper.watch()
         assert capfd.readouterr().err == ""
@@ -103,7 +103,7 @@ def test_a_port_in_use_is_said_once_and_that_is_all(tmp_path, capfd):
 def test_an_address_that_others_reach_is_said(tmp_path, capfd, monkeypatch):
     monkeypatch.setattr(LiveKeeper, "_run", lambda self: None)
     LiveKeeper(lambda *_: None, Address("0.0.0.0")).start(load_config(None), tmp_path, "can0")
-    assert "open to everyone who can reach 0.0.0.0; it can only be read" in capfd.readouterr().err
+    assert "open to everyone who can reach 0.0.0.0; it is read-only" in capfd.readouterr().err
 
 
 def test_without_the_package_the_daemon_refuses_in_one_line(monkeypatch, capsys):
@@ -151,7 +151,7 @@ def test_live_view_of_the_emulated_bench(tmp_path):
             and str(tmp_path).encode() in (entry / "cmdline").read_bytes()
         ]
         os.kill(pid, signal.SIGKILL)
-        wait_for("the live view ended with exit status -9; started again, the loop goes on")
+        wait_for("the live view ended with exit status -9; restarted, the loop continues")
         output, _ = process.communicate(timeout=60)
         assert process.returncode == 0, said.read_text()
         assert len(_LISTENING.findall(said.read_text())) == 2

@@ -269,7 +269,7 @@ def test_wrong_summary_is_made_anew(log, tmp_path):
 def test_files_with_nothing_to_read_are_refused_and_stay(tmp_path, content, capsys):
     path = tmp_path / "a.mcap.active"
     path.write_bytes(content)
-    with pytest.raises(RecoverError, match="found nothing"):
+    with pytest.raises(RecoverError, match="found no readable content"):
         recover(path)
     assert path.read_bytes() == content
     assert main([str(path)]) == 1

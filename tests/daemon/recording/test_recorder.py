@@ -287,7 +287,7 @@ def test_directory_that_cannot_be_made(recorder, tmp_path):
     assert status == 3
     assert errors == (
         f"recorder: cannot record to {tmp_path}/file/logs: Not a directory; "
-        "cycles are counted as lost until it goes on\n"
+        "cycles are counted as lost until it continues\n"
     )
     assert (summary["path"], summary["cycles"], summary["written"], summary["lost"]) == (None, 100, 0, 100)
 

@@ -120,8 +120,8 @@ def test_full_disk(start, small_disk) -> None:
     recording = summary["recording"]
     assert status == 3
     assert 1000 <= recording["lost"] <= 2000 + 1000
-    assert "recording ends: " in err
-    assert "recording goes on in part 2" in err
+    assert "recording pauses: " in err
+    assert "recording continues in part 2" in err
     assert len(recording["paths"]) == 2
     assert recording["left"] == []
     assert len(set(cycles_of(*recording["paths"]))) == recording["written"]

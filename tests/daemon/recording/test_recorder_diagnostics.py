@@ -139,15 +139,15 @@ def test_nodes(bench):
 
 def test_the_worst_condition_of_a_subject_is_its_level_and_text(bench):
     conditions = [
-        Condition("sensor_lost", "joint 1", WARNING, "torque sensor lost: node 3 is not there", 1),
+        Condition("sensor_lost", "joint 1", WARNING, "torque sensor lost: node 3 is absent", 1),
         Condition("temperature_lost", "joint 1", WARNING, "temperature lost", 2),
         Condition("joint_fault", "joint 2", ERROR, "no torque: x", 3),
-        Condition("bus_off", "bus", ERROR, "bus-off, before: error passive", 4),
+        Condition("bus_off", "bus", ERROR, "bus-off, previously error passive", 4),
     ]
     found = bench.look(statuses=(2, 15), conditions=conditions)
-    assert found["joint 1"][:2] == (WARN, "VALID: torque sensor lost: node 3 is not there")
+    assert found["joint 1"][:2] == (WARN, "VALID: torque sensor lost: node 3 is absent")
     assert found["joint 2"][:2] == (FAULT, "INVALID: no torque: x")
-    assert found["bus"][:2] == (FAULT, "bus-off, before: error passive")
+    assert found["bus"][:2] == (FAULT, "bus-off, previously error passive")
 
 
 def test_node_that_was_never_heard(bench):
@@ -158,9 +158,9 @@ def test_node_that_was_never_heard(bench):
 def test_recorder_and_disk(bench):
     bench.look()
     bench.account.overwritten = 7
-    found = bench.look(free=150_000_000, mode="waiting", obstacle="recording ends: no room")
+    found = bench.look(free=150_000_000, mode="waiting", obstacle="recording pauses: no room")
     assert found["recorder"][:2] == (FAULT, "7 cycles lost since the last message")
-    assert found["disk"][:2] == (FAULT, "recording ends: no room")
+    assert found["disk"][:2] == (FAULT, "recording pauses: no room")
     found = bench.look(free=150_000_000, budget=5 * 10**9)
     assert found["recorder"][:2] == (WARN, "7 cycles lost so far")
     assert found["disk"][:2] == (WARN, "little room")

@@ -179,4 +179,4 @@ def test_parent_that_goes_away_is_a_fault(tmp_path):
     process.wait_for(lambda: process.files("*.mcap"))
     path = Path(process.files("*.mcap")[0])
     assert cycles_of(path) == list(range(100))
-    assert metadata_of(path)["reason"] == "jtqd has gone"
+    assert metadata_of(path)["reason"] == "jtqd has ended"

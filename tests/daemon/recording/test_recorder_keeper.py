@@ -81,7 +81,7 @@ def test_one_that_dies_again_and_again_is_tried_again_after_a_long_pause_and_all
 ):
     for _ in range(2):
         kept.kill()
-        kept.until("jtqd: the recorder ended with exit status -9; started again, the loop goes on\n")
+        kept.until("jtqd: the recorder ended with exit status -9; restarted, the loop continues\n")
     kept.kill()
     kept.until("jtqd: the recorder ended with exit status -9; 3 times in a minute; the next try in 60 s\n")
     kept.feed(_SLOTS + 100)
@@ -91,7 +91,7 @@ def test_one_that_dies_again_and_again_is_tried_again_after_a_long_pause_and_all
     assert kept.capfd.readouterr().err == "", "said once"
     assert len(kept.children) == started
     monkeypatch.setattr(keeper_module, "_LONG_PAUSE_S", 0.0)
-    kept.until("started again")
+    kept.until("restarted, the loop")
     kept.wait()
     result = kept.keeper.end()
     assert result["cycles"] == kept.cycles == _SLOTS + 100
@@ -104,7 +104,7 @@ def test_one_that_dies_again_and_again_is_tried_again_after_a_long_pause_and_all
 def test_what_came_while_no_recorder_was_there_is_lost_in_the_account(kept):
     for _ in range(2):
         kept.kill()
-        kept.until("started again")
+        kept.until("restarted, the loop")
     kept.kill()
     kept.until("the next try in 60 s")
     kept.feed(4000)

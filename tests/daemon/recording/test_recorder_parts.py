@@ -251,8 +251,8 @@ def test_recording_ends_at_the_reserve_and_goes_on_when_there_is_room(tmp_path, 
     assert found[len(held)] >= 4000 - 101, "110 MB are not enough to begin again: 125 are"
     assert summary["lost"] == summary["lost_unwritten"] == missing
     assert [line.split(":")[0].split(" in part")[0] for line in said] == [
-        "recording ends",
-        "recording goes on",
+        "recording pauses",
+        "recording continues",
     ]
     event = next(
         event
@@ -260,7 +260,7 @@ def test_recording_ends_at_the_reserve_and_goes_on_when_there_is_room(tmp_path, 
         if event["kind"] == EVENT["WRITE_FAILED"]
     )
     assert event["count"] == missing
-    assert (metadata_of(summary["paths"][1])["reason"]) == "recording goes on"
+    assert (metadata_of(summary["paths"][1])["reason"]) == "recording continues"
 
 
 def test_start_without_room(tmp_path, free):
@@ -342,7 +342,7 @@ def test_file_that_is_removed_costs_what_was_in_it(tmp_path):
     summary = session.finish()
     assert cycles_of(*summary["paths"]) == list(range(before, 2000))
     assert (summary["written"], summary["lost"]) == (2000 - before, before)
-    assert said == [f"part 1 was removed while it was being written: {before} cycles are lost with it"]
+    assert said == [f"part 1 was removed while it was being written: cycles lost with it: {before}"]
     assert metadata_of(summary["paths"][0])["part"] == "2"
     events = [event for _, event in messages_of(*summary["paths"])["/events"]]
     assert [event["count"] for event in events if event["kind"] == EVENT["FILE_REMOVED"]] == [before]
@@ -359,7 +359,7 @@ def test_recorder_of_the_same_run_goes_on_with_the_numbers(tmp_path):
     told = metadata_of(summary["paths"][1])
     assert (told["previous"], told["reason"]) == (
         "test-20260102T030405Z-0001.mcap",
-        "the recorder was started again",
+        "recorder restarted",
     )
 
 

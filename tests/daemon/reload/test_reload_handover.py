@@ -103,7 +103,7 @@ def test_a_successor_that_ends_before_its_last_word_leaves_the_loop_running(
     taker.close()  # as the kernel does for one that is killed
     thread.join(20)
     assert said == [None]
-    assert giver.refused == "the new loop ended while it took over"
+    assert giver.refused == "the new loop ended during the hand-over"
     turn(one, 5)
     assert one.index == 35
 
@@ -276,8 +276,8 @@ def test_a_node_that_begins_again_meanwhile_refuses_and_the_loop_goes_on(
             break
     assert began
     assert done is None
-    assert ended in ("", "the running loop has given up")
-    assert giver.refused == "a node came or began again meanwhile; order it once more"
+    assert ended in ("", "the running loop has cancelled the hand-over")
+    assert giver.refused == "a node appeared or restarted meanwhile; send the order again"
     turn(one, 5)
     assert one.index == 36
     taker.close()

@@ -179,7 +179,7 @@ def test_new_files_come_into_force_between_two_cycles_and_bad_ones_never(tmp_pat
     assert [status for status, _ in replies] == [1, 1, 0]
     assert "rated_torque_nm" in replies[0][1]["error"]
     assert "gear ratio" in replies[1][1]["error"]
-    assert run.said.count("not reloaded, the old files stay in force") == 2
+    assert run.said.count("not reloaded, the old files remain in force") == 2
     change = replies[2][1]["changes"]
     assert change["joint_1"]["rms_change_nm"] > 0.05
     assert change["joint_2"]["rms_change_nm"] == 0.0

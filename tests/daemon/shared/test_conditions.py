@@ -93,10 +93,10 @@ def test_the_catalogue_is_complete_and_consistent():
 def test_a_condition_that_is_superseded_has_no_line_at_its_end():
     conditions, bus = Conditions(), Subject("bus")
     conditions.update("bus_passive", bus, True, 1.0, "error active")
-    assert [line.text for line in conditions.lines(1.0)] == ["bus: error passive, before: error active"]
+    assert [line.text for line in conditions.lines(1.0)] == ["bus: error passive, previously error active"]
     conditions.update("bus_passive", bus, False, 2.0, superseded=True)
     conditions.update("bus_off", bus, True, 2.0, "error passive")
-    assert [line.text for line in conditions.lines(2.0)] == ["bus: bus-off, before: error passive"]
+    assert [line.text for line in conditions.lines(2.0)] == ["bus: bus-off, previously error passive"]
     conditions.update("bus_off", bus, False, 3.5)
     assert [line.text for line in conditions.lines(3.5)] == ["bus: error active after 1.5 s"]
 
@@ -106,7 +106,7 @@ def test_a_condition_that_supersedes_another_one_has_its_own_end():
     conditions, bus = Conditions(), Subject("bus")
     conditions.update("bus_passive", bus, False, 1.0, superseded=True)
     conditions.update("bus_down", bus, True, 1.0, "error active", superseded=True)
-    assert [line.text for line in conditions.lines(1.0)] == ["bus: interface down, before: error active"]
+    assert [line.text for line in conditions.lines(1.0)] == ["bus: interface down, previously error active"]
     conditions.update("bus_down", bus, False, 2.0)
     assert [line.text for line in conditions.lines(2.0)] == ["bus: error active after 1.0 s"]
 

@@ -39,7 +39,7 @@ def test_each_kind_is_limited_by_itself_and_what_was_held_back_is_counted() -> N
     clock.now += WINDOW_S
     assert log("back", WARNING, "joint 1")
     last = stream.getvalue().splitlines()[-1]
-    assert last == f"jtqd: back ({100 - BURST} lines like this one were held back)"
+    assert last == f"jtqd: back ({100 - BURST} similar lines were suppressed)"
 
 
 def test_errors_and_lines_without_a_kind_always_come() -> None:

@@ -134,7 +134,7 @@ def test_another_user_is_refused_even_where_the_file_lets_him_in(served: Served)
         text=True,
         check=True,
     )
-    assert json.loads(done.stdout) == {"ok": False, "error": "user 65534 may give no orders"}
+    assert json.loads(done.stdout) == {"ok": False, "error": "user 65534 may not give orders"}
 
 
 def test_those_who_ask_nothing_do_not_shut_out_others_for_long(

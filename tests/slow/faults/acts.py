@@ -78,7 +78,7 @@ def step_clock(seconds: float) -> None:
 
 
 def stop_supervisor(rig: Rig) -> None:
-    """SIGSTOP to the process beside the loop."""
+    """SIGSTOP to the supervisor."""
     os.kill(rig.process.pid, signal.SIGSTOP)
 
 

@@ -132,7 +132,7 @@ CASES = (
     Case(
         "12",
         "second SYNC producer",
-        "SYNC of somebody else in each of 50 cycles",
+        "SYNC of another node in each of 50 cycles",
         lambda: Added(lambda rig: acts.foreign_sync(rig, b"\x05")),
         50,
         one=STALE | STARTING,
@@ -209,7 +209,7 @@ CASES = (
     of_inputs(
         "14d",
         "SYNC lost once",
-        "the nodes do not hear one SYNC",
+        "the nodes do not receive one SYNC",
         lambda: Deaf(0x080),
         1,
         two=STALE,
@@ -218,14 +218,14 @@ CASES = (
     of_inputs(
         "14e",
         "SYNC lost twice",
-        "the nodes do not hear two SYNC",
+        "the nodes do not receive two SYNC",
         lambda: Deaf(0x080),
         2,
         two=STALE,
         proof=proofs.withheld(2, *ALL),
     ),
     of_inputs(
-        *("14f", "SYNC lost for 20 cycles", "the nodes do not hear 20 SYNC", lambda: Deaf(0x080), 20),
+        *("14f", "SYNC lost for 20 cycles", "the nodes do not receive 20 SYNC", lambda: Deaf(0x080), 20),
         two=STALE,
         may=LATE,
         recover_ms=40.0,

@@ -38,7 +38,7 @@ CASES = (
         proof=proofs.frames(1, HEARTBEAT_1, b"\0"),
     ),
     Case(
-        *("24a", "node goes pre-operational silently", "state of node 1 changed in the node"),
+        *("24a", "node silently goes pre-operational", "state of node 1 changed in the node"),
         lambda: Added(first=lambda rig: acts.set_state(rig, 1, PRE_OPERATIONAL)),
         1,
         one=GAP,
@@ -49,7 +49,7 @@ CASES = (
         proof=proofs.all_of(proofs.frames(1, HEARTBEAT_1, b"\x7f"), proofs.withheld(20, 0x181)),
     ),
     Case(
-        *("24b", "node stops silently", "state of node 1 changed in the node"),
+        *("24b", "node silently stops", "state of node 1 changed in the node"),
         lambda: Added(first=lambda rig: acts.set_state(rig, 1, STOPPED)),
         1,
         one=GAP,
@@ -60,7 +60,7 @@ CASES = (
         proof=proofs.all_of(proofs.frames(1, HEARTBEAT_1, b"\x04"), proofs.withheld(20, 0x181)),
     ),
     Case(
-        *("25a", "heartbeat lost", "701h kept from the bus, 0.6 s"),
+        *("25a", "heartbeat lost", "701h suppressed, 0.6 s"),
         lambda: Lost(HEARTBEAT_1),
         600,
         emcy=codes("8130"),
@@ -144,7 +144,7 @@ CASES = (
         proof=proofs.all_of(proofs.frames(1, 0x581, b"\x60\x00\x18\x02"), proofs.withheld(50, 0x181)),
     ),
     Case(
-        *("28b", "the same without a trace in 1020h", "the signature in 1020h stays as it was"),
+        *("28b", "the same without a change of 1020h", "the signature in 1020h is unchanged"),
         lambda: Added(first=acts.reconfigure_signed),
         1,
         one=GAP,
@@ -186,7 +186,7 @@ CASES = (
         *(
             "32a",
             "SDO: no answer from a node that comes back",
-            "node 1 restarts, and does not hear 601h for 0.8 s",
+            "node 1 restarts, and does not receive 601h for 0.8 s",
         ),
         acts.mute_restart,
         800,
@@ -201,7 +201,7 @@ CASES = (
         ),
     ),
     Case(
-        *("32b", "SDO: flood of answers nobody asked for", "5 frames 581h and 582h in each of 200 cycles"),
+        *("32b", "SDO: flood of unsolicited answers", "5 frames 581h and 582h in each of 200 cycles"),
         lambda: Added(
             lambda rig: [
                 rig.send(can_id, b"\x43\x00\x10\x00\x92\x01\x02\x00") for can_id in (0x581, 0x582) * 5
@@ -217,7 +217,7 @@ CASES = (
         proof=proofs.all_of(proofs.frames(200, 0x5A0), proofs.frames(290, 0x581, b"\x43\x18\x10\x01")),
     ),
     Case(
-        *("36", "rated current is another after a restart", "node 1 restarts with half of 6075h for 0.8 s"),
+        *("36", "rated current changed after a restart", "node 1 restarts with half of 6075h for 0.8 s"),
         lambda: acts.returns_with(1, 0x6075, 0, None),
         800,
         one=GAP,
@@ -229,7 +229,7 @@ CASES = (
         proof=proofs.all_of(proofs.frames(2, HEARTBEAT_1, b"\0"), proofs.two_answers(0x581, 0x6075, 0)),
     ),
     Case(
-        *("36b", "rated current is another in service", "6075h of node 1 halved for 13 s, without a restart"),
+        *("36b", "rated current changed in service", "6075h of node 1 halved for 13 s, without a restart"),
         lambda: acts.changes(1, 0x6075, 0, 0.5),
         13_000,
         one=GAP,
@@ -275,7 +275,7 @@ CASES = (
         during=acts.loop_stands_still,
     ),
     Case(
-        *("38b", "supervisor stopped for 1 s", "SIGSTOP to the process beside the loop"),
+        *("38b", "supervisor stopped for 1 s", "SIGSTOP to the supervisor"),
         lambda: Added(first=acts.stop_supervisor, last=acts.go_on_supervisor),
         1000,
         note="the loop does not need it",

@@ -14,7 +14,7 @@ CASES = (
     of_inputs(
         "16a",
         "TPDO1 of node 1 lost once",
-        "181h kept from the bus",
+        "181h suppressed",
         lambda: Lost(0x181),
         1,
         proof=proofs.withheld(1, 0x181),
@@ -22,26 +22,26 @@ CASES = (
     of_inputs(
         "16b",
         "TPDO1 of node 1 lost twice",
-        "181h kept from the bus",
+        "181h suppressed",
         lambda: Lost(0x181),
         2,
         proof=proofs.withheld(2, 0x181),
     ),
     of_inputs(
-        *("16c", "TPDO1 of node 1 lost 20 times", "181h kept from the bus", lambda: Lost(0x181), 20),
+        *("16c", "TPDO1 of node 1 lost 20 times", "181h suppressed", lambda: Lost(0x181), 20),
         may=LATE,
         recover_ms=40.0,
         proof=proofs.withheld(20, 0x181),
     ),
     of_inputs(
-        *("16d", "TPDO1 of node 1 lost for 0.5 s", "181h kept from the bus", lambda: Lost(0x181), 500),
+        *("16d", "TPDO1 of node 1 lost for 0.5 s", "181h suppressed", lambda: Lost(0x181), 500),
         one=STALE | STARTING,
         emcy=LATE,
         recover_ms=60.0,
         proof=proofs.withheld(450, 0x181),
     ),
     of_inputs(
-        *("16e", "all PDOs of node 1 lost for 0.5 s", "181h, 281h kept from the bus"),
+        *("16e", "all PDOs of node 1 lost for 0.5 s", "181h, 281h suppressed"),
         lambda: Lost(*NODE_1),
         500,
         one=STALE | STARTING,
@@ -50,7 +50,7 @@ CASES = (
         proof=proofs.withheld(450, *NODE_1),
     ),
     of_inputs(
-        *("16f", "all PDOs of all nodes lost for 0.5 s", "181h..183h, 281h, 282h kept from the bus"),
+        *("16f", "all PDOs of all nodes lost for 0.5 s", "181h..183h, 281h, 282h suppressed"),
         lambda: Lost(*ALL),
         500,
         one=STALE | STARTING,

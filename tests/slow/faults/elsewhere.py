@@ -17,8 +17,8 @@ class Shown(NamedTuple):
 ELSEWHERE = (
     Shown(
         5,
-        "interface removed and made again",
-        "exit status 1 with one line; systemd starts it again when the interface is back",
+        "interface removed and created again",
+        "exit status 1 with one line; systemd restarts jtqd when the interface is back",
         (
             "tests/daemon/bus/test_master_vcan.py::test_an_interface_that_is_removed_ends_the_daemon_with_one_line",
             "tests/systemd/test_systemd_boot.py::test_whatever_happens_to_a_service",
@@ -27,7 +27,7 @@ ELSEWHERE = (
     Shown(
         6,
         "bus absent at the start",
-        "one line, exit status 1; a link that is down says so at the first receive",
+        "one line, exit status 1; a link that is down is reported at the first receive",
         (
             "tests/daemon/test_jtqd.py::test_unknown_bus",
             "tests/drivers/test_socketcan.py::test_opening_a_link_that_is_down_says_so_at_the_first_receive",
@@ -54,12 +54,12 @@ ELSEWHERE = (
     Shown(
         27,
         "wrong device at the start",
-        "refused with node, object, expected and found",
+        "refused with node, object, expected and found value",
         ("tests/drivers/test_boot.py::test_wrong_identity",),
     ),
     Shown(
         28,
-        "mapping or transmission type that does not stick",
+        "mapping or transmission type that reads back different",
         "refused at the boot",
         (
             "tests/drivers/test_boot.py::test_mapping_that_reads_back_different",
@@ -68,14 +68,14 @@ ELSEWHERE = (
     ),
     Shown(
         31,
-        "mode of operation displayed (6061h) is another than before",
-        "a line for the operator; the estimate uses current and positions, whatever the mode",
+        "mode of operation display (6061h) changes",
+        "a line for the operator; the estimate uses current and positions in any mode",
         ("tests/daemon/bus/test_master_changes.py::test_another_mode_is_told_and_the_node_is_used",),
     ),
     Shown(
         32,
         "SDO: aborts, toggle error, late and wrong answers, sizes, flood",
-        "each ends in a result, never in a wrong value",
+        "each transfer ends with a result or an error, never with a wrong value",
         (
             "tests/drivers/test_sdo.py::test_a_refusal_is_the_servers",
             "tests/drivers/test_sdo.py::test_answers_to_something_else_are_passed_over",
@@ -88,7 +88,7 @@ ELSEWHERE = (
     Shown(
         34,
         "position counter rolls over at 2^31",
-        "the estimate goes on",
+        "the estimate continues",
         ("tests/daemon/loop/test_cycle.py::test_a_position_that_rolls_over_goes_on",),
     ),
     Shown(
@@ -99,14 +99,14 @@ ELSEWHERE = (
     ),
     Shown(
         38,
-        "loop stopped for good",
+        "loop stopped permanently",
         "the watchdog of systemd restarts the service",
         ("tests/systemd/test_systemd_boot.py::test_installed_started_reloaded_hung_and_stopped",),
     ),
     Shown(
         39,
-        "a processor hog, 0.2 s at a priority above the loop's",
-        "slots are skipped and counted in `missed`; what is published then is from inputs of its own cycle",
+        "a busy process for 0.2 s at a priority above the loop's",
+        "slots are skipped and counted in `missed`; published estimates use inputs of their own cycle",
         (
             "tests/daemon/test_jtqd_hog.py::"
             "test_a_processor_hog_costs_counted_cycles_and_nothing_that_is_published_is_stale",
@@ -114,8 +114,8 @@ ELSEWHERE = (
     ),
     Shown(
         39,
-        "collection of garbage",
-        "it is off in the loop, and no cycle leaves anything that would need it",
+        "garbage collection",
+        "it is off in the loop, and no cycle creates objects that need it",
         (
             "tests/daemon/loop/test_loop_garbage.py::test_the_collector_is_off_once_the_loop_is_ready",
             "tests/daemon/loop/test_loop_garbage.py::test_no_cycle_leaves_anything_to_a_collector",
@@ -124,7 +124,7 @@ ELSEWHERE = (
     Shown(
         40,
         "disk full, slow recorder",
-        "cycles go on; what is not in the log is counted",
+        "cycles continue; cycles missing in the log are counted",
         (
             "tests/daemon/test_vcan.py::test_a_recorder_that_dies_or_stalls_costs_the_loop_nothing",
             "tests/slow/test_fuzz_soak.py::test_a_minute_of_faults",
@@ -135,7 +135,7 @@ ELSEWHERE = (
     Shown(
         41,
         "kill -9 while the log is written",
-        "repaired at the next start; nothing complete is lost",
+        "repaired at the next start; no complete chunk is lost",
         (
             "tests/daemon/test_vcan.py::test_a_recorder_that_dies_or_stalls_costs_the_loop_nothing",
             "tests/daemon/logs/test_recover.py::test_killed_between_two_chunks_loses_nothing",
@@ -146,7 +146,7 @@ ELSEWHERE = (
     Shown(
         42,
         "network: NaN, slow, far, corrupt, missing",
-        "refused at the start, or left out in the cycle and counted by reason",
+        "refused at the start, or not used in the cycle and counted by reason",
         (
             "tests/estimator/test_network.py::test_a_network_that_gives_nan_is_refused",
             "tests/estimator/test_network.py::test_unreadable_and_corrupt_files",
@@ -158,8 +158,8 @@ ELSEWHERE = (
     ),
     Shown(
         43,
-        "configuration and joint files that are none",
-        "one line that names file, key, found and expected",
+        "invalid configuration and joint files",
+        "one line that names file, key, found and expected value",
         (
             "tests/daemon/test_config.py::test_mistakes_are_named",
             "tests/daemon/test_config.py::test_files_that_are_no_configuration",
@@ -171,7 +171,7 @@ ELSEWHERE = (
     Shown(
         44,
         "EDS files",
-        "CiA 306 is kept; each breach is seen by the lint",
+        "CiA 306 is met; the lint detects each violation",
         (
             "tests/drivers/eds/test_eds.py::test_the_lint_sees_each_breach",
             "tests/slow/test_fuzz_files.py::test_every_kind_of_file",
@@ -180,7 +180,7 @@ ELSEWHERE = (
     Shown(
         45,
         "random frames",
-        "what is used carries its own cycle's number; garbage is counted and changes nothing",
+        "used inputs have the number of their own cycle; garbage is counted and has no effect",
         (
             "tests/daemon/loop/test_intake.py::test_whatever_is_lost_or_late_what_is_used_is_of_its_own_cycle",
             "tests/daemon/test_jtqd.py::test_garbage_on_the_bus_is_counted_and_changes_nothing",

@@ -1,4 +1,4 @@
-"""Kinds of fault: what is kept from the bus, changed, delayed or added while a case lasts."""
+"""Kinds of fault: what is suppressed, changed, delayed or added while a case lasts."""
 
 from __future__ import annotations
 

@@ -205,6 +205,6 @@ def two_answers(can_id: int, index: int, subindex: int) -> Proof:
     def proof(heard: Heard) -> Seen:
         data = [heard.bytes(n) for n in heard.at(can_id)]
         answers = {each for each in data if each[:1] and each[0] & 0xE0 == 0x40 and each[1:4] == multiplexer}
-        return Seen(len(answers) > 1, f"{len(answers)} values of {index:04X}h:{subindex} told")
+        return Seen(len(answers) > 1, f"{len(answers)} values of {index:04X}h:{subindex} read")
 
     return proof

@@ -51,7 +51,7 @@ HEAD = (
     "case",
     "fault",
     "injected",
-    "seen of it",
+    "proof",
     "status 1 / 2",
     "EMCY",
     "counters",

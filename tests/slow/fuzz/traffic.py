@@ -2,7 +2,7 @@
 
 Traffic comes in episodes of one kind. In the strict ones the frames of a PDO keep their order, nobody else sends under
 its identifier, and no frame is late by whole periods to within its usual arrival: there a valid estimate from a stale
-input is an error. In the others (`LOOSE`) a frame cannot be told from the right one by anything that is on the bus; they
+input is an error. In the others (`LOOSE`) a frame cannot be distinguished from the right one; they
 are followed by calm cycles, and what was used in them is counted apart.
 """
 

@@ -74,7 +74,7 @@ def test_a_scheduler_that_goes_ends_the_batch_in_one_line(tmp_path, cluster, cap
     assert jtq(["batch", *arguments(logs, out, "--scheduler", cluster.scheduler_address)]) == 1
     leaver.join()
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("jtq batch")]
-    assert "the scheduler has gone" in line
+    assert "the scheduler has ended" in line
     assert results(out), "what was finished is kept"
 
 

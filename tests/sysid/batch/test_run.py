@@ -247,7 +247,7 @@ def test_an_interrupted_batch_says_so_and_leaves_nothing_running(tmp_path):
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=120)
     assert process.returncode == 1
-    assert errors.splitlines()[-1] == "jtq batch: interrupted; the same command goes on from here"
+    assert errors.splitlines()[-1] == "jtq batch: interrupted; the same command continues from here"
     assert "Traceback" not in errors
 
 
@@ -289,7 +289,10 @@ def test_a_task_that_takes_too_long_is_a_failed_one(tmp_path):
         (["diagnose", "logs", "--joint", "x=a.yaml"], (2, "found joint 'x', expected a number from 1 to 7")),
         (["replay", "nothere.mcap"], (1, "nothere.mcap: found no such file or directory")),
         (["diagnose", "logs", "--joint", "none.yaml"], (1, "none.yaml: cannot be read: No such file")),
-        (["replay", "logs", "--out", "logs/a.mcap"], (1, "--out logs/a.mcap: cannot be made: it is a file")),
+        (
+            ["replay", "logs", "--out", "logs/a.mcap"],
+            (1, "--out logs/a.mcap: cannot be created: it is a file"),
+        ),
         (["replay", "logs", "--model", "none"], (1, "--model none: found no such directory")),
     ],
 )

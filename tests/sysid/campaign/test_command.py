@@ -59,7 +59,7 @@ def test_a_plan_that_is_not_there_is_said_before_a_missing_option(
         (["p.yaml", "--dry-run", "--runs", "3"], ["--runs belongs to"]),
         (["p.yaml", "--dry-run", "--hold", "3"], ["--hold belongs to"]),
         (["p.yaml", "--dry-run", "--quick"], ["--quick belongs to"]),
-        (["efficiency", "--bus", "can0", "--out", "x", "--plant", "p"], ["--plant belongs to --bus sim"]),
+        (["efficiency", "--bus", "can0", "--out", "x", "--plant", "p"], ["--plant requires --bus sim"]),
     ],
 )
 def test_misuse_is_status_2_and_one_line(

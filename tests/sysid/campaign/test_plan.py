@@ -112,7 +112,7 @@ def test_every_number_of_a_plan_counts_for_its_hash() -> None:
         (lambda p: p.update(runs=[]), ["'runs'", "at least one run"]),
         (lambda p: p["limits"].update(curent_a=1.0), ["limits.curent_a", "did you mean 'current_a'"]),
         (lambda p: p["limits"].update(torque_nm=0.0), ["limits.torque_nm", "> 0"]),
-        (lambda p: p["runs"][1].update(name="one"), ["runs[1].name", "no other run"]),
+        (lambda p: p["runs"][1].update(name="one"), ["runs[1].name", "a unique name"]),
         (lambda p: p["runs"][1].update(name="../up"), ["runs[1].name", "letters"]),
         (lambda p: p["runs"][1].update(name="plan"), ["runs[1].name", "'plan'"]),
         (lambda p: p["runs"][1].update(velocity_joint=3), ["velocity_joint", "3"]),
@@ -232,8 +232,8 @@ def test_travel_is_the_largest_distance_and_directions_cancel() -> None:
         ([Plateau(0.1, -5.5, 1.0), Rest(0.5)], ["current", "5", "limit 5 A"]),
         ([Plateau(2.0, 0.0, 6.0), Rest(0.5)], ["travel", "limit 10 rad"]),
         ([Plateau(1.0, 0.0, 1.0, 0.0), Rest(0.5)], ["jump"]),
-        ([Plateau(1.0, 0.0, 1.0)], ["ends at rest"]),
-        ([Rest(0.0, 0.0)], ["no time"]),
+        ([Plateau(1.0, 0.0, 1.0)], ["end at rest"]),
+        ([Rest(0.0, 0.0)], ["no duration"]),
     ],
 )
 def test_a_run_beyond_its_limits_is_refused_before_anything_moves(

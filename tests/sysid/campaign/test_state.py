@@ -93,7 +93,7 @@ def test_another_plan_is_refused_in_one_line_and_changes_nothing(tmp_path: Path)
 
 def test_two_campaigns_at_once_in_one_directory_are_refused(tmp_path: Path) -> None:
     directory = begun(tmp_path)
-    with pytest.raises(StateError, match="another campaign is at work"):
+    with pytest.raises(StateError, match="another campaign is running"):
         begun(tmp_path)
     directory.close()
     begun(tmp_path).close()

@@ -169,14 +169,14 @@ def unexplained() -> Findings:
     return Findings(
         verdict="unexplained",
         reasons=(
-            "the best effect (stribeck_friction) takes 4 % of the gap on runs left out",
+            "the best effect (stribeck_friction) takes 4 % of the gap on held-out runs",
             "the residual is above noise in 2 of 16 bins of the link angle, block permutation p < 0.001",
         ),
         runs=_runs(4),
         joints=(1,),
         gaps=(gap(1, "motor", 0.61, 0.2, {"link_angle": {3: 0.52, 4: 0.21}, "velocity": {6: 0.2}}),),
         candidates=candidates(
-            (1,), {("stribeck_friction", 1): (38.0, 0.04, "does not hold on runs left out")}
+            (1,), {("stribeck_friction", 1): (38.0, 0.04, "does not hold on held-out runs")}
         ),
         channel_notes=("excitation_03.csv.gz: j1.temperature_c is constant (25.0): not used",),
         traces=tuple(trace(run, 1, "motor", SLIP, seed=k) for k, run in enumerate(_runs(4))),

@@ -418,7 +418,7 @@ def in_milliseconds(table: RunTable) -> RunTable:
 @pytest.mark.parametrize(
     ("change", "wanted"),
     [
-        (without_sensor, "no torque sensor channel"),
+        (without_sensor, "no valid torque sensor channel"),
         (in_millinewtonmetres, "mNm suspected"),
         (in_milliseconds, "milliseconds"),
     ],

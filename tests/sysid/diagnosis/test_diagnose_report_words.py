@@ -20,11 +20,11 @@ PLAIN_SPACE = str.maketrans("\u00a0\u202f", "  ")
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (examples.one_cause, "What the simulation gets wrong: torque ripple of joint 1."),
+        (examples.one_cause, "Cause of the simulation error: torque ripple of joint 1."),
         (
             examples.two_causes,
-            "What the simulation gets wrong: viscous friction of joint 1 and either link inertia or channel delay "
-            "(joint 1); these runs cannot tell which.",
+            "Cause of the simulation error: viscous friction of joint 1 and either link inertia or channel delay "
+            "(joint 1); these runs cannot distinguish the alternatives.",
         ),
         (
             examples.no_gap,
@@ -32,11 +32,11 @@ PLAIN_SPACE = str.maketrans("\u00a0\u202f", "  ")
         ),
         (
             examples.unexplained,
-            "The simulation is wrong, and no effect of the library explains it: joint 1 is off by 0.610 Nm where "
-            "noise leaves 0.200 Nm; 52 % of it at link angle 1.18 to 1.57 rad.",
+            "The simulation has a gap that no effect of the library explains: joint 1, residual 0.610 Nm, "
+            "noise floor 0.200 Nm; 52 % of it at link angle 1.18 to 1.57 rad.",
         ),
-        (examples.insufficient, "These runs cannot tell what the simulation gets wrong, or whether it does."),
-        (examples.sensor, "What the simulation gets wrong: sensor gain."),
+        (examples.insufficient, "These runs are not sufficient to assess the simulation."),
+        (examples.sensor, "Cause of the simulation error: sensor gain."),
     ],
 )
 def test_the_verdict_is_one_sentence(make: Callable[[], Findings], said: str) -> None:
@@ -53,7 +53,9 @@ def test_a_line_and_bursts_are_said_as_what_they_are() -> None:
     line = Place("motor_angle", "order 3.57 per motor revolution", 1.0, 3.57, 3.57, "1/rev")
     assert said(line).endswith("; 100 % of it in a line at order 3.57 per motor revolution.")
     burst = Place("time", "events: run1 3.2 s, run4 0.7 s", 0.8, 3.2, 3.3, "s")
-    assert said(burst).endswith("; 80 % of it in events that noise does not make, the strongest run1 3.2 s.")
+    assert said(burst).endswith(
+        "; 80 % of it in events that noise does not explain, the strongest run1 3.2 s."
+    )
 
 
 def test_classes_of_any_size_are_said_whole() -> None:
@@ -80,7 +82,7 @@ def test_the_same_effect_in_both_joints_is_said_once() -> None:
         replace(ripple, joint=2),
     )
     assert verdict_sentence(replace(base, causes=both)) == (
-        "What the simulation gets wrong: torque ripple of joints 1 and 2 and torque constant of joint 1."
+        "Cause of the simulation error: torque ripple of joints 1 and 2 and torque constant of joint 1."
     )
 
 
@@ -88,7 +90,7 @@ def test_the_gain_is_said_with_its_interval_which_is_in_newton_metres() -> None:
     gain = Gain(0.8, 0.2, "split", (0.56, 0.64))
     findings = replace(examples.one_cause(), gain=gain)
     assert gain_sentence(findings).translate(PLAIN_SPACE) == (
-        "With it, the error on runs left out falls from 0.800 to 0.200 Nm, by 0.600 Nm (95 % interval 0.560 to 0.640)."
+        "With it, the error on held-out runs falls from 0.800 to 0.200 Nm, by 0.600 Nm (95 % interval 0.560 to 0.640)."
     )
     (bar,) = gain_views(gain)
     assert (bar.before_width, bar.after_width) == (100.0, 25.0)

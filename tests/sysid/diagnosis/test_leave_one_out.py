@@ -1,4 +1,4 @@
-"""With fewer than four runs a name needs each run left out: strong effects are still named, the rest is left open."""
+"""With fewer than four runs a name needs each held-out run: strong effects are still named, the rest is left open."""
 
 import pytest
 
@@ -42,7 +42,7 @@ def test_a_parameter_whose_interval_holds_the_files_value_is_no_settled_cause() 
     assert [c.name for c in findings.causes] == ["viscous_friction"]
     assert findings.verdict == AMBIGUOUS
     assert findings.next_experiment is not None
-    assert "not confirmed on every run left out: viscous_friction of joint 1" in findings.reasons[-1]
+    assert "not confirmed on every held-out run: viscous_friction of joint 1" in findings.reasons[-1]
 
 
 def test_with_four_runs_nothing_of_this_applies(monkeypatch: pytest.MonkeyPatch) -> None:

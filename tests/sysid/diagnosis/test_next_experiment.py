@@ -261,7 +261,7 @@ def test_the_text_says_why_what_and_how_long_and_the_limits_follow_the_joints() 
     assert set(made) == {"why", "plan"}
     why = made["why"]
     for part in (
-        "Two classes. Proposed to distinguish current_offset from friction_asymmetry and to make hysteresis visible:",
+        "Two classes. Proposed to distinguish current_offset from friction_asymmetry and to detect hysteresis:",
         "drives switched off",
         "Record both joints",
         " runs, ",

@@ -164,7 +164,7 @@ def test_a_run_holds_every_column_where_its_effect_shows() -> None:
         ("cogging", 2, 0),
     )
     run = run_data([s], found, 5)
-    assert run.channels[MOTOR1].index.tolist() == [0, 1, 2, 3], "nothing of the joint that is not there"
+    assert run.channels[MOTOR1].index.tolist() == [0, 1, 2, 3], "nothing of the joint that is absent"
     assert run.channels[TORSION1].index.tolist() == [3]
     assert gain_columns(found) == {3}
     for c in found[:3]:

@@ -349,7 +349,7 @@ def test_the_table_says_why_each_effect_was_not_chosen() -> None:
     reasons = {row.name: row.reason for row in table}
     assert reasons == {
         "viscous_friction": "chosen",
-        "rotor_inertia": "explained by what was chosen",
+        "rotor_inertia": "explained by the chosen effects",
         "current_offset": "invisible in these runs",
         "coulomb_friction": "below threshold",
         "torque_ripple": "below threshold",

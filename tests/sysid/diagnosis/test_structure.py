@@ -193,7 +193,9 @@ def test_events_are_found_at_their_times() -> None:
     assert not events.masks[1].any()
     assert events.part == pytest.approx(sum(m.sum() for m in events.masks) / 36000.0)
     assert events.part < 0.01
-    assert bursts(runs, {MOTOR1: parts}, {MOTOR1: AR}, STEP_S, {MOTOR1: 9.0}) == {}, "too small to matter"
+    assert bursts(runs, {MOTOR1: parts}, {MOTOR1: AR}, STEP_S, {MOTOR1: 9.0}) == {}, (
+        "too small to be relevant"
+    )
 
 
 def test_an_event_is_all_of_it() -> None:

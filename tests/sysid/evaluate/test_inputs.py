@@ -196,7 +196,7 @@ def test_a_joint_that_never_moves_is_named(bench: Path, tmp_path: Path) -> None:
     assert evaluate(bench, [good, tmp_path / "still.csv"], "--out", str(tmp_path / "out")) == 3
     found = report(tmp_path / "out")["findings"]
     assert [item["kind"] for item in found] == ["nothing_to_score"] * 2, seed
-    assert "standing" in found[0]["text"]
+    assert "standstill" in found[0]["text"]
 
 
 def test_methods_without_their_files_are_left_out_and_named(

@@ -112,7 +112,7 @@ def test_one_constant_speed_cannot_split_coulomb_from_viscous_and_says_so() -> N
     load = 10.0 * np.cos(4.0 * DT_S * np.arange(3000))
     noise = 0.1 * np.sin(40.0 * DT_S * np.arange(3000))
     fit = fit_friction(*_run(Friction(5.0, 3.0), speed, load, noise), JOINT)
-    assert fit.terms[1].kept.startswith("cannot be told from coulomb_nm")
+    assert fit.terms[1].kept.startswith("cannot be distinguished from coulomb_nm")
     # What it can say is the sum at that speed: Fc = 8 - 1.
     assert fit.friction.coulomb_nm == pytest.approx(7.0, abs=0.05)
     assert len(fit.warnings) == 1

@@ -74,12 +74,12 @@ def test_known_standard_deviations_come_back() -> None:
 def test_sigma_needs_three_unseen_runs_with_motion() -> None:
     rng = np.random.default_rng(32)
     none = PathResiduals(*[np.zeros(0)] * 7)
-    with pytest.raises(ValueError, match="found 2 unseen runs with motion, expected at least 3"):
+    with pytest.raises(ValueError, match="found 2 held-out runs with motion, expected at least 3"):
         fit_sigma([residuals(rng), none, residuals(rng)])
     slow = [
         run._replace(velocity_rad_s=0.01 * run.velocity_rad_s) for run in (residuals(rng) for _ in range(3))
     ]
-    with pytest.raises(ValueError, match=r"found no unseen sample above 0\.1 rad/s"):
+    with pytest.raises(ValueError, match=r"found no held-out sample above 0\.1 rad/s"):
         fit_sigma(slow)
 
 
@@ -254,7 +254,7 @@ def test_runs_without_motion_are_left_out(runs: list[RunSignals]) -> None:
 
 def test_what_cannot_be_fitted_is_refused(runs: list[RunSignals]) -> None:
     with pytest.raises(
-        ValueError, match="found 5 runs, expected at least 6: standard deviations need unseen"
+        ValueError, match="found 5 runs, expected at least 6: standard deviations need held-out"
     ):
         fit_fused(runs[:5], FRICTION)
     with pytest.raises(ValueError, match="found no motion in negative direction"):

@@ -157,7 +157,7 @@ def test_a_unix_bus_outlives_the_run_that_was_played_on_it(tmp_path) -> None:
         assert not socket.wait(0.1)  # silent means all services
         socket.close()
         assert play.wait(10) == 0
-        assert "the run is over" in play.stderr.read()
+        assert "the run has ended" in play.stderr.read()
     finally:
         play.kill()
         play.wait()

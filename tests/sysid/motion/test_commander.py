@@ -121,8 +121,8 @@ def test_joints_that_turn_are_not_enabled(lock: LockStep) -> None:
         (0x080, "no SYNC: is jtqd running on this bus?"),
         (0x702, "joint 2: no heartbeat 702h"),
         (0x703, "sensor: no heartbeat 703h"),
-        (0x181, "joint 1: no TPDO1 or TPDO2; jtqd's boot configures them"),
-        (0x282, "joint 2: no TPDO1 or TPDO2; jtqd's boot configures them"),
+        (0x181, "joint 1: no TPDO1 or TPDO2; start jtqd, which configures them"),
+        (0x282, "joint 2: no TPDO1 or TPDO2; start jtqd, which configures them"),
         (0x183, "sensor: no torque of channel 1"),
     ],
 )
@@ -157,7 +157,7 @@ def test_temperature_must_be_heard_when_it_is_limited(lock: LockStep, content: b
 
     lock.filter = filter_
     lock.run()
-    assert motion.refusal == "joint 2: no temperature (382h), which its limit needs"
+    assert motion.refusal == "joint 2: no temperature (382h), which is required by its limit"
 
 
 def test_a_drive_that_does_not_come_on_stops_the_other(lock: LockStep) -> None:

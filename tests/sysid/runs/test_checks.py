@@ -69,9 +69,9 @@ def test_a_joint_file_that_is_wrong_by_a_half_is_the_diagnosis_matter(run: RunTa
         (times("motor_velocity_rad_s", -1.0), "swapped sign"),
         (times("link_position_rad", -1.0), "swapped sign"),
         (times(ANGLES, -1.0), "gained instead of lost"),
-        (times("torque_nm", 0.0), "no torque sensor channel"),
+        (times("torque_nm", 0.0), "no valid torque sensor channel"),
         (times("motor_velocity_rad_s", 0.0), "dead channel"),
-        (lambda c: replace(c, torque_nm=None), "no torque sensor channel"),
+        (lambda c: replace(c, torque_nm=None), "no valid torque sensor channel"),
         (lambda c: replace(c, current_a=None), "j1.current_a"),
         (lambda c: JointColumns(current_a=c.current_a, torque_nm=c.torque_nm), "no position and no velocity"),
     ],
@@ -84,7 +84,7 @@ def test_contradictions_leave_the_joint_out(run: RunTable, change: Change, said:
 
 def test_a_joint_in_the_others_frame_is_left_out(run: RunTable) -> None:
     result = checked(changed(run, times(f"{ANGLES} current_a torque_nm", -1.0), 2))
-    assert "other's frame" in result.refused[0]
+    assert "frame of the other" in result.refused[0]
     assert list(result.runs[0][1].joints) == [1]
 
 

@@ -70,7 +70,7 @@ def test_out_that_cannot_hold_files_is_one_line(run, tmp_path, capsys):
     file = tmp_path / "file"
     file.touch()
     assert train_command.main([run(), "--joint", JOINT, "--network", "ours", "--out", str(file)]) == 1
-    assert capsys.readouterr().err == f"jtq train: --out {file}: cannot be made: it is a file\n"
+    assert capsys.readouterr().err == f"jtq train: --out {file}: cannot be created: it is a file\n"
 
 
 def test_too_few_runs_are_one_line_and_leave_nothing(run, tmp_path, capsys):
