@@ -13,10 +13,10 @@ field of the PDO) is decided here again.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from math import isnan
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -25,12 +25,13 @@ import numpy.typing as npt
 from jtqd.daemon.config import SafetySettings
 from jtqd.daemon.core import estimate_pdo
 from jtqd.daemon.core.cycle import STARTING_CYCLES
-from jtqd.daemon.core.intake import Intake, JointTemperature
+from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import JointCycle
 from jtqd.daemon.core.joint_safety import JointSafety
+from jtqd.daemon.core.rows import CycleRows
 from jtqd.daemon.core.status import JointStatus, drive_status
 from jtqd.daemon.loop.input_pdos import input_pdos, joint_temperatures
-from jtqd.daemon.replay.frames import Frames, Pdo, offsets
+from jtqd.daemon.replay.frames import Frames, offsets
 from jtqd.daemon.replay.origin import SAMPLE, Origin
 from jtqd.daemon.replay.runs import Steps
 from jtqd.daemon.shared import cycle_record as cr
@@ -45,6 +46,9 @@ from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import DEGRADED, INVALID, OFF, PUBLISHED, STALE, STANDSTILL, STARTING, VALID
 
 # ---- cycle by cycle, through the loop's own code ----
+
+_TOLD = 1 << 14
+"""Cycles between two calls of `progress`."""
 
 
 @dataclass
@@ -110,43 +114,57 @@ class ExactReplay:
     ) -> Replayed:
         """Replay the cycles of one part; `joints` are its states as logged. `progress` is called with the cycles done."""
         count = len(joints[0])
-        views = self._intake.views()
-        feeds = [_feed(each) for each in frames.pdos]
-        temperatures = _Temperatures(self._origin, self._intake.temperatures, frames, joints)
-        cycles = joints[0]["cycle"].tolist()
-        counters = joints[0]["sync_counter"].tolist()
-        withdrawn = ((joints[0]["cycle_flags"] & cr.FLAG_WITHDRAWN) != 0).tolist()
-        marks = [self._marks(n, joints[n], frames, steps[n]) for n in (0, 1)]
-        wanted = [((each["input_flags"] & FLAG_NETWORK_SKIPPED) == 0).tolist() for each in joints]
-        plans = list(zip(self._joints, [each.dt_ns.tolist() for each in steps], marks, wanted, strict=True))
-        out: tuple[list[tuple[float, ...]], list[tuple[float, ...]]] = ([], [])
-        pdos = bytearray()
-        one, two = self._joints
-        times = self._time_ns
-        for row, (cycle, counter) in enumerate(zip(cycles, counters, strict=True)):
-            for view, (fresh, values) in zip(views, feeds, strict=True):
-                view.fresh = fresh[row]
-                view.values = next(values)
-            temperatures.at(row, cycle)
-            starting = cycle < STARTING_CYCLES
-            for n, (joint, dt_ns, mark, network) in enumerate(plans):
-                if row in mark:
-                    for happens in mark[row]:
-                        happens()
-                times[n] += dt_ns[row]
-                joint.observe(times[n], starting, network[row])
-                if withdrawn[row]:
-                    joint.withdraw()
-                out[n].append(joint.sample)
-            pdos += estimate_pdo.encode(one.published, two.published, counter)
-            if not row & 0x3FFF:
-                progress(row)
-        progress(count)
-        return Replayed(
-            (np.array(out[0], SAMPLE), np.array(out[1], SAMPLE)),
-            np.frombuffer(bytes(pdos), np.uint8).reshape(-1, 8),
-            temperatures.from_log,
+        celsius, happens = self._temperatures(frames, joints)
+        for n in (0, 1):
+            for row, marks in self._marks(n, joints[n], frames, steps[n]).items():
+                happens.setdefault(row, []).extend(marks)
+        times = np.array(
+            [start + np.cumsum(each.dt_ns) for start, each in zip(self._time_ns, steps, strict=True)]
         )
+        one, two = self._joints
+        rows = CycleRows(
+            self._intake,
+            one,
+            two,
+            fresh=[each.fresh for each in frames.pdos],
+            values=[each.values for each in frames.pdos],
+            celsius=celsius,
+            cycle=joints[0]["cycle"],
+            counter=joints[0]["sync_counter"],
+            sync_ns=times,
+            wanted=[(each["input_flags"] & FLAG_NETWORK_SKIPPED) == 0 for each in joints],
+            withdrawn=(joints[0]["cycle_flags"] & cr.FLAG_WITHDRAWN) != 0,
+        )
+        ends = sorted({*happens, *range(0, count, _TOLD), count})
+        for first, end in pairwise(ends):
+            for each in happens.get(first, ()):
+                each()
+            rows.go_on(first, end)
+            progress(end)
+        if count:
+            self._time_ns = times[:, -1].tolist()
+        first_joint, second_joint = (each.view(SAMPLE)[:, 0] for each in rows.samples)
+        return Replayed((first_joint, second_joint), rows.estimates, rows.temperatures_from_log)
+
+    def _temperatures(
+        self, frames: Frames, joints: Sequence[RecordArray]
+    ) -> tuple[list[FloatArray], dict[int, list[Callable[[], object]]]]:
+        """Return each joint temperature as logged [n], and the frames to take before a row.
+
+        A node that restarted is not believed until it is configured, and a frame may have found no room in its record: where
+        the log says something else than the frames do, and there is such a reason, the log is right.
+        """
+        celsius: list[FloatArray] = []
+        happens: dict[int, list[Callable[[], object]]] = {}
+        for index, (each, events) in enumerate(
+            zip(self._intake.temperatures, frames.temperatures, strict=True)
+        ):
+            number = next(n for n, inputs in enumerate(self._origin.inputs) if inputs.temperature == index)
+            known = (joints[number]["input_flags"] & FLAG_TEMPERATURE) != 0
+            celsius.append(np.where(known, joints[number]["temperature_c"], np.nan))
+            for row, frame in events:
+                happens.setdefault(row, []).append(partial(each.receive, bytearray(frame), 0))
+        return celsius, happens
 
     def _marks(
         self, number: int, records: RecordArray, frames: Frames, steps: Steps
@@ -162,54 +180,6 @@ class ExactReplay:
             found = offsets(frames.pdos[each.position], records, each, row)
             marks.setdefault(row, []).append(partial(joint.resume, *found))
         return marks
-
-
-def _feed(pdo: Pdo) -> tuple[list[bool], Iterator[tuple[int, ...]]]:
-    values = zip(*(column.tolist() for column in pdo.values), strict=True)
-    return pdo.fresh.tolist(), values
-
-
-class _Temperatures:
-    """The joints' temperatures from cycle to cycle, by their frames.
-
-    A node that restarted is not believed until it is configured, and a frame may have found no room in its record: where
-    the log says something else than the frames do, and there is such a reason, the log is right.
-    """
-
-    def __init__(
-        self,
-        origin: Origin,
-        temperatures: Sequence[JointTemperature],
-        frames: Frames,
-        joints: Sequence[RecordArray],
-    ) -> None:
-        self.from_log = 0
-        self._all = []
-        for each, events in zip(temperatures, frames.temperatures, strict=True):
-            number = next(
-                n
-                for n, inputs in enumerate(origin.inputs)
-                if inputs.temperature is not None and temperatures[inputs.temperature] is each
-            )
-            records = joints[number]
-            due: dict[int, list[bytes]] = {}
-            for row, frame in events:
-                due.setdefault(row, []).append(frame)
-            known = (records["input_flags"] & FLAG_TEMPERATURE) != 0
-            logged = np.where(known, records["temperature_c"], np.nan).tolist()
-            self._all.append((each, due, logged))
-
-    def at(self, row: int, cycle: int) -> None:
-        """Update after the inputs of this cycle."""
-        for temperature, due, logged in self._all:
-            if row in due:
-                for frame in due[row]:
-                    temperature.receive(bytearray(frame), 0)
-            temperature.at(cycle)
-            said = logged[row]
-            if temperature.celsius != said and not (isnan(said) and isnan(temperature.celsius)):
-                self.from_log += 1
-                temperature.celsius = said
 
 
 WHOLE = np.dtype(

@@ -1,0 +1,29 @@
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from jtqd.daemon.core.intake import Intake
+from jtqd.daemon.core.joint import JointCycle
+from jtqd.estimator.arrays import BoolArray, FloatArray, IntegerArray
+
+class CycleRows:
+    samples: npt.NDArray[np.uint8]
+    estimates: npt.NDArray[np.uint8]
+    temperatures_from_log: int
+    def __init__(
+        self,
+        intake: Intake,
+        one: JointCycle,
+        two: JointCycle,
+        *,
+        fresh: BoolArray | Sequence[BoolArray],
+        values: Sequence[Sequence[IntegerArray]],
+        celsius: FloatArray | Sequence[FloatArray],
+        cycle: npt.NDArray[np.integer],
+        counter: npt.NDArray[np.integer],
+        sync_ns: IntegerArray | Sequence[IntegerArray],
+        wanted: BoolArray | Sequence[BoolArray],
+        withdrawn: BoolArray,
+    ) -> None: ...
+    def go_on(self, first: int, end: int) -> None: ...

@@ -1,0 +1,115 @@
+"""Cycles of a log through the joints of the loop, without a bus: inputs of many cycles at once, for replay."""
+
+from libc.math cimport isnan
+from libc.stdint cimport int64_t, uint8_t
+from libc.string cimport memcpy
+
+import numpy as np
+
+from jtqd.daemon.core.cycle import STARTING_CYCLES
+from jtqd.daemon.core.estimate_pdo cimport encode_into
+from jtqd.daemon.core.intake cimport MOST_FIELDS, Intake, Temperature, temperature_at
+from jtqd.daemon.core.joint cimport JointCycle
+from jtqd.daemon.core.record cimport JointBlock
+from jtqd.estimator import status as st
+
+cdef int64_t FIRST_CYCLES = STARTING_CYCLES
+cdef int STALE = st.STALE
+
+
+cdef class CycleRows:
+    """Rows of a log: inputs in, records and estimate PDOs out.
+
+    Args:
+        intake, one, two: the loop's; the intake decides nothing here, it holds the inputs.
+        fresh: of each input, whether it counted [inputs, n].
+        values: of each input, its integers in the order of its mapping; one array [objects, n] per input.
+        celsius: of each joint temperature, as logged [temperatures, n]; NaN where not known.
+        cycle, counter: number of the cycle, and its SYNC counter [n].
+        sync_ns: of both joints, when its SYNC went out [2, n].
+        wanted: of both joints, whether there was time for the network [2, n].
+        withdrawn: whether the estimate was too late [n].
+
+    Attributes:
+        samples: of both joints, blocks of the cycle record [2, n, bytes].
+        estimates: estimate PDOs [n, 8].
+        temperatures_from_log: how often the frames did not tell the temperature.
+
+    Raises:
+        ValueError: arrays that do not fit together.
+    """
+
+    cdef Intake intake
+    cdef JointCycle one, two
+    cdef const uint8_t[:, ::1] fresh, wanted
+    cdef const int64_t[:, :, ::1] values
+    cdef const double[:, ::1] celsius
+    cdef const int64_t[::1] cycle, counter
+    cdef const int64_t[:, ::1] sync_ns
+    cdef const uint8_t[::1] withdrawn
+    cdef uint8_t[:, :, ::1] to_samples
+    cdef uint8_t[:, ::1] to_estimates
+    cdef readonly object samples, estimates
+    cdef readonly int64_t temperatures_from_log
+
+    def __init__(
+        self, Intake intake, JointCycle one, JointCycle two, *, fresh, values, celsius, cycle, counter, sync_ns, wanted, withdrawn
+    ):
+        n = len(cycle)
+        laid = np.zeros((intake.count, MOST_FIELDS, n), np.int64)
+        for index, columns in enumerate(values):
+            laid[index, : len(columns)] = columns
+        self.intake, self.one, self.two = intake, one, two
+        self.fresh = _checked(fresh, np.uint8, (intake.count, n))
+        self.values = laid
+        self.celsius = _checked(celsius, np.float64, (intake.temperature_count, n))
+        self.cycle, self.counter = _checked(cycle, np.int64, (n,)), _checked(counter, np.int64, (n,))
+        self.sync_ns = _checked(sync_ns, np.int64, (2, n))
+        self.wanted, self.withdrawn = _checked(wanted, np.uint8, (2, n)), _checked(withdrawn, np.uint8, (n,))
+        self.samples, self.estimates = np.zeros((2, n, sizeof(JointBlock)), np.uint8), np.zeros((n, 8), np.uint8)
+        self.to_samples, self.to_estimates = self.samples, self.estimates
+
+    def go_on(self, Py_ssize_t first, Py_ssize_t end):
+        """Estimate rows first to end - 1; rows come in order."""
+        cdef Py_ssize_t row
+        if not 0 <= first <= end <= self.cycle.shape[0]:
+            raise ValueError(f"found rows {first} to {end}, there are {self.cycle.shape[0]}")
+        with nogil:
+            for row in range(first, end):
+                self.take(row)
+                self.observe(self.one, 0, row)
+                self.observe(self.two, 1, row)
+                encode_into(
+                    &self.to_estimates[row, 0], &self.one.now.published, &self.two.now.published, self.counter[row]
+                )
+
+    cdef void take(self, Py_ssize_t row) noexcept nogil:
+        """Put the inputs of a row in place; where the frames tell another temperature than the log, the log is right."""
+        cdef Temperature *temperature
+        cdef double said
+        cdef int n, m
+        for n in range(self.intake.count):
+            self.intake.inputs[n].fresh = self.fresh[n, row]
+            for m in range(MOST_FIELDS):
+                self.intake.inputs[n].values[m] = self.values[n, m, row]
+        for n in range(self.intake.temperature_count):
+            temperature, said = self.intake.celsius[n], self.celsius[n, row]
+            temperature_at(temperature, self.cycle[row])
+            if temperature.celsius != said and not (isnan(said) and isnan(temperature.celsius)):
+                self.temperatures_from_log += 1
+                temperature.celsius = said
+
+    cdef void observe(self, JointCycle joint, int number, Py_ssize_t row) noexcept nogil:
+        """Estimate one joint in a row and keep its block."""
+        joint.observe_at(self.sync_ns[number, row], self.cycle[row] < FIRST_CYCLES, self.wanted[number, row])
+        if self.withdrawn[row]:
+            joint.take_back(STALE)
+        memcpy(&self.to_samples[number, row, 0], &joint.now.sample, sizeof(JointBlock))
+
+
+def _checked(values, kind, shape):
+    """Return an array of this type and shape; ValueError for another shape."""
+    array = np.ascontiguousarray(values, kind).reshape(shape if np.size(values) == 0 else np.shape(values))
+    if array.shape != shape:
+        raise ValueError(f"found an array of shape {array.shape}, expected {shape}")
+    return array
