@@ -13,7 +13,7 @@ from jtqd.daemon.core.schedule cimport Grid, NetworkBudget, WakeUp
 
 cdef struct CycleState:
     int64_t index, heartbeat_due
-    int64_t sync_ns, sync_realtime_ns, realtime_offset_ns, work_start_ns, late_ns
+    int64_t sync_ns, sync_realtime_ns, realtime_offset_ns, work_start_ns, late_ns, sent_ns
     int64_t stale_before, late_before, duplicate_before, rejected_before  # counts of the intake when it began
     int counter
     uint32_t flags, next_flags
@@ -35,6 +35,12 @@ cdef class Cycle:
     cdef int64_t heartbeat_cycles
     cdef Frame estimate_frame, heartbeat_frame
     cdef CycleState now
+    cpdef int begin(self) except -1
+    cpdef int gather(self) except -1
+    cpdef int observe(self) except -1
+    cpdef int publish(self) except -1
+    cpdef int record(self) except -1
+    cpdef bint hold_back(self) except -1
     cdef void hold(self, const Frame *frame, int64_t stamp_ns) noexcept nogil
     cdef int write_snapshot(self) except -1
     cdef bint send_estimate(self) except -1

@@ -1,4 +1,4 @@
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from jtqd.daemon.core.clock import Clock
@@ -15,6 +15,9 @@ from jtqd.drivers.frame_socket import FrameSocket
 from jtqd.estimator.methods import AnyEstimator
 
 STARTING_CYCLES: Final = 20
+CYCLE_ENDED: Final = 0
+SLOT_PASSED: Final = 1
+RUN_ENDED: Final = 2
 clock: Clock
 
 class Cycle:
@@ -70,6 +73,9 @@ class Cycle:
     def sync_ns(self) -> int: ...
     @property
     def complete(self) -> bool: ...
+    @property
+    def sent_ns(self) -> int: ...
+    def go_on(self, slots: int, end_ns: int, after_sync: Callable[[], None] | None = None) -> int: ...
     def begin(self) -> None: ...
     def gather(self) -> None: ...
     def observe(self) -> None: ...

@@ -6,7 +6,8 @@
     publish  send the estimate PDO, and every n-th cycle the heartbeat
     record   hand the cycle to the ring, and every n-th cycle the snapshot
 
-No stage raises because of what is on the bus; a bus that is down is a counter and a stale estimate.
+`go_on` goes from slot to slot without the interpreter. No stage raises because of what is on the bus; a bus that is down is a
+counter and a stale estimate.
 """
 
 from libc.stdint cimport int64_t, uint8_t, uint32_t
@@ -36,11 +37,18 @@ STARTING_CYCLES: Final = 20
 _SNAPSHOT_EVERY: Final = 8
 _CLOCK_READING_NS: Final = 20_000
 """Both clocks are read within this, or their difference is not taken."""
+CYCLE_ENDED: Final = 0
+"""`Cycle.go_on`: the last slot's cycle has ended, and the grid stands at that slot."""
+SLOT_PASSED: Final = 1
+"""... the last slot passed without a cycle, and the grid stands at the next one."""
+RUN_ENDED: Final = 2
+"""... no cycle begins any more."""
 _LAST_CALL_NS: Final = 100_000
 """Before the next SYNC; nobody waits for inputs from here on."""
 
 cdef int64_t FIRST_CYCLES = STARTING_CYCLES, SNAPSHOT_EVERY = _SNAPSHOT_EVERY
 cdef int64_t CLOCK_READING_NS = _CLOCK_READING_NS, LAST_CALL_NS = _LAST_CALL_NS
+cdef int ENDED = CYCLE_ENDED, PASSED = SLOT_PASSED, OVER = RUN_ENDED
 cdef uint32_t COMPLETE = cr.FLAG_COMPLETE, PUBLISHED = cr.FLAG_PUBLISHED, WITHDRAWN = cr.FLAG_WITHDRAWN
 cdef uint32_t BEFORE_NEXT_SYNC = cr.FLAG_BEFORE_NEXT_SYNC, SYNC_CONFIRMED = cr.FLAG_SYNC_CONFIRMED
 cdef uint32_t RESET = cr.FLAG_RESET
@@ -83,6 +91,7 @@ cdef class Cycle:
         sync_ns: when its SYNC was sent, CLOCK_MONOTONIC.
         work_start_ns: when it woke up for its inputs.
         late_ns: by how much its SYNC was late.
+        sent_ns: when its estimate had been handed to the socket.
     """
 
     carried = (
@@ -176,7 +185,45 @@ cdef class Cycle:
     def work_start_ns(self, int64_t work_start_ns):
         self.now.work_start_ns = work_start_ns
 
-    def begin(self):
+    @property
+    def sent_ns(self):
+        return self.now.sent_ns
+
+    def go_on(self, int slots, int64_t end_ns, after_sync=None):
+        """Go through up to `slots` > 0 slots, from that of the grid on; return CYCLE_ENDED, SLOT_PASSED or RUN_ENDED.
+
+        A slot that cannot be begun in time is missed, one that the intake asks for passes without SYNC. No cycle begins from
+        end_ns on (CLOCK_MONOTONIC; 0: without end). after_sync: called when a SYNC has been sent and nobody waits yet.
+        """
+        cdef int outcome = PASSED
+        cdef int64_t at_ns
+        while slots:
+            slots -= 1
+            if outcome == ENDED:
+                self.now.index += self.grid.advance(self.clock.monotonic())
+            if self.clock.monotonic() < self.grid.now.slot_ns:
+                self.clock.sleep_until(self.grid.now.slot_ns)
+            at_ns = self.clock.monotonic()
+            outcome = PASSED
+            if self.grid.too_late(at_ns):
+                self.now.index += self.grid.advance(at_ns) + 1
+                self.grid.now.missed += 1
+            elif end_ns and self.grid.now.slot_ns >= end_ns:
+                return OVER
+            elif self.hold_back():
+                self.grid.advance(at_ns)
+            else:
+                self.begin()
+                if after_sync is not None:
+                    after_sync()
+                self.gather()
+                self.observe()
+                self.publish()
+                self.record()
+                outcome = ENDED
+        return outcome
+
+    cpdef int begin(self) except -1:
         """Drain the frames received after the last cycle was closed, then send SYNC."""
         cdef CycleState *now = &self.now
         cdef Intake intake = self.intake
@@ -206,7 +253,7 @@ cdef class Cycle:
         now.sync_ns = at_ns
         now.late_ns = at_ns - self.grid.now.slot_ns
 
-    def gather(self):
+    cpdef int gather(self) except -1:
         """Take the inputs: one wake-up for all that have come, then wait for the missing ones until the deadline."""
         cdef CycleState *now = &self.now
         cdef Intake intake = self.intake
@@ -240,7 +287,7 @@ cdef class Cycle:
         else:
             now.sync_realtime_ns = now.sync_ns + now.realtime_offset_ns
 
-    def observe(self):
+    cpdef int observe(self) except -1:
         """Estimate both joints from the inputs of this cycle; without their networks if there is no time for them."""
         cdef int64_t sync_ns = self.now.sync_realtime_ns - self.now.realtime_offset_ns
         cdef bint starting = self.now.index < FIRST_CYCLES
@@ -249,7 +296,7 @@ cdef class Cycle:
         wanted = self.budget.second(self.clock.monotonic())
         self.two.observe_at(sync_ns, starting, wanted)
 
-    def publish(self):
+    cpdef int publish(self) except -1:
         """Send the estimate PDO, and the heartbeat when it is due. A late estimate is withdrawn."""
         cdef CycleState *now = &self.now
         cdef int64_t at_ns = self.clock.monotonic()
@@ -263,12 +310,13 @@ cdef class Cycle:
             now.flags |= PUBLISHED
             if self.clock.monotonic() < self.grid.end_ns():
                 now.flags |= BEFORE_NEXT_SYNC
-        self.frames.keep_one(&self.estimate_frame, self.clock.monotonic() + now.realtime_offset_ns)
+        now.sent_ns = self.clock.monotonic()
+        self.frames.keep_one(&self.estimate_frame, now.sent_ns + now.realtime_offset_ns)
         if now.index >= now.heartbeat_due:
             now.heartbeat_due = now.index + self.heartbeat_cycles
             self.send(&self.heartbeat_frame)
 
-    def record(self):
+    cpdef int record(self) except -1:
         """Write the cycle to the ring, update counters and, every n-th cycle, the snapshot."""
         cdef CycleState *now = &self.now
         cdef Intake intake = self.intake
@@ -300,7 +348,7 @@ cdef class Cycle:
             self.write_snapshot()
         now.index += 1
 
-    def hold_back(self):
+    cpdef bint hold_back(self) except -1:
         """Return whether this slot must pass without SYNC, to distinguish late frames from lost ones (see intake)."""
         cdef Intake intake = self.intake
         cdef int count, n

@@ -23,7 +23,7 @@ from typing import Any
 
 from jtqd.daemon.config import Config, JointConfig, load_config
 from jtqd.daemon.core.counters import frame_counts
-from jtqd.daemon.core.cycle import Cycle
+from jtqd.daemon.core.cycle import RUN_ENDED, SLOT_PASSED, Cycle
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint_safety import safety_of
 from jtqd.daemon.core.schedule import Grid
@@ -42,15 +42,15 @@ from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.methods import AnyEstimator, load_network, make_estimator
 from jtqd.estimator.onnx_graph import NetworkError
 
-_ORDERS_EVERY = 16
-"""Cycles between two looks at the orders."""
+_SLOTS = 8
+"""Slots that pass without the interpreter: so late at most are signals, orders and the watchdog."""
 
 
 class Duties:
     """Duties in the pause after a cycle: the watchdog, orders of the supervisor, a hand-over.
 
-    Call it once after each cycle; True: the bus belongs to the successor, leave it silently. Costs one call per cycle and,
-    every n-th cycle, one datagram and one look at shared memory (docs/deployment.md).
+    Call it in the pause after every `slots()` cycles; True: the bus belongs to the successor, leave it silently. Costs one
+    look at shared memory and now and then a datagram (docs/deployment.md).
 
     Args:
         cycle: the loop's.
@@ -63,23 +63,25 @@ class Duties:
         self, cycle: Cycle, watchdog: LoopWatchdog, giver: Giver, report: Callable[[str], None]
     ) -> None:
         self._cycle, self._orders = cycle, cycle.snapshot.orders
-        self._advanced = watchdog.advanced
+        self._advanced, self._index = watchdog.advanced, cycle.index
         self._giver, self._report = giver, report
-        self._left = _ORDERS_EVERY
         self._wanted = self._giving = False
         signal.signal(signal.SIGUSR2, self._on_signal)
 
+    def slots(self) -> int:
+        """How many slots may pass before the next call: a hand-over needs each pause."""
+        return 1 if self._wanted or self._giving else _SLOTS
+
     def __call__(self) -> bool:
-        """Run the duties after a cycle."""
-        self._advanced()
-        self._left -= 1
-        if self._left == 0:
-            self._left = _ORDERS_EVERY
-            orders = self._orders
-            if orders[0] != orders[1]:
-                self._reset()
-            if orders[2] != orders[3]:
-                self._doubt()
+        """Run the duties after some cycles."""
+        index = self._cycle.index
+        self._advanced(index - self._index)
+        self._index = index
+        orders = self._orders
+        if orders[0] != orders[1]:
+            self._reset()
+        if orders[2] != orders[3]:
+            self._doubt()
         if self._wanted:
             self._wanted, self._giving = False, True
             self._giver.begin()
@@ -192,45 +194,31 @@ def run(
     *,
     after: Callable[[], bool] | None = None,
     after_sync: Callable[[], None] | None = None,
+    slots: Callable[[], int] = lambda: 1,
 ) -> bool:
-    """Cycle until `stop()`, `end_ns` (CLOCK_MONOTONIC) or until `after()`, called in the pause after each cycle, is true.
+    """Cycle until `stop()`, `end_ns` (CLOCK_MONOTONIC) or until `after()`, called in the pause after a cycle, is true.
 
     Args:
         cycle, grid: state of the loop; the first cycle is that of the grid's slot.
-        stop: asked before each cycle.
+        stop: asked before a cycle.
         end_ns: no cycle begins from here on; None: without end.
         after: see `jtqd.daemon.loop.process`.
         after_sync: called once, when the first SYNC has been sent and nobody waits for anything yet.
+        slots: how many slots may pass before `stop` and `after` are asked again.
 
     Returns:
         True when `after` ended it: the bus belongs to somebody else.
     """
-    monotonic_ns, sleep = time.monotonic_ns, time.sleep
     while not stop():
-        pause = grid.slot_ns - monotonic_ns()
-        if pause > 0:
-            sleep(pause * 1e-9)
-        now = monotonic_ns()
-        if grid.too_late(now):
-            cycle.skip(grid.advance(now) + 1)
-            grid.missed += 1
-            continue
-        if end_ns is not None and grid.slot_ns >= end_ns:
+        outcome = cycle.go_on(1 if after_sync else slots(), end_ns or 0, after_sync)
+        if outcome == RUN_ENDED:
             break
-        if cycle.hold_back():
-            grid.advance(now)
+        if outcome == SLOT_PASSED:
             continue
-        cycle.begin()
-        if after_sync is not None:
-            after_sync()
-            after_sync = None
-        cycle.gather()
-        cycle.observe()
-        cycle.publish()
-        cycle.record()
+        after_sync = None
         if after is not None and after():
             return True
-        cycle.skip(grid.advance(monotonic_ns()))
+        cycle.skip(grid.advance(time.monotonic_ns()))
     return False
 
 
@@ -303,7 +291,10 @@ def serve(request: dict[str, Any]) -> int:
     grid.slot_ns = time.monotonic_ns() + 2 * config.period_ns
     duration_s = request.get("duration_s")
     giver.end_ns = None if duration_s is None else grid.slot_ns + round(duration_s * 1e9)
-    return finish(cycle, lambda: run(cycle, grid, lambda: stop.requested, giver.end_ns, after=duties))
+    return finish(
+        cycle,
+        lambda: run(cycle, grid, lambda: stop.requested, giver.end_ns, after=duties, slots=duties.slots),
+    )
 
 
 def make_duties(cycle: Cycle, request: dict[str, Any]) -> tuple[Duties, Giver]:

@@ -197,7 +197,15 @@ def _succeed(request: dict[str, Any]) -> int:
 
     return finish(
         cycle,
-        lambda: run(cycle, grid, lambda: stop.requested, giver.end_ns, after=duties, after_sync=catch_up),
+        lambda: run(
+            cycle,
+            grid,
+            lambda: stop.requested,
+            giver.end_ns,
+            after=duties,
+            after_sync=catch_up,
+            slots=duties.slots,
+        ),
     )
 
 

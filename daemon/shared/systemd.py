@@ -58,7 +58,7 @@ class Notifier:
 
 
 class LoopWatchdog:
-    """Feeds systemd's watchdog from the loop: call `advanced` once per cycle; every n-th call sends one datagram.
+    """Feeds systemd's watchdog from the loop: call `advanced` after some cycles; every n-th cycle sends one datagram.
 
     Args:
         notifier: where to.
@@ -73,12 +73,12 @@ class LoopWatchdog:
         """Cycles between two datagrams; 0: never."""
         self._left = self.every
 
-    def advanced(self) -> None:
-        """Count a completed cycle."""
-        if self._left == 0:
+    def advanced(self, cycles: int = 1) -> None:
+        """Count completed cycles."""
+        if self.every == 0:
             return
-        self._left -= 1
-        if self._left == 0:
+        self._left -= cycles
+        if self._left <= 0:
             self._left = self.every
             self._notifier.send("WATCHDOG=1")
 

@@ -7,7 +7,7 @@ import time
 from typing import Any
 
 from jtqd.daemon.config import Config, load_config
-from jtqd.daemon.core.cycle import Cycle
+from jtqd.daemon.core.cycle import CYCLE_ENDED, Cycle
 from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.loop import process as loop
 from jtqd.daemon.loop import realtime
@@ -66,7 +66,7 @@ def loop_start(grid: Grid) -> None:
 
 
 class Measured:
-    """A cycle beside which the clocks are read after `publish` and `record`."""
+    """A cycle beside which the clocks are read after each slot."""
 
     def __init__(self, cycle: Cycle, meter: CycleMeter) -> None:
         self.cycle, self._meter = cycle, meter
@@ -74,20 +74,18 @@ class Measured:
     def __getattr__(self, name: str) -> Any:
         return getattr(self.cycle, name)
 
-    def publish(self) -> None:
-        """Read the clock after it."""
+    def go_on(self, slots: int, end_ns: int, after_sync: None = None) -> int:
+        """Go through one slot, whatever is asked for."""
         cycle, meter = self.cycle, self._meter
-        cycle.publish()
-        meter.sent(cycle.sync_ns)
-        one, two = cycle.joints
-        if cycle.flags & FLAG_PUBLISHED and one.status in PUBLISHED and two.status in PUBLISHED:
-            meter.published += 1
-
-    def record(self) -> None:
-        """Read the clock after it."""
-        self.cycle.record()
-        self._meter.late_ns.append(self.cycle.late_ns)
-        self._meter.cycle_done()
+        outcome = cycle.go_on(1, end_ns)
+        if outcome == CYCLE_ENDED:
+            meter.answer_ns.append(cycle.sent_ns - cycle.sync_ns)
+            one, two = cycle.joints
+            if cycle.flags & FLAG_PUBLISHED and one.status in PUBLISHED and two.status in PUBLISHED:
+                meter.published += 1
+            meter.late_ns.append(cycle.late_ns)
+            meter.cycle_done()
+        return outcome
 
 
 def _never() -> bool:

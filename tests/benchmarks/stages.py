@@ -11,10 +11,10 @@ import time
 from typing import Any
 
 from jtqd.daemon.core.cycle import Cycle
-from jtqd.daemon.loop import process as loop
+from jtqd.daemon.core.schedule import Grid
 from tests.benchmarks.contender import serve
-from tests.benchmarks.contender_jtqd import JtqdLoop, Measured, _never, loop_start
-from tests.benchmarks.measure import SETTLE_CYCLES, CycleMeter, quantile
+from tests.benchmarks.contender_jtqd import JtqdLoop, loop_start
+from tests.benchmarks.measure import SETTLE_CYCLES, quantile
 
 STAGES = {
     "begin": "what came late, SYNC",
@@ -26,43 +26,31 @@ STAGES = {
 }
 
 
-class Staged(Measured):
-    """A cycle whose stages are timed."""
+class Staged:
+    """A cycle whose stages are timed one by one."""
 
-    def __init__(self, cycle: Cycle, meter: CycleMeter) -> None:
-        super().__init__(cycle, meter)
+    def __init__(self, cycle: Cycle, grid: Grid) -> None:
+        self.cycle, self.grid = cycle, grid
         self.cycles: list[dict[str, int]] = []
-        self._now = dict.fromkeys(STAGES, 0)
 
-    def _timed(self, stage: str) -> None:
+    def run(self, end_ns: int) -> None:
+        """Go from slot to slot until end_ns (CLOCK_MONOTONIC); slots that come too late are skipped."""
+        cycle, grid = self.cycle, self.grid
+        while grid.slot_ns < end_ns:
+            time.sleep(max(0, grid.slot_ns - time.monotonic_ns()) * 1e-9)
+            if not (grid.too_late(time.monotonic_ns()) or cycle.hold_back()):
+                self.cycles.append({stage: self._timed(stage) for stage in STAGES if stage != "sleep"})
+                asleep = max(0, cycle.work_start_ns - self._gather_ns)
+                self.cycles[-1]["gather"] -= asleep
+                self.cycles[-1]["sleep"] = asleep
+            cycle.skip(grid.advance(time.monotonic_ns()))
+
+    def _timed(self, stage: str) -> int:
         began = time.monotonic_ns()
-        getattr(self.cycle, stage)()
-        self._now[stage] = time.monotonic_ns() - began
         if stage == "gather":
-            asleep = max(0, self.cycle.work_start_ns - began)
-            self._now["sleep"], self._now[stage] = asleep, self._now[stage] - asleep
-
-    def begin(self) -> None:
-        """Timed."""
-        self._timed("begin")
-
-    def gather(self) -> None:
-        """Timed, without the time asleep."""
-        self._timed("gather")
-
-    def observe(self) -> None:
-        """Timed."""
-        self._timed("observe")
-
-    def publish(self) -> None:
-        """Timed."""
-        self._timed("publish")
-
-    def record(self) -> None:
-        """Timed; the cycle's times are kept."""
-        self._timed("record")
-        self.cycles.append(self._now)
-        self._now = dict.fromkeys(STAGES, 0)
+            self._gather_ns = began
+        getattr(self.cycle, stage)()
+        return time.monotonic_ns() - began
 
 
 class StagedLoop(JtqdLoop):
@@ -72,9 +60,9 @@ class StagedLoop(JtqdLoop):
         """One plain round for the whole, one with timers for the parts."""
         plain = super().run(cycles)
         cycle, grid, socket = self.connect()
-        staged = Staged(cycle, CycleMeter())
+        staged = Staged(cycle, grid)
         loop_start(grid)
-        loop.run(staged, grid, _never, grid.slot_ns + cycles * grid.period_ns)  # type: ignore[arg-type]
+        staged.run(grid.slot_ns + cycles * grid.period_ns)
         socket.close()
         kept = staged.cycles[SETTLE_CYCLES:]
         parts = {

@@ -165,7 +165,7 @@ def test_a_node_in_doubt_is_not_used_until_it_is_configured_again(loop: Loop) ->
 class Fed:
     """A watchdog that is content."""
 
-    def advanced(self) -> None:
+    def advanced(self, cycles: int) -> None:
         pass
 
 
