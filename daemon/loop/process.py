@@ -73,7 +73,7 @@ class Duties:
         return 1 if self._wanted or self._giving else _SLOTS
 
     def __call__(self) -> bool:
-        """Some cycles have ended."""
+        """Run the duties after some cycles."""
         index = self._cycle.index
         self._advanced(index - self._index)
         self._index = index

@@ -74,7 +74,7 @@ class LoopWatchdog:
         self._left = self.every
 
     def advanced(self, cycles: int = 1) -> None:
-        """So many more cycles have ended."""
+        """Count completed cycles."""
         if self.every == 0:
             return
         self._left -= cycles
