@@ -28,11 +28,11 @@ from jtqd.daemon.core.cycle import STARTING_CYCLES
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import JointCycle
 from jtqd.daemon.core.joint_safety import JointSafety
-from jtqd.daemon.core.rows import CycleRows
 from jtqd.daemon.core.status import JointStatus, drive_status
 from jtqd.daemon.loop.input_pdos import input_pdos, joint_temperatures
 from jtqd.daemon.replay.frames import Frames, offsets
 from jtqd.daemon.replay.origin import SAMPLE, Origin
+from jtqd.daemon.replay.rows import CycleRows
 from jtqd.daemon.replay.runs import Steps
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared import faults
