@@ -93,10 +93,10 @@ $(VENV)/.installed: pyproject.toml setup.py $(COMPILED) $(VENV)/.created
 
 $(VENV)/.installed-dev: pyproject.toml $(VENV)/.installed
 	@echo "installing the development tools"
-	@$(PIP) install -e '.[dev]'
+	@$(BIN)/python .ci/extras dev > $(VENV)/dev.txt && $(PIP) install -r $(VENV)/dev.txt
 	@touch $@
 
 $(VENV)/.installed-test: pyproject.toml $(VENV)/.installed-dev
 	@echo "installing torch for training"
-	@$(PIP) install -e '.[dev,train]'
+	@$(BIN)/python .ci/extras train > $(VENV)/train.txt && $(PIP) install -r $(VENV)/train.txt
 	@touch $@
