@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-here test-hidden test-guest test-native test-all bench bench-kernel fuzz soak soak-exact lint format clean
+.PHONY: help setup demo test test-here test-hidden test-guest test-native test-sanitized test-all bench bench-kernel fuzz soak soak-exact lint format clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
@@ -45,6 +45,10 @@ test-native:
 test-all: lint ## everything
 	$(BIN)/python -m jtqd.sim_can.bench_kernel build --unless-vcan
 	$(BIN)/python -m pytest
+	$(MAKE) --no-print-directory test-sanitized
+
+test-sanitized: $(VENV)/.installed-test ## compiled code with bounds checks, AddressSanitizer and UBSan, a million frames
+	$(BIN)/python -m tests.slow.sanitized
 
 lint: $(VENV)/.installed-test ## ruff and mypy
 	$(BIN)/ruff format --check .
