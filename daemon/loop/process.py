@@ -209,11 +209,13 @@ def run(
     Returns:
         True when `after` ended it: the bus belongs to somebody else.
     """
+    passed = False
     while not stop():
-        outcome = cycle.go_on(1 if after_sync else slots(), end_ns or 0, after_sync)
+        outcome = cycle.go_on(1 if after_sync or passed else slots(), end_ns or 0, after_sync)
         if outcome == RUN_ENDED:
             break
-        if outcome == SLOT_PASSED:
+        passed = outcome == SLOT_PASSED  # then `after` waits for the very next cycle
+        if passed:
             continue
         after_sync = None
         if after is not None and after():
