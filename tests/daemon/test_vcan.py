@@ -199,7 +199,7 @@ def test_a_recorder_that_dies_or_stalls_costs_the_loop_nothing(
     assert recording["written"] + recording["lost"] == recording["cycles"] == summary["cycles"]
     if harm == signal.SIGKILL:
         assert daemon.returncode == 0, err
-        assert "started again" in err
+        assert "restarted, the loop continues" in err
         assert recording["lost"] == 0
         assert recording["left"] == [], "what the first one left was repaired"
         assert "repaired" in err

@@ -70,7 +70,7 @@ def test_the_load_dependent_loss_of_joint_2_is_shown_and_not_named(measured: dic
     assert not two.causes
     assert "load_dependent_friction of joint 2" in two.reasons[0]
     assert two.next_experiment is not None
-    assert "load_dependent_friction visible" in two.next_experiment["why"]
+    assert "to detect load_dependent_friction" in two.next_experiment["why"]
 
 
 def test_what_one_encoder_and_one_joint_cannot_tell_apart_is_one_class(measured: dict[int, Findings]) -> None:

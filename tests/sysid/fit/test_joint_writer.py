@@ -145,7 +145,7 @@ def test_the_old_file_stays_when_writing_fails(tmp_path: Path, monkeypatch: pyte
         return replace(joint1(), gear_ratio=50.0)
 
     monkeypatch.setattr(joint_writer, "load_joint", other)
-    with pytest.raises(ConfigError, match="does not read back as the joint joint1"):
+    with pytest.raises(ConfigError, match="reads back differently from the joint joint1"):
         write_joint(path, joint1(), "t")
     assert path.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["j.yaml"]
