@@ -315,7 +315,7 @@ def finish(cycle: Cycle, go: Callable[[], bool]) -> int:
             return 0
         cycle.leave()
     except BusGone as gone:
-        error = f"bus lost: {gone}"
+        error = str(gone)
     answer(done=True, error=error, counters=frame_counts(cycle.intake))
     return 1 if error else 0
 

@@ -64,7 +64,7 @@ def test_the_picture_shows_everything_and_fits(tmp_path: Path, width: int) -> No
             "3 of 8003 cycles, an input missing in 10",
             "84.8 % by configuration",
         ),
-        *("operational", "silent, was operational", "no heartbeat yet"),
+        *("operational", "silent, last operational", "no heartbeat yet"),
         *("7990 cycles written, 10 lost, 1.5 MB in this file", "free of"),
         "stale inputs 12",
         "node 2: no heartbeat for 0.5 s",

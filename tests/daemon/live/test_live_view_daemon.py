@@ -103,7 +103,10 @@ def test_a_port_in_use_is_said_once_and_that_is_all(tmp_path, capfd):
 def test_an_address_that_others_reach_is_said(tmp_path, capfd, monkeypatch):
     monkeypatch.setattr(LiveKeeper, "_run", lambda self: None)
     LiveKeeper(lambda *_: None, Address("0.0.0.0")).start(load_config(None), tmp_path, "can0")
-    assert "open to everyone who can reach 0.0.0.0; it is read-only" in capfd.readouterr().err
+    assert (
+        "accepts connections from every host that can reach 0.0.0.0; it is read-only"
+        in capfd.readouterr().err
+    )
 
 
 def test_without_the_package_the_daemon_refuses_in_one_line(monkeypatch, capsys):

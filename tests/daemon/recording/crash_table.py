@@ -274,7 +274,7 @@ def _removed(directory: Path, case: str, harm: Callable[[Bench], None]) -> Row:
     harm(bench)
     bench.run(1.2)
     bench.end()
-    told = re.search(r"(\d+) cycles are lost", " ".join(bench.said))
+    told = re.search(r"cycles lost with it: (\d+)", " ".join(bench.said))
     assert told, bench.said
     return bench.result(case, int(told[1]))
 
