@@ -143,7 +143,7 @@ def _identity(raw: object, where: str) -> Identity:
 
 
 def _given(raw: object, where: str) -> dict[Key, int]:
-    """Values by object: {"6091h:1": 100}."""
+    """Return values by object: {"6091h:1": 100}."""
     try:
         return {parse_key(key): value for key, value in _integers(raw, where).items()}
     except RequestError:
@@ -161,7 +161,7 @@ def _unit_words(node: Mapping[str, Any], where: str) -> dict[int, float]:
 
 
 def _mapping(raw: object, where: str, known: set[str] | None) -> Mapping[str, Any]:
-    """A mapping with keys of `known` only; None: any."""
+    """Return a mapping with keys of `known` only; None: any."""
     if not isinstance(raw, dict):
         raise RequestError(f"{where}: found {raw!r}, expected a mapping")
     unknown = sorted(set(raw) - known) if known is not None else []
@@ -192,7 +192,7 @@ def _optional_integer(mapping: Mapping[str, Any], key: str, low: int, high: int)
 
 
 def _integers(raw: object, where: str, known: set[str] | None = None) -> dict[str, int]:
-    """A mapping of 32-bit numbers; null entries are left out."""
+    """Return a mapping of 32-bit numbers; null entries are left out."""
     mapping = _mapping({} if raw is None else raw, where, known)
     kept = {key: value for key, value in mapping.items() if value is not None}
     return {key: _integer(kept, key, 0, 0xFFFF_FFFF, None, where=where) for key in kept}

@@ -102,11 +102,11 @@ class Section:
         return default
 
     def has(self, key: str) -> bool:
-        """Whether the key is present (does not count as reading it)."""
+        """Return whether the key is present (does not count as reading it)."""
         return key in self._mapping
 
     def names(self) -> tuple[str, ...]:
-        """All keys that are present, in file order."""
+        """Return all keys that are present, in file order."""
         return tuple(self._mapping)
 
     def raw(self, key: str, default: Any = REQUIRED, expected: str = "a value") -> Any:
@@ -237,7 +237,7 @@ def _bound(value: float) -> str:
 
 
 def seconds(text: str) -> float:
-    """A time in seconds, > 0 and below 1e9 (30 years). Raises argparse.ArgumentTypeError."""
+    """Return a time in seconds, > 0 and below 1e9 (30 years). Raises argparse.ArgumentTypeError."""
     try:
         value = float(text)
     except ValueError:
@@ -250,12 +250,12 @@ def seconds(text: str) -> float:
 
 
 def count(text: str) -> int:
-    """A whole number >= 1. Raises argparse.ArgumentTypeError."""
+    """Return a whole number >= 1. Raises argparse.ArgumentTypeError."""
     return _whole(text, 1)
 
 
 def natural(text: str) -> int:
-    """A whole number >= 0. Raises argparse.ArgumentTypeError."""
+    """Return a whole number >= 0. Raises argparse.ArgumentTypeError."""
     return _whole(text, 0)
 
 

@@ -179,7 +179,7 @@ class _Field:
         raise section.error(key, found, expected)
 
     def holds(self, value: Any) -> bool:
-        """Whether a number or choice keeps the annotation."""
+        """Return whether a number or choice keeps the annotation."""
         node = self.node
         if value is None:
             return self.nullable

@@ -367,7 +367,7 @@ class CanopenNode:
         self._heartbeat_due_ns = t_ns + self._heartbeat_ns if self._heartbeat_ns else NEVER_NS
 
     def _on_heartbeat(self, node: int, data: bytes, t_ns: int) -> list[bytes]:
-        """The error is over when every watched node is heard again."""
+        """Return whether the error is over: when every watched node is heard again."""
         if len(data) != 1 or not self._consumer.heard(node, t_ns):
             return []
         self.due_ns = min(self.due_ns, self._consumer.due_ns)

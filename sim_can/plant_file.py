@@ -171,7 +171,7 @@ class JointPlant:
 
     @cached_property
     def true_joint(self) -> Joint:
-        """The joint with its true constants: its file's, the deviations, and inertias that effects replace.
+        """Return the joint with its true constants: its file's, the deviations, and inertias that effects replace.
 
         An effect states the right value, whatever file and deviations say.
         """
@@ -286,7 +286,7 @@ def substep_limit(
     stiffer: tuple[float, float] = (1.0, 1.0),
     steeper: tuple[float, float] = (0.0, 0.0),
 ) -> float:
-    """Largest integration step [s]: substep_s, made smaller where a stiff or light joint needs it.
+    """Return the largest integration step [s]: substep_s, made smaller where a stiff or light joint needs it.
 
     stiffer: factor of each joint's stiffness by its effects; steeper: G |de/dθm| of their kinematic errors.
 

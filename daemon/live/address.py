@@ -14,7 +14,7 @@ NEEDED = "--live needs the package foxglove-sdk: pip install 'jtqd[live]'"
 
 
 def installed() -> bool:
-    """Whether the package that the live view needs is installed."""
+    """Return whether the package that the live view needs is installed."""
     return importlib.util.find_spec(_PACKAGE) is not None
 
 

@@ -255,7 +255,7 @@ def _joint_columns(upper: str, lower: str) -> Node:
 
 
 def layout(follow_s: float | None = None) -> dict[str, Any]:
-    """The layout as a tree for `json.dumps`: panels by identifier, user scripts, and how they are arranged.
+    """Return the layout as a tree for `json.dumps`: panels by identifier, user scripts, and how they are arranged.
 
     Args:
         follow_s: plots show this many seconds up to the newest message; None: everything there is.

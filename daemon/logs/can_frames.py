@@ -40,7 +40,7 @@ def can_topics(path: Path | Sequence[Path]) -> list[str]:
 def iter_frames(
     path: Path | Sequence[Path], topic: str, *, start_ns: int | None = None, end_ns: int | None = None
 ) -> Iterator[Frames]:
-    """Frames of one topic, chunk by chunk. Raises LogError, OSError."""
+    """Yield frames of one topic, chunk by chunk. Raises LogError, OSError."""
     for messages in iter_messages(path, topic, start_ns=start_ns, end_ns=end_ns):
         names = messages.records.dtype.names or ()
         if "frames" in names and "frame_count" in names and "stamps_ns" in names:

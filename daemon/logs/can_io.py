@@ -166,7 +166,7 @@ class McapCanWriter(SizedMessageWriter):  # type: ignore[misc]
             self.file.flush()
 
     def file_size(self) -> int:
-        """Bytes written so far."""
+        """Return bytes written so far."""
         return self.file.tell()
 
     def stop(self) -> None:

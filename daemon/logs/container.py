@@ -88,7 +88,7 @@ class Source:
         return self._block[:length]
 
     def blocks(self, start: int, end: int) -> Iterator[bytes]:
-        """The bytes from `start` to `end` in pieces of at most 1 MiB."""
+        """Yield the bytes from `start` to `end` in pieces of at most 1 MiB."""
         while start < end:
             block = os.pread(self._file, min(_BLOCK, end - start), start)
             if not block:
@@ -114,7 +114,7 @@ class Source:
 
 
 def parse(kind: type[_Record], body: bytes) -> _Record | None:
-    """A record from the bytes behind its head; None where they do not make one."""
+    """Return a record from the bytes behind its head; None where they do not make one."""
     if len(body) > MAX_SMALL:
         return None
     stream = ReadDataStream(io.BytesIO(body))
@@ -158,7 +158,7 @@ def attachment_index(source: Source, offset: int, end: int) -> AttachmentIndex |
 
 
 def attachment_data(source: Source, index: AttachmentIndex) -> bytes | None:
-    """Content of an attachment, checked against its CRC; None where the index does not point at it."""
+    """Return the content of an attachment, checked against its CRC; None where the index does not point at it."""
     found = source.head(index.offset)
     if found is None or found[0] != Opcode.ATTACHMENT:
         return None
@@ -281,7 +281,7 @@ def walk(data: bytes, hint: NDArray[np.int64] | None = None) -> Walk:
 
 
 def heads_at(data: bytes, offsets: NDArray[np.int64]) -> NDArray[np.void]:
-    """Heads of the Message records at these offsets, each at least 31 bytes before the end [n]."""
+    """Return heads of the Message records at these offsets, each at least 31 bytes before the end [n]."""
     return pieces(data, offsets, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD)
 
 
@@ -318,7 +318,7 @@ def _hinted(data: bytes, offsets: NDArray[np.int64]) -> Walk | None:
 
 
 def _stepped(data: bytes, at: int, stop: int) -> tuple[NDArray[np.int64], list[tuple[int, int, int]]]:
-    """Offsets of the messages between `at` and `stop`, and the other records, one after the other."""
+    """Return offsets of the messages between `at` and `stop`, and the other records, one after the other."""
     offsets, others = array("q"), []
     unpack_head = HEAD.unpack_from
     while at < stop:
@@ -395,7 +395,7 @@ class Summary:
 
 
 def footer_of(source: Source) -> Footer | None:
-    """The footer where the file ends as it should."""
+    """Return the footer where the file ends as it should."""
     at = source.size - len(MAGIC) - FOOTER_SIZE
     if at < len(MAGIC) or source.read(at + FOOTER_SIZE, len(MAGIC)) != MAGIC:
         return None
@@ -406,7 +406,7 @@ def footer_of(source: Source) -> Footer | None:
 
 
 def read_summary(source: Source) -> Summary | None:
-    """The summary at the end of the file, checked against its CRC; None where it does not hold together.
+    """Return the summary at the end of the file, checked against its CRC; None where it does not hold together.
 
     A file that ends properly without any summary gives an empty one with `data_end` 0.
     """

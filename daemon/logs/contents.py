@@ -162,7 +162,7 @@ def scan(source: Source, own: Summary | None) -> Contents:
 
 
 def _private_end(source: Source, at: int, limit: int) -> int | None:
-    """Where a private record ends (opcode 80h and above), which every reader skips; None where there is none."""
+    """Return where a private record ends (opcode 80h and above), which every reader skips; None where there is none."""
     framed = source.head(at)
     return framed[1] if framed is not None and framed[0] >= _PRIVATE and framed[1] <= limit else None
 
@@ -197,7 +197,7 @@ def _small_body(source: Source, at: int, end: int) -> bytes:
 
 
 def _take_chunk(source: Source, at: int, end: int, found: Contents) -> int | None:
-    """The same of a chunk and the message indexes that follow it."""
+    """Return the same of a chunk and the message indexes that follow it."""
     head = _framed_chunk(source, at, end)
     data = None if head is None else chunk_content(source, at, head)
     if head is None or data is None:
@@ -254,7 +254,7 @@ def _framed_chunk(source: Source, at: int, limit: int) -> ChunkHead | None:
 
 
 def chunk_content(source: Source, at: int, head: ChunkHead) -> bytes | None:
-    """What is in a chunk; None where it is not whole."""
+    """Return what is in a chunk; None where it is not whole."""
     try:
         return unpack(head, source.read(at + head.data_start, head.packed_size))
     except ChunkError:
@@ -290,7 +290,7 @@ def _definitions(data: bytes, records: Walk) -> Iterator[Schema | Channel]:
 
 
 def _data_end_here(source: Source, at: int) -> bool:
-    """The data section ends at `at`: there is DataEnd, or a record that stands in the summary only."""
+    """Return whether the data section ends at `at`: there is DataEnd, or a record that stands in the summary only."""
     framed = source.head(at)
     if framed is None:
         return False
@@ -302,7 +302,7 @@ def _data_end_here(source: Source, at: int) -> bool:
 
 
 def _next_whole(source: Source, at: int, limit: int, places: list[int]) -> int:
-    """Where to go on behind a damaged record: where its length leads, at the next chunk, or the end of the data.
+    """Return where to go on behind a damaged record: where its length leads, at the next chunk, or the end of the data.
 
     `places`: where the summary says that there are records.
     """
@@ -376,7 +376,7 @@ def _settle_definitions(found: Contents) -> None:
 
 
 def is_whole(found: Contents, own: Summary | None) -> bool:
-    """The file ends with a summary that names everything that was found in it, and nothing else."""
+    """Return whether the file ends with a summary that names everything that was found in it, and nothing else."""
     if own is None or not found.magic or found.header is None or found.contradicted or found.gaps:
         return False
     expected = [chunk.index for chunk in found.chunks]

@@ -80,7 +80,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _seconds(text: str) -> float:
-    """Seconds that log times can hold."""
+    """Return seconds that log times can hold."""
     try:
         value = float(text)
     except ValueError:
@@ -322,7 +322,7 @@ class RunTable:
         self.columns = tuple(self._wanted)
 
     def blocks(self) -> Iterator[Columns]:
-        """The table, some rows at a time."""
+        """Yield the table, some rows at a time."""
         self.cycles = self.left_out = 0
         first: int | None = None
         for rows in self._rows():
@@ -347,7 +347,7 @@ class RunTable:
             )
 
     def _rows(self) -> Iterator[dict[int, Records]]:
-        """Rows (`_ROW`) of both joints, of the same cycles."""
+        """Yield rows (`_ROW`) of both joints, of the same cycles."""
         rest = {number: np.empty(0, _ROW) for number in _JOINT_TOPICS}
         for found in iter_topics(self._path, tuple(_JOINT_TOPICS.values()), **self._span):
             for number, topic in _JOINT_TOPICS.items():
@@ -384,7 +384,7 @@ def _picked(records: Records, topic: str) -> Records:
 def topic_blocks(
     path: Path | Sequence[Path], topic: str, *, start_ns: int | None = None, end_ns: int | None = None
 ) -> Iterator[Columns]:
-    """All fields of a topic as columns, chunk by chunk; see `topic_table`. Raises ColumnsChangedError as well."""
+    """Yield all fields of a topic as columns, chunk by chunk; see `topic_table`. Raises ColumnsChangedError as well."""
     first: Columns | None = None
     for messages in iter_messages(path, topic, start_ns=start_ns, end_ns=end_ns):
         columns = _columns(messages)
@@ -536,7 +536,7 @@ def write_parquet(path: Path, blocks: Iterable[Columns]) -> TableSize:
 
 
 def _gathered(blocks: Iterable[Columns]) -> Iterator[Columns]:
-    """Blocks of at least `_GROUP_ROWS`, but for the last: Parquet packs each on its own."""
+    """Yield blocks of at least `_GROUP_ROWS`, but for the last: Parquet packs each on its own."""
     kept: list[Columns] = []
     for block in blocks:
         kept.append(block)
@@ -559,7 +559,7 @@ def _length(block: Columns) -> int:
 
 
 def candump_lines(frames: Frames, interface: str) -> Iterator[str]:
-    """Frames as lines of `candump -L`, without their ends: `(1700000000.000000) can0 181#0011223344556677`."""
+    """Yield frames as lines of `candump -L`, without their ends: `(1700000000.000000) can0 181#0011223344556677`."""
     rows = zip(
         frames.stamps_ns.tolist(), frames.ids.tolist(), frames.lengths.tolist(), frames.data, strict=True
     )

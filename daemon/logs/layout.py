@@ -110,7 +110,7 @@ class Types:
 
 @lru_cache(maxsize=16)
 def types_of(text: str) -> Types:
-    """Types of a schema, taken apart once however many chunks are of it."""
+    """Return types of a schema, taken apart once however many chunks are of it."""
     return Types(text)
 
 
@@ -130,7 +130,7 @@ class VariableLayoutError(LogError):
 
 
 def message_layout(types: Types, example: bytes) -> Layout:
-    """Layout of a message after the encapsulation, with the lengths that `example` has. Raises LogError."""
+    """Return the layout of a message after the encapsulation, with the lengths that `example` has. Raises LogError."""
     builder = _Builder(types, example)
     dtype = builder.of(types.main, 0, 0)[0]
     return Layout(dtype, tuple(builder.lengths))
@@ -145,7 +145,7 @@ class _Builder:
         self.lengths: list[tuple[int, int]] = []
 
     def of(self, name: str, start: int, depth: int) -> tuple[np.dtype[Any], int]:
-        """Layout of type `name` that begins at byte `start`, and the byte after it."""
+        """Return the layout of type `name` that begins at byte `start`, and the byte after it."""
         if depth > _MAX_DEPTH:
             raise LogError(f"found types nested deeper than {_MAX_DEPTH} in a schema")
         names, formats, offsets = [], [], []
@@ -199,7 +199,7 @@ class _Builder:
     def _array(
         self, kind: str, layout: np.dtype[Any], begin: int, count: int, depth: int
     ) -> tuple[np.dtype[Any], int, int]:
-        """A row of equal elements; a nested type must end where its next element can begin."""
+        """Return a row of equal elements; a nested type must end where its next element can begin."""
         if count * max(layout.itemsize, 1) > len(self._example):
             raise LogError(f"found an array of {count} {kind} in a message of {len(self._example)} bytes")
         known = len(self.lengths)

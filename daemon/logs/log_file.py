@@ -216,7 +216,7 @@ class LogFile:
     def batches(
         self, channels: Sequence[int] | None = None, start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Batch]:
-        """Messages in the order of the file, at most one batch of each channel from a chunk.
+        """Yield messages in the order of the file, at most one batch of each channel from a chunk.
 
         Args:
             channels: numbers of those that are wanted; None: all.
@@ -240,7 +240,7 @@ class LogFile:
         yield from self._of_flat(wanted, first, last)
 
     def _unpacked(self, chunk: _ChunkPlace) -> bytes | None:
-        """Content of a chunk; None for the torn last one of a file that is being written."""
+        """Return the content of a chunk; None for the torn last one of a file that is being written."""
         source = self._source
         found = source.head(chunk.offset)
         head = chunk_head(source.read(chunk.offset, HEAD_SIZE))
@@ -276,7 +276,7 @@ class LogFile:
         yield from self._of_walk(data, wanted, first, last)
 
     def _of_walk(self, data: bytes, wanted: set[int] | None, first: int, last: int) -> Iterator[Batch]:
-        """All messages of a chunk whose indexes are missing or wrong."""
+        """Yield all messages of a chunk whose indexes are missing or wrong."""
         try:
             records = walk(data)
         except ChunkError as error:
@@ -295,7 +295,7 @@ class LogFile:
                 yield _within(batch, first, last)
 
     def _of_flat(self, wanted: set[int] | None, first: int, last: int) -> Iterator[Batch]:
-        """Messages outside chunks, piece by piece."""
+        """Yield messages outside chunks, piece by piece."""
         offsets = np.frombuffer(self._flat, np.int64) if self._flat else np.empty(0, np.int64)
         begin = 0
         while begin < len(offsets):
@@ -323,7 +323,7 @@ class LogFile:
     # ---- attachments ----
 
     def attachment(self, index: AttachmentIndex) -> bytes:
-        """Content of an attachment. Raises LogError where it is damaged."""
+        """Return the content of an attachment. Raises LogError where it is damaged."""
         data = attachment_data(self._source, index)
         if data is None:
             raise LogError(f"{self.path}: attachment {index.name!r} is damaged")
@@ -331,7 +331,7 @@ class LogFile:
 
 
 def _indexed(data: bytes, channel: int, entries: NDArray[np.uint64]) -> Batch | None:
-    """Messages where an index says; None where at one of these places there is none."""
+    """Return messages where an index says; None where at one of these places there is none."""
     offsets = entries[:, 1].astype(np.int64)
     if not len(offsets):
         return Batch(channel, data, offsets, entries[:, 0], entries[:, 0])

@@ -132,7 +132,7 @@ class _Piece(NamedTuple):
 def _pieces(
     parts: Sequence[Path], topics: Sequence[str], start_ns: int | None, end_ns: int | None
 ) -> Iterator[_Piece]:
-    """Messages of the parts in their order; those that two parts have come once."""
+    """Yield messages of the parts in their order; those that two parts have come once."""
     filtered = _DuplicateFilter() if len(parts) > 1 else None
     for path in parts:
         with LogFile(path) as log:
@@ -328,19 +328,19 @@ class _Collector:
 
 
 def _grown(old: NDArray[Any], least: int, used: int) -> NDArray[Any]:
-    """A longer array; what is not written yet takes no memory."""
+    """Return a longer array; what is not written yet takes no memory."""
     new = np.empty(max(least, 2 * len(old)), old.dtype)
     new[:used] = old[:used]
     return new
 
 
 def _column(rows: NDArray[np.void], offset: int, kind: str) -> NDArray[Any]:
-    """One number of each row [n]."""
+    """Return one number of each row [n]."""
     return np.ndarray((len(rows),), np.dtype(kind), rows, offset, (rows.dtype.itemsize,))
 
 
 def _payload_dtype(fields: np.dtype[Any], length: int) -> np.dtype[Any]:
-    """A payload of that length whose fields lie behind the encapsulation."""
+    """Return a payload of that length whose fields lie behind the encapsulation."""
     names, places = fields.names or (), dict(fields.fields or {})
     made = {
         "names": list(names),
@@ -384,7 +384,7 @@ class _Decoder:
             raise LogError(f"found a schema that cannot be decoded: {error}") from None
 
     def rows(self, payloads: list[bytes]) -> NDArray[np.void]:
-        """The messages [n]. Raises LogError."""
+        """Return the messages [n]. Raises LogError."""
         found = np.empty(len(payloads), self.dtype)
         try:
             for n, payload in enumerate(payloads):
@@ -434,7 +434,7 @@ def _numbers(value: Any, code: str) -> NDArray[Any]:
 
 
 def _mapping(message: Any) -> Any:
-    """A message of the library as nested dictionaries."""
+    """Return a message of the library as nested dictionaries."""
     if isinstance(message, list):
         return [_mapping(each) for each in message]
     names = getattr(message, "__slots__", None)
@@ -471,7 +471,7 @@ class _DuplicateFilter:
         self._tails.clear()
 
     def new(self, topic: str, batch: Batch) -> Batch:
-        """The messages that the part before does not have. They can only be at the beginning of a part."""
+        """Return the messages that the part before does not have. They can only be at the beginning of a part."""
         tail = self._tails[topic]
         tail.append(batch)
         while len(tail) > _TAIL_BATCHES or (len(tail) > 1 and sum(len(b.data) for b in tail) > _TAIL_BYTES):

@@ -246,7 +246,7 @@ def _seconds(gap: Gap, found: Contents, own: Summary | None) -> float | None:
 
 
 def _torn_seconds(source: Source, gap: Gap, found: Contents) -> float | None:
-    """Time for which the torn end of a file stood [s]: by the head of its chunk, else by the rate so far."""
+    """Return the time for which the torn end of a file stood [s]: by the head of its chunk, else by the rate so far."""
     if not found.counts:
         return None
     head = chunk_head(source.read(gap.start, HEAD_SIZE))

@@ -82,7 +82,7 @@ def _failure(path: Path, error: LogError | OSError) -> dict[str, str]:
 
 
 def _files(paths: list[Path]) -> Iterator[tuple[Path, bool]]:
-    """Every file, and whether it was named by its directory only."""
+    """Yield every file, and whether it was named by its directory only."""
     for path in paths:
         if not path.is_dir():
             yield path, False

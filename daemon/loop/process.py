@@ -69,7 +69,7 @@ class Duties:
         signal.signal(signal.SIGUSR2, self._on_signal)
 
     def slots(self) -> int:
-        """How many slots may pass before the next call: a hand-over needs each pause."""
+        """Return how many slots may pass before the next call: a hand-over needs each pause."""
         return 1 if self._wanted or self._giving else _SLOTS
 
     def __call__(self) -> bool:

@@ -137,7 +137,7 @@ def _pdo_signals(pdo: PdoMap, quantities: Mapping[Key, Quantity]) -> list[_Signa
 
 
 def estimate_quantities(cob_id: int) -> dict[Key, Quantity]:
-    """The estimate PDO; see `jtqd.daemon.core.estimate_pdo`."""
+    """Return the estimate PDO; see `jtqd.daemon.core.estimate_pdo`."""
     torque = Quantity(TORQUE_UNIT_NM, "Nm", {NO_TORQUE: "no_torque"})
     sigma = Quantity(SIGMA_UNIT_NM, "Nm", {SIGMA_UNKNOWN: "unknown"})
     names = {code: name.lower() for code, name in STATUS_NAMES.items()}
@@ -199,6 +199,6 @@ def dbc_text(config: Config, report: Mapping[str, Any] | None) -> str:
 
 
 def _scaling(report: Mapping[str, Any] | None, node: int) -> Any:
-    """What the boot read from a node; None without a report, or of an optional node that was absent."""
+    """Return what the boot read from a node; None without a report, or of an optional node that was absent."""
     booted = None if report is None else report["nodes"].get(str(node))
     return None if booted is None else booted["scaling"]

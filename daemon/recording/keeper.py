@@ -238,7 +238,7 @@ def nodes_of(config: Config) -> list[tuple[int, str]]:
 
 
 def _attachment_names(config: Config) -> dict[Path, str]:
-    """Names of joint files and networks in the log: their own, unless two of them are called the same."""
+    """Return names of joint files and networks in the log: their own, unless two of them are called the same."""
     names: dict[Path, str] = {}
     for joint in config.joints:
         for path in (joint.joint_path, *([joint.network.path] if joint.network else [])):

@@ -438,7 +438,7 @@ class McapFile:
         return bytes(data + definitions)
 
     def _room(self) -> int:
-        """Bytes that the summary would take after one more chunk."""
+        """Return bytes that the summary would take after one more chunk."""
         return self._constant_room + len(self._chunk_index) + 10 * len(self.counts) + _ROOM_FOR_NEXT
 
     def _sync_directory(self) -> None:

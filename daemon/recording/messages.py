@@ -30,7 +30,7 @@ _DIAGNOSTIC_VALUE_LENGTH = 20
 
 
 def _text(value: str) -> bytes:
-    """A CDR string: length with the closing NUL, characters, NUL."""
+    """Return a CDR string: length with the closing NUL, characters, NUL."""
     data = value.encode() + b"\0"
     return struct.pack("<I", len(data)) + data
 
@@ -52,13 +52,13 @@ class CdrBuilder:
         return self
 
     def put(self, code: str, *values: float) -> CdrBuilder:
-        """Numbers of one `struct` code, aligned to their size."""
+        """Return numbers of one `struct` code, aligned to their size."""
         self.align(struct.calcsize("<" + code))
         self._data += struct.pack(f"<{len(values)}{code}", *values)
         return self
 
     def text(self, value: str) -> CdrBuilder:
-        """One string."""
+        """Return one string."""
         self.align(4)
         self._data += _text(value)
         return self
@@ -69,11 +69,11 @@ class CdrBuilder:
         return self.put("I", seconds & _MASK, nanoseconds)
 
     def body(self) -> bytes:
-        """The fields without the encapsulation header."""
+        """Return the fields without the encapsulation header."""
         return bytes(self._data)
 
     def payload(self) -> bytes:
-        """The whole message."""
+        """Return the whole message."""
         return CDR_HEADER + bytes(self._data)
 
 

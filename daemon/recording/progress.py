@@ -40,7 +40,7 @@ class ProgressFile:
             self._memory = mmap.mmap(file.fileno(), _LAYOUT.size)
 
     def load(self) -> Account:
-        """What was stored last."""
+        """Return what was stored last."""
         return Account(*_LAYOUT.unpack_from(self._memory, 0))
 
     def store(self, settled: Account) -> None:
@@ -49,7 +49,7 @@ class ProgressFile:
 
 
 def read_account(path: Path) -> Account | None:
-    """What was stored last, for those who only look; None where there is no such file, or it cannot be read."""
+    """Return what was stored last, for those who only look; None where there is no such file, or it cannot be read."""
     try:
         return Account(*_LAYOUT.unpack_from(path.read_bytes()))
     except (OSError, struct.error):

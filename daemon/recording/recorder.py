@@ -230,7 +230,7 @@ class Session:
             self._repair = None
 
     def _has_begun(self) -> bool:
-        """A chunk has been through; a repair delays nothing any more."""
+        """Return whether a chunk has been through; a repair delays nothing any more."""
         return self.account.written > 0 or self.account.let_go > 0 or bool(self.parts.obstacle)
 
 

@@ -148,7 +148,7 @@ class RecorderRequest:
 
 
 def _content(item: dict[str, str]) -> bytes:
-    """Bytes of an attachment. Raises OSError: a file that cannot be read; ValueError: wrong base64."""
+    """Return bytes of an attachment. Raises OSError: a file that cannot be read; ValueError: wrong base64."""
     if "base64" in item:
         return base64.b64decode(item["base64"], validate=True)
     return item["text"].encode() if "text" in item else Path(item["path"]).read_bytes()

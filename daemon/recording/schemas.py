@@ -197,7 +197,7 @@ uint32 line
 
 
 def _complete(text: str, *nested: tuple[str, str]) -> str:
-    """A definition followed by those it uses, in the notation of `rosidl`."""
+    """Return a definition followed by those it uses, in the notation of `rosidl`."""
     return text + "".join(f"{'=' * 80}\nMSG: {name}\n{body}" for name, body in nested)
 
 

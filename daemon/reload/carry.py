@@ -207,7 +207,7 @@ def _reader(names: list[str]) -> Callable[[Any], tuple[Any, ...]]:
 
 
 def _inside(value: Any) -> tuple[Any, ...] | None:
-    """What is in a list, set or mapping now; None for anything else."""
+    """Return what is in a list, set or mapping now; None for anything else."""
     if type(value) is dict:
         return (*value, *value.values())
     return tuple(value) if type(value) in (list, set) else None

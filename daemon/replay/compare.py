@@ -92,7 +92,7 @@ def compare(number: int, logged: RecordArray, replayed: RecordArray, taken: Bool
 
 
 def pdo_equal(logged: RecordArray, replayed: RecordArray) -> BoolArray:
-    """Whether a joint's fields of the estimate PDO are the same [n]."""
+    """Return whether a joint's fields of the estimate PDO are the same [n]."""
     one, two = (
         fields(each["torque_nm"], each["sigma_nm"], each["status"].astype(np.uint16))
         for each in (logged, replayed)
@@ -346,7 +346,7 @@ def _difference(
 
 
 def _first_of_each(differences: Sequence[Difference]) -> list[Difference]:
-    """One entry per joint: its first difference, with all of its cycles counted."""
+    """Return one entry per joint: its first difference, with all of its cycles counted."""
     result = []
     for number in sorted({each.joint for each in differences}):
         those = sorted((each for each in differences if each.joint == number), key=lambda each: each.cycle)

@@ -60,7 +60,7 @@ class _Table:
         self.lengths, self.data = frames["length"], frames["data"]
 
     def last(self, cob_id: int, length: int) -> tuple[BoolArray, npt.NDArray[np.uint8]]:
-        """Whether a cycle has the frame [n], and the data of its last one [n, 8]."""
+        """Return whether a cycle has the frame [n], and the data of its last one [n, 8]."""
         match = (self.ids == cob_id) & (self.lengths == length)
         place = self.capacity - 1 - np.argmax(match[:, ::-1], axis=1)
         return match.any(axis=1), self.data[np.arange(self.count), place]
@@ -77,7 +77,7 @@ class _Table:
 
 
 def decode(origin: Origin, records: RecordArray, joints: Sequence[RecordArray]) -> Frames:
-    """What the raw frames `records` (/can/frames) say, beside the joints' states of the same cycles."""
+    """Return what the raw frames `records` (/can/frames) say, beside the joints' states of the same cycles."""
     table = _Table(records)
     left_out = records["frames_left_out"] > 0
     pdos, from_si = [], 0
@@ -102,7 +102,7 @@ def decode(origin: Origin, records: RecordArray, joints: Sequence[RecordArray]) 
 
 
 def _fresh(index: int, inputs: Sequence[JointInputs], joints: Sequence[RecordArray]) -> BoolArray:
-    """Whether PDO `index` counted, by the flags of the joints that use it [n]."""
+    """Return whether PDO `index` counted, by the flags of the joints that use it [n]."""
     fresh: BoolArray = np.zeros(len(joints[0]), np.bool_)
     for each, records in zip(inputs, joints, strict=True):
         for place, flag in (

@@ -135,7 +135,7 @@ def open_origin(log: Path, attachments: Mapping[str, bytes], directory: Path) ->
 
 
 def _without(text: str, directory: Path) -> str:
-    """The message without the private directory, which is gone when somebody reads it."""
+    """Return the message without the private directory, which is gone when somebody reads it."""
     return text.replace(f"{directory}/", "").replace("as_logged.yaml", CONFIGURATION)
 
 
@@ -158,7 +158,7 @@ def _provenance(log: Path, data: bytes) -> dict[str, Any]:
 
 
 def _text(log: Path, content: Any, *keys: str) -> str:
-    """A text of the provenance by its path of keys."""
+    """Return a text of the provenance by its path of keys."""
     for key in keys:
         content = content.get(key) if isinstance(content, dict) else None
     if not isinstance(content, str):

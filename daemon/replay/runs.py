@@ -58,19 +58,19 @@ class Steps:
     breaks: tuple[tuple[int, str], ...]
 
     def part(self, first: int, end: int) -> Steps:
-        """The same of rows `first` to `end` only, counted from `first`."""
+        """Return the same of rows `first` to `end` only, counted from `first`."""
         begins = self.begins[(self.begins >= first) & (self.begins < end)] - first
         breaks = tuple((row - first, why) for row, why in self.breaks if first <= row < end)
         return Steps(self.used[first:end], self.dt_ns[first:end], begins, breaks)
 
 
 def cut_before(steps: Steps) -> Steps:
-    """The same where the state at the first row is not quite known."""
+    """Return the same where the state at the first row is not quite known."""
     return replace(steps, breaks=((0, CUT), *(each for each in steps.breaks if each[0])))
 
 
 def steps_of(records: RecordArray, config: Config) -> Steps:
-    """Time steps of one joint's states (/joint/N/state), in the order of the cycles."""
+    """Return the time steps of one joint's states (/joint/N/state), in the order of the cycles."""
     used = (records["input_flags"] & _BOTH) == _BOTH
     rows = np.flatnonzero(used)
     dt_ns = np.zeros(len(records), np.int64)
@@ -118,7 +118,7 @@ def _holes(records: RecordArray, overflow: int) -> npt.NDArray[np.int64]:
 
 
 def lost_cycles(records: RecordArray, overflow: int) -> int:
-    """Cycles that are missing between those in the log, by the SYNC counter (1..overflow)."""
+    """Return cycles that are missing between those in the log, by the SYNC counter (1..overflow)."""
     return int(_holes(records, overflow).sum())
 
 
@@ -143,7 +143,7 @@ class Part:
     piece: bool = False
 
     def frames(self) -> RecordArray:
-        """Messages of /can/frames of the same cycles. Raises LogError, OSError."""
+        """Return messages of /can/frames of the same cycles. Raises LogError, OSError."""
         cycles = self.joints[0]["cycle"]
         if self.piece:
             records = _frames_between(self.path, int(cycles[0]), int(cycles[-1]))
@@ -210,7 +210,7 @@ class Run:
         )
 
     def steps(self) -> tuple[Steps, Steps]:
-        """Time steps of both joints over all parts."""
+        """Return the time steps of both joints over all parts."""
         (records, _), (one, two), kept = self.widened()
         return one.part(kept, len(records)), two.part(kept, len(records))
 
@@ -245,7 +245,7 @@ def read_pieces(path: Path, directory: Path, limit: int = STRETCH_CYCLES) -> Ite
 
 
 def _most_cycles(path: Path) -> int:
-    """Cycles in a log as its summary says; without one as many as it may have by its size."""
+    """Return cycles in a log as its summary says; without one as many as it may have by its size."""
     with LogFile(path) as log:
         counts = [log.counts.get(n, 0) for n, each in log.channels.items() if each.topic in JOINT_TOPICS]
         return max(counts) if log.counts and counts else path.stat().st_size // _LEAST_BYTES
@@ -268,7 +268,7 @@ def _piece(path: Path, origin: Origin, kept: dict[str, list[RecordArray]]) -> Pa
 
 
 def _frames_between(path: Path, first: int, last: int) -> RecordArray:
-    """Messages of /can/frames of these cycles."""
+    """Return messages of /can/frames of these cycles."""
     found = []
     for messages in iter_messages(path, FRAMES_TOPIC):
         records = messages.records
@@ -324,7 +324,7 @@ class _Open:
 
 
 def stretches(parts: Iterable[Part], limit: int = STRETCH_CYCLES) -> Iterator[Run]:
-    """Runs of the parts, which come in the order of their time; cycles that two parts have are taken once.
+    """Yield runs of the parts, which come in the order of their time; cycles that two parts have are taken once.
 
     A run of more than `limit` cycles comes in several stretches of whole parts, each as soon as it is complete; what is
     shorter comes at the end, in the order of time.
@@ -347,7 +347,7 @@ def stretches(parts: Iterable[Part], limit: int = STRETCH_CYCLES) -> Iterator[Ru
 
 
 def _goes_on(before: Part, part: Part) -> bool:
-    """Whether `part` is a later part of the run of `before`; the pieces of one log always are."""
+    """Return whether `part` is a later part of the run of `before`; the pieces of one log always are."""
     if part.piece and part.path == before.path:
         return True
     if before.origin.hashes != part.origin.hashes or before.origin.inputs != part.origin.inputs:

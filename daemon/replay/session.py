@@ -145,7 +145,7 @@ def _network_file(directory: Path, number: int, method: str) -> Path | None:
 
 
 def _logged_network(origin: Origin, number: int, method: str) -> AnyNetwork | None:
-    """The log's network where the method is still the same; another method cannot read it."""
+    """Return the log's network where the method is still the same; another method cannot read it."""
     file = origin.config.joints[number - 1].network
     if file is None or method != origin.config.estimator.method:
         return None
@@ -353,7 +353,7 @@ def _replay_run(
 
 
 def _known(run: Run, same: Identity | None, number: int) -> npt.NDArray[np.bool_]:
-    """Cycles [n] whose state was known, as far as the comparison with the logged models has found out."""
+    """Return cycles [n] whose state was known, as far as the comparison with the logged models has found out."""
     cycle = run.joints[0]["cycle"].astype(np.int64)
     known: npt.NDArray[np.bool_] = np.ones(len(cycle), np.bool_)
     for each in () if same is None else same.unknown:

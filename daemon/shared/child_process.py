@@ -81,7 +81,7 @@ class Child:
         return self.process.pid
 
     def alive(self) -> bool:
-        """True while the process runs."""
+        """Return True while the process runs."""
         return self.process.poll() is None
 
     def tell(self, message: Any) -> None:

@@ -117,7 +117,7 @@ def selection(header: Collection[str], joint: Collection[str]) -> struct.Struct:
 
 
 def _selected(layout: str, names: tuple[str, ...], wanted: Collection[str]) -> str:
-    """The same layout with padding in place of what is not wanted."""
+    """Return the same layout with padding in place of what is not wanted."""
     codes = "".join(int(count or 1) * code for count, code in re.findall(r"(\d*)(\D)", layout))
     return "".join(
         code if name in wanted else f"{struct.calcsize('<' + code)}x"

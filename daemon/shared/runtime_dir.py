@@ -83,7 +83,7 @@ def _sweep(root: Path) -> None:
 
 
 def _swept(error: BlockingIOError) -> bool:
-    """The claim is held by none that runs there: somebody is just taking away what a killed daemon left."""
+    """Return whether nobody who runs there holds the claim: somebody is just taking away what a killed daemon left."""
     holder = str(error).split()[1]
     return not (holder.isdigit() and Path("/proc", holder).exists())
 
@@ -175,7 +175,7 @@ class About:
         return found
 
     def running(self) -> bool:
-        """True while the very process that wrote this is there; another one with its number does not count."""
+        """Return True while the very process that wrote this is there; another one with its number does not count."""
         return start_ticks(self.pid) == self.started_ticks
 
 

@@ -61,7 +61,7 @@ def joint_subjects(config: Config) -> tuple[Subject, ...]:
 
 
 def node_subjects(config: Config) -> dict[int, Subject]:
-    """Every node of the configuration, by its node-ID."""
+    """Return every node of the configuration, by its node-ID."""
     nodes = {
         joint.node_id: Subject(f"node {joint.node_id}", joint.node_id, 1 << n, joint.node_id)
         for n, joint in enumerate(config.joints)

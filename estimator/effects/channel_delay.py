@@ -47,7 +47,7 @@ class ChannelDelay(Effect):
         return -p["delay_s"] * s.link_velocity_rad_s
 
     def at_sensor_of(self, p: Values) -> bool:
-        """Whether it is the sensor that is late."""
+        """Return whether it is the sensor that is late."""
         return p["channel"] == SENSOR
 
     def terms(self, joint: JointValues) -> Sequence[Term]:

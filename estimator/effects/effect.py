@@ -251,11 +251,11 @@ class Effect:
         raise NotImplementedError
 
     def joint(self, p: Values, joint: AnyJoint) -> AnyJoint:
-        """The joint with the values that the effect replaces (`changes_joint`)."""
+        """Return the joint with the values that the effect replaces (`changes_joint`)."""
         return joint
 
     def at_sensor_of(self, p: Values) -> bool:
-        """Whether it belongs to the coupling's sensor with these parameters (see `at_sensor`)."""
+        """Return whether it belongs to the coupling's sensor with these parameters (see `at_sensor`)."""
         return self.at_sensor
 
     def at_motor_of(self, p: Values) -> bool:

@@ -38,7 +38,7 @@ class EncoderEccentricity(Effect):
         return p["amplitude_rad"] * x.sin(s.link_position_rad + p["phase_rad"])
 
     def at_motor_of(self, p: Values) -> bool:
-        """Whether it is the motor's encoder."""
+        """Return whether it is the motor's encoder."""
         return bool(p["motor_side"])
 
     def terms(self, joint: JointValues) -> Sequence[Term]:

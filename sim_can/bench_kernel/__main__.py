@@ -17,7 +17,7 @@ EXAMPLES = """examples:
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line's grammar."""
+    """Return the command line's grammar."""
     top = argparse.ArgumentParser(
         prog="python -m jtqd.sim_can.bench_kernel",
         description="Real SocketCAN in a user-mode kernel, for machines whose own kernel has none.",

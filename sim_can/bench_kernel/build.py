@@ -79,13 +79,13 @@ class BuildError(RuntimeError):
 
 
 def cache_root() -> Path:
-    """The directory that holds every cached kernel: ${XDG_CACHE_HOME:-~/.cache}/jtqd."""
+    """Return the directory that holds every cached kernel: ${XDG_CACHE_HOME:-~/.cache}/jtqd."""
     base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     return Path(base) / "jtqd"
 
 
 def recipe() -> bytes:
-    """All that makes one build from the same sources differ from another: configuration and edits."""
+    """Return all that makes one build from the same sources differ from another: configuration and edits."""
     return CONFIG_FILE.read_bytes() + b"\0" + repr(EDITS).encode()
 
 
@@ -100,13 +100,13 @@ def recipe_key(recipe: bytes) -> str:
 
 
 def wanted_options(config: str) -> list[str]:
-    """The lines `CONFIG_X=y` and `CONFIG_X=5` of a configuration (fragment or full)."""
+    """Return the lines `CONFIG_X=y` and `CONFIG_X=5` of a configuration (fragment or full)."""
     lines = (line.strip() for line in config.splitlines())
     return [line for line in lines if line.startswith("CONFIG_") and not line.endswith("=n")]
 
 
 def cached(recipe: bytes, source_version: str | None, root: Path) -> Path | None:
-    """The cached binary of this recipe and source version, or None.
+    """Return the cached binary of this recipe and source version, or None.
 
     Without an installed source package (version None) the newest cached kernel of this recipe serves.
     """
@@ -272,7 +272,7 @@ def _compile(tree: Path, log: Path, out: IO[str]) -> None:
 
 
 def _clean_environment() -> dict[str, str]:
-    """The environment without what a calling `make` or a shell could leak into the kernel's makefiles."""
+    """Return the environment without what a calling `make` or a shell could leak into the kernel's makefiles."""
     leaks = (
         "MAKEFLAGS",
         "MFLAGS",

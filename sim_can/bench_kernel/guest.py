@@ -128,7 +128,7 @@ class Guest:
             raise
 
     def running(self) -> bool:
-        """Whether the guest is still up."""
+        """Return whether the guest is still up."""
         return self._process.poll() is None
 
     def wait(
@@ -158,7 +158,7 @@ class Guest:
             time.sleep(_POLL_INTERVAL_S)
 
     def why(self) -> str:
-        """Why a guest that is not up any more went down, in one line."""
+        """Return why a guest that is not up any more went down, in one line."""
         return end_of_guest(_text(self.job / "console.log"), self._process.poll())
 
     def kill(self) -> None:
@@ -216,7 +216,7 @@ _CAUSES = (
 
 
 def end_of_guest(console: str, status: int | None) -> str:
-    """Why a guest went down, in one line, from its console and the exit status of its kernel."""
+    """Return why a guest went down, in one line, from its console and the exit status of its kernel."""
     for pattern, meaning in _CAUSES:
         seen = re.search(pattern, console)
         if seen is not None:
@@ -278,7 +278,7 @@ def kernel_arguments(
 
 
 def memory_directory(memory: str, fallback: Path, shared: str = "/dev/shm") -> str:
-    """Where the guest's RAM lies as a sparse file: shared memory if it has the room and may be executed."""
+    """Return where the guest's RAM lies as a sparse file: shared memory if it has the room and may be executed."""
     factor = {"K": 2**10, "M": 2**20, "G": 2**30}.get(memory[-1:].upper())
     size = int(memory[:-1]) * factor if factor else int(memory)
     try:
@@ -302,7 +302,7 @@ def _die_with_parent() -> list[str]:
 
 
 def _follow(path: Path, sink: IO[bytes]) -> Callable[[], None]:
-    """A function that copies to `sink` what has been added to the file since its last call."""
+    """Return a function that copies to `sink` what has been added to the file since its last call."""
     offset = 0
 
     def copy() -> None:

@@ -60,7 +60,7 @@ def missing(
     which: Callable[[str], str | None] = find_program,
     exists: Callable[[str], bool] = os.path.exists,
 ) -> list[str]:
-    """Names of the packages whose program or file is not there, in the order of `requirements`."""
+    """Return names of the packages whose program or file is not there, in the order of `requirements`."""
     return [
         need.package
         for need in requirements

@@ -8,7 +8,7 @@ from jtqd.sim_can.bench_kernel.packages import find_program
 
 
 def ready(name: str = "vcan0") -> bool:
-    """Whether a raw CAN socket can be bound to the interface and the interface is up."""
+    """Return whether a raw CAN socket can be bound to the interface and the interface is up."""
     try:
         with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as probe:
             probe.bind((name,))

@@ -118,7 +118,7 @@ class BenchConfig:
 
 
 def _node(section: Section, kind: str) -> dict[str, Any]:
-    """A node of the configuration as the boot takes it: the commander asks of it what jtqd's boot asks."""
+    """Return a node of the configuration as the boot takes it: the commander asks of it what jtqd's boot asks."""
     node = {"node": section.integer("node", low=1, high=127), "kind": kind}
     node |= {key: section.raw(key) for key in ("identity", "given", "unit_words") if section.has(key)}
     if kind == "sensor":
@@ -139,7 +139,7 @@ class Bench:
     config: BenchConfig
 
     def play(self, limits: Limits, on_progress: Progress) -> Play:
-        """The commander on this bench."""
+        """Return the commander on this bench."""
 
         def motion(setpoints: Setpoints) -> MotionResult:
             with on_time():

@@ -45,7 +45,7 @@ _EXAMPLES: Final = """examples:
 
 
 def parser() -> argparse.ArgumentParser:
-    """All options; `usage_error` and `missing_option` check their combination."""
+    """Return all options; `usage_error` and `missing_option` check their combination."""
     made = argparse.ArgumentParser(
         prog="jtq campaign",
         description="Drive both joints through a campaign of runs, record and check each; continue an interrupted campaign.",
@@ -88,7 +88,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def usage_error(options: argparse.Namespace) -> str:
-    """What is wrong with the combination of options; empty when nothing is."""
+    """Return what is wrong with the combination of options; empty when nothing is."""
     if options.plan not in KINDS:
         if not options.plan.endswith((".yaml", ".yml")):
             return f"found plan {options.plan!r}, expected {', '.join(KINDS)} or a .yaml file"
@@ -109,12 +109,12 @@ def missing_option(options: argparse.Namespace) -> str:
 
 
 def emulated(bus: str | None) -> bool:
-    """Whether the campaign brings its own bench."""
+    """Return whether the campaign brings its own bench."""
     return bus is not None and (bus == EMULATED or bus.startswith(f"{EMULATED}:"))
 
 
 def recipe(options: argparse.Namespace, joints: tuple[Joint, Joint]) -> dict[str, Any]:
-    """What the plan is made from, as plain values; the same recipe is the same plan. Raises ConfigError."""
+    """Return what the plan is made from, as plain values; the same recipe is the same plan. Raises ConfigError."""
     limits = {name: None if math.isinf(value) else value for name, value in options.limit}
     if options.plan not in KINDS:
         return {"plan_sha256": load_plan(Path(options.plan)).sha256, "limits": limits}
@@ -159,7 +159,7 @@ def _limit(text: str) -> tuple[str, float]:
 
 
 def rows(plan: Plan, setpoints: Mapping[str, Setpoints]) -> list[dict[str, Any]]:
-    """One row per run: name, velocity joint, segments, seconds, peaks of velocity and current, travel."""
+    """Return one row per run: name, velocity joint, segments, seconds, peaks of velocity and current, travel."""
     result = []
     for run in plan.runs:
         points = setpoints[run.name]
@@ -183,7 +183,7 @@ def total_s(setpoints: Mapping[str, Setpoints]) -> float:
 
 
 def dry_run_mapping(plan: Plan, setpoints: Mapping[str, Setpoints], load: BusLoad) -> dict[str, Any]:
-    """What a campaign would do, for a program: its runs, how long they take, the bus load."""
+    """Return what a campaign would do, for a program: its runs, how long they take, the bus load."""
     return {
         "schema": "jtq.campaign_plan/1",
         "name": plan.name,
@@ -197,7 +197,7 @@ def dry_run_mapping(plan: Plan, setpoints: Mapping[str, Setpoints], load: BusLoa
 
 
 def dry_run_text(plan: Plan, setpoints: Mapping[str, Setpoints], load: BusLoad) -> str:
-    """The same for people."""
+    """Return the same for people."""
     table = rows(plan, setpoints)
     width = max(len("run"), *(len(row["run"]) for row in table))
     lines = [
@@ -254,7 +254,7 @@ def main(argv: list[str]) -> int:
 
 
 def _make_plan(options: argparse.Namespace, config: BenchConfig) -> Plan:
-    """The plan, with a bar or a line where making it takes its time."""
+    """Return the plan, with a bar or a line where making it takes its time."""
     if options.plan != "excitation":
         return wanted_plan(options, config.joints)
     with Designing(scale_of(options, config.joints).motions_tried) as designing:
@@ -364,7 +364,7 @@ def _commander_log(reporter: Reporter) -> Iterator[None]:
 
 @contextmanager
 def _folder() -> Iterator[Path]:
-    """A short path: the address of a unix socket holds 107 bytes."""
+    """Yield a short path: the address of a unix socket holds 107 bytes."""
     folder = Path(tempfile.mkdtemp(prefix="jtq-campaign-"))
     try:
         yield folder

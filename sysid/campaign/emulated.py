@@ -54,7 +54,7 @@ def emulated_run(bench: PlantParameters, seed: int, day: int, run: Run) -> RunTa
 
 
 def _sampled(values: FloatArray) -> TimeFunction:
-    """The command of a drive as a function of time, one value per millisecond."""
+    """Return the command of a drive as a function of time, one value per millisecond."""
     each = values.tolist()
 
     def at(time_s: float) -> float:

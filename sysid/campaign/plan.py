@@ -204,7 +204,7 @@ class Plan:
         return sum(run.duration_s for run in self.runs)
 
     def to_yaml(self) -> str:
-        """The plan as a file; `from_mapping` of it gives the same plan."""
+        """Return the plan as a file; `from_mapping` of it gives the same plan."""
         return yaml.safe_dump(self.to_mapping(), sort_keys=False, default_flow_style=None, width=120)
 
 
@@ -330,12 +330,12 @@ def expand(run: Run) -> Setpoints:
 
 
 def samples(duration_s: float) -> int:
-    """Number of set-points in a time, to the nearest one."""
+    """Return the number of set-points in a time, to the nearest one."""
     return round(duration_s / PERIOD_S)
 
 
 def travel_rad(setpoints: Setpoints) -> float:
-    """Largest distance of the velocity joint from where the run begins [rad], joint side, either way."""
+    """Return the largest distance of the velocity joint from where the run begins [rad], joint side, either way."""
     position = np.cumsum(setpoints.velocity_rad_s) * PERIOD_S
     return float(np.abs(position).max())
 
@@ -367,7 +367,7 @@ def check_plan(plan: Plan) -> dict[str, Setpoints]:
 
 
 def marks_of(run: Run, setpoints: Setpoints) -> dict[str, Any]:
-    """Content of NAME.json: which segment was when, in seconds of the run table (to about a cycle)."""
+    """Return the content of NAME.json: which segment was when, in seconds of the run table (to about a cycle)."""
     return {
         "run": run.name,
         "velocity_joint": run.velocity_joint,

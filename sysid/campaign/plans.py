@@ -57,7 +57,7 @@ def currents_of(velocity_rad_s: float) -> tuple[float, ...]:
 def ladder(
     name: str, velocity_joint: int, points: Iterable[Point], hold_s: float, travel_rad: float = math.inf
 ) -> Run:
-    """One run: from rest over all points, each held for hold_s after its ramp, back to rest.
+    """Return one run: from rest over all points, each held for hold_s after its ramp, back to rest.
 
     Before a point that would take the joint further than travel_rad from where the run began (with some room to stop
     in), it turns back there without load; a smooth ramp covers the mean of its two velocities times its length.
@@ -227,7 +227,7 @@ def variable_runs(
 def outside_runs(
     limits: Limits, count: int, run_s: float, *, seed: int, joints: Joints = None
 ) -> tuple[Run, ...]:
-    """Runs with half as much load again as any other campaign has: what no model has been trained on.
+    """Return runs with half as much load again as any other campaign has: what no model has been trained on.
 
     Raises:
         ConfigError: runs too short for a trajectory.
@@ -325,7 +325,7 @@ class Scale:
     joints: Joints = None
 
     def or_else(self, name: str, whole: Any, quick: Any) -> Any:
-        """The value of an option: as given, else by the size of the campaign."""
+        """Return the value of an option: as given, else by the size of the campaign."""
         given = getattr(self, name)
         return given if given is not None else quick if self.quick else whole
 

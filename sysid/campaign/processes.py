@@ -46,7 +46,7 @@ def _die_with_parent() -> None:
 
 
 def _start(module: str, arguments: Sequence[str], messages: Path, **streams: Any) -> subprocess.Popen[bytes]:
-    """A Python module as a process; its standard error goes to the file `messages`.
+    """Return a Python module as a process; its standard error goes to the file `messages`.
 
     It has a session of its own: Ctrl-C on a terminal must reach the commander alone, which needs the SYNC of jtqd to
     bring both joints to rest. It gets SIGTERM when we die, however we die.
@@ -192,7 +192,7 @@ class Jtqd:
             self._status = _end(self._process)
 
     def log(self) -> tuple[tuple[Path, ...], dict[str, Any]]:
-        """Parts of the log in their order, and the summary, after the end.
+        """Return parts of the log in their order, and the summary, after the end.
 
         Raises:
             ProcessError: it ended by a failure, or recorded nothing.

@@ -59,7 +59,7 @@ class Remaining:
         self._current_s = 0.0
 
     def seconds(self, played_s: float = 0.0) -> float:
-        """Time that is left when played_s of the run under way have been played."""
+        """Return the time that is left when played_s of the run under way have been played."""
         between_s = BETWEEN_RUNS_S
         if self._finished:
             elapsed_s = self._now() - self._began

@@ -161,7 +161,7 @@ def _keep(paths: Sequence[Path], out: Path, run: str, ending: str) -> None:
 
 
 def gap_too_long(logged: LoggedRun) -> str | None:
-    """Why a table cannot be kept at all, or None."""
+    """Return why a table cannot be kept at all, or None."""
     if logged.longest_gap_s > LONGEST_GAP_S:
         time_s = logged.table.time_s
         at = time_s[int(np.argmax(np.diff(time_s)))]
@@ -175,7 +175,7 @@ def gap_too_long(logged: LoggedRun) -> str | None:
 def findings(
     logged: LoggedRun, setpoints: Setpoints, joints: tuple[Joint, Joint], *, sensor: bool
 ) -> tuple[str, ...]:
-    """What is wrong with a run beside its set-points, a line each; empty when nothing is.
+    """Return what is wrong with a run beside its set-points, a line each; empty when nothing is.
 
     Nothing here judges a model: looked for are missing cycles, broken channels, wrong wiring, and motions that did not
     take place.
@@ -212,7 +212,7 @@ def _no_sensor(logged: LoggedRun) -> Iterator[str]:
 
 
 def _followed(logged: LoggedRun, setpoints: Setpoints, joints: tuple[Joint, Joint]) -> Iterator[str]:
-    """The velocity joint against its velocity, the other one against its current."""
+    """Yield the velocity joint against its velocity, the other one against its current."""
     table = logged.table
     place = np.minimum(np.round(table.time_s / PERIOD_S).astype(np.intp), len(setpoints) - 1)
     mover, driver = setpoints.velocity_joint, setpoints.current_joint
@@ -275,7 +275,7 @@ class Outcome:
     ended: str = ""
 
     def count(self, status: str) -> int:
-        """Runs with this status."""
+        """Return runs with this status."""
         return sum(state.status == status for state in self.runs.values())
 
     @property
@@ -367,7 +367,7 @@ def _attempts(
     reporter: Reporter,
     attempt_run: AttemptRun,
 ) -> Attempt:
-    """The last attempt; the directory has its state."""
+    """Return the last attempt; the directory has its state."""
     for number in range(1, ATTEMPTS + 1):
         last = attempt_run(run, setpoints)
         directory.put(run.name, replace(last.state, attempts=number))

@@ -144,7 +144,7 @@ class CampaignDirectory:
         self._save()
 
     def _still_done(self, name: str) -> RunState:
-        """The state of a run as recorded; pending again when it is not done, or its files have gone."""
+        """Return the state of a run as recorded; pending again when it is not done, or its files have gone."""
         state = self.runs.get(name, RunState())
         if state.status == DONE and all((self.path / (name + ending)).is_file() for ending in ENDINGS):
             return state
@@ -186,7 +186,7 @@ def _run_state(section: Section) -> RunState:
 
 
 def _files_of(directory: Path, run: str) -> list[Path]:
-    """Files of a run that are there, all parts of its log among them."""
+    """Return files of a run that are there, all parts of its log among them."""
     endings = "|".join(map(re.escape, (*ENDINGS, *EVIDENCE)))
     of_run = re.compile(rf"{re.escape(run)}(@\d+)?({endings})")
     return sorted(path for path in directory.iterdir() if of_run.fullmatch(path.name))

@@ -62,7 +62,7 @@ def extended(
 
 
 def files(joints: Mapping[int, Joint], findings: Findings) -> dict[str, int]:
-    """Names of the files to write and the joint that each holds.
+    """Return names of the files to write and the joint that each holds.
 
     extended.joint.yaml is the joint of the largest cause (a cause of the sensor is in every file, so the next one
     decides; then the joint of the largest gap, then the first). With more joints than one each has its own file as well.

@@ -183,7 +183,7 @@ def to_mapping(
 
 
 def plain(value: Any) -> Any:
-    """The same value with what JSON knows: numpy's numbers and arrays become plain, NaN and infinity None.
+    """Return the same value with what JSON knows: numpy's numbers and arrays become plain, NaN and infinity None.
 
     Raises TypeError for anything else.
     """

@@ -61,11 +61,11 @@ class Leftover:
         return bool(self.found or self.bursts or self.lines)
 
     def energy_nm2(self) -> float:
-        """Largest energy per channel that is structure, summed over channels [Nm^2]."""
+        """Return the largest energy per channel that is structure, summed over channels [Nm^2]."""
         return sum(self.by_channel().values())
 
     def by_channel(self) -> dict[Channel, float]:
-        """Largest energy that is structure, per channel [Nm^2]."""
+        """Return the largest energy that is structure, per channel [Nm^2]."""
         by_channel: dict[Channel, float] = {}
         items = [
             *((m.channel, m.energy_nm2) for m in self.found),

@@ -163,7 +163,7 @@ class Kind:
     make: Make
 
     def runs(self, reach: Reach) -> tuple[Run, ...]:
-        """All runs, either joint as the velocity joint."""
+        """Return all runs, either joint as the velocity joint."""
         return tuple(run for role in _ROLES for run in self.make(reach, role, f"{self.name}_v{role}"))
 
 

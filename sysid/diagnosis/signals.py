@@ -285,7 +285,7 @@ def _or_nan(column: FloatArray | None, count: int) -> FloatArray:
 
 
 def _motor_speed(time: FloatArray, raw: JointColumns, columns: JointColumns) -> FloatArray:
-    """Velocity of the motor [rad/s]: of its position where that is fine enough, else the channel itself."""
+    """Return the velocity of the motor [rad/s]: of its position where that is fine enough, else the channel itself."""
     assert columns.motor_velocity_rad_s is not None
     if raw.motor_position_rad is None:
         return columns.motor_velocity_rad_s
@@ -309,7 +309,7 @@ def second_difference(x: FloatArray, time: FloatArray) -> FloatArray:
 
 
 def _moving(time: FloatArray, velocity: FloatArray) -> BoolArray:
-    """True where the joint moves and has done so, and will, for _AFTER_REST_S."""
+    """Return True where the joint moves and has done so, and will, for _AFTER_REST_S."""
     slow = np.abs(velocity) < SLOWEST_RAD_S
     wide = max(1, round(_AFTER_REST_S / max(float(np.median(np.diff(time))), 1e-9)))
     near = np.convolve(slow, np.ones(2 * wide + 1), "same") > 0.5

@@ -225,7 +225,7 @@ def _envelopes(models: Iterable[JointModels]) -> dict[int, Envelope]:
 
 
 def _picture(samples: Sequence[Samples], modes: Mapping[str, int | None]) -> Samples | None:
-    """The median run, of the joint in velocity mode where that is known, as in the paper's Fig. 16."""
+    """Return the median run, of the joint in velocity mode where that is known, as in the paper's Fig. 16."""
     tested = [each for each in samples if modes.get(each.run) == each.number]
     return median_run(tested or samples)
 

@@ -157,7 +157,7 @@ def run_figure(samples: Samples) -> Any:
 
 
 def paper_figure(tables: ErrorTables) -> Any | None:
-    """Mean square errors at variable velocity beside the paper's three; None without any."""
+    """Return the mean square errors at variable velocity beside the paper's three; None without any."""
     if not tables.both:
         return None
     methods = [method for method in TITLES if method in tables.both]
@@ -256,7 +256,7 @@ def velocities_figure(tables: ErrorTables, number: int) -> Any | None:
 
 
 def calibration_figure(tables: Mapping[str, IntervalTables]) -> Any | None:
-    """How often the interval held the sensor against how often it should have; None without intervals."""
+    """Return how often the interval held the sensor against how often it should have; None without intervals."""
     if not tables:
         return None
     figure, (axis,) = new_figure(1, 3.6)

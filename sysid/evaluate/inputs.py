@@ -171,7 +171,7 @@ def _check(name: str, file: RunFile, number: int, joint: Joint) -> list[RunIssue
 
 
 def _marks(path: Path) -> object:
-    """The campaign's NAME.json beside NAME.csv.gz; None where there is none or it is no JSON."""
+    """Return the campaign's NAME.json beside NAME.csv.gz; None where there is none or it is no JSON."""
     stem = path.name.removesuffix(".gz").removesuffix(".csv")
     try:
         return json.loads(path.with_name(f"{stem}.json").read_text(encoding="utf-8"))

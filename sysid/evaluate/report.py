@@ -320,7 +320,7 @@ def _coverage(one: Coverage | None) -> str:
 
 
 def _targets(targets: Sequence[Target]) -> list[str]:
-    """The table, and under it the details of what is not reached."""
+    """Return the table, and under it the details of what is not reached."""
     rows = [[each.figure, each.paper, each.goal, each.ours, _MARKS[each.reached]] for each in targets]
     lines = table(["figure", "paper", "target", "ours", "met"], rows)
     for each in targets:

@@ -411,7 +411,7 @@ def largest_jump(samples: Iterable[Samples], method: str, *, passage: bool = Fal
 
 
 def _all_crossings(samples: Samples) -> list[tuple[str, Crossing]]:
-    """The crossings of both quantities; where the observer was not running the velocity counts as zero."""
+    """Return the crossings of both quantities; where the observer was not running the velocity counts as zero."""
     velocity = np.nan_to_num(samples.velocity_rad_s)
     return [
         *(("v = 0", one) for one in crossings(velocity, VELOCITY_BAND_RAD_S)),

@@ -126,7 +126,7 @@ def main(argv: list[str]) -> int:
 
 
 def _joints(options: argparse.Namespace) -> tuple[Joint, Joint]:
-    """Velocity joint, driving joint."""
+    """Return the velocity joint, driving joint."""
     if options.joints is not None:
         one, two = options.joints
     else:
@@ -204,7 +204,7 @@ def peaks_of(one: Design, joints: tuple[Joint, Joint]) -> dict[str, float]:
 
 
 def as_plan(designs: tuple[Design, ...], velocity_joint: int) -> Plan:
-    """A plan with one run per design, at rest before and after, within the campaigns' own limits."""
+    """Return a plan with one run per design, at rest before and after, within the campaigns' own limits."""
     runs = tuple(
         Run(
             f"excitation_{k:02d}",
@@ -218,7 +218,7 @@ def as_plan(designs: tuple[Design, ...], velocity_joint: int) -> Plan:
 
 @contextmanager
 def _progress(text: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A bar on standard error, on a terminal only."""
+    """Yield a bar on standard error, on a terminal only."""
     from rich.console import Console
     from rich.progress import Progress
 

@@ -126,7 +126,7 @@ class FourierTrajectory:
         return self.motion(time_s)[0]
 
     def velocity(self, time_s: ArrayLike) -> FloatArray:
-        """Velocity [rad/s, joint side] at time_s [s], any shape."""
+        """Return the velocity [rad/s, joint side] at time_s [s], any shape."""
         return self.motion(time_s)[1]
 
     def acceleration(self, time_s: ArrayLike) -> FloatArray:

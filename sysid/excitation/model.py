@@ -209,7 +209,7 @@ class Candidates:
         return np.maximum(low, -limit), np.minimum(high, limit)
 
     def _idle_allowed(self, velocity: FloatArray, acceleration: FloatArray) -> NDArray[np.bool_]:
-        """Whether the motion is allowed while the driving joint has no current, [m] of arrays [m, n]."""
+        """Return whether the motion is allowed while the driving joint has no current, [m] of arrays [m, n]."""
         torque = self.bench.torque(np.zeros_like(velocity), velocity, acceleration)
         low, high = self._torque_range(velocity, acceleration)
         return _between(low, torque, high)
@@ -252,12 +252,12 @@ def _unit_vectors(count: int) -> list[tuple[float, ...]]:
 
 
 def _peak(values: FloatArray) -> FloatArray:
-    """Largest size of each row, [m, 1], never zero: a genome of zeros stays at rest."""
+    """Return the largest size of each row, [m, 1], never zero: a genome of zeros stays at rest."""
     return np.asarray(np.maximum(np.abs(values).max(axis=1, keepdims=True), 1e-12))
 
 
 def _between(low: FloatArray, value: FloatArray, high: FloatArray) -> NDArray[np.bool_]:
-    """Whether a row lies within its range at every instant, [m] of arrays [m, n]."""
+    """Return whether a row lies within its range at every instant, [m] of arrays [m, n]."""
     return np.asarray(((low <= value) & (value <= high)).all(axis=1))
 
 

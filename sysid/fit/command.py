@@ -115,7 +115,7 @@ def positive(text: str) -> float:
 
 
 def today() -> str:
-    """The date of a fit, ISO 8601, local time."""
+    """Return the date of a fit, ISO 8601, local time."""
     return dt.datetime.now().astimezone().date().isoformat()
 
 
@@ -211,7 +211,7 @@ def efficiency_parser() -> argparse.ArgumentParser:
 
 
 def _new_joint(joint: Joint, result: EfficiencyResult, options: argparse.Namespace) -> Joint | None:
-    """The joint with its new efficiency; None when a quadrant is refused and that was not allowed."""
+    """Return the joint with its new efficiency; None when a quadrant is refused and that was not allowed."""
     fit = result.fits[0]
     if fit.refused and not options.allow_missing:
         return None

@@ -69,7 +69,7 @@ class EtaPoint:
         return self.ratio if convention == "joint_over_motor" else 1.0 / self.ratio
 
     def eta_se(self, convention: str) -> float:
-        """Its standard error, to first order."""
+        """Return its standard error, to first order."""
         return self.se if convention == "joint_over_motor" else self.se / self.ratio**2
 
     @property
@@ -174,7 +174,7 @@ def fit_efficiency(
 
 
 def distinct_points(points: Sequence[EtaPoint]) -> int:
-    """Number of different operating points: a plateau measured again near (i, v) of another adds none."""
+    """Return the number of different operating points: a plateau measured again near (i, v) of another adds none."""
     seen: list[tuple[float, float]] = []
     for point in points:
         i, v = point.plateau.current.value, point.plateau.velocity.value
@@ -184,7 +184,7 @@ def distinct_points(points: Sequence[EtaPoint]) -> int:
 
 
 def design_matrix(current_a: FloatArray, velocity_rad_s: FloatArray) -> FloatArray:
-    """Columns [n, 6] of Eq. (8) in the order of COEFFICIENTS."""
+    """Return columns [n, 6] of Eq. (8) in the order of COEFFICIENTS."""
     i, v = current_a, velocity_rad_s
     return np.column_stack((np.ones_like(i), i, v, i * i, i * v, v * v))
 

@@ -63,7 +63,7 @@ def difference_from_table(
 
 
 def report_lines(result: EfficiencyResult) -> list[str]:
-    """The report, ready to print."""
+    """Return the report, ready to print."""
     lines = [
         f"{result.joint} (j{result.number}): {len(result.points)} plateaus in {len(result.runs)} runs"
         + ("" if math.isnan(result.temperature_c) else f", {result.temperature_c:.1f} degC on average")
@@ -104,7 +104,7 @@ def _measured_lines(result: EfficiencyResult) -> list[str]:
 
 
 def _summary_lines(fit: EfficiencyFit) -> list[str]:
-    """One line per quadrant; the paper's RMSE beside ours where the convention is Table I's."""
+    """Return one line per quadrant; the paper's RMSE beside ours where the convention is Table I's."""
     beside = fit.convention == TABLE_I.convention
     kind = "weighted least squares" if fit.weighted else "least squares"
     paper = f"{'paper':>9}" if beside else ""
@@ -150,7 +150,7 @@ def _place(plateau: Plateau) -> str:
 
 
 def as_mapping(result: EfficiencyResult) -> dict[str, Any]:
-    """The same for a program (schema jtq.efficiency/1)."""
+    """Return the same for a program (schema jtq.efficiency/1)."""
     return {
         "schema": SCHEMA,
         "joint": result.joint,
@@ -190,7 +190,7 @@ def _fit_mapping(fit: EfficiencyFit, points: Sequence[EtaPoint]) -> dict[str, An
 
 
 def plateau_mapping(plateau: Plateau) -> dict[str, Any]:
-    """One plateau as plain values; means as value and standard error, an unknown temperature as None."""
+    """Return one plateau as plain values; means as value and standard error, an unknown temperature as None."""
     out: dict[str, Any] = {}
     for item in fields(plateau):
         value = getattr(plateau, item.name)

@@ -69,7 +69,7 @@ class FrictionFit:
     warnings: tuple[str, ...]
 
     def lines(self) -> list[str]:
-        """The report, one fact per line."""
+        """Return the report, one fact per line."""
         lines = []
         for term in self.terms:
             how = f"kept: {term.kept}" if term.kept else f"+- {term.ci95:.3g} (95 %)"
@@ -154,7 +154,7 @@ def fit_friction(
 def loss_torque(
     dt_s: Array, current: Array, omega_m: Array, torque: Array, *, joint: Joint, bandwidth_rad_s: float
 ) -> Array:
-    """What the friction must explain [n] in Nm: LP(G (Kt i - Jm domega_m/dt) - tau)."""
+    """Return what the friction must explain [n] in Nm: LP(G (Kt i - Jm domega_m/dt) - tau)."""
     momentum = joint.rotor_inertia_kgm2 * bandwidth_rad_s * omega_m
     motor = low_pass(joint.torque_constant_nm_per_a * current + momentum, dt_s, bandwidth_rad_s) - momentum
     return joint.gear_ratio * motor - low_pass(torque, dt_s, bandwidth_rad_s)
@@ -168,7 +168,7 @@ def _needed(run: JointColumns) -> tuple[Array, Array, Array]:
 
 
 def _regressors(speed: Array, friction: Friction, stribeck: bool) -> dict[str, Array]:
-    """The estimator's own friction torque at unit value of each term: the model is linear in them."""
+    """Return the estimator's own friction torque at unit value of each term: the model is linear in them."""
     names = (COULOMB, VISCOUS, STRIBECK) if stribeck else (COULOMB, VISCOUS)
     none = replace(friction, coulomb_nm=0.0, viscous_nms_per_rad=0.0, stribeck_nm=0.0)
     return {name: FrictionModel(replace(none, **{name: 1.0})).torque_many(speed) for name in names}

@@ -72,7 +72,7 @@ def with_fit(
 
 
 def joint_text(joint: Joint, title: str) -> str:
-    """The joint file as text; `title` is its first line, a comment."""
+    """Return the joint file as text; `title` is its first line, a comment."""
     blocks = [f"# {' '.join(title.split())}\n# {_UNITS}\n"]
     simple: dict[str, Any] = {}
     for key, value in joint.to_mapping().items():

@@ -41,7 +41,7 @@ class NoLoadFit:
     warnings: tuple[str, ...]
 
     def lines(self) -> list[str]:
-        """The report, one fact per line."""
+        """Return the report, one fact per line."""
         lines = [f"{term.name} = {term.value:.4g}  +- {term.ci95:.2g} (95 %)" for term in self.terms]
         lines.append(f"residual {self.rmse_nm:.3f} Nm RMS over {self.plateaus} plateaus at no load")
         return lines + [f"warning: {text}" for text in self.warnings]

@@ -107,7 +107,7 @@ def configured(config: Path) -> tuple[tuple[Joint, Joint], EstimatorSettings]:
 
 
 def published_torque(frames: Records, joint: int) -> Array:
-    """Torque of joint 0 or 1 in the estimate PDO of each cycle [n]; NaN: no PDO, or one without a torque."""
+    """Return the torque of joint 0 or 1 in the estimate PDO of each cycle [n]; NaN: no PDO, or one without a torque."""
     raw = frames["frames"]
     at = (raw["id"] == ESTIMATE_COB_ID) & (np.arange(raw.shape[1]) < frames["frame_count"][:, None])
     data = raw["data"][np.arange(len(raw)), np.argmax(at, axis=1)]
@@ -155,12 +155,12 @@ def score_log(log: Path, index: int, played: Played) -> BusRun:
 
 
 def as_mapping(run: BusRun) -> Mapping[str, object]:
-    """The numbers of a BusRun for a program, without its arrays."""
+    """Return the numbers of a BusRun for a program, without its arrays."""
     return {key: value for key, value in vars(run).items() if not isinstance(value, np.ndarray)}
 
 
 def sync_time(stamp: Records) -> Array:
-    """Time of each SYNC since the first [s]."""
+    """Return the time of each SYNC since the first [s]."""
     whole = (stamp["sec"].astype(np.int64) - int(stamp["sec"][0])) * 1_000_000_000
     return np.asarray((whole + stamp["nanosec"] - int(stamp["nanosec"][0])) * _NS)
 
@@ -185,7 +185,7 @@ def _offline(played: Played) -> Array:
 
 
 def reference_torque(state: Records, time_s: Array, bandwidth_rad_s: float) -> Array:
-    """The sensor as received through the observer's low-pass; NaN where no sensor value came."""
+    """Return the sensor as received through the observer's low-pass; NaN where no sensor value came."""
     sensor = state["sensor_torque_nm"]
     there = np.isfinite(sensor)
     result = np.full(len(sensor), np.nan)
@@ -326,7 +326,7 @@ def evaluate(bus: str, out: Path) -> list[BusRun]:
 
 
 def table_lines(results: list[BusRun]) -> list[str]:
-    """One line per joint, run and configuration."""
+    """Return one line per joint, run and configuration."""
     lines = [
         f"{'joint':>5}  {'run':<20}{'config':<8}{'rows':>6}{'missed':>8}{'incomplete':>12}{'scored':>8}"
         f"{'on the bus':>18}{'offline':>10}{'bus-offline':>13}{'replay':>10}  after the end"

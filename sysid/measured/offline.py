@@ -86,7 +86,7 @@ def estimate(joint: Joint, table: RunTable, number: int) -> EstimateRun:
 
 
 def fitted_joint(joint: Joint, fit: FrictionFit, file: RunFile, *, number: int, run: str, date: str) -> Joint:
-    """The joint with the fitted friction (four decimals) and where it comes from."""
+    """Return the joint with the fitted friction (four decimals) and where it comes from."""
     friction: dict[str, float] = {key: round(value, 4) for key, value in asdict(fit.friction).items()}
     temperature = file.table.joints[number].temperature_c
     origin: dict[str, object] = {
@@ -172,7 +172,7 @@ def table_lines(cases: list[Case]) -> list[str]:
 
 
 def as_mapping(cases: list[Case], fits: dict[tuple[int, str], FrictionFit]) -> dict[str, object]:
-    """The same for a program: scores per case, terms per fit."""
+    """Return the same for a program: scores per case, terms per fit."""
     return {
         "schema": "jtq.measured/1",
         "cases": [

@@ -359,7 +359,7 @@ def _held_rows(
     moving: NDArray[np.bool_],
     moved: float,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Rows [n] that are stuck for STUCK_S, and rows at the channel's limits for _CLIPPED_ROWS or more, often."""
+    """Return rows [n] that are stuck for STUCK_S, and rows at the channel's limits for _CLIPPED_ROWS or more, often."""
     starts = np.flatnonzero(np.diff(values, prepend=math.nan) != 0.0)
     ends = np.append(starts[1:], len(values))
     long = (ends - starts) >= _CLIPPED_ROWS
@@ -386,7 +386,7 @@ def _held_rows(
 
 
 def _moved(partner: FloatArray) -> float:
-    """How far a channel went, single rows of noise averaged."""
+    """Return how far a channel went, single rows of noise averaged."""
     width = max(1, len(partner) // 8)
     whole = len(partner) // width * width
     return float(np.ptp(partner[:whole].reshape(-1, width).mean(axis=1)))

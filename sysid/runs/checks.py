@@ -142,7 +142,7 @@ def channel_findings(runs: Sequence[RunFile], number: int, joint: Joint) -> list
 def _checked_joint(
     table: RunTable, number: int, joint: Joint, where: str
 ) -> tuple[JointColumns | None, list[RunIssue], list[RunIssue]]:
-    """Columns that may be used (None: the joint is left out of this run), why not, and notes."""
+    """Return columns that may be used (None: the joint is left out of this run), why not, and notes."""
     columns = table.joints[number]
     missing = _missing(columns, where)
     if missing:
@@ -180,7 +180,7 @@ def _checked_joint(
 
 
 def _missing(columns: JointColumns, where: str) -> list[RunIssue]:
-    """The first column that is missing and without which a joint cannot be diagnosed."""
+    """Return the first column that is missing and without which a joint cannot be diagnosed."""
     if columns.torque_nm is None or not np.any(columns.torque_nm):
         return [
             RunIssue(
@@ -199,7 +199,7 @@ def _missing(columns: JointColumns, where: str) -> list[RunIssue]:
 
 
 def _spared(columns: JointColumns, issues: Sequence[RunIssue]) -> tuple[JointColumns, list[RunIssue]]:
-    """Columns without the stuck ones that a diagnosis can do without."""
+    """Return columns without the stuck ones that a diagnosis can do without."""
     notes = []
     for item in issues:
         unused = _SPARE.get(item.kind)

@@ -200,7 +200,7 @@ def _column(section: Section) -> Column:
 
 
 def _wanted_columns(header: Sequence[str], path: Path, columns: ColumnMap | None) -> Mapping[str, Column]:
-    """Where each target column comes from: the map's, or the run table's own names that are there."""
+    """Return where each target column comes from: the map's, or the run table's own names that are there."""
     if columns is None and TIME not in header:
         raise RunError(
             f"{path}:{_header_place(path)} found no column '{TIME}' (first columns: {list(header[:4])}), "
@@ -295,7 +295,7 @@ def _check_time(time_s: NDArray[np.float64], lines: Sequence[int] | None, path: 
 
 
 def _bytes(path: Path) -> tuple[bytes, str]:
-    """Content of a file and its SHA-256."""
+    """Return the content of a file and its SHA-256."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -358,7 +358,7 @@ def _next_row(rows: _Rows, path: Path) -> list[str] | None:
 def _cells_of_text(
     rows: _Rows, path: Path, header: list[str], wanted: Mapping[str, Column]
 ) -> tuple[dict[str, FloatArray], list[int]]:
-    """Columns of the file as arrays [n], n >= 2, all finite, and the line [n] on which each sample ends."""
+    """Return columns of the file as arrays [n], n >= 2, all finite, and the line [n] on which each sample ends."""
     source = {column.name: header.index(column.name) for column in wanted.values()}
     cells: dict[str, list[float]] = {name: [] for name in source}
     lines: list[int] = []
@@ -409,7 +409,7 @@ def _read_parquet(path: Path, columns: ColumnMap | None) -> RunFile:
 
 
 def _cells_of_arrow(path: Path, name: str, column: Any) -> FloatArray:
-    """One column as float64 [n]; text that is no number, empty cells, NaN: RunError with the first bad row."""
+    """Return one column as float64 [n]; text that is no number, empty cells, NaN: RunError with the first bad row."""
     values = column.to_numpy()
     try:
         cells: FloatArray = np.asarray(values, np.float64)

@@ -125,7 +125,7 @@ def _span(states: list[Records], log: Path) -> slice:
 
 
 def _complete(state: Records, number: int, log: Path) -> Flags:
-    """Cycles [n] with all four inputs of a joint; LogError for one that never came."""
+    """Return cycles [n] with all four inputs of a joint; LogError for one that never came."""
     there: Flags = (state["input_flags"] & DRIVE_INPUTS) == DRIVE_INPUTS
     for name in _INPUTS:
         finite = np.isfinite(state[name])
@@ -138,7 +138,7 @@ def _complete(state: Records, number: int, log: Path) -> Flags:
 
 
 def _with_sensor(one: Records, two: Records) -> Flags:
-    """Cycles [n] in which every joint that has the sensor at all has it."""
+    """Return cycles [n] in which every joint that has the sensor at all has it."""
     flags = [np.isfinite(state["sensor_torque_nm"]) for state in (one, two)]
     have = [each for each in flags if each.any()] or flags
     result: Flags = np.logical_and.reduce(have)

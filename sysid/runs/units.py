@@ -155,7 +155,7 @@ def _angles(time_s: FloatArray, run: JointColumns, joint: Joint, where: str) -> 
 
 
 def _fast(time_s: FloatArray, run: JointColumns, joint: Joint, where: str) -> list[RunIssue]:
-    """A motor faster than motors are: all angles in degrees or counts."""
+    """Return an issue for a motor faster than motors are: all angles are in degrees or counts."""
     velocity = run.derived(time_s, joint.gear_ratio).motor_velocity_rad_s
     if velocity is None:
         return []

@@ -59,14 +59,14 @@ def render(findings: Findings, made: str = "", effects: Mapping[str, Effect] | N
 
 
 def library() -> Mapping[str, Effect]:
-    """The effects that ship, by name."""
+    """Return the effects that ship, by name."""
     from jtqd.estimator.effects.library import EFFECTS
 
     return EFFECTS
 
 
 def _scope(findings: Findings) -> str:
-    """What was looked at, e.g. "6 runs, joints 1 and 2"."""
+    """Return what was looked at, e.g. "6 runs, joints 1 and 2"."""
     count = len(findings.runs)
     runs = "1 run" if count == 1 else f"{count} runs"
     if not findings.joints:

@@ -131,7 +131,7 @@ def _top_places(places: Sequence[Place]) -> tuple[PlaceView, ...]:
 
 
 def _axis(name: str, places: Sequence[Place], highest: float) -> AxisView:
-    """One axis; highest: full height, in units of an even share."""
+    """Return one axis; highest: full height, in units of an even share."""
     ordered = sorted(places, key=lambda each: (each.low, each.high))
     top = max(ordered, key=lambda each: each.share)
     even = 1.0 / len(ordered)
@@ -280,7 +280,7 @@ def _evidence(candidate: CandidateEvidence) -> EvidenceView:
 
 
 def _held(share: float) -> str:
-    """A part of the evidence; how far below nothing it can be has no meaning."""
+    """Return a part of the evidence; how far below nothing it can be has no meaning."""
     return f"below {percent(-1.0)}" if share < -1.0 else percent(share)
 
 
@@ -318,7 +318,7 @@ def gain_views(gain: Gain | None) -> list[BarView]:
 def _bar(
     title: str, unit: str, errors: tuple[float, float], interval: tuple[float, float], drop: str
 ) -> BarView:
-    """One error before and after; interval: of the one after; drop: what goes, as a text."""
+    """Return one error before and after; interval: of the one after; drop: what goes, as a text."""
     before, after = errors
     share = after / before if before > 0.0 else math.nan
     rest = [end / before if before > 0.0 else math.nan for end in interval]
