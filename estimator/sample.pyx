@@ -4,8 +4,11 @@ from libc.math cimport NAN
 
 import numpy as np
 
+from jtqd.estimator import status as st
 from jtqd.estimator.run import EstimateRun
 from jtqd.estimator.status import Estimate
+
+cdef int INVALID = st.INVALID
 
 
 cdef void no_values(Values *out, int status) noexcept nogil:
@@ -60,6 +63,7 @@ cdef class Estimator:
             dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, temperature_c
         )
         cdef Values out
+        no_values(&out, INVALID)  # of an estimator that raises, which Python prints
         self.advance(&sample, network_wanted, &out)
         return Estimate(out.torque_nm, out.sigma_nm, out.status, out.tob_nm, out.physics_nm, out.network_nm)
 
@@ -96,6 +100,8 @@ cdef class Estimator:
         with nogil:
             for k in range(x.shape[1]):
                 sample = Sample(x[0, k], x[1, k], x[2, k], x[3, k], x[4, k], x[5, k])
+                no_values(&out, INVALID)
+                self.observed = False
                 self.advance(&sample, w[k], &out)
                 to[0, k], to[1, k] = out.torque_nm, out.sigma_nm
                 to[2, k], to[3, k], to[4, k] = out.tob_nm, out.physics_nm, out.network_nm

@@ -9,11 +9,13 @@ from __future__ import annotations
 import gc
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from jtqd.estimator.estimator import JointEstimator
+from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.losses import LossModel
 from jtqd.estimator.methods import load_network, make_estimator
-from jtqd.estimator.network import TorqueNetwork
+from jtqd.estimator.network import FusedNetwork, TorqueNetwork
 from jtqd.estimator.settings import METHODS, EstimatorSettings
 from tests.benchmarks.table import mark
 from tests.estimator.estimator_helpers import joint1, motion, small_network
@@ -57,6 +59,17 @@ def step_costs_us() -> dict[str, float]:
     return {method: min(each[method] for each in rounds) for method in METHODS}
 
 
+def with_effects(count: int) -> Joint:
+    """Return the joint of method fused with so many effects."""
+    effects = (
+        Effect("viscous_friction", {"viscous_nms_per_rad": 4.0}),
+        Effect("hysteresis", {"torque_nm": 1.5, "travel_rad": 2e-4}),
+        Effect("encoder_eccentricity", {"amplitude_rad": 1e-4, "phase_rad": 0.3}),
+        Effect("coulomb_friction", {"coulomb_nm": 5.5}),
+    )
+    return replace(joint_of(1), effects=effects[:count])
+
+
 def costs_us() -> dict[str, float]:
     """Cost of each part by name [us]."""
     network = TorqueNetwork(small_network().data)
@@ -66,6 +79,16 @@ def costs_us() -> dict[str, float]:
         "network, one sample": best_us(lambda: network.run_one(1.0, 2.0, 3.0, 0.1, 0.2, 5.0)),
     }
     costs |= {f"step, {method}": cost for method, cost in step_costs_us().items()}
+    graph = network_of(1)
+    foreign = FusedNetwork(graph)
+    foreign.perceptron = None  # type: ignore[misc]
+    for name, joint, used in (
+        ("step, fused, network by ONNX Runtime", joint_of(1), foreign),
+        ("step, fused, one effect", with_effects(1), FusedNetwork(graph)),
+        ("step, fused, four effects", with_effects(4), FusedNetwork(graph)),
+    ):
+        step = make_estimator(joint, EstimatorSettings(method="fused"), used).step
+        costs[name] = best_us(lambda step=step: step(*_STEP))
     run = motion(1, SAMPLES).arrays()
     began = time.process_time()
     JointEstimator(joint1(), EstimatorSettings(), network).run(*run)

@@ -414,3 +414,28 @@ def test_the_daemon_takes_an_extended_joint_file(tmp_path: Path) -> None:
     without = [plain.step(1e-3, 2.0, 0.1 * n, 100.0, 0.001 * n - 1e-3, 25.0) for n in range(50)][-1]
     assert found.status == without.status == st.VALID
     assert abs(found.physics_nm - without.physics_nm) > 0.1
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_correction_that_raises_is_invalid_and_no_repeated_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a step and in the middle of a run; what raised is printed, not lost."""
+    joint = extended(PLAIN, ("viscous_friction", ALL["viscous_friction"]))
+    m = twisted(3, 1200)
+    samples = 0
+    real = ExtendedInputs.step
+
+    def step(inputs: ExtendedInputs, *sample: float) -> tuple[float, float]:
+        nonlocal samples
+        samples += 1
+        if samples in range(600, 611):
+            raise OverflowError("math range error")
+        return real(inputs, *sample)
+
+    monkeypatch.setattr(ExtendedInputs, "step", step)
+    estimator = make_estimator(joint, EstimatorSettings(method="tob"))
+    run = estimator.run(*m.arrays())
+    assert (run.status[599:610] == st.INVALID).all()
+    assert np.isnan(run.torque_nm[599:610]).all()
+    assert np.isnan(run.features[599:610]).all()
+    assert np.isfinite(run.torque_nm[598])
+    assert np.isfinite(run.torque_nm[640:]).all()
