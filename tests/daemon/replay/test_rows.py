@@ -1,0 +1,135 @@
+"""Rows of a log against the joints of the loop, cycle by cycle: missing inputs, late estimates, no time, temperatures."""
+
+from __future__ import annotations
+
+from array import array
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jtqd.daemon.core import estimate_pdo
+from jtqd.daemon.core.intake import Intake, JointTemperature
+from jtqd.daemon.core.joint import JointCycle
+from jtqd.daemon.core.joint_safety import JointSafety
+from jtqd.daemon.loop.input_pdos import JointInputs
+from jtqd.daemon.replay.origin import SAMPLE
+from jtqd.daemon.replay.rows import CycleRows
+from jtqd.daemon.shared.snapshot import COUNTERS
+from jtqd.estimator.methods import load_network, make_estimator
+from jtqd.estimator.settings import EstimatorSettings
+from tests.daemon.loop.cycle_helpers import ENABLED, PDOS, SCALE
+from tests.estimator.fused_configuration import joint_of, network_of
+
+ROWS = 1500
+PERIOD_NS = 1_000_000
+SETTINGS = EstimatorSettings(method="fused")
+
+
+class Counts:
+    def __init__(self) -> None:
+        self.counters, self.errors = array("Q", [0] * len(COUNTERS)), array("d", [0.0] * 4)
+
+
+def made() -> tuple[Intake, list[JointCycle]]:
+    intake = Intake(PDOS, [JointTemperature(0x380 + n, n, f"{n}", 2000) for n in (1, 2)])
+    counts = Counts()
+    joints = [
+        JointCycle(
+            n,
+            JointInputs(2 * n, 2 * n + 1, 4, temperature=n, **SCALE),
+            make_estimator(joint_of(n + 1), SETTINGS, load_network("fused", network_of(n + 1))),
+            intake=intake,
+            snapshot=counts,
+            period_ns=PERIOD_NS,
+            safety=JointSafety(None, SETTINGS, joint_of(n + 1), PERIOD_NS),
+        )
+        for n in (0, 1)
+    ]
+    return intake, joints
+
+
+def log(seed: int) -> dict[str, Any]:
+    """Inputs as a log has them; printed seed, everything that may happen to a cycle in it."""
+    rng = np.random.default_rng(seed)
+    speed, current = np.full((2, ROWS), 50_000), rng.integers(140, 160, (2, ROWS))
+    speed[:, 1200:], current[:, 1200:] = (
+        rng.integers(-60_000, 60_000, (2, 300)),
+        rng.integers(-300, 300, (2, 300)),
+    )
+    steps = np.cumsum(speed, axis=1) // 100  # 1e-3 rad/s for 1 ms against 1e-4 rad a count
+    word = np.full(ROWS, ENABLED)
+    word[700:720] = 0x08  # fault
+    torque = (rng.integers(-9000, 9000, ROWS), (rng.random(ROWS) < 0.05).astype(int))
+    celsius = np.full((2, ROWS), np.nan)
+    celsius[0, 300:] = 31.5
+    celsius[1, 500:] = 29.0
+    dt = np.full((2, ROWS), PERIOD_NS)
+    dt[:, rng.integers(0, ROWS, 9)] += 3 * PERIOD_NS
+    return {
+        "fresh": rng.random((5, ROWS)) > 0.02,
+        "values": [
+            *[
+                part
+                for n in (0, 1)
+                for part in ((steps[n], steps[n] // 10 - 20), (speed[n], current[n], word))
+            ],
+            torque,
+        ],
+        "celsius": celsius,
+        "cycle": np.arange(5, ROWS + 5),
+        "counter": np.arange(ROWS) % 240 + 1,
+        "sync_ns": (1 << 60) + np.cumsum(dt, axis=1),
+        "wanted": rng.random((2, ROWS)) > 0.05,
+        "withdrawn": rng.random(ROWS) < 0.03,
+    }
+
+
+@pytest.mark.parametrize("seed", [31, 32])
+def test_rows_are_what_the_joints_make_of_each_cycle(seed: int) -> None:
+    given = log(seed)
+    intake, joints = made()
+    samples: list[list[tuple[float, ...]]] = [[], []]
+    pdos = b""
+    from_log = 0
+    for row in range(ROWS):
+        for view, fresh, values in zip(intake.views(), given["fresh"], given["values"], strict=True):
+            view.fresh, view.values = bool(fresh[row]), tuple(int(each[row]) for each in values)
+        for known, said in zip(intake.temperatures, given["celsius"], strict=True):
+            known.at(int(given["cycle"][row]))
+            if not np.array_equal(known.celsius, said[row], equal_nan=True):
+                known.celsius, from_log = said[row], from_log + 1
+        for n, joint in enumerate(joints):
+            joint.observe(
+                int(given["sync_ns"][n, row]), bool(given["cycle"][row] < 20), bool(given["wanted"][n, row])
+            )
+            if given["withdrawn"][row]:
+                joint.withdraw()
+            samples[n].append(joint.sample)
+        pdos += estimate_pdo.encode(joints[0].published, joints[1].published, int(given["counter"][row]))
+    again, others = made()
+    rows = CycleRows(again, *others, **given)
+    for first, end in ((0, 1), (1, 700), (700, 700), (700, ROWS)):
+        rows.go_on(first, end)
+    for n in (0, 1):
+        assert rows.samples[n].view(SAMPLE)[:, 0].tobytes() == np.array(samples[n], SAMPLE).tobytes(), (
+            f"seed {seed}"
+        )
+    assert rows.estimates.tobytes() == pdos
+    assert rows.temperatures_from_log == from_log == 2
+    published = rows.samples[0].view(SAMPLE)[:, 0]["status"]
+    assert {1, 2, 3, 4, 5, 6} <= set(published.tolist())
+    assert (published[given["withdrawn"]] != 2).all()
+
+
+def test_arrays_that_do_not_fit_are_refused() -> None:
+    intake, joints = made()
+    for key in ("fresh", "celsius", "counter", "sync_ns", "wanted", "withdrawn"):
+        given = log(1)
+        given[key] = given[key][..., :-1]
+        with pytest.raises(ValueError, match="found an array of shape"):
+            CycleRows(intake, *joints, **given)
+    rows = CycleRows(intake, *joints, **log(1))
+    for first, end in ((-1, 3), (5, 3), (0, ROWS + 1)):
+        with pytest.raises(ValueError, match=f"found rows {first} to {end}"):
+            rows.go_on(first, end)
