@@ -22,7 +22,8 @@ from jtqd.sysid.diagnosis.extended_joint import FILE, write_extended
 from jtqd.sysid.diagnosis.findings import INSUFFICIENT, NO_GAP, Findings, summary_lines, to_mapping
 from jtqd.sysid.progress import waiting
 from jtqd.sysid.runs.checks import CheckedRuns, check_runs
-from jtqd.sysid.runs.files import ColumnMap, RunError, RunFile, read_runs
+from jtqd.sysid.runs.column_map import ColumnMap
+from jtqd.sysid.runs.files import RunError, RunFile, read_runs
 from jtqd.sysid.runs.joints import UsageError, check_joint_files, joint_files, joints_of
 
 BY: Final = "jtq diagnose"

@@ -1,6 +1,6 @@
 """Recorded runs: files to run tables and back, checks of what may be used, and the joint file of each joint.
 
-In: CSV, gzipped CSV, Parquet, MCAP logs of jtqd, with an optional column map. Out: `RunFile` and `CheckedRun`, frozen.
+In: CSV, gzipped CSV, Parquet, MCAP logs of jtqd, with an optional column map (expressions, known loads, voltage drives). Out: `RunFile` and `CheckedRun`, frozen.
 Imports estimator and models; logs (`jtqd.sysid.runs.logs`) and Parquet are imported when such a file is read.
 
     >>> import tempfile
@@ -15,11 +15,11 @@ Imports estimator and models; logs (`jtqd.sysid.runs.logs`) and Parquet are impo
 """
 
 from jtqd.sysid.runs.checks import CheckedRun, CheckedRuns, RunIssue, check_run, check_runs
+from jtqd.sysid.runs.column_map import Column, ColumnMap
 from jtqd.sysid.runs.files import (
-    Column,
-    ColumnMap,
     RunError,
     RunFile,
+    read_pieces,
     read_run,
     read_runs,
     run_paths,
@@ -40,6 +40,7 @@ __all__ = [
     "joint_files",
     "joint_number",
     "joints_of",
+    "read_pieces",
     "read_run",
     "read_runs",
     "run_paths",
