@@ -1,6 +1,6 @@
 """Recorded runs: files to run tables and back, checks of what may be used, and the joint file of each joint.
 
-In: CSV, gzipped CSV, Parquet, MCAP logs of jtqd, with an optional column map (expressions, known loads, voltage drives). Out: `RunFile` and `CheckedRun`, frozen.
+In: CSV, gzipped CSV, Parquet, MCAP logs of jtqd, with an optional column map. Out: `RunFile` and `CheckedRun`, frozen.
 Imports estimator and models; logs (`jtqd.sysid.runs.logs`) and Parquet are imported when such a file is read.
 
     >>> import tempfile
