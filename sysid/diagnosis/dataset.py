@@ -135,7 +135,7 @@ def usable_signals(
             except SignalsError as error:
                 reasons.append(str(error))
         if mine:
-            out.append([_without_known_effects(s) for s in about_zero(mine, bases)])
+            out.append([without_known_effects(s) for s in about_zero(mine, bases)])
     common = {tuple(s.number for s in run) for run in out}
     if len(common) > 1:  # only what every run has can be stacked
         keep = set.intersection(*(set(c) for c in common))
@@ -167,7 +167,7 @@ def _same_balances(runs: list[list[JointSignals]]) -> None:
         run[:] = [replace(s, torsion_nm=None, twist_rad=None) if s.number in lacking else s for s in run]
 
 
-def _without_known_effects(s: JointSignals) -> JointSignals:
+def without_known_effects(s: JointSignals) -> JointSignals:
     """Return the signals less what the joint file's own effects explain, at the torsion that the encoders saw."""
     motor, torsion, usual = s.motor_nm, s.torsion_nm, s.state.torsion_rad
     if s.twist_rad is not None:
