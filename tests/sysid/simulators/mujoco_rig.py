@@ -15,7 +15,7 @@ WINDOW_S = 0.5
 def free_run_error(xml: str, table: RunTable, number: int, gear_ratio: float) -> float:
     """Rms error of the velocity [rad/s, joint side] over windows that begin in the measured state.
 
-    ctrl is the measured current, and the measured torque acts on the link, so in every coordinate that turns it: the arm beyond the sensor.
+    ctrl is the measured current. The measured torque acts on the link, so in every coordinate that turns it.
     """
     model = mujoco.MjModel.from_xml_string(xml)
     dt = float(np.median(np.diff(table.time_s)))
