@@ -59,6 +59,7 @@
       figure.append(this.bar, this.box);
       figure.classList.add("live");
       this.listen();
+      this.draw();
       new ResizeObserver(() => this.draw()).observe(this.box);
     }
     all() { this.from = 0; this.to = this.count; }
