@@ -22,6 +22,8 @@ from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.signals import JointSignals
 
 RATE_HZ: Final = 100.0
+NO_LIMIT: Final = 1e6
+"""Values of `MotionLimits` that were left out."""
 INSIDE: Final = 0.05
 """Part of the travel that is left free at either end."""
 _TORQUE_SHARE: Final = 0.9
@@ -37,7 +39,7 @@ _SHORTEST_PASS_S: Final = 0.5
 @dataclass(frozen=True)
 class Room:
     """What a motion may use, joint side: low..high [rad], velocity [rad/s], acceleration [rad/s2]; torque_nm: allowed;
-    needed_nm: most that the runs needed between low and high.
+    needed_nm: most that the runs needed between low and high, NaN without runs.
     """
 
     low_rad: float
@@ -49,9 +51,12 @@ class Room:
 
 
 def room_of(joint: Joint, signals: Sequence[JointSignals]) -> Room | None:
-    """Return what the joint file allows and these runs have already done; None where nothing moved."""
+    """Return what the joint file allows and these runs have already done; None where nothing moved.
+
+    Without a usable run it is what the joint file allows, where that says everything.
+    """
     if not signals:
-        return None
+        return _of_limits(joint)
     position = np.concatenate([s.state.link_position_rad for s in signals])
     torque = np.abs(np.concatenate([s.sensor_nm for s in signals]))
     speed = max(float(np.max(np.abs(s.state.velocity_rad_s))) for s in signals)
@@ -75,6 +80,16 @@ def room_of(joint: Joint, signals: Sequence[JointSignals]) -> Room | None:
     margin = INSIDE * (high - low)
     there = (position >= low) & (position <= high)
     return Room(low + margin, high - margin, speed, quick, allowed, float(np.max(torque[there])))
+
+
+def _of_limits(joint: Joint) -> Room | None:
+    limits = joint.motion_limits
+    if limits is None or max(map(abs, limits.travel_rad)) >= NO_LIMIT:
+        return None
+    if max(limits.velocity_rad_s, limits.acceleration_rad_s2) >= NO_LIMIT:
+        return None
+    torque = min(joint.rated_torque_nm, limits.torque_nm)
+    return Room(*limits.travel_rad, limits.velocity_rad_s, limits.acceleration_rad_s2, torque, math.nan)
 
 
 def _calm_stretch(

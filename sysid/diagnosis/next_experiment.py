@@ -560,16 +560,27 @@ def _of_one_joint(
         "balances of both joints, a joint fault in one."
     )
     if room is None:
-        parts.append("No motion is planned: these runs do not show where the joint may go.")
+        parts.append(
+            "No motion is planned: neither these runs nor motion_limits of the joint file (or --limits) say where it may go."
+        )
         return {"why": " ".join(parts), "plan": None, "motion": None}
     made = motions(kinds, room)
     minutes = sum(motion.duration_s for motion in made) / 60.0
     parts.append(
         f"Joint {number} alone, {counted(len(made), 'run')}, {minutes:.0f} min, {room.low_rad:.3g} to {room.high_rad:.3g} "
-        f"rad, at most {room.velocity_rad_s:.3g} rad/s and {room.acceleration_rad_s2:.3g} rad/s2, as in these runs and "
-        f"within the joint's limits; there they needed up to {room.needed_nm:.3g} Nm of {room.torque_nm:.3g} Nm, a payload "
-        "may add no more than the rest. All other joints stand as they did in these runs."
+        f"rad, at most {room.velocity_rad_s:.3g} rad/s and {room.acceleration_rad_s2:.3g} rad/s2, "
     )
+    if math.isfinite(room.needed_nm):
+        parts[-1] += (
+            "as in these runs and within the joint's limits; there they needed up to "
+            f"{room.needed_nm:.3g} Nm of {room.torque_nm:.3g} Nm, a payload may add no more than the rest."
+        )
+    else:
+        parts[-1] += (
+            f"within the joint's limits; no run shows what torque that needs, so go slowly first and watch "
+            f"{room.torque_nm:.3g} Nm."
+        )
+    parts.append("All other joints stand as they did in these runs.")
     return {
         "why": " ".join(parts),
         "plan": None,

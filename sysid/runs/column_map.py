@@ -18,6 +18,7 @@ A drive that gives no current gives its voltage; the winding's inductance is lef
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,7 +36,8 @@ TIME: Final = "time_s"
 JOINTS: Final = range(1, 8)
 GRAVITY_M_S2: Final = 9.80665
 WINDOW_S: Final = 0.05
-"""Velocity and acceleration of a known load are those of a cubic fitted to this much of its position."""
+"""Longest piece of a position to which a cubic is fitted for its velocity and acceleration."""
+_QUIET: Final = 0.02
 _FEWEST_ROWS: Final = 7
 
 
@@ -201,22 +203,39 @@ def targets() -> list[str]:
 
 
 def motion_of(time_s: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return velocity and acceleration [n]: of the cubic through WINDOW_S of the position around each row, ends held.
+    """Return velocity and acceleration [n]: of the cubic through a window of the position around each row, ends held.
 
-    Rows are taken as even (Savitzky and Golay 1964, doi 10.1021/ac60214a047); a piece shorter than a window is one
-    cubic's own.
+    The window is the shortest in which the position's noise (rounding included) is below _QUIET of the motion's largest
+    acceleration, WINDOW_S at most: what is longer rounds the reversals off. Rows are taken as even (Savitzky and Golay 1964,
+    doi 10.1021/ac60214a047).
     """
     step = float(np.median(np.diff(time_s)))
-    half = max(_FEWEST_ROWS // 2, round(0.5 * WINDOW_S / step))
-    half = min(half, (len(position) - 1) // 2)
-    if half < 2:
+    longest = min(
+        max(_FEWEST_ROWS // 2, round(0.5 * WINDOW_S / step)),
+        (len(position) - 1) // 2,
+    )
+    if longest < 2:
         velocity = np.gradient(position, time_s)
         return velocity, np.gradient(velocity, time_s)
-    at = np.arange(-half, half + 1) * step
-    weights = np.linalg.pinv(np.column_stack((np.ones_like(at), at, at * at, at**3)))
-    slope = np.correlate(position, weights[1], mode="valid")
-    bend = np.correlate(position, 2.0 * weights[2], mode="valid")
+    weights = _weights(longest, step)
+    largest = float(np.max(np.abs(np.correlate(position, weights[1], mode="valid"))))
+    noise = float(np.std(np.diff(position, 4))) / math.sqrt(
+        70.0
+    )  # of white noise; of the motion next to nothing
+    half = longest
+    for half in range(min(_FEWEST_ROWS // 2, longest), longest + 1):
+        weights = _weights(half, step)
+        if noise * float(np.linalg.norm(weights[1])) <= _QUIET * largest:
+            break
+    slope, bend = (np.correlate(position, each, mode="valid") for each in weights)
     return np.pad(slope, half, mode="edge"), np.pad(bend, half, mode="edge")
+
+
+def _weights(half: int, step: float) -> tuple[FloatArray, FloatArray]:
+    """Weights [2 half + 1] of a cubic's slope and second derivative in its middle."""
+    at = np.arange(-half, half + 1) * step
+    cubic = np.linalg.pinv(np.column_stack((np.ones_like(at), at, at * at, at**3)))
+    return cubic[1], 2.0 * cubic[2]
 
 
 def _column(section: Section) -> Column:

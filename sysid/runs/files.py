@@ -121,6 +121,9 @@ def read_runs(
         same = next((other.name for other in runs if other.sha256 == read[0].sha256), None)
         if same is not None:
             raise RunError(f"{path}: found the same data as in {same}, expected every run once")
+        if runs and mapping is not None:  # what holds for every file is said once
+            said = set(mapping.remarks())
+            read[0] = replace(read[0], notes=tuple(note for note in read[0].notes if note not in said))
         taken = {other.name for other in runs}
         runs += [
             replace(run, name=run.name.replace(path.name, str(path), 1)) if run.name in taken else run

@@ -95,6 +95,15 @@ def test_without_room_there_is_no_motion(limits: MotionLimits) -> None:
     assert "No motion is planned" in made["why"]
 
 
+def test_without_runs_the_limits_of_the_file_are_the_room() -> None:
+    limits = MotionLimits((-0.2, 0.4), velocity_rad_s=0.3, acceleration_rad_s2=1.0, torque_nm=10.0)
+    made = next_experiment([], {1: replace(JOINT, motion_limits=limits)})
+    assert made["motion"]["travel_rad"] == [-0.2, 0.4]
+    assert "no run shows what torque that needs" in made["why"]
+    assert next_experiment([], {1: JOINT})["motion"] is None
+    assert next_experiment([], {1: replace(JOINT, motion_limits=MotionLimits((-0.2, 0.4)))})["motion"] is None
+
+
 def test_one_joint_gets_a_motion_and_no_towing_plan() -> None:
     made = next_experiment([("torque_constant", "sensor_gain")], {3: JOINT}, "Why.", signals=[swung()])
     assert made["plan"] is None
