@@ -64,7 +64,7 @@ def logs(folder: Path) -> None:
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A directory with what the page takes for given: the shipped models and logs of jtqd; all commands have been run there."""
+    """Where all commands have been run: a directory with what the page takes for given, the models and logs of jtqd."""
     folder = tmp_path_factory.mktemp("your_data")
     (folder / "models").symlink_to(ROOT / "models")
     logs(folder / "logs")
