@@ -14,10 +14,8 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.run import JointColumns, RunTable
-from jtqd.sim_can.days import NOMINAL_DAY, Day
-from jtqd.sim_can.days import day as day_of
-from jtqd.sim_can.plant_file import PlantParameters
 from jtqd.sim_can.plant_source import PlantSource
+from jtqd.sim_can.plants import AnyDay, AnyPlant
 from jtqd.sim_can.source import CURRENT, OFF, VELOCITY, DriveRatings
 
 SENSOR_NM_PER_UNIT = 0.001  # 6132h:1 = 3 decimal digits
@@ -54,13 +52,13 @@ def _zero(_time_s: float) -> float:
 
 
 def emulate_run(
-    plant: PlantParameters,
+    plant: AnyPlant,
     commands: tuple[JointCommand, JointCommand],
     duration_s: float,
     seed: int = 0,
     period_s: float = 0.001,
     *,
-    day: int | Day | None = None,
+    day: int | AnyDay | None = None,
 ) -> RunTable:
     """Run both joints from rest for duration_s and return what was measured every period_s.
 
@@ -81,17 +79,17 @@ def emulate_run(
     if not (0.0 < period_s < math.inf and period_s <= duration_s < math.inf):
         raise ValueError(f"a run of {duration_s} s in steps of {period_s} s")
     count = round(duration_s / period_s)
-    if day is None or isinstance(day, Day):
-        source = PlantSource(plant, seed)
-        source.begin_day(NOMINAL_DAY if day is None else day)
+    if isinstance(day, int):
+        source = PlantSource(plant, seed, noise_seed=f"{seed} day {day}")
+        source.begin_day(plant.run_to_run.day(seed, day))
     else:
-        source = PlantSource(plant, seed, noise_seed=f"{seed} day {int(day)}")
-        source.begin_day(day_of(plant.run_to_run, seed, int(day)))
+        source = PlantSource(plant, seed)
+        source.begin_day(day)
     rows = np.empty((count, 2 * _SIGNALS + 1))
     # velocity targets are joint side here, motor side in the drives
     scale = [
-        side.joint.gear_ratio if c.mode == VELOCITY else 1.0
-        for side, c in zip(plant.joints, commands, strict=True)
+        drive.gear_ratio if c.mode == VELOCITY else 1.0
+        for drive, c in zip(source.ratings, commands, strict=True)
     ]
     one, two = source.drives
     channel = source.channels[0]
