@@ -9,7 +9,7 @@ import pytest
 
 from jtqd.estimator.checked import ConfigError
 from jtqd.models.files import load_joint, load_yaml
-from jtqd.sim_can.emulated_run import JointCommand, emulate_run
+from jtqd.sim_can.emulated_run import JointCommand, emulate, emulate_run
 from jtqd.sim_can.source import CURRENT, VELOCITY
 from jtqd.sim_can.towing.bench_file import bench_from_mapping
 from jtqd.sim_can.towing.days import DayWidths, JointDay
@@ -239,3 +239,20 @@ def loaded(change) -> None:
 def test_what_is_wrong_with_a_bench_file_is_named(change, expected: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(expected)):
         loaded(change)
+
+
+def test_the_true_torques_stand_beside_what_was_measured() -> None:
+    day = PLAIN.run_to_run.nominal_day
+    run = emulate(
+        replace(PLAIN, sensor=replace(PLAIN.sensor, gain=2.0, offset_nm=1.0)),
+        commands(),
+        1.0,
+        seed=5,
+        day=day,
+    )
+    assert np.max(np.abs(run.table.joints[1].torque_nm - 2.0 * run.torque_nm - 1.0)) < 1e-3
+    inertia = [side.link_inertia_kgm2 for side in PLAIN.joints]
+    one, two = run.joint_torque_nm.T
+    # the sensor is between the links: the mean of both torques, weighted by the other one's inertia
+    expected = (inertia[1] * one + inertia[0] * two) / sum(inertia)
+    assert np.max(np.abs(run.torque_nm - expected)) < 1e-9
