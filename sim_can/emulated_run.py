@@ -52,7 +52,7 @@ def _zero(_time_s: float) -> float:
 
 
 class EmulatedRun(NamedTuple):
-    """A run with what no instrument knows: torque_nm [n], in the sensor; joint_torque_nm [n, 2], τ of each gear, own frames."""
+    """A run, and what no instrument knows: torque_nm [n] in the sensor, joint_torque_nm [n, 2]: τ of each gear, own frames."""
 
     table: RunTable
     torque_nm: FloatArray
