@@ -19,7 +19,7 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Joint
-from jtqd.sysid.diagnosis.signals import JointSignals
+from jtqd.sysid.diagnosis.signals import JointSignals, smooth
 
 RATE_HZ: Final = 100.0
 NO_LIMIT: Final = 1e6
@@ -32,6 +32,7 @@ _BINS: Final = 24
 _LEAST_TRAVEL_RAD: Final = 0.02
 _LEAST_SPEED_RAD_S: Final = 0.005
 _ACCELERATION_QUANTILE: Final = 0.99
+_ACCELERATION_S: Final = 0.1
 _REST_S: Final = 1.0
 _SHORTEST_PASS_S: Final = 0.5
 
@@ -60,9 +61,7 @@ def room_of(joint: Joint, signals: Sequence[JointSignals]) -> Room | None:
     position = np.concatenate([s.state.link_position_rad for s in signals])
     torque = np.abs(np.concatenate([s.sensor_nm for s in signals]))
     speed = max(float(np.max(np.abs(s.state.velocity_rad_s))) for s in signals)
-    quick = max(
-        float(np.quantile(np.abs(s.state.link_acceleration_rad_s2), _ACCELERATION_QUANTILE)) for s in signals
-    )
+    quick = max(_acceleration(s) for s in signals)
     low, high = float(np.min(position)), float(np.max(position))
     allowed = joint.rated_torque_nm
     limits = joint.motion_limits
@@ -80,6 +79,15 @@ def room_of(joint: Joint, signals: Sequence[JointSignals]) -> Room | None:
     margin = INSIDE * (high - low)
     there = (position >= low) & (position <= high)
     return Room(low + margin, high - margin, speed, quick, allowed, float(np.max(torque[there])))
+
+
+def _acceleration(s: JointSignals) -> float:
+    """Return the acceleration of a run [rad/s2], mean over _ACCELERATION_S: single samples are noise of the encoder."""
+    v = s.state.velocity_rad_s
+    step = float(np.median(np.diff(s.time_s)))
+    wide = min(max(1, round(_ACCELERATION_S / step)), len(v) - 1)
+    calm = smooth(v, max(1, wide // 4))
+    return float(np.quantile(np.abs(calm[wide:] - calm[:-wide]), _ACCELERATION_QUANTILE)) / (wide * step)
 
 
 def _of_limits(joint: Joint) -> Room | None:

@@ -16,7 +16,7 @@ JOINT = load_joint(shipped("joint1.yaml"))
 GRAVITY_NM = 20.0
 
 
-def swung(low: float = -0.6, high: float = 1.0, speed: float = 0.7) -> JointSignals:
+def swung(low: float = -0.6, high: float = 1.0, speed: float = 0.7, noise_rad: float = 0.0) -> JointSignals:
     """An arm's joint swung from low to high and back under gravity."""
     half, middle = 0.5 * (high - low), 0.5 * (high + low)
     rate = speed / half
@@ -25,7 +25,8 @@ def swung(low: float = -0.6, high: float = 1.0, speed: float = 0.7) -> JointSign
     torque = GRAVITY_NM * np.sin(angle)
     columns = JointColumns(
         current_a=torque / JOINT.gear_ratio / JOINT.torque_constant_nm_per_a,
-        motor_position_rad=JOINT.gear_ratio * angle,
+        motor_position_rad=JOINT.gear_ratio
+        * (angle + noise_rad * np.random.default_rng(1).normal(size=len(angle))),
         torque_nm=torque,
     )
     return joint_signals("r", RunTable(time_s, {1: columns}), 1, JOINT, BaseLoss(JOINT))
@@ -69,6 +70,13 @@ def test_the_room_is_where_the_runs_have_been() -> None:
     assert room.high_rad == pytest.approx(1.0 - 0.05 * 1.6, abs=1e-3)
     assert room.velocity_rad_s == pytest.approx(0.7, rel=0.01)
     assert room.needed_nm == pytest.approx(GRAVITY_NM * np.sin(1.0), rel=0.01)
+
+
+@pytest.mark.parametrize("noise_rad", [0.0, 2e-4])
+def test_noise_of_the_encoder_is_no_acceleration(noise_rad: float) -> None:
+    room = room_of(JOINT, [swung(noise_rad=noise_rad)])
+    assert room is not None
+    assert room.acceleration_rad_s2 == pytest.approx(0.7**2 / 0.8, rel=0.15)
 
 
 def test_the_limits_of_the_joint_file_make_it_smaller() -> None:
