@@ -19,6 +19,7 @@ import importlib.util
 import io
 import math
 import os
+import re
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -38,6 +39,8 @@ from jtqd.sysid.runs.expressions import Expression, ExpressionError
 
 TABLES: Final = (".csv", ".csv.gz", ".parquet")
 LOGS: Final = (".mcap",)
+_PART: Final = re.compile(r"(?P<run>.+-\d{8}T\d{6}Z(?:_\d+)?)-\d{4,}\.mcap", re.ASCII)
+"""Name of a part of a run: PREFIX-RUN-PART.mcap."""
 LONGEST_GAP: Final = 10.0
 """Median steps: a longer step means that the run consists of pieces. A reader of whole runs refuses it, because a fit or an
 observer would take the jump for a measurement; `read_runs(.., in_pieces=True)` takes it apart. Shorter gaps (lost cycles)
@@ -108,7 +111,8 @@ def read_runs(
     """Read all runs of files and directories (`run_paths`); a progress bar on a terminal.
 
     columns: a column map or its file. Names are unique: the file's, or its path where two files share a name.
-    in_pieces: a recording with gaps gives one run for each piece between them, "a.csv (1 of 3)", not an error.
+    in_pieces: a recording with gaps gives one run for each piece between them, "a.csv (1 of 3)", not an error; the parts of
+    one run of jtqd are one recording.
 
     Raises:
         RunError: as `read_run` and `run_paths`, or the same data given twice, which would count it twice.
@@ -116,8 +120,13 @@ def read_runs(
     """
     mapping = ColumnMap.load(columns) if isinstance(columns, Path) else columns
     runs: list[RunFile] = []
-    for path in progress(run_paths(arguments), "reading runs"):
-        read = read_pieces(path, mapping) if in_pieces else [read_run(path, mapping)]
+    paths = run_paths(arguments)
+    groups = _recordings(paths) if in_pieces else [(path,) for path in paths]
+    for path, *parts in progress(groups, "reading runs"):
+        if parts:
+            read = _checked(_read_log(path, *parts), whole=False)
+        else:
+            read = read_pieces(path, mapping) if in_pieces else [read_run(path, mapping)]
         same = next((other.name for other in runs if other.sha256 == read[0].sha256), None)
         if same is not None:
             raise RunError(f"{path}: found the same data as in {same}, expected every run once")
@@ -147,6 +156,16 @@ def read_pieces(path: Path | str, columns: ColumnMap | None = None) -> list[RunF
     Raises RunError, also where no piece is long enough.
     """
     return _checked(_content(Path(path), columns), whole=False)
+
+
+def _recordings(paths: Sequence[Path]) -> list[tuple[Path, ...]]:
+    """Return the files of each recording: jtqd ends a log and begins the next part after a while (docs/recording.md)."""
+    groups: dict[object, list[Path]] = {}
+    for path in paths:
+        run = _PART.fullmatch(path.name)
+        key = path if run is None else (path.parent, run["run"])
+        groups.setdefault(key, []).append(path)
+    return [tuple(sorted(group)) for group in groups.values()]
 
 
 @dataclass(frozen=True)
@@ -459,19 +478,22 @@ def _is_number(value: object) -> bool:
     return True
 
 
-def _read_log(path: Path) -> _Content:
+def _read_log(path: Path, *parts: Path) -> _Content:
+    """Read a log, or all parts of one run; the hash is that of all files one after another."""
     from jtqd.daemon.logs import LogError
     from jtqd.sysid.runs.logs import log_to_run
 
-    _, sha256 = _bytes(path)
+    sha256 = _bytes(path)[1]
+    if parts:
+        sha256 = hashlib.sha256(b"".join(_bytes(each)[0] for each in (path, *parts))).hexdigest()
     try:
-        logged = log_to_run(path)
+        logged = log_to_run((path, *parts) if parts else path)
     except LogError as error:
         text = str(error)
         raise RunError(text if text.startswith(str(path)) else f"{path}: {text}") from None
     except OSError as error:
         raise RunError(f"{path}: cannot be read: {error.strerror or error}") from None
-    notes = []
+    notes = [f"{len(parts) + 1} parts of one run: {path.name} to {parts[-1].name}"] if parts else []
     if logged.missed or logged.incomplete:
         by = ", ".join(f"{count} of {name}" for name, count in logged.incomplete_by.items() if count)
         notes.append(
