@@ -257,6 +257,7 @@ def _checked(content: _Content, *, whole: bool) -> list[RunFile]:
             f"{counted(len(cuts) - 1, 'gap')} of more than {BRIDGED_S:g} s: used as {counted(len(long), 'piece')} of one "
             f"recording, {kept:.3g} s of {time_s[-1] - time_s[0]:.3g} s"
         )
+        notes += _unwrapped_over_gaps(content)
     if content.columns is not None:
         notes += content.columns.remarks()
     return [
@@ -301,6 +302,14 @@ def _pieces(time_s: FloatArray) -> list[slice]:
     longest = max(LONGEST_GAP * float(np.median(steps)), BRIDGED_S)
     ends = [0, *(np.flatnonzero(steps > longest) + 1), len(time_s)]
     return [slice(int(a), int(b)) for a, b in pairwise(ends)]
+
+
+def _unwrapped_over_gaps(content: _Content) -> list[str]:
+    if content.columns is None:
+        return []
+    named = [key for key, column in content.columns.sources().items() if "unwrap(" in column.name]
+    what = "its turns in the gaps are not known: an angle of a later piece may be off by whole periods"
+    return [f"{key} is unwrapped, {what}" for key in named]
 
 
 def _length_s(time_s: FloatArray, cut: slice) -> float:

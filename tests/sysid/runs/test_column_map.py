@@ -164,6 +164,20 @@ def test_gaps_make_pieces_that_keep_their_time(tmp_path: Path) -> None:
     assert pieces[1].notes == ()
 
 
+def test_turns_in_a_gap_are_not_known(tmp_path: Path) -> None:
+    keep = ~((T > 2.0) & (T < 2.5))
+    path = table(tmp_path / "a.csv", {"t": T[keep], "q": np.mod(9.0 * T[keep], 2.0 * np.pi), "i": Q[keep]})
+    columns = ColumnMap.from_mapping(
+        {"time_s": "t", "j1.current_a": "i", "j1.motor_position_rad": "unwrap(q, 2 * pi)"}, "m", Path()
+    )
+    first, second = read_pieces(path, columns)
+    assert any("j1.motor_position_rad is unwrapped, its turns in the gaps" in note for note in first.notes)
+    for piece in (first, second):
+        position = piece.table.joints[1].motor_position_rad
+        assert position is not None
+        assert np.diff(position) == pytest.approx(9.0 * np.diff(piece.table.time_s), abs=1e-6)
+
+
 def test_pieces_that_are_all_too_short_are_refused(tmp_path: Path) -> None:
     keep = (T % 0.5) < 0.4
     path = table(tmp_path / "a.csv", {"time_s": T[keep], "j1.current_a": Q[keep]})
