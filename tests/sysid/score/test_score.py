@@ -62,6 +62,13 @@ def test_an_effect_of_the_file_is_part_of_its_simulation() -> None:
     assert errors_on("r", swing(0.3), 1, mended).errors[MOTOR] < 0.01
 
 
+def test_an_effect_that_no_value_stands_for_is_simulated_too() -> None:
+    """A ripple that the joint does not have is an error of its own size."""
+    ripple = Effect("torque_ripple", {"amplitude_nm": 0.5, "order_per_motor_rev": 1.0, "phase_rad": 0.0})
+    found = errors_on("r", swing(0.3), 1, replace(TRUE, effects=(ripple,)))
+    assert found.errors[MOTOR] == pytest.approx(0.5 / math.sqrt(2.0), rel=0.15)
+
+
 def test_all_runs_together_are_weighted_by_their_samples() -> None:
     short, long = swing(0.3, 3.0), swing(1.1, 9.0)
     scored = [[errors_on(name, table, 1, WRONG) for name, table in (("a", short), ("b", long))]]
