@@ -7,7 +7,7 @@ from libc.stdint cimport int64_t, uint8_t, uint64_t
 
 import struct
 
-from jtqd.daemon.core.block cimport copied, put_back
+from jtqd.estimator.block cimport copied, put_back
 from jtqd.daemon.core.bus cimport Bus, bus_of
 from jtqd.daemon.core.intake cimport MOST_INPUTS, NODES, Input, Intake, NodeState
 from jtqd.daemon.core.joint cimport JointState

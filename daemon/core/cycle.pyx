@@ -15,7 +15,7 @@ from libc.string cimport memcpy, memset
 
 from typing import Final
 
-from jtqd.daemon.core.block cimport copied, put_back
+from jtqd.estimator.block cimport copied, put_back
 from jtqd.daemon.core.bus cimport Bus, bus_of
 from jtqd.daemon.core.clock cimport Clock
 from jtqd.daemon.core.configured_nodes import ConfiguredNodes

@@ -35,7 +35,7 @@ from libc.string cimport memcmp, memcpy, memset
 
 from typing import Final
 
-from jtqd.daemon.core.block cimport copied, put_back
+from jtqd.estimator.block cimport copied, put_back
 from jtqd.drivers.frame_socket cimport Frame
 from jtqd.drivers import devices, nmt
 from jtqd.drivers import frame as can_frame

@@ -6,7 +6,7 @@ from libc.stdint cimport int64_t
 from dataclasses import replace
 from typing import Final
 
-from jtqd.daemon.core.block cimport copied, put_back
+from jtqd.estimator.block cimport copied, put_back
 from jtqd.daemon.core.estimate_pdo cimport Published, field_of, has_torque
 from jtqd.daemon.core.intake cimport Input, InputState, Intake, JointTemperature
 from jtqd.daemon.core.intake import UNKNOWN

@@ -9,7 +9,7 @@ from libc.string cimport memcpy
 
 import sys
 
-from jtqd.daemon.core.block cimport copied, put_back
+from jtqd.estimator.block cimport copied, put_back
 from jtqd.drivers.frame_socket cimport Frame
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared import ring as shared_ring

@@ -7,7 +7,7 @@ from libc.stdint cimport int64_t
 
 from typing import Final
 
-from jtqd.daemon.core.block cimport copied, put_back
+from jtqd.estimator.block cimport copied, put_back
 
 _STEP_NS: Final = 160
 _MARGIN_NS: Final = 10_000

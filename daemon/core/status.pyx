@@ -28,7 +28,7 @@ from libc.stdint cimport int64_t, uint64_t
 
 from typing import Final
 
-from jtqd.daemon.core.block cimport copied, put_back
+from jtqd.estimator.block cimport copied, put_back
 from jtqd.daemon.core.estimate_pdo cimport has_torque
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared import faults

@@ -9,7 +9,7 @@ import pytest
 
 from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.reload.files import needs_restart
-from jtqd.daemon.reload.successor import Shadow
+from jtqd.daemon.reload.shadow import Shadow
 from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import INVALID, VALID, Estimate
