@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -33,6 +34,8 @@ class Refused(Exception):  # noqa: N818 - a no, not an error
 
 def prepare(request: dict[str, Any]) -> int:
     """Build, shadow, write. Returns the exit status; what is wrong goes to the supervisor."""
+    with suppress(OSError):  # whatever the supervisor itself was started with
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     os.nice(_NICE)
     config, estimators = build_estimators(request)
     for joint, estimator in zip(config.joints, estimators, strict=True):

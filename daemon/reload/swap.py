@@ -125,6 +125,8 @@ class Swap:
             self._steps = None
         except (BlockFileError, OSError, ValueError) as error:
             self._refuse(str(error))
+        except MemoryError:  # locked memory has a limit, too
+            self._refuse("there is no memory for the new estimators")
         self._costs_ns[name].append(time.monotonic_ns() - began)
 
     def rehearse(self, estimators: Sequence[Estimator]) -> None:

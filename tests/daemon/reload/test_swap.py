@@ -367,6 +367,17 @@ def test_a_file_of_another_layout_of_the_right_hash(loop: Loop, monkeypatch: pyt
     assert "the program has changed since jtqd started" in loop.refused(order)
 
 
+def test_no_memory(loop: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
+    loop.turn(50)
+    order = loop.prepared(others("tob"))
+
+    def full(*_: Any) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(swap, "estimator_of", full)
+    assert loop.refused(order) == "there is no memory for the new estimators"
+
+
 def test_estimators_that_are_too_far_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     loop = Loop(tmp_path, monkeypatch)
     loop.turn(10)
