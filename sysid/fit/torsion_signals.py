@@ -34,8 +34,9 @@ def _motor_waves(run: RunSignals, order: float) -> FloatArray:
 
 def _known(angle_rad: FloatArray | None, order: float) -> FloatArray:
     if angle_rad is None:
+        known = " and ".join(map(str, RIPPLE_ORDERS))
         raise ValueError(
-            f"found a torsion of order {order:g}, expected {RIPPLE_ORDERS}: no positions are known"
+            f"found a torsion of order {order:g}, expected one of {known}: no positions are known"
         )
     return angle_rad
 
