@@ -32,7 +32,7 @@ from rich.progress import Progress
 
 from tests.hidden.figures import table
 from tests.hidden.scores import Outcome, score
-from tests.worlds.benches import BENCHES
+from tests.worlds.benches import BENCHES, missing
 from tests.worlds.figures import failures, figures, lost_to_wrong
 from tests.worlds.judge import judged
 from tests.worlds.oracle import hidden_size
@@ -277,6 +277,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("found neither --table nor --bench and --out, expected one of them", file=sys.stderr)
         return USAGE
     seed = int(np.random.default_rng().integers(10**6)) if options.seed is None else options.seed
+    lacking = missing(options.bench) if options.table is None else ""
+    if lacking:
+        print(lacking, file=sys.stderr)
+        return FAILED
     kinds = tuple(k for k in options.kinds.split(",") if k)
     counts = Counts(options.per_effect, options.none, options.pairs, options.foreign)
     try:

@@ -24,7 +24,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from tests.worlds.benches import BENCHES
+from tests.worlds.benches import BENCHES, missing
 from tests.worlds.sets import Array, Bench, Columns, Hidden
 from tests.worlds.units import UNITS
 
@@ -188,6 +188,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--sets", type=int, default=6, help="with nothing hidden (default 6)")
     parser.add_argument("--write", action="store_true", help=f"into {FILE.name}")
     options = parser.parse_args(arguments)
+    if lacking := missing(options.bench):
+        print(lacking, file=sys.stderr)
+        return 1
     bench = BENCHES[options.bench]()
     oracle = Oracle(bench, options.sets)
     found = {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -171,6 +172,15 @@ def test_the_command_prints_the_table_and_compares(
     (tmp_path / "other.jsonl").write_text("{}\n")
     assert main(["--table", str(tmp_path / "other.jsonl")]) == campaigns.FAILED
     assert main(["--bench", "measured"]) == campaigns.USAGE
+
+
+def test_a_missing_mujoco_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert main(["--bench", "mujoco", "--seed", "1", "--out", str(tmp_path / "a")]) == campaigns.FAILED
+    assert capsys.readouterr().err.count("\n") == 1
 
 
 def outcome(kind: str, **values: Any) -> Outcome:
