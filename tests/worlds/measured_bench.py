@@ -1,10 +1,11 @@
 """Bench `measured`: the Kinova runs that ship (`models/kinova_gen3`), with effects put into the recordings.
 
 A set is one joint with six recordings of its actuator's size: joints 1 to 4, or 5 to 7, of both runs, each in its own or
-mirrored about zero (all signs turned). Motion, torque sensor, spikes, repeated rows and noise are as measured. The
-current, which this recorder wrote up to a row too early, is put in step, and an ordinary ladder is taken from it,
+mirrored about zero (all signs turned). Motion, torque sensor, spikes, repeated rows and noise are as measured. Current
+and sensor are put in step with the motion (this recorder wrote the one early, the other late, by a row or two), and an
+ordinary ladder is taken from the current,
 
-    G Kt i(t - d) - G^2 Jm dv/dt - Fc s - Fv v - tau  =  c . (1, s, v, dv/dt, tau, |tau| s) + rest
+    G Kt i - G^2 Jm dv/dt - Fc s - Fv v - tau  =  c . (1, s, v, dv/dt, tau, |tau| s) + rest
 
 fitted to each recording alone, so that the joint file is right about the terms in it and the rest stays where it was: it
 is real and not noise, and a tool that says so about a set with nothing hidden is not wrong. Each run then gets its day (zero
@@ -55,7 +56,7 @@ JOINTS: Final[dict[str, dict[str, Any]]] = {
 }
 """Joint files: what models/kinova_gen3 says of gear, motor and rating; the ladder makes the rest true."""
 _SLOW_RAD_S: Final = 0.02
-_DELAYS_S: Final = np.arange(-2e-3, 2.01e-3, 0.25e-3)
+_SHIFTS_S: Final = tuple(np.arange(-3e-3, 3.01e-3, 0.5e-3).tolist())
 _DRAW, _DAYS, _HIDDEN = range(3)
 
 
@@ -181,23 +182,30 @@ def acceleration(v: Array) -> Array:
 
 
 def _without_ladder(run: Columns, joint: Mapping[str, Any]) -> Columns:
-    v, torque, t = _speed(run, joint), run["j1.torque_nm"], run["time_s"]
+    v, t = _speed(run, joint), run["time_s"]
     s, a = _direction(v), acceleration(v)
     own = joint["gear_ratio"] ** 2 * joint["rotor_inertia_kgm2"]
     friction = joint["friction"]
-    known = own * a + friction["coulomb_nm"] * s + friction["viscous_nms_per_rad"] * v + torque
-    ladder = np.column_stack((np.ones_like(v), s, v, a, torque, np.abs(torque) * s))
+    known = own * a + friction["coulomb_nm"] * s + friction["viscous_nms_per_rad"] * v
     moving = np.abs(v) > 2.5 * _SLOW_RAD_S
-    ladder = ladder / np.sqrt(np.mean(np.square(ladder[moving]), axis=0))
-    best, least = run["j1.current_a"], np.inf
-    for delay in _DELAYS_S:
-        current = np.interp(t - delay, t, run["j1.current_a"])
-        left = _gain(joint) * current - known
+
+    def taken(late_current_s: float, early_sensor_s: float) -> tuple[float, Columns]:
+        """Return what is left and the run without its ladder, both channels shifted."""
+        current = np.interp(t - late_current_s, t, run["j1.current_a"])
+        torque = np.interp(t + early_sensor_s, t, run["j1.torque_nm"])
+        ladder = np.column_stack((np.ones_like(v), s, v, a, torque, np.abs(torque) * s))
+        ladder /= np.sqrt(np.mean(np.square(ladder[moving]), axis=0))
+        left = _gain(joint) * current - known - torque
         c, *_ = np.linalg.lstsq(ladder[moving], left[moving], rcond=1e-3)
         rest = float(np.mean(np.square((left - ladder @ c)[moving])))
-        if rest < least:
-            best, least = current - ladder @ c / _gain(joint), rest
-    return {**run, "j1.current_a": best}
+        shifted = {"j1.current_a": current - ladder @ c / _gain(joint), "j1.torque_nm": torque}
+        return rest, {**run, **shifted}
+
+    late = early = 0.0
+    for _ in range(2):  # one channel after the other
+        late = min(_SHIFTS_S, key=lambda x: taken(x, early)[0])
+        early = min(_SHIFTS_S, key=lambda x: taken(late, x)[0])
+    return taken(late, early)[1]
 
 
 def _mirrored(run: Columns, sign: float) -> Columns:
