@@ -69,6 +69,7 @@ class Job:
 def jobs(bench: Bench, seed: int, counts: Counts) -> list[Job]:
     """Return all sets of a campaign in a mixed order; the same whatever the recorder."""
     out: list[Job] = []
+    plain: list[int] = []
     there = [name for name in bench.effects if hidden_size(bench.name, name, FULL) is not None]
 
     def effect(rng: np.random.Generator, name: str, factor: float) -> Hidden:
@@ -81,14 +82,18 @@ def jobs(bench: Bench, seed: int, counts: Counts) -> list[Job]:
         number = len(out)
         rng = np.random.default_rng([seed, number])
         own = int(rng.integers(2**31))
+        if bench.real and plain:
+            own = plain[int(rng.integers(len(plain)))]
         out.append(Job(f"{kind}.{label}", kind, own, tuple(hide(rng))))
 
+    for k in range(counts.none):
+        add("nothing", str(k), lambda rng: [])
+    if bench.real:
+        plain += [job.seed for job in out]
     for k in range(counts.per_effect):
         for name in there:
             add("single", f"{name}.{k}", lambda rng, n=name: [effect(rng, n, FULL)])
             add("half", f"{name}.{k}", lambda rng, n=name: [effect(rng, n, HALF)])
-    for k in range(counts.none):
-        add("nothing", str(k), lambda rng: [])
     for k in range(counts.pairs):
         add(
             "pair",
@@ -103,8 +108,9 @@ def jobs(bench: Bench, seed: int, counts: Counts) -> list[Job]:
                 f"{kind}.{k}",
                 lambda rng, n=kind: [_strange(rng, bench, n), effect(rng, str(rng.choice(there)), FULL)],
             )
-    order = np.random.default_rng([seed, 2**20]).permutation(len(out))
-    return [out[int(k)] for k in order]
+    first = counts.none if bench.real else 0  # what the others are judged beside comes first
+    order = np.random.default_rng([seed, 2**20]).permutation(len(out) - first) + first
+    return [*out[:first], *(out[int(k)] for k in order)]
 
 
 def _strange(rng: np.random.Generator, bench: Bench, kind: str) -> Hidden:
@@ -304,7 +310,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(
         f"bench {header['bench']}, recorder {header['recorder']}, seed {header['seed']}, {len(outcomes)} sets"
     )
-    rows = figures(list(outcomes.values()))
+    real = BENCHES[header["bench"]]().real
+    rows = figures(list(outcomes.values()), real)
     print(table(rows))
     if against is not None:
         same = against[0]["bench"], against[0]["seed"], against[0]["counts"]
@@ -317,9 +324,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         common = {key: outcomes[key] for key in outcomes if key in against[1]}
         full = {key: against[1][key] for key in common}
         print(f"\nthe same {len(common)} sets, recorder {against[0]['recorder']}")
-        print(table(figures(list(full.values()))))
+        print(table(figures(list(full.values()), real)))
         print(f"\nthe same {len(common)} sets, recorder {header['recorder']}")
-        print(table(figures(list(common.values()))))
+        print(table(figures(list(common.values()), real)))
         print(f"a wrong name instead of a found one: {len(lost_to_wrong(full, common))} sets (none allowed)")
     if options.failures:
         for line in failures(list(outcomes.values())):

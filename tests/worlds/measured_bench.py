@@ -7,9 +7,10 @@ ordinary ladder is taken from the current,
 
     G Kt i - G^2 Jm dv/dt - Fc s - Fv v - tau  =  c . (1, s, v, dv/dt, tau, |tau| s) + rest
 
-fitted to each recording alone, so that the joint file is right about the terms in it and the rest stays where it was: it
-is real and not noise, and a tool that says so about a set with nothing hidden is not wrong. Each run then gets its day (zero
-of the sensor, friction). Effects are functions of the measured channels, put into the current or into the sensor.
+fitted to each recording alone, so that the joint file is right about the terms in it and the rest stays where it was. The
+rest is real and not noise, and a tool that says so about a set with nothing hidden need not be wrong: real joints have a
+ripple. So every set shares its seed with one that hides nothing, and counts by what is said beyond that one. Each run then
+gets its day (zero of the sensor, friction). Effects are functions of the measured channels, put into current or sensor.
 """
 
 from __future__ import annotations
@@ -64,6 +65,7 @@ class MeasuredBench:
     """The bench."""
 
     name = "measured"
+    real = True
     effects: Sequence[str] = (
         "coulomb_friction",
         "viscous_friction",

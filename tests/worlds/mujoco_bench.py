@@ -55,6 +55,7 @@ class MujocoBench:
     """The bench; fewer and shorter runs for tests of the bench itself."""
 
     name = "mujoco"
+    real = False
     effects: Sequence[str] = tuple(UNITS)
     foreign: Sequence[str] = (
         "slipping_hub",

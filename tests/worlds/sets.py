@@ -39,9 +39,14 @@ class Set:
 
 
 class Bench(Protocol):
-    """What the campaign needs of a bench. foreign: kinds that are in no library."""
+    """What the campaign needs of a bench.
+
+    foreign: kinds that are in no library. real: with nothing hidden there may still be something in its runs: every set is
+    judged beside the set with nothing hidden of the same seed.
+    """
 
     name: str
+    real: bool
     effects: Sequence[str]
     foreign: Sequence[str]
 

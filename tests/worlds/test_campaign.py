@@ -72,7 +72,21 @@ def test_a_campaign_has_all_kinds_in_their_sizes() -> None:
             assert len({h.name for h in job.hidden}) == 2
         if job.kind in ("foreign", "beside"):
             assert job.hidden[0].name in bench.foreign
-    assert len({job.seed for job in there}) == len(there)
+    plain = {job.seed for job in there if job.kind == "nothing"}
+    assert len(plain) == 40
+    assert {job.seed for job in there} == plain  # of a real bench
+
+
+def test_a_set_of_a_real_bench_counts_beside_the_one_that_hides_nothing() -> None:
+    plain = outcome("nothing", causes=(("cogging", 1, ("cogging",)),))
+    same = outcome("single", named=(True,), classed=(False,), wrong=("cogging of 1",))
+    new = outcome("single", named=(True,), classed=(False,), wrong=("unbalance of 1",))
+    both = {row.what: row for row in figures([plain, same, new], real=True)}
+    assert both["a wrong name"].value == pytest.approx(1 / 3)
+    assert both["single, three times visible: named, or class of at most 3"].trials == 2
+    named = outcome("nothing", causes=(("torque_ripple", 1, ("torque_ripple",)),))
+    assert not any(row.what.startswith("single") for row in figures([named, same], real=True))
+    assert not any(row.what.startswith("single") for row in figures([same], real=True))
 
 
 def test_the_files_do_not_tell_what_is_hidden(tmp_path: Path) -> None:
