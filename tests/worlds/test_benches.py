@@ -120,7 +120,7 @@ CLOSED = [n for n in UNITS if n not in ("hysteresis", "rotor_inertia", "link_ine
 def test_an_effect_moves_the_balances_by_its_equation(name: str, mujoco_bench: MujocoBench) -> None:
     """To a fifth of its own size, or a thousandth of rated torque for what drive filters leave at reversals."""
     place = mujoco_bench.places(name)[0]
-    hidden = Hidden(name, place, 3.0 * UNITS[name].start)
+    hidden = Hidden(name, place, (10.0 if name == "kinematic_error" else 3.0) * UNITS[name].start)
     drawn = mujoco_bench.draw(SEED, [hidden], quiet=True)
     joint = 1 if place == SENSOR else int(place)
     rated = drawn.joints[joint]["rated_torque_nm"]
@@ -132,6 +132,7 @@ def test_an_effect_moves_the_balances_by_its_equation(name: str, mujoco_bench: M
             if name in (
                 "cogging",
                 "torque_ripple",
+                "kinematic_error",
             ):  # faster waves are gone with the mean of a bin, and in the drive's filter
                 rate = (
                     drawn.truth[0]["parameters"]["order_per_motor_rev"]
@@ -145,20 +146,29 @@ def test_an_effect_moves_the_balances_by_its_equation(name: str, mujoco_bench: M
             assert rms(left - trace) < 0.2 * rms(np.where(np.isfinite(left), trace, np.nan)) + 0.004 * rated
 
 
-def amplitude(
-    found: Set, plain: Set, trace: Sequence[tuple[Array, Array]], joint: int, balance: int
-) -> float:
+def amplitude(found: Set, plain: Set, trace: Sequence[Array], joint: int, balance: int) -> float:
     """Return how much of a trace [n] per run is in the difference of a balance (0 motor, 1 torsion) of two sets."""
     top = bottom = 0.0
-    for run, other, (x, y) in zip(found.runs, plain.runs, trace, strict=True):
+    for run, other, x in zip(found.runs, plain.runs, trace, strict=True):
         own = {joint: plain.joints[joint]}
         d = residuals(run, own)[balance][0] - residuals(other, own)[balance][0]
-        m = len(d)
-        shape = (x - 0.0 * y)[: m * 10].reshape(m, 10).mean(axis=1)
+        shape = x[: len(d) * 10].reshape(len(d), 10).mean(axis=1)
         there = np.isfinite(d)
         top += float(d[there] @ shape[there])
         bottom += float(shape[there] @ shape[there])
     return top / bottom
+
+
+def test_a_kinematic_error_takes_torque_from_the_motor(mujoco_bench: MujocoBench, plain: Set) -> None:
+    """Virtual work: slope of the error times the transmitted torque; where the wave is slow enough to see."""
+    drawn = mujoco_bench.draw(SEED, [Hidden("kinematic_error", 1, 0.1)], quiet=True)
+    order = drawn.truth[0]["parameters"]["order_per_motor_rev"]
+    traces = []
+    for k, run in enumerate(drawn.runs):
+        loss, _ = expected("kinematic_error", drawn, k, 1)
+        assert loss is not None
+        traces.append(np.where(np.abs(order * run["j1.motor_velocity_rad_s"]) < 100.0, loss, 0.0))
+    assert amplitude(drawn, plain, traces, 1, 0) == pytest.approx(1.0, abs=0.2)
 
 
 def test_inertias_are_inertias(mujoco_bench: MujocoBench, plain: Set) -> None:
@@ -174,9 +184,7 @@ def test_inertias_are_inertias(mujoco_bench: MujocoBench, plain: Set) -> None:
         )
         scale = gear if side == "motor" else 1.0
         trace = [more * np.gradient(run[f"j1.{side}_velocity_rad_s"] / scale, 1e-3) for run in drawn.runs]
-        assert amplitude(drawn, plain, [(x, x) for x in trace], 1, balance) == pytest.approx(1.0, abs=0.15), (
-            name
-        )
+        assert amplitude(drawn, plain, trace, 1, balance) == pytest.approx(1.0, abs=0.15), name
 
 
 def test_hysteresis_is_a_loop_of_its_torque(mujoco_bench: MujocoBench) -> None:
