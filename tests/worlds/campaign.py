@@ -182,6 +182,7 @@ def campaign(  # noqa: PLR0917
     processes: int = 1,
     minutes: float = float("inf"),
     kinds: Sequence[str] = (),
+    most: int | None = None,
 ) -> None:
     """Score what is missing in the file, line by line. Raises ValueError for a file of another campaign, OSError."""
     header = {"schema": SCHEMA, "bench": bench, "seed": seed, "recorder": recorder, "counts": asdict(counts)}
@@ -199,7 +200,7 @@ def campaign(  # noqa: PLR0917
         path.write_text(json.dumps(header) + "\n", encoding="utf-8")
     left = [
         job
-        for job in jobs(BENCHES[bench](), seed, counts)
+        for job in jobs(BENCHES[bench](), seed, counts)[:most]
         if job.key not in done and (not kinds or job.kind in kinds)
     ]
     deadline = time.monotonic() + 60.0 * minutes
@@ -269,6 +270,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--kinds", default="", help="some of single,half,nothing,pair,foreign,beside")
     parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--sets", type=int, metavar="N", help="only the first N of the mixed order")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no set after this time")
     parser.add_argument(
         "--out", type=Path, metavar="FILE.jsonl", help="one line per set; begun or gone on with"
@@ -301,6 +303,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 options.processes,
                 options.minutes,
                 kinds,
+                options.sets,
             )
         header, outcomes = read(options.table or options.out)
         against = None if options.against is None else read(options.against)

@@ -147,6 +147,11 @@ def test_it_goes_on_where_it_stopped(asked: list[Recorder], tmp_path: Path) -> N
         campaign(path, "measured", 6, "full", FEW)
 
 
+def test_a_part_is_the_first_of_the_same_sets(asked: list[Recorder], tmp_path: Path) -> None:
+    campaign(tmp_path / "a.jsonl", "measured", 5, "full", FEW, most=3)
+    assert list(read(tmp_path / "a.jsonl")[1]) == [job.key for job in jobs(MeasuredBench(), 5, FEW)[:3]]
+
+
 def test_it_ends_in_time(asked: list[Recorder], tmp_path: Path) -> None:
     campaign(tmp_path / "a.jsonl", "measured", 5, "full", FEW, minutes=0.0)
     assert not asked
