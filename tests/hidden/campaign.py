@@ -2,6 +2,7 @@
 
     python -m tests.hidden.campaign --trials 25 --seed 1
     python -m tests.hidden.campaign --trials 100 --kinds nothing,one --json > figures.json
+    python -m tests.hidden.campaign --trials 25 --seed 1 --recorder seven_digits
     python -m tests.hidden.campaign --trials 0 --cost               what ten runs of 60 s cost
 
 One trial is one bench of two joints, diagnosed with nothing hidden, one effect at three times and at one time its minimum
@@ -31,17 +32,24 @@ from tests.hidden.cost import cost_table
 from tests.hidden.figures import coverage_by_parameter, failures, figures, table
 from tests.hidden.scores import Outcome
 from tests.hidden.trials import KINDS, trial
+from tests.worlds.recorder import PRESETS, Recorder
 
 REACHED: Final = 0
 FAILED: Final = 1
 MISSED: Final = 3
 
 
-def run(
-    trials: int, seed: int, kinds: Sequence[str] = KINDS, processes: int = 2, first: int = 0
+def run(  # noqa: PLR0917
+    trials: int,
+    seed: int,
+    kinds: Sequence[str] = KINDS,
+    processes: int = 2,
+    first: int = 0,
+    recorder: str | None = None,
 ) -> list[Outcome]:
-    """Return the outcomes of trials first .. first + trials - 1, in order."""
-    work = [(number, seed, tuple(kinds)) for number in range(first, first + trials)]
+    """Return the outcomes of trials first .. first + trials - 1, in order; recorder: a name of `PRESETS`."""
+    preset = None if recorder is None else PRESETS[recorder]
+    work = [(number, seed, tuple(kinds), preset) for number in range(first, first + trials)]
     shown = sys.stderr.isatty()
     out: list[list[Outcome]] = []
     with Progress(disable=not shown) as progress:
@@ -58,7 +66,7 @@ def run(
     return [o for outcomes in out for o in outcomes]
 
 
-def _trial(item: tuple[int, int, tuple[str, ...]]) -> list[Outcome]:
+def _trial(item: tuple[int, int, tuple[str, ...], Recorder | None]) -> list[Outcome]:
     return trial(*item)
 
 
@@ -73,6 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--first", type=int, default=0, help="number of the first trial, to repeat one")
     parser.add_argument("--kinds", default=",".join(KINDS), help=f"some of {','.join(KINDS)}")
     parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--recorder", choices=sorted(PRESETS), help="judge what it writes of the runs")
     parser.add_argument("--cost", action="store_true", help="measure ten runs of 60 s as well")
     parser.add_argument("--json", action="store_true", help="figures and all outcomes as JSON")
     options = parser.parse_args(arguments)
@@ -85,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     seed = int(np.random.default_rng().integers(10**6)) if options.seed is None else options.seed
     print(f"seed {seed}", file=sys.stderr)
     begin = time.monotonic()
-    outcomes = run(options.trials, seed, kinds, options.processes, options.first)
+    outcomes = run(options.trials, seed, kinds, options.processes, options.first, options.recorder)
     rows = figures(outcomes)
     if options.cost:
         try:

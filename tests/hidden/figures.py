@@ -39,24 +39,24 @@ def figures(outcomes: Sequence[Outcome]) -> list[Figure]:
     hidden = [*one, *of["two"]]
     classed = sum(not all(o.named) and all(o.found) for o in one)
     rows = [
-        _share(
+        share(
             "hidden effect at 3x its minimum: named, or in a class of at most 3",
             [all(o.found) for o in one],
             0.95,
             f"{classed} in a class, {unseen} not visible in their runs",
         ),
-        _share(
+        share(
             "the same at 1x its minimum (no target)", [all(o.found) for o in least], None, "named or classed"
         ),
-        _share("wrong single name", [bool(o.wrong) for o in hidden], -0.02),
-        _share(
+        share("wrong single name", [bool(o.wrong) for o in hidden], -0.02),
+        share(
             "nothing hidden: anything named",
             [bool(o.causes) for o in of["nothing"]],
             -0.01,
             "else than no_gap: " + str(sum(o.verdict != "no_gap" for o in of["nothing"])),
         ),
-        _share("two effects at once: both found", [all(o.found) for o in of["two"]], 0.85),
-        _share(
+        share("two effects at once: both found", [all(o.found) for o in of["two"]], 0.85),
+        share(
             "not in the library: unexplained, right place in the map",
             [bool(o.place) for o in of["unknown"]],
             0.90,
@@ -64,7 +64,7 @@ def figures(outcomes: Sequence[Outcome]) -> list[Figure]:
         ),
     ]
     inside = [good for o in hidden for _, _, good in o.inside]
-    covered = _share("95 % intervals of parameters cover the truth", inside, None)
+    covered = share("95 % intervals of parameters cover the truth", inside, None)
     if covered is not None:
         reached = 0.90 <= covered.value <= 0.98
         rows.append(Figure(covered.what, *_numbers(covered), "90 to 98 %", reached, covered.trials))
@@ -76,7 +76,7 @@ def _numbers(f: Figure) -> tuple[float, float, float]:
     return f.value, f.low, f.high
 
 
-def _share(what: str, good: Sequence[bool], target: float | None, note: str = "") -> Figure | None:
+def share(what: str, good: Sequence[bool], target: float | None, note: str = "") -> Figure | None:
     """Return a row of a share; target > 0: at least, < 0: at most."""
     n = len(good)
     if n == 0:

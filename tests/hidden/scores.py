@@ -7,7 +7,7 @@ or when it is in a class of at most three that comes with a next experiment.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -19,7 +19,7 @@ from tests.hidden.profiles import RUN_S
 LARGEST_CLASS: Final = 3
 _PLACES: Final = 3  # of the largest gap that may be right
 _MOMENT_S: Final = 0.3  # tolerance of a time
-_MOMENT: Final = re.compile(r"(run\d+) ([\d.]+) s")
+_MOMENT: Final = re.compile(r"(run\d+)(?:\.csv)? ([\d.]+) s")
 
 Truth = Mapping[str, Any]
 
@@ -54,8 +54,17 @@ class Outcome:
         return tuple(n or (c and late) for n, c in zip(self.named, self.classed, strict=True))
 
 
-def score(kind: str, seed: int, truth: Sequence[Truth], findings: Findings, **more: Any) -> Outcome:
-    """Return the outcome of one diagnosis."""
+def score(
+    kind: str,
+    seed: int,
+    truth: Sequence[Truth],
+    findings: Findings,
+    *,
+    run_s: float = RUN_S,
+    not_wrong: Collection[str] = (),
+    **more: Any,
+) -> Outcome:
+    """Return the outcome of one diagnosis of runs of about `run_s`; not_wrong: names that the recorder put there itself."""
     wanted = tuple((t["name"], t["joint"]) for t in truth)
     library = [t for t in truth if "places" not in t]
     strange = [t for t in truth if "places" in t]
@@ -70,7 +79,7 @@ def score(kind: str, seed: int, truth: Sequence[Truth], findings: Findings, **mo
         wrong=tuple(
             f"{c.name} of {c.joint}"
             for c in findings.causes
-            if len(c.names) == 1 and (c.name, c.joint) not in wanted
+            if len(c.names) == 1 and (c.name, c.joint) not in wanted and c.name not in not_wrong
         ),
         inside=tuple(item for t in library for item in intervals(t, findings.causes)),
         shown=tuple(
@@ -78,7 +87,7 @@ def score(kind: str, seed: int, truth: Sequence[Truth], findings: Findings, **mo
             for g in findings.gaps[:1]
             for p in shown(g)
         ),
-        place=place_is_right(strange[0], findings) if strange else None,
+        place=place_is_right(strange[0], findings, run_s) if strange else None,
         **more,
     )
 
@@ -127,7 +136,7 @@ def _between(value: float, low: float, high: float, angle: bool) -> bool:
     return bool(low <= value <= high)
 
 
-def place_is_right(truth: Truth, findings: Findings) -> bool:
+def place_is_right(truth: Truth, findings: Findings, run_s: float = RUN_S) -> bool:
     """Return whether the verdict is "unexplained" and the map of the largest gap points at one of the right places."""
     if findings.verdict != "unexplained" or not findings.gaps:
         return False
@@ -135,7 +144,7 @@ def place_is_right(truth: Truth, findings: Findings) -> bool:
     if truth["joint"] not in ("sensor", largest.joint):
         return False
     return any(_hit(place, right) for place in shown(largest) for right in truth["places"]) or _moments_hit(
-        shown(largest), truth["places"]
+        shown(largest), truth["places"], run_s
     )
 
 
@@ -160,7 +169,7 @@ def _hit(place: Place, right: Mapping[str, Any]) -> bool:
     return bool(place.low <= high and place.high >= low)
 
 
-def _moments_hit(places: Sequence[Place], right: Sequence[Mapping[str, Any]]) -> bool:
+def _moments_hit(places: Sequence[Place], right: Sequence[Mapping[str, Any]], run_s: float) -> bool:
     """Return whether most of the moments that the map names (run and time) are right, and at least twice as many as moments
     drawn at random would be: where something is wrong half of the time, naming times is no answer unless all are right.
     """
@@ -170,13 +179,13 @@ def _moments_hit(places: Sequence[Place], right: Sequence[Mapping[str, Any]]) ->
         any(run == r and low - _MOMENT_S <= t <= high + _MOMENT_S for r, low, high in spans)
         for run, t in named
     ]
-    chance = sum(_covered([(low, high) for r, low, high in spans if r == run]) for run, _ in named)
+    chance = sum(_covered([(low, high) for r, low, high in spans if r == run], run_s) for run, _ in named)
     return bool(hits) and sum(hits) >= max(0.5 * len(hits), min(2.0 * chance, len(hits)))
 
 
-def _covered(spans: Sequence[tuple[float, float]]) -> float:
+def _covered(spans: Sequence[tuple[float, float]], run_s: float) -> float:
     """Return the part of a run that is within the tolerance of these times."""
-    t = np.arange(0.0, RUN_S, 0.02)
+    t = np.arange(0.0, run_s, 0.02)
     near = np.zeros(len(t), bool)
     for low, high in spans:
         near |= (t >= low - _MOMENT_S) & (t <= high + _MOMENT_S)

@@ -26,6 +26,8 @@ from tests.hidden.order import Hidden, Order
 from tests.hidden.profiles import Reference
 from tests.hidden.scores import Outcome, score
 from tests.hidden.unknown import UNKNOWN
+from tests.worlds.judge import judged
+from tests.worlds.recorder import Recorder
 
 KINDS: Final = ("nothing", "one", "least", "two", "unknown")
 FACTOR: Final = 3.0
@@ -33,16 +35,28 @@ UNLIKE: Final = tuple(name for name, entry in UNKNOWN.items() if not entry.resem
 _WHERE: Final = re.compile(r"(motor|torsion) balance of joint (\d)")
 
 
-def trial(number: int, seed: int, kinds: Sequence[str] = KINDS) -> list[Outcome]:
-    """Return the outcomes of trial `number` of a campaign; every effect and every unknown thing has its turn by number."""
+def trial(
+    number: int, seed: int, kinds: Sequence[str] = KINDS, recorder: Recorder | None = None
+) -> list[Outcome]:
+    """Return the outcomes of trial `number` of a campaign; every effect and every unknown thing has its turn by number.
+
+    recorder: what is diagnosed are the files that it writes; the sizes are those for the runs as they are.
+    """
     own = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
     rng = np.random.default_rng([own, 77])
     plain = draw_many([Order(own)])[0]
     findings = diagnose(tables(plain.runs), joint_files(plain))
-    out = [score("nothing", own, plain.truth, findings)]
+    seen = findings if recorder is None else judged(plain.runs, plain.joints, recorder, own)
+    allowed = recorder.explains if recorder is not None else ()
+    out = [score("nothing", own, plain.truth, seen, not_wrong=allowed)]
     orders = _orders(number, own, rng, plain, findings, kinds, out)
     cases = draw_many([order for _, order in orders]) if orders else []
     for (kind, order), case in zip(orders, cases, strict=True):
+        if recorder is not None:
+            recorded = judged(case.runs, case.joints, recorder, own)
+            detail = [_short(t) for t in case.truth]
+            out.append(score(kind, own, case.truth, recorded, not_wrong=allowed, detail=detail))
+            continue
         found = diagnose(tables(case.runs), joint_files(case))
         more: dict[str, Any] = {"detail": [_short(t) for t in case.truth]}
         if kind in ("one", "two"):
