@@ -56,6 +56,11 @@ GROUPS = {
             "jtqd.sysid.diagnosis.command",
             "find the cause of the simulation error on runs, and extend the joint file",
         ),
+        "score": ("jtqd.sysid.score.command", "print the error of a joint file on runs, before and after"),
+        "export-model": (
+            "jtqd.sysid.simulators.command",
+            "write a joint file for other simulators: MJCF, URDF",
+        ),
         "reproduce": ("jtqd.sysid.reproduce", "repeat all campaigns, fits, training and evaluation"),
         "measured": (
             "jtqd.sysid.measured.command",

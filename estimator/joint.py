@@ -208,6 +208,26 @@ class Fused:
 
 
 @dataclass(frozen=True, slots=True)
+class MotionLimits:
+    """Where and how fast the joint may be moved, joint side: what planned experiments keep. The estimator does not read it.
+
+    travel_rad: lowest and highest position; what is left out is not limited.
+    """
+
+    travel_rad: Annotated[tuple[float, float], limits("rad")] = (-1e6, 1e6)
+    velocity_rad_s: Annotated[float, limits("rad/s", gt=0.0)] = 1e6
+    acceleration_rad_s2: Annotated[float, limits("rad/s2", gt=0.0)] = 1e6
+    torque_nm: Annotated[float, limits("Nm", gt=0.0)] = 1e6
+
+    def __post_init__(self) -> None:
+        check(self, "motion_limits")
+        if not self.travel_rad[0] < self.travel_rad[1]:
+            raise FieldError(
+                "motion_limits", "travel_rad", list(self.travel_rad), "two rising numbers in rad"
+            )
+
+
+@dataclass(frozen=True, slots=True)
 class Effect:
     """One term of the extended model: a name of the effect library and its parameters in SI units.
 
@@ -255,6 +275,7 @@ class Joint:
     efficiency: Efficiency | None = None
     fused: Fused | None = None
     effects: tuple[Effect, ...] = ()
+    motion_limits: MotionLimits | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -29,7 +29,8 @@ from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.command import diagnosed
 from jtqd.sysid.diagnosis.findings import Cause, Findings, Gap, Value, to_mapping
 from jtqd.sysid.report import figures as parts
-from jtqd.sysid.runs.files import ColumnMap, RunError, RunFile, read_run
+from jtqd.sysid.runs.column_map import ColumnMap
+from jtqd.sysid.runs.files import RunError, RunFile, read_run
 
 mpl.use("Agg")  # files only; a display is not needed
 

@@ -24,7 +24,8 @@ from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTableError
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.source import ChannelSignal, DriveRatings, DriveSignals
-from jtqd.sysid.runs.files import ColumnMap, RunError, RunFile, read_run
+from jtqd.sysid.runs.column_map import ColumnMap
+from jtqd.sysid.runs.files import RunError, RunFile, read_run
 
 COLUMN_MAP_NAME = "columns.yaml"
 

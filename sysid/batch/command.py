@@ -34,7 +34,8 @@ from jtqd.sysid.batch.run import (
     write_whole,
 )
 from jtqd.sysid.batch.summary import DIAGNOSE, REPLAY, counts, render, to_mapping
-from jtqd.sysid.runs.files import LOGS, TABLES, ColumnMap, RunError
+from jtqd.sysid.runs.column_map import ColumnMap
+from jtqd.sysid.runs.files import LOGS, TABLES, RunError
 from jtqd.sysid.runs.joints import UsageError, check_joint_files, joint_files
 
 BY: Final = "jtq batch"

@@ -7,22 +7,25 @@ import datetime as dt
 import importlib.util
 import json
 import os
+import shlex
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Final
 
 from jtqd.estimator.checked import ConfigError, counted, make_directory
-from jtqd.estimator.joint import Joint
+from jtqd.estimator.joint import Joint, MotionLimits
 from jtqd.estimator.run import RunTableError
 from jtqd.sysid.campaign.plan import Plan
 from jtqd.sysid.diagnosis.extended_joint import FILE, write_extended
 from jtqd.sysid.diagnosis.findings import INSUFFICIENT, NO_GAP, Findings, summary_lines, to_mapping
+from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, scope_of
 from jtqd.sysid.progress import waiting
 from jtqd.sysid.runs.checks import CheckedRuns, check_runs
-from jtqd.sysid.runs.files import ColumnMap, RunError, RunFile, read_runs
+from jtqd.sysid.runs.column_map import ColumnMap
+from jtqd.sysid.runs.files import RunError, RunFile, read_runs
 from jtqd.sysid.runs.joints import UsageError, check_joint_files, joint_files, joints_of
 
 BY: Final = "jtq diagnose"
@@ -30,7 +33,8 @@ _NEEDED: Final = ("matplotlib", "jinja2")
 FINDINGS: Final = "findings.json"
 REPORT: Final = "report.html"
 PLAN: Final = "next_experiment.plan.yaml"
-_OWN: Final = (FINDINGS, REPORT, PLAN, FILE, *(f"extended.joint{n}.yaml" for n in range(1, 8)))
+MOTION: Final = "next_experiment.motion.csv"
+_OWN: Final = (FINDINGS, REPORT, PLAN, MOTION, FILE, *(f"extended.joint{n}.yaml" for n in range(1, 8)))
 """All names that a diagnosis may write."""
 
 
@@ -46,12 +50,15 @@ def main(argv: list[str]) -> int:
         files = joint_files(options.joint, columns)
         check_joint_files(files)
         _check_out(options.out, options.force)
-        runs = read_runs(options.runs, columns)
+        runs = read_runs(options.runs, columns, in_pieces=True)
         joints = joints_of(files, runs)
+        known = () if columns is None else columns.known_loads
+        scope = scope_of(options.without, options.given, joints, known)
         for run in runs:
             for note in run.notes:
                 print(f"{BY}: {run.name}: {note}", file=sys.stderr)
-        findings = diagnosed(runs, joints)
+        findings = diagnosed(runs, with_limits(joints, options.limits), scope)
+        findings = replace(findings, joint_files=joints, next_experiment=_with_command(options, findings))
         mapping = _write(options.out, findings, joints, {run.name: run.sha256 for run in runs})
     except UsageError as error:
         print(f"{BY}: {error}", file=sys.stderr)
@@ -69,7 +76,26 @@ def main(argv: list[str]) -> int:
     return 0 if findings.verdict == NO_GAP else 3
 
 
-def diagnosed(runs: Sequence[RunFile], joints: Mapping[int, Joint]) -> Findings:
+def with_limits(joints: Mapping[int, Joint], given: Mapping[str, Any] | None) -> dict[int, Joint]:
+    """Return the joints with `motion_limits` of --limits in the place of their files'. Raises ConfigError."""
+    made = {}
+    for number, joint in joints.items():
+        limits = joint.motion_limits or MotionLimits()
+        made[number] = replace(joint, motion_limits=replace(limits, **given)) if given else joint
+    return made
+
+
+def _with_command(options: argparse.Namespace, findings: Findings) -> dict[str, Any] | None:
+    """Return the next experiment with the command that runs it; nothing of ours runs the motion of an arm."""
+    experiment = findings.next_experiment
+    if experiment is None or not experiment.get("plan"):
+        return None if experiment is None else dict(experiment)
+    config = "" if options.config is None else f" --config {shlex.quote(str(options.config))}"
+    plan = shlex.quote(str(options.out / PLAN))
+    return {**experiment, "command": f"jtq campaign {plan} --bus {options.bus}{config} --out RUNS"}
+
+
+def diagnosed(runs: Sequence[RunFile], joints: Mapping[int, Joint], scope: Scope = EVERYTHING) -> Findings:
     """Check the channels and diagnose what may be used; the findings list what may not."""
     checked = check_runs([(run.name, run.table) for run in runs], joints)
     for line in (*checked.refused, *checked.notes):
@@ -88,7 +114,7 @@ def diagnosed(runs: Sequence[RunFile], joints: Mapping[int, Joint]) -> Findings:
         from jtqd.sysid.diagnosis.diagnose import diagnose
 
         left = {number: joint for number, joint in joints.items() if number not in checked.lost}
-        findings = diagnose(checked.runs, left)
+        findings = diagnose(checked.runs, left, scope)
     return _with_channels(findings, checked, notes)
 
 
@@ -121,10 +147,12 @@ def parser() -> argparse.ArgumentParser:
             "examples:\n"
             "  jtq diagnose campaigns/validate --joint models/joint1.yaml --out diagnosis\n"
             "  jtq diagnose a.csv b.csv.gz --joint 1=joint1.yaml --joint 2=joint2.yaml --out diagnosis --json\n"
-            "  jtq diagnose rig/*.csv --columns columns.yaml --joint arm.yaml --out diagnosis\n\n"
+            "  jtq diagnose rig/*.csv --columns columns.yaml --joint arm.yaml --out diagnosis\n"
+            "  jtq diagnose rig/*.csv --columns columns.yaml --joint 3=arm3.yaml --without sensor_drift \\\n"
+            "      --limits travel_rad=-0.5:0.5,velocity_rad_s=1 --out diagnosis\n\n"
             f"DIR/{REPORT} is for people, DIR/{FINDINGS} for programs, DIR/{FILE} the joint file with the effects found;\n"
-            f"DIR/{PLAN}, when there is one, is for `jtq campaign`. Exit status: 0 no gap; 3 any other verdict;\n"
-            "1 failure; 2 usage."
+            f"DIR/{PLAN}, when there is one, is for `jtq campaign`, DIR/{MOTION} for the controller\n"
+            "of an arm. Exit status: 0 no gap; 3 any other verdict; 1 failure; 2 usage."
         ),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -149,10 +177,60 @@ def parser() -> argparse.ArgumentParser:
         "--columns", type=Path, metavar="FILE", help="column map for other names, units and signs"
     )
     parser.add_argument(
+        "--without",
+        action="append",
+        default=[],
+        metavar="[N=]EFFECT",
+        help="an effect that is absent: not looked for (of joint N, or sensor=EFFECT); may be given again",
+    )
+    parser.add_argument(
+        "--given",
+        action="append",
+        default=[],
+        metavar="[N=]EFFECT",
+        help="an effect that is known: as the joint file has it, not questioned; may be given again",
+    )
+    parser.add_argument(
+        "--limits",
+        type=motion_limits,
+        metavar="NAME=VALUE,...",
+        help="where the next experiment may move: travel_rad=LOW:HIGH, velocity_rad_s, acceleration_rad_s2, torque_nm "
+        "(default: motion_limits of the joint file); never beyond what the runs did",
+    )
+    parser.add_argument(
+        "--config", type=Path, metavar="FILE", help="configuration of jtqd for the printed command"
+    )
+    parser.add_argument(
+        "--bus", default="can0", metavar="BUS", help="bus for the printed command (default can0)"
+    )
+    parser.add_argument(
         "--force", action="store_true", help="replace the results of an earlier diagnosis in DIR"
     )
     parser.add_argument("--json", action="store_true", help="print findings.json instead of the summary")
     return parser
+
+
+def motion_limits(text: str) -> dict[str, Any]:
+    """Return the limits of a text such as "travel_rad=-0.5:0.5,velocity_rad_s=1". Raises argparse.ArgumentTypeError."""
+    names = [item.name for item in fields(MotionLimits)]
+    found: dict[str, Any] = {}
+    for part in text.split(","):
+        name, _, value = part.strip().partition("=")
+        numbers = value.split(":")
+        try:
+            values = tuple(float(number) for number in numbers)
+        except ValueError:
+            values = ()
+        if name not in names or len(values) != (2 if name == "travel_rad" else 1):
+            raise argparse.ArgumentTypeError(
+                f"found {part.strip()!r}, expected travel_rad=LOW:HIGH or NAME=VALUE with one of {', '.join(names[1:])}"
+            )
+        found[name] = values if name == "travel_rad" else values[0]
+    try:
+        MotionLimits(**found)
+    except ConfigError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return found
 
 
 def _check_out(directory: Path, force: bool) -> None:
@@ -180,6 +258,9 @@ def _write(
         fresh = Path(made)
         names = write_extended(fresh, joints, findings, sha256=sha256, date=date)
         experiment = findings.next_experiment
+        if experiment and experiment.get("table"):
+            names.append(MOTION)
+            (fresh / MOTION).write_text(experiment["table"], encoding="utf-8")
         if experiment and experiment.get("plan"):
             names.append(PLAN)
             plan = Plan.from_mapping(experiment["plan"], PLAN)

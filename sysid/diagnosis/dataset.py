@@ -32,6 +32,7 @@ from jtqd.sysid.diagnosis.regressors import (
     gain_columns,
     run_data,
 )
+from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope
 from jtqd.sysid.diagnosis.signals import (
     BaseLoss,
     Channel,
@@ -134,7 +135,7 @@ def usable_signals(
             except SignalsError as error:
                 reasons.append(str(error))
         if mine:
-            out.append([_without_known_effects(s) for s in about_zero(mine, bases)])
+            out.append([without_known_effects(s) for s in about_zero(mine, bases)])
     common = {tuple(s.number for s in run) for run in out}
     if len(common) > 1:  # only what every run has can be stacked
         keep = set.intersection(*(set(c) for c in common))
@@ -166,7 +167,7 @@ def _same_balances(runs: list[list[JointSignals]]) -> None:
         run[:] = [replace(s, torsion_nm=None, twist_rad=None) if s.number in lacking else s for s in run]
 
 
-def _without_known_effects(s: JointSignals) -> JointSignals:
+def without_known_effects(s: JointSignals) -> JointSignals:
     """Return the signals less what the joint file's own effects explain, at the torsion that the encoders saw."""
     motor, torsion, usual = s.motor_nm, s.torsion_nm, s.state.torsion_rad
     if s.twist_rad is not None:
@@ -180,14 +181,18 @@ def _without_known_effects(s: JointSignals) -> JointSignals:
     return replace(s, motor_nm=motor, torsion_nm=torsion)
 
 
-def build_dataset(signals: list[list[JointSignals]], joints: Mapping[int, Joint]) -> Dataset:
+def build_dataset(
+    signals: list[list[JointSignals]], joints: Mapping[int, Joint], scope: Scope = EVERYTHING
+) -> Dataset:
     """Return binned residuals, candidates, unknown lines and zero readings of these runs [run][joint]."""
     samples = bin_samples(s for run in signals for s in run)
     step = samples * float(np.median(np.diff(signals[0][0].time_s)))
-    candidates = library_candidates(signals, joints)
-    candidates += _cogging_orders(signals, joints, candidates)
+    candidates = library_candidates(signals, joints, scope)
+    candidates += _cogging_orders(signals, joints, candidates, scope)
     lines = unknown_lines(signals, candidates, samples, step)
     groups = families([s.number for s in signals[0]], lines)
+    if scope.known_references & set(joints):  # a known load has no zero that differs from run to run
+        groups = [group for group in groups if group.name != "zero"]
     runs = [run_data(run, candidates, samples, groups) for run in signals]
     leave = gain_columns(candidates)
     unexplained = {c: saturated_residuals(runs, c, leave) for c in runs[0].channels}
@@ -195,9 +200,9 @@ def build_dataset(signals: list[list[JointSignals]], joints: Mapping[int, Joint]
 
 
 def library_candidates(
-    signals: Sequence[Sequence[JointSignals]], joints: Mapping[int, Joint]
+    signals: Sequence[Sequence[JointSignals]], joints: Mapping[int, Joint], scope: Scope = EVERYTHING
 ) -> list[EffectCandidate]:
-    """Return every term of every effect that these runs have the channels for, columns numbered."""
+    """Return every term of every effect of the scope that these runs have the channels for, columns numbered."""
     out: list[EffectCandidate] = []
     first = 0
     numbers = [s.number for s in signals[0]]
@@ -208,7 +213,7 @@ def library_candidates(
                 if at_sensor and n != numbers[0]:
                     continue
                 where: JointName = "sensor" if at_sensor else n
-                if not _has_channels(effect, signals, n):
+                if not scope.looks_for(effect.name, where, n) or not _has_channels(effect, signals, n):
                     continue
                 shown = [contribution(effect, term.basis[0], s) for s in signals[0] if s.number == n]
                 size = max((float(np.abs(v).max()) for found in shown for v in found.values()), default=0.0)
@@ -235,6 +240,7 @@ def _cogging_orders(
     signals: Sequence[Sequence[JointSignals]],
     joints: Mapping[int, Joint],
     candidates: Sequence[EffectCandidate],
+    scope: Scope,
 ) -> list[EffectCandidate]:
     """Return cogging at integer orders that stand out of the residual's order spectrum."""
     first = candidates[-1].columns.stop if candidates else 0
@@ -244,6 +250,8 @@ def _cogging_orders(
     step *= every
     bare = [run_data(run, [], every) for run in signals]
     for s in signals[0]:
+        if not scope.looks_for("cogging", s.number, s.number):
+            continue
         channel = Channel(s.number, "motor")
         parts = [np.where(r.channels[channel].valid, r.channels[channel].residual, np.nan) for r in bare]
         there = {

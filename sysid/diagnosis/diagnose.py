@@ -32,6 +32,7 @@ from jtqd.sysid.diagnosis.next_experiment import next_experiment
 from jtqd.sysid.diagnosis.noise import Noise, noise_model, run_sums
 from jtqd.sysid.diagnosis.refine import present_effects, refine
 from jtqd.sysid.diagnosis.regressors import RunData, column_moments
+from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope
 from jtqd.sysid.diagnosis.search import HELD_OUT, Hypothesis, Search
 from jtqd.sysid.diagnosis.signals import Channel
 from jtqd.sysid.diagnosis.verdict import conclude
@@ -40,32 +41,34 @@ _WORST_FIRST: Final = (UNEXPLAINED, AMBIGUOUS, CAUSE, INSUFFICIENT, NO_GAP)
 _PASSES: Final = 2
 
 
-def diagnose(runs: Sequence[tuple[str, RunTable]], joints: Mapping[int, Joint]) -> Findings:
+def diagnose(
+    runs: Sequence[tuple[str, RunTable]], joints: Mapping[int, Joint], scope: Scope = EVERYTHING
+) -> Findings:
     """Return what the joint files' simulation gets wrong in these runs.
 
-    runs: (name, table); joints: nominal joint per number. Never raises for what is in the tables: data that cannot
-    serve give the verdict insufficient_data with its reasons. Joints with a sensor each are diagnosed one by one. Where a
-    cause has the name of an effect that a file already has, the diagnosis is made again without that effect, so that what
-    is reported is the whole of it.
+    runs: (name, table); joints: nominal joint per number; scope: what may be named. Never raises for what is in the
+    tables: data that cannot serve give the verdict insufficient_data with its reasons. Joints with a sensor each are
+    diagnosed one by one. Where a cause has the name of an effect that a file already has, the diagnosis is made again
+    without that effect, so that what is reported is the whole of it.
     """
     numbers = tuple(sorted(n for n in joints if any(n in table.joints for _, table in runs)))
     if len(numbers) > 1 and not one_sensor(runs, numbers):
-        return combined([diagnose(runs, {n: joints[n]}) for n in numbers])
+        return combined([diagnose(runs, {n: joints[n]}, scope) for n in numbers])
     applied = {n: with_effects_applied(joint) for n, joint in joints.items()}
-    findings = _diagnosed(runs, applied, numbers)
+    findings = _diagnosed(runs, applied, numbers, scope)
     for n in numbers:
         new = {c.name for c in findings.causes if c.joint in (n, "sensor")}
         kept = tuple(e for e in applied[n].effects if e.name not in new)
         if len(kept) < len(applied[n].effects):
             applied[n] = replace(applied[n], effects=kept)
     if any(len(with_effects_applied(joints[n]).effects) > len(applied[n].effects) for n in numbers):
-        whole = _diagnosed(runs, applied, numbers)
+        whole = _diagnosed(runs, applied, numbers, scope)
         findings = replace(whole, gaps=findings.gaps)
     return findings
 
 
 def _diagnosed(
-    runs: Sequence[tuple[str, RunTable]], joints: Mapping[int, Joint], numbers: tuple[int, ...]
+    runs: Sequence[tuple[str, RunTable]], joints: Mapping[int, Joint], numbers: tuple[int, ...], scope: Scope
 ) -> Findings:
     names = tuple(name for name, _ in runs)
     usable, reasons = usable_signals(runs, joints, numbers)
@@ -73,7 +76,7 @@ def _diagnosed(
         there = {n: joints[n] for n in numbers}
         plan = next_experiment([], there, "; ".join(reasons)) if there else None
         return Findings(INSUFFICIENT, tuple(reasons), names, numbers, next_experiment=plan)
-    dataset = build_dataset(usable, joints)
+    dataset = build_dataset(usable, joints, scope)
     least = RELEVANT * max(joints[n].rated_torque_nm for n in numbers)
     noise, search, best = _searched(dataset, least)
     refined = refine(dataset, present_effects(best), noise)

@@ -10,6 +10,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.joint import Joint
+from jtqd.sysid.diagnosis.file_values import FileValue, file_values
 
 SCHEMA: Final = "jtq.findings/1"
 NO_GAP: Final = "no_gap"
@@ -141,6 +143,9 @@ class Findings:
     channel_notes: tuple[str, ...] = ()
     next_experiment: Mapping[str, Any] | None = None  # {"why": text, "plan": mapping of jtq.plan/1}
     traces: tuple[Trace, ...] = field(default=(), repr=False)
+    joint_files: Mapping[int, Joint] = field(
+        default_factory=dict, repr=False
+    )  # to compare the found values with
 
 
 _NO_GAP_MEASURED: Final[dict[str, Any]] = {
@@ -167,9 +172,9 @@ def to_mapping(
         "schema": SCHEMA,
         "verdict": findings.verdict,
         "gap": _gap(findings.gaps[0]) if findings.gaps else _NO_GAP_MEASURED,
-        "causes": [_cause(each) for each in findings.causes],
+        "causes": [_cause(each, findings.joint_files) for each in findings.causes],
         "gain": _NO_GAIN_MEASURED if findings.gain is None else _gain(findings.gain),
-        "next_experiment": findings.next_experiment,
+        "next_experiment": _without_table(findings.next_experiment),
         "reasons": findings.reasons,
         "joints": findings.joints,
         "runs": [{"name": name, "sha256": (sha256 or {}).get(name)} for name in findings.runs],
@@ -223,22 +228,32 @@ def _place(place: Place) -> dict[str, Any]:
     }
 
 
-def _cause(cause: Cause) -> dict[str, Any]:
+def _without_table(experiment: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+    """The positions of a motion are a file of their own."""
+    return experiment and {key: value for key, value in experiment.items() if key != "table"}
+
+
+def _cause(cause: Cause, joints: Mapping[int, Joint]) -> dict[str, Any]:
     return {
         "name": cause.name,
         "joint": cause.joint,
         "class": list(cause.names),
-        "parameters": _values(cause.parameters),
+        "parameters": _values(cause, joints),
         "evidence": {"delta_bic": cause.delta_bic, "held_out_gain": cause.held_out_gain},
         "rms_nm": cause.rms_nm,
         "balance": cause.balance,
     }
 
 
-def _values(values: Mapping[str, Value]) -> dict[str, Any]:
-    return {
-        name: {"value": each.value, "ci95": each.ci95, "unit": each.unit} for name, each in values.items()
-    }
+def _values(cause: Cause, joints: Mapping[int, Joint]) -> dict[str, Any]:
+    """Value, interval and unit; and with joint files the file's value and the relative change."""
+    known = file_values(cause.name, cause.joint, cause.parameters, joints)
+    found: dict[str, Any] = {}
+    for name, each in cause.parameters.items():
+        found[name] = {"value": each.value, "ci95": each.ci95, "unit": each.unit}
+        if name in known:
+            found[name] |= {"file_value": known[name].value, "change": known[name].change(each.value)}
+    return found
 
 
 def _candidate(candidate: CandidateEvidence) -> dict[str, Any]:
@@ -286,7 +301,7 @@ def summary_lines(findings: Findings) -> list[str]:
         )
         if findings.verdict != NO_GAP:
             lines += [f"  {each.share:4.0%} of it {_where(each)}" for each in gap.localisation[:3]]
-    lines += [_summary_cause(each) for each in findings.causes]
+    lines += [_summary_cause(each, findings.joint_files) for each in findings.causes]
     gain = findings.gain
     if gain is not None and math.isfinite(gain.rmse_before_nm):
         low, high = gain.ci95
@@ -296,6 +311,8 @@ def summary_lines(findings: Findings) -> list[str]:
         )
     if findings.next_experiment:
         lines.append(f"next experiment: {findings.next_experiment['why']}")
+        if findings.next_experiment.get("command"):
+            lines.append(f"run it: {findings.next_experiment['command']}")
     return lines
 
 
@@ -308,17 +325,24 @@ def _where(place: Place) -> str:
     return f"at {place.axis.replace('_', ' ')} {place.bin}"
 
 
-def _summary_cause(cause: Cause) -> str:
+def _summary_cause(cause: Cause, joints: Mapping[int, Joint]) -> str:
     at = "the sensor" if cause.joint == "sensor" else f"joint {cause.joint}"
-    values = ", ".join(_value(name, each) for name, each in cause.parameters.items())
+    known = file_values(cause.name, cause.joint, cause.parameters, joints)
+    values = ", ".join(_value(name, each, known.get(name)) for name, each in cause.parameters.items())
     others = [name for name in cause.names if name != cause.name]
     either = f"; these runs cannot distinguish it from {', '.join(others)}" if others else ""
     return f"cause: {cause.name} of {at}: {values} ({cause.rms_nm:.3g} Nm rms){either}"
 
 
-def _value(name: str, value: Value) -> str:
+def _value(name: str, value: Value, known: FileValue | None) -> str:
+    """Return "coulomb_nm 3.5 -> 4.4 [4.3, 4.5] Nm (+26 %)"; without the file's value just what was found."""
     low, high = value.ci95
     unit = f" {value.unit}" if value.unit else ""
+    before = after = ""
+    if known is not None and known.value is not None:
+        before = f"{known.value:.4g} -> "
+        change = known.change(value.value)
+        after = "" if change is None else f" ({100.0 * change:+.3g} %)"
     if not math.isfinite(low + high) or low == high:
-        return f"{name} {value.value:.4g}{unit}"
-    return f"{name} {value.value:.4g} [{low:.4g}, {high:.4g}]{unit}"
+        return f"{name} {before}{value.value:.4g}{unit}{after}"
+    return f"{name} {before}{value.value:.4g} [{low:.4g}, {high:.4g}]{unit}{after}"

@@ -1,4 +1,5 @@
-"""The next experiment: which kind of motion separates what these runs cannot, as a plan that `jtq campaign` drives.
+"""The next experiment: which kind of motion separates what these runs cannot: for two joints on a towing bench a plan that
+`jtq campaign` drives, for one joint a table of positions (`arm_motion`).
 
 What an effect needs to be seen at all is its `Effect.experiment`. For two effects that look alike the kind that separates
 them is in PAIRS where it is another one. Of all kinds that a diagnosis would like, at most MOST_KINDS are planned, those
@@ -22,6 +23,8 @@ from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import LossModel
 from jtqd.sysid.campaign.plan import Fourier, Off, Plan, Plateau, Rest, Run, Segment, check_plan, travel_rad
 from jtqd.sysid.campaign.plans import seed_of
+from jtqd.sysid.diagnosis.arm_motion import KINDS, Room, csv_text, described, motions, room_of
+from jtqd.sysid.diagnosis.signals import JointSignals
 from jtqd.sysid.excitation.design import draw
 from jtqd.sysid.excitation.model import Bench as StaticBench
 from jtqd.sysid.excitation.model import ExcitationLimits
@@ -88,7 +91,8 @@ def reach_of(
     velocity_rad_s: float = VELOCITY_RAD_S,
     temperature: bool = True,
 ) -> Reach:
-    """Return what two coupled joints can do; one joint alone is taken to face one like itself.
+    """Return what two coupled joints can do within the `motion_limits` of their files but for travel, which a coupling has
+    not; one joint alone is taken to face one like itself.
 
     joints: by number, at least one; the first two count. temperature: whether the drives measure theirs (a plan with a
     limit for it is refused otherwise).
@@ -100,6 +104,9 @@ def reach_of(
     files = [joints[number] for number in sorted(joints)][:2]
     pair = (files[0], files[-1])
     rated = min(j.rated_torque_nm for j in pair)
+    for allowed in (j.motion_limits for j in pair):
+        if allowed is not None:
+            rated, velocity_rad_s = min(rated, allowed.torque_nm), min(velocity_rad_s, allowed.velocity_rad_s)
     currents = [_current_at(j, rated, velocity_rad_s) for j in pair]
     limits = Limits(
         current_a=_down(max(currents)),
@@ -110,6 +117,9 @@ def reach_of(
     )
     rotors = sum(j.gear_ratio**2 * j.rotor_inertia_kgm2 + j.link_inertia_kgm2 for j in pair)
     acceleration = min(20.0, _INERTIA_SHARE * rated / (0.5 * rotors))
+    acceleration = min(
+        [acceleration, *(j.motion_limits.acceleration_rad_s2 for j in pair if j.motion_limits)]
+    )
     own = [_CURRENT_SHARE * min(current, limits.current_a) for current in currents]
     return Reach(pair, limits, velocity_rad_s, acceleration, (own[0], own[1]))
 
@@ -513,38 +523,84 @@ def next_experiment(
     *,
     velocity_rad_s: float = VELOCITY_RAD_S,
     temperature: bool = True,
+    signals: Sequence[JointSignals] = (),
 ) -> dict[str, Any]:
-    """Return {"why": text, "plan": mapping of jtq.plan/1} of the campaign that would settle it.
+    """Return what would settle it: {"why": text, "plan": mapping of jtq.plan/1} for two joints on a towing bench, and
+    {"why": text, "plan": None, "motion": ..} for one joint, which is moved by itself (`arm_motion`).
 
     classes: names of effects that the runs cannot distinguish, one sequence per class; a sequence of one name asks to make
     that effect visible. joints: files of the joints in the runs, one or two, whose ratings the plan keeps. why: what the
     diagnosis says before it. velocity_rad_s: the fastest motion allowed. temperature: whether the runs have one; without
-    it the plan does not supervise it. Raises ValueError without a joint.
+    it the plan does not supervise it. signals: of one joint, its runs so far: where it may go. Raises ValueError without
+    a joint.
     """
     classes = [tuple(names) for names in classes]
     kinds = kinds_for(classes)
+    if len(joints) == 1:
+        [(number, joint)] = joints.items()
+        return _of_one_joint(classes, kinds, number, why, room_of(joint, signals))
     reach = reach_of(joints, velocity_rad_s=velocity_rad_s, temperature=temperature)
     runs = tuple(run for kind in kinds for run in EXPERIMENTS[kind].runs(reach))
     plan = Plan("next_" + "_".join(kinds), replace(reach.limits, travel_rad=1e3), runs)
     setpoints = check_plan(plan)
     travel = 1.1 * max(travel_rad(one) for one in setpoints.values()) + 1.0
     plan = replace(plan, limits=replace(plan.limits, travel_rad=float(np.ceil(travel))))
-    return {"why": _text(classes, kinds, joints, why, plan), "plan": plan.to_mapping()}
+    return {"why": _text(classes, kinds, why, plan), "plan": plan.to_mapping()}
 
 
-def _text(
-    classes: Sequence[Sequence[str]], kinds: Sequence[str], joints: Mapping[int, Joint], why: str, plan: Plan
-) -> str:
-    """Reason, what is to be separated, what is done, what it takes, what is left to do by hand."""
+def _of_one_joint(
+    classes: Sequence[Sequence[str]], kinds: Sequence[str], number: int, why: str, room: Room | None
+) -> dict[str, Any]:
+    """Return the experiment of a joint that nothing tows."""
+    parts = _begun(classes, why)
+    parts += [f"{kind}: {KINDS[kind][0]}." for kind in kinds]
+    parts += [note for pair, note in _BY_HAND.items() if any(pair <= set(names) for names in classes)]
+    parts.append(
+        "On a towing bench diagnose both joints together: the plan is then a campaign, and a sensor fault is in the "
+        "balances of both joints, a joint fault in one."
+    )
+    if room is None:
+        parts.append(
+            "No motion is planned: neither these runs nor motion_limits of the joint file (or --limits) say where it may go."
+        )
+        return {"why": " ".join(parts), "plan": None, "motion": None}
+    made = motions(kinds, room)
+    minutes = sum(motion.duration_s for motion in made) / 60.0
+    parts.append(
+        f"Joint {number} alone, {counted(len(made), 'run')}, {minutes:.0f} min, {room.low_rad:.3g} to {room.high_rad:.3g} "
+        f"rad, at most {room.velocity_rad_s:.3g} rad/s and {room.acceleration_rad_s2:.3g} rad/s2, "
+    )
+    if math.isfinite(room.needed_nm):
+        parts[-1] += (
+            "as in these runs and within the joint's limits; there they needed up to "
+            f"{room.needed_nm:.3g} Nm of {room.torque_nm:.3g} Nm, a payload may add no more than the rest."
+        )
+    else:
+        parts[-1] += (
+            f"within the joint's limits; no run shows what torque that needs, so go slowly first and watch "
+            f"{room.torque_nm:.3g} Nm."
+        )
+    parts.append("All other joints stand as they did in these runs.")
+    return {
+        "why": " ".join(parts),
+        "plan": None,
+        "motion": described(number, made, room),
+        "table": csv_text(made),
+    }
+
+
+def _begun(classes: Sequence[Sequence[str]], why: str) -> list[str]:
+    """Reason, and what is to be separated."""
     parts = [why.strip().rstrip(".") + "."] if why.strip() else []
     aims = [f"to distinguish {', '.join(names[:-1])} from {names[-1]}" for names in classes if len(names) > 1]
     aims += [f"to detect {names[0]}" for names in classes if len(names) == 1]
-    parts.append(f"Proposed{' ' if aims else ''}{' and '.join(aims)}:")
+    return [*parts, f"Proposed{' ' if aims else ''}{' and '.join(aims)}:"]
+
+
+def _text(classes: Sequence[Sequence[str]], kinds: Sequence[str], why: str, plan: Plan) -> str:
+    """Reason, what is to be separated, what is done, what it takes, what is left to do by hand."""
+    parts = _begun(classes, why)
     parts += [f"{kind}: {EXPERIMENTS[kind].what}." for kind in kinds]
-    if len(joints) == 1 and any(len(names) > 1 for names in classes):
-        parts.append(
-            "Record both joints of the bench: a sensor fault is in the balances of both joints, a joint fault in one."
-        )
     parts += [note for pair, note in _BY_HAND.items() if any(pair <= set(names) for names in classes)]
     parts.append(
         f"{counted(len(plan.runs), 'run')}, {plan.duration_s / 60.0:.0f} min, at most {plan.limits.torque_nm:g} Nm and "

@@ -190,7 +190,8 @@ def _settling_experiment(
         )
     text = "; ".join(reasons)
     classes += [(name,) for name in alone]
-    return next_experiment(classes, known, text, temperature=warm)
+    seen = [run[0] for run in dataset.signals]
+    return next_experiment(classes, known, text, temperature=warm, signals=seen)
 
 
 def _without_negligible(  # noqa: PLR0917

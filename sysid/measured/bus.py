@@ -32,7 +32,8 @@ from jtqd.estimator.status import DEGRADED, STALE, STANDSTILL, STARTING, VALID
 from jtqd.models.files import load_joint, load_yaml, shipped
 from jtqd.sim_can.bench import LONGEST_STEP_NS
 from jtqd.sysid.measured.offline import JOINTS, RUNS
-from jtqd.sysid.runs.files import ColumnMap, read_run
+from jtqd.sysid.runs.column_map import ColumnMap
+from jtqd.sysid.runs.files import read_run
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

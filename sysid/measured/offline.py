@@ -24,7 +24,8 @@ from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import STANDSTILL
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.fit.friction import FrictionFit, fit_friction
-from jtqd.sysid.runs.files import ColumnMap, RunError, RunFile, read_run
+from jtqd.sysid.runs.column_map import ColumnMap
+from jtqd.sysid.runs.files import RunError, RunFile, read_run
 
 Array = NDArray[np.float64]
 

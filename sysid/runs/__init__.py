@@ -15,11 +15,11 @@ Imports estimator and models; logs (`jtqd.sysid.runs.logs`) and Parquet are impo
 """
 
 from jtqd.sysid.runs.checks import CheckedRun, CheckedRuns, RunIssue, check_run, check_runs
+from jtqd.sysid.runs.column_map import Column, ColumnMap
 from jtqd.sysid.runs.files import (
-    Column,
-    ColumnMap,
     RunError,
     RunFile,
+    read_pieces,
     read_run,
     read_runs,
     run_paths,
@@ -40,6 +40,7 @@ __all__ = [
     "joint_files",
     "joint_number",
     "joints_of",
+    "read_pieces",
     "read_run",
     "read_runs",
     "run_paths",

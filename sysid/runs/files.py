@@ -19,9 +19,11 @@ import importlib.util
 import io
 import math
 import os
+import re
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -29,18 +31,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import Section, counted
+from jtqd.estimator.checked import counted
 from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable, RunTableError
-from jtqd.models.files import load_yaml
 from jtqd.sysid.progress import progress
+from jtqd.sysid.runs.column_map import JOINTS, TIME, Column, ColumnMap, targets
+from jtqd.sysid.runs.expressions import Expression, ExpressionError
 
-TIME: Final = "time_s"
-JOINTS: Final = range(1, 8)
 TABLES: Final = (".csv", ".csv.gz", ".parquet")
 LOGS: Final = (".mcap",)
+_PART: Final = re.compile(r"(?P<run>.+-\d{8}T\d{6}Z(?:_\d+)?)-\d{4,}\.mcap", re.ASCII)
+"""Name of a part of a run: PREFIX-RUN-PART.mcap."""
 LONGEST_GAP: Final = 10.0
-"""Median steps: a longer step means that the run consists of pieces. Refused, because a fit or an observer would take the
-jump for a measurement; shorter gaps (lost cycles) are notes."""
+"""Median steps: a longer step means that the run consists of pieces. A reader of whole runs refuses it, because a fit or an
+observer would take the jump for a measurement; `read_runs(.., in_pieces=True)` takes it apart. Shorter gaps (lost cycles)
+are notes."""
+BRIDGED_S: Final = 0.025
+"""Taking apart, a gap this short is no end of a piece: what lies in it is interpolated (`time_base.on_even_steps`)."""
+SHORTEST_PIECE_S: Final = 1.0
 GAP_NOTED: Final = 1.5
 DEAD_ROWS: Final = 100
 """A channel without a single non-zero value over this many rows is dead, not quiet."""
@@ -51,53 +58,6 @@ class RunError(ValueError):
 
 
 @dataclass(frozen=True)
-class Column:
-    """value = scale * cell + offset, in the target's SI unit. A negative scale flips the sign."""
-
-    name: str
-    scale: float = 1.0
-    offset: float = 0.0
-
-
-@dataclass(frozen=True)
-class ColumnMap:
-    """Where each target column comes from, and the joint files named by `jN.joint_file` (beside the map)."""
-
-    columns: Mapping[str, Column]
-    joint_files: Mapping[int, Path]
-
-    @classmethod
-    def from_mapping(cls, mapping: Mapping[str, object], where: str, folder: Path) -> ColumnMap:
-        """Check a column map read from YAML.
-
-        `TARGET: NAME` is short for `TARGET: {column: NAME, scale: 1.0, offset: 0.0}`. Raises ConfigError.
-        """
-        full = {
-            key: {"column": value} if isinstance(value, str) and key in _targets() else value
-            for key, value in mapping.items()
-        }
-        section = Section(full, where)
-        columns: dict[str, Column] = {}
-        for key in _targets():
-            inner = section.section(key, optional=key != TIME and full.get(key, "") is not None)
-            if inner is not None:
-                columns[key] = _column(inner)
-        files = {
-            joint: folder / section.text(f"j{joint}.joint_file")
-            for joint in JOINTS
-            if f"j{joint}.joint_file" in full
-        }
-        section.finish()
-        return cls(columns, files)
-
-    @classmethod
-    def load(cls, path: Path) -> ColumnMap:
-        """Read a column map file. Raises ConfigError."""
-        mapping = load_yaml(path)
-        return cls.from_mapping(mapping, str(path), path.parent)
-
-
-@dataclass(frozen=True)
 class RunFile:
     """A run as read.
 
@@ -105,8 +65,9 @@ class RunFile:
         name: for messages; unique among runs that were read together.
         path, source: the file, and what it is: "csv", "parquet" or "mcap".
         sha256: of the file on disk (hex).
-        table: its columns.
+        table: its columns. The pieces of one recording keep its time.
         notes: what is suspicious about it, one line each.
+        piece: number of this piece of the file, and how many there are.
     """
 
     name: str
@@ -115,6 +76,7 @@ class RunFile:
     sha256: str
     table: RunTable
     notes: tuple[str, ...] = ()
+    piece: tuple[int, int] = (1, 1)
 
 
 def run_paths(arguments: Sequence[Path]) -> list[Path]:
@@ -143,10 +105,14 @@ def run_paths(arguments: Sequence[Path]) -> list[Path]:
     return paths
 
 
-def read_runs(arguments: Sequence[Path], columns: ColumnMap | Path | None = None) -> list[RunFile]:
+def read_runs(
+    arguments: Sequence[Path], columns: ColumnMap | Path | None = None, *, in_pieces: bool = False
+) -> list[RunFile]:
     """Read all runs of files and directories (`run_paths`); a progress bar on a terminal.
 
     columns: a column map or its file. Names are unique: the file's, or its path where two files share a name.
+    in_pieces: a recording with gaps gives one run for each piece between them, "a.csv (1 of 3)", not an error; the parts of
+    one run of jtqd are one recording.
 
     Raises:
         RunError: as `read_run` and `run_paths`, or the same data given twice, which would count it twice.
@@ -154,22 +120,68 @@ def read_runs(arguments: Sequence[Path], columns: ColumnMap | Path | None = None
     """
     mapping = ColumnMap.load(columns) if isinstance(columns, Path) else columns
     runs: list[RunFile] = []
-    for path in progress(run_paths(arguments), "reading runs"):
-        run = read_run(path, mapping)
-        same = next((other.name for other in runs if other.sha256 == run.sha256), None)
+    paths = run_paths(arguments)
+    groups = _recordings(paths) if in_pieces else [(path,) for path in paths]
+    for path, *parts in progress(groups, "reading runs"):
+        if parts:
+            read = _checked(_read_log(path, *parts), whole=False)
+        else:
+            read = read_pieces(path, mapping) if in_pieces else [read_run(path, mapping)]
+        same = next((other.name for other in runs if other.sha256 == read[0].sha256), None)
         if same is not None:
             raise RunError(f"{path}: found the same data as in {same}, expected every run once")
-        taken = any(run.name == other.name for other in runs)
-        runs.append(replace(run, name=str(path)) if taken else run)
+        if runs and mapping is not None:  # what holds for every file is said once
+            said = set(mapping.remarks())
+            read[0] = replace(read[0], notes=tuple(note for note in read[0].notes if note not in said))
+        taken = {other.name for other in runs}
+        runs += [
+            replace(run, name=run.name.replace(path.name, str(path), 1)) if run.name in taken else run
+            for run in read
+        ]
     return runs
 
 
 def read_run(path: Path | str, columns: ColumnMap | None = None) -> RunFile:
     """Read one run by the ending of its name; without a column map a table must use the run table's own column names.
 
-    columns: for tables; a log of jtqd has its own names. Raises RunError.
+    columns: for tables; a log of jtqd has its own names. Raises RunError, also for a recording with gaps.
     """
-    path = Path(path)
+    [run] = _checked(_content(Path(path), columns), whole=True)
+    return run
+
+
+def read_pieces(path: Path | str, columns: ColumnMap | None = None) -> list[RunFile]:
+    """Read one file as `read_run`, taken apart at its gaps; pieces shorter than SHORTEST_PIECE_S are left out and noted.
+
+    Raises RunError, also where no piece is long enough.
+    """
+    return _checked(_content(Path(path), columns), whole=False)
+
+
+def _recordings(paths: Sequence[Path]) -> list[tuple[Path, ...]]:
+    """Return the files of each recording: jtqd ends a log and begins the next part after a while (docs/recording.md)."""
+    groups: dict[object, list[Path]] = {}
+    for path in paths:
+        run = _PART.fullmatch(path.name)
+        key = path if run is None else (path.parent, run["run"])
+        groups.setdefault(key, []).append(path)
+    return [tuple(sorted(group)) for group in groups.values()]
+
+
+@dataclass(frozen=True)
+class _Content:
+    """What was read of a file: target columns and further sources [n] by key, lines [n] for messages (None: samples)."""
+
+    path: Path
+    source: str
+    sha256: str
+    values: Mapping[str, FloatArray]
+    lines: Sequence[int] | None = None
+    notes: tuple[str, ...] = ()
+    columns: ColumnMap | None = None
+
+
+def _content(path: Path, columns: ColumnMap | None) -> _Content:
     if not path.is_file():
         found = "something that is no file" if path.exists() else "no such file"
         found = "a directory" if path.is_dir() else found
@@ -183,44 +195,31 @@ def read_run(path: Path | str, columns: ColumnMap | None = None) -> RunFile:
     raise RunError(f"{path}: found a file ending in '{path.suffix}', expected {', '.join(TABLES + LOGS)}")
 
 
-def _column(section: Section) -> Column:
-    scale = section.number("scale", unit="target units per cell unit", default=1.0)
-    if scale == 0.0:
-        raise section.error("scale", scale, "a number other than 0")
-    column = Column(
-        section.text("column"),
-        scale,
-        section.number("offset", unit="target units", default=0.0),
-    )
-    section.finish()
-    return column
-
-
 # From columns to a run table, whatever the file.
 
 
-def _wanted_columns(header: Sequence[str], path: Path, columns: ColumnMap | None) -> Mapping[str, Column]:
-    """Return where each target column comes from: the map's, or the run table's own names that are there."""
-    if columns is None and TIME not in header:
+def _wanted_columns(header: Sequence[str], path: Path, columns: ColumnMap | None) -> ColumnMap:
+    """Return the map, or for none one of the run table's own names that are there."""
+    if columns is not None:
+        return columns
+    if TIME not in header:
         raise RunError(
             f"{path}:{_header_place(path)} found no column '{TIME}' (first columns: {list(header[:4])}), "
             "expected the run table's names or a column map"
         )
-    wanted = (
-        columns.columns
-        if columns is not None
-        else {name: Column(name) for name in _targets() if name in header}
-    )
-    for target, column in wanted.items():
-        if column.name not in header:
-            raise RunError(
-                f"{path}:{_header_place(path)} found no column '{column.name}', expected it for {target}"
-            )
-    return wanted
+    return ColumnMap({name: Column(name) for name in targets() if name in header}, {})
 
 
-def _targets() -> list[str]:
-    return [TIME, *(f"j{joint}.{quantity}" for joint in JOINTS for quantity in COLUMN_NAMES)]
+def _expressions(header: Sequence[str], path: Path, columns: ColumnMap) -> dict[str, Expression]:
+    try:
+        return columns.parsed(list(header), f"{path}:{_header_place(path)}")
+    except ExpressionError as error:
+        raise RunError(str(error)) from None
+
+
+def _names(wanted: Mapping[str, Expression]) -> list[str]:
+    """Return the columns of the file that are read, each once."""
+    return list(dict.fromkeys(name for each in wanted.values() for name in each.names))
 
 
 def _header_place(path: Path) -> str:
@@ -228,24 +227,51 @@ def _header_place(path: Path) -> str:
     return " line 1:" if ".csv" in path.suffixes else ""
 
 
-def _scaled(cells: Mapping[str, FloatArray], wanted: Mapping[str, Column]) -> dict[str, FloatArray]:
+def _scaled(
+    cells: Mapping[str, FloatArray], wanted: Mapping[str, Expression], columns: ColumnMap
+) -> dict[str, FloatArray]:
+    sources = columns.sources()
     with np.errstate(over="ignore", invalid="ignore"):  # the table refuses what is not finite
-        return {target: c.scale * cells[c.name] + c.offset for target, c in wanted.items()}
+        return {
+            key: sources[key].scale * each.value(cells) + sources[key].offset for key, each in wanted.items()
+        }
 
 
-def _checked_run(
-    path: Path,
-    source: str,
-    values: Mapping[str, FloatArray],
-    sha256: str,
-    *,
-    lines: Sequence[int] | None = None,
-    notes: Sequence[str] = (),
-) -> RunFile:
-    """Check the target columns [n] of a run and make its table; lines [n] are for the messages, None: sample numbers."""
-    if len(values[TIME]) < 2:
-        raise RunError(f"{path}: found {counted(len(values[TIME]), 'sample')}, expected at least 2")
-    notes = [*notes, *_check_time(values[TIME], lines, path)]
+def _checked(content: _Content, *, whole: bool) -> list[RunFile]:
+    """Check time and columns of a file and make its run table, or one for each of its pieces."""
+    time_s, path = content.values[TIME], content.path
+    if len(time_s) < 2:
+        raise RunError(f"{path}: found {counted(len(time_s), 'sample')}, expected at least 2")
+    notes = [*content.notes, *_check_time(time_s, content.lines, path, whole=whole)]
+    cuts = [slice(0, len(time_s))] if whole else _pieces(time_s)
+    long = [cut for cut in cuts if len(cuts) == 1 or _length_s(time_s, cut) >= SHORTEST_PIECE_S]
+    if not long:
+        longest = max(_length_s(time_s, cut) for cut in cuts)
+        raise RunError(
+            f"{path}: found {len(cuts)} pieces between gaps, the longest of {longest:.3g} s, expected one of at least "
+            f"{SHORTEST_PIECE_S:g} s"
+        )
+    if len(cuts) > 1:
+        kept = sum(_length_s(time_s, cut) for cut in long)
+        notes.append(
+            f"{counted(len(cuts) - 1, 'gap')} of more than {BRIDGED_S:g} s: used as {counted(len(long), 'piece')} of one "
+            f"recording, {kept:.3g} s of {time_s[-1] - time_s[0]:.3g} s"
+        )
+        notes += _unwrapped_over_gaps(content)
+    if content.columns is not None:
+        notes += content.columns.remarks()
+    return [
+        _piece(content, cut, notes if number == 1 else [], (number, len(long)))
+        for number, cut in enumerate(long, 1)
+    ]
+
+
+def _piece(content: _Content, cut: slice, notes: Sequence[str], place: tuple[int, int]) -> RunFile:
+    """Make the run table of the rows of one piece."""
+    path, notes = content.path, list(notes)
+    values = {key: value[cut] for key, value in content.values.items()}
+    if content.columns is not None:
+        values = content.columns.completed(values)
     joints: dict[int, JointColumns] = {}
     for joint in JOINTS:
         parts = {q: values.get(f"j{joint}.{q}") for q in COLUMN_NAMES}
@@ -266,11 +292,34 @@ def _checked_run(
         table = RunTable(time_s=values[TIME], joints=joints)
     except RunTableError as error:  # a scale of the column map that leaves the range of a float
         raise RunError(f"{path}: {error}") from None
-    return RunFile(path.name, path, source, sha256, table, tuple(notes))
+    name = path.name if place[1] == 1 else f"{path.name} ({place[0]} of {place[1]})"
+    return RunFile(name, path, content.source, content.sha256, table, tuple(notes), place)
 
 
-def _check_time(time_s: NDArray[np.float64], lines: Sequence[int] | None, path: Path) -> list[str]:
-    """Refuse time that stands, runs back or has long gaps; note the short gaps."""
+def _pieces(time_s: FloatArray) -> list[slice]:
+    """Return the rows between gaps; the time rises."""
+    steps = np.diff(time_s)
+    longest = max(LONGEST_GAP * float(np.median(steps)), BRIDGED_S)
+    ends = [0, *(np.flatnonzero(steps > longest) + 1), len(time_s)]
+    return [slice(int(a), int(b)) for a, b in pairwise(ends)]
+
+
+def _unwrapped_over_gaps(content: _Content) -> list[str]:
+    if content.columns is None:
+        return []
+    named = [key for key, column in content.columns.sources().items() if "unwrap(" in column.name]
+    what = "its turns in the gaps are not known: an angle of a later piece may be off by whole periods"
+    return [f"{key} is unwrapped, {what}" for key in named]
+
+
+def _length_s(time_s: FloatArray, cut: slice) -> float:
+    return float(time_s[cut.stop - 1] - time_s[cut.start])
+
+
+def _check_time(
+    time_s: NDArray[np.float64], lines: Sequence[int] | None, path: Path, *, whole: bool
+) -> list[str]:
+    """Refuse time that stands or runs back, and in a whole run long gaps; note the short gaps."""
 
     def at(row: int) -> str:
         return f"sample {row}" if lines is None else f"line {lines[row]}"
@@ -284,7 +333,7 @@ def _check_time(time_s: NDArray[np.float64], lines: Sequence[int] | None, path: 
         )
     median = float(np.median(steps))
     longest = int(np.argmax(steps))
-    if steps[longest] > LONGEST_GAP * median:
+    if whole and steps[longest] > LONGEST_GAP * median:
         raise RunError(
             f"{path}: {at(longest + 1)}: found a gap of {steps[longest]:.6g} s, "
             f"expected steps of about {median:.6g} s"
@@ -316,12 +365,14 @@ class _Rows(Protocol):
     def __next__(self) -> list[str]: ...
 
 
-def _read_csv(path: Path, columns: ColumnMap | None) -> RunFile:
+def _read_csv(path: Path, columns: ColumnMap | None) -> _Content:
     data, sha256 = _bytes(path)
     rows = csv.reader(io.StringIO(_text(path, data), newline=""))
     header = _header(rows, path)
-    cells, lines = _cells_of_text(rows, path, header, wanted := _wanted_columns(header, path, columns))
-    return _checked_run(path, "csv", _scaled(cells, wanted), sha256, lines=lines)
+    columns = _wanted_columns(header, path, columns)
+    wanted = _expressions(header, path, columns)
+    cells, lines = _cells_of_text(rows, path, header, _names(wanted))
+    return _Content(path, "csv", sha256, _scaled(cells, wanted, columns), lines, columns=columns)
 
 
 def _text(path: Path, data: bytes) -> str:
@@ -356,10 +407,10 @@ def _next_row(rows: _Rows, path: Path) -> list[str] | None:
 
 
 def _cells_of_text(
-    rows: _Rows, path: Path, header: list[str], wanted: Mapping[str, Column]
+    rows: _Rows, path: Path, header: list[str], wanted: Sequence[str]
 ) -> tuple[dict[str, FloatArray], list[int]]:
     """Return columns of the file as arrays [n], n >= 2, all finite, and the line [n] on which each sample ends."""
-    source = {column.name: header.index(column.name) for column in wanted.values()}
+    source = {name: header.index(name) for name in wanted}
     cells: dict[str, list[float]] = {name: [] for name in source}
     lines: list[int] = []
     while (row := _next_row(rows, path)) is not None:
@@ -388,7 +439,7 @@ def _cells_of_text(
 # Parquet and logs.
 
 
-def _read_parquet(path: Path, columns: ColumnMap | None) -> RunFile:
+def _read_parquet(path: Path, columns: ColumnMap | None) -> _Content:
     data, sha256 = _bytes(path)
     if importlib.util.find_spec("pyarrow") is None:
         raise RunError(f"{path}: reading Parquet needs pyarrow, which is not installed: pip install pyarrow")
@@ -398,14 +449,15 @@ def _read_parquet(path: Path, columns: ColumnMap | None) -> RunFile:
     try:
         file = pq.ParquetFile(pa.BufferReader(data))
         header = list(file.schema_arrow.names)
-        wanted = _wanted_columns(header, path, columns)
-        table = file.read(columns=list(dict.fromkeys(column.name for column in wanted.values())))
+        columns = _wanted_columns(header, path, columns)
+        wanted = _expressions(header, path, columns)
+        table = file.read(columns=_names(wanted))
     except (pa.ArrowException, OSError, ValueError) as error:
         if isinstance(error, RunError):
             raise
         raise RunError(f"{path}: not a readable Parquet file: {' '.join(str(error).split())}") from None
     cells = {name: _cells_of_arrow(path, name, table.column(name)) for name in table.column_names}
-    return _checked_run(path, "parquet", _scaled(cells, wanted), sha256)
+    return _Content(path, "parquet", sha256, _scaled(cells, wanted, columns), columns=columns)
 
 
 def _cells_of_arrow(path: Path, name: str, column: Any) -> FloatArray:
@@ -435,19 +487,22 @@ def _is_number(value: object) -> bool:
     return True
 
 
-def _read_log(path: Path) -> RunFile:
+def _read_log(path: Path, *parts: Path) -> _Content:
+    """Read a log, or all parts of one run; the hash is that of all files one after another."""
     from jtqd.daemon.logs import LogError
     from jtqd.sysid.runs.logs import log_to_run
 
-    _, sha256 = _bytes(path)
+    sha256 = _bytes(path)[1]
+    if parts:
+        sha256 = hashlib.sha256(b"".join(_bytes(each)[0] for each in (path, *parts))).hexdigest()
     try:
-        logged = log_to_run(path)
+        logged = log_to_run((path, *parts) if parts else path)
     except LogError as error:
         text = str(error)
         raise RunError(text if text.startswith(str(path)) else f"{path}: {text}") from None
     except OSError as error:
         raise RunError(f"{path}: cannot be read: {error.strerror or error}") from None
-    notes = []
+    notes = [f"{len(parts) + 1} parts of one run: {path.name} to {parts[-1].name}"] if parts else []
     if logged.missed or logged.incomplete:
         by = ", ".join(f"{count} of {name}" for name, count in logged.incomplete_by.items() if count)
         notes.append(
@@ -460,7 +515,7 @@ def _read_log(path: Path) -> RunFile:
             column = getattr(columns, name)
             if column is not None:
                 values[f"j{number}.{name}"] = column
-    return _checked_run(path, "mcap", values, sha256, notes=notes)
+    return _Content(path, "mcap", sha256, values, notes=tuple(notes))
 
 
 # Writing.

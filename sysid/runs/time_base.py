@@ -25,6 +25,8 @@ _SKEW_LONGEST_S: Final = 0.6
 _SKEW_STEP_S: Final = 0.005
 _SKEW_GAIN: Final = 0.3
 """Part of the residual energy that a shift must take away to be believed."""
+_SKEW_MATTERS: Final = 0.005
+"""Part of the torque's variance that it must take away: where a regression leaves next to nothing, stiction bends that."""
 _POSITIONS: Final = ("motor_position_rad", "link_position_rad")
 
 
@@ -142,6 +144,8 @@ def skew_s(table: RunTable, number: int, joint: Joint) -> float | None:
     q, _ = np.linalg.qr(x / np.where(size > 0.0, size, 1.0))
     left = _left_over(q, tau - np.mean(tau), 2 * reach + 1)
     best = int(np.argmin(left))
+    if left[reach] - left[best] < _SKEW_MATTERS:
+        return 0.0
     if left[best] > (1.0 - _SKEW_GAIN) * left[reach] or left[best] > 0.5 or best in (0, 2 * reach):
         return 0.0 if best == reach else None
     return (best - reach) * step

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import yaml
@@ -19,6 +19,7 @@ from jtqd.sysid.report.numbers import number
 
 TEMPLATE: Final = "report.html.j2"
 PLAN_FILE: Final = "next_experiment.plan.yaml"
+MOTION_FILE: Final = "next_experiment.motion.csv"
 
 
 def render(findings: Findings, made: str = "", effects: Mapping[str, Effect] | None = None) -> str:
@@ -53,6 +54,7 @@ def render(findings: Findings, made: str = "", effects: Mapping[str, Effect] | N
         "pictures": drawn,
         "closed": sum(1 for each in drawn if not each.opened),
         "traces": trace_rows(findings),
+        "motion_file": MOTION_FILE,
         "next": _next(findings),
     }
     return page.render("jtqd.sysid.diagnosis.report", TEMPLATE, content)
@@ -83,9 +85,24 @@ def _next(findings: Findings) -> dict[str, Any] | None:
     return {
         "why": findings.next_experiment["why"],
         "file": PLAN_FILE,
-        "amount": "" if plan is None else plan_amount(plan),
+        "command": findings.next_experiment.get("command")
+        or f"jtq campaign {PLAN_FILE} --bus can0 --out RUNS",
+        "motion": _motion(findings.next_experiment.get("motion")),
+        "amount": _amount(plan, findings.next_experiment.get("motion")),
         "yaml": "" if plan is None else yaml.safe_dump(plan, sort_keys=False, allow_unicode=True),
     }
+
+
+def _amount(plan: Mapping[str, Any] | None, motion: Mapping[str, Any] | None) -> str:
+    if plan is not None:
+        return plan_amount(plan)
+    return "" if motion is None else _runs_text([run["duration_s"] for run in motion["runs"]])
+
+
+def _motion(motion: Mapping[str, Any] | None) -> list[tuple[str, str, str]]:
+    """Name, what is done beside it, and length of every run of one joint."""
+    runs = [] if motion is None else motion["runs"]
+    return [(run["name"], run["what"], f"{number(run['duration_s'])} s") for run in runs]
 
 
 def plan_amount(plan: Mapping[str, Any]) -> str:
@@ -96,6 +113,10 @@ def plan_amount(plan: Mapping[str, Any]) -> str:
         runs = Plan.from_mapping(dict(plan), PLAN_FILE).runs
     except ConfigError:
         return ""
-    seconds = sum(run.duration_s for run in runs)
+    return _runs_text([run.duration_s for run in runs])
+
+
+def _runs_text(durations_s: Sequence[float]) -> str:
+    seconds, count = sum(durations_s), len(durations_s)
     length = f"{number(seconds)} s" if seconds < 120.0 else f"{number(seconds / 60.0, 2)} minutes"
-    return f"{len(runs)} run{'s' if len(runs) > 1 else ''}, {length} of motion"
+    return f"{count} run{'s' if count > 1 else ''}, {length} of motion"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -9,6 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from jtqd.estimator.arrays import FloatArray
 from jtqd.sysid.diagnosis.findings import Findings, Trace
 from jtqd.sysid.diagnosis.report.words import balance_title
 from jtqd.sysid.report.figures import page_svg, thinned
@@ -21,7 +24,7 @@ FIRST: Final = 2
 """Of them, shown without a click."""
 WIDE_IN: Final = 9.2
 NARROW_IN: Final = 4.4
-_BUCKETS: Final = {WIDE_IN: 600, NARROW_IN: 260}
+_BUCKETS: Final = {WIDE_IN: 360, NARROW_IN: 160}
 _VISIBLE_GAIN: Final = 0.1
 """Least part of the residual's energy that the causes remove in a figure shown without a click."""
 _FLOOR_SIGMAS: Final = 2.0
@@ -40,13 +43,16 @@ class TraceRow:
 
 @dataclass(frozen=True)
 class Picture:
-    """One trace as SVG, wide and narrow; text: its alternative text; opened: shown without a click."""
+    """One trace as SVG, wide and narrow; text: its alternative text; opened: shown without a click; data: the curves as
+    JSON for `traces.js`.
+    """
 
     title: str
     text: str
     wide: str
     narrow: str
     opened: bool
+    data: str
 
 
 def rms(x: Any) -> float:
@@ -122,9 +128,37 @@ def _picture(
         page_svg(partial(_figure, trace, width, floor, both), f"p{place}{name}")
         for width, name in ((WIDE_IN, "w"), (NARROW_IN, "n"))
     )
-    return Picture(
-        f"{trace.run}, joint {trace.joint}, {balance_title(trace.balance)}", text, wide, narrow, opened
-    )
+    title = f"{trace.run}, joint {trace.joint}, {balance_title(trace.balance)}"
+    return Picture(title, text, wide, narrow, opened, _data(trace, floor, both))
+
+
+def _data(trace: Trace, floor: float, both: bool) -> str:
+    """Return the curves of a figure as JSON: 16 bits a value, base64, which is finer than any screen."""
+    curves = [_curve("before", "simulation as it is", "before", trace.before_nm, "Nm", tall=True)]
+    if both:
+        curves.append(_curve("after", "with the causes", "after", trace.after_nm, "Nm", tall=True))
+    curves.append(_curve("soft", "velocity [rad/s]", "velocity", trace.velocity_rad_s, "rad/s"))
+    curves.append(_curve("soft", "torque [Nm]", "torque", trace.torque_nm, "Nm"))
+    step = float(np.median(np.diff(trace.time_s))) if len(trace.time_s) > 1 else 1.0
+    content = {
+        "start_s": round(float(trace.time_s[0]), 6),
+        "step_s": float(f"{step:.9g}"),
+        "floor_nm": float(f"{floor:.4g}") if np.isfinite(floor) else None,
+        "curves": curves,
+    }
+    return json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def _curve(
+    role: str, title: str, short: str, values: FloatArray, unit: str, *, tall: bool = False
+) -> dict[str, Any]:
+    good = np.isfinite(values)
+    largest = float(np.max(np.abs(values[good]))) if good.any() else 0.0
+    scale = largest / 32767.0 or 1.0
+    whole = np.where(good, np.round(np.where(good, values, 0.0) / scale), -32768.0).astype("<i2")
+    text = base64.b64encode(whole.tobytes()).decode("ascii")
+    named = {"role": role, "title": title, "short": short, "unit": unit, "tall": tall}
+    return {**named, "scale": float(f"{scale:.6g}"), "values": text}
 
 
 def _figure(trace: Trace, width: float, floor: float, both: bool) -> Any:

@@ -8,12 +8,15 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from jtqd.estimator.effects.effect import Effect
+from jtqd.estimator.joint import Joint
+from jtqd.sysid.diagnosis.file_values import file_values
 from jtqd.sysid.diagnosis.findings import CandidateEvidence, Cause, Findings, Gain, Gap, Place
 from jtqd.sysid.diagnosis.report.words import (
     AXES,
     balance_title,
     bin_name,
     effect_title,
+    evidence_in_words,
     gain_interval,
     of_place,
     parameter_title,
@@ -121,12 +124,13 @@ def _normalised(places: Sequence[Place]) -> list[Place]:
 
 
 def _top_places(places: Sequence[Place]) -> tuple[PlaceView, ...]:
-    """Return the first place of every axis, in the order of the findings."""
+    """Return the first place of every axis of the findings, the largest share first."""
     first: dict[str, Place] = {}
     for each in places:
         first.setdefault(each.axis, each)
+    ranked = sorted(first.values(), key=lambda each: -each.share)
     return tuple(
-        PlaceView(where(each), percent(each.share), min(max(each.share, 0.0), 1.0)) for each in first.values()
+        PlaceView(where(each), percent(each.share), min(max(each.share, 0.0), 1.0)) for each in ranked
     )
 
 
@@ -168,22 +172,29 @@ _BIC_DECADES: Final = 6.0
 
 @dataclass(frozen=True)
 class ParameterView:
-    """One parameter: name in words, key of the joint file, value with unit, interval ("" for none)."""
+    """One parameter: name in words, key of the joint file, value with unit, interval ("" for none); before: what the joint
+    file says, change: in percent ("" where there is nothing to compare with).
+    """
 
     title: str
     key: str
     value: str
     interval: str
+    before: str = ""
+    change: str = ""
 
 
 @dataclass(frozen=True)
 class CauseView:
-    """One effect found; others: effects indistinguishable from it; equation, tell_tale: "" without a library effect."""
+    """One effect found; others: effects indistinguishable from it; evidence: how sure it is, in words; equation, tell_tale:
+    "" without a library effect.
+    """
 
     title: str
     name: str
     others: tuple[str, ...]
     parameters: tuple[ParameterView, ...]
+    evidence: str
     delta_bic: str
     held_out: str
     rms: str
@@ -223,20 +234,28 @@ class BarView:
 
 def cause_views(findings: Findings, effects: Mapping[str, Effect]) -> list[CauseView]:
     """Return the causes, largest first."""
-    return [_cause(each, effects) for each in findings.causes]
+    return [_cause(each, effects, findings.joint_files) for each in findings.causes]
 
 
-def _cause(cause: Cause, effects: Mapping[str, Effect]) -> CauseView:
+def _cause(cause: Cause, effects: Mapping[str, Effect], joints: Mapping[int, Joint]) -> CauseView:
     effect = effects.get(cause.name)
+    known = file_values(cause.name, cause.joint, cause.parameters, joints)
     rows = []
     for name, value in cause.parameters.items():
         text, interval = with_interval(value.value, value.ci95, value.unit)
-        rows.append(ParameterView(parameter_title(name), name, text, interval))
+        before = change = ""
+        there = known.get(name)
+        if there is not None and there.value is not None:
+            before = with_unit(there.value, value.unit)
+            share = there.change(value.value)
+            change = "not in the file" if share is None else f"{'+' if share > 0.0 else ''}{percent(share)}"
+        rows.append(ParameterView(parameter_title(name), name, text, interval, before, change))
     return CauseView(
         of_place(cause.name, cause.joint),
         cause.name,
         tuple(effect_title(name) for name in cause.names if name != cause.name),
         tuple(rows),
+        evidence_in_words(cause),
         fixed(cause.delta_bic, 0),
         percent(cause.held_out_gain),
         f"{number(cause.rms_nm)}{SPACE}Nm",

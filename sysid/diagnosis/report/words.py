@@ -137,6 +137,18 @@ def verdict_sentence(findings: Findings) -> str:
     return f"{text}; these runs cannot distinguish the alternatives." if classes else f"{text}."
 
 
+CERTAIN_BIC: Final = 100.0
+CERTAIN_HELD_OUT: Final = 0.5
+"""Evidence, and part of it on held-out runs, from which a cause is called certain; below both it is likely."""
+
+
+def evidence_in_words(cause: Cause) -> str:
+    """Return how sure a cause is: "certain", or "likely"; of a class that it is one of them."""
+    sure = cause.delta_bic >= CERTAIN_BIC and cause.held_out_gain >= CERTAIN_HELD_OUT
+    word = "certain" if sure else "likely"
+    return f"{word} that it is one of {len(cause.names)}" if len(cause.names) > 1 else word
+
+
 def gain_sentence(findings: Findings) -> str:
     """Return what the extended model is worth on held-out runs, "" where that was not measured."""
     gain = findings.gain

@@ -106,7 +106,8 @@ def targets(directory: Path) -> list[Target]:
     from jtqd.sim_can.plant_file import load_plant
     from jtqd.sysid.campaign.plan import load_plan
     from jtqd.sysid.campaign.plans import Scale, make_plan
-    from jtqd.sysid.runs.files import ColumnMap, RunError, read_run
+    from jtqd.sysid.runs.column_map import ColumnMap
+    from jtqd.sysid.runs.files import RunError, read_run
 
     configuration = _configuration(directory)
     request = directory / "request.json"

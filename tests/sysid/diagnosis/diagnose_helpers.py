@@ -19,6 +19,7 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.command import main
 from jtqd.sysid.diagnosis.findings import Cause, Findings, Gain, Gap, Place, Value
+from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope
 from jtqd.sysid.runs.files import write_run
 
 JOINT_FILE = shipped("joint1.yaml")
@@ -100,9 +101,13 @@ class Core:
 
     def __init__(self) -> None:
         self.answer: Findings = findings(causes=(COULOMB,))
+        self.scopes: list[Scope] = []
         self.asked: list[tuple[list[tuple[str, RunTable]], dict[int, Joint]]] = []
 
-    def diagnose(self, runs: Sequence[tuple[str, RunTable]], joints: Mapping[int, Joint]) -> Findings:
+    def diagnose(
+        self, runs: Sequence[tuple[str, RunTable]], joints: Mapping[int, Joint], scope: Scope = EVERYTHING
+    ) -> Findings:
+        self.scopes.append(scope)
         self.asked.append((list(runs), dict(joints)))
         return replace(self.answer, runs=tuple(name for name, _ in runs), joints=tuple(joints))
 

@@ -72,7 +72,9 @@ def test_status_and_files_by_verdict(
     assert run(tmp_path, "--joint", JOINT_FILE, "--out", out) == (0 if verdict == "no_gap" else 3)
     text, _ = capsys.readouterr()
     assert text.startswith(f"{verdict}: ")
-    assert ("coulomb_friction of joint 2: coulomb_nm 4.4 [4.3, 4.5] Nm" in text) == (verdict == "cause")
+    assert ("coulomb_friction of joint 2: coulomb_nm 3 -> 4.4 [4.3, 4.5] Nm (+46.7 %)" in text) == (
+        verdict == "cause"
+    )
     made = json.loads((out / "findings.json").read_text())
     assert made["verdict"] == verdict
     assert [each["name"] for each in made["runs"]] == ["a.csv", "b.csv.gz", "c.csv"]
@@ -224,8 +226,68 @@ def test_the_next_experiment_is_a_plan_that_the_campaign_reads(tmp_path: Path, c
     assert run(tmp_path, "--joint", JOINT_FILE, "--out", out) == 3
     assert load_plan(out / "next_experiment.plan.yaml").name == "more"
     made = json.loads((out / "findings.json").read_text())
-    assert made["next_experiment"] == {"why": "load both ways", "plan": PLAN}
+    plan = out / "next_experiment.plan.yaml"
+    command = f"jtq campaign {plan} --bus can0 --out RUNS"
+    assert made["next_experiment"] == {"why": "load both ways", "plan": PLAN, "command": command}
     assert "next_experiment.plan.yaml" in made["files"]
+
+
+def test_the_printed_command_has_the_users_bus_and_configuration(
+    tmp_path: Path, core: Core, capsys: pytest.CaptureFixture[str]
+) -> None:
+    core.answer = findings("ambiguous", next_experiment={"why": "load both ways", "plan": PLAN})
+    write_runs(tmp_path)
+    out = tmp_path / "o"
+    run(tmp_path, "--joint", JOINT_FILE, "--out", out, "--config", "my arm.yaml", "--bus", "can1")
+    plan = out / "next_experiment.plan.yaml"
+    assert (
+        f"run it: jtq campaign {plan} --bus can1 --config 'my arm.yaml' --out RUNS" in capsys.readouterr().out
+    )
+
+
+def test_the_motion_of_an_arm_is_a_file_beside(tmp_path: Path, core: Core) -> None:
+    motion = {"joint": 1, "runs": [{"name": "a", "what": "empty", "duration_s": 3.0}]}
+    made = {"why": "w", "plan": None, "motion": motion, "table": "run,time_s\na,0\n"}
+    core.answer = findings("ambiguous", next_experiment=made)
+    write_runs(tmp_path)
+    out = tmp_path / "o"
+    run(tmp_path, "--joint", JOINT_FILE, "--out", out)
+    assert (out / "next_experiment.motion.csv").read_text() == "run,time_s\na,0\n"
+    found = json.loads((out / "findings.json").read_text())
+    assert found["next_experiment"] == {"why": "w", "plan": None, "motion": motion}
+    assert "next_experiment.motion.csv" in found["files"]
+    core.answer = findings("no_gap")
+    run(tmp_path, "--joint", JOINT_FILE, "--out", out, "--force")
+    assert not (out / "next_experiment.motion.csv").exists()
+
+
+def test_options_reach_the_diagnosis(tmp_path: Path, core: Core, capsys: pytest.CaptureFixture[str]) -> None:
+    write_runs(tmp_path, numbers=(1,))
+    limits = "travel_rad=-0.5:0.5, velocity_rad_s=1"
+    asked = ("--without", "sensor_drift", "--given", "1=coulomb_friction", "--limits", limits)
+    run(tmp_path, "--joint", JOINT_FILE, "--out", tmp_path / "o", *asked)
+    assert core.scopes[0].out == {(None, "sensor_drift"), (1, "coulomb_friction")}
+    asked_limits = core.asked[0][1][1].motion_limits
+    assert asked_limits is not None
+    assert (asked_limits.travel_rad, asked_limits.velocity_rad_s) == ((-0.5, 0.5), 1.0)
+    assert load_joint(tmp_path / "o" / "extended.joint.yaml").motion_limits is None  # not of the joint
+    assert run(tmp_path, "--joint", JOINT_FILE, "--out", tmp_path / "p", "--without", "gravity") == 1
+    assert "--without gravity: found no effect of that name" in capsys.readouterr().err
+    for wrong in ("speed=1", "travel_rad=1", "travel_rad=1:-1", "velocity_rad_s=fast", "torque_nm=0"):
+        with pytest.raises(SystemExit) as caught:
+            run(tmp_path, "--joint", JOINT_FILE, "--out", tmp_path / "p", "--limits", wrong)
+        assert caught.value.code == 2
+
+
+def test_a_known_load_of_the_map_is_no_sensor(tmp_path: Path, core: Core) -> None:
+    paths = write_runs(tmp_path, numbers=(1,))
+    names = ("current_a", "motor_position_rad", "link_position_rad")
+    mapping: dict[str, object] = {"time_s": "time_s"} | {f"j1.{name}": f"j1.{name}" for name in names}
+    mapping["j1.load"] = {"torque_nm": "j1.torque_nm + 0"}
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump(mapping))
+    options = ("--columns", tmp_path / "map.yaml", "--joint", JOINT_FILE, "--out", tmp_path / "o")
+    assert run(*paths, *options) == 3
+    assert core.scopes[0].known_references == {1}
 
 
 def test_nothing_is_overwritten_without_force(
@@ -309,7 +371,6 @@ def cell(text: str, row: int, column: int, content: str) -> str:
         (lambda text: cell(text, 9, 1, "1.5 A"), "line 10, column 'j1.current_a': found '1.5 A'"),
         (lambda text: cell(text, 9, 0, "0.001"), "expected rising time"),
         (lambda text: text.replace("time_s", "Time"), "no column 'time_s'"),
-        (lambda text: "\n".join([*text.splitlines()[:800], *text.splitlines()[1500:]]) + "\n", "found a gap"),
     ],
 )
 def test_bad_run_files(

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import html.parser
 import itertools
+import json
 import math
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 
+from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.findings import Trace
 from jtqd.sysid.diagnosis.report.views import evidence_views
 from jtqd.sysid.diagnosis.report.words import effect_title
@@ -25,7 +30,7 @@ pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
 
 from jtqd.sysid.diagnosis.report.page import render
-from jtqd.sysid.diagnosis.report.pictures import MOST, chosen_traces
+from jtqd.sysid.diagnosis.report.pictures import MOST, chosen_traces, pictures
 
 VOID = {"meta", "br", "link", "img", "input", "hr"}
 PLAIN_SPACE = str.maketrans("\u00a0\u202f", "  ")
@@ -56,7 +61,7 @@ class Page(html.parser.HTMLParser):
         assert self.open.pop() == tag, f"</{tag}> closes nothing, line {self.getpos()}"
 
     def handle_data(self, data: str) -> None:
-        if "style" not in self.open:
+        if not {"style", "script"} & set(self.open):
             self.text += data
 
     def _seen(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
@@ -87,7 +92,10 @@ def test_a_page_is_whole_and_needs_nothing_else(pages: dict[str, str], name: str
     for each in re.findall(r"url\(([^)]*)\)", pages[name]):
         assert each.startswith("#")
         assert each[1:] in page.ids
-    assert not {"script", "link", "img", "iframe"} & {tag for tag, _ in page.elements}
+    assert not {"link", "img", "iframe"} & {tag for tag, _ in page.elements}
+    scripts = [named for tag, named in page.elements if tag == "script"]
+    assert all(set(named) <= {"type"} for named in scripts), "a script from somewhere else"
+    assert not re.search(r"https?://(?!www\.w3\.org/)", pages[name])
     assert "@import" not in pages[name]
     assert not re.search(r"\b(nan|NaN|inf|None|Undefined)\b", text_of(pages[name]))
 
@@ -106,6 +114,73 @@ def test_whoever_cannot_see_the_pictures_is_told_what_they_show(pages: dict[str,
     assert levels[0] == 1
     assert levels.count(1) == 1
     assert all(after <= before + 1 for before, after in itertools.pairwise(levels))
+
+
+def test_the_curves_that_can_be_zoomed_are_the_traces() -> None:
+    findings = examples.two_causes()
+    picture = pictures(findings)[0]
+    trace = chosen_traces(findings)[0]
+    data = json.loads(picture.data)
+    assert [curve["role"] for curve in data["curves"]] == ["before", "after", "soft", "soft"]
+    for curve, values in zip(
+        data["curves"],
+        (trace.before_nm, trace.after_nm, trace.velocity_rad_s, trace.torque_nm),
+        strict=True,
+    ):
+        whole = np.frombuffer(base64.b64decode(curve["values"]), "<i2")
+        back = np.where(whole == -32768, np.nan, whole * curve["scale"])
+        assert back == pytest.approx(values, abs=1e-4 * np.nanmax(np.abs(values)), nan_ok=True)
+    assert data["start_s"] + data["step_s"] * (len(trace.time_s) - 1) == pytest.approx(trace.time_s[-1])
+
+
+BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no browser")
+def test_a_browser_draws_them(pages: dict[str, str], tmp_path: Path) -> None:
+    """Dragging over a third of the first figure leaves a third of its run."""
+    drag = """<script>
+    window.onerror = (text) => { document.title = "ERROR " + text; };
+    const svg = document.querySelector(".zoom svg"), box = svg.getBoundingClientRect();
+    svg.setPointerCapture = () => {};
+    const send = (kind, x) => svg.dispatchEvent(
+      new PointerEvent(kind, { clientX: box.left + x, clientY: box.top + 40, pointerId: 1, bubbles: true }));
+    send("pointerdown", 300); send("pointermove", 400); send("pointerup", 500);
+    </script></body>"""
+    path = tmp_path / "page.html"
+    path.write_text(pages["one_cause"].replace("</body>", drag), encoding="utf-8")
+    assert BROWSER is not None
+    found = subprocess.run(
+        [
+            BROWSER,
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--window-size=1000,1500",
+            f"--user-data-dir={tmp_path / 'profile'}",
+            "--virtual-time-budget=2000",
+            "--dump-dom",
+            path.as_uri(),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    ).stdout
+    assert "ERROR" not in found.partition("</title>")[0]
+    assert found.count('class="live"') == found.count("<figure data-trace")
+    assert re.search(r"[\d.]+ to [\d.]+ s; double click: whole run", found)
+
+
+def test_the_files_value_stands_before_the_found_one() -> None:
+    joint = load_joint(shipped("joint1.yaml"))
+    found = replace(examples.two_causes(), joint_files={1: joint})
+    text = text_of(render(found))
+    viscous = found.causes[0].parameters["viscous_nms_per_rad"].value
+    before = joint.friction.viscous_nms_per_rad
+    assert f"{before:.2f} Nm s/rad → {viscous:.2f} Nm s/rad +{100.0 * (viscous / before - 1.0):.0f} %" in text
+    assert "certain ΔBIC" in text
+    assert "that it is one of 2" in text
 
 
 def test_pictures_follow_the_page_into_the_dark(pages: dict[str, str]) -> None:

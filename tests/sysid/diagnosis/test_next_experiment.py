@@ -256,14 +256,13 @@ def _friction_only(joint: Joint) -> dict[str, Any]:
 
 def test_the_text_says_why_what_and_how_long_and_the_limits_follow_the_joints() -> None:
     made = next_experiment(
-        [("current_offset", "friction_asymmetry"), ("hysteresis",)], {1: SHIPPED[1]}, "Two classes."
+        [("current_offset", "friction_asymmetry"), ("hysteresis",)], SHIPPED, "Two classes."
     )
     assert set(made) == {"why", "plan"}
     why = made["why"]
     for part in (
         "Two classes. Proposed to distinguish current_offset from friction_asymmetry and to detect hysteresis:",
         "drives switched off",
-        "Record both joints",
         " runs, ",
         "at most 40 Nm",
     ):

@@ -12,7 +12,8 @@ from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.fit.friction import FitError, effective_samples, fit_friction, student_975
-from jtqd.sysid.runs.files import ColumnMap, read_run
+from jtqd.sysid.runs.column_map import ColumnMap
+from jtqd.sysid.runs.files import read_run
 
 Array = NDArray[np.float64]
 DT_S = 0.001

@@ -16,7 +16,8 @@ from jtqd.estimator.status import STALE, STARTING
 from jtqd.models.files import load_yaml, shipped
 from jtqd.sysid.measured import offline as measured
 from jtqd.sysid.measured.bus import Played, config_file, configured, published_torque, record, score_log
-from jtqd.sysid.runs.files import ColumnMap, read_run
+from jtqd.sysid.runs.column_map import ColumnMap
+from jtqd.sysid.runs.files import read_run
 from tests.daemon.recording.cdr_decoder import Definition
 
 pytestmark = pytest.mark.native

@@ -14,7 +14,8 @@ from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant, plant_of_joint
 from jtqd.sysid.runs.channels import check_channels, gear_ratio_of
-from jtqd.sysid.runs.files import ColumnMap, read_run
+from jtqd.sysid.runs.column_map import ColumnMap
+from jtqd.sysid.runs.files import read_run
 from tests.estimator.estimator_helpers import joint1
 from tests.sysid.campaign_helpers import plateau_run
 from tests.sysid.runs.random_motion import Excitation, random_current, random_velocity

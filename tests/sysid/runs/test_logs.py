@@ -1,5 +1,6 @@
 """From jtqd's log to the run table: what is in it, what is left out, and that every slot is accounted for."""
 
+import hashlib
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ import pytest
 
 from jtqd.daemon.logs import LogError
 from jtqd.estimator.run import COLUMN_NAMES
+from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.logs import log_to_run
 from tests.daemon.logs.campaign_log import OFF, Cycle, Joint, regular, temperature, write_log
 
@@ -229,3 +231,23 @@ def test_the_account_holds_for_any_losses(tmp_path: Path) -> None:
         assert found is not None
         assert found.tolist() == pytest.approx((0.1 * np.flatnonzero(good)).tolist()), f"seed {seed}"
         assert replace(logged, incomplete=0).lost_share <= logged.lost_share
+
+
+def test_the_parts_of_a_run_are_one_recording(tmp_path: Path) -> None:
+    """Read in pieces: two parts of one run and a log of another; the second part's beginning is lost for 60 ms."""
+    cycles = regular(4000, joints)
+    parts = [tmp_path / f"b-20260101T000000Z-000{k}.mcap" for k in (1, 2)]
+    write_log(parts[0], cycles[:2000])
+    write_log(parts[1], cycles[2060:])
+    write_log(tmp_path / "b-20260102T000000Z-0001.mcap", regular(1500, joints, start=9))
+    runs = read_runs([tmp_path], in_pieces=True)
+    assert [run.name for run in runs] == [
+        f"{parts[0].name} (1 of 2)",
+        f"{parts[0].name} (2 of 2)",
+        "b-20260102T000000Z-0001.mcap",
+    ]
+    assert runs[1].table.time_s[0] == pytest.approx(2.06)
+    assert runs[0].notes[0] == f"2 parts of one run: {parts[0].name} to {parts[1].name}"
+    whole = b"".join(part.read_bytes() for part in parts)
+    assert runs[0].sha256 == runs[1].sha256 == hashlib.sha256(whole).hexdigest()
+    assert len(read_runs([parts[1]], in_pieces=True)) == 1

@@ -1,0 +1,81 @@
+"""What a diagnosis may name: effects that the user leaves out or takes as given, and references that are no sensor's."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.joint import Joint
+from jtqd.sysid.diagnosis.findings import JointName
+
+SENSOR: Final = "sensor"
+_ITEM: Final = re.compile(r"(?:(?P<joint>[1-7]|sensor)=)?(?P<name>[a-z_]+)")
+
+
+@dataclass(frozen=True)
+class Scope:
+    """Effects that are not looked for, and joints whose torque is known.
+
+    out: (joint or "sensor", name); joint None: wherever it may be. known_references: joints whose reference is a known load
+    or a model's torque: no sensor effect may touch it, and it has no zero that drifts.
+    """
+
+    out: frozenset[tuple[JointName | None, str]] = frozenset()
+    known_references: frozenset[int] = frozenset()
+
+    def looks_for(self, name: str, where: JointName, number: int) -> bool:
+        """Return whether an effect of a joint or the sensor, seen in the balances of joint `number`, is a candidate."""
+        if where == SENSOR and number in self.known_references:
+            return False
+        return (None, name) not in self.out and (where, name) not in self.out
+
+
+EVERYTHING: Final = Scope()
+
+
+def scope_of(
+    without: Iterable[str], given: Iterable[str], joints: Mapping[int, Joint], known: Iterable[int] = ()
+) -> Scope:
+    """Return the scope that options --without and --given ask for; items as "NAME", "2=NAME" or "sensor=NAME".
+
+    Without: the effect is taken to be absent. Given: it is as the joint files have it, in `effects` or as one of their
+    values, which is then not questioned. Raises ConfigError for a name that is no effect, or a given effect that no joint
+    file has.
+    """
+    out: set[tuple[JointName | None, str]] = set()
+    for option, items in (("--without", without), ("--given", given)):
+        for text in items:
+            match = _ITEM.fullmatch(text)
+            if match is None or match["name"] not in EFFECTS:
+                raise ConfigError(
+                    f"{option} {text}: found no effect of that name, expected NAME, N=NAME or sensor=NAME of "
+                    f"{', '.join(sorted(EFFECTS))}"
+                )
+            where: JointName | None = match["joint"]
+            if where is not None and where != SENSOR:
+                where = int(where)
+                if where not in joints:
+                    have = ", ".join(str(number) for number in sorted(joints))
+                    raise ConfigError(
+                        f"{option} {text}: found no joint {where} in runs and joint files: {have}"
+                    )
+            if option == "--given":
+                _check_given(text, match["name"], where, joints)
+            out.add((where, match["name"]))
+    return Scope(frozenset(out), frozenset(known))
+
+
+def _check_given(text: str, name: str, where: JointName | None, joints: Mapping[int, Joint]) -> None:
+    """Refuse an effect that no joint file says anything about: taken as given it would be --without."""
+    asked = [joint for number, joint in joints.items() if where in (None, SENSOR, number)]
+    in_file = any(effect.name == name for joint in asked for effect in joint.effects)
+    if not in_file and not any(parameter.key for parameter in EFFECTS[name].parameters):
+        files = " or ".join(joint.name for joint in asked)
+        raise ConfigError(
+            f"--given {text}: found no effect {name} in {files}, expected it under `effects` with its parameters "
+            f"(or --without {text} for an effect that is absent)"
+        )

@@ -1,0 +1,193 @@
+"""Errors of a joint file on runs: what its simulation and its estimators get wrong, against the torque that was measured.
+
+    simulation  residuals of the motor and the torsion balance with all effects of the file, averaged over
+                5 ms as there, rms in motion; the torsion's without its mean in each run, whose zero differs
+    free run    error of the simulated velocity after half a second on its own (`jtqd.sysid.diagnosis.gain.free_run`)
+    estimators  estimate less sensor, the sensor passed through the same low-pass, rms over the samples in motion
+
+Nothing is fitted. A method that needs what a joint file does not have (efficiency, section `fused`) is left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from jtqd.estimator.arrays import BoolArray, FloatArray
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.methods import estimate_columns
+from jtqd.estimator.observer import low_pass
+from jtqd.estimator.run import RunTable
+from jtqd.estimator.settings import EstimatorSettings
+from jtqd.sysid.diagnosis.dataset import without_known_effects
+from jtqd.sysid.diagnosis.diagnose import with_effects_applied
+from jtqd.sysid.diagnosis.gain import free_run
+from jtqd.sysid.diagnosis.regressors import all_in_bin, bin_samples, binned
+from jtqd.sysid.diagnosis.signals import BaseLoss, about_zero, joint_signals
+
+SCHEMA: Final = "jtq.score/1"
+MOTOR: Final = "simulation, motor balance"
+TORSION: Final = "simulation, torsion balance"
+FREE: Final = "simulation, free run"
+ESTIMATORS: Final = {
+    "tob": "estimator tob",
+    "efficiency": "estimator efficiency",
+    "fused": "estimator fused, without network",
+}
+"""Method of jtqd -> name of its row. Networks are no part of a joint file (`jtq evaluate` scores them)."""
+UNITS: Final = {FREE: "rad/s"}
+SETTLE_S: Final = 0.1
+"""From the first sample on for so long the filters' starts are in the estimates."""
+
+
+@dataclass(frozen=True)
+class RunErrors:
+    """Rms errors of one joint file on one run by what is wrong (NaN: not measurable), and the samples in motion."""
+
+    run: str
+    errors: Mapping[str, float]
+    samples: int
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of the table: what, run ("all" for all of them), its error with each joint file, unit."""
+
+    what: str
+    run: str
+    errors: tuple[float, ...]
+    unit: str
+
+    @property
+    def change(self) -> float:
+        """Relative change from the first file to the last; NaN with one file."""
+        first, last = self.errors[0], self.errors[-1]
+        return last / first - 1.0 if len(self.errors) > 1 and first > 0.0 else math.nan
+
+
+def errors_on(name: str, table: RunTable, number: int, joint: Joint) -> RunErrors:
+    """Return the errors of one joint file on one run.
+
+    Raises SignalsError for a run without what a simulation needs, ConfigError for a joint file that an estimator refuses.
+    """
+    plain = with_effects_applied(joint)
+    base = BaseLoss(plain)
+    raw = joint_signals(name, table, number, plain, base)
+    [signals] = about_zero([raw], {number: base})
+    signals = without_known_effects(signals)
+    moving = signals.moving
+    samples = bin_samples([signals])
+    whole = all_in_bin(moving, samples)
+    errors = {MOTOR: _rms(binned(signals.motor_nm, samples)[whole])}
+    if signals.torsion_nm is not None:
+        rest = binned(signals.torsion_nm, samples)[whole]
+        errors[TORSION] = _rms(rest - rest.mean()) if len(rest) else math.nan
+    errors[FREE] = free_run(raw, plain).rmse_rad_s if moving.any() else math.nan
+    columns = table.joint(number, joint.gear_ratio)
+    assert columns.torque_nm is not None
+    settled = moving & (table.time_s - table.time_s[0] >= SETTLE_S)
+    dt = table.dt_s
+    for method, title in ESTIMATORS.items():
+        if (method == "efficiency" and joint.efficiency is None) or (
+            method == "fused" and joint.fused is None
+        ):
+            continue
+        settings = EstimatorSettings(method=method)
+        estimate = estimate_columns(joint, settings, None, table.time_s, columns).torque_nm
+        sensor = low_pass(columns.torque_nm, dt, settings.bandwidth_rad_s)
+        errors[title] = _rms((estimate - sensor)[settled])
+    return RunErrors(name, errors, int(np.count_nonzero(moving)))
+
+
+def rows_of(scored: Sequence[Sequence[RunErrors]]) -> list[Row]:
+    """Return the table of [file][run]: for each row that every file has all runs together, then each run.
+
+    All runs together: root of the mean square, weighted by the samples in motion.
+    """
+    rows = []
+    for what in (MOTOR, TORSION, FREE, *ESTIMATORS.values()):
+        each = [[run.errors.get(what, math.nan) for run in runs] for runs in scored]
+        if not any(math.isfinite(error) for errors in each for error in errors):
+            continue
+        unit = UNITS.get(what, "Nm")
+        weights = np.array([run.samples for run in scored[0]], np.float64)
+        rows.append(Row(what, "all", tuple(_together(np.array(errors), weights) for errors in each), unit))
+        rows += [
+            Row(what, run.run, tuple(errors[k] for errors in each), unit) for k, run in enumerate(scored[0])
+        ]
+    return rows
+
+
+def to_mapping(
+    rows: Sequence[Row], *, joint: int, files: Sequence[str], notes: Sequence[str]
+) -> dict[str, Any]:
+    """Return the table for programs; what has no value is null."""
+    return {
+        "schema": SCHEMA,
+        "joint": joint,
+        "files": list(files),
+        "rows": [
+            {
+                "what": row.what,
+                "run": row.run,
+                "unit": row.unit,
+                "rmse": [_finite(error) for error in row.errors],
+                "change": _finite(row.change),
+            }
+            for row in rows
+        ],
+        "notes": list(notes),
+    }
+
+
+def table_lines(rows: Sequence[Row], files: Sequence[str]) -> list[str]:
+    """Return the table as lines of text."""
+    names = ["before", "after"][: len(files)] if len(files) > 1 else ["rmse"]
+    head = ["error, rms", "run", *names, "unit", *(["change"] if len(files) > 1 else [])]
+    body = [
+        [
+            row.what if row.run == "all" else "",
+            row.run,
+            *(_number(error) for error in row.errors),
+            row.unit,
+            *(
+                [f"{100.0 * row.change:+.0f} %" if math.isfinite(row.change) else "-"]
+                if len(files) > 1
+                else []
+            ),
+        ]
+        for row in rows
+    ]
+    widths = [max(len(line[k]) for line in [head, *body]) for k in range(len(head))]
+    left = {0, 1, len(names) + 2}
+    return [
+        "  ".join(
+            cell.ljust(width) if k in left else cell.rjust(width)
+            for k, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in [head, ["-" * width for width in widths], *body]
+    ]
+
+
+def _rms(values: FloatArray) -> float:
+    good = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(good * good))) if len(good) else math.nan
+
+
+def _together(errors: FloatArray, weights: FloatArray) -> float:
+    good: BoolArray = np.isfinite(errors) & (weights > 0.0)
+    if not good.any():
+        return math.nan
+    return float(np.sqrt(np.sum(weights[good] * errors[good] ** 2) / np.sum(weights[good])))
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}" if math.isfinite(value) else "-"
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

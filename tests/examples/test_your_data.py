@@ -1,0 +1,154 @@
+"""docs/your_data.md: every command runs as it stands, every map is a map, and what the page says of the results holds."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import yaml
+
+from examples.own_rig import DATA_SHEET, TRUE
+from examples.own_rig import main as own_rig
+from jtqd.daemon.jtq import main as jtq
+from jtqd.models.files import load_joint
+from jtqd.sysid.runs.column_map import ColumnMap
+from jtqd.sysid.runs.files import read_run
+from jtqd.sysid.simulators.model import mjcf, model_of
+from tests.daemon.logs.campaign_log import Cycle, write_log
+from tests.daemon.logs.campaign_log import Joint as LogJoint
+from tests.paths import ROOT
+from tests.sysid.diagnosis.diagnose_helpers import bench_run
+from tests.sysid.simulators.mujoco_rig import free_run_error
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("jinja2")
+
+PAGE = (ROOT / "docs" / "your_data.md").read_text()
+COMMANDS = re.findall(r"^    ((?:jtq|python -m) .*)$", PAGE, re.MULTILINE)
+MAPS = re.findall(r"^    ((?:time_s|j\d\.\w+): .*)$", PAGE, re.MULTILINE)
+
+
+def logs(folder: Path) -> None:
+    """Two logs of jtqd on the emulated bench's equations; each has lost 0.3 s."""
+    folder.mkdir()
+    for number, phase in enumerate((0.0, 0.9), 1):
+        table = bench_run(seconds=6.0, phase=phase)
+        columns = [table.joints[n] for n in (1, 2)]
+        cycles = []
+        for k in range(len(table.time_s)):
+            if 1500 <= k < 1650:
+                continue
+            joints = []
+            for c in columns:
+                assert c.current_a is not None
+                assert c.motor_position_rad is not None
+                assert c.link_position_rad is not None
+                assert c.torque_nm is not None
+                before = c.motor_position_rad[max(k - 1, 0)]
+                after = c.motor_position_rad[min(k + 1, len(table.time_s) - 1)]
+                joints.append(
+                    LogJoint(
+                        float(c.current_a[k]),
+                        float(c.motor_position_rad[k]),
+                        float(after - before) / 0.004,
+                        float(c.link_position_rad[k]),
+                        float(c.torque_nm[k]),
+                    )
+                )
+            cycles.append(Cycle(100 + k, 7_000_000_000 + 2_000_000 * k, (joints[0], joints[1])))
+        write_log(folder / f"jtqd-can0-2026112{number}T080000Z-0001.mcap", cycles)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where all commands have been run: a directory with what the page takes for given, the models and logs of jtqd."""
+    folder = tmp_path_factory.mktemp("your_data")
+    (folder / "models").symlink_to(ROOT / "models")
+    logs(folder / "logs")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for command in COMMANDS:
+            program, *arguments = shlex.split(command)
+            if program == "python":
+                assert arguments[:2] == ["-m", "examples.own_rig"]
+                status = own_rig(arguments[2:])
+            else:
+                status = jtq(arguments)
+            assert status in (0, 3), command
+    return folder
+
+
+def test_the_page_has_commands_and_maps() -> None:
+    assert len(COMMANDS) >= 8
+    assert len(MAPS) >= 10
+
+
+def test_every_map_of_the_page_is_one() -> None:
+    whole: dict[str, object] = {}
+    for line in MAPS:
+        mapping = yaml.safe_load(line)
+        beside = {"time_s": "t", "j1.link_position_rad": "q", "j1.motor_position_rad": "m"}
+        ColumnMap.from_mapping({**beside, **mapping}, "docs", Path())
+        whole |= mapping
+    for key in ("j3.torque_nm", "j3.load"):  # one reference of joint 3
+        ColumnMap.from_mapping(
+            {k: v for k, v in whole.items() if k.startswith("j3") and k != key} | {"time_s": "t"}, "", Path()
+        )
+
+
+def test_the_rig_is_found_as_it_is(place: Path) -> None:
+    found = json.loads((place / "rig" / "diagnosis" / "findings.json").read_text())
+    assert found["verdict"] == "cause"
+    values = {name: each for cause in found["causes"] for name, each in cause["parameters"].items()}
+    for key, attribute in (("coulomb_nm", "coulomb"), ("viscous_nms_per_rad", "viscous")):
+        true, before = getattr(TRUE, attribute), getattr(DATA_SHEET, attribute)
+        low, high = values[key]["ci95"]
+        assert low <= true <= high
+        assert values[key]["value"] == pytest.approx(true, rel=0.05)
+        assert values[key]["file_value"] == before
+        assert values[key]["change"] == pytest.approx(values[key]["value"] / before - 1.0)
+    assert len(found["causes"]) == 2
+    assert any("2 pieces of one recording" in note for note in found["channel_notes"])
+    assert any("taken as true" in note for note in found["channel_notes"])
+
+
+def test_the_gain_is_there_on_new_runs_in_our_simulation_and_in_mujoco(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = [str(place / "rig" / "servo.yaml"), str(place / "rig" / "new")]
+    options = ["--columns", str(place / "rig" / "columns.yaml"), "--after"]
+    options.append(str(place / "rig" / "diagnosis" / "extended.joint.yaml"))
+    assert jtq(["score", *arguments, *options, "--json"]) == 0
+    rows = {row["what"]: row for row in json.loads(capsys.readouterr().out)["rows"] if row["run"] == "all"}
+    assert rows["simulation, motor balance"]["change"] < -0.9
+    columns = ColumnMap.load(place / "rig" / "columns.yaml")
+    table = read_run(place / "rig" / "new" / "swing_7.csv", columns).table
+    errors = []
+    for name in ("servo.yaml", "diagnosis/extended.joint.yaml"):
+        joint = load_joint(place / "rig" / name)
+        errors.append(free_run_error(mjcf(model_of(joint)), table, 1, joint.gear_ratio))
+    assert errors[1] < 0.1 * errors[0]
+
+
+def test_logs_with_gaps_are_used(place: Path) -> None:
+    found = json.loads((place / "diagnosis_logs" / "findings.json").read_text())
+    assert sum("(1 of 2)" in run["name"] or "(2 of 2)" in run["name"] for run in found["runs"]) == 4
+    assert found["verdict"] != "insufficient_data"
+
+
+def test_an_arm_gets_a_motion_of_one_joint_within_the_limits(place: Path) -> None:
+    found = json.loads((place / "kinova4" / "findings.json").read_text())
+    assert not any("sensor_crosstalk" in cause["class"] for cause in found["causes"])
+    experiment = found["next_experiment"]
+    assert experiment["plan"] is None
+    motion = experiment["motion"]
+    assert motion["joint"] == 4
+    assert motion["velocity_rad_s"] <= 0.5
+    assert motion["torque_nm"] == 20.0
+    rows = (place / "kinova4" / "next_experiment.motion.csv").read_text().splitlines()
+    assert rows[0] == "run,time_s,position_rad,velocity_rad_s"
+    assert max(abs(float(row.split(",")[3])) for row in rows[1:]) <= 0.51
+    assert not (place / "kinova4" / "next_experiment.plan.yaml").exists()

@@ -1,0 +1,133 @@
+"""Motions of one joint of an arm: whatever the kind and the room, no sample leaves it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jtqd.estimator.joint import MotionLimits
+from jtqd.estimator.run import JointColumns, RunTable
+from jtqd.models.files import load_joint, shipped
+from jtqd.sysid.diagnosis.arm_motion import KINDS, RATE_HZ, Room, csv_text, motions, room_of
+from jtqd.sysid.diagnosis.next_experiment import EXPERIMENTS, next_experiment
+from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
+
+JOINT = load_joint(shipped("joint1.yaml"))
+GRAVITY_NM = 20.0
+
+
+def swung(low: float = -0.6, high: float = 1.0, speed: float = 0.7, noise_rad: float = 0.0) -> JointSignals:
+    """An arm's joint swung from low to high and back under gravity."""
+    half, middle = 0.5 * (high - low), 0.5 * (high + low)
+    rate = speed / half
+    time_s = np.arange(0.0, 12.0, 0.002)
+    angle = middle + half * np.sin(rate * time_s)
+    torque = GRAVITY_NM * np.sin(angle)
+    columns = JointColumns(
+        current_a=torque / JOINT.gear_ratio / JOINT.torque_constant_nm_per_a,
+        motor_position_rad=JOINT.gear_ratio
+        * (angle + noise_rad * np.random.default_rng(1).normal(size=len(angle))),
+        torque_nm=torque,
+    )
+    return joint_signals("r", RunTable(time_s, {1: columns}), 1, JOINT, BaseLoss(JOINT))
+
+
+def test_every_kind_of_the_bench_has_one_for_an_arm() -> None:
+    assert set(KINDS) == set(EXPERIMENTS)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "room",
+    [
+        Room(-0.5, 0.9, 0.7, 2.0, 40.0, 18.0),
+        Room(0.1, 0.13, 0.02, 0.05, 5.0, 1.0),
+        Room(-6.0, 6.0, 3.0, 0.8, 300.0, 100.0),
+        Room(-0.01, 0.2, 3.0, 60.0, 5.0, 1.0),
+    ],
+)
+def test_no_motion_leaves_its_room(kind: str, room: Room) -> None:
+    made = motions([kind], room)
+    assert len(made) >= 2  # a run to leave out
+    for motion in made:
+        assert motion.position_rad.min() >= room.low_rad - 1e-9
+        assert motion.position_rad.max() <= room.high_rad + 1e-9
+        assert np.abs(motion.velocity_rad_s).max() <= room.velocity_rad_s * 1.02
+        steps = np.abs(np.diff(motion.velocity_rad_s)) * RATE_HZ
+        smallest = 2.0 / RATE_HZ  # a ramp is at least two samples
+        assert steps.max() <= max(1.05 * room.acceleration_rad_s2, room.velocity_rad_s / smallest)
+        assert motion.velocity_rad_s[0] == motion.velocity_rad_s[-1] == 0.0
+        turned = np.diff(motion.position_rad) * RATE_HZ
+        between = 0.5 * (motion.velocity_rad_s[1:] + motion.velocity_rad_s[:-1])
+        assert turned == pytest.approx(between, abs=1e-9)
+        assert 1.0 < motion.duration_s < 3600.0
+
+
+def test_the_room_is_where_the_runs_have_been() -> None:
+    room = room_of(JOINT, [swung()])
+    assert room is not None
+    assert room.low_rad == pytest.approx(-0.6 + 0.05 * 1.6, abs=1e-3)
+    assert room.high_rad == pytest.approx(1.0 - 0.05 * 1.6, abs=1e-3)
+    assert room.velocity_rad_s == pytest.approx(0.7, rel=0.01)
+    assert room.needed_nm == pytest.approx(GRAVITY_NM * np.sin(1.0), rel=0.01)
+
+
+@pytest.mark.parametrize("noise_rad", [0.0, 2e-4])
+def test_noise_of_the_encoder_is_no_acceleration(noise_rad: float) -> None:
+    room = room_of(JOINT, [swung(noise_rad=noise_rad)])
+    assert room is not None
+    assert room.acceleration_rad_s2 == pytest.approx(0.7**2 / 0.8, rel=0.15)
+
+
+def test_the_limits_of_the_joint_file_make_it_smaller() -> None:
+    limits = MotionLimits((-0.2, 5.0), velocity_rad_s=0.3, acceleration_rad_s2=0.1, torque_nm=10.0)
+    room = room_of(replace(JOINT, motion_limits=limits), [swung()])
+    assert room is not None
+    assert room.low_rad >= -0.2
+    assert GRAVITY_NM * np.sin(room.high_rad) <= 10.0  # nowhere where gravity alone needs more
+    assert (room.velocity_rad_s, room.acceleration_rad_s2, room.torque_nm) == (0.3, 0.1, 10.0)
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [
+        MotionLimits((2.0, 3.0)),
+        MotionLimits(velocity_rad_s=1e-4),
+        MotionLimits(travel_rad=(0.5, 0.9), torque_nm=1.0),
+    ],
+)
+def test_without_room_there_is_no_motion(limits: MotionLimits) -> None:
+    assert room_of(replace(JOINT, motion_limits=limits), [swung()]) is None
+    made = next_experiment([("hysteresis",)], {3: replace(JOINT, motion_limits=limits)}, signals=[swung()])
+    assert made["motion"] is made["plan"] is None
+    assert "No motion is planned" in made["why"]
+
+
+def test_without_runs_the_limits_of_the_file_are_the_room() -> None:
+    limits = MotionLimits((-0.2, 0.4), velocity_rad_s=0.3, acceleration_rad_s2=1.0, torque_nm=10.0)
+    made = next_experiment([], {1: replace(JOINT, motion_limits=limits)})
+    assert made["motion"]["travel_rad"] == [-0.2, 0.4]
+    assert "no run shows what torque that needs" in made["why"]
+    assert next_experiment([], {1: JOINT})["motion"] is None
+    assert next_experiment([], {1: replace(JOINT, motion_limits=MotionLimits((-0.2, 0.4)))})["motion"] is None
+
+
+def test_one_joint_gets_a_motion_and_no_towing_plan() -> None:
+    made = next_experiment([("torque_constant", "sensor_gain")], {3: JOINT}, "Why.", signals=[swung()])
+    assert made["plan"] is None
+    assert made["motion"]["joint"] == 3
+    assert "with a payload" in {run["what"] for run in made["motion"]["runs"]}
+    rows = made["table"].splitlines()
+    assert rows[0] == "run,time_s,position_rad,velocity_rad_s"
+    positions = [float(row.split(",")[2]) for row in rows[1:]]
+    assert min(positions) >= made["motion"]["travel_rad"][0] - 1e-6
+    assert max(positions) <= made["motion"]["travel_rad"][1] + 1e-6
+    assert made["why"].startswith(
+        "Why. Proposed to distinguish torque_constant from sensor_gain: load_at_both"
+    )
+    assert "a payload may add no more than the rest" in made["why"]
+
+
+def test_the_same_room_gives_the_same_table() -> None:
+    room = Room(-0.5, 0.9, 0.7, 2.0, 40.0, 18.0)
+    assert csv_text(motions(["excitation"], room)) == csv_text(motions(["excitation"], room))

@@ -1,0 +1,87 @@
+"""Options --without and --given, known references, and the file's values beside those found."""
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.joint import Effect
+from jtqd.models.files import load_joint, shipped
+from jtqd.sysid.diagnosis.dataset import build_dataset, usable_signals
+from jtqd.sysid.diagnosis.file_values import file_values
+from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, scope_of
+from tests.sysid.diagnosis.diagnose_helpers import bench_run
+
+JOINT = load_joint(shipped("joint1.yaml"))
+RIPPLE = Effect("torque_ripple", {"amplitude_nm": 0.4, "order_per_motor_rev": 2.0, "phase_rad": 0.1})
+JOINTS = {1: JOINT, 2: replace(JOINT, effects=(RIPPLE,))}
+
+
+def names(scope: Scope, numbers: tuple[int, ...] = (1, 2)) -> set[tuple[str, int | str]]:
+    runs = [(f"r{k}", bench_run(phase=0.7 * k, numbers=numbers)) for k in range(3)]
+    joints = dict.fromkeys(numbers, JOINT)
+    usable, reasons = usable_signals(runs, joints, numbers)
+    assert usable, reasons
+    dataset = build_dataset(usable, joints, scope)
+    found = {(c.effect.name, c.joint) for c in dataset.candidates}
+    return found | {("nuisance " + f.name, f.joint) for f in dataset.families}
+
+
+def test_what_is_left_out_is_no_candidate() -> None:
+    everything = names(EVERYTHING)
+    assert {("coulomb_friction", 1), ("coulomb_friction", 2), ("sensor_gain", "sensor")} <= everything
+    scope = scope_of(["coulomb_friction", "2=viscous_friction", "sensor=sensor_drift"], [], JOINTS)
+    gone = everything - names(scope)
+    assert gone == {
+        ("coulomb_friction", 1),
+        ("coulomb_friction", 2),
+        ("viscous_friction", 2),
+        ("sensor_drift", "sensor"),
+    }
+
+
+def test_no_sensor_effect_touches_a_known_load() -> None:
+    everything, known = names(EVERYTHING, (1,)), names(Scope(known_references=frozenset({1})), (1,))
+    gone = everything - known
+    assert ("sensor_gain", "sensor") in gone
+    assert ("nuisance zero", 0) in gone
+    assert not [where for _, where in known if where == "sensor"]
+    assert ("channel_delay", 1) in known  # of current and link, not of the load
+
+
+@pytest.mark.parametrize(
+    ("without", "given", "said"),
+    [
+        (["gravity"], [], "--without gravity: found no effect of that name, expected NAME"),
+        (["3=coulomb_friction"], [], "found no joint 3 in runs and joint files: 1, 2"),
+        ([], ["1=torque_ripple"], "found no effect torque_ripple in synthetic_joint_1"),
+        ([], ["nothing="], "--given nothing=: found no effect"),
+    ],
+)
+def test_wrong_names_are_told(without: list[str], given: list[str], said: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        scope_of(without, given, JOINTS)
+    assert said.replace("synthetic_joint_1", JOINT.name) in str(caught.value)
+
+
+def test_given_is_what_the_file_has() -> None:
+    scope = scope_of([], ["2=torque_ripple", "coulomb_friction"], JOINTS)
+    assert not scope.looks_for("torque_ripple", 2, 2)
+    assert scope.looks_for("torque_ripple", 1, 1)
+    assert not scope.looks_for("coulomb_friction", 1, 1)
+
+
+def test_the_files_value_stands_beside_the_found_one() -> None:
+    found = file_values("coulomb_friction", 1, ("coulomb_nm",), JOINTS)["coulomb_nm"]
+    assert found == (JOINT.friction.coulomb_nm, "friction.coulomb_nm")
+    assert found.change(1.5 * JOINT.friction.coulomb_nm) == pytest.approx(0.5)
+    gain = file_values("sensor_gain", "sensor", ("gain",), JOINTS)["gain"]
+    assert (gain.value, gain.change(1.03)) == (1.0, pytest.approx(0.03))
+    ripple = file_values("torque_ripple", 2, RIPPLE.parameters, JOINTS)
+    assert ripple["amplitude_nm"].value == 0.4
+    fresh = file_values("torque_ripple", 1, RIPPLE.parameters, JOINTS)
+    assert (fresh["amplitude_nm"].value, fresh["amplitude_nm"].change(0.2)) == (0.0, None)
+    assert fresh["phase_rad"].value is None
+    assert file_values("unheard_of", 1, ("x",), JOINTS) == {}
+    assert gain.change(math.nan) is None
