@@ -229,7 +229,9 @@ def dry_run_text(plan: Plan, setpoints: Mapping[str, Setpoints], load: BusLoad) 
     return "\n".join(lines)
 
 
-_LATE: Final = "runs were lost because this machine was late: SCHED_FIFO (root, or ulimit -r 80), nothing else running; jtq doctor"
+_LATE: Final = (
+    "runs were lost because this machine was late: give it SCHED_FIFO (root, or ulimit -r 80); see jtq doctor"
+)
 _TOO_BUSY: Final = (
     f"{_LATE}; or in exact time, however busy the machine is: "
     "python -m jtqd.sim_can.bench_kernel run --time-travel --out DIR -- jtq campaign ... --bus sim:vcan0 --out DIR"

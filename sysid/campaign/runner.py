@@ -278,6 +278,12 @@ class Outcome:
     runs: Mapping[str, RunState]
     ended: str = ""
 
+    @property
+    def short_of_time(self) -> bool:
+        """Whether a run is not done because the bus or the machine was late."""
+        reasons = [state.reason for state in self.runs.values() if state.status in (STOPPED, FAILED)]
+        return any(_BUS_WAS_LATE.search(reason) or "found a gap of" in reason for reason in reasons)
+
     def count(self, status: str) -> int:
         """Return runs with this status."""
         return sum(state.status == status for state in self.runs.values())
