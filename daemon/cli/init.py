@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -33,7 +34,6 @@ from jtqd.drivers.object_dictionary import EdsError
 from jtqd.drivers.survey import DRIVE, SENSOR, BusSurvey, Survey, survey_of_eds
 from jtqd.estimator.checked import ConfigError
 
-CONFIG = "jtqd.yaml"
 MAX_JOINTS = 2
 _PERIODS_US = (1000, 2000, 4000, 5000, 10_000)
 _EXAMPLES = """examples:
@@ -94,6 +94,12 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         "--bitrate", type=_count, default=1_000_000, metavar="B", help="of the bus [bit/s] (default 1000000)"
     )
+    made.add_argument(
+        "--name",
+        type=_name,
+        default="jtqd",
+        help="of the configuration: NAME.yaml (default jtqd; can0 for jtqd@can0)",
+    )
     made.add_argument("--out", type=Path, required=True, metavar="DIR", help="directory for the files")
     made.add_argument("--force", action="store_true", help="replace files that are there")
     made.add_argument("--no-questions", action="store_true", help="ask nothing, also on a terminal")
@@ -105,6 +111,14 @@ def _node(text: str) -> int:
     if not text.isdecimal() or not 1 <= int(text) <= MAX_NODE_ID:
         raise argparse.ArgumentTypeError(f"found {text!r}, expected a node-ID from 1 to {MAX_NODE_ID}")
     return int(text)
+
+
+def _name(text: str) -> str:
+    if not re.fullmatch(r"\w[\w.-]*", text) or text.startswith("joint_"):
+        raise argparse.ArgumentTypeError(
+            f"found {text!r}, expected letters, digits, . _ -, and not joint_..."
+        )
+    return text
 
 
 def _sensor(text: str) -> int:
@@ -155,7 +169,7 @@ def _run(options: argparse.Namespace) -> int:
     _refuse_what_is_there(options)
     found = _found(options)
     joints = _drafts(options, found)
-    files, period_us = _write(options.out, _config(options, found, joints))
+    files, period_us = _write(options.out, options.name, _config(options, found, joints))
     problems = [each for joint in joints for each in joint.problems]
     if found.sensor is not None:
         problems += sensor_problems(found.sensor, found.surveys.get(found.sensor))
@@ -183,7 +197,7 @@ def _text(report: dict[str, Any]) -> str:
 
 
 def _refuse_what_is_there(options: argparse.Namespace) -> None:
-    for name in (CONFIG, *(f"joint_{number}.yaml" for number in range(1, MAX_JOINTS + 1))):
+    for name in (f"{options.name}.yaml", *(f"joint_{number}.yaml" for number in range(1, MAX_JOINTS + 1))):
         if not options.force and (options.out / name).exists():
             raise UsageError(f"{options.out / name}: is there already; --force replaces it")
 
@@ -358,14 +372,14 @@ def _config(options: argparse.Namespace, found: Found, joints: list[JointDraft])
     )
 
 
-def _write(directory: Path, draft: ConfigDraft) -> tuple[list[Path], int]:
+def _write(directory: Path, name: str, draft: ConfigDraft) -> tuple[list[Path], int]:
     """Write the files with the shortest period whose bus load fits; returns paths and period [us]. Raises ConfigError."""
     directory.mkdir(parents=True, exist_ok=True)
     files = []
     for joint in draft.joints:
         files.append(directory / f"joint_{joint.number}.yaml")
         files[-1].write_text(joint_text(joint), encoding="utf-8")
-    files.append(directory / CONFIG)
+    files.append(directory / f"{name}.yaml")
     for period_us in _PERIODS_US:
         files[-1].write_text(config_text(replace(draft, period_us=period_us)), encoding="utf-8")
         if bus_load_of(load_config(files[-1])).worst <= LIMIT:

@@ -175,6 +175,15 @@ def test_every_guess_is_marked_in_the_files_and_told(tmp_path, capsys):
     assert len(marked) == 8
 
 
+def test_a_name_for_the_unit_of_an_interface(tmp_path, capsys):
+    arguments = ["--from-eds", EDS, "--node", 5, "--gear-ratio", 101, "--out", tmp_path]
+    assert run(capsys, *arguments, "--name", "can0")[0] == 0
+    assert load_config(tmp_path / "can0.yaml").joints[0].node_id == 5
+    for wrong in ("joint_1", "../x", ""):
+        with pytest.raises(SystemExit):
+            init.main([*map(str, arguments), "--name", wrong])
+
+
 def test_what_is_there_is_not_overwritten(tmp_path, capsys):
     (tmp_path / "joint_2.yaml").write_text("mine")
     status, _, err = run(capsys, "--from-eds", EDS, "--node", 5, "--gear-ratio", 101, "--out", tmp_path)
