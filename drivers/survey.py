@@ -24,7 +24,8 @@ from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import FRAME, FRAME_SIZE, pack
 from jtqd.drivers.frame_socket import FrameSocket, open_frame_socket
 from jtqd.drivers.object_dictionary import VISIBLE_STRING, read_eds
-from jtqd.drivers.sdo import Key, SdoAbort, Transfer
+from jtqd.drivers.pdo import CAN_ID, INVALID
+from jtqd.drivers.sdo import Key, SdoAbort, Transfer, label
 from jtqd.drivers.sdo_client import REQUEST_ID, RESPONSE_ID, FrameChannel, SdoAccess, SdoClient, SdoTimeout
 
 DRIVE, SENSOR = 402, 404
@@ -93,6 +94,36 @@ class Survey:
     def tells(self, key: Key) -> bool:
         """Whether the device itself will scale with it: it has a value, or it is only known by an EDS and has the object."""
         return self.number(key) is not None or (self.defaults and key in self.numbers)
+
+
+@dataclass(frozen=True)
+class Tpdo:
+    """One TPDO as it is configured: its objects as "6064h:0/32" (bits)."""
+
+    number: int
+    cob_id: int
+    on: bool
+    transmission_type: int
+    objects: tuple[str, ...]
+
+
+def tpdos(access: SdoAccess) -> list[Tpdo]:
+    """Read the four TPDOs of the predefined connection set (CiA 301, 1800h and 1A00h)."""
+    found = []
+    for number in range(1, 5):
+        cob_id, kind = (_number(access, (0x1800 + number - 1, sub)) for sub in (1, 2))
+        if cob_id is None:
+            continue
+        count = min(_number(access, (0x1A00 + number - 1, 0)) or 0, 64)
+        entries = [_number(access, (0x1A00 + number - 1, sub)) or 0 for sub in range(1, count + 1)]
+        objects = tuple(f"{label(each >> 16, each >> 8 & 0xFF)}/{each & 0xFF}" for each in entries)
+        found.append(Tpdo(number, cob_id & CAN_ID, not cob_id & INVALID, kind or 0, objects))
+    return found
+
+
+def _number(access: SdoAccess, key: Key) -> int | None:
+    raw = _optional(access, key)
+    return None if raw is None else int.from_bytes(raw[:8], "little")
 
 
 def survey(access: SdoAccess, node: int) -> Survey:
@@ -185,6 +216,10 @@ class BusSurvey:
             return survey(SdoClient(FrameChannel(self._socket, node), _ANSWER_S), node)
         except SdoTimeout:
             return None
+
+    def tpdos(self, node: int) -> list[Tpdo]:
+        """Read the TPDOs of one node."""
+        return tpdos(SdoClient(FrameChannel(self._socket, node), _ANSWER_S))
 
     def _answers(self, timeout_s: float) -> set[int]:
         return {can_id - RESPONSE_ID for can_id in self._received(timeout_s) if can_id > RESPONSE_ID}

@@ -3,7 +3,7 @@
     Wanted          what the operator gave, per joint
     draft_joint     Wanted + Survey -> JointDraft: every value with its origin
     joint_text      the joint file
-    config_text     the configuration
+    config_text     the configuration; `drive_lines`, `sensor_lines`: a section of it
 
 A guess is scaled from the shipped bench by the rated torque: orders of magnitude of a harmonic-drive joint, no more.
 """
@@ -325,7 +325,7 @@ def config_text(draft: ConfigDraft) -> str:
             "  mandatory: false",
         ]
     if draft.sensor_node is not None:
-        lines += _sensor_section(draft.sensor_node, draft.sensor)
+        lines += sensor_lines(draft.sensor_node, draft.sensor)
     lines += [
         "realtime: {priority: 80, lock_memory: true}",
         f"recording: {{budget_mb: {draft.budget_mb}, keep_run: false}}  # of --record DIR: the oldest logs are removed",
@@ -335,6 +335,14 @@ def config_text(draft: ConfigDraft) -> str:
 
 
 def _joint_section(joint: JointDraft, draft: ConfigDraft) -> list[str]:
+    lines = drive_lines(joint)
+    if joint.number in draft.joints_of_sensor:
+        lines.append("  sensor_channel: 1       # the torque sensor measures this joint's torque")
+    return lines
+
+
+def drive_lines(joint: JointDraft) -> list[str]:
+    """Return the section of a joint as far as its drive is concerned."""
     survey = joint.survey
     title = f"{survey.title}, by {survey.source}" if survey is not None else "not looked at"
     lines = [
@@ -348,8 +356,6 @@ def _joint_section(joint: JointDraft, draft: ConfigDraft) -> list[str]:
         for key, value in joint.given.items():
             entry = f'    "{label(*key)}": {round(value.number)}'
             lines.append(f"{entry:<26}# {'GUESS, ' * value.guess}{value.origin}")
-    if joint.number in draft.joints_of_sensor:
-        lines.append("  sensor_channel: 1       # the torque sensor measures this joint's torque")
     return lines
 
 
@@ -364,7 +370,8 @@ def _identity(survey: Survey | None) -> list[str]:
     return [f"  identity: {{{inside}}}"] if known else []
 
 
-def _sensor_section(node: int, survey: Survey | None) -> list[str]:
+def sensor_lines(node: int, survey: Survey | None) -> list[str]:
+    """Return the section of the torque sensor."""
     title = f"{survey.title}, by {survey.source}" if survey is not None else "not looked at"
     return [
         f"sensor:                   # {title}",

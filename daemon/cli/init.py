@@ -67,7 +67,7 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument(
         "--node",
-        type=_node,
+        type=node_id,
         action="append",
         metavar="N",
         help=f"node-ID of a drive; again for the next joint, at most {MAX_JOINTS} (default: drives on the bus)",
@@ -107,7 +107,8 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def _node(text: str) -> int:
+def node_id(text: str) -> int:
+    """Parse a node-ID. Raises argparse.ArgumentTypeError."""
     if not text.isdecimal() or not 1 <= int(text) <= MAX_NODE_ID:
         raise argparse.ArgumentTypeError(f"found {text!r}, expected a node-ID from 1 to {MAX_NODE_ID}")
     return int(text)
@@ -122,7 +123,7 @@ def _name(text: str) -> str:
 
 
 def _sensor(text: str) -> int:
-    return 0 if text == "none" else _node(text)
+    return 0 if text == "none" else node_id(text)
 
 
 def _positive(text: str) -> float:
@@ -217,7 +218,7 @@ def _found(options: argparse.Namespace) -> Found:
         surveys = _on_the_bus(options.bus, nodes, sensor)
         drives = [node for node, each in surveys.items() if each.profile == DRIVE]
         sensors = [node for node, each in surveys.items() if each.profile == SENSOR]
-        notes += [f"node {node}: {_description(each)}" for node, each in surveys.items()]
+        notes += [f"node {node}: {description(each)}" for node, each in surveys.items()]
         if sensor is None and sensors:
             sensor = sensors[0]
         if not nodes:
@@ -233,11 +234,11 @@ def _found(options: argparse.Namespace) -> Found:
         raise UsageError(f"--node: {len(nodes)} drives, this version of jtqd has at most {MAX_JOINTS} joints")
     for node, path in zip(nodes, _each("from_eds", options.from_eds, len(nodes)), strict=True):
         if path is not None:
-            surveys[node] = _merged(survey_of_eds(path, node), surveys.get(node))
-            notes.append(f"node {node}: {_description(surveys[node])}")
+            surveys[node] = merged(survey_of_eds(path, node), surveys.get(node))
+            notes.append(f"node {node}: {description(surveys[node])}")
     for node in nodes:
         if node in surveys and surveys[node].profile != DRIVE:
-            raise UsageError(f"node {node} is no CiA 402 drive: {_description(surveys[node])}")
+            raise UsageError(f"node {node} is no CiA 402 drive: {description(surveys[node])}")
     return Found(nodes, surveys, sensor or None, notes)
 
 
@@ -258,12 +259,13 @@ def _survey(bus: str) -> Iterator[BusSurvey]:
         reader.close()
 
 
-def _merged(eds: Survey, bus: Survey | None) -> Survey:
+def merged(eds: Survey, bus: Survey | None) -> Survey:
     """A device on the bus knows its values; its EDS knows what can be mapped."""
     return eds if bus is None else replace(bus, unmappable=eds.unmappable)
 
 
-def _description(survey: Survey) -> str:
+def description(survey: Survey) -> str:
+    """Return a device in one line: name, versions, vendor, profile, source."""
     texts = [text for name in ("hardware", "software") if (text := survey.texts.get(name))]
     vendor = survey.numbers.get((0x1018, 1))
     parts = [survey.title, *texts, *([f"vendor {vendor:08X}h"] if vendor else [])]

@@ -11,7 +11,7 @@ from jtqd.drivers.hub import Hub
 from jtqd.drivers.object_dictionary import EdsError, ObjectStore, read_eds
 from jtqd.drivers.sdo_client import REQUEST_ID, RESPONSE_ID, SdoTimeout
 from jtqd.drivers.sdo_server import SdoServer
-from jtqd.drivers.survey import DRIVE, SENSOR, BusSurvey, survey, survey_of_eds
+from jtqd.drivers.survey import DRIVE, SENSOR, BusSurvey, Tpdo, survey, survey_of_eds, tpdos
 from tests.paths import ROOT
 
 EDS = ROOT / "drivers" / "eds"
@@ -44,6 +44,18 @@ def test_what_is_missing_or_zero_is_told_apart_from_a_value():
     assert found.number((0x6091, 1)) is None
     assert not found.tells((0x6091, 1))
     assert found.title == "drive"
+
+
+def test_tpdos_as_they_are():
+    store = without()
+    store.set_number(0x1800, 1, 0x8000_0185)
+    store.set_number(0x1800, 2, 1)
+    store.set_number(0x1A00, 0, 2)
+    store.set_number(0x1A00, 1, 0x6064_0020)
+    store.set_number(0x1A00, 2, 0x60E4_0120)
+    one = tpdos(store)[0]
+    assert one == Tpdo(1, 0x185, False, 1, ("6064h:0/32", "60E4h:1/32"))
+    assert len(tpdos(store)) == 3, "the fourth is not there"
 
 
 def test_a_sensor():

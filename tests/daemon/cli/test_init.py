@@ -10,7 +10,7 @@ import sys
 import pytest
 import yaml
 
-from jtqd.daemon.cli import init
+from jtqd.daemon.cli import init, probe
 from jtqd.daemon.cli.draft import DraftError, Wanted, draft_joint
 from jtqd.daemon.config import load_config
 from jtqd.drivers.devices import DriveProfile, drive_scaling
@@ -239,6 +239,36 @@ def test_the_devices_of_a_bus(bench, tmp_path, capsys):
     assert status == 2
     assert "node 8 does not answer" in err
     assert "1 (emulated joint drive)" in err
+
+
+def test_probe_of_a_bus_and_of_its_devices(bench, capsys):
+    assert probe.main(["--bus", bench]) == 0
+    assert [line.split(":")[0] for line in capsys.readouterr().out.splitlines()] == [
+        "node 1",
+        "node 2",
+        "node 3",
+    ]
+    assert probe.main(["--bus", bench, "--node", "1"]) == 0
+    told = capsys.readouterr().out
+    for words in ("608Fh:1", "60E4h:1", "TPDOs", "181h", "identity: {vendor: 0x000007A1"):
+        assert words in told
+    assert probe.main(["--bus", bench, "--node", "1", "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content["device"]["vendor"] == 0x7A1
+    assert content["missing"] == content["problems"] == []
+    assert content["tpdos"][0]["objects"]
+    assert probe.main(["--bus", bench, "--node", "3"]) == 0
+    assert "sensor:" in capsys.readouterr().out
+    assert probe.main(["--bus", bench, "--node", "9"]) == 1
+    assert capsys.readouterr().err == f"jtq probe: node 9 does not answer on {bench}\n"
+    assert probe.main(["--bus", bench, "--eds", "x.eds"]) == 2
+
+
+def test_probe_names_what_a_drive_lacks():
+    found = drive(without=[(0x60E4, 1)])
+    (problem,) = probe.problems_of(found)
+    assert "60E4h:1" in problem
+    assert "60E4h:1  not there" in probe.text(found, [], [problem])
 
 
 def test_on_a_terminal_what_is_missing_is_asked_for(tmp_path):
