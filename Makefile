@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-here test-hidden test-guest test-native test-sanitized test-all bench bench-kernel fuzz soak soak-exact lint format clean
+.PHONY: help setup demo dist deb test test-here test-hidden test-guest test-native test-sanitized test-all bench bench-kernel fuzz soak soak-exact lint format clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
@@ -76,6 +76,13 @@ soak-exact: $(VENV)/.installed-dev ## the same in the bench kernel: as much gues
 
 bench-kernel: $(VENV)/.installed ## build the kernel with SocketCAN into the cache, once
 	$(BIN)/python -m jtqd.sim_can.bench_kernel build
+
+dist: $(VENV)/.installed-dev ## wheel and sdist into dist/
+	$(PIP) install build
+	$(BIN)/python -m build --outdir dist .
+
+deb: $(VENV)/.installed ## Debian package into dist/: jtqd in /opt/jtqd, units, user, configuration
+	$(BIN)/python packaging/deb.py --out dist
 
 clean: ## remove what make made here; the cached bench kernel stays
 	rm -rf $(VENV) build dist src/*.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -2,5 +2,5 @@
 
 hidden_effect     an effect is hidden in the emulated bench, found by a campaign and a diagnosis, and jtqd's gain is measured
 kinova_diagnosis  the diagnosis of the seven joints of a measured arm, with the figures of docs/measured_diagnosis.md
-receive_estimate  receive the estimate PDO with python-can; receive_estimate.c does the same in C on SocketCAN
+receivers         receive the estimate PDOs, in C, C++ and Python: to be copied into a controller
 """

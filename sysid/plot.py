@@ -11,11 +11,30 @@ from pathlib import Path
 import numpy as np
 
 from jtqd.daemon.logs import LogError, Records, read_topic
-from jtqd.estimator.status import DEGRADED, NAMES, STANDSTILL, VALID
+from jtqd.estimator.status import (
+    DEGRADED,
+    DRIVE_FAULT,
+    INVALID,
+    NAMES,
+    OFF,
+    STALE,
+    STANDSTILL,
+    STARTING,
+    VALID,
+)
 from jtqd.sysid.report.figures import check_picture, shade
 
-_SHADES = {STANDSTILL: "#dcecf2", DEGRADED: "#fbe8c8"}
-_OTHER = "#f3d6d6"
+_SHADES = {
+    STANDSTILL: "#dcecf2",
+    DEGRADED: "#fbe8c8",
+    STARTING: "#e3f0d8",
+    OFF: "#e4e4e4",
+    STALE: "#f5c9c9",
+    DRIVE_FAULT: "#c9b3dd",
+    INVALID: "#e08f8f",
+}
+"""By status; a torque was published with the first two only."""
+_OTHER = "#c0c0c0"
 
 
 def parser() -> argparse.ArgumentParser:
@@ -74,7 +93,7 @@ def draw(log: Records, joint: int, path: Path) -> float:
     published = np.isin(status, (VALID, DEGRADED, STANDSTILL))
     torque = np.where(published, log["torque_nm"], np.nan)
     sigma, sensor = log["sigma_nm"], log["sensor_torque_nm"]
-    figure, (above, below) = plt.subplots(2, 1, figsize=(10, 5.2), sharex=True, height_ratios=(3, 1.3))
+    figure, (above, below) = plt.subplots(2, 1, figsize=(11, 5.2), sharex=True, height_ratios=(3, 1.3))
     above.fill_between(
         time_s, torque - sigma, torque + sigma, color="#9ec5e8", linewidth=0, label="estimate ± sigma"
     )
@@ -94,8 +113,8 @@ def draw(log: Records, joint: int, path: Path) -> float:
         for code in np.unique(status[status != VALID]):
             label = NAMES.get(int(code), str(code)) if axis is above else None
             shade(axis, time_s, status == code, _SHADES.get(int(code), _OTHER), label)
-    above.legend(loc="upper right", fontsize=8, ncols=3)
-    figure.tight_layout()
+    figure.tight_layout(rect=(0.0, 0.0, 0.84, 1.0))
+    above.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0.0, fontsize=8)
     figure.savefig(path, dpi=110)
     plt.close(figure)
     return rmse

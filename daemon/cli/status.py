@@ -8,15 +8,19 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import select
 import sys
+import termios
 import time
+import tty
 from collections.abc import Iterator, Sequence
-from math import nan
+from math import isfinite, nan
 from typing import Any
 
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.live import Live
 from rich.padding import Padding
+from rich.segment import Segment, Segments
 from rich.table import Table
 from rich.text import Text
 
@@ -32,6 +36,7 @@ from jtqd.daemon.cli.reading import (
     find_daemons,
     on_bus,
 )
+from jtqd.daemon.cli.recent import Moment, Recent, page, sparkline
 from jtqd.daemon.shared.conditions import SEVERITIES, Condition
 from jtqd.daemon.shared.notices import ERROR, WARNING, Notice
 from jtqd.daemon.shared.reasons import drive_state, joint_reason, silent_s
@@ -202,10 +207,10 @@ def _quantiles(values: tuple[float, float, float]) -> dict[str, float | None]:
 
 
 class StatusView:
-    """Rich view of one reading."""
+    """Rich view of one reading; `recent`: with what a live view remembers of the last seconds."""
 
-    def __init__(self, reading: Reading) -> None:
-        self._reading = reading
+    def __init__(self, reading: Reading, recent: Recent | None = None) -> None:
+        self._reading, self._recent = reading, recent
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Render for the width of the terminal (called by rich)."""
@@ -221,6 +226,8 @@ class StatusView:
         yield _joints(about, view, still=still)
         if not still:
             yield from _reasons(about, view, reading.earlier)
+            if self._recent is not None:
+                yield from _last_seconds(self._recent, len(about.joints), width)
         yield ""
         yield _inputs(about, view)
         yield ""
@@ -237,6 +244,22 @@ class StatusView:
         yield from _log(reading.log)
         yield from _conditions(reading.conditions)
         yield from _notices(reading.notices)
+
+
+def _last_seconds(recent: Recent, joints: int, width: int) -> Iterator[RenderableType]:
+    """Return the torque of each joint as a sparkline, and the slowest cycle, of the last seconds."""
+    columns = min(50, max(10, width - 40))
+    for joint in range(joints):
+        torques = recent.torques(joint)
+        known = [each for each in torques if isfinite(each)]
+        extent = f"{min(known):.2f} to {max(known):.2f} Nm" if known else "no torque"
+        yield _line(f"torque {joint + 1}", Text.assemble((sparkline(torques, columns), "cyan"), f" {extent}"))
+    work = recent.largest_us(WORK_BIN_NS / 1000, late=False)
+    late = recent.largest_us(LATE_BIN_NS / 1000, late=True)
+    if work is not None and late is not None:
+        yield _line(
+            f"last {recent.seconds:.0f} s", f"work at most {work:.0f} us, SYNC late by at most {late:.0f} us"
+        )
 
 
 def _title(reading: Reading) -> Text:
@@ -442,11 +465,50 @@ def _notices(notices: Sequence[Notice]) -> Iterator[RenderableType]:
         yield _line(when, Text(each.text, style=_style_of(each.level)))
 
 
-def clock() -> RenderableType:
+def clock(pages: str = "") -> RenderableType:
     """Return the line below a live view."""
     return Padding(
-        Text(time.strftime("%H:%M:%S  Ctrl-C ends this view; jtqd continues"), style="dim"), (1, 0, 0, 0)
+        Text(time.strftime(f"%H:%M:%S  {pages}Ctrl-C ends this view; jtqd continues"), style="dim"),
+        (1, 0, 0, 0),
     )
+
+
+_FOOT_LINES = 2
+
+
+def paged(console: Console, picture: RenderableType, number: int) -> tuple[RenderableType, int]:
+    """Return the page of a picture that fits the terminal, with the line below, and its number: no line is dropped."""
+    lines = console.render_lines(picture, console.options.update(height=None), pad=False)
+    shown, number, count = page(lines, console.height - _FOOT_LINES, number)
+    rows = [Segments([*line, Segment.line()]) for line in shown]
+    return Group(*rows, clock(f"page {number + 1} of {count}, SPACE turns; " if count > 1 else "")), number
+
+
+class Keys:
+    """Keys of the terminal, without their echo, while a view is shown; nothing where standard input is none."""
+
+    def __enter__(self) -> Keys:
+        self._before: list[Any] | None = None
+        if sys.stdin.isatty():
+            self._before = termios.tcgetattr(sys.stdin)
+            tty.setcbreak(sys.stdin.fileno())
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._before is not None:
+            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._before)
+
+    def turned(self, wait_s: float) -> int:
+        """Wait, at most until a key comes; return how many pages to turn: SPACE, n forward, b, p back."""
+        if self._before is None:
+            time.sleep(wait_s)
+            return 0
+        if not select.select([sys.stdin.fileno()], [], [], wait_s)[0]:
+            return 0
+        pressed = os.read(sys.stdin.fileno(), 64)
+        if not pressed:  # the terminal has gone
+            time.sleep(wait_s)
+        return sum(pressed.count(key) for key in b" n") - sum(pressed.count(key) for key in b"bp")
 
 
 def parser() -> argparse.ArgumentParser:
@@ -500,19 +562,30 @@ def _once(daemon: Daemon, *, as_json: bool) -> int:
 
 def _live(console: Console, daemon: Daemon) -> int:
     """Show the live view until Ctrl-C; a restarted daemon is found again."""
-    watch = Watch(daemon)
-    with Live(console=console, screen=True, auto_refresh=False) as live:
+    watch, recent, number = Watch(daemon), Recent(), 0
+    with Keys() as keys, Live(console=console, screen=True, auto_refresh=False) as live:
         while True:
             if daemon.about.running():
-                live.update(Group(StatusView(watch.read()), clock()), refresh=True)
+                reading = watch.read()
+                _remember(recent, reading)
+                shown, number = paged(console, StatusView(reading, recent), number)
+                live.update(shown, refresh=True)
             else:
                 live.update(
                     f"jtqd on {daemon.about.instance} has ended; waiting for its restart", refresh=True
                 )
                 again = on_bus(find_daemons(), daemon.about.instance)
                 if again is not None:
-                    daemon, watch = again, Watch(again)
-            time.sleep(_PERIOD_S)
+                    daemon, watch, recent = again, Watch(again), Recent()
+            number += keys.turned(_PERIOD_S)
+
+
+def _remember(recent: Recent, reading: Reading) -> None:
+    view = reading.view
+    if view is None or reading.state != RUNNING:
+        return
+    torques = tuple(each.torque_nm if each.status in PUBLISHED else nan for each in view.joints)
+    recent.add(Moment(time.monotonic(), torques, tuple(reading.work), tuple(reading.late)))
 
 
 def _lines(daemon: Daemon) -> int:

@@ -30,6 +30,7 @@ from typing import Any, NamedTuple
 import foxglove
 
 from jtqd.daemon.live.address import Address
+from jtqd.daemon.live.gateway import Gateway
 from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.diagnostics import Diagnostics, Node
 from jtqd.daemon.recording.messages import (
@@ -196,6 +197,8 @@ class LiveStream:
 
 # ---- websocket server ----
 
+_INNER_HOST = "127.0.0.1"
+"""Where the server itself listens; viewers come through the gateway."""
 _BACKLOG = 512
 """Messages kept for a slow viewer: 2.5 s of all topics."""
 
@@ -226,13 +229,18 @@ class LiveServer:
         }
         self._server = foxglove.start_server(
             name=name,
-            host=address.host,
-            port=address.port,
+            host=_INNER_HOST,
+            port=0,  # any that is free
             capabilities=[],  # read only: no publishing, no parameters, no services
             context=context,
             message_backlog_size=_BACKLOG,
         )
-        self.address = Address(address.host, self._server.port)
+        try:
+            self._gateway = Gateway(address, Address(_INNER_HOST, self._server.port))
+        except BaseException:
+            self._server.stop()
+            raise
+        self.address = Address(address.host, self._gateway.port)
 
     @property
     def watched(self) -> bool:
@@ -245,6 +253,7 @@ class LiveServer:
 
     def stop(self) -> None:
         """Stop the server."""
+        self._gateway.stop()
         self._server.stop()
 
 

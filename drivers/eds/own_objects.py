@@ -61,7 +61,7 @@ interface down; the controller's two error counters as last reported; then how o
 
 NODES = 3
 """Nodes of a bus: joint 1, joint 2, the sensor. Sub-indices 1.. of 1016h, 2206h and 2207h."""
-VERSION = "0.1.0"
+VERSION = "0.2.0"
 """100Ah."""
 
 JOINT_PARAMETERS = (

@@ -3,4 +3,4 @@
 The packages stand at the top level of the source tree (`daemon/` is `jtqd.daemon`); links beside this file give them one name.
 """
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

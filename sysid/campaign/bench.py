@@ -132,11 +132,15 @@ Play = Callable[[Setpoints], MotionResult]
 
 @dataclass(frozen=True)
 class Bench:
-    """Where the runs take place: bus, jtqd's configuration (None: the one that ships) and what is in it."""
+    """Where the runs take place: bus, jtqd's configuration (None: the one that ships) and what is in it.
+
+    timing: of the commander's supervision; None: its own.
+    """
 
     bus: str
     config_path: Path | None
     config: BenchConfig
+    timing: Timing | None = None
 
     def play(self, limits: Limits, on_progress: Progress) -> Play:
         """Return the commander on this bench."""
@@ -150,6 +154,7 @@ class Bench:
                     on_progress=on_progress,
                     drives=self.config.drives,
                     sensor=self.config.sensor,
+                    timing=self.timing,
                 )
 
         return motion

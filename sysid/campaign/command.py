@@ -25,16 +25,19 @@ from jtqd.estimator.checked import ConfigError, count, counted, natural, seconds
 from jtqd.estimator.joint import Joint
 from jtqd.models.files import shipped
 from jtqd.sysid.campaign.bench import Bench, BenchConfig
+from jtqd.sysid.campaign.pieces import LONGEST_FILLED_S
 from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Plan, check_plan, load_plan, travel_rad
 from jtqd.sysid.campaign.plans import KINDS, OnTried, Scale, make_plan, seed_of
 from jtqd.sysid.campaign.processes import EmulatedBench, ProcessError, StopAsked, unix_bus
 from jtqd.sysid.campaign.reporter import BETWEEN_RUNS_S, Designing, Reporter, clock_text
 from jtqd.sysid.campaign.runner import Outcome, attempt, go_through
 from jtqd.sysid.campaign.state import DONE, CampaignDirectory, StateError
-from jtqd.sysid.motion.setpoints import Limits, Setpoints
+from jtqd.sysid.motion.setpoints import Limits, Setpoints, Timing
 
 EMULATED: Final = "sim"
 PLANT: Final = "campaign_plant.yaml"
+EMULATED_TIMING: Final = Timing(sync_lost_s=LONGEST_FILLED_S, late_s=LONGEST_FILLED_S, stale_cycles=50)
+"""Nothing can break on the emulated bench: the motion goes on over what can be interpolated."""
 LIMIT_NAMES: Final = tuple(item.name for item in fields(Limits))
 _SCALING: Final = ("runs", "seconds", "hold_s", "seed", "evaluations", "quick")
 _EXAMPLES: Final = """examples:
@@ -226,6 +229,13 @@ def dry_run_text(plan: Plan, setpoints: Mapping[str, Setpoints], load: BusLoad) 
     return "\n".join(lines)
 
 
+_LATE: Final = (
+    "runs were lost because this machine was late: give it SCHED_FIFO (root, or ulimit -r 80); see jtq doctor"
+)
+_TOO_BUSY: Final = (
+    f"{_LATE}; or in exact time, however busy the machine is: "
+    "python -m jtqd.sim_can.bench_kernel run --time-travel --out DIR -- jtq campaign ... --bus sim:vcan0 --out DIR"
+)
 _MASTER_GONE: Final = "fault 8130h"
 """Drives watch jtqd's heartbeat (1016h:1): when jtqd ended with the run before, they went to this fault, powered off."""
 
@@ -293,6 +303,8 @@ def _campaign(options: argparse.Namespace) -> int:
     finally:
         directory.close()
     print(json.dumps(outcome.content()) if options.json else outcome.text())
+    if outcome.short_of_time:
+        print(f"jtq campaign: {_TOO_BUSY if emulated(options.bus) else _LATE}", file=sys.stderr)
     return outcome.exit_status
 
 
@@ -315,7 +327,7 @@ def _run(
                 bus, folder, options.plant or shipped(PLANT), _bench_seed(plan, options, done)
             )
         with process, Reporter(to_do, len(plan.runs), done) as reporter, _commander_log(reporter):
-            bench = Bench(bus, options.config, config)
+            bench = Bench(bus, options.config, config, EMULATED_TIMING if emulated(options.bus) else None)
             motion = bench.play(plan.limits, reporter.on_progress)
             return go_through(
                 plan,

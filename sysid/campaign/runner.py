@@ -1,7 +1,8 @@
 """Runs of a campaign: play what is not done, record, check, keep the files, report the outcome.
 
 One attempt: jtqd is started, the motion played, jtqd ended, its log turned into the run's table and checked (`findings`).
-`go_through` does so for every run that is not done; a run against which was nothing but time is tried again.
+`go_through` does so for every run that is not done; a run against which was nothing but time is tried again, piece by piece
+where it can be cut (`pieces`).
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.campaign.bench import Bench, BenchConfig, Play
-from jtqd.sysid.campaign.plan import Plan, Run, marks_of
+from jtqd.sysid.campaign.pieces import fill, pieces_of
+from jtqd.sysid.campaign.plan import Plan, Run, expand, marks_of
 from jtqd.sysid.campaign.processes import Interrupted, Jtqd, ProcessError, StopAsked
 from jtqd.sysid.campaign.reporter import Reporter
 from jtqd.sysid.campaign.state import DONE, FAILED, PARTS, PENDING, STOPPED, CampaignDirectory, RunState
@@ -128,8 +130,10 @@ def _kept(
     except LogError as error:
         _keep(log, out, run.name, ".failed.mcap")
         return Attempt(replace(state, reason=str(error)), again=True)
+    logged, interpolated = fill(logged, LONGEST_GAP_S)
     state = replace(
         state,
+        interpolated=interpolated,
         rows=len(logged.table.time_s),
         missed=logged.missed,
         incomplete=logged.incomplete,
@@ -274,6 +278,12 @@ class Outcome:
     runs: Mapping[str, RunState]
     ended: str = ""
 
+    @property
+    def short_of_time(self) -> bool:
+        """Whether a run is not done because the bus or the machine was late."""
+        reasons = [state.reason for state in self.runs.values() if state.status in (STOPPED, FAILED)]
+        return any(_BUS_WAS_LATE.search(reason) or "found a gap of" in reason for reason in reasons)
+
     def count(self, status: str) -> int:
         """Return runs with this status."""
         return sum(state.status == status for state in self.runs.values())
@@ -294,6 +304,8 @@ class Outcome:
             "rows": sum(state.rows for state in self.runs.values()),
             "missed_cycles": {name: s.missed for name, s in self.runs.items() if s.missed},
             "incomplete_cycles": {name: s.incomplete for name, s in self.runs.items() if s.incomplete},
+            "interpolated_rows": {name: s.interpolated for name, s in self.runs.items() if s.interpolated},
+            "pieces": {name: s.pieces for name, s in self.runs.items() if s.pieces > 1},
             "findings": {name: list(s.findings) for name, s in self.runs.items() if s.findings},
             "not_done": {name: s.reason for name, s in self.runs.items() if s.status in (STOPPED, FAILED)},
             "ended": self.ended or None,
@@ -307,7 +319,13 @@ class Outcome:
         lines.append(
             f"cycles    {counted(rows, 'row')}, {_where(self.runs, 'missed')}, {_where(self.runs, 'incomplete')}"
         )
+        if any(state.interpolated for state in self.runs.values()):
+            lines.append(
+                f"rows      {_where(self.runs, 'interpolated')}: lost cycles in a row, at most 50 ms"
+            )
         for name, state in self.runs.items():
+            if state.pieces > 1:
+                lines.append(f"pieces    {name}: {', '.join(state.tables(name))}")
             if state.status in (STOPPED, FAILED):
                 lines.append(f"{state.status:<9} {name}: {state.reason}")
             lines += [f"finding   {name}: {finding}" for finding in state.findings]
@@ -337,8 +355,9 @@ def go_through(
 ) -> Outcome:
     """Play what is not done; the directory always holds the state of every run.
 
-    A run whose attempt failed for want of time only is tried again, up to ATTEMPTS times. A limit ends the campaign
-    unless keep_going; so does a bench that cannot be started, or a signal.
+    A run whose attempt failed for want of time only is tried again, up to ATTEMPTS times; one that can be cut into
+    pieces is tried once, and then each piece up to ATTEMPTS times. What is lost all the same does not keep the other runs
+    back. A limit ends the campaign unless keep_going; so does a bench that cannot be started, or a signal.
     """
     for run in plan.runs:
         if directory.runs[run.name].status == DONE:
@@ -355,7 +374,7 @@ def go_through(
             return Outcome(directory.runs, f"{state.reason} during {run.name}")
         if state.status != DONE and not last.begun:
             return Outcome(directory.runs, f"{run.name}: {state.reason}")
-        if state.status == STOPPED and not keep_going:
+        if state.status == STOPPED and not last.again and not keep_going:
             return Outcome(directory.runs, f"{run.name}: {state.reason}")
     return Outcome(directory.runs)
 
@@ -368,10 +387,58 @@ def _attempts(
     attempt_run: AttemptRun,
 ) -> Attempt:
     """Return the last attempt; the directory has its state."""
-    for number in range(1, ATTEMPTS + 1):
+    pieces = pieces_of(run)
+    whole = ATTEMPTS if len(pieces) == 1 else 1
+    number, last = _tried(run, setpoints, reporter, attempt_run, whole)
+    state = replace(last.state, attempts=number)
+    if len(pieces) > 1 and last.again and last.begun and state.status != DONE:
+        reporter.write_line(f"{run.name}: {state.reason}; driven again in {len(pieces)} pieces")
+        states = []
+        for piece in pieces:
+            tries, last = _tried(piece, expand(piece), reporter, attempt_run, ATTEMPTS)
+            number += tries
+            states.append(last.state)
+            if last.state.status != DONE:
+                break
+        state = replace(_together(pieces, states), attempts=number)
+    directory.put(run.name, state)
+    return last
+
+
+def _tried(
+    run: Run, setpoints: Setpoints, reporter: Reporter, attempt_run: AttemptRun, attempts: int
+) -> tuple[int, Attempt]:
+    """Return the number of attempts, and the last of them."""
+    for number in range(1, attempts + 1):
         last = attempt_run(run, setpoints)
-        directory.put(run.name, replace(last.state, attempts=number))
-        if last.state.status == DONE or not last.again or number == ATTEMPTS:
+        if last.state.status == DONE or not last.again or number == attempts:
             break
         reporter.attempt_failed(run.name, last.state.reason, number)
-    return last
+    return number, last
+
+
+def _together(pieces: Sequence[Run], states: Sequence[RunState]) -> RunState:
+    """Return the state of a run that was driven in pieces; done when all of them are."""
+    last = states[-1]
+    by: dict[str, int] = {}
+    for state in states:
+        for name, count in state.incomplete_by.items():
+            by[name] = by.get(name, 0) + count
+    done = len(states) == len(pieces) and last.status == DONE
+    return RunState(
+        status=DONE if done else last.status,
+        reason="" if done else f"{pieces[len(states) - 1].name}: {last.reason}",
+        played_s=sum(state.played_s for state in states),
+        rows=sum(state.rows for state in states),
+        missed=sum(state.missed for state in states),
+        incomplete=sum(state.incomplete for state in states),
+        incomplete_by=by,
+        findings=tuple(
+            f"{piece.name}: {finding}"
+            for piece, state in zip(pieces, states, strict=False)
+            for finding in state.findings
+        ),
+        sha256=" ".join(state.sha256 for state in states) if done else "",
+        interpolated=sum(state.interpolated for state in states),
+        pieces=len(pieces) if done else 1,
+    )

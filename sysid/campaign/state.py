@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
 
-from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.checked import REQUIRED, ConfigError, Section
 from jtqd.sysid.campaign.plan import Plan, load_plan
 
 SCHEMA: Final = "jtq.campaign/1"
@@ -44,6 +44,7 @@ class RunState:
         reason: one line for stopped and failed. attempts: how often it was begun.
         played_s: length of the set-points that were sent in the last attempt.
         rows: of the run table. missed, incomplete: cycles that are no rows (see log_to_run).
+        interpolated: rows among `rows` that were made by interpolation. pieces: tables that the run has become.
         findings: what is wrong with the table, a line each. sha256: of NAME.csv.gz.
     """
 
@@ -57,6 +58,12 @@ class RunState:
     incomplete_by: Mapping[str, int] = field(default_factory=dict)
     findings: tuple[str, ...] = ()
     sha256: str = ""
+    interpolated: int = 0
+    pieces: int = 1
+
+    def tables(self, name: str) -> list[str]:
+        """Return the names of its tables: its own, or NAME~1, NAME~2, ... of its pieces."""
+        return [name] if self.pieces == 1 else [f"{name}~{number}" for number in range(1, self.pieces + 1)]
 
 
 class CampaignDirectory:
@@ -146,7 +153,8 @@ class CampaignDirectory:
     def _still_done(self, name: str) -> RunState:
         """Return the state of a run as recorded; pending again when it is not done, or its files have gone."""
         state = self.runs.get(name, RunState())
-        if state.status == DONE and all((self.path / (name + ending)).is_file() for ending in ENDINGS):
+        files = (self.path / (table + ending) for table in state.tables(name) for ending in ENDINGS)
+        if state.status == DONE and all(file.is_file() for file in files):
             return state
         return RunState()
 
@@ -180,7 +188,8 @@ class CampaignDirectory:
 
 def _run_state(section: Section) -> RunState:
     section.text("status", STATUSES)
-    values = {item.name: section.raw(item.name) for item in fields(RunState)}
+    newer = {"interpolated": 0, "pieces": 1}  # a campaign.json of before has no such keys
+    values = {item.name: section.raw(item.name, newer.get(item.name, REQUIRED)) for item in fields(RunState)}
     values["findings"] = tuple(values["findings"])
     return RunState(**values)
 
@@ -188,7 +197,7 @@ def _run_state(section: Section) -> RunState:
 def _files_of(directory: Path, run: str) -> list[Path]:
     """Return files of a run that are there, all parts of its log among them."""
     endings = "|".join(map(re.escape, (*ENDINGS, *EVIDENCE)))
-    of_run = re.compile(rf"{re.escape(run)}(@\d+)?({endings})")
+    of_run = re.compile(rf"{re.escape(run)}(~\d+)?(@\d+)?({endings})")
     return sorted(path for path in directory.iterdir() if of_run.fullmatch(path.name))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jtqd.daemon.logs import LogError
-from jtqd.estimator.status import DEGRADED, STALE, STANDSTILL, VALID
+from jtqd.estimator.status import DEGRADED, NAMES, STALE, STANDSTILL, VALID
 from jtqd.sysid import plot as plot_command
 
 pytest.importorskip("matplotlib")
@@ -86,3 +86,27 @@ def test_a_log_that_cannot_be_read_is_one_line(tmp_path, capsys, monkeypatch):
     said = capsys.readouterr()
     assert said.out == ""
     assert said.err == "jtq plot: run.mcap: not a log\n"
+
+
+def test_every_status_has_a_colour_of_its_own(monkeypatch, tmp_path):
+    """What was merely starting must not look like what was stale."""
+    shades = plot_command._SHADES
+    assert set(shades) == set(NAMES) - {VALID}
+    assert len(set(shades.values())) == len(shades)
+
+
+def test_the_legend_covers_no_data(log, tmp_path, monkeypatch):
+    from matplotlib.figure import Figure
+
+    seen = []
+
+    def look(figure, *_, **__):
+        figure.canvas.draw()
+        above = figure.axes[0]
+        seen.append((above.get_window_extent(), above.get_legend().get_window_extent(), figure.bbox))
+
+    monkeypatch.setattr(Figure, "savefig", look)
+    assert plot_command.main(["run.mcap", "--out", str(tmp_path / "a.png")]) == 0
+    ((axes, legend, whole),) = seen
+    assert legend.x0 >= axes.x1
+    assert legend.x1 <= whole.x1

@@ -1,5 +1,6 @@
 """`jtq status`: the picture at any width; no daemon, several, one that stands still."""
 
+import io
 import json
 import os
 import pty
@@ -12,9 +13,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from rich.console import Console
+from rich.text import Text
 
-from jtqd.daemon.cli.reading import find_daemons
-from jtqd.daemon.cli.status import main
+from jtqd.daemon.cli.reading import Watch, find_daemons
+from jtqd.daemon.cli.recent import Moment, Recent
+from jtqd.daemon.cli.status import StatusView, main, paged
 from jtqd.daemon.recording.progress import Account, ProgressFile
 from jtqd.daemon.shared.conditions import Condition, ConditionsFile
 from jtqd.daemon.shared.notices import ERROR, WARNING, Notices
@@ -177,6 +181,48 @@ def test_the_live_view_on_a_terminal_outlives_its_daemon_and_ends_by_ctrl_c(tmp_
     until(terminal, "jtqd on vcan0 has ended; waiting for its restart")
     write_about(daemon.directory, daemon.about)
     until(terminal, "-117.94 Nm")
+    os.write(terminal, b"\x03")
+    until(terminal, "\x1b[?1049l")
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    os.close(terminal)
+
+
+def test_no_line_is_dropped_on_a_small_terminal(tmp_path: Path) -> None:
+    """All pages together hold every line of the picture, each fits, and the line below says how many there are."""
+    console = Console(file=io.StringIO(), width=80, height=24, force_terminal=True)
+    reading = Watch(running(tmp_path)).read()
+    recent = Recent()
+    recent.add(Moment(0.0, (1.0, -1.0), reading.work, reading.late))
+    picture = StatusView(replace(reading, earlier=reading.view), recent)
+    console.print(picture)
+    whole = Text.from_ansi(console.file.getvalue()).plain.splitlines()
+    assert len(whole) > 24
+    seen, number = [], 0
+    while True:
+        console.file = io.StringIO()
+        shown, place = paged(console, picture, number)
+        console.print(shown)
+        lines = Text.from_ansi(console.file.getvalue()).plain.splitlines()
+        if number and not place:
+            break
+        assert len(lines) <= 24
+        assert f"page {number + 1} of " in lines[-1]
+        assert "SPACE" in lines[-1]
+        seen += lines[:-2]
+        number += 1
+    assert [line.rstrip() for line in seen] == [line.rstrip() for line in whole]
+
+
+def test_space_turns_the_page_on_a_terminal(tmp_path: Path) -> None:
+    daemon = running(tmp_path)
+    write_about(daemon.directory, daemon.about)
+    child, terminal = pty.fork()
+    if not child:
+        os.environ |= {"RUNTIME_DIRECTORY": str(tmp_path), "TERM": "xterm", "COLUMNS": "80", "LINES": "24"}
+        os.execv(sys.executable, [sys.executable, "-m", "jtqd.daemon.jtq", "status", "--bus", "vcan0"])
+    until(terminal, "page 1 of ")
+    os.write(terminal, b" ")
+    until(terminal, "page 2 of ")
     os.write(terminal, b"\x03")
     until(terminal, "\x1b[?1049l")
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0

@@ -111,8 +111,8 @@ class LiveProcess:
 class Viewer:
     """A websocket client: knows what the server said of itself, and collects messages by topic."""
 
-    def __init__(self, url, topics=None, **options):
-        self._connection = connect(url, subprotocols=[SUBPROTOCOL], max_size=None, **options)
+    def __init__(self, url, topics=None, subprotocols=(SUBPROTOCOL,), **options):
+        self._connection = connect(url, subprotocols=list(subprotocols), max_size=None, **options)
         self.socket = self._connection.__enter__()
         self.texts, self.channels, self.messages = [], {}, {}
         self._subscribed = {}

@@ -9,6 +9,7 @@ import time
 import pytest
 
 from jtqd.daemon.live.address import Address, address
+from jtqd.daemon.live.gateway import OLDER, PROTOCOL
 from jtqd.daemon.live.process import LiveStream
 from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.messages import CAN_FRAMES_SIZE, JOINT_ESTIMATE_SIZE
@@ -159,6 +160,45 @@ def test_a_viewer_gets_the_topics_and_schemas_of_the_log_at_50_hz(memory):
         names = [status["name"] for status in viewer.messages["/diagnostics"][0][1]["status"]]
         assert names[0] == "jtqd: loop"
         viewer.leave()
+
+
+@pytest.mark.parametrize(
+    ("offered", "chosen"),
+    [
+        ([OLDER], OLDER),
+        ([PROTOCOL], PROTOCOL),
+        ([OLDER, PROTOCOL], PROTOCOL),
+        (["other.v1", OLDER], OLDER),
+    ],
+)
+def test_viewers_of_both_protocols_are_served(memory, offered, chosen):
+    with LiveProcess(memory.directory) as live:
+        viewer = Viewer(live.url, ["/joint/1/state"], subprotocols=offered)
+        assert viewer.socket.subprotocol == chosen
+        feeding = memory.feeding(500)
+        viewer.wait_for("/joint/1/state")
+        feeding.join()
+        stamp, message = viewer.messages["/joint/1/state"][0]
+        assert stamp == START_NS + message["cycle"] * 1_000_000
+        viewer.leave()
+
+
+@pytest.mark.parametrize(
+    "header",
+    ["", "Sec-WebSocket-Protocol: chat\r\n", "Accept: text/html\r\n"],
+    ids=["none", "other", "browser"],
+)
+def test_whoever_asks_for_no_known_protocol_is_told_what_to_use(memory, header):
+    with LiveProcess(memory.directory) as live:
+        port = int(live.url.rpartition(":")[2])
+        with socket.create_connection(("127.0.0.1", port), timeout=10) as client:
+            client.sendall(f"GET / HTTP/1.1\r\nHost: a\r\n{header}\r\n".encode())
+            answer = b""
+            while part := client.recv(4096):
+                answer += part
+        assert answer.startswith(b"HTTP/1.1 400 ")
+        for word in ("Foxglove", "Lichtblick", PROTOCOL, OLDER):
+            assert word.encode() in answer
 
 
 def test_nothing_that_a_viewer_sends_changes_anything(memory):

@@ -15,12 +15,25 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant
-from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Plan, Plateau, Rest, Run, check_plan, expand, marks_of
+from jtqd.sysid.campaign.pieces import fill, pieces_of
+from jtqd.sysid.campaign.plan import (
+    DEFAULT_LIMITS,
+    Fourier,
+    Plan,
+    Plateau,
+    Rest,
+    Run,
+    Segment,
+    check_plan,
+    expand,
+    marks_of,
+)
 from jtqd.sysid.campaign.plans import ladder
 from jtqd.sysid.campaign.processes import Interrupted
 from jtqd.sysid.campaign.reporter import BETWEEN_RUNS_S, Remaining, Reporter, clock_text
 from jtqd.sysid.campaign.runner import (
     ATTEMPTS,
+    LONGEST_GAP_S,
     Attempt,
     Outcome,
     _stopped,
@@ -29,6 +42,7 @@ from jtqd.sysid.campaign.runner import (
     go_through,
 )
 from jtqd.sysid.campaign.state import DONE, FAILED, STOPPED, CampaignDirectory, RunState
+from jtqd.sysid.excitation.fourier import FourierSeries, FourierTrajectory
 from jtqd.sysid.motion.commander import Pace
 from jtqd.sysid.motion.setpoints import JointSample, Limits, Monitor, MotionResult, Sample, Setpoints, Timing
 from jtqd.sysid.runs.logs import LoggedRun
@@ -84,7 +98,7 @@ def gone(directory: CampaignDirectory, script: Script, **options: bool) -> Outco
         ({"b": [GAP] * 9}, {}, "abbbc", ([DONE, FAILED, DONE], 3)),
         ({"b": [LIMIT]}, {}, "ab", ([DONE, STOPPED, "pending"], 1)),
         ({"b": [LIMIT]}, {"keep_going": True}, "abc", ([DONE, STOPPED, DONE], 3)),
-        ({"b": [LATE] * 9}, {}, "abbb", ([DONE, STOPPED, "pending"], 1)),
+        ({"b": [LATE] * 9}, {}, "abbbc", ([DONE, STOPPED, DONE], 3)),
         ({"b": [NO_BENCH]}, {"keep_going": True}, "ab", ([DONE, FAILED, "pending"], 1)),
         ({"b": [REFUSED]}, {}, "abbc", ([DONE, DONE, DONE], 0)),
         ({"b": [REFUSED] * 9}, {}, "abbb", ([DONE, FAILED, "pending"], 1)),
@@ -107,6 +121,83 @@ def test_what_is_tried_and_what_becomes_of_it(
     assert outcome.exit_status == status
     assert bool(outcome.ended) == (status == 1)
     assert all(state.attempts <= ATTEMPTS for state in outcome.runs.values())
+
+
+def fourier_run(name: str = "b", trajectories: int = 2) -> Run:
+    segments: list[Segment] = [Rest(1.0, 0.0)]
+    for number in range(trajectories):
+        velocity = FourierTrajectory(2.0 * np.pi / 4.0, (0.2,), (0.1 * (number + 1),), 4.0)
+        segments += [
+            Fourier(velocity, FourierSeries(1.0, (1.0,), (0.5,), 4.0)),
+            Rest(1.0, 0.0),
+            Rest(1.0, 0.0),
+        ]
+    return Run(name, 1, tuple(segments))
+
+
+def test_a_run_of_trajectories_is_cut_where_it_rests() -> None:
+    run = fourier_run()
+    one, two = pieces_of(run)
+    assert (one.name, two.name) == ("b~1", "b~2")
+    assert one.duration_s + two.duration_s == run.duration_s
+    whole = expand(run)
+    parts = [expand(piece) for piece in (one, two)]
+    for name in ("velocity_rad_s", "current_a"):
+        joined = np.concatenate([getattr(part, name) for part in parts])
+        assert np.array_equal(joined, getattr(whole, name))
+    assert all(part.velocity_rad_s[0] == part.velocity_rad_s[-1] == 0.0 for part in parts)
+
+
+def test_a_ladder_and_a_single_trajectory_are_not_cut() -> None:
+    for run in (ladder("r", 2, [(1.2, 1.0), (-1.2, 3.0)], 0.8), fourier_run(trajectories=1), PLAN.runs[0]):
+        assert pieces_of(run) == (run,)
+
+
+@pytest.mark.parametrize(
+    ("attempts", "asked", "status", "pieces"),
+    [
+        ({}, ["b"], DONE, 1),
+        ({"b": [LATE]}, ["b", "b~1", "b~2"], DONE, 2),
+        ({"b": [GAP], "b~2": [LATE]}, ["b", "b~1", "b~2", "b~2"], DONE, 2),
+        ({"b": [LATE], "b~1": [LATE] * 3}, ["b", "b~1", "b~1", "b~1"], STOPPED, 1),
+        ({"b": [LATE], "b~1": [LIMIT]}, ["b", "b~1"], STOPPED, 1),
+        ({"b": [LIMIT]}, ["b"], STOPPED, 1),
+    ],
+)
+def test_what_is_lost_is_driven_again_in_pieces(
+    tmp_path: Path,
+    attempts: dict[str, list[Attempt | BaseException]],
+    asked: list[str],
+    status: str,
+    pieces: int,
+) -> None:
+    plan = Plan("p", DEFAULT_LIMITS, (fourier_run(),))
+    made = CampaignDirectory(tmp_path)
+    made.begin(plan, {})
+    script = Script(**attempts)
+    with Reporter([3.0], 1, 0, Console(file=io.StringIO())) as reporter:
+        outcome = go_through(plan, check_plan(plan), made, reporter, script)
+    made.close()
+    assert script.asked == asked
+    state = outcome.runs["b"]
+    assert (state.status, state.pieces, state.attempts) == (status, pieces, len(asked))
+    if status == DONE:
+        assert state.rows == 1000 * pieces
+        for table in state.tables("b"):
+            for ending in (".csv.gz", ".json", ".mcap"):
+                (tmp_path / f"{table}{ending}").write_text("x")
+        again = CampaignDirectory(tmp_path)
+        again.begin(plan, {})
+        assert again.runs["b"].status == DONE, "the pieces are its files"
+        again.close()
+    if "b~1" in attempts:
+        assert state.reason.startswith("b~1: ")
+
+
+def test_a_campaign_that_was_short_of_time_is_told_apart() -> None:
+    assert Outcome({"a": LATE.state}).short_of_time
+    assert Outcome({"a": RunState(FAILED, "b~1: found a gap of 30.0 ms in the log")}).short_of_time
+    assert not Outcome({"a": LIMIT.state, "b": GOOD.state}).short_of_time
 
 
 def test_only_what_is_not_done_is_played_when_the_command_is_repeated(directory: CampaignDirectory) -> None:
@@ -350,6 +441,44 @@ def test_lost_cycles_do_not_make_a_motion_look_wrong() -> None:
         for number, joint in table.joints.items()
     }
     assert findings(logged(RunTable(table.time_s[keep], columns)), points, joints, sensor=True) == ()
+
+
+def with_gaps(*gaps: tuple[int, int]) -> LoggedRun:
+    """A good run without the rows [first, first + count) of each gap."""
+    table, _, _ = good_run()
+    keep = np.ones(len(table.time_s), bool)
+    for first, count in gaps:
+        keep[first : first + count] = False
+    columns = {
+        number: JointColumns(
+            **{
+                name: None if getattr(joint, name) is None else getattr(joint, name)[keep]
+                for name in joint.__slots__
+            }
+        )
+        for number, joint in table.joints.items()
+    }
+    return logged(RunTable(table.time_s[keep], columns))
+
+
+def test_a_gap_is_interpolated_and_counted() -> None:
+    table, _, _ = good_run()
+    whole, made = fill(with_gaps((1000, 15), (2000, 5)), LONGEST_GAP_S)
+    assert made == 15, "a short gap is left to the readers"
+    assert gap_too_long(whole) is None
+    time_s = np.asarray(whole.table.time_s)
+    assert np.abs(np.diff(time_s)[990:1020] - 1e-3).max() < 1e-9
+    place = slice(1000, 1015)
+    for name, worst in (("motor_position_rad", 0.05), ("link_position_rad", 1e-3), ("current_a", 0.5)):
+        found = np.asarray(getattr(whole.table.joints[2], name))[place]
+        assert np.abs(found - np.asarray(getattr(table.joints[2], name))[place]).max() < worst
+
+
+@pytest.mark.parametrize("gaps", [((1000, 60),), ((1000, 45), (3000, 45)), ()], ids=["long", "many", "none"])
+def test_what_is_too_long_or_too_much_is_not_interpolated(gaps: tuple[tuple[int, int], ...]) -> None:
+    run = with_gaps(*gaps)
+    assert fill(run, LONGEST_GAP_S) == (run, 0)
+    assert (gap_too_long(run) is None) == (not gaps)
 
 
 def test_a_gap_that_readers_refuse_makes_a_run_gap_too_long() -> None:

@@ -1,10 +1,11 @@
-"""Receive the torque estimate of jtqd with python-can and print it (docs/bus.md: estimate PDO of node 20h).
+"""Receive the torque estimate of jtqd with python-can and print it (docs/bus.md: estimate PDOs of node 20h).
 
-    jtqd --bus unix:/tmp/bus ...     python -m examples.receive_estimate --bus unix:/tmp/bus
-    jtqd --bus vcan0 ...             python -m examples.receive_estimate --bus vcan0 --count 10
+    jtqd --bus unix:/tmp/bus ...     python examples/receivers/receive_estimate.py --bus unix:/tmp/bus
+    jtqd --bus vcan0 ...             python examples/receivers/receive_estimate.py --bus vcan0 --count 10
 
-On SocketCAN nothing of jtqd is needed; the unix bus needs it installed, for its python-can interface. A controller that
-acts on the torque must read docs/safety.md first: check status and sequence of every PDO, and time out without one.
+On SocketCAN nothing of jtqd is needed; the unix bus needs it installed, for its python-can interface. For looking, not
+for control: a controller that acts on the torque must read docs/safety.md first. The C and C++ receivers beside this file
+check status, SYNC counter and age of every estimate.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from typing import NamedTuple
 
 import can
 
-COB_ID = 0x1A0
+COB_IDS = {0x1A0: (1, 2), 0x2A0: (3, 4)}
+"""COB-ID of the estimate PDOs of node 20h, and their joints."""
 LAYOUT = struct.Struct("<hhBBBB")  # torque 1, torque 2, sigma 1, sigma 2, status of both, SYNC counter
 NO_TORQUE = -0x8000
 UNKNOWN_SIGMA = 255
@@ -56,7 +58,7 @@ def decode(data: bytes) -> tuple[JointEstimate, JointEstimate, int]:
 
 def open_bus(name: str) -> can.BusABC:
     """Open a SocketCAN interface, or the unix bus unix:PATH. Raises can.CanError, OSError."""
-    filters = [{"can_id": COB_ID, "can_mask": 0x7FF, "extended": False}]
+    filters = [{"can_id": each, "can_mask": 0x7FF, "extended": False} for each in COB_IDS]
     if name.startswith("unix:"):
         return can.Bus(interface="jtq_unix", channel=name.removeprefix("unix:"), can_filters=filters)
     return can.Bus(interface="socketcan", channel=name, can_filters=filters)
@@ -72,7 +74,7 @@ def line(joint: JointEstimate) -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Print every estimate; exit status 0 after --count or Ctrl-C, 1 without bus or estimate."""
     parser = argparse.ArgumentParser(
-        prog="python -m examples.receive_estimate",
+        prog="receive_estimate.py",
         description="Print the torque estimate that jtqd publishes.",
     )
     parser.add_argument("--bus", required=True, help="can0, vcan0 or unix:PATH")
@@ -87,10 +89,12 @@ def main(arguments: list[str] | None = None) -> int:
                 if message is None:
                     print(f"no estimate on {options.bus} for {options.timeout:g} s", file=sys.stderr)
                     return 1
-                if message.arbitration_id != COB_ID or message.dlc != LAYOUT.size:
+                joints = COB_IDS.get(message.arbitration_id)
+                if joints is None or message.dlc != LAYOUT.size:
                     continue
-                one, two, sequence = decode(bytes(message.data))
-                print(f"{sequence:3}  1: {line(one)}  2: {line(two)}".rstrip(), flush=True)
+                *estimates, sequence = decode(bytes(message.data))
+                told = (f"{joint}: {line(each)}" for joint, each in zip(joints, estimates, strict=True))
+                print(f"{sequence:3}  {'  '.join(told)}".rstrip(), flush=True)
                 received += 1
     except KeyboardInterrupt:
         return 0

@@ -1,0 +1,392 @@
+"""First configuration and joint files of somebody's own bench: what is known, from where, and what is a guess. Pure.
+
+    Wanted          what the operator gave, per joint
+    draft_joint     Wanted + Survey -> JointDraft: every value with its origin
+    joint_text      the joint file
+    config_text     the configuration; `drive_lines`, `sensor_lines`: a section of it
+
+A guess is scaled from the shipped bench by the rated torque: orders of magnitude of a harmonic-drive joint, no more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from jtqd.drivers.devices import COMMANDER_NODE, JTQD_NODE
+from jtqd.drivers.sdo import Key, label
+from jtqd.drivers.survey import (
+    DRIVE,
+    GEAR,
+    IDENTITY,
+    MAPPED,
+    RATED_CURRENT,
+    RATED_TORQUE,
+    SENSOR,
+    Survey,
+)
+
+EFFICIENCY = 0.7
+"""Of a harmonic drive near its rated torque (catalogues: 0.6 to 0.8): joint torque of a motor's rated torque."""
+COULOMB, VISCOUS = 0.075, 0.05
+"""Friction by rated torque: Coulomb, and viscous per rad/s of the joint. Shipped bench: 3.0 Nm and 2.0 Nms/rad of 40 Nm."""
+STIFFNESS_PER_RAD, DAMPING_S = 300.0, 1 / 1500
+"""Stiffness by rated torque, damping by stiffness. Shipped bench: 12 000 Nm/rad, 8 Nms/rad."""
+INERTIA_S2, LINK_INERTIA_S2 = 0.0175, 2e-4
+"""Rotor's inertia at the joint and the link's own one, by rated torque. Shipped bench: 0.7 and 0.008 kg m2."""
+
+POSITION: tuple[Key, Key] = ((0x608F, 1), (0x608F, 2))
+VELOCITY: tuple[Key, Key] = ((0x6090, 1), (0x6090, 2))
+LINK: tuple[Key, Key] = ((0x60E6, 1), (0x60EB, 1))
+
+
+class DraftError(ValueError):
+    """Something that cannot be guessed is missing; the message names the option."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What the operator gave about one joint; None: not given."""
+
+    gear_ratio: float | None = None
+    rated_torque_nm: float | None = None
+    torque_constant_nm_per_a: float | None = None
+    rated_current_a: float | None = None
+    encoder_counts: int | None = None
+    link_encoder_counts: int | None = None
+
+
+@dataclass(frozen=True)
+class Value:
+    """A number, where it is from, and how it is measured where it is a guess."""
+
+    number: float
+    origin: str
+    better: str = ""
+
+    @property
+    def guess(self) -> bool:
+        """Whether nobody has given or told it."""
+        return bool(self.better)
+
+
+@dataclass(frozen=True)
+class JointDraft:
+    """One joint: `values` by the keys of the joint file, objects of the drive that the configuration gives instead."""
+
+    number: int
+    node: int
+    survey: Survey | None
+    values: Mapping[str, Value]
+    given: Mapping[Key, Value]
+    problems: tuple[str, ...]
+    """Why this version of jtqd does not work with this drive."""
+
+    @property
+    def guesses(self) -> list[str]:
+        """One line per guess: what, how much, what to do."""
+        named = [(f"joint_{self.number}.yaml: {name}", value) for name, value in self.values.items()]
+        named += [(f"joint_{self.number}.given: {label(*key)}", value) for key, value in self.given.items()]
+        return [
+            f"{name} = {plain(value.number)} ({value.origin}): {value.better}"
+            for name, value in named
+            if value.guess
+        ]
+
+
+def _guess(number: float, origin: str, better: str) -> Value:
+    """Return a guess: three digits are more than it is worth."""
+    return Value(float(f"{number:.3g}"), origin, better)
+
+
+def plain(number: float) -> str:
+    """Return a number of at most six digits as YAML reads it.
+
+    >>> plain(100.0), plain(0.0000712), plain(12000.0), plain(0.062)
+    ('100.0', '7.12e-05', '12000.0', '0.062')
+    """
+    return repr(float(f"{number:.6g}"))
+
+
+def draft_joint(number: int, node: int, survey: Survey | None, wanted: Wanted) -> JointDraft:
+    """Return what is known and guessed of a joint. Raises DraftError."""
+    given: dict[Key, Value] = {}
+    gear = _gear(number, node, survey, wanted, given)
+    current_a = _rated_current(survey, wanted, given)
+    motor_mnm = None if survey is None else survey.number(RATED_TORQUE)
+    rated = _rated_torque(number, wanted, gear, None if motor_mnm is None else 1e-3 * motor_mnm, survey)
+    constant = _torque_constant(
+        number, wanted=wanted, gear=gear, rated=rated, current_a=current_a, motor_mnm=motor_mnm, survey=survey
+    )
+    _encoders(node, survey, wanted, given)
+    torque, origin = rated.number, "shipped bench scaled by the rated torque"
+    stiffness = STIFFNESS_PER_RAD * torque
+    values = {
+        "gear_ratio": gear,
+        "torque_constant_nm_per_a": constant,
+        "rated_torque_nm": rated,
+        "rotor_inertia_kgm2": _guess(
+            INERTIA_S2 * torque / gear.number**2, origin, "data sheet of the motor, or jtq diagnose"
+        ),
+        "stiffness_nm_per_rad": _guess(stiffness, origin, "data sheet of the gear (K2)"),
+        "damping_nms_per_rad": _guess(DAMPING_S * stiffness, origin, "jtq diagnose"),
+        "link_inertia_kgm2": _guess(LINK_INERTIA_S2 * torque, origin, "your CAD"),
+        "coulomb_nm": _guess(COULOMB * torque, origin, "jtq fit friction"),
+        "viscous_nms_per_rad": _guess(VISCOUS * torque, origin, "jtq fit friction"),
+    }
+    return JointDraft(number, node, survey, values, given, _problems(node, survey))
+
+
+def _told(survey: Survey | None, key: Key) -> str:
+    return f"{label(*key)}, {survey.source}" if survey is not None else ""
+
+
+def _gear(number: int, node: int, survey: Survey | None, wanted: Wanted, given: dict[Key, Value]) -> Value:
+    turns = [None if survey is None else survey.number(key) for key in GEAR]
+    told = turns[0] / turns[1] if turns[0] is not None and turns[1] is not None else None
+    if wanted.gear_ratio is None:
+        if told is None:
+            raise DraftError(f"joint {number} (node {node}): no 6091h is known: give --gear-ratio")
+        if told == 1.0:
+            raise DraftError(
+                f"joint {number} (node {node}): 6091h says 1:1, as drives do that do not know their gear: give --gear-ratio"
+            )
+        return Value(told, _told(survey, GEAR[0]))
+    if survey is not None and told != wanted.gear_ratio:
+        why = "the drive has none" if told is None else f"the drive says {told:g}"
+        numerator, denominator = ratio(wanted.gear_ratio)
+        given[GEAR[0]] = Value(numerator, f"--gear-ratio; {why}")
+        given[GEAR[1]] = Value(denominator, f"--gear-ratio; {why}")
+    return Value(wanted.gear_ratio, "--gear-ratio")
+
+
+def ratio(value: float) -> tuple[int, int]:
+    """Return numerator and denominator of a gear ratio of up to six decimals.
+
+    >>> ratio(100.0), ratio(50.5)
+    ((100, 1), (101, 2))
+    """
+    from fractions import Fraction
+
+    found = Fraction(value).limit_denominator(1_000_000)
+    return found.numerator, found.denominator
+
+
+def _rated_current(survey: Survey | None, wanted: Wanted, given: dict[Key, Value]) -> float | None:
+    told = None if survey is None else survey.number(RATED_CURRENT)
+    if wanted.rated_current_a is None:
+        return None if told is None else 1e-3 * told
+    milliampere = round(1000 * wanted.rated_current_a)
+    if survey is not None and told != milliampere:
+        why = "the drive has none" if told is None else f"the drive says {told} mA"
+        given[RATED_CURRENT] = Value(milliampere, f"--rated-current; {why}")
+    return wanted.rated_current_a
+
+
+def _rated_torque(
+    number: int, wanted: Wanted, gear: Value, motor_nm: float | None, survey: Survey | None
+) -> Value:
+    if wanted.rated_torque_nm is not None:
+        return Value(wanted.rated_torque_nm, "--rated-torque")
+    if motor_nm is None:
+        raise DraftError(
+            f"joint {number}: the motor's rated torque (6076h) is not known: give --rated-torque"
+        )
+    origin = f"{EFFICIENCY:g} x gear ratio x rated torque of the motor ({_told(survey, RATED_TORQUE)})"
+    return _guess(EFFICIENCY * gear.number * motor_nm, origin, "data sheet of the gear or joint")
+
+
+def _torque_constant(
+    number: int,
+    *,
+    wanted: Wanted,
+    gear: Value,
+    rated: Value,
+    current_a: float | None,
+    motor_mnm: int | None,
+    survey: Survey | None,
+) -> Value:
+    if wanted.torque_constant_nm_per_a is not None:
+        return Value(wanted.torque_constant_nm_per_a, "--torque-constant")
+    if current_a is None:
+        if survey is None:
+            raise DraftError(f"joint {number}: give --torque-constant, or --rated-current")
+        raise DraftError(f"joint {number}: the rated current (6075h) is not known: give --rated-current")
+    better = "data sheet of the motor (per ampere as 6078h counts it: peak or RMS), or jtq diagnose"
+    if motor_mnm is not None:
+        return Value(
+            1e-3 * motor_mnm / current_a, f"6076h / 6075h, {survey.source if survey else ''}", better
+        )
+    constant = rated.number / (EFFICIENCY * gear.number * current_a)
+    return _guess(constant, f"rated torque / ({EFFICIENCY:g} x gear ratio x rated current)", better)
+
+
+def _encoders(node: int, survey: Survey | None, wanted: Wanted, given: dict[Key, Value]) -> None:
+    """Give what the drive does not tell, or tells otherwise. Raises DraftError."""
+
+    def give(keys: tuple[Key, Key], counts: int | None, option: str) -> None:
+        told = [None if survey is None else survey.number(key) for key in keys]
+        if counts is None:
+            if survey is not None and not all(survey.tells(key) for key in keys):
+                raise DraftError(f"node {node}: {label(*keys[0])} is not known: give {option}")
+        elif survey is not None and told != [counts, 1]:
+            given[keys[0]] = Value(counts, option)
+            given[keys[1]] = Value(1, option)
+
+    give(POSITION, wanted.encoder_counts, "--encoder-counts")
+    if survey is not None and not all(survey.tells(key) for key in VELOCITY):
+        for ours, of_position in zip(VELOCITY, POSITION, strict=True):
+            number = given[of_position].number if of_position in given else survey.number(of_position)
+            better = "turn the motor at a known speed and compare jtq status; 606Ch may be in rpm"
+            given[ours] = Value(number or 1, "606Ch taken for encoder counts per second: no 6090h", better)
+    if survey is None or (0x60E4, 1) not in survey.missing:
+        give(LINK, wanted.link_encoder_counts, "--link-encoder-counts")
+
+
+def _problems(node: int, survey: Survey | None) -> tuple[str, ...]:
+    if survey is None:
+        return ()
+    found = [
+        f"node {node} ({survey.title}): has no {label(*key)}, which jtqd maps"
+        for key in MAPPED[DRIVE]
+        if key in survey.missing
+    ]
+    found += [
+        f"node {node} ({survey.title}): {label(*key)} cannot be mapped, by {survey.source}"
+        for key in MAPPED[DRIVE]
+        if key in survey.unmappable
+    ]
+    return tuple(found)
+
+
+# ---- files ----
+
+
+def joint_text(draft: JointDraft) -> str:
+    """Return the joint file."""
+    values = draft.values
+    friction = ("coulomb_nm", "viscous_nms_per_rad")
+    lines = [
+        f"# Joint {draft.number}, node {draft.node}. Written by jtq init. A GUESS is an order of magnitude: replace it.",
+        "# SI units. Torque constant and rotor inertia are motor side; all else is joint side.",
+        f"name: joint{draft.number}",
+        *(_line(name, value) for name, value in values.items() if name not in friction),
+        "friction:",
+        *(_line(name, values[name], "  ") for name in friction),
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _line(name: str, value: Value, indent: str = "") -> str:
+    comment = f"GUESS, {value.origin}; better: {value.better}" if value.guess else value.origin
+    return f"{f'{indent}{name}: {plain(value.number)}':<42}# {comment}"
+
+
+@dataclass(frozen=True)
+class ConfigDraft:
+    """All of a configuration. `joint_of_sensor`: joints whose torque the sensor measures."""
+
+    bus: str
+    bitrate: int
+    period_us: int
+    joints: Sequence[JointDraft]
+    sensor: Survey | None
+    sensor_node: int | None
+    joints_of_sensor: Sequence[int] = ()
+    budget_mb: int = 2000
+    spare_node: int | None = field(default=None)
+    """Node-ID of the second joint that this version's configuration names, where the bench has one joint only."""
+
+    @property
+    def node_id(self) -> int:
+        """jtqd's own node-ID: 20h, or the next that no node has."""
+        used = [*(each.node for each in self.joints), self.sensor_node, COMMANDER_NODE, self.spare_node]
+        free: list[int] = [each for each in (JTQD_NODE, *range(JTQD_NODE + 2, 128)) if each not in used]
+        return free[0]
+
+
+def config_text(draft: ConfigDraft) -> str:
+    """Return the configuration."""
+    lines = [
+        f"# jtqd on {draft.bus}. Written by jtq init; docs/deployment.md says what other keys there are.",
+        f"node_id: {draft.node_id:<17}# jtqd's own; its estimate PDO is {0x180 + draft.node_id:X}h",
+        f"bitrate: {draft.bitrate:<17}# as the interface is set up: ip -details link show",
+        f"sync: {{period_us: {draft.period_us}}}",
+        "estimator: {method: tob}  # until runs against a torque sensor have been fitted: docs/first_joint.md",
+    ]
+    for joint in draft.joints:
+        lines += _joint_section(joint, draft)
+    if draft.spare_node is not None:
+        lines += [
+            "joint_2:                  # this version's configuration names two joints; this one is not there",
+            f"  node: {draft.spare_node}",
+            "  file: joint_1.yaml",
+            "  mandatory: false",
+        ]
+    if draft.sensor_node is not None:
+        lines += sensor_lines(draft.sensor_node, draft.sensor)
+    lines += [
+        "realtime: {priority: 80, lock_memory: true}",
+        f"recording: {{budget_mb: {draft.budget_mb}, keep_run: false}}  # of --record DIR: the oldest logs are removed",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _joint_section(joint: JointDraft, draft: ConfigDraft) -> list[str]:
+    lines = drive_lines(joint)
+    if joint.number in draft.joints_of_sensor:
+        lines.append("  sensor_channel: 1       # the torque sensor measures this joint's torque")
+    return lines
+
+
+def drive_lines(joint: JointDraft) -> list[str]:
+    """Return the section of a joint as far as its drive is concerned."""
+    survey = joint.survey
+    title = f"{survey.title}, by {survey.source}" if survey is not None else "not looked at"
+    lines = [
+        f"joint_{joint.number}:{'':18}# {title}",
+        f"  node: {joint.node}",
+        f"  file: joint_{joint.number}.yaml",
+    ]
+    lines += _identity(survey)
+    if joint.given:
+        lines.append("  given:                  # instead of what the drive says")
+        for key, value in joint.given.items():
+            entry = f'    "{label(*key)}": {round(value.number)}'
+            lines.append(f"{entry:<26}# {'GUESS, ' * value.guess}{value.origin}")
+    return lines
+
+
+def _identity(survey: Survey | None) -> list[str]:
+    """Refuse another device at this node-ID; serial numbers change with every repair, so they are left out."""
+    known = {
+        name: survey.numbers[key]
+        for name, key in IDENTITY.items()
+        if survey is not None and name in ("vendor", "product") and survey.numbers.get(key)
+    }
+    inside = ", ".join(f"{name}: 0x{value:08X}" for name, value in known.items())
+    return [f"  identity: {{{inside}}}"] if known else []
+
+
+def sensor_lines(node: int, survey: Survey | None) -> list[str]:
+    """Return the section of the torque sensor."""
+    title = f"{survey.title}, by {survey.source}" if survey is not None else "not looked at"
+    return [
+        f"sensor:                   # {title}",
+        f"  node: {node}",
+        *_identity(survey),
+        "  channels: 1",
+    ]
+
+
+def sensor_problems(node: int, survey: Survey | None) -> list[str]:
+    """Why this version of jtqd does not work with this sensor."""
+    if survey is None:
+        return []
+    return [
+        f"node {node} ({survey.title}): has no {label(*key)}"
+        for key in MAPPED[SENSOR]
+        if key in survey.missing
+    ]

@@ -1,0 +1,389 @@
+"""`jtq init`: a first configuration and joint files for the bench at hand, with every guess named.
+
+The devices are read on the bus (nothing is written to them) or from EDS files; what neither tells is an option, or a
+question on a terminal. The files use method `tob`, which needs no fitted data, and are checked by reading them as jtqd does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from jtqd.daemon.bus.boot import bus_load_of
+from jtqd.daemon.cli.draft import (
+    ConfigDraft,
+    DraftError,
+    JointDraft,
+    Wanted,
+    config_text,
+    draft_joint,
+    joint_text,
+    sensor_problems,
+)
+from jtqd.daemon.config import MAX_NODE_ID, load_config
+from jtqd.drivers.bus_load import LIMIT, BusLoadError
+from jtqd.drivers.frame_socket import BusError
+from jtqd.drivers.object_dictionary import EdsError
+from jtqd.drivers.survey import DRIVE, SENSOR, BusSurvey, Survey, survey_of_eds
+from jtqd.estimator.checked import ConfigError
+
+MAX_JOINTS = 2
+_PERIODS_US = (1000, 2000, 4000, 5000, 10_000)
+_EXAMPLES = """examples:
+  jtq init --bus can0 --out arm                        look on the bus, ask for what the devices do not tell
+  jtq init --bus can0 --out arm --node 5 --gear-ratio 101 --rated-torque 28
+  jtq init --from-eds drive.eds --node 5 --node 6 --gear-ratio 101 --out arm     before the bus is there
+  jtq init --bus can0 --out arm --gear-ratio 101 --gear-ratio 51                 one value for each joint
+
+Options about joints may be given once for all joints, or once for each in the order of --node.
+Nothing is written to a device. A bus with SYNC is refused: its master reads by SDO, too.
+
+exit status: 0 the files are there and jtqd can use them, 1 failure, 2 usage or something missing,
+3 the files are there, and the devices lack what this version of jtqd needs"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the arguments of `jtq init`."""
+    made = argparse.ArgumentParser(
+        prog="jtq init",
+        description="Write a first configuration and joint files that run at once, and say what in them is a guess.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    made.add_argument("--bus", metavar="BUS", help="look at the devices on this bus: can0, or unix:PATH")
+    made.add_argument(
+        "--from-eds",
+        type=Path,
+        action="append",
+        metavar="FILE",
+        help="EDS of the drives (one for all, or one for each)",
+    )
+    made.add_argument(
+        "--node",
+        type=node_id,
+        action="append",
+        metavar="N",
+        help=f"node-ID of a drive; again for the next joint, at most {MAX_JOINTS} (default: drives on the bus)",
+    )
+    made.add_argument(
+        "--sensor", type=_sensor, metavar="N|none", help="node-ID of the torque sensor (default: as found)"
+    )
+    made.add_argument(
+        "--sensor-joint",
+        type=int,
+        action="append",
+        metavar="J",
+        help="joint whose torque the sensor measures (default: all)",
+    )
+    for name, kind, unit, text in (
+        ("gear-ratio", _positive, "G", "motor revolutions per joint revolution"),
+        ("rated-torque", _positive, "NM", "rated torque of the joint [Nm]"),
+        ("torque-constant", _positive, "KT", "of the motor [Nm/A]"),
+        ("rated-current", _positive, "A", "of the motor [A], as 6075h should say"),
+        ("encoder-counts", _count, "N", "counts per revolution of the motor, all edges"),
+        ("link-encoder-counts", _count, "N", "counts per revolution of the joint, at the link"),
+    ):
+        made.add_argument(f"--{name}", type=kind, action="append", metavar=unit, help=text)
+    made.add_argument(
+        "--bitrate", type=_count, default=1_000_000, metavar="B", help="of the bus [bit/s] (default 1000000)"
+    )
+    made.add_argument(
+        "--name",
+        type=_name,
+        default="jtqd",
+        help="of the configuration: NAME.yaml (default jtqd; can0 for jtqd@can0)",
+    )
+    made.add_argument("--out", type=Path, required=True, metavar="DIR", help="directory for the files")
+    made.add_argument("--force", action="store_true", help="replace files that are there")
+    made.add_argument("--no-questions", action="store_true", help="ask nothing, also on a terminal")
+    made.add_argument("--json", action="store_true", help="print as JSON; asks nothing")
+    return made
+
+
+def node_id(text: str) -> int:
+    """Parse a node-ID. Raises argparse.ArgumentTypeError."""
+    if not text.isdecimal() or not 1 <= int(text) <= MAX_NODE_ID:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a node-ID from 1 to {MAX_NODE_ID}")
+    return int(text)
+
+
+def _name(text: str) -> str:
+    if not re.fullmatch(r"\w[\w.-]*", text) or text.startswith("joint_"):
+        raise argparse.ArgumentTypeError(
+            f"found {text!r}, expected letters, digits, . _ -, and not joint_..."
+        )
+    return text
+
+
+def _sensor(text: str) -> int:
+    return 0 if text == "none" else node_id(text)
+
+
+def _positive(text: str) -> float:
+    with suppress(ValueError):
+        if 0.0 < (value := float(text)) < 1e9:
+            return value
+    raise argparse.ArgumentTypeError(f"found {text!r}, expected a number above 0")
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) < 2**31:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number above 0")
+    return int(text)
+
+
+class UsageError(Exception):
+    """Options that contradict each other, or too few of them."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """Devices: node-IDs of the drives in the order of the joints, what is known of each, and the sensor."""
+
+    nodes: list[int]
+    surveys: dict[int, Survey]
+    sensor: int | None
+    notes: list[str]
+
+
+def main(argv: list[str]) -> int:
+    """Write the files; returns the exit status."""
+    options = parser().parse_args(argv)
+    try:
+        return _run(options)
+    except (UsageError, DraftError) as error:
+        print(f"jtq init: {error}", file=sys.stderr)
+        return 2
+    except (BusError, EdsError, ConfigError, BusLoadError, ValueError) as error:
+        print(f"jtq init: {error}", file=sys.stderr)
+        return 1
+
+
+def _run(options: argparse.Namespace) -> int:
+    _refuse_what_is_there(options)
+    found = _found(options)
+    joints = _drafts(options, found)
+    files, period_us = _write(options.out, options.name, _config(options, found, joints))
+    problems = [each for joint in joints for each in joint.problems]
+    if found.sensor is not None:
+        problems += sensor_problems(found.sensor, found.surveys.get(found.sensor))
+    report = {
+        "files": [str(each) for each in files],
+        "period_us": period_us,
+        "notes": found.notes,
+        "guesses": [each for joint in joints for each in joint.guesses],
+        "problems": problems,
+        "next": f"jtqd --bus {options.bus or 'can0'} --config {files[-1]} --record logs",
+    }
+    print(json.dumps(report) if options.json else _text(report))
+    return 3 if problems else 0
+
+
+def _text(report: dict[str, Any]) -> str:
+    lines = [
+        *report["notes"],
+        f"wrote {', '.join(report['files'])}: method tob, {1e6 / report['period_us']:g} Hz",
+    ]
+    for title, key in (("still a guess:", "guesses"), ("jtqd does not work with it yet:", "problems")):
+        if report[key]:
+            lines += [title, *(f"  {line}" for line in report[key])]
+    return "\n".join([*lines, f"next: {report['next']}"])
+
+
+def _refuse_what_is_there(options: argparse.Namespace) -> None:
+    for name in (f"{options.name}.yaml", *(f"joint_{number}.yaml" for number in range(1, MAX_JOINTS + 1))):
+        if not options.force and (options.out / name).exists():
+            raise UsageError(f"{options.out / name}: is there already; --force replaces it")
+
+
+# ---- devices ----
+
+
+def _found(options: argparse.Namespace) -> Found:
+    """Return the devices by options, bus and EDS. Raises UsageError, BusError, EdsError."""
+    nodes: list[int] = options.node or []
+    if len(set(nodes)) != len(nodes):
+        raise UsageError(f"--node: {nodes} names a node twice")
+    surveys: dict[int, Survey] = {}
+    notes: list[str] = []
+    sensor = options.sensor
+    if options.bus is not None:
+        surveys = _on_the_bus(options.bus, nodes, sensor)
+        drives = [node for node, each in surveys.items() if each.profile == DRIVE]
+        sensors = [node for node, each in surveys.items() if each.profile == SENSOR]
+        notes += [f"node {node}: {description(each)}" for node, each in surveys.items()]
+        if sensor is None and sensors:
+            sensor = sensors[0]
+        if not nodes:
+            nodes = drives[:MAX_JOINTS]
+            notes += [f"node {node}: left out, give --node to choose" for node in drives[MAX_JOINTS:]]
+        for node in nodes:
+            if node not in surveys and not options.from_eds:
+                raise UsageError(f"node {node} does not answer on {options.bus}{_others(surveys)}")
+    if not nodes:
+        where = f"no CiA 402 drive answers on {options.bus}" if options.bus else "no drive is known"
+        raise UsageError(f"{where}: give --node{_others(surveys)}")
+    if len(nodes) > MAX_JOINTS:
+        raise UsageError(f"--node: {len(nodes)} drives, this version of jtqd has at most {MAX_JOINTS} joints")
+    for node, path in zip(nodes, _each("from_eds", options.from_eds, len(nodes)), strict=True):
+        if path is not None:
+            surveys[node] = merged(survey_of_eds(path, node), surveys.get(node))
+            notes.append(f"node {node}: {description(surveys[node])}")
+    for node in nodes:
+        if node in surveys and surveys[node].profile != DRIVE:
+            raise UsageError(f"node {node} is no CiA 402 drive: {description(surveys[node])}")
+    return Found(nodes, surveys, sensor or None, notes)
+
+
+def _on_the_bus(bus: str, nodes: Sequence[int], sensor: int | None) -> dict[int, Survey]:
+    with _survey(bus) as reader:
+        wanted = {*nodes, *([sensor] if sensor else [])}
+        there = reader.nodes() if not nodes or sensor is None else sorted(wanted)
+        read = {node: reader.read(node) for node in there}
+    return {node: each for node, each in read.items() if each is not None}
+
+
+@contextmanager
+def _survey(bus: str) -> Iterator[BusSurvey]:
+    reader = BusSurvey(bus)
+    try:
+        yield reader
+    finally:
+        reader.close()
+
+
+def merged(eds: Survey, bus: Survey | None) -> Survey:
+    """A device on the bus knows its values; its EDS knows what can be mapped."""
+    return eds if bus is None else replace(bus, unmappable=eds.unmappable)
+
+
+def description(survey: Survey) -> str:
+    """Return a device in one line: name, versions, vendor, profile, source."""
+    texts = [text for name in ("hardware", "software") if (text := survey.texts.get(name))]
+    vendor = survey.numbers.get((0x1018, 1))
+    parts = [survey.title, *texts, *([f"vendor {vendor:08X}h"] if vendor else [])]
+    return f"{', '.join(parts)} (profile {survey.profile or 'unknown'}, by {survey.source})"
+
+
+def _others(surveys: dict[int, Survey]) -> str:
+    if not surveys:
+        return ""
+    return f"; there are {', '.join(f'{node} ({each.title})' for node, each in surveys.items())}"
+
+
+# ---- joints ----
+
+
+def _each(name: str, values: list[Any] | None, count: int) -> list[Any]:
+    """Return one value per joint. Raises UsageError."""
+    if values is None:
+        return [None] * count
+    if len(values) == 1:
+        return values * count
+    if len(values) != count:
+        option = f"--{name.replace('_', '-')}"
+        raise UsageError(
+            f"{option}: given {len(values)} times, expected once or {count} times (for each joint)"
+        )
+    return values
+
+
+_OPTIONS = {
+    "gear_ratio": "gear_ratio",
+    "rated_torque_nm": "rated_torque",
+    "torque_constant_nm_per_a": "torque_constant",
+    "rated_current_a": "rated_current",
+    "encoder_counts": "encoder_counts",
+    "link_encoder_counts": "link_encoder_counts",
+}
+"""Field of Wanted -> option."""
+
+
+def _drafts(options: argparse.Namespace, found: Found) -> list[JointDraft]:
+    count = len(found.nodes)
+    columns = {field: _each(name, getattr(options, name), count) for field, name in _OPTIONS.items()}
+    ask = sys.stdin.isatty() and not options.no_questions and not options.json
+    drafts = []
+    for position, node in enumerate(found.nodes):
+        wanted = Wanted(**{each.name: columns[each.name][position] for each in fields(Wanted)})
+        drafts.append(_draft(position + 1, node, found.surveys.get(node), wanted, ask))
+    return drafts
+
+
+def _draft(number: int, node: int, survey: Survey | None, wanted: Wanted, ask: bool) -> JointDraft:
+    """Return a joint's draft; on a terminal, ask for what is missing."""
+    while True:
+        try:
+            return draft_joint(number, node, survey, wanted)
+        except DraftError as error:
+            option = str(error).rpartition("give --")[2].partition(",")[0]
+            field = next((name for name, each in _OPTIONS.items() if each == option.replace("-", "_")), None)
+            if not ask or field is None:
+                raise
+            answer: Any = _answer(str(error).rpartition(":")[0], option)
+            wanted = replace(wanted, **{field: answer})
+
+
+def _answer(why: str, option: str) -> float | int:
+    """Ask until a number comes. Raises UsageError at the end of input."""
+    kind = _count if option.endswith("counts") else _positive
+    print(why, file=sys.stderr)
+    while True:
+        print(f"{option.replace('-', ' ')}? ", end="", file=sys.stderr, flush=True)
+        line = sys.stdin.readline()
+        if not line:
+            raise UsageError(f"no answer: give --{option}")
+        try:
+            return kind(line.strip())
+        except argparse.ArgumentTypeError as error:
+            print(error, file=sys.stderr)
+
+
+# ---- files ----
+
+
+def _config(options: argparse.Namespace, found: Found, joints: list[JointDraft]) -> ConfigDraft:
+    numbers = [joint.number for joint in joints]
+    measured = options.sensor_joint if options.sensor_joint is not None else numbers
+    if found.sensor is None:
+        if options.sensor_joint is not None:
+            raise UsageError("--sensor-joint: there is no sensor")
+        measured = []
+    if not set(measured) <= set(numbers):
+        raise UsageError(f"--sensor-joint: found {measured}, expected among {numbers}")
+    taken = {*found.nodes, *found.surveys, found.sensor}
+    spare = (
+        next(node for node in range(MAX_NODE_ID, 0, -1) if node not in taken) if len(joints) == 1 else None
+    )
+    return ConfigDraft(
+        bus=options.bus or "a bus that was not looked at",
+        bitrate=options.bitrate,
+        period_us=_PERIODS_US[0],
+        joints=joints,
+        sensor=None if found.sensor is None else found.surveys.get(found.sensor),
+        sensor_node=found.sensor,
+        joints_of_sensor=measured,
+        spare_node=spare,
+    )
+
+
+def _write(directory: Path, name: str, draft: ConfigDraft) -> tuple[list[Path], int]:
+    """Write the files with the shortest period whose bus load fits; returns paths and period [us]. Raises ConfigError."""
+    directory.mkdir(parents=True, exist_ok=True)
+    files = []
+    for joint in draft.joints:
+        files.append(directory / f"joint_{joint.number}.yaml")
+        files[-1].write_text(joint_text(joint), encoding="utf-8")
+    files.append(directory / f"{name}.yaml")
+    for period_us in _PERIODS_US:
+        files[-1].write_text(config_text(replace(draft, period_us=period_us)), encoding="utf-8")
+        if bus_load_of(load_config(files[-1])).worst <= LIMIT:
+            return files, period_us
+    raise ConfigError(f"{files[-1]}: at {draft.bitrate} bit/s not even 100 Hz fit the bus")

@@ -1,0 +1,150 @@
+"""`jtq probe`: what one device on the bus tells of itself, what jtqd needs of it, and its section of the configuration.
+
+Only objects are read; nothing is written and no node is started. Which objects can be mapped is told by an EDS alone
+(`--eds`); what the TPDOs carry now is read.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from jtqd.daemon.cli.draft import DraftError, Wanted, draft_joint, drive_lines, sensor_lines, sensor_problems
+from jtqd.daemon.cli.init import description, merged, node_id
+from jtqd.drivers.frame_socket import BusError
+from jtqd.drivers.object_dictionary import EdsError
+from jtqd.drivers.sdo import label
+from jtqd.drivers.survey import DRIVE, IDENTITY, SENSOR, BusSurvey, Survey, Tpdo, survey_of_eds
+
+_EXAMPLES = """examples:
+  jtq probe --bus can0                      which nodes are there
+  jtq probe --bus can0 --node 5             identity, scaling, TPDOs, section of the configuration
+  jtq probe --bus can0 --node 5 --eds drive.eds --json
+
+exit status: 0 jtqd can use it, 1 failure or no answer, 2 usage, 3 it lacks what this version of jtqd needs"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the arguments of `jtq probe`."""
+    made = argparse.ArgumentParser(
+        prog="jtq probe",
+        description="Read a device on the bus, and print its section of the configuration. Nothing is written to it.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    made.add_argument("--bus", required=True, help="can0, or unix:PATH")
+    made.add_argument("--node", type=node_id, metavar="N", help="node-ID (default: list the nodes)")
+    made.add_argument("--eds", type=Path, metavar="FILE", help="its EDS, which tells what can be mapped")
+    made.add_argument("--json", action="store_true", help="print as JSON")
+    return made
+
+
+def main(argv: list[str]) -> int:
+    """Read and print; returns the exit status."""
+    options = parser().parse_args(argv)
+    if options.eds is not None and options.node is None:
+        print("jtq probe: --eds needs --node", file=sys.stderr)
+        return 2
+    try:
+        bus = BusSurvey(options.bus)
+        try:
+            return _list(options, bus) if options.node is None else _one(options, bus)
+        finally:
+            bus.close()
+    except (BusError, EdsError, ValueError) as error:
+        print(f"jtq probe: {error}", file=sys.stderr)
+        return 1
+
+
+def _list(options: argparse.Namespace, bus: BusSurvey) -> int:
+    found = [each for node in bus.nodes() if (each := bus.read(node)) is not None]
+    if options.json:
+        print(json.dumps([content(each, [], [])["device"] for each in found]))
+    else:
+        print("\n".join(f"node {each.node}: {description(each)}" for each in found) or "no node answers")
+    return 0 if found else 1
+
+
+def _one(options: argparse.Namespace, bus: BusSurvey) -> int:
+    found = bus.read(options.node)
+    if found is None:
+        raise ValueError(f"node {options.node} does not answer on {options.bus}")
+    tpdos = bus.tpdos(options.node)
+    if options.eds is not None:
+        found = merged(survey_of_eds(options.eds, options.node), found)
+    problems = problems_of(found)
+    if options.json:
+        print(json.dumps(content(found, tpdos, problems)))
+    else:
+        print(text(found, tpdos, problems))
+    return 3 if problems else 0
+
+
+def problems_of(survey: Survey) -> list[str]:
+    """Why this version of jtqd does not work with a device."""
+    if survey.profile == DRIVE:
+        return list(draft_joint(1, survey.node, survey, _ANY).problems)
+    if survey.profile == SENSOR:
+        return sensor_problems(survey.node, survey)
+    return [f"node {survey.node}: {description(survey)}: neither a drive (402) nor a sensor (404)"]
+
+
+_ANY = Wanted(1.0, 1.0, 1.0, 1.0, 1, 1)
+"""Of a joint whose values do not matter: only what the drive lacks is asked."""
+
+
+def section(survey: Survey) -> list[str]:
+    """Return its section of the configuration; objects that it has no value of are left to be given."""
+    if survey.profile == SENSOR:
+        return sensor_lines(survey.node, survey)
+    try:
+        draft = draft_joint(1, survey.node, survey, Wanted(rated_torque_nm=1.0, torque_constant_nm_per_a=1.0))
+    except DraftError as error:
+        return [f"# jtq init: {error}"]
+    return drive_lines(draft)
+
+
+def content(survey: Survey, tpdos: list[Tpdo], problems: list[str]) -> dict[str, Any]:
+    """Return everything for a program."""
+    return {
+        "schema": "jtq.probe/1",
+        "device": {
+            "node": survey.node,
+            "profile": survey.profile,
+            **survey.texts,
+            **{name: survey.numbers.get(key) for name, key in IDENTITY.items()},
+        },
+        "objects": {label(*key): value for key, value in sorted(survey.numbers.items())},
+        "missing": [label(*key) for key in sorted(survey.missing)],
+        "unmappable": [label(*key) for key in sorted(survey.unmappable)],
+        "tpdos": [
+            {
+                "number": each.number,
+                "cob_id": f"{each.cob_id:X}h",
+                "on": each.on,
+                "type": each.transmission_type,
+                "objects": list(each.objects),
+            }
+            for each in tpdos
+        ],
+        "problems": problems,
+    }
+
+
+def text(survey: Survey, tpdos: list[Tpdo], problems: list[str]) -> str:
+    """Return everything for people."""
+    lines = [f"node {survey.node}: {description(survey)}"]
+    lines += [f"  {label(*key):<8} {value}" for key, value in sorted(survey.numbers.items())]
+    lines += [f"  {label(*key):<8} not there" for key in sorted(survey.missing)]
+    lines.append("TPDOs as they are now (jtqd writes its own mapping at its start)")
+    for each in tpdos:
+        kind = f"type {each.transmission_type}" if each.on else "off"
+        lines.append(f"  {each.number}  {each.cob_id:X}h  {kind:<8}  {', '.join(each.objects) or 'nothing'}")
+    if survey.profile in (DRIVE, SENSOR):
+        lines += ["section of the configuration", *(f"  {line}" for line in section(survey))]
+    if problems:
+        lines += ["jtqd does not work with it yet:", *(f"  {line}" for line in problems)]
+    return "\n".join(lines)

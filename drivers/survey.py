@@ -1,0 +1,244 @@
+"""What a device tells of itself, read by SDO or from its EDS: identity, scaling, the objects that jtqd maps.
+
+Reading changes nothing in a device and starts nothing. Objects: CiA 301 (1000h, 1008h to 100Ah, 1018h), CiA 402-2
+(6075h, 6076h, 608Fh, 6090h, 6091h, 60E6h, 60EBh and what the TPDOs carry), CiA 404 (6131h, 6132h, 9130h, 6150h).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from jtqd.drivers.devices import (
+    DECIMALS_OBJECT,
+    DRIVE_SCALING_OBJECTS,
+    SYNC_COB_ID,
+    UNIT_OBJECT,
+    drive_tpdo1,
+    drive_tpdo2,
+    sensor_tpdo1,
+)
+from jtqd.drivers.filters import exact
+from jtqd.drivers.frame import FRAME, FRAME_SIZE, pack
+from jtqd.drivers.frame_socket import FrameSocket, open_frame_socket
+from jtqd.drivers.object_dictionary import VISIBLE_STRING, read_eds
+from jtqd.drivers.pdo import CAN_ID, INVALID
+from jtqd.drivers.sdo import Key, SdoAbort, Transfer, label
+from jtqd.drivers.sdo_client import REQUEST_ID, RESPONSE_ID, FrameChannel, SdoAccess, SdoClient, SdoTimeout
+
+DRIVE, SENSOR = 402, 404
+"""Device profiles: low 16 bits of 1000h."""
+TEXTS: Mapping[str, Key] = {"name": (0x1008, 0), "hardware": (0x1009, 0), "software": (0x100A, 0)}
+IDENTITY: Mapping[str, Key] = {
+    name: (0x1018, sub) for sub, name in enumerate(("vendor", "product", "revision", "serial"), 1)
+}
+RATED_CURRENT, RATED_TORQUE = (0x6075, 0), (0x6076, 0)
+GEAR: tuple[Key, Key] = ((0x6091, 1), (0x6091, 2))
+"""Motor shaft revolutions per driving shaft revolutions."""
+MAPPED: Mapping[int, tuple[Key, ...]] = {
+    DRIVE: tuple(
+        (each.index, each.subindex) for pdo in (drive_tpdo1(1), drive_tpdo2(1)) for each in pdo.objects
+    ),
+    SENSOR: tuple((each.index, each.subindex) for each in sensor_tpdo1(1).objects),
+}
+"""Objects that jtqd maps into TPDOs, by profile; of a sensor the first channel."""
+_READ: Mapping[int, tuple[Key, ...]] = {
+    DRIVE: (*DRIVE_SCALING_OBJECTS, RATED_TORQUE, *MAPPED[DRIVE]),
+    SENSOR: (
+        *((index, channel) for index in (UNIT_OBJECT, DECIMALS_OBJECT) for channel in (1,)),
+        *MAPPED[SENSOR],
+    ),
+}
+_NODES = range(1, 128)
+_LISTEN_S = 0.12
+"""A SYNC comes within this, where there is one."""
+_ANSWER_S = 0.5
+
+
+@dataclass(frozen=True)
+class Survey:
+    """One device.
+
+    Attributes:
+        source: where the values are from: "the bus", or "defaults of NAME.eds".
+        profile: 402, 404 or another device profile; 0 where it names none.
+        texts: 1008h to 100Ah by the names of TEXTS, where it has them.
+        numbers: objects that it has, with their values (of an EDS: the defaults).
+        missing: objects of its profile that it does not have.
+        unmappable: objects that its EDS says cannot be mapped; empty when read on a bus, which does not tell.
+        defaults: the numbers are defaults; the device itself may have others.
+    """
+
+    node: int
+    source: str
+    profile: int
+    texts: Mapping[str, str]
+    numbers: Mapping[Key, int]
+    missing: frozenset[Key] = frozenset()
+    unmappable: frozenset[Key] = frozenset()
+    defaults: bool = False
+
+    @property
+    def title(self) -> str:
+        """Its name, or its kind."""
+        kinds = {DRIVE: "drive", SENSOR: "torque sensor"}
+        return self.texts.get("name") or kinds.get(self.profile, f"device of profile {self.profile}")
+
+    def number(self, key: Key) -> int | None:
+        """Return a value that can scale: at least 1; None where there is none."""
+        value = self.numbers.get(key)
+        return value if value is not None and value >= 1 else None
+
+    def tells(self, key: Key) -> bool:
+        """Whether the device itself will scale with it: it has a value, or it is only known by an EDS and has the object."""
+        return self.number(key) is not None or (self.defaults and key in self.numbers)
+
+
+@dataclass(frozen=True)
+class Tpdo:
+    """One TPDO as it is configured: its objects as "6064h:0/32" (bits)."""
+
+    number: int
+    cob_id: int
+    on: bool
+    transmission_type: int
+    objects: tuple[str, ...]
+
+
+def tpdos(access: SdoAccess) -> list[Tpdo]:
+    """Read the four TPDOs of the predefined connection set (CiA 301, 1800h and 1A00h)."""
+    found = []
+    for number in range(1, 5):
+        cob_id, kind = (_number(access, (0x1800 + number - 1, sub)) for sub in (1, 2))
+        if cob_id is None:
+            continue
+        count = min(_number(access, (0x1A00 + number - 1, 0)) or 0, 64)
+        entries = [_number(access, (0x1A00 + number - 1, sub)) or 0 for sub in range(1, count + 1)]
+        objects = tuple(f"{label(each >> 16, each >> 8 & 0xFF)}/{each & 0xFF}" for each in entries)
+        found.append(Tpdo(number, cob_id & CAN_ID, not cob_id & INVALID, kind or 0, objects))
+    return found
+
+
+def _number(access: SdoAccess, key: Key) -> int | None:
+    raw = _optional(access, key)
+    return None if raw is None else int.from_bytes(raw[:8], "little")
+
+
+def survey(access: SdoAccess, node: int) -> Survey:
+    """Read a device by SDO. Raises SdoTimeout: it does not answer."""
+    numbers: dict[Key, int] = {}
+    texts: dict[str, str] = {}
+    missing: set[Key] = set()
+    device_type = int.from_bytes(access.read(0x1000, 0)[:4], "little")
+    for name, key in TEXTS.items():
+        raw = _optional(access, key)
+        if raw is not None:
+            texts[name] = _text(raw)
+    for key in (*IDENTITY.values(), *_READ.get(device_type & 0xFFFF, ())):
+        raw = _optional(access, key)
+        if raw is None:
+            missing.add(key)
+        else:
+            numbers[key] = int.from_bytes(raw[:8], "little")
+    return Survey(node, "the bus", device_type & 0xFFFF, texts, numbers, frozenset(missing))
+
+
+def survey_of_eds(path: Path, node: int) -> Survey:
+    """Read a device from its EDS. Raises EdsError."""
+    entries = {(each.index, each.subindex): each for each in read_eds(path, node)}
+
+    def number(key: Key) -> int:
+        entry = entries[key]
+        return int.from_bytes(entry.default, "little") if entry.is_integer else 0
+
+    profile = number((0x1000, 0)) & 0xFFFF if (0x1000, 0) in entries else 0
+    wanted = (*IDENTITY.values(), *_READ.get(profile, ()))
+    return Survey(
+        node=node,
+        source=f"defaults of {path.name}",
+        defaults=True,
+        profile=profile,
+        texts={
+            name: text
+            for name, key in TEXTS.items()
+            if key in entries
+            and entries[key].data_type == VISIBLE_STRING
+            and (text := _text(entries[key].default))
+        },
+        numbers={key: number(key) for key in wanted if key in entries},
+        missing=frozenset(key for key in wanted if key not in entries),
+        unmappable=frozenset(
+            key for key in MAPPED.get(profile, ()) if key in entries and not entries[key].mappable
+        ),
+    )
+
+
+class BusSurvey:
+    """Surveys of a bus without a master. Raises BusError (open, and every call), ValueError: a bus in service.
+
+    Requests and answers of an SDO server that another master uses would be mixed up, so a bus with SYNC is refused.
+    """
+
+    def __init__(self, bus: str) -> None:
+        identifiers = [SYNC_COB_ID, *(RESPONSE_ID + node for node in _NODES)]
+        self._socket: FrameSocket = open_frame_socket(bus, [exact(each) for each in identifiers])
+        end = time.monotonic() + _LISTEN_S
+        while (left := end - time.monotonic()) > 0.0:
+            if SYNC_COB_ID in self._received(left):
+                self._socket.close()
+                raise ValueError(
+                    f"{bus}: SYNC is on the bus: a master is running; end it first (jtqd, a PLC)"
+                )
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+    def nodes(self, among: Iterable[int] = _NODES) -> list[int]:
+        """Return the nodes that answer to a read of 1000h within half a second, a few asked at a time."""
+        found: set[int] = set()
+        waiting = list(among)
+        while waiting:
+            asked, waiting = waiting[:16], waiting[16:]
+            for node in asked:
+                self._socket.send(pack(REQUEST_ID + node, Transfer(0x1000, 0).request))
+            found |= self._answers(0.02)
+        end = time.monotonic() + _ANSWER_S
+        while (left := end - time.monotonic()) > 0.0:
+            found |= self._answers(left)
+        return sorted(found)
+
+    def read(self, node: int) -> Survey | None:
+        """Survey one node; None when it does not answer."""
+        try:
+            return survey(SdoClient(FrameChannel(self._socket, node), _ANSWER_S), node)
+        except SdoTimeout:
+            return None
+
+    def tpdos(self, node: int) -> list[Tpdo]:
+        """Read the TPDOs of one node."""
+        return tpdos(SdoClient(FrameChannel(self._socket, node), _ANSWER_S))
+
+    def _answers(self, timeout_s: float) -> set[int]:
+        return {can_id - RESPONSE_ID for can_id in self._received(timeout_s) if can_id > RESPONSE_ID}
+
+    def _received(self, timeout_s: float) -> list[int]:
+        socket = self._socket
+        if not socket.wait(timeout_s):
+            return []
+        return [FRAME.unpack_from(socket.frames, FRAME_SIZE * at)[0] for at in range(socket.receive())]
+
+
+def _optional(access: SdoAccess, key: Key) -> bytes | None:
+    """Return an object, None when the device refuses it or is silent about it."""
+    try:
+        return access.read(*key)
+    except (SdoAbort, SdoTimeout):
+        return None
+
+
+def _text(raw: bytes) -> str:
+    """Return a VISIBLE_STRING without what a terminal would obey."""
+    return "".join(each for each in raw.decode("ascii", "replace") if each.isprintable()).strip()

@@ -1,0 +1,292 @@
+"""`jtq init`: from devices, EDS files and options to files that jtqd reads; what is a guess is named."""
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+
+import pytest
+import yaml
+
+from jtqd.daemon.cli import init, probe
+from jtqd.daemon.cli.draft import DraftError, Wanted, draft_joint
+from jtqd.daemon.config import load_config
+from jtqd.drivers.devices import DriveProfile, drive_scaling
+from jtqd.drivers.object_dictionary import ObjectStore, read_eds
+from jtqd.drivers.survey import survey
+from tests.paths import ROOT
+
+EDS = ROOT / "drivers" / "eds" / "drive.eds"
+NODE = 5
+GIVEN = Wanted(gear_ratio=101.0, encoder_counts=4096, link_encoder_counts=2**19, rated_current_a=8.0)
+
+
+def drive(values=None, without=()):
+    """Survey of a drive with these values, and without some objects."""
+    entries = [each for each in read_eds(EDS, NODE) if (each.index, each.subindex) not in without]
+    store = ObjectStore(entries, NODE)
+    for (index, sub), value in {
+        (0x6091, 1): 100,
+        (0x608F, 1): 65536,
+        (0x6090, 1): 65536,
+        **(values or {}),
+    }.items():
+        if (index, sub) in store.entries:
+            store.set_number(index, sub, value)
+    return survey(store, NODE)
+
+
+def test_what_the_drive_tells_is_taken_and_nothing_else_is_given():
+    draft = draft_joint(1, NODE, drive({(0x6075, 0): 8000, (0x6076, 0): 500}), Wanted())
+    values = {name: value.number for name, value in draft.values.items()}
+    assert values["gear_ratio"] == 100.0
+    assert values["torque_constant_nm_per_a"] == pytest.approx(0.5 / 8.0, rel=0.01)
+    assert values["rated_torque_nm"] == pytest.approx(0.7 * 100 * 0.5)
+    assert draft.given == {}
+    assert draft.problems == ()
+    assert not draft.values["gear_ratio"].guess
+    assert len(draft.guesses) == 8
+
+
+def test_an_option_goes_before_the_drive_and_says_so():
+    wanted = Wanted(gear_ratio=50.5, rated_torque_nm=28.0, torque_constant_nm_per_a=0.05, rated_current_a=6.0)
+    draft = draft_joint(1, NODE, drive({(0x6075, 0): 8000}), wanted)
+    assert {name: draft.values[name].number for name in ("gear_ratio", "rated_torque_nm")} == {
+        "gear_ratio": 50.5,
+        "rated_torque_nm": 28.0,
+    }
+    given = {key: value.number for key, value in draft.given.items()}
+    assert given == {(0x6091, 1): 101, (0x6091, 2): 2, (0x6075, 0): 6000}
+    assert "the drive says 100" in draft.given[0x6091, 1].origin
+
+
+def test_an_option_that_agrees_with_the_drive_gives_nothing():
+    wanted = Wanted(gear_ratio=100.0, rated_current_a=8.0, encoder_counts=65536)
+    assert draft_joint(1, NODE, drive({(0x6075, 0): 8000}), wanted).given == {}
+
+
+@pytest.mark.parametrize(
+    ("without", "wanted", "option"),
+    [
+        (((0x6091, 1),), Wanted(), "--gear-ratio"),
+        (((0x6075, 0),), Wanted(rated_torque_nm=30.0), "--rated-current"),
+        (((0x6076, 0),), Wanted(), "--rated-torque"),
+        (((0x608F, 1),), Wanted(), "--encoder-counts"),
+        (((0x60E6, 1),), Wanted(), "--link-encoder-counts"),
+    ],
+)
+def test_what_cannot_be_guessed_is_asked_for_by_its_option(without, wanted, option):
+    with pytest.raises(DraftError, match=f"give {option}"):
+        draft_joint(1, NODE, drive(without=without), wanted)
+
+
+def test_a_gear_of_one_to_one_is_not_believed():
+    with pytest.raises(DraftError, match="1:1"):
+        draft_joint(1, NODE, drive({(0x6091, 1): 1}), Wanted())
+
+
+def test_a_drive_without_scaling_is_scaled_by_options_as_the_boot_does():
+    """What is given makes the same factors as a drive that has the objects: one turn is one turn."""
+    missing = [
+        (0x608F, 1),
+        (0x608F, 2),
+        (0x6090, 1),
+        (0x6090, 2),
+        (0x60E6, 1),
+        (0x60EB, 1),
+        (0x6091, 1),
+        (0x6091, 2),
+    ]
+    found = drive({(0x6075, 0): 8000}, without=missing)
+    draft = draft_joint(1, NODE, found, GIVEN)
+    given = {key: round(value.number) for key, value in draft.given.items()}
+    assert set(missing) == set(given)
+    scaling, gear = drive_scaling(DriveProfile(NODE, given=given), found.numbers)
+    assert gear == 101.0
+    assert scaling.motor_rad_per_count * 4096 == pytest.approx(6.283185307)
+    assert scaling.motor_rad_s_per_unit == scaling.motor_rad_per_count
+    assert scaling.link_rad_per_count * 2**19 == pytest.approx(6.283185307)
+    assert any("606Ch" in each for each in draft.guesses)
+
+
+def test_a_drive_that_jtqd_cannot_use_is_told():
+    (problem,) = draft_joint(1, NODE, drive(without=[(0x60E4, 1)]), Wanted()).problems
+    assert problem == "node 5 (emulated joint drive): has no 60E4h:1, which jtqd maps"
+
+
+def run(capsys, *arguments):
+    status = init.main([*map(str, arguments)])
+    out, err = capsys.readouterr()
+    return status, out, err
+
+
+def test_from_an_eds_alone(tmp_path, capsys):
+    status, out, err = run(
+        capsys, "--from-eds", EDS, "--node", 5, "--node", 6, "--gear-ratio", 101, "--out", tmp_path / "arm"
+    )
+    assert (status, err) == (0, "")
+    assert "still a guess:" in out
+    config = load_config(tmp_path / "arm" / "jtqd.yaml")
+    assert [joint.node_id for joint in config.joints] == [5, 6]
+    assert config.estimator.method == "tob"
+    assert config.sensor is None
+    assert config.joints[0].joint.gear_ratio == 101.0
+    assert config.joints[0].identity.vendor == 0x7A1
+
+
+def test_one_joint_alone(tmp_path, capsys):
+    arguments = ["--node", 9, "--gear-ratio", 50, "--rated-torque", 20, "--torque-constant", 0.05]
+    status, _, err = run(capsys, *arguments, "--out", tmp_path)
+    assert (status, err) == (0, "")
+    config = load_config(tmp_path / "jtqd.yaml")
+    assert config.joints[0].node_id == 9
+    assert [each.node_id for each in config.joints if each.mandatory] == [9]
+
+
+def test_a_slower_bus_gets_a_longer_period(tmp_path, capsys):
+    arguments = [
+        "--from-eds",
+        EDS,
+        "--node",
+        1,
+        "--node",
+        2,
+        "--gear-ratio",
+        100,
+        "--bitrate",
+        500_000,
+        "--json",
+    ]
+    status, out, _ = run(capsys, *arguments, "--out", tmp_path)
+    assert status == 0
+    assert json.loads(out)["period_us"] == load_config(tmp_path / "jtqd.yaml").period_ns // 1000 == 2000
+
+
+def test_every_guess_is_marked_in_the_files_and_told(tmp_path, capsys):
+    _, out, _ = run(
+        capsys, "--from-eds", EDS, "--node", 5, "--gear-ratio", 101, "--out", tmp_path, "--json", "--force"
+    )
+    told = json.loads(out)["guesses"]
+    text = (tmp_path / "joint_1.yaml").read_text()
+    marked = [line.split(":")[0].strip() for line in text.splitlines() if "# GUESS" in line]
+    assert marked == [each.split(": ")[1].split(" = ")[0] for each in told]
+    assert len(marked) == 8
+
+
+def test_a_name_for_the_unit_of_an_interface(tmp_path, capsys):
+    arguments = ["--from-eds", EDS, "--node", 5, "--gear-ratio", 101, "--out", tmp_path]
+    assert run(capsys, *arguments, "--name", "can0")[0] == 0
+    assert load_config(tmp_path / "can0.yaml").joints[0].node_id == 5
+    for wrong in ("joint_1", "../x", ""):
+        with pytest.raises(SystemExit):
+            init.main([*map(str, arguments), "--name", wrong])
+
+
+def test_what_is_there_is_not_overwritten(tmp_path, capsys):
+    (tmp_path / "joint_2.yaml").write_text("mine")
+    status, _, err = run(capsys, "--from-eds", EDS, "--node", 5, "--gear-ratio", 101, "--out", tmp_path)
+    assert status == 2
+    assert "joint_2.yaml: is there already" in err
+    assert (tmp_path / "joint_2.yaml").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "told"),
+    [
+        (["--node", "5", "--node", "5"], 2, "names a node twice"),
+        (["--node", "5", "--node", "6", "--node", "7"], 2, "at most"),
+        ([], 2, "give --node"),
+        (["--node", "5", "--gear-ratio", "1", "--gear-ratio", "2"], 2, "--gear-ratio: given 2 times"),
+        (["--node", "5", "--from-eds", "none.eds"], 1, "none.eds"),
+        (["--bus", "unix:/none/bus"], 1, "/none"),
+        (["--node", "5", "--from-eds", str(EDS.parent / "torque_sensor.eds")], 2, "no CiA 402 drive"),
+        (["--node", "5", "--sensor-joint", "1"], 2, "--gear-ratio"),
+    ],
+)
+def test_wrong_input_is_one_line(arguments, status, told, tmp_path, capsys):
+    found, out, err = run(capsys, *arguments, "--out", tmp_path / "arm")
+    assert (found, out) == (status, "")
+    assert told in err
+    assert err.count("\n") == 1
+
+
+@pytest.fixture
+def bench(tmp_path):
+    """The emulated bench on a unix bus."""
+    bus = f"unix:{tmp_path}/bus"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "jtqd.sim_can", "--bus", bus], stderr=subprocess.PIPE, text=True
+    )
+    assert "ready" in process.stderr.readline()
+    yield bus
+    process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=20)
+
+
+def test_the_devices_of_a_bus(bench, tmp_path, capsys):
+    status, out, err = run(capsys, "--bus", bench, "--out", tmp_path / "arm")
+    assert (status, err) == (0, "")
+    assert "node 3: emulated torque sensor" in out
+    content = yaml.safe_load((tmp_path / "arm" / "jtqd.yaml").read_text())
+    assert (content["joint_1"]["node"], content["joint_2"]["node"], content["sensor"]["node"]) == (1, 2, 3)
+    assert "given" not in content["joint_1"]
+    config = load_config(tmp_path / "arm" / "jtqd.yaml")
+    assert config.joints[0].sensor_channel == 1
+
+    status, _, err = run(capsys, "--bus", bench, "--node", 8, "--out", tmp_path / "other")
+    assert status == 2
+    assert "node 8 does not answer" in err
+    assert "1 (emulated joint drive)" in err
+
+
+def test_probe_of_a_bus_and_of_its_devices(bench, capsys):
+    assert probe.main(["--bus", bench]) == 0
+    assert [line.split(":")[0] for line in capsys.readouterr().out.splitlines()] == [
+        "node 1",
+        "node 2",
+        "node 3",
+    ]
+    assert probe.main(["--bus", bench, "--node", "1"]) == 0
+    told = capsys.readouterr().out
+    for words in ("608Fh:1", "60E4h:1", "TPDOs", "181h", "identity: {vendor: 0x000007A1"):
+        assert words in told
+    assert probe.main(["--bus", bench, "--node", "1", "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content["device"]["vendor"] == 0x7A1
+    assert content["missing"] == content["problems"] == []
+    assert content["tpdos"][0]["objects"]
+    assert probe.main(["--bus", bench, "--node", "3"]) == 0
+    assert "sensor:" in capsys.readouterr().out
+    assert probe.main(["--bus", bench, "--node", "9"]) == 1
+    assert capsys.readouterr().err == f"jtq probe: node 9 does not answer on {bench}\n"
+    assert probe.main(["--bus", bench, "--eds", "x.eds"]) == 2
+
+
+def test_probe_names_what_a_drive_lacks():
+    found = drive(without=[(0x60E4, 1)])
+    (problem,) = probe.problems_of(found)
+    assert "60E4h:1" in problem
+    assert "60E4h:1  not there" in probe.text(found, [], [problem])
+
+
+def test_on_a_terminal_what_is_missing_is_asked_for(tmp_path):
+    """A number that is none is asked for again."""
+    master, slave = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "jtqd.daemon.jtq", "init", "--node", "5", "--out", str(tmp_path / "arm")],
+        stdin=slave,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    os.write(master, b"fast\n100\n30\n0.06\n")
+    out, err = process.communicate(timeout=60)
+    os.close(slave)
+    os.close(master)
+    assert process.returncode == 0, err
+    assert "expected a number above 0" in err
+    joint = load_config(tmp_path / "arm" / "jtqd.yaml").joints[0].joint
+    assert (joint.gear_ratio, joint.rated_torque_nm, joint.torque_constant_nm_per_a) == (100.0, 30.0, 0.06)
+    assert "still a guess:" in out

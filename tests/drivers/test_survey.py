@@ -1,0 +1,154 @@
+"""What a device tells of itself: a node in memory, its EDS, and nodes on a bus."""
+
+import threading
+from dataclasses import replace
+
+import pytest
+
+from jtqd.drivers.frame import pack
+from jtqd.drivers.frame_socket import open_frame_socket
+from jtqd.drivers.hub import Hub
+from jtqd.drivers.object_dictionary import EdsError, ObjectStore, read_eds
+from jtqd.drivers.sdo_client import REQUEST_ID, RESPONSE_ID, SdoTimeout
+from jtqd.drivers.sdo_server import SdoServer
+from jtqd.drivers.survey import DRIVE, SENSOR, BusSurvey, Tpdo, survey, survey_of_eds, tpdos
+from tests.paths import ROOT
+
+EDS = ROOT / "drivers" / "eds"
+DRIVE_EDS, SENSOR_EDS = EDS / "drive.eds", EDS / "torque_sensor.eds"
+
+
+def without(*keys, eds=DRIVE_EDS, node=5):
+    return ObjectStore(
+        [each for each in read_eds(eds, node) if (each.index, each.subindex) not in keys], node
+    )
+
+
+def test_a_drive_that_has_all():
+    store = without()
+    store.set_number(0x6075, 0, 8000)
+    store.set_number(0x6091, 1, 101)
+    store.set_text(0x1008, 0, "drive\x1b[31m")
+    found = survey(store, 5)
+    assert (found.node, found.profile, found.source) == (5, DRIVE, "the bus")
+    assert found.title == "drive[31m", "nothing that a terminal obeys"
+    assert (found.number((0x6075, 0)), found.number((0x6091, 1))) == (8000, 101)
+    assert not found.missing
+
+
+def test_what_is_missing_or_zero_is_told_apart_from_a_value():
+    store = without((0x60E4, 1), (0x6090, 1), (0x6090, 2), (0x1008, 0))
+    store.set_number(0x6091, 1, 0)
+    found = survey(store, 5)
+    assert found.missing == {(0x60E4, 1), (0x6090, 1), (0x6090, 2)}
+    assert found.number((0x6091, 1)) is None
+    assert not found.tells((0x6091, 1))
+    assert found.title == "drive"
+
+
+def test_tpdos_as_they_are():
+    store = without()
+    store.set_number(0x1800, 1, 0x8000_0185)
+    store.set_number(0x1800, 2, 1)
+    store.set_number(0x1A00, 0, 2)
+    store.set_number(0x1A00, 1, 0x6064_0020)
+    store.set_number(0x1A00, 2, 0x60E4_0120)
+    one = tpdos(store)[0]
+    assert one == Tpdo(1, 0x185, False, 1, ("6064h:0/32", "60E4h:1/32"))
+    assert len(tpdos(store)) == 3, "the fourth is not there"
+
+
+def test_a_sensor():
+    found = survey(without(eds=SENSOR_EDS, node=3), 3)
+    assert found.profile == SENSOR
+    assert not found.missing
+
+
+def test_a_node_that_does_not_answer():
+    class Silent:
+        def read(self, index, subindex):
+            raise SdoTimeout(0.5)
+
+    with pytest.raises(SdoTimeout):
+        survey(Silent(), 5)
+
+
+def test_an_eds_tells_defaults_and_what_can_be_mapped(tmp_path):
+    text = DRIVE_EDS.read_text()
+    start = text.index("[60E4sub1]")
+    end = text.index("[", start + 1)
+    (tmp_path / "vendor.eds").write_text(
+        text[:start] + text[start:end].replace("PDOMapping=1", "PDOMapping=0") + text[end:]
+    )
+    found = survey_of_eds(tmp_path / "vendor.eds", 7)
+    assert found.unmappable == {(0x60E4, 1)}
+    assert (found.node, found.source) == (7, "defaults of vendor.eds")
+    assert found.numbers[0x1018, 1] == 0x7A1
+    zero = replace(found, numbers={**found.numbers, (0x608F, 1): 0})
+    assert zero.number((0x608F, 1)) is None
+    assert zero.tells((0x608F, 1)), "the device itself will"
+
+
+def test_no_eds(tmp_path):
+    (tmp_path / "bad.eds").write_text("not an EDS")
+    for path in (tmp_path / "bad.eds", tmp_path / "none.eds"):
+        with pytest.raises(EdsError):
+            survey_of_eds(path, 1)
+
+
+@pytest.fixture
+def bus(tmp_path):
+    """A unix bus with nodes 5 and 127 as SDO servers; whoever asks for `syncs` gets a SYNC every 10 ms."""
+    path = f"unix:{tmp_path}/bus"
+    hub, stop, syncs = Hub(str(tmp_path / "bus")), threading.Event(), threading.Event()
+    servers = {node: SdoServer(ObjectStore(DRIVE_EDS, node)) for node in (5, 127)}
+
+    def serve_hub():
+        while not stop.is_set():
+            hub.run_once(0.01)
+
+    def serve_nodes():
+        socket = open_frame_socket(path, None)
+        while not stop.is_set():
+            socket.wait(0.01)
+            for at in range(socket.receive()):
+                can_id = int.from_bytes(socket.frames[16 * at : 16 * at + 4], "little")
+                data = bytes(socket.frames[16 * at + 8 : 16 * at + 16])
+                server = servers.get(can_id - REQUEST_ID)
+                if server is not None:
+                    answer = server.handle(data)
+                    if answer is not None:
+                        socket.send(pack(RESPONSE_ID + can_id - REQUEST_ID, answer))
+            if syncs.is_set():
+                socket.send(pack(0x080, b""))
+        socket.close()
+
+    threads = [threading.Thread(target=each) for each in (serve_hub, serve_nodes)]
+    for thread in threads:
+        thread.start()
+    yield path, syncs
+    stop.set()
+    for thread in threads:
+        thread.join()
+    hub.close()
+
+
+def test_nodes_are_found_on_a_bus_and_read(bus):
+    path, _ = bus
+    reader = BusSurvey(path)
+    try:
+        assert reader.nodes() == [5, 127]
+        assert reader.nodes([5, 6]) == [5]
+        found = reader.read(127)
+        assert found is not None
+        assert found.profile == DRIVE
+        assert reader.read(6) is None
+    finally:
+        reader.close()
+
+
+def test_a_bus_in_service_is_left_alone(bus):
+    path, syncs = bus
+    syncs.set()
+    with pytest.raises(ValueError, match="a master is running"):
+        BusSurvey(path)
