@@ -22,6 +22,8 @@ from jtqd.models.files import read_yaml, shipped
 
 DEFAULT_CONFIG: Final = "bench.yaml"
 MAX_NODE_ID: Final = 127
+MAX_COUNTER: Final = 240
+"""Of SYNC (CiA 301, 7.2.5.3)."""
 LATCHED_BY_DEFAULT: Final = faults.NOT_FINITE | faults.BITS["motor_jump"] | faults.BITS["link_jump"]
 """What leaves numbers behind that look right and are not: a broken estimator, an encoder that has lost its zero."""
 _ERROR_BEHAVIOURS: Final = ("pre_operational", "none", "stopped")
@@ -32,6 +34,8 @@ _WITH_NETWORK: Final = ("network", "fused")
 """Methods that use one; `fused` is its physics alone without."""
 
 NodeId = Annotated[int, limits(ge=1, le=MAX_NODE_ID)]
+_SdoTimeout = Annotated[int, limits(ge=10, le=10_000)]
+"""Silence of a node [ms] after which an SDO request is repeated."""
 _Unsigned32 = Annotated[int, limits(ge=0, le=0xFFFF_FFFF)]
 _Given = Mapping[str, Annotated[float, limits(ge=0.0)]]
 """Free names to numbers; what the names may be is checked by the boot."""
@@ -152,6 +156,8 @@ class JointConfig:
     """The drive sends the joint's temperature (3001h by TPDO3)."""
     mandatory: bool
     """jtqd does not start without it."""
+    sdo_timeout_ms: int
+    """Silence of the drive after which an SDO request is repeated."""
     joint_data: bytes = field(default=b"", repr=False)
     """The joint file as it was read, for the log."""
 
@@ -168,6 +174,8 @@ class SensorConfig:
     """Values of 6131h that mean a torque, in Nm per unit, e.g. {"0x00560000": 1.0}: CiA 303-2 names none for Nm."""
     mandatory: bool
     """jtqd does not start without it. By default it does, and configures the sensor when it appears."""
+    sdo_timeout_ms: int
+    """As of a joint."""
 
 
 @dataclass(frozen=True)
@@ -175,8 +183,12 @@ class _Sync:
     """Section `sync`."""
 
     period_us: Annotated[int, limits(ge=500, le=100_000)] = 1000
-    counter_overflow: Annotated[int, limits(ge=2, le=240)] = 240
-    """1019h: 1 is reserved."""
+    counter_overflow: Annotated[int, limits(ge=0, le=240)] = 0
+    """1019h: 0 for SYNC without a counter byte; 1 is reserved. A drive that comes back from its power-up has 0 there."""
+
+    def __post_init__(self) -> None:
+        if self.counter_overflow == 1:
+            raise FieldError("sync", "counter_overflow", 1, "0, or a whole number 2..240")
 
 
 @dataclass(frozen=True)
@@ -196,6 +208,9 @@ class _Nodes:
     error_behaviour: Annotated[str, choice(_ERROR_BEHAVIOURS)] = "pre_operational"
     emcy_inhibit_ms: Annotated[int, limits(ge=0, le=6000)] = 10
     boot_timeout_s: Annotated[float, limits("s", ge=0.1, le=60.0)] = 2.0
+    sdo_timeout_ms: _SdoTimeout = 600
+    reset_communication: bool = True
+    """NMT reset communication before the nodes are configured."""
 
     def __post_init__(self) -> None:
         least, timeout = 2 * self.heartbeat_ms, self.timeout_ms
@@ -229,6 +244,7 @@ class _JointSection:
     sensor_channel: Annotated[int, limits(ge=1, le=2)] | None = None
     temperature: bool = False
     mandatory: bool = True
+    sdo_timeout_ms: _SdoTimeout | None = None
     network: _Network | None = None
 
 
@@ -242,6 +258,7 @@ class _SensorSection:
     given: _Given = field(default_factory=dict)
     unit_words: _Given = field(default_factory=dict)
     mandatory: bool = False
+    sdo_timeout_ms: _SdoTimeout | None = None
 
 
 @dataclass(frozen=True)
@@ -337,6 +354,7 @@ class Config:
     emcy_inhibit_ms: int
     """Time between two EMCY of jtqd (1015h)."""
     boot_timeout_s: float
+    reset_communication: bool
     estimator: EstimatorSettings
     safety: SafetySettings
     joints: tuple[JointConfig, ...]
@@ -351,6 +369,11 @@ class Config:
         """Hash of the configuration and its joint files together; networks are named in it by theirs."""
         parts = [self.sha256, *(hashlib.sha256(joint.joint_data).hexdigest() for joint in self.joints)]
         return hashlib.sha256("".join(parts).encode()).hexdigest()
+
+    @property
+    def sequence_overflow(self) -> int:
+        """Last number of a cycle in estimate PDO and log; SYNC itself carries it only with a `counter_overflow`."""
+        return self.counter_overflow or MAX_COUNTER
 
     @property
     def ring_cycles(self) -> int:
@@ -369,7 +392,7 @@ def load_config(path: Path | None) -> Config:
     mapping, data = read_yaml(path)
     file = decode(_File, Section(mapping, str(path)))
     one, two = (
-        _joint(path, number, section, file.estimator.method)
+        _joint(path, number, section, file.estimator.method, file.nodes.sdo_timeout_ms)
         for number, section in enumerate((file.joint_1, file.joint_2), start=1)
     )
     return Config(
@@ -387,17 +410,18 @@ def load_config(path: Path | None) -> Config:
         error_behaviour=_ERROR_BEHAVIOURS.index(file.nodes.error_behaviour),
         emcy_inhibit_ms=file.nodes.emcy_inhibit_ms,
         boot_timeout_s=file.nodes.boot_timeout_s,
+        reset_communication=file.nodes.reset_communication,
         estimator=file.estimator,
         safety=file.safety,
         joints=(one, two),
-        sensor=None if file.sensor is None else _sensor(file.sensor),
+        sensor=None if file.sensor is None else _sensor(file.sensor, file.nodes.sdo_timeout_ms),
         realtime=file.realtime,
         recording=file.recording,
         metrics_file=None if file.metrics is None else Path(file.metrics.file),
     )
 
 
-def _sensor(section: _SensorSection) -> SensorConfig:
+def _sensor(section: _SensorSection, sdo_timeout_ms: int) -> SensorConfig:
     return SensorConfig(
         node_id=section.node,
         identity=section.identity,
@@ -405,10 +429,11 @@ def _sensor(section: _SensorSection) -> SensorConfig:
         given=_whole(section.given),
         unit_words=dict(section.unit_words),
         mandatory=section.mandatory,
+        sdo_timeout_ms=section.sdo_timeout_ms or sdo_timeout_ms,
     )
 
 
-def _joint(path: Path, number: int, section: _JointSection, method: str) -> JointConfig:
+def _joint(path: Path, number: int, section: _JointSection, method: str, sdo_timeout_ms: int) -> JointConfig:
     """Read what a section `joint_N` names: the joint file and, where the method uses one, the network."""
     network = None if section.network is None else _network(section.network, path)
     joint_path = path.parent / section.file
@@ -435,6 +460,7 @@ def _joint(path: Path, number: int, section: _JointSection, method: str) -> Join
         sensor_channel=section.sensor_channel,
         temperature=section.temperature,
         mandatory=section.mandatory,
+        sdo_timeout_ms=section.sdo_timeout_ms or sdo_timeout_ms,
         joint_data=data,
     )
 

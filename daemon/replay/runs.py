@@ -88,7 +88,7 @@ def steps_of(records: RecordArray, config: Config) -> Steps:
     stamps = np.diff(_stamps(records)[rows])
     here = dt_ns[rows[1:]]
     apart = np.minimum(np.abs(between - here), np.abs(stamps - here)) > config.period_ns // 2
-    holes = np.diff(np.cumsum(_holes(records, config.counter_overflow))[rows]) > 0
+    holes = np.diff(np.cumsum(_holes(records, config.sequence_overflow))[rows]) > 0
     for at in np.flatnonzero((here != 0) & apart & holes).tolist():
         row = int(rows[at + 1])
         breaks.append((row, LOST))

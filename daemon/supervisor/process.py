@@ -111,11 +111,12 @@ def start_bench(config: Config, bus: str, start_child: StartChild) -> Child:
     return bench
 
 
-def boot_nodes(config: Config, bus: str, start_child: StartChild, stopped: Stopped) -> dict[str, Any] | None:
-    """Boot all nodes; the report holds their scaling. None after a stop order. Raises SupervisorError."""
-    child = start_child("jtqd.drivers.boot", [], "the boot")
+def boot_nodes(config: Config, bus: str, child: Child, stopped: Stopped) -> dict[str, Any] | None:
+    """Boot all nodes; the report holds their scaling. None after a stop order. Raises SupervisorError.
+
+    The child sends jtqd's heartbeat until its input ends.
+    """
     child.tell(boot_request(config, bus))
-    child.end_of_input()
     report = wait_for(child, stopped)
     if report is None:
         return None
@@ -284,7 +285,8 @@ class Supervisor:
         bench = start_bench(self._config, self._bus, self._child) if self._emulate else None
         socket = open_frame_socket(self._bus, service_filters(self._config), error_frames=True)
         loop = self._child("jtqd.daemon.loop.process", [json.dumps(self._loop_request())], "the loop")
-        report = boot_nodes(self._config, self._bus, self._child, self._stopped)
+        boot = self._child("jtqd.drivers.boot", [], "the boot")
+        report = boot_nodes(self._config, self._bus, boot, self._stopped)
         if report is None:
             return None
         self._send = socket.send  # from here on the nodes are ours to put back
@@ -297,6 +299,7 @@ class Supervisor:
         running = wait_for(loop, self._stopped)
         if running is None:
             return None
+        boot.end_of_input()
         for line in running["refused"]:
             self._log(f"not granted: {line}", WARNING)
         if running["refused"]:

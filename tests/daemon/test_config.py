@@ -53,7 +53,7 @@ def test_what_is_left_out_has_its_default(tmp_path: Path) -> None:
         content["inputs"] = None
 
     config = load_config(write(tmp_path, change))
-    assert (config.bitrate, config.period_ns, config.counter_overflow) == (1_000_000, 2_000_000, 240)
+    assert (config.bitrate, config.period_ns, config.counter_overflow) == (1_000_000, 2_000_000, 0)
     assert (config.input_wait_ns, config.input_deadline_ns) == (1_000_000, 1_700_000)
     assert (config.heartbeat_ms, config.heartbeat_timeout_ms, config.emcy_inhibit_ms) == (200, 600, 10)
     assert (config.error_behaviour, config.boot_timeout_s, config.sensor) == (0, 2.0, None)

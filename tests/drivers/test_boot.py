@@ -177,7 +177,7 @@ def test_a_lost_answer_is_asked_for_again(bench):
         return reply
 
     bench.drive1.answer = lose_first
-    bench.boot()
+    bench.boot(nodes=[{**NODES[0], "sdo_timeout_ms": 50}, *NODES[1:]])
     assert bench.drive1.requests.count(lost[0]) == 2
 
 
@@ -325,17 +325,32 @@ def test_never_operational(bench):
     assert str(error) == "node 2: NMT start: expected operational within 0.1 s, found pre-operational"
 
 
-def test_restart_during_boot(bench):
-    """A boot-up message after the configuration: the mapping is the default one again."""
+def restarting(node, times):
+    """Frames of a node that sends its boot-up message again each time that it has been configured, so many times."""
     sent = []
 
     def boot_up():
-        if sent or not bench.drive2.store.number(0x1017):
+        configured = [request for request in node.requests if request[:3] == bytes.fromhex("2b 17 10")]
+        if len(sent) == min(times, len(configured)):
             return []
         sent.append(1)
-        return [(0x702, b"\x00")]
+        return [(0x700 + node.node, b"\x00")]
 
-    bench.extra = boot_up
+    return boot_up
+
+
+def test_a_node_that_restarts_during_its_configuration_is_configured_again(bench):
+    """Some send their boot-up message twice; of others the mapping is the default one again."""
+    bench.extra = restarting(bench.drive2, 1)
+    report = bench.boot()
+    assert report.nodes[2].notes == (
+        "it sent its boot-up message again during its configuration: configured once more",
+    )
+    assert bench.drive2.state == 5
+
+
+def test_a_node_that_restarts_at_every_configuration_is_refused(bench):
+    bench.extra = restarting(bench.drive2, 100)
     assert str(bench.fails()).startswith("node 2: the node restarted during boot")
 
 
