@@ -7,6 +7,7 @@ cycle is late for it.
 from __future__ import annotations
 
 import json
+import math
 import os
 import select
 import signal
@@ -433,6 +434,8 @@ class Supervisor:
         for line in self._conditions.lines(now):
             # What concerns a joint may come and go with its cable: few lines of each joint reach the operator.
             kind = line.subject.name if line.definition.about in (JOINT, PDO) else ""
+            if kind and line.definition.repeat_s < math.inf:
+                kind += f" {line.definition.name}"  # what waits for the operator is not held back by the inputs' lines
             self._log_event(line.definition.topic, line.subject.node, line.text, kind, line.severity)
         self._conditions_file.write(self._conditions.present())
 

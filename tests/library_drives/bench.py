@@ -43,6 +43,7 @@ class LibraryBench:
         self.statuses: list[tuple[int, int]] = []
         self.heard: list[tuple[int, bytes]] = []
         self.logs: list[Path] = []
+        self._sync_s = 0.0
 
     def __enter__(self) -> Self:
         if self._hub:
@@ -122,7 +123,9 @@ class LibraryBench:
                 can_id, length, data = FRAME.unpack_from(self.socket.frames, 16 * n)
                 if can_id == 0x1A0:
                     self.statuses.append(decode(bytes(data)).status)
-                elif not 0x180 <= can_id < 0x580 and can_id != 0x080:
+                elif can_id == 0x080:
+                    self._sync_s = time.monotonic()
+                elif not 0x180 <= can_id < 0x580:
                     self.heard.append((can_id, bytes(data[:length])))
 
     def listen_anew(self) -> None:
@@ -152,9 +155,11 @@ class LibraryBench:
         return len(last) == _FRESH and all(each[joint] == STALE for each in last)
 
     def stop(self, jtqd: subprocess.Popen[str], number: int = signal.SIGTERM) -> int:
-        """End a jtqd by a signal and return its exit status."""
+        """End a jtqd by a signal and return its exit status, when its loop has ended as well."""
         jtqd.send_signal(number)
-        return jtqd.wait(20)
+        status = jtqd.wait(20)
+        assert self.until(lambda: time.monotonic() - self._sync_s > 0.1)
+        return status
 
     def emergencies(self, node: int) -> list[int]:
         """Codes of the EMCY messages of a node that were heard, without the resets."""
