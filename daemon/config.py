@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 from jtqd.daemon.shared import faults
-from jtqd.estimator.checked import ConfigError, Section, range_text
+from jtqd.drivers.devices import DRIVE_SCALING_OBJECTS, SENSOR_SCALING_OBJECTS, parse_key
+from jtqd.drivers.sdo import Key, label
+from jtqd.estimator.checked import ConfigError, Section, Verbatim, range_text
 from jtqd.estimator.decoder import FieldError, Text, check, choice, decode, limits
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.settings import EstimatorSettings, PlausibilityLimits
-from jtqd.models.files import read_yaml, shipped
+from jtqd.models.files import read_regular, read_yaml, shipped
 
 DEFAULT_CONFIG: Final = "bench.yaml"
 MAX_NODE_ID: Final = 127
@@ -28,6 +30,8 @@ LATCHED_BY_DEFAULT: Final = faults.NOT_FINITE | faults.BITS["motor_jump"] | faul
 """What leaves numbers behind that look right and are not: a broken estimator, an encoder that has lost its zero."""
 _ERROR_BEHAVIOURS: Final = ("pre_operational", "none", "stopped")
 """1029h:1 in the order of its values."""
+_LARGEST_NETWORK: Final = 64_000_000
+"""Bytes; ours have 50 000."""
 _NEEDED: Final = {"tob": (), "efficiency": ("efficiency",), "network": ("efficiency",), "fused": ("fused",)}
 """Sections of a joint file that a method cannot do without."""
 _WITH_NETWORK: Final = ("network", "fused")
@@ -38,7 +42,7 @@ _SdoTimeout = Annotated[int, limits(ge=10, le=10_000)]
 """Silence of a node [ms] after which an SDO request is repeated."""
 _Unsigned32 = Annotated[int, limits(ge=0, le=0xFFFF_FFFF)]
 _Given = Mapping[str, Annotated[float, limits(ge=0.0)]]
-"""Free names to numbers; what the names may be is checked by the boot."""
+"""Objects ("6091h:1") to their values; `_check_given` knows which."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,6 +237,33 @@ class _Network:
     sha256: Text
 
 
+def _check_given(where: str, given: Mapping[str, float], known: Mapping[Key, tuple[str, int]]) -> None:
+    """Refuse objects that scale nothing, and values that they cannot have. Raises FieldError."""
+    for name, value in given.items():
+        try:
+            key = parse_key(name)
+        except ValueError:
+            key = (0, 0)
+        if key not in known:
+            expected = "one of " + ", ".join(label(*each) for each in known)
+            raise FieldError(where, f"given.{name}", Verbatim("that object"), expected)
+        what, highest = known[key]
+        if value != int(value) or not value <= highest:
+            expected = f"{what}, {range_text('a whole number', 0, highest, None)}"
+            raise FieldError(where, f"given.{name}", value, expected)
+
+
+def _check_unit_words(words: Mapping[str, float]) -> None:
+    for word in words:
+        try:
+            known = 0 <= int(word, 0) <= 0xFFFF_FFFF
+        except ValueError:
+            known = False
+        if not known:
+            expected = "a word of 32 bits as in 6131h, such as 0x00560000"
+            raise FieldError("sensor", f"unit_words.{word}", Verbatim("that word"), expected)
+
+
 @dataclass(frozen=True)
 class _JointSection:
     """Section `joint_N`; files lie beside the configuration."""
@@ -247,6 +278,9 @@ class _JointSection:
     sdo_timeout_ms: _SdoTimeout | None = None
     network: _Network | None = None
 
+    def __post_init__(self) -> None:
+        _check_given("joint", self.given, DRIVE_SCALING_OBJECTS)
+
 
 @dataclass(frozen=True)
 class _SensorSection:
@@ -259,6 +293,10 @@ class _SensorSection:
     unit_words: _Given = field(default_factory=dict)
     mandatory: bool = False
     sdo_timeout_ms: _SdoTimeout | None = None
+
+    def __post_init__(self) -> None:
+        _check_given("sensor", self.given, SENSOR_SCALING_OBJECTS)
+        _check_unit_words(self.unit_words)
 
 
 @dataclass(frozen=True)
@@ -471,10 +509,7 @@ def _whole(values: Mapping[str, float]) -> dict[str, int]:
 
 def _network(section: _Network, path: Path) -> NetworkFile:
     file, expected = path.parent / section.file, section.sha256.lower()
-    try:
-        data = file.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{file}: cannot be read: {error.strerror}") from None
+    data = read_regular(file, _LARGEST_NETWORK, "a network")
     found = hashlib.sha256(data).hexdigest()
     if found != expected:
         raise ConfigError(f"{file}: sha256 of the network: found {found}, expected {expected} (from {path})")

@@ -116,7 +116,7 @@ class NodeBoot:
         name = self._objects.best_effort((0x1008, 0)) or b""
         return BootedNode(
             node_id=self._node,
-            name=name.rstrip(b"\0").decode("ascii", "replace"),
+            name=printable(name),
             device_type=device_type,
             serial=serial,
             scaling=scaling,
@@ -163,7 +163,7 @@ class NodeBoot:
         raw, key, name = self._objects.read(_SOFTWARE), _SOFTWARE, "software version"
         if raw is None:
             raise mismatch(self._node, key, name, expected=expected, found="no such object", letter="G")
-        found = raw.rstrip(b"\0").decode("ascii", "replace")
+        found = printable(raw)
         if found != expected:
             raise mismatch(self._node, key, name, expected=expected, found=found, letter="H")
 
@@ -313,6 +313,12 @@ class NodeBoot:
         if found not in (None, 1):
             expected = "1 (normal operation)"
             raise mismatch(self._node, key, "channel operating mode", expected=expected, found=str(found))
+
+
+def printable(raw: bytes) -> str:
+    """Return a text of a device as lines can show it: what is no printable ASCII character is replaced."""
+    text = raw.rstrip(b"\0").decode("ascii", "replace")
+    return "".join(each if " " <= each <= "~" else "?" for each in text)
 
 
 def reset_during_boot(node: int) -> BootError:

@@ -34,6 +34,15 @@ DRIVE_SCALING_OBJECTS: dict[Key, tuple[str, int]] = {
 UNIT_OBJECT, DECIMALS_OBJECT, OPERATING_MODE_OBJECT = 0x6131, 0x6132, 0x6112
 JOULE = 0x23  # CiA 303-2 code of J = Nm; the table has none of the newton metre that could be verified
 MAX_DECIMALS = 9
+SENSOR_SCALING_OBJECTS: dict[Key, tuple[str, int]] = {
+    (index, channel): (f"{name} of channel {channel}", highest)
+    for channel in (1, 2)
+    for index, name, highest in (
+        (UNIT_OBJECT, "physical unit", 0xFFFF_FFFF),
+        (DECIMALS_OBJECT, "decimal digits", MAX_DECIMALS),
+    )
+}
+"""Objects that scale a sensor's channels, with their largest value."""
 
 TEMPERATURE: Key = (0x3001, 0)
 """Joint temperature of a drive, I16."""

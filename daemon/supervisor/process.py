@@ -57,12 +57,16 @@ class SupervisorError(Exception):
     """The daemon cannot start; the message is one line for the operator."""
 
 
+class ConfigurationRefused(SupervisorError):  # noqa: N818 - what happens to the operator
+    """The configuration, or a file that it names, cannot be used; the message is one line for the operator."""
+
+
 def checked_load(config: Config) -> BusLoad:
-    """Return the worst-case bus load of a configuration. Raises SupervisorError if it is too high."""
+    """Return the worst-case bus load of a configuration. Raises ConfigurationRefused if it is too high."""
     try:
         return check_bus_load(bus_load_of(config))
     except BusLoadError as error:
-        raise SupervisorError(f"{config.path}: {error}") from None
+        raise ConfigurationRefused(f"{config.path}: {error}") from None
 
 
 def log_directory(record: str | None) -> Path | None:
@@ -140,7 +144,7 @@ def wait_for(child: Child, stopped: Stopped) -> dict[str, Any] | None:
 
     Raises:
         ChildError: it ended, or kept silent for too long.
-        SupervisorError: it reports that it has failed.
+        SupervisorError: it reports that it has failed; ConfigurationRefused where a file is the reason.
     """
     deadline = time.monotonic() + _WARM_UP_TIMEOUT_S
     while not stopped():
@@ -151,7 +155,8 @@ def wait_for(child: Child, stopped: Stopped) -> dict[str, Any] | None:
                 raise
             continue
         if "failed" in answer:
-            raise SupervisorError(str(answer["failed"]))
+            failure = ConfigurationRefused if answer.get("configuration") else SupervisorError
+            raise failure(str(answer["failed"]))
         return None if stopped() else answer
     return None
 
@@ -419,6 +424,7 @@ class Supervisor:
                 if self._live is not None:
                     self._live.watch()
                 node.recorder_lost = self._recorder.lost
+                reader.note_alive()
                 view, now = reader.read(), time.monotonic()
                 self._health.observe(
                     view, now, absent=self._bus_service.care.absent, cycles_lost=node.recorder_lost
