@@ -78,6 +78,7 @@ def dbc_of(
     node_names: Mapping[int, str],
     *,
     sync_producer: int,
+    sync_counter: bool = False,
 ) -> str:
     """DBC with SYNC, every PDO, and heartbeat and EMCY of every node.
 
@@ -86,11 +87,13 @@ def dbc_of(
         quantities: by (COB-ID, index, sub-index); a mapped object without one is a plain integer.
         node_names: node-ID -> name, an identifier of C.
         sync_producer: node-ID of who sends SYNC.
+        sync_counter: it has a counter byte (1019h).
 
     Raises:
         ValueError: a PDO is on no identifier of the set, or its node has no name.
     """
-    messages = [(SYNC_ID, "SYNC", 1, sync_producer, [_Signal("sync_counter", 0, 8, False, _PLAIN)])]
+    counter = [_Signal("sync_counter", 0, 8, False, _PLAIN)] if sync_counter else []
+    messages = [(SYNC_ID, "SYNC", len(counter), sync_producer, counter)]
     for pdo in pdo_maps:
         base, node = pdo.cob_id & 0x780, pdo.cob_id & 0x07F
         if base not in _PDO_NUMBER or node not in node_names:
@@ -195,7 +198,13 @@ def dbc_text(config: Config, report: Mapping[str, Any] | None) -> str:
                 maps.append(pdo)
                 if factors is not None:
                     quantities[pdo.cob_id, index, channel] = Quantity(factors[str(channel)], "Nm")
-    return dbc_of(maps, quantities, names, sync_producer=config.node_id)
+    return dbc_of(
+        maps,
+        quantities,
+        names,
+        sync_producer=config.node_id,
+        sync_counter=config.counter_overflow > 0,
+    )
 
 
 def _scaling(report: Mapping[str, Any] | None, node: int) -> Any:
