@@ -9,12 +9,19 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 from jtqd.daemon.shared import faults
-from jtqd.drivers.devices import DRIVE_SCALING_OBJECTS, SENSOR_SCALING_OBJECTS, parse_key
+from jtqd.drivers.devices import (
+    CIA_402,
+    DRIVE_SCALING_OBJECTS,
+    SENSOR_SCALING_OBJECTS,
+    DriveObject,
+    DriveObjects,
+    parse_key,
+)
 from jtqd.drivers.sdo import Key, label
 from jtqd.estimator.checked import ConfigError, Section, Verbatim, range_text
 from jtqd.estimator.decoder import FieldError, Text, check, choice, decode, limits
@@ -32,6 +39,7 @@ _ERROR_BEHAVIOURS: Final = ("pre_operational", "none", "stopped")
 """1029h:1 in the order of its values."""
 _LARGEST_NETWORK: Final = 64_000_000
 """Bytes; ours have 50 000."""
+_PDO_BITS: Final = 64
 _NEEDED: Final = {"tob": (), "efficiency": ("efficiency",), "network": ("efficiency",), "fused": ("fused",)}
 """Sections of a joint file that a method cannot do without."""
 _WITH_NETWORK: Final = ("network", "fused")
@@ -162,6 +170,8 @@ class JointConfig:
     """jtqd does not start without it."""
     sdo_timeout_ms: int
     """Silence of the drive after which an SDO request is repeated."""
+    objects: DriveObjects
+    """Which objects of the drive are mapped, with sign and factor."""
     joint_data: bytes = field(default=b"", repr=False)
     """The joint file as it was read, for the log."""
 
@@ -264,6 +274,81 @@ def _check_unit_words(words: Mapping[str, float]) -> None:
             raise FieldError("sensor", f"unit_words.{word}", Verbatim("that word"), expected)
 
 
+_TYPES: Final = {"I16": (16, True), "I32": (32, True), "U16": (16, False), "U32": (32, False)}
+_Index = Annotated[int, limits(ge=0x1000, le=0xFFFF)]
+_SubIndex = Annotated[int, limits(ge=0, le=254)]
+
+
+@dataclass(frozen=True)
+class _Object:
+    """One object in section `joint_N.objects`; what is left out is as in CiA 402."""
+
+    index: _Index | None = None
+    sub: _SubIndex | None = None
+    type: Annotated[str, choice(_TYPES)] | None = None
+    sign: Annotated[int, limits(ge=-1, le=1)] = 1
+    factor: Annotated[float, limits(gt=0.0)] | None = None
+    """SI units (rad, rad/s, A) per unit; without it the drive's scaling objects count."""
+
+    def __post_init__(self) -> None:
+        if self.sign == 0:
+            raise FieldError("object", "sign", 0, "1 or -1")
+
+    def of_drive(self, standard: DriveObject) -> DriveObject:
+        """Return the object of the drive; `standard` is that of CiA 402."""
+        bits, signed = _TYPES[self.type] if self.type else (standard.bits, standard.signed)
+        return DriveObject(
+            standard.index if self.index is None else self.index,
+            (standard.subindex if self.index is None else 0) if self.sub is None else self.sub,
+            bits,
+            signed,
+            self.sign,
+            self.factor,
+        )
+
+
+@dataclass(frozen=True)
+class _Objects:
+    """Section `joint_N.objects`."""
+
+    motor_position: _Object = _Object()
+    link_position: _Object = _Object()
+    motor_velocity: _Object = _Object()
+    current: _Object = _Object()
+    statusword: _Object = _Object()
+
+    def of_drive(self, joint: str, path: Path) -> DriveObjects:
+        """Return the objects of the drive. Raises ConfigError for what cannot be mapped or scaled."""
+        where = f"{path}: key '{joint}.objects"
+        found = {}
+        for each in fields(self):
+            standard: DriveObject = getattr(CIA_402, each.name)
+            chosen = found[each.name] = getattr(self, each.name).of_drive(standard)
+            another = (chosen.index, chosen.subindex) != (standard.index, standard.subindex)
+            if each.name == "statusword":
+                if chosen.bits != standard.bits or chosen.sign != 1 or chosen.factor is not None:
+                    raise ConfigError(
+                        f"{where}.statusword': expected an object of type U16, no sign, no factor"
+                    )
+            elif another and chosen.factor is None:
+                unit = "A" if each.name == "current" else "rad/s" if "velocity" in each.name else "rad"
+                raise ConfigError(
+                    f"{where}.{each.name}.factor': missing, expected {unit} per unit: "
+                    f"CiA 402 scales {label(standard.index, standard.subindex)} alone"
+                )
+            if "position" in each.name and (chosen.bits, chosen.signed) != (32, True):
+                raise ConfigError(
+                    f"{where}.{each.name}.type': expected I32: a position rolls over at 32 bits"
+                )
+        objects = DriveObjects(**found)
+        bits = objects.motor_velocity.bits + objects.current.bits + objects.statusword.bits
+        if bits > _PDO_BITS:
+            raise ConfigError(
+                f"{where}': found {bits} bits of velocity, current and statusword, expected at most {_PDO_BITS}: one PDO"
+            )
+        return objects
+
+
 @dataclass(frozen=True)
 class _JointSection:
     """Section `joint_N`; files lie beside the configuration."""
@@ -276,6 +361,7 @@ class _JointSection:
     temperature: bool = False
     mandatory: bool = True
     sdo_timeout_ms: _SdoTimeout | None = None
+    objects: _Objects = _Objects()
     network: _Network | None = None
 
     def __post_init__(self) -> None:
@@ -499,6 +585,7 @@ def _joint(path: Path, number: int, section: _JointSection, method: str, sdo_tim
         temperature=section.temperature,
         mandatory=section.mandatory,
         sdo_timeout_ms=section.sdo_timeout_ms or sdo_timeout_ms,
+        objects=section.objects.of_drive(f"joint_{number}", path),
         joint_data=data,
     )
 

@@ -11,18 +11,21 @@ Only "bus" and "nodes" with "node" and "kind" are needed. `given` replaces objec
 a drive asks for TPDO3 with 3001h; a node that is not `mandatory` may be absent. "error_behaviour" is 1029h:1; without it
 the nodes keep theirs. "reset": NMT reset communication comes first. `sdo_timeout_ms`: silence of the node after which a
 request is repeated.
+`objects` of a drive: fields of `devices.DriveObjects`, each with those of `DriveObject`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 from jtqd.drivers.boot_procedure import BootedNode, BusSettings
 from jtqd.drivers.devices import (
     JTQD_NODE,
     SYNC_COB_ID,
+    DriveObject,
+    DriveObjects,
     DriveProfile,
     Identity,
     Profile,
@@ -45,7 +48,7 @@ _TOP = {
 }
 _SYNC = {"cob_id", "counter_overflow", "check_foreign"}
 _NODE = {"node", "kind", "identity", "channels", "given", "unit_words", "temperature", "mandatory"}
-_NODE |= {"sdo_timeout_ms"}
+_NODE |= {"sdo_timeout_ms", "objects"}
 _OPTIONAL_TIMEOUT_S = 0.5
 """An optional node is not waited for any longer: it is booted again when it appears."""
 
@@ -143,7 +146,8 @@ def _profile(raw: object, where: str) -> Profile:
     kind = node.get("kind")
     if kind == "drive":
         temperature = _boolean(node, "temperature", default=False, where=where)
-        return DriveProfile(number, identity, given, temperature)
+        objects = _objects(node.get("objects"), f"{where}.objects")
+        return DriveProfile(number, identity, given, temperature, objects)
     if kind != "sensor":
         raise RequestError(f"{where}.kind: found {kind!r}, expected 'drive' or 'sensor'")
     channels = node.get("channels", [1])
@@ -159,6 +163,21 @@ def _identity(raw: object, where: str) -> Identity:
     if software is not None and not isinstance(software, str):
         raise RequestError(f"{where}.software: found {software!r}, expected a text")
     return Identity(**_integers(mapping, where, fields), software=software)
+
+
+def _objects(raw: object, where: str) -> DriveObjects:
+    """Return the objects of a drive from what `asdict` made of them; None: those of CiA 402."""
+    if raw is None:
+        return DriveObjects()
+    names = {each.name for each in fields(DriveObjects)}
+    known = {each.name for each in fields(DriveObject)}
+    found = _mapping(raw, where, names)
+    try:
+        return DriveObjects(
+            **{name: DriveObject(**_mapping(each, f"{where}.{name}", known)) for name, each in found.items()}
+        )
+    except TypeError as error:
+        raise RequestError(f"{where}: {error}") from error
 
 
 def _given(raw: object, where: str) -> dict[Key, int]:

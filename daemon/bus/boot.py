@@ -35,6 +35,7 @@ def boot_request(
             "given": joint.given,
             "temperature": joint.temperature,
             "sdo_timeout_ms": joint.sdo_timeout_ms,
+            "objects": asdict(joint.objects),
             "mandatory": joint.mandatory or only is not None,
         }
         for joint in config.joints

@@ -168,17 +168,21 @@ def dbc_text(config: Config, report: Mapping[str, Any] | None) -> str:
     for joint in config.joints:
         node = joint.node_id
         names[node] = f"drive_{joint.number}"
-        position, motion = drive_tpdo1(node), drive_tpdo2(node)
+        objects = joint.objects
+        position, motion = drive_tpdo1(node, objects), drive_tpdo2(node, objects)
         maps += [position, motion]
         scaling = _scaling(report, node)
         quantities |= (
             {}
             if scaling is None
             else {
-                (position.cob_id, 0x6064, 0): Quantity(scaling["motor_rad_per_count"], "rad"),
-                (position.cob_id, 0x60E4, 1): Quantity(scaling["link_rad_per_count"], "rad"),
-                (motion.cob_id, 0x606C, 0): Quantity(scaling["motor_rad_s_per_unit"], "rad/s"),
-                (motion.cob_id, 0x6078, 0): Quantity(scaling["ampere_per_unit"], "A"),
+                (pdo.cob_id, each.index, each.subindex): Quantity(scaling[factor], unit)
+                for pdo, each, factor, unit in (
+                    (position, objects.motor_position, "motor_rad_per_count", "rad"),
+                    (position, objects.link_position, "link_rad_per_count", "rad"),
+                    (motion, objects.motor_velocity, "motor_rad_s_per_unit", "rad/s"),
+                    (motion, objects.current, "ampere_per_unit", "A"),
+                )
             }
         )
         if joint.temperature:

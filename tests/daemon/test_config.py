@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from jtqd.daemon.config import Identity, Realtime, RecordingSettings, SafetySettings, load_config
+from jtqd.drivers.devices import CIA_402, DriveObject
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import shipped
@@ -110,6 +111,25 @@ def drop(key: str) -> Any:
         (put("joint_1.given", {"6091h:1": "a"}), ["joint_1.given.6091h:1", "found 'a'"]),
         (put("sensor.given", {"6132h:1": 30}), ["sensor.given.6132h:1", "found 30", "from 0 to 9"]),
         (put("sensor.unit_words", {"Nm": 1.0}), ["sensor.unit_words.Nm", "0x00560000"]),
+        (
+            put("joint_1.objects", {"current": {"index": 0x2030}}),
+            ["objects.current.factor", "A per unit", "6078h:0"],
+        ),
+        (put("joint_1.objects", {"curent": {}}), ["joint_1.objects.curent", "did you mean 'current'"]),
+        (
+            put("joint_1.objects", {"current": {"sign": 0}}),
+            ["joint_1.objects.current.sign", "found 0", "1 or -1"],
+        ),
+        (
+            put("joint_1.objects", {"current": {"type": "I32"}}),
+            ["joint_1.objects", "found 80 bits", "at most 64"],
+        ),
+        (
+            put("joint_1.objects", {"motor_position": {"type": "I16"}}),
+            ["motor_position.type", "expected I32"],
+        ),
+        (put("joint_1.objects", {"statusword": {"sign": -1}}), ["objects.statusword", "no sign"]),
+        (put("joint_1.objects", {"current": {"index": 6}}), ["joint_1.objects.current.index", "found 6"]),
         (put("joint_1.sdo_timeout_ms", 1), ["joint_1.sdo_timeout_ms", "found 1"]),
         (put("joint_1.network", {"file": "/dev/zero", "sha256": "00"}), ["/dev/zero", "no regular file"]),
         (put("metrics", {"file": "a\0b"}), ["metrics.file", "printable"]),
@@ -131,6 +151,20 @@ def test_mistakes_are_named(tmp_path: Path, change: Any, words: list[str]) -> No
     assert "\n" not in message
     for word in words:
         assert word in message, message
+
+
+def test_objects_of_a_drive_are_those_of_cia_402_with_what_the_file_says(tmp_path: Path) -> None:
+    current = {"index": 0x2030, "sub": 2, "type": "I32", "sign": -1, "factor": 0.001}
+    velocity = {"type": "I16", "index": 0x2031, "factor": 0.1}
+    change = put(
+        "joint_2.objects", {"current": current, "motor_velocity": velocity, "link_position": {"sign": -1}}
+    )
+    one, two = (joint.objects for joint in load_config(write(tmp_path, change)).joints)
+    assert one == CIA_402
+    assert two.current == DriveObject(0x2030, 2, 32, True, -1, 0.001)
+    assert two.motor_velocity == DriveObject(0x2031, 0, 16, True, 1, 0.1)
+    assert two.link_position == DriveObject(0x60E4, 1, 32, True, -1)
+    assert two.motor_position == CIA_402.motor_position
 
 
 def test_files_that_would_never_end_are_not_read(tmp_path: Path) -> None:

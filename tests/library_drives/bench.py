@@ -30,7 +30,7 @@ class LibraryBench:
     """Hub (or a SocketCAN interface), drives 1 and 2, sensor 3. Context manager; `start` starts a jtqd.
 
     Attributes:
-        statuses: of both joints, of the estimate PDOs since the last `listen_anew`.
+        statuses, torques_nm: of both joints, of the estimate PDOs since the last `listen_anew`.
         heard: every other frame but SYNC and inputs.
     """
 
@@ -41,6 +41,7 @@ class LibraryBench:
         self.bus = f"unix:{directory / 'hub'}" if bus is None else bus
         self._manners = manners
         self.statuses: list[tuple[int, int]] = []
+        self.torques_nm: list[tuple[float | None, float | None]] = []
         self.heard: list[tuple[int, bytes]] = []
         self.logs: list[Path] = []
         self._sync_s = 0.0
@@ -122,7 +123,9 @@ class LibraryBench:
             for n in range(count):
                 can_id, length, data = FRAME.unpack_from(self.socket.frames, 16 * n)
                 if can_id == 0x1A0:
-                    self.statuses.append(decode(bytes(data)).status)
+                    estimate = decode(bytes(data))
+                    self.statuses.append(estimate.status)
+                    self.torques_nm.append(estimate.torque_nm)
                 elif can_id == 0x080:
                     self._sync_s = time.monotonic()
                 elif not 0x180 <= can_id < 0x580:
@@ -132,6 +135,7 @@ class LibraryBench:
         """Forget what was heard."""
         self.listen()
         self.statuses.clear()
+        self.torques_nm.clear()
         self.heard.clear()
 
     def until(self, condition: Callable[[], bool], longest_s: float = 20.0) -> bool:

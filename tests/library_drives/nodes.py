@@ -408,10 +408,12 @@ class _Local(canopen.LocalNode):  # type: ignore[misc]
 
 
 class StrictDrive(StrictNode):
-    """A CiA 402 drive whose motor swings to and fro."""
+    """A CiA 402 drive whose motor swings to and fro; its maker's own objects count mA, backwards, and rpm."""
 
     device_type = 0x00020192
     process: ClassVar = {
+        (0x2030, 0): (INTEGER16, 0, "ro"),
+        (0x2031, 0): (INTEGER16, 0, "ro"),
         (0x6041, 0): (UNSIGNED16, 0x1237, "ro"),
         (0x6061, 0): (UNSIGNED8, 9, "ro"),
         (0x6064, 0): (INTEGER32, 0, "ro"),
@@ -439,6 +441,8 @@ class StrictDrive(StrictNode):
         phase = 2.0 * math.pi * 0.2 * now
         turns, per_s = math.sin(phase), 2.0 * math.pi * 0.2 * math.cos(phase)
         return {
+            0x2030: round(-1000 * math.sin(phase)),
+            0x2031: round(60 * per_s),
             0x6041: 0x1237,
             0x6061: 9,
             0x6064: round(MOTOR_COUNTS * turns),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import tempfile
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from jtqd.models.files import shipped
 from tests.library_drives.bench import LibraryBench
 
 
@@ -133,6 +135,23 @@ def test_devices_differ(manners: tuple[str, ...]) -> None:
         if "1016" in manners[-1]:
             assert "1016h:1 consumer heartbeat time: no such object" in bench.said()
         assert bench.stop(jtqd) == 0
+
+
+def test_objects_of_the_makers_own(bench: LibraryBench) -> None:
+    """Joint 1 by its drive's mA, counted backwards, and rpm; joint 2, with the same motion, by CiA 402."""
+    objects = {
+        "current": {"index": 0x2030, "sign": -1, "factor": 0.001},
+        "motor_velocity": {"index": 0x2031, "type": "I16", "factor": 2.0 * math.pi / 60.0},
+    }
+    jtqd = bench.start(joint_1={"objects": objects}, joint_2={"file": str(shipped("joint1.yaml"))})
+    assert bench.until(bench.both_used), bench.said()
+    assert bench.until(lambda: len(bench.torques_nm) > 600)
+    pairs = [(one, two) for one, two in bench.torques_nm[100:] if one is not None and two is not None]
+    assert len(pairs) > 300
+    assert max(abs(one) for one, _ in pairs) > 2.0
+    apart = sorted(abs(one - two) for one, two in pairs)  # at a reversal one rpm is another quadrant
+    assert apart[round(0.8 * len(apart))] < 0.3
+    assert bench.stop(jtqd) == 0
 
 
 @pytest.mark.campaign
