@@ -189,7 +189,38 @@ class NodeBoot:
             if pdo is None:
                 self._switch_off(0x1800 + number - 1)
             else:
-                self._configure_pdo(0x1800 + number - 1, pdo)
+                self._configure_or_accept(0x1800 + number - 1, pdo)
+
+    def _configure_or_accept(self, communication: int, pdo: PdoMap) -> None:
+        """Configure a PDO; of a drive whose mapping is fixed, accept one that is as it should be."""
+        try:
+            self._configure_pdo(communication, pdo)
+        except BootError as refused:
+            written = refused.letter == "J" and refused.expected.endswith(" accepted")
+            if not (written and refused.object.startswith("1A")):
+                raise
+            found = self._mapped(communication)
+            self._restore(communication, pdo)
+            if found != (pdo.transmission_type, *pdo.words):
+                words = ", ".join(f"0x{word:08X}" for word in found[1:]) or "nothing"
+                text = f"{label(communication + 0x200)} maps {words} with transmission type {found[0]}"
+                raise refused.explained(text) from refused
+            self._notes.append(f"TPDO {pdo.cob_id:03X}h is fixed, and as it should be ({refused.detail})")
+
+    def _mapped(self, communication: int) -> tuple[int, ...]:
+        """Return transmission type and mapping words of a PDO."""
+        objects, mapping = self._objects, communication + 0x200
+        count = objects.number((mapping, 0), 1)
+        words = (objects.number((mapping, entry), 4) for entry in range(1, min(count, 8) + 1))
+        return (objects.number((communication, 2), 1), *words)
+
+    def _restore(self, communication: int, pdo: PdoMap) -> None:
+        """Switch a PDO on again that was switched off to be mapped."""
+        key = (communication, 1)
+        found = self._objects.number(key, 4)
+        enabled = found & NO_RTR | pdo.cob_id & CAN_ID
+        if found != enabled:
+            self._objects.put(key, enabled, 4, "COB-ID")
 
     def _switch_off(self, communication: int) -> None:
         cob_id = self._objects.optional_number((communication, 1), 4)

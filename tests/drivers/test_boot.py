@@ -228,7 +228,8 @@ def test_refused_mapping(bench):
     bench.drive1.answer = refuse
     error = bench.fails()
     assert str(error) == (
-        "node 1: 1A00h:1: write of 0x60640020 refused: object cannot be mapped (06040041h) (status J)"
+        "node 1: 1A00h:1: write of 0x60640020 refused: object cannot be mapped (06040041h); "
+        "1A00h:0 maps nothing with transmission type 255 (status J)"
     )
     assert error.letter == "J"
 
@@ -581,3 +582,29 @@ def test_what_is_cosmetic_or_optional_fails_nothing(bench):
 def test_a_name_that_steers_a_terminal_is_replaced(bench):
     bench.drive1.store.set_text(0x1008, 0, "\x1b[2Jdrive")
     assert bench.boot().nodes[1].name == "?[2Jdrive"
+
+
+def fixed(node, *words):
+    """Make the mapping of its TPDO1 read-only, with these words."""
+    node.store.set_number(0x1A00, 0, len(words))
+    for entry, word in enumerate(words, 1):
+        node.store.set_number(0x1A00, entry, word)
+    node.store.set_number(0x1800, 2, 1)
+    for key, entry in node.store.entries.items():
+        if key[0] == 0x1A00:
+            node.store.entries[key] = dataclasses.replace(entry, access="ro")
+
+
+def test_a_mapping_that_is_fixed_in_the_drive_is_used_where_it_is_the_right_one(bench):
+    fixed(bench.drive1, *drive_tpdo1(1).words)
+    node = bench.boot().nodes[1]
+    assert bench.drive1.state == 5
+    assert bench.drive1.store.number(0x1800, 1) == 0x4000_0181, "it is on"
+    assert node.notes[0].startswith("TPDO 181h is fixed, and as it should be (1A00h:0: write of 0x00 refused")
+
+
+def test_a_mapping_that_is_fixed_otherwise_is_named(bench):
+    fixed(bench.drive1, 0x6064_0020, 0x606C_0020)
+    said = str(bench.fails())
+    assert "node 1: 1A00h:0: write of 0x00 refused: object is read only (06010002h)" in said
+    assert "1A00h:0 maps 0x60640020, 0x606C0020 with transmission type 1" in said
