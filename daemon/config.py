@@ -9,32 +9,48 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 from jtqd.daemon.shared import faults
-from jtqd.estimator.checked import ConfigError, Section, range_text
+from jtqd.drivers.devices import (
+    CIA_402,
+    DRIVE_SCALING_OBJECTS,
+    SENSOR_SCALING_OBJECTS,
+    DriveObject,
+    DriveObjects,
+    parse_key,
+)
+from jtqd.drivers.sdo import Key, label
+from jtqd.estimator.checked import ConfigError, Section, Verbatim, range_text
 from jtqd.estimator.decoder import FieldError, Text, check, choice, decode, limits
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.settings import EstimatorSettings, PlausibilityLimits
-from jtqd.models.files import read_yaml, shipped
+from jtqd.models.files import read_regular, read_yaml, shipped
 
 DEFAULT_CONFIG: Final = "bench.yaml"
 MAX_NODE_ID: Final = 127
+MAX_COUNTER: Final = 240
+"""Of SYNC (CiA 301, 7.2.5.3)."""
 LATCHED_BY_DEFAULT: Final = faults.NOT_FINITE | faults.BITS["motor_jump"] | faults.BITS["link_jump"]
 """What leaves numbers behind that look right and are not: a broken estimator, an encoder that has lost its zero."""
 _ERROR_BEHAVIOURS: Final = ("pre_operational", "none", "stopped")
 """1029h:1 in the order of its values."""
+_LARGEST_NETWORK: Final = 64_000_000
+"""Bytes; ours have 50 000."""
+_PDO_BITS: Final = 64
 _NEEDED: Final = {"tob": (), "efficiency": ("efficiency",), "network": ("efficiency",), "fused": ("fused",)}
 """Sections of a joint file that a method cannot do without."""
 _WITH_NETWORK: Final = ("network", "fused")
 """Methods that use one; `fused` is its physics alone without."""
 
 NodeId = Annotated[int, limits(ge=1, le=MAX_NODE_ID)]
+_SdoTimeout = Annotated[int, limits(ge=10, le=10_000)]
+"""Silence of a node [ms] after which an SDO request is repeated."""
 _Unsigned32 = Annotated[int, limits(ge=0, le=0xFFFF_FFFF)]
 _Given = Mapping[str, Annotated[float, limits(ge=0.0)]]
-"""Free names to numbers; what the names may be is checked by the boot."""
+"""Objects ("6091h:1") to their values; `_check_given` knows which."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +168,10 @@ class JointConfig:
     """The drive sends the joint's temperature (3001h by TPDO3)."""
     mandatory: bool
     """jtqd does not start without it."""
+    sdo_timeout_ms: int
+    """Silence of the drive after which an SDO request is repeated."""
+    objects: DriveObjects
+    """Which objects of the drive are mapped, with sign and factor."""
     joint_data: bytes = field(default=b"", repr=False)
     """The joint file as it was read, for the log."""
 
@@ -168,6 +188,8 @@ class SensorConfig:
     """Values of 6131h that mean a torque, in Nm per unit, e.g. {"0x00560000": 1.0}: CiA 303-2 names none for Nm."""
     mandatory: bool
     """jtqd does not start without it. By default it does, and configures the sensor when it appears."""
+    sdo_timeout_ms: int
+    """As of a joint."""
 
 
 @dataclass(frozen=True)
@@ -175,8 +197,12 @@ class _Sync:
     """Section `sync`."""
 
     period_us: Annotated[int, limits(ge=500, le=100_000)] = 1000
-    counter_overflow: Annotated[int, limits(ge=2, le=240)] = 240
-    """1019h: 1 is reserved."""
+    counter_overflow: Annotated[int, limits(ge=0, le=240)] = 0
+    """1019h: 0 for SYNC without a counter byte; 1 is reserved. A drive that comes back from its power-up has 0 there."""
+
+    def __post_init__(self) -> None:
+        if self.counter_overflow == 1:
+            raise FieldError("sync", "counter_overflow", 1, "0, or a whole number 2..240")
 
 
 @dataclass(frozen=True)
@@ -196,6 +222,9 @@ class _Nodes:
     error_behaviour: Annotated[str, choice(_ERROR_BEHAVIOURS)] = "pre_operational"
     emcy_inhibit_ms: Annotated[int, limits(ge=0, le=6000)] = 10
     boot_timeout_s: Annotated[float, limits("s", ge=0.1, le=60.0)] = 2.0
+    sdo_timeout_ms: _SdoTimeout = 600
+    reset_communication: bool = True
+    """NMT reset communication before the nodes are configured."""
 
     def __post_init__(self) -> None:
         least, timeout = 2 * self.heartbeat_ms, self.timeout_ms
@@ -218,6 +247,108 @@ class _Network:
     sha256: Text
 
 
+def _check_given(where: str, given: Mapping[str, float], known: Mapping[Key, tuple[str, int]]) -> None:
+    """Refuse objects that scale nothing, and values that they cannot have. Raises FieldError."""
+    for name, value in given.items():
+        try:
+            key = parse_key(name)
+        except ValueError:
+            key = (0, 0)
+        if key not in known:
+            expected = "one of " + ", ".join(label(*each) for each in known)
+            raise FieldError(where, f"given.{name}", Verbatim("that object"), expected)
+        what, highest = known[key]
+        if value != int(value) or not value <= highest:
+            expected = f"{what}, {range_text('a whole number', 0, highest, None)}"
+            raise FieldError(where, f"given.{name}", value, expected)
+
+
+def _check_unit_words(words: Mapping[str, float]) -> None:
+    for word in words:
+        try:
+            known = 0 <= int(word, 0) <= 0xFFFF_FFFF
+        except ValueError:
+            known = False
+        if not known:
+            expected = "a word of 32 bits as in 6131h, such as 0x00560000"
+            raise FieldError("sensor", f"unit_words.{word}", Verbatim("that word"), expected)
+
+
+_TYPES: Final = {"I16": (16, True), "I32": (32, True), "U16": (16, False), "U32": (32, False)}
+_Index = Annotated[int, limits(ge=0x1000, le=0xFFFF)]
+_SubIndex = Annotated[int, limits(ge=0, le=254)]
+
+
+@dataclass(frozen=True)
+class _Object:
+    """One object in section `joint_N.objects`; what is left out is as in CiA 402."""
+
+    index: _Index | None = None
+    sub: _SubIndex | None = None
+    type: Annotated[str, choice(_TYPES)] | None = None
+    sign: Annotated[int, limits(ge=-1, le=1)] = 1
+    factor: Annotated[float, limits(gt=0.0)] | None = None
+    """SI units (rad, rad/s, A) per unit; without it the drive's scaling objects count."""
+
+    def __post_init__(self) -> None:
+        if self.sign == 0:
+            raise FieldError("object", "sign", 0, "1 or -1")
+
+    def of_drive(self, standard: DriveObject) -> DriveObject:
+        """Return the object of the drive; `standard` is that of CiA 402."""
+        bits, signed = _TYPES[self.type] if self.type else (standard.bits, standard.signed)
+        return DriveObject(
+            standard.index if self.index is None else self.index,
+            (standard.subindex if self.index is None else 0) if self.sub is None else self.sub,
+            bits,
+            signed,
+            self.sign,
+            self.factor,
+        )
+
+
+@dataclass(frozen=True)
+class _Objects:
+    """Section `joint_N.objects`."""
+
+    motor_position: _Object = _Object()
+    link_position: _Object = _Object()
+    motor_velocity: _Object = _Object()
+    current: _Object = _Object()
+    statusword: _Object = _Object()
+
+    def of_drive(self, joint: str, path: Path) -> DriveObjects:
+        """Return the objects of the drive. Raises ConfigError for what cannot be mapped or scaled."""
+        where = f"{path}: key '{joint}.objects"
+        found = {}
+        for each in fields(self):
+            standard: DriveObject = getattr(CIA_402, each.name)
+            chosen = found[each.name] = getattr(self, each.name).of_drive(standard)
+            another = (chosen.index, chosen.subindex) != (standard.index, standard.subindex)
+            if each.name == "statusword":
+                if chosen.bits != standard.bits or chosen.sign != 1 or chosen.factor is not None:
+                    raise ConfigError(
+                        f"{where}.statusword': expected an object of type U16, no sign, no factor"
+                    )
+            elif another and chosen.factor is None:
+                unit = "A" if each.name == "current" else "rad/s" if "velocity" in each.name else "rad"
+                raise ConfigError(
+                    f"{where}.{each.name}.factor': missing, expected {unit} per unit: "
+                    f"CiA 402 scales {label(standard.index, standard.subindex)} alone"
+                )
+            if "position" in each.name and (chosen.bits, chosen.signed) != (32, True):
+                raise ConfigError(
+                    f"{where}.{each.name}.type': expected I32: a position rolls over at 32 bits"
+                )
+        objects = DriveObjects(**found)
+        bits = objects.motor_velocity.bits + objects.current.bits + objects.statusword.bits
+        if bits > _PDO_BITS:
+            raise ConfigError(
+                f"{where}': found {bits} bits of velocity, current and statusword, expected at most {_PDO_BITS}: one PDO"
+            )
+        return objects
+
+
 @dataclass(frozen=True)
 class _JointSection:
     """Section `joint_N`; files lie beside the configuration."""
@@ -229,7 +360,12 @@ class _JointSection:
     sensor_channel: Annotated[int, limits(ge=1, le=2)] | None = None
     temperature: bool = False
     mandatory: bool = True
+    sdo_timeout_ms: _SdoTimeout | None = None
+    objects: _Objects = _Objects()
     network: _Network | None = None
+
+    def __post_init__(self) -> None:
+        _check_given("joint", self.given, DRIVE_SCALING_OBJECTS)
 
 
 @dataclass(frozen=True)
@@ -242,6 +378,11 @@ class _SensorSection:
     given: _Given = field(default_factory=dict)
     unit_words: _Given = field(default_factory=dict)
     mandatory: bool = False
+    sdo_timeout_ms: _SdoTimeout | None = None
+
+    def __post_init__(self) -> None:
+        _check_given("sensor", self.given, SENSOR_SCALING_OBJECTS)
+        _check_unit_words(self.unit_words)
 
 
 @dataclass(frozen=True)
@@ -337,6 +478,7 @@ class Config:
     emcy_inhibit_ms: int
     """Time between two EMCY of jtqd (1015h)."""
     boot_timeout_s: float
+    reset_communication: bool
     estimator: EstimatorSettings
     safety: SafetySettings
     joints: tuple[JointConfig, ...]
@@ -351,6 +493,11 @@ class Config:
         """Hash of the configuration and its joint files together; networks are named in it by theirs."""
         parts = [self.sha256, *(hashlib.sha256(joint.joint_data).hexdigest() for joint in self.joints)]
         return hashlib.sha256("".join(parts).encode()).hexdigest()
+
+    @property
+    def sequence_overflow(self) -> int:
+        """Last number of a cycle in estimate PDO and log; SYNC itself carries it only with a `counter_overflow`."""
+        return self.counter_overflow or MAX_COUNTER
 
     @property
     def ring_cycles(self) -> int:
@@ -369,7 +516,7 @@ def load_config(path: Path | None) -> Config:
     mapping, data = read_yaml(path)
     file = decode(_File, Section(mapping, str(path)))
     one, two = (
-        _joint(path, number, section, file.estimator.method)
+        _joint(path, number, section, file.estimator.method, file.nodes.sdo_timeout_ms)
         for number, section in enumerate((file.joint_1, file.joint_2), start=1)
     )
     return Config(
@@ -387,17 +534,18 @@ def load_config(path: Path | None) -> Config:
         error_behaviour=_ERROR_BEHAVIOURS.index(file.nodes.error_behaviour),
         emcy_inhibit_ms=file.nodes.emcy_inhibit_ms,
         boot_timeout_s=file.nodes.boot_timeout_s,
+        reset_communication=file.nodes.reset_communication,
         estimator=file.estimator,
         safety=file.safety,
         joints=(one, two),
-        sensor=None if file.sensor is None else _sensor(file.sensor),
+        sensor=None if file.sensor is None else _sensor(file.sensor, file.nodes.sdo_timeout_ms),
         realtime=file.realtime,
         recording=file.recording,
         metrics_file=None if file.metrics is None else Path(file.metrics.file),
     )
 
 
-def _sensor(section: _SensorSection) -> SensorConfig:
+def _sensor(section: _SensorSection, sdo_timeout_ms: int) -> SensorConfig:
     return SensorConfig(
         node_id=section.node,
         identity=section.identity,
@@ -405,10 +553,11 @@ def _sensor(section: _SensorSection) -> SensorConfig:
         given=_whole(section.given),
         unit_words=dict(section.unit_words),
         mandatory=section.mandatory,
+        sdo_timeout_ms=section.sdo_timeout_ms or sdo_timeout_ms,
     )
 
 
-def _joint(path: Path, number: int, section: _JointSection, method: str) -> JointConfig:
+def _joint(path: Path, number: int, section: _JointSection, method: str, sdo_timeout_ms: int) -> JointConfig:
     """Read what a section `joint_N` names: the joint file and, where the method uses one, the network."""
     network = None if section.network is None else _network(section.network, path)
     joint_path = path.parent / section.file
@@ -435,6 +584,8 @@ def _joint(path: Path, number: int, section: _JointSection, method: str) -> Join
         sensor_channel=section.sensor_channel,
         temperature=section.temperature,
         mandatory=section.mandatory,
+        sdo_timeout_ms=section.sdo_timeout_ms or sdo_timeout_ms,
+        objects=section.objects.of_drive(f"joint_{number}", path),
         joint_data=data,
     )
 
@@ -445,10 +596,7 @@ def _whole(values: Mapping[str, float]) -> dict[str, int]:
 
 def _network(section: _Network, path: Path) -> NetworkFile:
     file, expected = path.parent / section.file, section.sha256.lower()
-    try:
-        data = file.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{file}: cannot be read: {error.strerror}") from None
+    data = read_regular(file, _LARGEST_NETWORK, "a network")
     found = hashlib.sha256(data).hexdigest()
     if found != expected:
         raise ConfigError(f"{file}: sha256 of the network: found {found}, expected {expected} (from {path})")

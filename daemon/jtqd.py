@@ -24,7 +24,7 @@ _EXAMPLES = """examples:
   jtqd --bus can0 --config /etc/jtqd/arm.yaml --record /var/log/jtqd
   jtqd --bus can0 --live                open ws://127.0.0.1:8765 in Foxglove, with the layout of `jtq layout`
 
-exit status: 0 done, 1 failure, 2 usage, 3 done, but cycles are missing in the log"""
+exit status: 0 done, 1 failure, 2 usage or a wrong configuration, 3 done, but cycles are missing in the log"""
 
 _LONGEST_INTERFACE = 15
 """IFNAMSIZ of Linux without its final zero."""
@@ -109,7 +109,7 @@ def _run(arguments: argparse.Namespace, stop_requests: list[int]) -> int:
         print(f"jtqd: {NEEDED}", file=sys.stderr)
         return 1
     from jtqd.daemon.config import load_config
-    from jtqd.daemon.supervisor.process import Supervisor, SupervisorError
+    from jtqd.daemon.supervisor.process import ConfigurationRefused, Supervisor, SupervisorError
     from jtqd.drivers.frame_socket import BusError
     from jtqd.estimator.checked import ConfigError
 
@@ -123,7 +123,8 @@ def _run(arguments: argparse.Namespace, stop_requests: list[int]) -> int:
         summary = supervisor.run()
     except (ConfigError, BusError, SupervisorError) as error:
         print(f"jtqd: {error}", file=sys.stderr)
-        return 1
+        # 2: started again it would fail again, until somebody has changed a file
+        return 2 if isinstance(error, ConfigError | ConfigurationRefused) else 1
     if summary is None:
         print("jtqd: stopped before it ran", file=sys.stderr)
         return 0

@@ -28,10 +28,15 @@ class BootError(Exception):
         detail: str = "",
     ) -> None:
         self.node, self.object, self.expected, self.found, self.letter = node, where, expected, found, letter
-        text = detail or f"{where}: expected {expected}, found {found}"
+        self.detail = text = detail or f"{where}: expected {expected}, found {found}"
         who = "" if node is None else f"node {node}: "
         status = f" (status {letter})" if letter else ""
         super().__init__(f"{who}{text}{status}")
+
+    def explained(self, by: str) -> BootError:
+        """Return the same error with what the node itself says about it; "" for nothing."""
+        fields = {"expected": self.expected, "found": self.found, "letter": self.letter}
+        return BootError(self.node, self.object, **fields, detail=f"{self.detail}; {by}") if by else self
 
     def report(self) -> dict[str, object]:
         """Return it as a JSON-able mapping: node, object, expected, found, letter, message."""

@@ -24,7 +24,7 @@ from jtqd.drivers.devices import (
     sensor_scaling,
 )
 from jtqd.drivers.pdo import CAN_ID, INVALID, NO_RTR, PdoMap
-from jtqd.drivers.sdo import Key
+from jtqd.drivers.sdo import Key, label
 from jtqd.drivers.sdo_client import NodeObjects, SdoAccess
 
 _IDENTITY = (
@@ -39,6 +39,7 @@ _SOFTWARE: Key = (0x100A, 0)
 VERIFY_CONFIGURATION = 0x1020
 _ERROR_BEHAVIOUR: Key = (0x1029, 1)
 _ABORT_OPTION: Key = (0x6007, 0)
+_SYNC_PRODUCER = 1 << 30  # of 1005h
 _INHIBIT_TIME, _EVENT_TIMER = 3, 5  # sub-indices of a PDO's communication parameter
 
 
@@ -74,6 +75,7 @@ class BootedNode:
         signed: 1020h holds the signature of this configuration.
         watched: objects that its PDOs and scaling depend on (`watched_objects`).
         notes: what the operator should know although nothing is wrong.
+        boot_ups: its boot-up messages before it was configured: the reset of the boot is one.
     """
 
     node_id: int
@@ -87,6 +89,7 @@ class BootedNode:
     signed: bool = False
     watched: tuple[tuple[int, int, int], ...] = ()
     notes: tuple[str, ...] = ()
+    boot_ups: int = 0
 
 
 class NodeBoot:
@@ -110,10 +113,10 @@ class NodeBoot:
         watched = watched_objects(self._objects.values, self._profile.scaling_objects)
         sha256 = configuration_sha256(self._objects.values)
         signed = self.sign(sha256)
-        name = self._objects.read((0x1008, 0)) or b""
+        name = self._objects.best_effort((0x1008, 0)) or b""
         return BootedNode(
             node_id=self._node,
-            name=name.rstrip(b"\0").decode("ascii", "replace"),
+            name=printable(name),
             device_type=device_type,
             serial=serial,
             scaling=scaling,
@@ -160,7 +163,7 @@ class NodeBoot:
         raw, key, name = self._objects.read(_SOFTWARE), _SOFTWARE, "software version"
         if raw is None:
             raise mismatch(self._node, key, name, expected=expected, found="no such object", letter="G")
-        found = raw.rstrip(b"\0").decode("ascii", "replace")
+        found = printable(raw)
         if found != expected:
             raise mismatch(self._node, key, name, expected=expected, found=found, letter="H")
 
@@ -186,7 +189,38 @@ class NodeBoot:
             if pdo is None:
                 self._switch_off(0x1800 + number - 1)
             else:
-                self._configure_pdo(0x1800 + number - 1, pdo)
+                self._configure_or_accept(0x1800 + number - 1, pdo)
+
+    def _configure_or_accept(self, communication: int, pdo: PdoMap) -> None:
+        """Configure a PDO; of a drive whose mapping is fixed, accept one that is as it should be."""
+        try:
+            self._configure_pdo(communication, pdo)
+        except BootError as refused:
+            written = refused.letter == "J" and refused.expected.endswith(" accepted")
+            if not (written and refused.object.startswith("1A")):
+                raise
+            found = self._mapped(communication)
+            self._restore(communication, pdo)
+            if found != (pdo.transmission_type, *pdo.words):
+                words = ", ".join(f"0x{word:08X}" for word in found[1:]) or "nothing"
+                text = f"{label(communication + 0x200)} maps {words} with transmission type {found[0]}"
+                raise refused.explained(text) from refused
+            self._notes.append(f"TPDO {pdo.cob_id:03X}h is fixed, and as it should be ({refused.detail})")
+
+    def _mapped(self, communication: int) -> tuple[int, ...]:
+        """Return transmission type and mapping words of a PDO."""
+        objects, mapping = self._objects, communication + 0x200
+        count = objects.number((mapping, 0), 1)
+        words = (objects.number((mapping, entry), 4) for entry in range(1, min(count, 8) + 1))
+        return (objects.number((communication, 2), 1), *words)
+
+    def _restore(self, communication: int, pdo: PdoMap) -> None:
+        """Switch a PDO on again that was switched off to be mapped."""
+        key = (communication, 1)
+        found = self._objects.number(key, 4)
+        enabled = found & NO_RTR | pdo.cob_id & CAN_ID
+        if found != enabled:
+            self._objects.put(key, enabled, 4, "COB-ID")
 
     def _switch_off(self, communication: int) -> None:
         cob_id = self._objects.optional_number((communication, 1), 4)
@@ -221,34 +255,67 @@ class NodeBoot:
         self._objects.put((communication, _EVENT_TIMER), EVENT_MS, 2, "event timer in ms")
 
     def configure_sync(self) -> None:
-        """Check that 1005h is jtqd's SYNC; announce the counter byte in 1019h where the node has it."""
+        """Check that 1005h is jtqd's SYNC; make 1019h tell whether it has a counter byte."""
         found = self._objects.number((0x1005, 0), 4)
         wanted = self._settings.sync_cob_id
         if found & CAN_ID != wanted:
             raise mismatch(
                 self._node, (0x1005, 0), "COB-ID SYNC", expected=f"{wanted:03X}h", found=f"0x{found:08X}"
             )
-        overflow = self._settings.counter_overflow
-        if overflow is not None and self._objects.read((0x1019, 0)) is not None:
-            self._objects.put((0x1019, 0), overflow, 1, "SYNC counter overflow")
+        if found & _SYNC_PRODUCER:
+            self._objects.put((0x1005, 0), found & ~_SYNC_PRODUCER, 4, "COB-ID SYNC")
+            self._notes.append("1005h: it was a SYNC producer, which jtqd is")
+        overflow, key = self._settings.counter_overflow, (0x1019, 0)
+        if overflow is None:
+            return
+        counts = self._objects.optional_number(key, 1)
+        if counts is None and overflow:
+            expected = f"{overflow} (sync.counter_overflow; 0 for SYNC without a counter)"
+            name = "SYNC counter overflow"
+            raise mismatch(self._node, key, name, expected=expected, found="no such object", letter="J")
+        if counts not in (None, overflow):  # some refuse any write while 1006h is set
+            self._objects.put(key, overflow, 1, "SYNC counter overflow")
 
     def configure_heartbeat(self) -> None:
         """Set the node's heartbeat, and on drives the supervision of the master's, whose loss must stop them."""
         settings = self._settings
         if isinstance(self._profile, DriveProfile):
             consumer = settings.master_node << 16 | settings.master_timeout_ms
-            self._objects.put((0x1016, 1), consumer, 4, "consumer heartbeat time")
+            why = self._try((0x1016, 1), consumer, 4, "consumer heartbeat time")
+            if why:
+                self._notes.append(f"{why}: the drive does not notice when jtqd's heartbeat ends")
         self._objects.put((0x1017, 0), settings.heartbeat_ms, 2, "producer heartbeat time")
+        emcy = self._objects.best_effort((0x1014, 0))
+        if emcy is not None:
+            cob_id, expected = int.from_bytes(emcy[:4], "little"), 0x080 + self._node
+            if cob_id & (INVALID | CAN_ID) != expected:
+                self._notes.append(
+                    f"1014h COB-ID EMCY: expected {expected:03X}h, found 0x{cob_id:08X}: its EMCY messages are not read"
+                )
+
+    def _try(self, key: Key, value: int, size: int, name: str) -> str:
+        """Write and read back what a node can do without; return why it does, "" where it has it."""
+        if self._objects.best_effort(key) is None:
+            return f"{label(*key)} {name}: no such object"
+        try:
+            self._objects.put(key, value, size, name)
+        except BootError as error:
+            if not error.letter:
+                raise
+            return error.detail
+        return ""
 
     def configure_error_behaviour(self) -> None:
         """Set 1029h:1 where the node has it; note a drive whose 6007h lets it run on without its master."""
         behaviour = self._settings.error_behaviour
         if behaviour is None:
             return
-        if self._objects.read(_ERROR_BEHAVIOUR) is not None:
-            self._objects.put(_ERROR_BEHAVIOUR, behaviour, 1, "error behaviour")
+        if self._objects.best_effort(_ERROR_BEHAVIOUR) is not None:
+            why = self._try(_ERROR_BEHAVIOUR, behaviour, 1, "error behaviour")
+            if why:
+                self._notes.append(why)
         if isinstance(self._profile, DriveProfile):
-            option = self._objects.read(_ABORT_OPTION)
+            option = self._objects.best_effort(_ABORT_OPTION)
             if option is not None and not any(option):
                 self._notes.append(
                     "6007h abort connection option is 0: the drive does not stop when jtqd's heartbeat ends"
@@ -277,6 +344,12 @@ class NodeBoot:
         if found not in (None, 1):
             expected = "1 (normal operation)"
             raise mismatch(self._node, key, "channel operating mode", expected=expected, found=str(found))
+
+
+def printable(raw: bytes) -> str:
+    """Return a text of a device as lines can show it: what is no printable ASCII character is replaced."""
+    text = raw.rstrip(b"\0").decode("ascii", "replace")
+    return "".join(each if " " <= each <= "~" else "?" for each in text)
 
 
 def reset_during_boot(node: int) -> BootError:

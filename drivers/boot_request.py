@@ -1,34 +1,38 @@
 """Request and report of the boot process as JSON; the request is checked into frozen profiles.
 
     {"bus": "can0", "master_node": 32, "heartbeat_ms": 100, "master_timeout_ms": 500, "answer_timeout_s": 0.5,
-     "own_eds": "jtqd.eds", "error_behaviour": 0,
-     "sync": {"cob_id": 128, "counter_overflow": 240, "check_foreign": true},
+     "own_eds": "jtqd.eds", "error_behaviour": 0, "reset": true,
+     "sync": {"cob_id": 128, "counter_overflow": 0, "check_foreign": true},
      "nodes": [{"node": 1, "kind": "drive", "identity": {"vendor": 1953, "product": 1026}},
-               {"node": 2, "kind": "drive", "given": {"6091h:1": 100}, "temperature": true},
+               {"node": 2, "kind": "drive", "given": {"6091h:1": 100}, "temperature": true, "sdo_timeout_ms": 1000},
                {"node": 3, "kind": "sensor", "channels": [1], "unit_words": {"0x00560000": 1.0}, "mandatory": false}]}
 
 Only "bus" and "nodes" with "node" and "kind" are needed. `given` replaces objects that are then not read; `temperature` of
 a drive asks for TPDO3 with 3001h; a node that is not `mandatory` may be absent. "error_behaviour" is 1029h:1; without it
-the nodes keep theirs.
+the nodes keep theirs. "reset": NMT reset communication comes first. `sdo_timeout_ms`: silence of the node after which a
+request is repeated.
+`objects` of a drive: fields of `devices.DriveObjects`, each with those of `DriveObject`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 from jtqd.drivers.boot_procedure import BootedNode, BusSettings
 from jtqd.drivers.devices import (
     JTQD_NODE,
     SYNC_COB_ID,
+    DriveObject,
+    DriveObjects,
     DriveProfile,
     Identity,
     Profile,
     SensorProfile,
     parse_key,
 )
-from jtqd.drivers.sdo import Key
+from jtqd.drivers.sdo import ANSWER_S, Key
 
 _TOP = {
     "bus",
@@ -40,9 +44,11 @@ _TOP = {
     "master_timeout_ms",
     "answer_timeout_s",
     "error_behaviour",
+    "reset",
 }
 _SYNC = {"cob_id", "counter_overflow", "check_foreign"}
 _NODE = {"node", "kind", "identity", "channels", "given", "unit_words", "temperature", "mandatory"}
+_NODE |= {"sdo_timeout_ms", "objects"}
 _OPTIONAL_TIMEOUT_S = 0.5
 """An optional node is not waited for any longer: it is booted again when it appears."""
 
@@ -62,6 +68,8 @@ class BootRequest:
         own_eds: data sheet to be read for the caller, who then does without the parser: its entries are in the report as
             "own_entries".
         optional: nodes that may be absent.
+        reset: begin with NMT reset communication.
+        sdo_answer_s: silence of a node after which a request is repeated, by node; ANSWER_S for the others.
     """
 
     bus: str
@@ -71,11 +79,17 @@ class BootRequest:
     answer_timeout_s: float = 0.5
     own_eds: str | None = None
     optional: frozenset[int] = frozenset()
+    reset: bool = True
+    sdo_answer_s: Mapping[int, float] = field(default_factory=dict)
 
     def timeout_s(self, node: int) -> float:
-        """Return how long a node may take for an answer."""
+        """Return how long a node may take for its first answer."""
         longest = _OPTIONAL_TIMEOUT_S if node in self.optional else self.answer_timeout_s
-        return min(self.answer_timeout_s, longest)
+        return max(min(self.answer_timeout_s, longest), self.sdo_answer_s.get(node, 0.0))
+
+    def answer_s(self, node: int) -> float:
+        """Return the silence of a node after which a request is repeated."""
+        return self.sdo_answer_s.get(node, ANSWER_S)
 
 
 def parse_request(raw: object) -> BootRequest:
@@ -113,7 +127,15 @@ def parse_request(raw: object) -> BootRequest:
         if not _boolean(node, "mandatory", default=True)
     )
     foreign = bool(sync.get("check_foreign", True))
-    return BootRequest(bus, profiles, settings, foreign, float(timeout), own_eds, optional)
+    answers = {
+        profile.node_id: _integer(node, "sdo_timeout_ms", 10, 10_000, None) * 1e-3
+        for profile, node in zip(profiles, nodes, strict=True)
+        if "sdo_timeout_ms" in node
+    }
+    reset = _boolean(top, "reset", default=True, where="request")
+    return BootRequest(
+        bus, profiles, settings, foreign, float(timeout), own_eds, optional, reset=reset, sdo_answer_s=answers
+    )
 
 
 def _profile(raw: object, where: str) -> Profile:
@@ -124,7 +146,8 @@ def _profile(raw: object, where: str) -> Profile:
     kind = node.get("kind")
     if kind == "drive":
         temperature = _boolean(node, "temperature", default=False, where=where)
-        return DriveProfile(number, identity, given, temperature)
+        objects = _objects(node.get("objects"), f"{where}.objects")
+        return DriveProfile(number, identity, given, temperature, objects)
     if kind != "sensor":
         raise RequestError(f"{where}.kind: found {kind!r}, expected 'drive' or 'sensor'")
     channels = node.get("channels", [1])
@@ -140,6 +163,21 @@ def _identity(raw: object, where: str) -> Identity:
     if software is not None and not isinstance(software, str):
         raise RequestError(f"{where}.software: found {software!r}, expected a text")
     return Identity(**_integers(mapping, where, fields), software=software)
+
+
+def _objects(raw: object, where: str) -> DriveObjects:
+    """Return the objects of a drive from what `asdict` made of them; None: those of CiA 402."""
+    if raw is None:
+        return DriveObjects()
+    names = {each.name for each in fields(DriveObjects)}
+    known = {each.name for each in fields(DriveObject)}
+    found = _mapping(raw, where, names)
+    try:
+        return DriveObjects(
+            **{name: DriveObject(**_mapping(each, f"{where}.{name}", known)) for name, each in found.items()}
+        )
+    except TypeError as error:
+        raise RequestError(f"{where}: {error}") from error
 
 
 def _given(raw: object, where: str) -> dict[Key, int]:
@@ -218,4 +256,5 @@ def node_report(node: BootedNode) -> dict[str, object]:
         "signed": node.signed,
         "watched": [list(each) for each in node.watched],
         "notes": list(node.notes),
+        "boot_ups": node.boot_ups,
     }

@@ -7,7 +7,7 @@ by the configuration instead ("608Fh:1" -> number); no factor is a constant of t
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from jtqd.drivers.boot_error import mismatch
@@ -34,6 +34,15 @@ DRIVE_SCALING_OBJECTS: dict[Key, tuple[str, int]] = {
 UNIT_OBJECT, DECIMALS_OBJECT, OPERATING_MODE_OBJECT = 0x6131, 0x6132, 0x6112
 JOULE = 0x23  # CiA 303-2 code of J = Nm; the table has none of the newton metre that could be verified
 MAX_DECIMALS = 9
+SENSOR_SCALING_OBJECTS: dict[Key, tuple[str, int]] = {
+    (index, channel): (f"{name} of channel {channel}", highest)
+    for channel in (1, 2)
+    for index, name, highest in (
+        (UNIT_OBJECT, "physical unit", 0xFFFF_FFFF),
+        (DECIMALS_OBJECT, "decimal digits", MAX_DECIMALS),
+    )
+}
+"""Objects that scale a sensor's channels, with their largest value."""
 
 TEMPERATURE: Key = (0x3001, 0)
 """Joint temperature of a drive, I16."""
@@ -59,10 +68,57 @@ class Identity:
 
 
 @dataclass(frozen=True)
+class DriveObject:
+    """Which object of a drive holds a quantity.
+
+    Attributes:
+        index, subindex, bits, signed: the object; it is mapped as a whole.
+        sign: -1 where the drive counts the other way.
+        factor: SI units per unit; None: by the scaling objects of CiA 402.
+    """
+
+    index: int
+    subindex: int = 0
+    bits: int = 32
+    signed: bool = True
+    sign: int = 1
+    factor: float | None = None
+
+
+@dataclass(frozen=True)
+class DriveObjects:
+    """Objects of a drive's two synchronous TPDOs; those of CiA 402 unless the configuration names others.
+
+    The first PDO holds both positions, of 32 bits each; the second one velocity, current and statusword, together 8 bytes.
+    """
+
+    motor_position: DriveObject = DriveObject(0x6064)
+    link_position: DriveObject = DriveObject(0x60E4, 1)
+    motor_velocity: DriveObject = DriveObject(0x606C)
+    current: DriveObject = DriveObject(0x6078, bits=16)
+    statusword: DriveObject = DriveObject(0x6041, bits=16, signed=False)
+
+    def scaled_by(self) -> dict[str, tuple[Key, ...]]:
+        """Return the scaling objects of each quantity; none for one with a factor of its own."""
+        return {name: () if getattr(self, name).factor else keys for name, keys in _SCALED_BY.items()}
+
+
+_SCALED_BY: dict[str, tuple[Key, ...]] = {
+    "motor_position": ((0x608F, 1), (0x608F, 2)),
+    "motor_velocity": ((0x6090, 1), (0x6090, 2)),
+    "link_position": ((0x60E6, 1), (0x60EB, 1)),
+    "current": ((0x6075, 0),),
+}
+_GEAR: tuple[Key, ...] = ((0x6091, 1), (0x6091, 2))
+CIA_402 = DriveObjects()
+
+
+@dataclass(frozen=True)
 class DriveProfile:
     """A CiA 402 drive as jtqd configures it.
 
     Attributes:
+        objects: which of its objects are mapped.
         given: scaling objects by the configuration, which are then not read.
         temperature: it has 3001h, and shall send it by TPDO3.
     """
@@ -71,18 +127,26 @@ class DriveProfile:
     identity: Identity = Identity()
     given: Mapping[Key, int] = field(default_factory=dict)
     temperature: bool = False
+    objects: DriveObjects = CIA_402
     profile_number = 402
 
     @property
     def tpdos(self) -> tuple[PdoMap, ...]:
         """TPDO1 and TPDO2, and TPDO3 with the temperature."""
-        every = drive_tpdo1(self.node_id), drive_tpdo2(self.node_id), drive_tpdo3(self.node_id)
+        node, objects = self.node_id, self.objects
+        every = drive_tpdo1(node, objects), drive_tpdo2(node, objects), drive_tpdo3(node)
         return every if self.temperature else every[:2]
 
     @property
     def scaling_objects(self) -> tuple[Key, ...]:
         """Objects that the boot must read."""
-        return tuple(key for key in DRIVE_SCALING_OBJECTS if key not in self.given)
+        used = self.used_scaling
+        return tuple(key for key in DRIVE_SCALING_OBJECTS if key in used and key not in self.given)
+
+    @property
+    def used_scaling(self) -> set[Key]:
+        """Scaling objects that mean something for this drive, read or given."""
+        return {*_GEAR, *(key for keys in self.objects.scaled_by().values() for key in keys)}
 
 
 @dataclass(frozen=True)
@@ -139,17 +203,21 @@ class SensorScaling:
     nm_per_unit: Mapping[int, float]
 
 
-def drive_tpdo1(node: int) -> PdoMap:
+def drive_tpdo1(node: int, objects: DriveObjects = CIA_402) -> PdoMap:
     """180h+n: motor position, link position."""
-    motor = MappedObject(0x6064, 0, 32, True, "motor_position")
-    return PdoMap(0x180 + node, (motor, MappedObject(0x60E4, 1, 32, True, "link_position")))
+    return PdoMap(0x180 + node, _mapped(objects, "motor_position", "link_position"))
 
 
-def drive_tpdo2(node: int) -> PdoMap:
+def drive_tpdo2(node: int, objects: DriveObjects = CIA_402) -> PdoMap:
     """280h+n: motor velocity, current, statusword."""
-    velocity = MappedObject(0x606C, 0, 32, True, "motor_velocity")
-    current = MappedObject(0x6078, 0, 16, True, "current")
-    return PdoMap(0x280 + node, (velocity, current, MappedObject(0x6041, 0, 16, False, "statusword")))
+    return PdoMap(0x280 + node, _mapped(objects, "motor_velocity", "current", "statusword"))
+
+
+def _mapped(objects: DriveObjects, *names: str) -> tuple[MappedObject, ...]:
+    found = ((getattr(objects, name), name) for name in names)
+    return tuple(
+        MappedObject(each.index, each.subindex, each.bits, each.signed, name) for each, name in found
+    )
 
 
 def drive_tpdo3(node: int) -> PdoMap:
@@ -191,15 +259,22 @@ def estimate_tpdo(node: int = JTQD_NODE) -> PdoMap:
 def drive_scaling(profile: DriveProfile, read: Mapping[Key, int]) -> tuple[DriveScaling, float]:
     """Return (scaling, gear ratio) from the objects read and given. Raises BootError for an impossible value."""
     values = {**read, **profile.given}
+    objects = profile.objects
+    used = profile.used_scaling
     for key, (name, highest) in DRIVE_SCALING_OBJECTS.items():
-        if not 1 <= values[key] <= highest:
+        if key in used and not 1 <= values[key] <= highest:
             raise mismatch(profile.node_id, key, name, expected=f"1..{highest}", found=str(values[key]))
     turn = 2.0 * math.pi
+
+    def factor(each: DriveObject, of_cia_402: Callable[[], float]) -> float:
+        return each.sign * (of_cia_402() if each.factor is None else each.factor)
+
     scaling = DriveScaling(
-        motor_rad_per_count=turn * values[0x608F, 2] / values[0x608F, 1],
-        motor_rad_s_per_unit=turn * values[0x6090, 2] / values[0x6090, 1],
-        link_rad_per_count=turn * values[0x60EB, 1] / values[0x60E6, 1],
-        ampere_per_unit=values[0x6075, 0] * 1e-3 * 1e-3,  # 6078h is 1/1000 of 6075h, which is in mA
+        factor(objects.motor_position, lambda: turn * values[0x608F, 2] / values[0x608F, 1]),
+        factor(objects.motor_velocity, lambda: turn * values[0x6090, 2] / values[0x6090, 1]),
+        factor(objects.link_position, lambda: turn * values[0x60EB, 1] / values[0x60E6, 1]),
+        # 6078h is 1/1000 of 6075h, which is in mA
+        factor(objects.current, lambda: values[0x6075, 0] * 1e-3 * 1e-3),
     )
     return scaling, values[0x6091, 1] / values[0x6091, 2]
 

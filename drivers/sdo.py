@@ -246,14 +246,23 @@ class Transfer:
         return True
 
 
-ANSWER_S = 0.1
-"""A device answers within milliseconds; a longer silence is a lost frame, so the request is repeated."""
+ANSWER_S = 0.6
+"""Most devices answer within milliseconds, some in 500; a longer silence is a lost frame, so the request is repeated."""
+_LONGEST = 10.0
+"""A transfer of many segments may take so many times the waiting time of one answer."""
 
 
 class Exchange:
     """One object read (`data` None) or written, asked for again until it is answered or `timeout_s` is over.
 
-    The methods return the requests to be sent, 8 bytes each.
+    The methods return the requests to be sent, 8 bytes each. Nothing is repeated inside a segmented transfer, where a late
+    answer and a repeated request would be taken for the next segment: each segment may take `timeout_s`.
+
+    Args:
+        index, subindex, data: of the transfer.
+        now: time of its begin.
+        timeout_s: for an answer, and for all repetitions of the first request together.
+        answer_s: silence after which the first request is repeated.
 
     Attributes:
         value: what was read, or b"" for a write that was accepted; None until then.
@@ -264,15 +273,23 @@ class Exchange:
     """
 
     def __init__(
-        self, index: int, subindex: int, data: bytes | None, *, now: float, timeout_s: float
+        self,
+        index: int,
+        subindex: int,
+        data: bytes | None,
+        *,
+        now: float,
+        timeout_s: float,
+        answer_s: float = ANSWER_S,
     ) -> None:
         self.index, self.subindex, self._data = index, subindex, data
         self.value: bytes | None = None
         self.refusal: int | None = None
         self.timed_out = False
         self.ignored = self.repeats = 0
-        self._answer_s = min(ANSWER_S, timeout_s)
+        self._answer_s, self._timeout_s = min(answer_s, timeout_s), timeout_s
         self._deadline = now + timeout_s
+        self._longest = now + _LONGEST * timeout_s
         self._repeat_at = now + self._answer_s
         self._transfer = Transfer(index, subindex, data)
 
@@ -306,14 +323,15 @@ class Exchange:
         if self._transfer.done:
             self.value = self._transfer.value
             return []
-        self._repeat_at = now + self._answer_s
+        self._deadline = self._repeat_at = min(now + self._timeout_s, self._longest)
         return [self._transfer.request]
 
     def tick(self, now: float) -> list[bytes]:
         """Let time pass: nothing, the request once more, or the end."""
         if self.ended or now < self.due:
             return []
-        if now >= self._deadline - 0.5 * self._answer_s:  # too late for one more answer
+        # too late for one more answer, or between two segments
+        if now >= self._deadline - 0.5 * self._answer_s or self._repeat_at >= self._deadline:
             self.timed_out = True
             return [self._transfer.abort(PROTOCOL_TIMED_OUT)]
         return self._repeat(now)
@@ -351,13 +369,18 @@ class SdoQueue:
     The queue is bounded, each request has its own timeout, and its result is given to the function it was submitted with.
     Frames are the 8 bytes of 600h+n and 580h+n.
 
+    Args:
+        limit: requests that may wait.
+        answer_s: silence after which a request is repeated.
+
     Attributes:
         ignored: answers that belonged to no request of ours.
         repeats, timeouts, refusals: requests repeated, never answered, refused.
     """
 
-    def __init__(self, limit: int = 32) -> None:
+    def __init__(self, limit: int = 32, answer_s: float = ANSWER_S) -> None:
         self._waiting: deque[_Request] = deque()
+        self._answer_s = answer_s
         self._limit = limit
         self._exchange: Exchange | None = None
         self._done: Callable[[SdoResult], None] = lambda _result: None
@@ -428,6 +451,11 @@ class SdoQueue:
         request = self._waiting.popleft()
         self._done = request.done
         self._exchange = Exchange(
-            request.index, request.subindex, request.data, now=now, timeout_s=request.timeout_s
+            request.index,
+            request.subindex,
+            request.data,
+            now=now,
+            timeout_s=request.timeout_s,
+            answer_s=self._answer_s,
         )
         return self._exchange.begin()

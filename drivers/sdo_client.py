@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 from jtqd.drivers.boot_error import BootError, mismatch
 from jtqd.drivers.frame import FRAME, FRAME_SIZE, pack
-from jtqd.drivers.sdo import NO_OBJECT, NO_SUBINDEX, Exchange, Key, SdoAbort, describe_abort, label
+from jtqd.drivers.sdo import ANSWER_S, NO_OBJECT, NO_SUBINDEX, Exchange, Key, SdoAbort, describe_abort, label
 
 REQUEST_ID, RESPONSE_ID = 0x600, 0x580
 """COB-IDs of the default SDO, plus the node number."""
@@ -120,13 +120,17 @@ class SdoAccess(Protocol):
 
 
 class SdoClient:
-    """One exchange at a time with one node; each may take `timeout_s` seconds.
+    """One exchange at a time with one node; each may take `timeout_s` seconds, and is repeated after `answer_s` of silence.
 
     Both methods raise SdoAbort (the node refuses), SdoTimeout, and what the channel raises.
     """
 
-    def __init__(self, channel: Channel, timeout_s: float = 0.5) -> None:
-        self._channel, self._timeout_s = channel, timeout_s
+    def __init__(self, channel: Channel, timeout_s: float = 0.5, answer_s: float = ANSWER_S) -> None:
+        self._channel, self._timeout_s, self._answer_s = channel, timeout_s, answer_s
+
+    def wait_longer(self, timeout_s: float) -> None:
+        """Wait at least so long for an answer from here on: the node has given its first one."""
+        self._timeout_s = max(self._timeout_s, timeout_s)
 
     def read(self, index: int, subindex: int) -> bytes:
         """Upload an object, expedited or segmented."""
@@ -138,7 +142,8 @@ class SdoClient:
 
     def _exchange(self, index: int, subindex: int, data: bytes | None) -> bytes:
         self._channel.receive(0.0)  # answers to a request that was given up
-        exchange = Exchange(index, subindex, data, now=time.monotonic(), timeout_s=self._timeout_s)
+        now, timeout_s = time.monotonic(), self._timeout_s
+        exchange = Exchange(index, subindex, data, now=now, timeout_s=timeout_s, answer_s=self._answer_s)
         self._send(exchange.begin())
         while not exchange.ended:
             for reply in self._channel.receive(max(exchange.due - time.monotonic(), 1e-4)):
@@ -178,6 +183,13 @@ class NodeObjects:
             if abort.code in (NO_OBJECT, NO_SUBINDEX):
                 return None
             raise self._refused(key, "read", abort, letter) from abort
+
+    def best_effort(self, key: Key) -> bytes | None:
+        """Upload an object that nothing depends on; None where the device gives none, for whatever reason."""
+        try:
+            return self._access.read(*key)
+        except (SdoAbort, SdoTimeout):
+            return None
 
     def number(self, key: Key, size: int, letter: str = "") -> int:
         """Upload a number that the device must have."""

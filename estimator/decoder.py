@@ -46,6 +46,8 @@ from jtqd.estimator.checked import (
 )
 
 T = TypeVar("T")
+_LARGEST = 1e30
+"""Of a number in a file: no quantity here is larger, and powers of it overflow."""
 
 
 def limits(
@@ -71,8 +73,14 @@ def choice(names: Iterable[str], expected: str = "") -> msgspec.Meta:
     return msgspec.Meta(pattern=rf"\A({pattern})\Z", extra={"choices": names, "expected": expected})
 
 
-Text = Annotated[str, msgspec.Meta(pattern=r"\S")]
-"""A text that is not empty."""
+Text = Annotated[
+    str,
+    msgspec.Meta(
+        pattern=r"\A(?=.*\S)[^\x00-\x1f\x7f-\x9f]+\Z",
+        extra={"expected": "a text of printable characters that is not empty"},
+    ),
+]
+"""A text that is not empty; it comes to terminals, file names and reports, so it holds no control characters."""
 
 
 def numbers_text(count: int) -> Verbatim:
@@ -176,6 +184,8 @@ class _Field:
             found = numbers_text(len(value))
         if isinstance(self.node, inspect.FloatType):
             expected += number_as_text(value)
+            if isinstance(value, float) and math.isfinite(value) and abs(value) > _LARGEST:
+                expected += f" and at most {_LARGEST:g} in magnitude"
         raise section.error(key, found, expected)
 
     def holds(self, value: Any) -> bool:
@@ -212,7 +222,7 @@ def _plain(value: object) -> object:
 def _finite(value: object) -> bool:
     if isinstance(value, tuple):
         return all(map(_finite, value))
-    return not isinstance(value, float) or math.isfinite(value)
+    return not isinstance(value, float) or abs(value) <= _LARGEST
 
 
 def _lengths(node: Any) -> range:

@@ -12,7 +12,9 @@ import hashlib
 import json
 import math
 import os
+import stat
 import struct
+import threading
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -25,6 +27,8 @@ from jtqd.estimator.onnx_weights import read_perceptron
 
 _PROBES: Final = (0.25, -0.5)  # two different inputs: the binding must see the second one
 _WARM_UP: Final = 50
+_LONGEST_S: Final = 5.0
+"""For each step before the first use."""
 _NATIVE_PROBES: Final = 256
 """Inputs at which native evaluation is compared: in the range of the training data, and a quarter of it beyond."""
 
@@ -56,7 +60,7 @@ class OnnxGraph:
         if sha256 is not None and sha256.lower() != self.sha256:
             raise self.error(f"found SHA-256 {self.sha256}, expected {sha256}")
         self._width: Final = len(features)
-        self._session: Final = self._open(data)
+        self._session: Final = self._answered(partial(self._open, data))
         self.perceptron: Final = read_perceptron(data)
         self._output: Final = self._check_graph()
         self.metadata: Final = self._read_metadata(features, keys)
@@ -89,10 +93,33 @@ class OnnxGraph:
 
     def prepare(self, low: FloatArray, high: FloatArray) -> None:
         """Bind and warm up between `low` and `high` [features], where the graph must give finite torques."""
-        self._bind(low, high)
-        self._warm_up((low + high) / 2)
+        self._answered(partial(self._bind, low, high))
+        self._answered(partial(self._warm_up, (low + high) / 2))
         share = np.random.default_rng(0).uniform(-0.25, 1.25, (_NATIVE_PROBES, self._width))
         self._probes = low + share * (high - low)
+
+    def _answered(self, step: Callable[[], Any]) -> Any:
+        """Return what `step` returns; NetworkError when it has not after _LONGEST_S: a graph may hold an endless loop.
+
+        ONNX Runtime cannot be interrupted: the thread stays behind until the process, which refuses the network, ends.
+        """
+        results: list[Any] = []
+        errors: list[BaseException] = []
+
+        def run() -> None:
+            try:
+                results.append(step())
+            except BaseException as error:
+                errors.append(error)
+
+        thread = threading.Thread(target=run, daemon=True)
+        thread.start()
+        thread.join(_LONGEST_S)
+        if errors:
+            raise errors[0]
+        if not results:
+            raise self.error(f"found no answer within {_LONGEST_S:g} s, expected one: it is not used")
+        return results[0]
 
     def error(self, text: str) -> NetworkError:
         """Return the error to raise, with the file's name."""
@@ -101,8 +128,8 @@ class OnnxGraph:
     def text(self, key: str) -> str:
         """Return a text of the metadata."""
         value = self.metadata[key]
-        if not isinstance(value, str) or not value:
-            raise self.error(f"metadata '{key}': found {value!r}, expected a text")
+        if not isinstance(value, str) or not value.isprintable() or not value:
+            raise self.error(f"metadata '{key}': found {value!r}, expected a text of printable characters")
         return value
 
     def numbers(self, key: str, count: int) -> tuple[float, ...]:
@@ -114,9 +141,14 @@ class OnnxGraph:
 
     def _read(self, path: str | os.PathLike[str]) -> bytes:
         try:
-            return Path(path).read_bytes()
+            if stat.S_ISREG(os.stat(path).st_mode):  # a pipe would be waited for
+                return Path(path).read_bytes()
+            reason = "not a regular file"
         except OSError as error:
-            raise self.error(f"cannot be read: {error.strerror or error}") from None
+            reason = error.strerror or str(error)
+        except ValueError as error:  # a NUL in the name
+            reason = str(error)
+        raise self.error(f"cannot be read: {reason}")
 
     def _open(self, data: bytes) -> Any:
         import onnxruntime as ort
@@ -161,7 +193,7 @@ class OnnxGraph:
                 raise self.error(f"metadata '{key}': missing, found only {sorted(raw)}")
             try:
                 metadata[key] = json.loads(raw[key])
-            except ValueError:
+            except (ValueError, RecursionError):  # the latter: nested a thousand times
                 raise self.error(f"metadata '{key}': found {raw[key][:60]!r}, expected JSON") from None
         if metadata["features"] != list(features):
             raise self.error(f"metadata 'features': found {metadata['features']}, expected {list(features)}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from pathlib import Path
 from typing import Any, Final
 
@@ -47,6 +48,32 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
+def read_regular(path: str | os.PathLike[str], largest: int, expected: str) -> bytes:
+    """Return the bytes of a regular file of at most `largest` bytes: no pipe, device or directory is waited for.
+
+    Raises ConfigError; `expected` names in its message what the file should be.
+    """
+    name = os.fspath(path)
+    try:
+        with open(path, "rb", opener=_open_at_once) as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise ConfigError(f"{name}: found no regular file, expected {expected}")
+            data = file.read(largest + 1)
+    except OSError as error:
+        raise ConfigError(f"{name}: cannot be read: {error.strerror or error}") from None
+    except ConfigError:
+        raise
+    except ValueError as error:  # a NUL in the name
+        raise ConfigError(f"{name!r}: cannot be read: {error}") from None
+    if len(data) > largest:
+        raise ConfigError(f"{name}: found more than {largest} bytes, expected {expected}")
+    return data
+
+
+def _open_at_once(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NONBLOCK)
+
+
 def load_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Return the root mapping of a YAML file. Raises ConfigError."""
     return read_yaml(path)[0]
@@ -55,15 +82,7 @@ def load_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
 def read_yaml(path: str | os.PathLike[str]) -> tuple[dict[str, Any], bytes]:
     """Return the root mapping of a YAML file and the very bytes it was read from. Raises ConfigError."""
     name = os.fspath(path)
-    try:
-        with open(path, "rb") as file:
-            data = file.read(_LARGEST_YAML + 1)
-    except OSError as error:
-        raise ConfigError(f"{name}: cannot be read: {error.strerror or error}") from None
-    if len(data) > _LARGEST_YAML:
-        raise ConfigError(
-            f"{name}: found more than {_LARGEST_YAML} bytes, expected a YAML file written by hand"
-        )
+    data = read_regular(path, _LARGEST_YAML, "a YAML file written by hand")
     try:
         content = yaml.load(data, Loader=_Loader)
     except yaml.MarkedYAMLError as error:

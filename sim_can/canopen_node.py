@@ -66,6 +66,7 @@ class HeartbeatConsumer:
         self._entries = range(1, store.number(_CONSUMER, 0) + 1)
         self._due_ns: dict[int, int] = {}  # by entry, of those that were heard
         self._missing: set[int] = set()
+        self._active: set[int] = set()
         self.due_ns = NEVER_NS
         for entry in self._entries:
             store.on_write(_CONSUMER, entry, partial(self._on_write, entry))
@@ -73,6 +74,7 @@ class HeartbeatConsumer:
     def heard(self, node: int, t_ns: int) -> bool:
         """Take a heartbeat of `node`; return True when it is watched and none of the watched nodes is missing."""
         watched = False
+        self._active.add(node)
         for entry in self._entries:
             word = self._store.number(_CONSUMER, entry)
             period_ns = (word & 0xFFFF) * _NS_PER_MS
@@ -82,6 +84,23 @@ class HeartbeatConsumer:
                 watched = True
         self._plan()
         return watched and not self._missing
+
+    @property
+    def missing(self) -> bool:
+        """Whether a watched node is missing."""
+        return bool(self._missing)
+
+    def restarted(self, node: int) -> bool:
+        """Take a boot-up message of `node`; return True when it is watched and was heard before: it has forgotten us."""
+        if node not in self._active:
+            return False
+        self._active.discard(node)
+        late = {entry for entry in self._due_ns if self._store.number(_CONSUMER, entry) >> 16 & 0x7F == node}
+        for entry in late:
+            del self._due_ns[entry]
+        self._missing |= late
+        self._plan()
+        return bool(late)
 
     def lost(self, t_ns: int) -> bool:
         """Return True when a watched node has become missing since the last call."""
@@ -96,6 +115,7 @@ class HeartbeatConsumer:
         """Start again after an NMT reset: no node was heard, none is missing."""
         self._due_ns.clear()
         self._missing.clear()
+        self._active.clear()
         self._plan()
 
     def _on_write(self, entry: int, _data: bytes) -> None:
@@ -334,6 +354,8 @@ class CanopenNode:
         command = data[0]
         self.due_ns = 0
         if command == nmt.START:
+            if self._consumer.missing:
+                return []  # no start before every watched node is heard again
             if self.state != nmt.OPERATIONAL:
                 self.state = nmt.OPERATIONAL
                 self._generation = -1
@@ -368,6 +390,8 @@ class CanopenNode:
 
     def _on_heartbeat(self, node: int, data: bytes, t_ns: int) -> list[bytes]:
         """Return whether the error is over: when every watched node is heard again."""
+        if len(data) == 1 and data[0] == nmt.BOOT_UP:
+            return self._on_master_lost() if self._consumer.restarted(node) else []
         if len(data) != 1 or not self._consumer.heard(node, t_ns):
             return []
         self.due_ns = min(self.due_ns, self._consumer.due_ns)

@@ -20,8 +20,13 @@ from jtqd.drivers.bus_load import BusLoad, configured_load
 _OWN_EDS = Path(__file__).resolve().parents[2] / "drivers" / "eds" / "jtqd.eds"
 
 
-def boot_request(config: Config, bus: str, only: int | None = None) -> dict[str, Any]:
-    """Return the request to the boot process (`python -m jtqd.drivers.boot`, as JSON) for all nodes, or for `only` one."""
+def boot_request(
+    config: Config, bus: str, only: int | None = None, *, reset: bool | None = None
+) -> dict[str, Any]:
+    """Return the request to the boot process (`python -m jtqd.drivers.boot`, as JSON) for all nodes, or for `only` one.
+
+    reset: begin with NMT reset communication; None: as configured.
+    """
     nodes: list[dict[str, Any]] = [
         {
             "node": joint.node_id,
@@ -29,6 +34,8 @@ def boot_request(config: Config, bus: str, only: int | None = None) -> dict[str,
             "identity": asdict(joint.identity),
             "given": joint.given,
             "temperature": joint.temperature,
+            "sdo_timeout_ms": joint.sdo_timeout_ms,
+            "objects": asdict(joint.objects),
             "mandatory": joint.mandatory or only is not None,
         }
         for joint in config.joints
@@ -43,6 +50,7 @@ def boot_request(config: Config, bus: str, only: int | None = None) -> dict[str,
                 "channels": list(sensor.channels),
                 "given": sensor.given,
                 "unit_words": sensor.unit_words,
+                "sdo_timeout_ms": sensor.sdo_timeout_ms,
                 "mandatory": sensor.mandatory or only is not None,
             }
         )
@@ -53,6 +61,7 @@ def boot_request(config: Config, bus: str, only: int | None = None) -> dict[str,
         "own_eds": str(_OWN_EDS),
         "heartbeat_ms": config.heartbeat_ms,
         "error_behaviour": config.error_behaviour,
+        "reset": config.reset_communication if reset is None else reset,
         # Drives that watch our heartbeat allow two to be lost.
         "master_timeout_ms": min(max(500, 3 * config.heartbeat_ms), 0xFFFF),
         # In service the node has just been heard.
@@ -149,7 +158,8 @@ class ReturningNodes:
             if answer is None and running:
                 return None
             node, self._child, self.busy = self.busy, None, 0
-            # One that has restarted meanwhile may have lost what was written to it.
+            # One that has restarted meanwhile, but for the boot's own reset, may have lost what was written to it.
+            self._restarts += _boot_ups(answer, node)
             if view.restarts[node] != self._restarts:
                 self._refuse(
                     node,
@@ -173,7 +183,9 @@ class ReturningNodes:
     def _start(self, node: int, restarts: int) -> None:
         self.busy, self._restarts = node, restarts
         self._child = self._start_child("jtqd.drivers.boot", [], f"the boot of node {node}")
-        self._child.tell(boot_request(self._config, self._bus, only=node))
+        # A node that has just restarted needs no reset; one that could not be booted may.
+        reset = self._config.reset_communication and node in self._retry_s
+        self._child.tell(boot_request(self._config, self._bus, only=node, reset=reset))
         self._child.end_of_input()
 
     def _put_off(self, node: int, now_s: float) -> None:
@@ -232,6 +244,14 @@ class ReturningNodes:
     def _refuse(self, node: int, text: str, now_s: float) -> None:
         if self._limit.admit(text, now_s) is not None:
             self._log("boot", node, text)
+
+
+def _boot_ups(answer: dict[str, Any] | None, node: int) -> int:
+    """Return the boot-up messages that the boot heard before it configured the node."""
+    if answer is None or not answer["ok"]:
+        return 0
+    count: int = answer["nodes"].get(str(node), {}).get("boot_ups", 0)
+    return count
 
 
 def gear_ratio_error(config: Config, node: int, found: float | None) -> str | None:

@@ -6,7 +6,7 @@ service; it owns the SDO queues of the nodes. Pure but for the boot processes: r
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from math import inf
@@ -315,7 +315,7 @@ class NodeCare:
     """Call `turn` often, and the others for what arrives.
 
     Args:
-        nodes: their node-IDs.
+        nodes: silence of each node-ID after which an SDO request is repeated [s].
         reader: tells the loop which nodes may be believed.
         returning: boots nodes.
         heartbeats: who is heard; nodes are watched from their boot on.
@@ -327,14 +327,15 @@ class NodeCare:
 
     def __init__(
         self,
-        nodes: Iterable[int],
+        nodes: Mapping[int, float],
         reader: SnapshotReader,
         returning: ReturningNodes,
         heartbeats: NodeWatch,
         log: Callable[[str, int, str], None],
     ) -> None:
         self._reader, self._returning, self._heartbeats, self._log = reader, returning, heartbeats, log
-        self._queues = {node: SdoQueue() for node in nodes}
+        self._queues = {node: SdoQueue(answer_s=answer_s) for node, answer_s in nodes.items()}
+        self._timeouts_s = {node: max(_SDO_TIMEOUT_S, answer_s) for node, answer_s in nodes.items()}
         self._out: list[tuple[int, bytes]] = []
         self._checks: dict[int, ConfigurationWatch] = {}
         self._present_until: dict[int, float] = {}
@@ -417,7 +418,7 @@ class NodeCare:
             for node in returning.waiting(view, now_s):
                 queue = self._queues.get(node)
                 if queue is not None and not queue.busy and not self._others_talk_to(node, now_s):
-                    queue.read(0x1000, 0, _nothing, _SDO_TIMEOUT_S)
+                    queue.read(0x1000, 0, _nothing, _SDO_TIMEOUT_S)  # a later answer shows it, too
         if now_s >= self._check_due:
             self._check_due = now_s + _CHECK_S
             self._check_one(view, now_s)
@@ -447,7 +448,7 @@ class NodeCare:
         node = nodes[self._check_turn % len(nodes)]
         check, watch = self._checks[node].next(), self._checks[node]
         self._queues[node].read(
-            check.index, check.subindex, partial(self._on_check, node, watch), _SDO_TIMEOUT_S
+            check.index, check.subindex, partial(self._on_check, node, watch), self._timeouts_s[node]
         )
 
     def _on_check(self, node: int, watch: ConfigurationWatch, result: SdoResult) -> None:

@@ -131,6 +131,14 @@ def nodes_of(config: Config) -> list[int]:
     ]
 
 
+def sdo_timeouts_s(config: Config) -> dict[int, float]:
+    """Return the silence of each node after which an SDO request is repeated."""
+    timeouts_ms = {joint.node_id: joint.sdo_timeout_ms for joint in config.joints}
+    if config.sensor is not None:
+        timeouts_ms[config.sensor.node_id] = config.sensor.sdo_timeout_ms
+    return {node: timeout_ms * 1e-3 for node, timeout_ms in timeouts_ms.items()}
+
+
 class BusService:
     """Call `turn` about twenty times a second, and whenever the socket has frames.
 
@@ -179,7 +187,7 @@ class BusService:
             lambda node: self.care.state(node, self._view),
             self._emergency,
         )
-        self.care = NodeCare(nodes, reader, returning, self.heartbeats, log)
+        self.care = NodeCare(sdo_timeouts_s(config), reader, returning, self.heartbeats, log)
         self._limit = RateLimit()
         self._report_due = 0.0
         self._view = reader.read()

@@ -120,7 +120,7 @@ class Traffic:
 
     def __init__(self, config: Config) -> None:
         self._period_ns, self._deadline_ns = config.period_ns, config.input_deadline_ns
-        self._overflow = config.counter_overflow
+        self._overflow = config.sequence_overflow
         self.inputs = {pdo.cob_id: PdoCount(pdo.name, pdo.length) for pdo in input_pdos(config)}
         self._estimate_id = 0x180 + config.node_id
         self.estimate = PdoCount(f"{self._estimate_id:03X}h jtqd estimate", 8)
@@ -295,13 +295,14 @@ def drive(socket: FrameSocket, traffic: Traffic, seconds: float, config: Config)
     The socket must give back own frames, so that SYNC's own echo stands among the answers in the order of arrival.
     """
     timing = Timing()
-    syncs = [pack(SYNC, bytes((n,))) for n in range(config.counter_overflow + 1)]
+    overflow = config.counter_overflow
+    syncs = [pack(SYNC, bytes((n,)) if overflow else b"") for n in range(max(overflow, 1) + 1)]
     heartbeat = nmt.heartbeat(config.node_id, nmt.OPERATIONAL)
     every = max(1, config.heartbeat_ms * 1_000_000 // config.period_ns)
     counter, sent_ns = 0, 0
     for slot in _slots(seconds, config.period_ns, timing):
         _take(socket, traffic, timing.echo, sent_ns)
-        counter = counter % config.counter_overflow + 1
+        counter = counter % max(overflow, 1) + 1
         sent_ns = time.time_ns()
         timing.unsent += not _send(socket, syncs[counter])
         if slot % every == 0:

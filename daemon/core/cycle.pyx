@@ -42,6 +42,8 @@ SLOT_PASSED: Final = 1
 """... the last slot passed without a cycle, and the grid stands at the next one."""
 RUN_ENDED: Final = 2
 """... no cycle begins any more."""
+_LAST_NUMBER: Final = 240
+"""Of the cycles of a SYNC without counter, in estimate PDO and record."""
 _LAST_CALL_NS: Final = 100_000
 """Before the next SYNC; nobody waits for inputs from here on."""
 
@@ -53,7 +55,7 @@ cdef uint32_t BEFORE_NEXT_SYNC = cr.FLAG_BEFORE_NEXT_SYNC, SYNC_CONFIRMED = cr.F
 cdef uint32_t RESET = cr.FLAG_RESET
 cdef uint32_t SYNC = devices.SYNC_COB_ID, HEARTBEAT = nmt.HEARTBEAT_BASE, ESTIMATE = 0x180
 cdef uint8_t OPERATIONAL = nmt.OPERATIONAL
-cdef int STALE = st.STALE, OFF = st.OFF
+cdef int STALE = st.STALE, OFF = st.OFF, LAST_NUMBER = _LAST_NUMBER
 cdef int64_t BYTE = 255, MOST_WORK_NS = 0xFFFF_FFFF, MOST_LATE_NS = 0x7FFF_FFFF
 
 clock = Clock()
@@ -78,7 +80,7 @@ cdef class Cycle:
         ring, snapshot: shared memory towards recorder and viewers.
         safety: limits and checks of joint 1 and 2; None for those that need no joint file.
         node_id: own node-ID; the estimate PDO is 180h + node_id, the heartbeat 700h + node_id.
-        counter_overflow: SYNC counter runs 1..overflow (1019h).
+        counter_overflow: SYNC counter runs 1..overflow (1019h); 0: SYNC without counter.
         wait_ns, deadline_ns: from SYNC to the wake-up for the inputs (it follows their arrival) and to the end of the wait.
         heartbeat_cycles: cycles between two heartbeats.
         grid: time grid; its slot is the current cycle's.
@@ -218,15 +220,15 @@ cdef class Cycle:
                 intake.drain_frame(&self.bus.frames[n], self.bus.stamps_ns[n], self.bus.own[n])
             intake.drained()
             self.frames.keep(self.bus.frames, self.bus.stamps_ns, count)
-        now.counter = now.counter % self.counter_overflow + 1
+        now.counter = now.counter % (self.counter_overflow or LAST_NUMBER) + 1
         intake.begin_cycle(now.counter)
         before_ns = self.clock.monotonic()
         realtime_ns = self.clock.realtime()
         at_ns = self.clock.monotonic()
         if at_ns - before_ns < CLOCK_READING_NS or not now.realtime_offset_ns:
             now.realtime_offset_ns = realtime_ns - at_ns  # else something came between: the last one is better
-        sync = _frame(SYNC, 1)
-        sync.data[0] = now.counter
+        sync = _frame(SYNC, 1 if self.counter_overflow else 0)
+        sync.data[0] = now.counter  # of a plain SYNC behind its end: not on the wire, but in our own echo
         self.send(&sync)
         now.sync_ns = at_ns
         now.late_ns = at_ns - self.grid.now.slot_ns

@@ -65,8 +65,12 @@ def input_pdos(config: Config) -> list[InputPdo]:
 
     pdos = []
     for joint in config.joints:
-        pdos.append(pdo(drive_tpdo1(joint.node_id), joint.node_id, f"drive {joint.node_id} TPDO1"))
-        pdos.append(pdo(drive_tpdo2(joint.node_id), joint.node_id, f"drive {joint.node_id} TPDO2"))
+        pdos.append(
+            pdo(drive_tpdo1(joint.node_id, joint.objects), joint.node_id, f"drive {joint.node_id} TPDO1")
+        )
+        pdos.append(
+            pdo(drive_tpdo2(joint.node_id, joint.objects), joint.node_id, f"drive {joint.node_id} TPDO2")
+        )
     if config.sensor is not None:
         node = config.sensor.node_id
         for channel in config.sensor.channels:

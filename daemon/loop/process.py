@@ -42,12 +42,16 @@ from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.methods import AnyEstimator, load_network, make_estimator
 from jtqd.estimator.onnx_graph import NetworkError
 
+_PATIENCE_S = 1.0
+"""The supervisor turns twenty times a second; after so long without a turn the watchdog is fed no more."""
 _SLOTS = 8
 """Slots that pass without the interpreter: so late at most are signals, orders and the watchdog."""
 
 
 class Duties:
     """Duties in the pauses of the loop: the watchdog, orders of the supervisor, new estimators.
+
+    The watchdog is fed only while the supervisor turns as well: a stopped one serves no node, no order and no log.
 
     Call it in the pause after every `slots()` cycles. Costs one look at shared memory and now and then a datagram
     (docs/deployment.md).
@@ -62,6 +66,8 @@ class Duties:
     def __init__(self, cycle: Cycle, watchdog: LoopWatchdog, swap: Swap, orders: TextIO = sys.stdin) -> None:
         self._cycle, self._orders = cycle, cycle.snapshot.orders
         self._advanced, self._index = watchdog.advanced, cycle.index
+        self._turn, self._turned = self._orders[4], self._index
+        self._patience = round(_PATIENCE_S * 1e9 / cycle.grid.period_ns)
         self._swap, self._ordered_from = swap, orders
         self._announced = False
         signal.signal(signal.SIGUSR2, self._on_signal)
@@ -78,9 +84,12 @@ class Duties:
     def __call__(self) -> None:
         """Run the duties after some cycles."""
         index = self._cycle.index
-        self._advanced(index - self._index)
-        self._index = index
         orders = self._orders
+        if orders[4] != self._turn:
+            self._turn, self._turned = orders[4], index
+        if index - self._turned <= self._patience:
+            self._advanced(index - self._index)
+        self._index = index
         if orders[0] != orders[1]:
             self._reset()
         if orders[2] != orders[3]:
@@ -309,7 +318,7 @@ def main(argv: list[str], go: Callable[[dict[str, Any]], int] = serve) -> int:
     try:
         return go(json.loads(argv[0]))
     except (ConfigError, NetworkError, BusError) as error:
-        answer(failed=str(error))
+        answer(failed=str(error), configuration=not isinstance(error, BusError))
         return 1
     except OSError as error:
         answer(failed=f"shared memory: {error.strerror or error}")

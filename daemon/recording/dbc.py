@@ -78,6 +78,7 @@ def dbc_of(
     node_names: Mapping[int, str],
     *,
     sync_producer: int,
+    sync_counter: bool = False,
 ) -> str:
     """DBC with SYNC, every PDO, and heartbeat and EMCY of every node.
 
@@ -86,11 +87,13 @@ def dbc_of(
         quantities: by (COB-ID, index, sub-index); a mapped object without one is a plain integer.
         node_names: node-ID -> name, an identifier of C.
         sync_producer: node-ID of who sends SYNC.
+        sync_counter: it has a counter byte (1019h).
 
     Raises:
         ValueError: a PDO is on no identifier of the set, or its node has no name.
     """
-    messages = [(SYNC_ID, "SYNC", 1, sync_producer, [_Signal("sync_counter", 0, 8, False, _PLAIN)])]
+    counter = [_Signal("sync_counter", 0, 8, False, _PLAIN)] if sync_counter else []
+    messages = [(SYNC_ID, "SYNC", len(counter), sync_producer, counter)]
     for pdo in pdo_maps:
         base, node = pdo.cob_id & 0x780, pdo.cob_id & 0x07F
         if base not in _PDO_NUMBER or node not in node_names:
@@ -165,17 +168,21 @@ def dbc_text(config: Config, report: Mapping[str, Any] | None) -> str:
     for joint in config.joints:
         node = joint.node_id
         names[node] = f"drive_{joint.number}"
-        position, motion = drive_tpdo1(node), drive_tpdo2(node)
+        objects = joint.objects
+        position, motion = drive_tpdo1(node, objects), drive_tpdo2(node, objects)
         maps += [position, motion]
         scaling = _scaling(report, node)
         quantities |= (
             {}
             if scaling is None
             else {
-                (position.cob_id, 0x6064, 0): Quantity(scaling["motor_rad_per_count"], "rad"),
-                (position.cob_id, 0x60E4, 1): Quantity(scaling["link_rad_per_count"], "rad"),
-                (motion.cob_id, 0x606C, 0): Quantity(scaling["motor_rad_s_per_unit"], "rad/s"),
-                (motion.cob_id, 0x6078, 0): Quantity(scaling["ampere_per_unit"], "A"),
+                (pdo.cob_id, each.index, each.subindex): Quantity(scaling[factor], unit)
+                for pdo, each, factor, unit in (
+                    (position, objects.motor_position, "motor_rad_per_count", "rad"),
+                    (position, objects.link_position, "link_rad_per_count", "rad"),
+                    (motion, objects.motor_velocity, "motor_rad_s_per_unit", "rad/s"),
+                    (motion, objects.current, "ampere_per_unit", "A"),
+                )
             }
         )
         if joint.temperature:
@@ -195,7 +202,13 @@ def dbc_text(config: Config, report: Mapping[str, Any] | None) -> str:
                 maps.append(pdo)
                 if factors is not None:
                     quantities[pdo.cob_id, index, channel] = Quantity(factors[str(channel)], "Nm")
-    return dbc_of(maps, quantities, names, sync_producer=config.node_id)
+    return dbc_of(
+        maps,
+        quantities,
+        names,
+        sync_producer=config.node_id,
+        sync_counter=config.counter_overflow > 0,
+    )
 
 
 def _scaling(report: Mapping[str, Any] | None, node: int) -> Any:

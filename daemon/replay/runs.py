@@ -88,7 +88,7 @@ def steps_of(records: RecordArray, config: Config) -> Steps:
     stamps = np.diff(_stamps(records)[rows])
     here = dt_ns[rows[1:]]
     apart = np.minimum(np.abs(between - here), np.abs(stamps - here)) > config.period_ns // 2
-    holes = np.diff(np.cumsum(_holes(records, config.counter_overflow))[rows]) > 0
+    holes = np.diff(np.cumsum(_holes(records, config))[rows]) > 0
     for at in np.flatnonzero((here != 0) & apart & holes).tolist():
         row = int(rows[at + 1])
         breaks.append((row, LOST))
@@ -103,23 +103,30 @@ def _stamps(records: RecordArray) -> npt.NDArray[np.int64]:
     return seconds * 1_000_000_000 + stamp["nanosec"].astype(np.int64)
 
 
-def _holes(records: RecordArray, overflow: int) -> npt.NDArray[np.int64]:
-    """Cycles that are missing before each row [n], as many at least: whole rounds of the SYNC counter do not show.
+def _holes(records: RecordArray, config: Config) -> npt.NDArray[np.int64]:
+    """Cycles that are missing before each row [n].
 
-    Slots without SYNC do not count; but a pause of a whole round and more may be a hole, and counts as one cycle.
+    The cycle numbers count every slot, the SYNC counter only those with a SYNC, in rounds; the step `dt_s` of a row spans
+    the slots without SYNC just before it. The missing cycles are as many as fit between both: exact while fewer slots than
+    one round have passed without SYNC elsewhere in the hole. Where the step is not known (0), whole rounds do not show.
     """
+    overflow = config.sequence_overflow
     counter: npt.NDArray[np.int64] = records["sync_counter"].astype(np.int64)
     cycle: npt.NDArray[np.int64] = records["cycle"].astype(np.int64)
     found = np.zeros(len(records), np.int64)
     slots = cycle[1:] - cycle[:-1]
     lost = np.remainder(counter[1:] - counter[:-1] - 1, overflow)
-    found[1:] = np.where(slots > overflow, np.maximum(lost, 1), np.minimum(lost, slots - 1))
+    step = np.rint(records["dt_s"][1:] * (1e9 / config.period_ns)).astype(np.int64)
+    most = slots - np.maximum(step, 1)
+    exact = most - np.remainder(most - lost, overflow)
+    least = np.where(slots > overflow, np.maximum(lost, 1), np.minimum(lost, slots - 1))
+    found[1:] = np.where((step > 0) & (exact >= 0), exact, least)
     return found
 
 
-def lost_cycles(records: RecordArray, overflow: int) -> int:
-    """Return cycles that are missing between those in the log, by the SYNC counter (1..overflow)."""
-    return int(_holes(records, overflow).sum())
+def lost_cycles(records: RecordArray, config: Config) -> int:
+    """Return cycles that are missing between those in the log (joint states), by cycle number and SYNC counter."""
+    return int(_holes(records, config).sum())
 
 
 JOINT_TOPICS = ("/joint/1/state", "/joint/2/state")

@@ -343,7 +343,7 @@ def _replay_run(
         run.cycles * run.origin.config.period_ns * 1e-9,
         read_s,
         replay_s,
-        lost_cycles(logged[0], run.origin.config.counter_overflow),
+        lost_cycles(logged[0], run.origin.config),
         found.from_si,
         found.temperatures,
         same,

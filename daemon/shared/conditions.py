@@ -75,6 +75,7 @@ class Definition:
         topic: of the event that a line becomes (`jtqd.daemon.shared.notices.Notice`).
         emcy: of the EMCY messages of its begin and end; None: none.
         hold_s: a change that does not last so long is none.
+        repeat_s: while it is present, its line comes again so often; such lines have a rate limit of their own.
         logged: a line when it begins and when it ends; not where lines of another condition or of events say the same.
     """
 
@@ -87,9 +88,11 @@ class Definition:
     emcy: Emcy | None = None
     hold_s: float = 0.0
     logged: bool = True
+    repeat_s: float = inf
 
 
 _HOLD_S = 0.1
+_REPEAT_S = 60.0
 _ROWS = (
     # Joints
     Definition("stale_input", JOINT, WARNING, "inputs lost: {}", "inputs back", hold_s=_HOLD_S),
@@ -114,6 +117,7 @@ _ROWS = (
         "latched faults released",
         topic="fault",
         emcy=Emcy(0xFF02, _MANUFACTURER),
+        repeat_s=_REPEAT_S,
     ),
     Definition(
         "drive_fault",
@@ -239,7 +243,13 @@ _ROWS = (
     Definition("loop_stopped", LOOP, ERROR, "no cycle for {}", "cycles again", topic="loop"),
     Definition("late_loop", LOOP, WARNING, "cycles are missed: the loop is late", topic="loop", logged=False),
     Definition(
-        "cycles_lost", RECORDER, ERROR, "cycles are lost: not in the log", topic="recorder", logged=False
+        "cycles_lost",
+        RECORDER,
+        ERROR,
+        "cycles are lost: {} are not in the log",
+        "no further cycles lost",
+        topic="recorder",
+        repeat_s=_REPEAT_S,
     ),
     Definition(
         "stolen_time", MACHINE, INFO, "the hypervisor takes processor time", topic="machine", logged=False
@@ -336,6 +346,7 @@ class _State:
         self._reading, self._reading_since_s = False, -inf
         self._unlogged, self._unlogged_s = 0, 0.0
         self._logged, self._not_before_s = False, -inf
+        self._repeat_s = inf
         self._again = False
         self._texts: dict[str, float] = {}
 
@@ -380,9 +391,10 @@ class _State:
             return None
         may = now_s >= self._not_before_s
         if self.present:
-            if not (self._may_repeat(now_s) if self._logged else may):
+            if not (self._may_repeat(now_s) or now_s >= self._repeat_s if self._logged else may):
                 return None
             self._logged, self._again, self._not_before_s = True, False, now_s + QUIET_S
+            self._repeat_s = now_s + definition.repeat_s
             self._texts[self.text] = now_s
             return Line(definition, self.subject, definition.severity, f"{self.subject.name}: {self.text}")
         if not self._unlogged or not (self._logged or may):

@@ -185,7 +185,7 @@ LATE_BINS, LATE_BIN_NS = 250, 4_000
 MAX_INPUTS = 8
 """Two TPDOs of each drive and two sensor channels are six."""
 
-_MAGIC = 0x4A54_5144_5354_4105  # "JTQDSTA", layout 5
+_MAGIC = 0x4A54_5144_5354_4106  # "JTQDSTA", layout 6
 _HEAD = struct.Struct("<QQdd")
 JOINT = struct.Struct("<6dHBBHH")
 _ESTIMATE = struct.Struct("<qQqq2q")
@@ -193,7 +193,7 @@ _MEASURED = struct.Struct("<12d")
 INPUT = struct.Struct("<12q")
 """An `InputView`."""
 _ORDERS_OFFSET = 32
-_COUNTERS_OFFSET = 64
+_COUNTERS_OFFSET = _ORDERS_OFFSET + 5 * 8
 _SEQUENCE_OFFSET = _COUNTERS_OFFSET + 8 * len(COUNTERS)
 _ESTIMATE_OFFSET = _SEQUENCE_OFFSET + 8
 ESTIMATE_SIZE = _ESTIMATE.size + 2 * JOINT.size + _MEASURED.size
@@ -227,7 +227,8 @@ class Snapshot:
     """Writer's side, one per loop: the memory that `daemon/core/counters.pyx` writes into.
 
     Attributes:
-        orders: requests of the supervisor and what became of them: [resets asked, done, doubts reported, seen].
+        orders: requests of the supervisor and what became of them: [resets asked, done, doubts reported, seen,
+            turns of the supervisor].
         counters: memory of the counters, one unsigned 64-bit word each, in the order of `COUNTERS`.
         work: histogram of the work per cycle, `WORK_BIN_NS` per bin, the last bin takes the rest.
         late: histogram of the SYNC's lateness, `LATE_BIN_NS` per bin.
@@ -391,6 +392,10 @@ class SnapshotReader:
         offset = _DOUBTS_OFFSET + node_id
         self._memory[offset] = (self._memory[offset] + 1) % 256
         self._ask(2)
+
+    def note_alive(self) -> None:
+        """Tell the loop that the supervisor turns (supervisor only)."""
+        self._ask(4)
 
     def ask_reset(self) -> int:
         """Request the release of latched faults (supervisor only); return the number of the request."""

@@ -264,7 +264,7 @@ class Health:
             self._conditions.update(name, change.pdo, change.present, now_s, str(TIMEOUT_CYCLES))
         for counter, (name, subject) in _COUNTED.items():
             self._observe_counter(name, subject, view.counters[counter], now_s)
-        self._observe_counter("cycles_lost", THE_RECORDER, cycles_lost, now_s)
+        self._observe_counter("cycles_lost", THE_RECORDER, cycles_lost, now_s, str(cycles_lost))
         for joint, seen, limit_nm in zip(self._joints, view.joints, self._network_limits_nm, strict=True):
             self._observe_inputs(joint, seen, view, now_s)
             self._observe_status(joint, seen, limit_nm, now_s)
@@ -312,12 +312,14 @@ class Health:
         why = partial(degraded_reason, seen, limit_nm)
         conditions.update("degraded", subject, seen.status == st.DEGRADED, now_s, why)
 
-    def _observe_counter(self, name: str, subject: Subject, value: int, now_s: float) -> None:
+    def _observe_counter(
+        self, name: str, subject: Subject, value: int, now_s: float, details: str = ""
+    ) -> None:
         before, until_s = self._counters.get(name, (0, -inf))
         if value > before:
             until_s = now_s + COUNTER_QUIET_S
         self._counters[name] = value, until_s
-        self._conditions.update(name, subject, now_s < until_s, now_s)
+        self._conditions.update(name, subject, now_s < until_s, now_s, details)
 
     def _observe_node(
         self, node: int, subject: Subject, view: View, absent: Collection[int], now_s: float

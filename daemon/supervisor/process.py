@@ -7,6 +7,7 @@ cycle is late for it.
 from __future__ import annotations
 
 import json
+import math
 import os
 import select
 import signal
@@ -56,12 +57,16 @@ class SupervisorError(Exception):
     """The daemon cannot start; the message is one line for the operator."""
 
 
+class ConfigurationRefused(SupervisorError):  # noqa: N818 - what happens to the operator
+    """The configuration, or a file that it names, cannot be used; the message is one line for the operator."""
+
+
 def checked_load(config: Config) -> BusLoad:
-    """Return the worst-case bus load of a configuration. Raises SupervisorError if it is too high."""
+    """Return the worst-case bus load of a configuration. Raises ConfigurationRefused if it is too high."""
     try:
         return check_bus_load(bus_load_of(config))
     except BusLoadError as error:
-        raise SupervisorError(f"{config.path}: {error}") from None
+        raise ConfigurationRefused(f"{config.path}: {error}") from None
 
 
 def log_directory(record: str | None) -> Path | None:
@@ -111,11 +116,12 @@ def start_bench(config: Config, bus: str, start_child: StartChild) -> Child:
     return bench
 
 
-def boot_nodes(config: Config, bus: str, start_child: StartChild, stopped: Stopped) -> dict[str, Any] | None:
-    """Boot all nodes; the report holds their scaling. None after a stop order. Raises SupervisorError."""
-    child = start_child("jtqd.drivers.boot", [], "the boot")
+def boot_nodes(config: Config, bus: str, child: Child, stopped: Stopped) -> dict[str, Any] | None:
+    """Boot all nodes; the report holds their scaling. None after a stop order. Raises SupervisorError.
+
+    The child sends jtqd's heartbeat until its input ends.
+    """
     child.tell(boot_request(config, bus))
-    child.end_of_input()
     report = wait_for(child, stopped)
     if report is None:
         return None
@@ -138,7 +144,7 @@ def wait_for(child: Child, stopped: Stopped) -> dict[str, Any] | None:
 
     Raises:
         ChildError: it ended, or kept silent for too long.
-        SupervisorError: it reports that it has failed.
+        SupervisorError: it reports that it has failed; ConfigurationRefused where a file is the reason.
     """
     deadline = time.monotonic() + _WARM_UP_TIMEOUT_S
     while not stopped():
@@ -149,7 +155,8 @@ def wait_for(child: Child, stopped: Stopped) -> dict[str, Any] | None:
                 raise
             continue
         if "failed" in answer:
-            raise SupervisorError(str(answer["failed"]))
+            failure = ConfigurationRefused if answer.get("configuration") else SupervisorError
+            raise failure(str(answer["failed"]))
         return None if stopped() else answer
     return None
 
@@ -284,7 +291,8 @@ class Supervisor:
         bench = start_bench(self._config, self._bus, self._child) if self._emulate else None
         socket = open_frame_socket(self._bus, service_filters(self._config), error_frames=True)
         loop = self._child("jtqd.daemon.loop.process", [json.dumps(self._loop_request())], "the loop")
-        report = boot_nodes(self._config, self._bus, self._child, self._stopped)
+        boot = self._child("jtqd.drivers.boot", [], "the boot")
+        report = boot_nodes(self._config, self._bus, boot, self._stopped)
         if report is None:
             return None
         self._send = socket.send  # from here on the nodes are ours to put back
@@ -297,6 +305,7 @@ class Supervisor:
         running = wait_for(loop, self._stopped)
         if running is None:
             return None
+        boot.end_of_input()
         for line in running["refused"]:
             self._log(f"not granted: {line}", WARNING)
         if running["refused"]:
@@ -414,6 +423,7 @@ class Supervisor:
                 if self._live is not None:
                     self._live.watch()
                 node.recorder_lost = self._recorder.lost
+                reader.note_alive()
                 view, now = reader.read(), time.monotonic()
                 self._health.observe(
                     view, now, absent=self._bus_service.care.absent, cycles_lost=node.recorder_lost
@@ -429,6 +439,8 @@ class Supervisor:
         for line in self._conditions.lines(now):
             # What concerns a joint may come and go with its cable: few lines of each joint reach the operator.
             kind = line.subject.name if line.definition.about in (JOINT, PDO) else ""
+            if kind and line.definition.repeat_s < math.inf:
+                kind += f" {line.definition.name}"  # what waits for the operator is not held back by the inputs' lines
             self._log_event(line.definition.topic, line.subject.node, line.text, kind, line.severity)
         self._conditions_file.write(self._conditions.present())
 

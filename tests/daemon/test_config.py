@@ -1,5 +1,6 @@
 """Configuration: what ships is valid, and every mistake is one line that names file, key, found and expected."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +8,7 @@ import pytest
 import yaml
 
 from jtqd.daemon.config import Identity, Realtime, RecordingSettings, SafetySettings, load_config
+from jtqd.drivers.devices import CIA_402, DriveObject
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import shipped
@@ -53,7 +55,7 @@ def test_what_is_left_out_has_its_default(tmp_path: Path) -> None:
         content["inputs"] = None
 
     config = load_config(write(tmp_path, change))
-    assert (config.bitrate, config.period_ns, config.counter_overflow) == (1_000_000, 2_000_000, 240)
+    assert (config.bitrate, config.period_ns, config.counter_overflow) == (1_000_000, 2_000_000, 0)
     assert (config.input_wait_ns, config.input_deadline_ns) == (1_000_000, 1_700_000)
     assert (config.heartbeat_ms, config.heartbeat_timeout_ms, config.emcy_inhibit_ms) == (200, 600, 10)
     assert (config.error_behaviour, config.boot_timeout_s, config.sensor) == (0, 2.0, None)
@@ -102,6 +104,36 @@ def drop(key: str) -> Any:
         (put("nodes.heartbeat_timeout_ms", 199), ["nodes.heartbeat_timeout_ms", "from 200 to 65535"]),
         (put("nodes.error_behaviour", "stop"), ["nodes.error_behaviour", "'stop'", "'stopped'"]),
         (put("joint_1.given", {"6091h:1": -1}), ["joint_1.given.6091h:1", "found -1", ">= 0"]),
+        (put("joint_1.given", {"6091h:9": 1}), ["joint_1.given.6091h:9", "6091h:1, 6091h:2, 6075h:0"]),
+        (put("joint_1.given", {"gear": 1}), ["joint_1.given.gear", "608Fh:1"]),
+        (put("joint_1.given", {"6091h:1": 1.5}), ["joint_1.given.6091h:1", "found 1.5", "a whole number"]),
+        (put("joint_1.given", {"6091h:1": 1e300}), ["joint_1.given.6091h:1", "found 1e+300"]),
+        (put("joint_1.given", {"6091h:1": "a"}), ["joint_1.given.6091h:1", "found 'a'"]),
+        (put("sensor.given", {"6132h:1": 30}), ["sensor.given.6132h:1", "found 30", "from 0 to 9"]),
+        (put("sensor.unit_words", {"Nm": 1.0}), ["sensor.unit_words.Nm", "0x00560000"]),
+        (
+            put("joint_1.objects", {"current": {"index": 0x2030}}),
+            ["objects.current.factor", "A per unit", "6078h:0"],
+        ),
+        (put("joint_1.objects", {"curent": {}}), ["joint_1.objects.curent", "did you mean 'current'"]),
+        (
+            put("joint_1.objects", {"current": {"sign": 0}}),
+            ["joint_1.objects.current.sign", "found 0", "1 or -1"],
+        ),
+        (
+            put("joint_1.objects", {"current": {"type": "I32"}}),
+            ["joint_1.objects", "found 80 bits", "at most 64"],
+        ),
+        (
+            put("joint_1.objects", {"motor_position": {"type": "I16"}}),
+            ["motor_position.type", "expected I32"],
+        ),
+        (put("joint_1.objects", {"statusword": {"sign": -1}}), ["objects.statusword", "no sign"]),
+        (put("joint_1.objects", {"current": {"index": 6}}), ["joint_1.objects.current.index", "found 6"]),
+        (put("joint_1.sdo_timeout_ms", 1), ["joint_1.sdo_timeout_ms", "found 1"]),
+        (put("joint_1.network", {"file": "/dev/zero", "sha256": "00"}), ["/dev/zero", "no regular file"]),
+        (put("metrics", {"file": "a\0b"}), ["metrics.file", "printable"]),
+        (put("joint_1.identity", {"software": "\x1b[2J"}), ["joint_1.identity.software", "printable"]),
         (put("joint_1.identity", {"vendor": 1 << 32}), ["joint_1.identity.vendor", "from 0 to 4294967295"]),
         (drop("sensor"), ["joint_1.sensor_channel", "found 1", "no channel without a sensor"]),
         (put("metrics", {}), ["metrics.file", "missing", "a text"]),
@@ -119,6 +151,39 @@ def test_mistakes_are_named(tmp_path: Path, change: Any, words: list[str]) -> No
     assert "\n" not in message
     for word in words:
         assert word in message, message
+
+
+def test_objects_of_a_drive_are_those_of_cia_402_with_what_the_file_says(tmp_path: Path) -> None:
+    current = {"index": 0x2030, "sub": 2, "type": "I32", "sign": -1, "factor": 0.001}
+    velocity = {"type": "I16", "index": 0x2031, "factor": 0.1}
+    change = put(
+        "joint_2.objects", {"current": current, "motor_velocity": velocity, "link_position": {"sign": -1}}
+    )
+    one, two = (joint.objects for joint in load_config(write(tmp_path, change)).joints)
+    assert one == CIA_402
+    assert two.current == DriveObject(0x2030, 2, 32, True, -1, 0.001)
+    assert two.motor_velocity == DriveObject(0x2031, 0, 16, True, 1, 0.1)
+    assert two.link_position == DriveObject(0x60E4, 1, 32, True, -1)
+    assert two.motor_position == CIA_402.motor_position
+
+
+def test_files_that_would_never_end_are_not_read(tmp_path: Path) -> None:
+    """A pipe without a writer, a device: one line, at once."""
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", Path("/dev/zero")):
+        with pytest.raises(ConfigError, match="found no regular file"):
+            load_config(path)
+
+
+def test_a_number_too_large_for_any_quantity_is_refused(tmp_path: Path) -> None:
+    joint = yaml.safe_load(shipped("joint1.yaml").read_text())
+    (tmp_path / "j.yaml").write_text(yaml.safe_dump({**joint, "gear_ratio": 1e300}))
+    path = write(tmp_path, lambda content: None)
+    content = yaml.safe_load(path.read_text())
+    content["joint_1"]["file"] = str(tmp_path / "j.yaml")
+    path.write_text(yaml.safe_dump(content))
+    with pytest.raises(ConfigError, match=r"'gear_ratio': found 1e\+300, .*at most 1e\+30"):
+        load_config(path)
 
 
 def test_a_network_method_needs_a_network(tmp_path: Path) -> None:

@@ -167,7 +167,7 @@ def test_a_network_of_another_method_is_refused_in_one_line(
 ) -> None:
     config = str(configured(tmp_path, "network", networks()))
     result = run("--bus", "sim", "--config", config, "--record", "none", environment=environment)
-    assert result.returncode == 1
+    assert result.returncode == 2, "a file is wrong: systemd does not start it again"
     (line,) = (text for text in no_traceback(result).splitlines() if not text.startswith("bench ready"))
     assert line.startswith(
         f"jtqd: {tmp_path}/n1.onnx: found input 'x' of shape ['N', 7], expected ['N', 6] ("
@@ -377,7 +377,7 @@ def test_what_does_not_fit_is_named_and_nothing_is_published(
     result = run(
         "--bus", bench, "--config", path, "--duration", "1", "--record", "none", environment=environment
     )
-    assert result.returncode == 1
+    assert result.returncode == (2 if words[0] in ("estimator.method", "bus load") else 1)
     lines = no_traceback(result).splitlines()
     assert len(lines) == 1, lines
     for word in words:

@@ -40,6 +40,7 @@ class TestNode:
         self.beats = True
         self.answer: Callable[[bytes, bytes | None], bytes | None] = lambda _request, reply: reply
         self.next_beat = 0.0
+        self.power_up: dict[tuple[int, int], int] = {}
         self.requests: list[bytes] = []
 
     def frames(self, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
@@ -47,11 +48,24 @@ class TestNode:
         if can_id == 0 and data[1] in (0, self.node):
             states = {1: 0x05 if self.obeys_start else self.state, 2: 0x04, 0x80: 0x7F}
             self.state = states.get(data[0], self.state)
+            if data[0] in (0x81, 0x82):
+                return self.restart()
         if can_id == 0x600 + self.node and self.state != 0x04:
             self.requests.append(data)
+            key = int.from_bytes(data[1:3], "little"), data[3]
+            if data[0] & 0xE0 == 0x20 and key[0] < 0x2000 and self.store.has(*key):
+                self.power_up.setdefault(key, self.store.number(*key))
             reply = self.answer(data, self.server.handle(data))
             return [(0x580 + self.node, reply)] if reply is not None else []
         return []
+
+    def restart(self) -> list[tuple[int, bytes]]:
+        """As after NMT reset communication, with the boot-up message: what was written by SDO is lost."""
+        for key, value in ((key, value) for key, value in self.power_up.items() if self.store.has(*key)):
+            self.store.set_number(*key, value)
+        self.power_up.clear()
+        self.server, self.state, self.next_beat = SdoServer(self.store), 0x7F, 0.0
+        return [(0x700 + self.node, b"\0")]
 
     def beat(self, now: float) -> list[tuple[int, bytes]]:
         """The heartbeat when it is due."""

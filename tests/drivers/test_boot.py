@@ -1,5 +1,6 @@
 """Boot against emulated nodes: the way it goes, and each thing that goes wrong with the message it gets."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -177,7 +178,7 @@ def test_a_lost_answer_is_asked_for_again(bench):
         return reply
 
     bench.drive1.answer = lose_first
-    bench.boot()
+    bench.boot(nodes=[{**NODES[0], "sdo_timeout_ms": 50}, *NODES[1:]])
     assert bench.drive1.requests.count(lost[0]) == 2
 
 
@@ -227,7 +228,8 @@ def test_refused_mapping(bench):
     bench.drive1.answer = refuse
     error = bench.fails()
     assert str(error) == (
-        "node 1: 1A00h:1: write of 0x60640020 refused: object cannot be mapped (06040041h) (status J)"
+        "node 1: 1A00h:1: write of 0x60640020 refused: object cannot be mapped (06040041h); "
+        "1A00h:0 maps nothing with transmission type 255 (status J)"
     )
     assert error.letter == "J"
 
@@ -325,17 +327,32 @@ def test_never_operational(bench):
     assert str(error) == "node 2: NMT start: expected operational within 0.1 s, found pre-operational"
 
 
-def test_restart_during_boot(bench):
-    """A boot-up message after the configuration: the mapping is the default one again."""
+def restarting(node, times):
+    """Frames of a node that sends its boot-up message again each time that it has been configured, so many times."""
     sent = []
 
     def boot_up():
-        if sent or not bench.drive2.store.number(0x1017):
+        configured = [request for request in node.requests if request[:3] == bytes.fromhex("2b 17 10")]
+        if len(sent) == min(times, len(configured)):
             return []
         sent.append(1)
-        return [(0x702, b"\x00")]
+        return [(0x700 + node.node, b"\x00")]
 
-    bench.extra = boot_up
+    return boot_up
+
+
+def test_a_node_that_restarts_during_its_configuration_is_configured_again(bench):
+    """Some send their boot-up message twice; of others the mapping is the default one again."""
+    bench.extra = restarting(bench.drive2, 1)
+    report = bench.boot()
+    assert report.nodes[2].notes == (
+        "it sent its boot-up message again during its configuration: configured once more",
+    )
+    assert bench.drive2.state == 5
+
+
+def test_a_node_that_restarts_at_every_configuration_is_refused(bench):
+    bench.extra = restarting(bench.drive2, 100)
     assert str(bench.fails()).startswith("node 2: the node restarted during boot")
 
 
@@ -491,3 +508,103 @@ def test_boot_over_socketcan(bench):
         report = boot(parse_request({**REQUEST, "bus": "vcan0"}))
     assert sorted(report.nodes) == [1, 2, 3]
     assert [node.state for node in bench.nodes] == [5, 5, 5]
+
+
+def test_a_sync_producer_is_told_to_leave_it(bench):
+    store = bench.drive1.store
+    store.entries[0x1005, 0] = dataclasses.replace(store.entries[0x1005, 0], access="rw")
+    store.set_number(0x1005, 0, 0x4000_0080)
+    report = bench.boot(sync={"counter_overflow": 0})
+    assert bench.drive1.store.number(0x1005, 0) == 0x80
+    assert report.nodes[1].notes == ("1005h: it was a SYNC producer, which jtqd is",)
+
+
+def test_a_node_that_cannot_count_syncs_is_refused_only_where_they_have_a_counter(bench):
+    del bench.drive1.store.entries[0x1019, 0]
+    bench.drive1.store._indices.discard(0x1019)
+    assert bench.boot(sync={"counter_overflow": 0}).nodes[1].notes == ()
+    assert str(bench.fails()) == (
+        "node 1: 1019h:0 SYNC counter overflow: expected 240 (sync.counter_overflow; 0 for SYNC without a counter), "
+        "found no such object (status J)"
+    )
+
+
+def test_1019h_is_written_only_where_it_differs(bench):
+    bench.boot(sync={"counter_overflow": 0})
+    assert not [request for request in bench.drive1.requests if request[:3] == bytes.fromhex("2f 19 10")]
+    bench.boot(sync={"counter_overflow": 240})
+    assert [request for request in bench.drive1.requests if request[:3] == bytes.fromhex("2f 19 10")]
+
+
+def test_a_node_that_fails_says_why(bench):
+    """It does not start: 1001h, 1003h and the last EMCY of the boot are in the line."""
+    node, sent = bench.drive1, []
+    node.obeys_start = False
+    node.store.set_number(0x1001, 0, 0x11)
+    node.store.on_read(0x1003, 0, lambda: 1)
+    node.store.on_read(0x1003, 1, lambda: 0x8130)
+
+    def emergency():
+        if sent or not node.requests:
+            return []
+        sent.append(1)
+        return [(0x081, bytes.fromhex("10 23 03 00 00 00 00 00"))]
+
+    bench.extra = emergency
+    said = str(bench.fails())
+    assert said.startswith("node 1: NMT start: expected operational")
+    assert "; 1001h is 11h (generic, communication), 1003h:1 is 8130h (life guard or heartbeat)" in said
+    assert said.endswith(", its last EMCY is 2310h (continuous overcurrent)")
+
+
+def test_what_is_cosmetic_or_optional_fails_nothing(bench):
+    """1008h is refused with a code of its own, 1016h does not keep what is written, 1014h is another COB-ID."""
+    store = bench.drive1.store
+    answered = bench.drive1.answer
+
+    def refuse_name(request, reply):
+        if request[1:3] == bytes.fromhex("08 10"):
+            return bytes.fromhex("80 08 10 00 20 00 00 08")
+        return answered(request, reply)
+
+    bench.drive1.answer = refuse_name
+    store.on_read(0x1016, 1, lambda: 0)
+    store.on_read(0x1014, 0, lambda: 0x8000_0081)
+    node = bench.boot().nodes[1]
+    assert node.name == ""
+    assert node.notes == (
+        "1016h:1 consumer heartbeat time read back: expected 0x002001F4, found 0x00000000: "
+        "the drive does not notice when jtqd's heartbeat ends",
+        "1014h COB-ID EMCY: expected 081h, found 0x80000081: its EMCY messages are not read",
+    )
+
+
+def test_a_name_that_steers_a_terminal_is_replaced(bench):
+    bench.drive1.store.set_text(0x1008, 0, "\x1b[2Jdrive")
+    assert bench.boot().nodes[1].name == "?[2Jdrive"
+
+
+def fixed(node, *words):
+    """Make the mapping of its TPDO1 read-only, with these words."""
+    node.store.set_number(0x1A00, 0, len(words))
+    for entry, word in enumerate(words, 1):
+        node.store.set_number(0x1A00, entry, word)
+    node.store.set_number(0x1800, 2, 1)
+    for key, entry in node.store.entries.items():
+        if key[0] == 0x1A00:
+            node.store.entries[key] = dataclasses.replace(entry, access="ro")
+
+
+def test_a_mapping_that_is_fixed_in_the_drive_is_used_where_it_is_the_right_one(bench):
+    fixed(bench.drive1, *drive_tpdo1(1).words)
+    node = bench.boot().nodes[1]
+    assert bench.drive1.state == 5
+    assert bench.drive1.store.number(0x1800, 1) == 0x4000_0181, "it is on"
+    assert node.notes[0].startswith("TPDO 181h is fixed, and as it should be (1A00h:0: write of 0x00 refused")
+
+
+def test_a_mapping_that_is_fixed_otherwise_is_named(bench):
+    fixed(bench.drive1, 0x6064_0020, 0x606C_0020)
+    said = str(bench.fails())
+    assert "node 1: 1A00h:0: write of 0x00 refused: object is read only (06010002h)" in said
+    assert "1A00h:0 maps 0x60640020, 0x606C0020 with transmission type 1" in said

@@ -4,6 +4,8 @@ import pytest
 
 from jtqd.drivers.boot_error import BootError
 from jtqd.drivers.devices import (
+    DriveObject,
+    DriveObjects,
     DriveProfile,
     SensorProfile,
     drive_scaling,
@@ -124,3 +126,29 @@ def test_keys():
     for bad in ("608f:1", "608Fh:x", "", "608Fh:1:2"):
         with pytest.raises(ValueError, match=r".*"):
             parse_key(bad)
+
+
+def test_objects_of_a_drive_with_factors_and_signs_of_their_own():
+    """A factor of its own needs no scaling object, and a sign turns either kind."""
+    objects = DriveObjects(
+        current=DriveObject(0x2030, 0, 16, sign=-1, factor=0.001),
+        motor_velocity=DriveObject(0x2031, 0, 16, factor=0.1),
+        link_position=DriveObject(0x60E4, 1, sign=-1),
+    )
+    profile = DriveProfile(1, objects=objects)
+    assert profile.tpdos[1].words == (0x20310010, 0x20300010, 0x60410010)
+    read = {
+        (0x608F, 1): 65536,
+        (0x608F, 2): 1,
+        (0x60E6, 1): 4096,
+        (0x60EB, 1): 1,
+        (0x6091, 1): 100,
+        (0x6091, 2): 1,
+    }
+    assert set(profile.scaling_objects) == set(read)
+    scaling, gear = drive_scaling(profile, read)
+    assert scaling.ampere_per_unit == -0.001
+    assert scaling.motor_rad_s_per_unit == 0.1
+    assert scaling.link_rad_per_count == pytest.approx(-2.0 * math.pi / 4096)
+    assert scaling.motor_rad_per_count == pytest.approx(2.0 * math.pi / 65536)
+    assert gear == 100.0

@@ -171,6 +171,29 @@ def test_a_toggle_error_ends_the_transfer_and_it_is_begun_again():
     assert exchange.repeats == 1
 
 
+def test_nothing_is_repeated_inside_a_segmented_transfer():
+    """A slow device takes its time for each segment; a request sent twice would be answered twice."""
+    exchange = Exchange(0x1008, 0, None, now=0.0, timeout_s=2.0, answer_s=0.1)
+    assert (
+        exchange.tick(0.11) == exchange.begin()
+    )  # the first request may be repeated: it begins the transfer anew
+    segment = [frame("60 00 00 00 00 00 00 00")]
+    assert exchange.on_reply(frame("41 08 10 00 0b 00 00 00"), 0.5) == segment
+    assert exchange.tick(2.4) == [], "nor is the transfer given up: each answer may take the timeout"
+    assert exchange.on_reply(frame("00 6a 6f 69 6e 74 20 64"), 2.4) == [frame("70 00 00 00 00 00 00 00")]
+    exchange.on_reply(frame("17 72 69 76 65 00 00 00"), 4.3)
+    assert exchange.value == b"joint drive"
+
+
+def test_a_node_that_falls_silent_between_two_segments_is_given_up():
+    exchange = Exchange(0x1008, 0, None, now=0.0, timeout_s=0.5, answer_s=0.1)
+    exchange.begin()
+    exchange.on_reply(frame("41 08 10 00 0b 00 00 00"), 0.1)
+    assert exchange.tick(0.59) == []
+    assert exchange.tick(0.61) == [frame("80 08 10 00 00 00 04 05")]
+    assert exchange.timed_out
+
+
 def test_a_size_that_is_not_kept_and_one_that_is_too_large():
     transfer = Transfer(0x1008, 0)
     transfer.answer(frame("41 08 10 00 09 00 00 00"))  # 9 bytes announced
@@ -192,7 +215,7 @@ def test_a_size_that_is_not_kept_and_one_that_is_too_large():
 
 
 def test_silence_is_asked_again_and_then_given_up():
-    exchange = Exchange(0x1000, 0, None, now=0.0, timeout_s=0.3)
+    exchange = Exchange(0x1000, 0, None, now=0.0, timeout_s=0.3, answer_s=0.1)
     request = exchange.begin()
     assert exchange.tick(0.05) == []
     assert exchange.tick(0.11) == request
@@ -223,7 +246,7 @@ def test_requests_to_one_node_go_one_after_the_other_and_each_gets_its_own_answe
 
 
 def test_a_request_that_is_never_answered_keeps_the_next_one_waiting_and_no_longer():
-    queue, results = SdoQueue(), []
+    queue, results = SdoQueue(answer_s=0.1), []
     queue.read(0x1000, 0, results.append, timeout_s=0.2)
     queue.write(0x1017, 0, frame("64 00"), results.append)
     sent = [each for step in range(60) for each in queue.tick(0.01 * step)]

@@ -49,7 +49,7 @@ class FakeSocket:
 
 
 def client(socket: FakeSocket, timeout_s: float = 0.5) -> SdoClient:
-    return SdoClient(FrameChannel(socket, 5), timeout_s)
+    return SdoClient(FrameChannel(socket, 5), timeout_s, answer_s=0.1)
 
 
 def test_transcripts() -> None:

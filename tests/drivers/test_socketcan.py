@@ -4,6 +4,8 @@ The behaviour both transports share is in test_frame_socket.py, run on AF_CAN to
 """
 
 import os
+import socket
+import struct
 import subprocess
 
 import pytest
@@ -150,3 +152,22 @@ def test_stamps_and_filters_hold_for_29_bit_frames_under_load(link):
     assert b.rx_dropped == 0
     a.close()
     b.close()
+
+
+def test_fd_frames_are_given_to_no_classic_socket(link):
+    """The identifier is one of ours, the length that of a classic frame: it is neither read nor in the way."""
+    ip("set", link, "down")
+    ip("set", link, "mtu", "72")
+    ip("set", link, "up")
+    sock = open_frame_socket(link, [exact(0x181), exact(0x080)])
+    fd_frame = struct.pack("<IB3x64s", 0x181, 8, bytes(8))
+    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as sender:
+        sender.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
+        sender.bind((link,))
+        sender.send(fd_frame)
+        sender.send(TPDO)
+        sender.send(fd_frame)
+        assert frames_of(sock) == [TPDO]
+        assert frames_of(sock) == []
+    assert sock.rx_dropped == 0
+    sock.close()

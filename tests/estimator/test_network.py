@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -151,6 +153,58 @@ def test_metadata_that_is_not_json() -> None:
         next(p for p in model.metadata_props if p.key == "sigma_nm").value = "0.3 Nm"
 
     assert "metadata 'sigma_nm': found '0.3 Nm', expected JSON" in refused(edited(spoil))
+
+
+def test_metadata_nested_without_end_and_names_that_steer_a_terminal() -> None:
+    def nested(model: onnx.ModelProto) -> None:
+        next(p for p in model.metadata_props if p.key == "sigma_nm").value = "[" * 100_000
+
+    assert "metadata 'sigma_nm': found '[[[" in refused(edited(nested))
+    message = refused(small_network().with_metadata(joint="\x1b[31mjoint1").data)
+    assert "metadata 'joint': found '\\x1b[31mjoint1', expected a text of printable characters" in message
+
+
+def test_a_graph_that_does_not_answer_is_refused(tmp_path: Path) -> None:
+    """It is well-formed, and has a loop of 10^15 turns inside; the process that refuses it can end."""
+    helper, kind = onnx.helper, onnx.TensorProto
+    one = helper.make_tensor("one", kind.DOUBLE, [], [1.0])
+    body = helper.make_graph(
+        [helper.make_node("Identity", ["go"], ["go_on"]), helper.make_node("Add", ["s", "one"], ["more"])],
+        "body",
+        [
+            helper.make_tensor_value_info("n", kind.INT64, []),
+            helper.make_tensor_value_info("go", kind.BOOL, []),
+            helper.make_tensor_value_info("s", kind.DOUBLE, ["N", 1]),
+        ],
+        [
+            helper.make_tensor_value_info("go_on", kind.BOOL, []),
+            helper.make_tensor_value_info("more", kind.DOUBLE, ["N", 1]),
+        ],
+        [one],
+    )
+
+    def endless(model: onnx.ModelProto) -> None:
+        (out,) = model.graph.output
+        model.graph.initializer.append(helper.make_tensor("turns", kind.INT64, [], [10**15]))
+        model.graph.initializer.append(helper.make_tensor("true", kind.BOOL, [], [True]))
+        last = next(node for node in model.graph.node if out.name in node.output)
+        last.output[0] = "before"
+        model.graph.node.append(helper.make_node("Loop", ["turns", "true", "before"], [out.name], body=body))
+
+    (tmp_path / "endless.onnx").write_bytes(edited(endless))
+    program = f"""
+from jtqd.estimator import onnx_graph
+from jtqd.estimator.network import TorqueNetwork
+onnx_graph._LONGEST_S = 0.3
+try:
+    TorqueNetwork({str(tmp_path / "endless.onnx")!r})
+except onnx_graph.NetworkError as error:
+    print(error)
+"""
+    result = subprocess.run(
+        [sys.executable, "-c", program], check=False, capture_output=True, text=True, timeout=30
+    )
+    assert "endless.onnx: found no answer within 0.3 s, expected one: it is not used" in result.stdout
 
 
 def test_wrong_shapes_types_and_names() -> None:

@@ -53,6 +53,20 @@ def test_heartbeat_comes_on_its_own_grid_with_the_state(player):
     assert player.tick(5000) == []
 
 
+def test_a_master_that_restarts_is_missing_until_its_heartbeat_is_back(player):
+    """As CANopenNode: the boot-up message of a node that was heard is 8130h, and no start before it is over."""
+    quiet(player)
+    player.put(1, 0x1016, 1, 0x0020_01F4, 4)
+    assert player.send(0x720, b"\x00") == [], "nobody was heard before"
+    assert player.send(0x720, b"\x7f") == []
+    assert player.send(0x720, b"\x00") == ["081#3081110000000000"]
+    player.nmt(START, 1)
+    assert player.bench.drives[0].state == 0x7F
+    assert player.send(0x720, b"\x7f") == ["081#0000000000000000"]
+    player.nmt(START, 1)
+    assert player.bench.drives[0].state == 0x05
+
+
 @pytest.mark.parametrize("data", [b"", b"\x01", b"\x01\x01\x01", b"\x01\x02"])
 def test_nmt_of_wrong_length_or_for_another_node_is_ignored(player, data):
     player.send(0x000, data)

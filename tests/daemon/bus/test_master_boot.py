@@ -96,8 +96,7 @@ def test_error_behaviour_is_written_and_read_back(bus: Bus, behaviour: int) -> N
 
 def test_error_behaviour_that_does_not_stick_and_a_node_without(bus: Bus) -> None:
     bus.one.store.on_read(0x1029, 1, lambda: 1)
-    error = bus.fails()
-    assert str(error) == "node 1: 1029h:1 error behaviour read back: expected 0x00, found 0x01 (status J)"
+    assert bus.boot().nodes[1].notes == ("1029h:1 error behaviour read back: expected 0x00, found 0x01",)
     for sub in (0, 1):
         del bus.one.store.entries[0x1029, sub]
     bus.one.store._indices.discard(0x1029)
@@ -143,7 +142,8 @@ def test_whatever_fails_with_an_optional_node_does_not_keep_the_others(bus: Bus,
         sent: list[int] = []
 
         def boot_up() -> list[tuple[int, bytes]]:
-            if sent or not sensor.store.number(0x1017):
+            configured = [each for each in sensor.requests if each[:3] == bytes.fromhex("2b 17 10")]
+            if len(sent) == len(configured):
                 return []
             sent.append(1)
             return [(0x703, b"\x00")]
@@ -162,7 +162,26 @@ def test_jtqd_says_its_boot_up_message_before_it_touches_a_node(bus: Bus) -> Non
     bus.boot()
     ours = [each for each in bus.heard if each[0] in (0x000, 0x720)]
     assert ours[0] == (0x720, b"\x00")
-    assert ours[1] == (0x000, b"\x80\x01")
+    orders = [data for can_id, data in ours if can_id == 0x000]
+    assert orders[:4] == [b"\x82\x01", b"\x82\x02", b"\x82\x03", b"\x80\x01"]
+
+
+def test_jtqds_heartbeat_runs_from_its_boot_up_message_on(bus: Bus) -> None:
+    """A drive that watches it (1016h) from its configuration on never misses it, until the loop takes over."""
+    bus.boot(answer_timeout_s=1.0)
+    ours = [data for can_id, data in bus.heard if can_id == 0x720]
+    assert ours[0] == b"\x00"
+    assert ours[1:]
+    assert set(ours[1:]) == {b"\x7f"}
+    first_write = next(n for n, (can_id, data) in enumerate(bus.heard) if can_id == 0x601 and data[0] != 0x40)
+    assert (0x720, b"\x7f") in bus.heard[:first_write]
+
+
+def test_without_the_reset_the_nodes_are_only_stopped(bus: Bus) -> None:
+    bus.boot(reset=False)
+    orders = [data for can_id, data in bus.heard if can_id == 0x000]
+    assert orders[0] == b"\x80\x01"
+    assert not any(data[0] in (0x81, 0x82) for data in orders)
 
 
 def test_another_jtqd_that_boots_at_the_same_time_is_noticed_by_its_boot_up_message(bus: Bus) -> None:

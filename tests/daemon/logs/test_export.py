@@ -161,12 +161,12 @@ def test_candump_lines_and_the_dbc_are_what_cantools_takes(tmp_path):
     """Lines out of the log, decoded by the DBC of the shipped configuration as plain integers."""
     pytest.importorskip("cantools")
     position = (1000).to_bytes(4, "little") + (-7).to_bytes(4, "little", signed=True)
-    cycle = Cycle(1, 1_000_000, (Joint(), Joint()), [(0x181, position), (0x080, b"\5")])
+    cycle = Cycle(1, 1_000_000, (Joint(), Joint()), [(0x181, position), (0x701, b"\5")])
     log = write_log(tmp_path / "a.mcap", [cycle])
     lines = run(BIN / "jtq", "export", "candump", log)
     assert lines.stdout.splitlines() == [
         "(1700000000.001000) can0 181#E8030000F9FFFFFF",
-        "(1700000000.001000) can0 080#05",
+        "(1700000000.001000) can0 701#05",
     ]
     dbc = tmp_path / "bus.dbc"
     made = run(
@@ -175,7 +175,7 @@ def test_candump_lines_and_the_dbc_are_what_cantools_takes(tmp_path):
     assert json.loads(made.stdout)["messages"] > 10
     decoded = run(sys.executable, "-m", "cantools", "decode", "--single-line", dbc, stdin=lines.stdout).stdout
     assert re.search(r"drive_1_TPDO1\(motor_position: 1000, link_position: -7\)", decoded)
-    assert "SYNC(sync_counter: 5)" in decoded
+    assert "(nmt_state: operational)" in decoded
 
 
 def test_dbc_of_the_log_is_its_attachment(log, tmp_path, capsys):

@@ -157,6 +157,7 @@ def make(
     estimators: Sequence[Any] | None = None,
     safety: Sequence[JointSafety] | None = None,
     slots: int = 64,
+    counter_overflow: int = 240,
 ) -> tuple[Cycle, ScriptedSocket, RingReader]:
     """A cycle with both joints by method efficiency; `temperatures` are of joint 1 and 2, in this order."""
     socket = ScriptedSocket(script)
@@ -178,7 +179,7 @@ def make(
         Snapshot(tmp_path / "snapshot", 1e-3, 0.8),
         safety=safety,
         node_id=0x20,
-        counter_overflow=240,
+        counter_overflow=counter_overflow,
         wait_ns=0,
         deadline_ns=100_000,
         heartbeat_cycles=100,

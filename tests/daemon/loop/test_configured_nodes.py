@@ -6,6 +6,7 @@ import random
 import struct
 from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -161,6 +162,33 @@ def test_a_node_in_doubt_is_not_used_until_it_is_configured_again(loop: Loop, tm
         turn(loop.cycle)
         duties()
     assert waits(loop.cycle) == {2, 3}
+
+
+def test_the_watchdog_is_fed_only_while_the_supervisor_turns(loop: Loop) -> None:
+    fed: list[int] = []
+
+    class Counting:
+        def advanced(self, cycles: int) -> None:
+            fed.append(cycles)
+
+    cycle = SimpleNamespace(index=0, grid=loop.cycle.grid, snapshot=loop.cycle.snapshot)
+    duties = Duties(cycle, Counting(), SimpleNamespace(active=False))  # type: ignore[arg-type]
+    patience = round(1e9 / cycle.grid.period_ns)
+    for _ in range(3):
+        loop.supervisor.note_alive()
+        for _ in range(patience):
+            cycle.index += 1
+            duties()
+    assert sum(fed) == 3 * patience
+    for _ in range(3 * patience):  # it is stopped
+        cycle.index += 1
+        duties()
+    assert 3 * patience <= sum(fed) <= 4 * patience + 1
+    before = sum(fed)
+    loop.supervisor.note_alive()
+    cycle.index += 1
+    duties()
+    assert sum(fed) == before + 1
 
 
 class Fed:

@@ -30,6 +30,16 @@ def test_each_sync_gets_one_estimate_with_its_counter(tmp_path: Path) -> None:
     assert [decode(data).sequence for data in estimates(socket)] == counters
 
 
+def test_a_sync_without_counter_is_empty_and_the_estimate_still_counts(tmp_path: Path) -> None:
+    cycle, socket, reader = make(tmp_path, lambda n: inputs(), counter_overflow=0)
+    turn(cycle, 250)
+    syncs = [data for data in socket.sent if struct.unpack_from("<I", data)[0] == 0x080]
+    assert {data[4] for data in syncs} == {0}
+    assert [decode(data).sequence for data in estimates(socket)] == [n % 240 + 1 for n in range(250)]
+    flags = {cr.header_of(record).flags & cr.FLAG_SYNC_CONFIRMED for record in reader.read().records}
+    assert flags == {cr.FLAG_SYNC_CONFIRMED}
+
+
 def test_the_first_cycles_are_published_as_starting(tmp_path: Path) -> None:
     cycle, socket, _ = make(tmp_path, lambda n: inputs())
     turn(cycle, 30)

@@ -185,6 +185,35 @@ def test_a_sync_that_waited_in_the_transmit_queue_is_not_this_cycles(bus: Bus) -
     assert bus.intake.sync_errors == 30
 
 
+def test_a_plain_sync_is_known_by_the_number_behind_its_end() -> None:
+    """Length 0: nothing of it is on the wire; the kernel and the hub give back the very frame that was sent."""
+    intake = Intake([TPDO1])
+    for counter in range(1, 40):
+        intake.begin(counter)
+        earlier = frame(0x080, bytes([counter - 1 or 240]) + bytes(7), 0)
+        own = frame(0x080, bytes([counter]) + bytes(7), 0)
+        stamps = [counter * MS, counter * MS + 1]
+        intake.take(bytearray(earlier + own), stamps, [True, True], 2)
+        assert intake.sync_stamp_ns == counter * MS + 1
+        intake.close()
+    assert intake.sync_errors == 39
+
+
+def test_of_an_echo_without_its_number_the_first_of_a_cycle_counts() -> None:
+    """A driver that echoes no more than it has sent."""
+    intake = Intake([TPDO1])
+    for counter in range(1, 40):
+        intake.begin(counter)
+        echo = frame(0x080, bytes(8), 0)
+        intake.take(bytearray(echo + one(counter)), [counter * MS, counter * MS + 9], [True, False], 2)
+        intake.close()
+        assert intake.fresh(0)
+    assert intake.sync_errors == 0
+    intake.begin(40)
+    intake.take(bytearray(2 * frame(0x080, bytes(8), 0)), [40 * MS, 40 * MS + 1], [True, True], 2)
+    assert intake.sync_errors == 1
+
+
 def test_a_foreign_sync_just_before_ours_counts_as_well(bus: Bus) -> None:
     foreign = bytearray(frame(0x080))
     bus.intake.drain(foreign, [bus.sync_ns + 970_000], [False], 1)

@@ -8,6 +8,7 @@ import pytest
 
 from jtqd.daemon.core.estimate_pdo import encode
 from jtqd.daemon.recording.dbc import Quantity, dbc_of, dbc_text
+from jtqd.drivers.devices import CIA_402
 from jtqd.drivers.pdo import MappedObject, PdoMap
 
 TURN = 2 * math.pi
@@ -21,8 +22,13 @@ SCALING = {
 
 @pytest.fixture(scope="module")
 def database():
-    joints = tuple(SimpleNamespace(number=n, node_id=n, temperature=n == 2) for n in (1, 2))
-    config = SimpleNamespace(node_id=0x20, joints=joints, sensor=SimpleNamespace(node_id=3, channels=(1, 2)))
+    joints = tuple(SimpleNamespace(number=n, node_id=n, temperature=n == 2, objects=CIA_402) for n in (1, 2))
+    config = SimpleNamespace(
+        counter_overflow=240,
+        node_id=0x20,
+        joints=joints,
+        sensor=SimpleNamespace(node_id=3, channels=(1, 2)),
+    )
     nodes = {"1": {"scaling": SCALING}, "2": {"scaling": SCALING | {"ampere_per_unit": 0.002}}}
     nodes["3"] = {"scaling": {"nm_per_unit": {"1": 0.001, "2": 0.01}}}
     return cantools.database.load_string(dbc_text(config, {"nodes": nodes}), "dbc")
@@ -91,8 +97,8 @@ def test_services(database):
 
 
 def test_without_a_sensor():
-    joints = tuple(SimpleNamespace(number=n, node_id=n, temperature=False) for n in (1, 2))
-    config = SimpleNamespace(node_id=0x20, joints=joints, sensor=None)
+    joints = tuple(SimpleNamespace(number=n, node_id=n, temperature=False, objects=CIA_402) for n in (1, 2))
+    config = SimpleNamespace(counter_overflow=0, node_id=0x20, joints=joints, sensor=None)
     text = dbc_text(config, {"nodes": {"1": {"scaling": SCALING}, "2": {"scaling": SCALING}}})
     assert "torque_sensor" not in text
     assert len(cantools.database.load_string(text, "dbc").messages) == 1 + 5 + 2 * 3
@@ -100,7 +106,9 @@ def test_without_a_sensor():
 
 def test_objects_without_name_and_mapped_in_any_order():
     pdo = PdoMap(0x381, (MappedObject(0x2000, 1, 8, True), MappedObject(0x2001, 0, 32, False, "count")))
-    text = dbc_of([pdo], {(0x381, 0x2001, 0): Quantity(0.5, "s")}, {1: "box"}, sync_producer=1)
+    quantities = {(0x381, 0x2001, 0): Quantity(0.5, "s")}
+    text = dbc_of([pdo], quantities, {1: "box"}, sync_producer=1, sync_counter=True)
+    assert "BO_ 128 SYNC: 1 box" in text
     values = cantools.database.load_string(text, "dbc").decode_message(0x381, bytes.fromhex("ff 03000000"))
     assert values == {"object_2000_1": -1, "count": 1.5}
 

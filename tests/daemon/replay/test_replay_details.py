@@ -38,7 +38,19 @@ def test_one_lost_cycle_is_seen() -> None:
     log = records([*range(40), *range(41, 100)])
     assert steps_of(log, CONFIG).breaks == ((40, LOST),)
     assert steps_of(log, CONFIG).dt_ns[40] == 2 * MS
-    assert lost_cycles(log, 240) == 1
+    assert lost_cycles(log, CONFIG) == 1
+
+
+def test_holes_longer_than_a_round_of_the_sync_counter_are_counted_in_full() -> None:
+    log = records([*range(40), *range(25_998, 26_100)])
+    assert lost_cycles(log, CONFIG) == 25_958
+    slots = records([*range(40), *range(1000, 1100)])  # 300 of them passed without SYNC: the loop stood still
+    slots["dt_s"][40] = 0.301
+    slots["sync_counter"][40:] = (slots["sync_counter"][40:].astype(int) - 1 - 300) % 240 + 1
+    assert lost_cycles(slots, CONFIG) == 660
+    stood = records([*range(40), *range(1000, 1100)])
+    stood["dt_s"][40], stood["sync_counter"] = 0.961, np.arange(140) % 240 + 1
+    assert lost_cycles(stood, CONFIG) == 0
 
 
 def test_the_first_row_of_a_stretch_has_one_reason() -> None:

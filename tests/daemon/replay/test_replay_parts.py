@@ -103,11 +103,11 @@ def test_where_the_state_is_known() -> None:
     log = records([*range(40), *range(60, 100)])
     assert steps_of(log, CONFIG).breaks == ((40, LOST),)
     assert steps_of(log, CONFIG).dt_ns[40] == 21 * MS
-    assert lost_cycles(log, 240) == 20
+    assert lost_cycles(log, CONFIG) == 20
     slots = records([*range(40), *range(60, 100)])  # slots without SYNC: the loop knew, and nothing is lost
     slots["dt_s"][40], slots["sync_counter"] = 0.021, np.arange(80) % 240 + 1
     assert steps_of(slots, CONFIG).breaks == ()
-    assert lost_cycles(slots, 240) == 0
+    assert lost_cycles(slots, CONFIG) == 0
     call = records(
         list(range(100))
     )  # the call that sends was late by 0.7 ms, the SYNC was where its echo says

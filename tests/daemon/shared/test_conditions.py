@@ -81,6 +81,17 @@ def test_two_losses_are_two_and_the_next_line_waits_for_its_time():
     assert lines[3] == (11.125, "back after 0.5 s (inputs lost: asked at 7.125)")
 
 
+def test_what_waits_for_the_operator_is_said_again_while_it_lasts():
+    conditions, lines = Conditions(), []
+    for second in range(200):
+        conditions.update("fault_latched", JOINT, True, float(second), "position jump")
+        conditions.update("stale_input", JOINT, True, float(second), "gone")
+        lines += [(second, line.text) for line in conditions.lines(float(second))]
+    latched = [at for at, text in lines if "latched" in text]
+    assert latched == [0, 60, 120, 180]
+    assert len([text for _, text in lines if "inputs lost" in text]) == 1
+
+
 def test_the_catalogue_is_complete_and_consistent():
     for definition in CATALOGUE.values():
         if definition.emcy is not None:

@@ -22,6 +22,14 @@ def told(lost, before=None, seconds=0.5):
     return [line for line in lines if not line.startswith("bus: ")]
 
 
+def test_a_recorder_that_loses_cycles_is_told_while_it_runs():
+    watch = Observer()
+    watch.lines(view(0), 0.0)
+    assert watch.lines(view(8), 1.0, cycles_lost=31) == ["recorder: cycles are lost: 31 are not in the log"]
+    assert watch.lines(view(16), 2.0, cycles_lost=90) == []
+    assert watch.lines(view(24), 30.0, cycles_lost=90) == ["recorder: no further cycles lost after 29.0 s"]
+
+
 def test_healthy_and_switched_off_joints_are_no_news():
     assert told(view(8, two=WELL._replace(status=OFF, torque_nm=NAN)), seconds=10) == []
 

@@ -47,9 +47,11 @@ class Observer:
         self.conditions = Conditions()
         self.health = Health(config or load_config(None), self.conditions)
 
-    def lines(self, reading: View, now_s: float, absent: Collection[int] = ()) -> list[str]:
+    def lines(
+        self, reading: View, now_s: float, absent: Collection[int] = (), cycles_lost: int = 0
+    ) -> list[str]:
         """Take a reading; lines for the operator that are due."""
-        self.health.observe(reading, now_s, absent=absent)
+        self.health.observe(reading, now_s, absent=absent, cycles_lost=cycles_lost)
         return [line.text for line in self.conditions.lines(now_s)]
 
     def present(self) -> list[tuple[str, str]]:

@@ -1,0 +1,178 @@
+"""jtqd with drives and a sensor of the `canopen` library: strict nodes that share no code with it (tests/library_drives)."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from jtqd.models.files import shipped
+from tests.library_drives.bench import LibraryBench
+
+
+@contextmanager
+def a_bench(*manners: str, bus: str | None = None) -> Iterator[LibraryBench]:
+    with (
+        tempfile.TemporaryDirectory(prefix="jtq") as directory,
+        LibraryBench(Path(directory), *manners, bus=bus) as bench,
+    ):
+        yield bench
+
+
+@pytest.fixture(scope="module")
+def bench() -> Iterator[LibraryBench]:
+    with a_bench() as bench:
+        yield bench
+
+
+def no_errors(bench: LibraryBench) -> bool:
+    return not any(node["errors"] for node in bench.order("state").values())
+
+
+def test_first_start_and_restart_after_a_clean_stop_and_after_a_kill(bench: LibraryBench) -> None:
+    """The drives watch jtqd's heartbeat: 8130h, once it has ended, and no start before that is over."""
+    first = bench.start()
+    assert bench.until(bench.both_used), bench.said()
+    assert no_errors(bench), bench.order("state")
+    assert bench.stop(first) == 0
+    assert bench.until(lambda: not no_errors(bench), 3.0), "a drive that misses its master"
+    assert bench.until(lambda: set(bench.emergencies(1)) == {0x8130})
+    bench.listen_anew()
+    second = bench.start()
+    assert bench.until(bench.both_used), bench.said()
+    assert no_errors(bench)
+    bench.stop(second, signal.SIGKILL)
+    bench.listen_anew()
+    third = bench.start()  # within the 0.5 s in which the drives still wait for the second one
+    assert bench.until(bench.both_used), bench.said()
+    assert no_errors(bench)
+    assert bench.stop(third) == 0
+
+
+def test_a_second_jtqd_is_refused_and_the_first_goes_on(bench: LibraryBench) -> None:
+    first = bench.start()
+    assert bench.until(bench.both_used), bench.said()
+    bench.listen_anew()
+    second = bench.start()
+    assert second.wait(20) == 1
+    assert "another SYNC producer is on the bus" in bench.said()
+    assert not [data for can_id, data in bench.heard if can_id == 0x000], "it touches no node"
+    assert bench.until(bench.both_used)
+    assert bench.stop(first) == 0
+
+
+@pytest.mark.parametrize("node", [1, 2, 3])
+def test_power_cycle_of_a_node_in_service(node: int) -> None:
+    """It comes back with 1019h = 0, nothing mapped and no heartbeat, and is used again."""
+    with a_bench() as bench:
+        jtqd = bench.start()
+        assert bench.until(bench.both_used), bench.said()
+        bench.order(f"off {node}")
+        if node < 3:
+            assert bench.until(lambda: bench.joint_stale(node - 1))
+        time.sleep(0.5)
+        bench.listen_anew()
+        bench.order(f"on {node}")
+        assert bench.until(lambda: "returned and is configured again" in bench.said()), bench.said()
+        assert bench.until(bench.both_used), bench.said()
+        assert bench.until(lambda: bench.order("state")[str(node)]["state"] == 5)
+        assert bench.emergencies(node) == []
+        assert bench.stop(jtqd) == 0
+
+
+def test_emcy_with_and_without_heartbeat(bench: LibraryBench) -> None:
+    jtqd = bench.start()
+    assert bench.until(bench.both_used), bench.said()
+    bench.order("emcy 1 2310")
+    assert bench.until(lambda: "node 1: EMCY 2310h (continuous overcurrent)" in bench.said()), bench.said()
+    bench.order("well 1 2310")
+    assert bench.until(lambda: "node 1: EMCY 0000h: error reset" in bench.said())
+    bench.order("mute 2")
+    assert bench.until(lambda: "node 2: no heartbeat for 0.3 s" in bench.said()), bench.said()
+    bench.order("emcy 2 4310")
+    assert bench.until(lambda: "node 2: EMCY 4310h (excess temperature of the drive)" in bench.said())
+    bench.listen_anew()
+    assert bench.until(bench.both_used), "its PDOs come in time and are used"
+    assert bench.stop(jtqd) == 0
+
+
+def test_bus_off_of_one_node() -> None:
+    """It neither hears nor is heard for a second: its master's heartbeat is missing, and it waits in pre-operational."""
+    with a_bench() as bench:
+        jtqd = bench.start()
+        assert bench.until(bench.both_used), bench.said()
+        bench.order("cut 1")
+        assert bench.until(lambda: bench.joint_stale(0)), bench.said()
+        assert bench.until(lambda: 0x8130 in bench.order("state")["1"]["errors"])
+        bench.listen_anew()
+        bench.order("join 1")
+        assert bench.until(bench.both_used), bench.said()
+        assert bench.until(lambda: no_errors(bench))
+        assert bench.stop(jtqd) == 0
+
+
+@pytest.mark.parametrize(
+    "manners",
+    [
+        ("--boot-ups", "2"),
+        ("--without", "1016,1029,1014"),
+        ("--without", "1019,1008"),
+        ("--sdo", "0.06", "--boot-ups", "2"),
+    ],
+    ids=["boot-up twice", "no 1016h 1029h 1014h", "no 1019h 1008h", "slow, boot-up twice"],
+)
+def test_devices_differ(manners: tuple[str, ...]) -> None:
+    with a_bench(*manners) as bench:
+        jtqd = bench.start()
+        assert bench.until(bench.both_used, 40.0), bench.said()
+        if "1016" in manners[-1]:
+            assert "1016h:1 consumer heartbeat time: no such object" in bench.said()
+        assert bench.stop(jtqd) == 0
+
+
+def test_objects_of_the_makers_own(bench: LibraryBench) -> None:
+    """Joint 1 by its drive's mA, counted backwards, and rpm; joint 2, with the same motion, by CiA 402."""
+    objects = {
+        "current": {"index": 0x2030, "sign": -1, "factor": 0.001},
+        "motor_velocity": {"index": 0x2031, "type": "I16", "factor": 2.0 * math.pi / 60.0},
+    }
+    jtqd = bench.start(joint_1={"objects": objects}, joint_2={"file": str(shipped("joint1.yaml"))})
+    assert bench.until(bench.both_used), bench.said()
+    assert bench.until(lambda: len(bench.torques_nm) > 600)
+    pairs = [(one, two) for one, two in bench.torques_nm[100:] if one is not None and two is not None]
+    assert len(pairs) > 300
+    assert max(abs(one) for one, _ in pairs) > 2.0
+    apart = sorted(abs(one - two) for one, two in pairs)  # at a reversal one rpm is another quadrant
+    assert apart[round(0.8 * len(apart))] < 0.3
+    assert bench.stop(jtqd) == 0
+
+
+@pytest.mark.campaign
+def test_answers_of_half_a_second() -> None:
+    with a_bench("--sdo", "0.5") as bench:
+        jtqd = bench.start(sensor={"sdo_timeout_ms": 800}, nodes={"sdo_timeout_ms": 800})
+        assert bench.until(bench.both_used, 150.0), bench.said()
+        assert bench.stop(jtqd) == 0
+
+
+@pytest.mark.socketcan
+def test_first_start_restart_and_power_cycle_on_socketcan() -> None:
+    with a_bench(bus=os.environ.get("JTQD_CAN_INTERFACE", "vcan0")) as bench:
+        first = bench.start()
+        assert bench.until(bench.both_used), bench.said()
+        bench.stop(first, signal.SIGKILL)
+        bench.listen_anew()
+        second = bench.start()
+        assert bench.until(bench.both_used), bench.said()
+        bench.order("off 1")
+        assert bench.until(lambda: bench.joint_stale(0))
+        bench.order("on 1")
+        assert bench.until(bench.both_used), bench.said()
+        assert bench.stop(second) == 0
