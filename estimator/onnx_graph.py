@@ -3,6 +3,10 @@
 The graph takes "x" [N, n] (named features, SI units, normalisation inside) and gives [N, 1] torque [Nm]. Its
 metadata hold one JSON value per key; the caller names the keys that must be there.
 
+    OnnxGraph       opened here: the referee of every graph, and what runs one that is not ours
+    RefereedGraph   one of ours that ONNX Runtime has judged in another process (`Verdict`): runs natively, without the
+                    40 MB of the runtime
+
 A single sample goes through an I/O binding on two preallocated numpy buffers: no array is made per call.
 """
 
@@ -16,7 +20,7 @@ import struct
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -33,66 +37,32 @@ class NetworkError(ValueError):
     """The network file cannot be used; one line that names file, found and expected."""
 
 
-class OnnxGraph:
-    """A loaded graph with `features` inputs.
+class Verdict(NamedTuple):
+    """What ONNX Runtime has found in a file that it accepts.
 
-    source: path of an ONNX file, or its bytes; sha256: expected hash of the bytes (hex), not checked when
-    None; features: names and order of the inputs, which the metadata must repeat; keys: metadata that must be
-    there. Raises NetworkError for an unreadable or corrupt file, another hash, shape, type or missing
-    metadata. Public: `name`, `sha256`, `metadata`, `run_one`, `bound` (after `prepare`: samples go through the
-    binding, not through run()), `perceptron` (the same graph for native evaluation, None for a graph that is not ours).
+    native_error_nm: largest difference of native evaluation at the probes; None for a graph that is not one of ours.
     """
 
-    def __init__(
-        self,
-        source: bytes | str | os.PathLike[str],
-        sha256: str | None,
-        features: tuple[str, ...],
-        keys: tuple[str, ...],
-    ) -> None:
+    sha256: str
+    metadata: dict[str, Any]
+    native_error_nm: float | None
+
+
+class NetworkFile:
+    """Bytes of a network file with their hash, and what the metadata say.
+
+    source: path of an ONNX file, or its bytes; sha256: expected hash of the bytes (hex), not checked when None.
+    Raises NetworkError for an unreadable file or another hash. Public: `name`, `sha256`, `metadata`.
+    """
+
+    metadata: dict[str, Any]
+
+    def __init__(self, source: bytes | str | os.PathLike[str], sha256: str | None) -> None:
         self.name: Final = "network (bytes)" if isinstance(source, bytes) else os.fspath(source)
-        data = source if isinstance(source, bytes) else self._read(source)
-        self.sha256: Final = hashlib.sha256(data).hexdigest()
+        self._data: Final = source if isinstance(source, bytes) else self._read(source)
+        self.sha256: Final = hashlib.sha256(self._data).hexdigest()
         if sha256 is not None and sha256.lower() != self.sha256:
             raise self.error(f"found SHA-256 {self.sha256}, expected {sha256}")
-        self._width: Final = len(features)
-        self._session: Final = self._open(data)
-        self.perceptron: Final = read_perceptron(data)
-        self._output: Final = self._check_graph()
-        self.metadata: Final = self._read_metadata(features, keys)
-        self._x: Final = np.zeros((1, self._width))
-        self._y: Final = np.zeros((1, 1))
-        self._x_bytes: Final[Any] = self._x.reshape(-1).view(np.uint8).data
-        self._y_view: Final[Any] = self._y.reshape(-1).data  # 3 times faster than numpy indexing
-        self._pack: Final = struct.Struct(f"={self._width}d").pack_into
-        self.bound = False
-        self.run_one: Callable[..., float] = self._run_plain
-        """Torque [Nm] of one sample; the arguments are the features in their order. Take it after `prepare`."""
-
-    def _run_plain(self, *x: float) -> float:
-        self._pack(self._x_bytes, 0, *x)
-        return float(self._session.run(None, {"x": self._x})[0][0, 0])
-
-    def run_many(self, features: FloatArray) -> FloatArray:
-        """Return torques [n] of samples [n, features]; equal to run_one to rounding."""
-        if features.ndim != 2 or features.shape[1] != self._width:
-            raise ValueError(f"found features of shape {features.shape}, expected [n, {self._width}]")
-        if len(features) == 0:
-            return np.zeros(0)
-        result: FloatArray = self._session.run(None, {"x": np.ascontiguousarray(features, np.float64)})[0]
-        return result[:, 0]
-
-    def native_error_nm(self) -> float:
-        """Return the largest difference [Nm] between native evaluation and ONNX Runtime over the probes."""
-        assert self.perceptron is not None
-        return float(np.max(np.abs(self.perceptron.run_many(self._probes) - self.run_many(self._probes))))
-
-    def prepare(self, low: FloatArray, high: FloatArray) -> None:
-        """Bind and warm up between `low` and `high` [features], where the graph must give finite torques."""
-        self._bind(low, high)
-        self._warm_up((low + high) / 2)
-        share = np.random.default_rng(0).uniform(-0.25, 1.25, (_NATIVE_PROBES, self._width))
-        self._probes = low + share * (high - low)
 
     def error(self, text: str) -> NetworkError:
         """Return the error to raise, with the file's name."""
@@ -118,7 +88,107 @@ class OnnxGraph:
         except OSError as error:
             raise self.error(f"cannot be read: {error.strerror or error}") from None
 
+
+class RefereedGraph(NetworkFile):
+    """A graph of ours that ONNX Runtime has judged in another process; runs natively.
+
+    source, sha256, errors: as `NetworkFile`; verdict: on the very bytes that are read here. NetworkError for a verdict on
+    other bytes, or on a graph that is not one of ours.
+    """
+
+    def __init__(self, source: bytes | str | os.PathLike[str], sha256: str | None, verdict: Verdict) -> None:
+        super().__init__(source, sha256)
+        if self.sha256 != verdict.sha256:
+            raise self.error(
+                f"was changed while it was checked: found SHA-256 {self.sha256}, checked {verdict.sha256}"
+            )
+        perceptron = read_perceptron(self._data)
+        if perceptron is None or verdict.native_error_nm is None:
+            raise self.error("found a graph that needs ONNX Runtime, expected one of ours")
+        self.metadata = verdict.metadata
+        self.perceptron: Final = perceptron
+        self.bound: Final = False
+        self.run_one: Final = perceptron.run_one
+        self.run_many: Final = perceptron.run_many
+        self._verdict: Final = verdict
+
+    def prepare(self, low: FloatArray, high: FloatArray) -> None:
+        """Return at once: what needs preparation is the runtime."""
+
+    def verdict(self) -> Verdict:
+        """Return the verdict."""
+        return self._verdict
+
+    def native_error_nm(self) -> float:
+        """Return the largest difference [Nm] between native evaluation and ONNX Runtime over the probes."""
+        assert self._verdict.native_error_nm is not None
+        return self._verdict.native_error_nm
+
+
+class OnnxGraph(NetworkFile):
+    """A loaded graph with `features` inputs.
+
+    source, sha256: as `NetworkFile`; features: names and order of the inputs, which the metadata must repeat; keys:
+    metadata that must be there. Raises NetworkError for an unreadable or corrupt file, another hash, shape, type or
+    missing metadata. Public: `run_one`, `bound` (after `prepare`: samples go through the binding, not through run()),
+    `perceptron` (the same graph for native evaluation, None for a graph that is not one of ours).
+    """
+
+    def __init__(
+        self,
+        source: bytes | str | os.PathLike[str],
+        sha256: str | None,
+        features: tuple[str, ...],
+        keys: tuple[str, ...],
+    ) -> None:
+        super().__init__(source, sha256)
+        self._width: Final = len(features)
+        self._session: Final = self._open(self._data)
+        self.perceptron: Final = read_perceptron(self._data)
+        self._output: Final = self._check_graph()
+        self.metadata = self._read_metadata(features, keys)
+        self._x: Final = np.zeros((1, self._width))
+        self._y: Final = np.zeros((1, 1))
+        self._x_bytes: Final[Any] = self._x.reshape(-1).view(np.uint8).data
+        self._y_view: Final[Any] = self._y.reshape(-1).data  # 3 times faster than numpy indexing
+        self._pack: Final = struct.Struct(f"={self._width}d").pack_into
+        self.bound = False
+        self.run_one: Callable[..., float] = self._run_plain
+        """Torque [Nm] of one sample; the arguments are the features in their order. Take it after `prepare`."""
+
+    def _run_plain(self, *x: float) -> float:
+        self._pack(self._x_bytes, 0, *x)
+        return float(self._session.run(None, {"x": self._x})[0][0, 0])
+
+    def run_many(self, features: FloatArray) -> FloatArray:
+        """Return torques [n] of samples [n, features]; equal to run_one to rounding."""
+        if features.ndim != 2 or features.shape[1] != self._width:
+            raise ValueError(f"found features of shape {features.shape}, expected [n, {self._width}]")
+        if len(features) == 0:
+            return np.zeros(0)
+        result: FloatArray = self._session.run(None, {"x": np.ascontiguousarray(features, np.float64)})[0]
+        return result[:, 0]
+
+    def verdict(self) -> Verdict:
+        """Return what a `RefereedGraph` of the same bytes needs; after `prepare`."""
+        return Verdict(
+            self.sha256, self.metadata, None if self.perceptron is None else self.native_error_nm()
+        )
+
+    def native_error_nm(self) -> float:
+        """Return the largest difference [Nm] between native evaluation and ONNX Runtime over the probes."""
+        assert self.perceptron is not None
+        return float(np.max(np.abs(self.perceptron.run_many(self._probes) - self.run_many(self._probes))))
+
+    def prepare(self, low: FloatArray, high: FloatArray) -> None:
+        """Bind and warm up between `low` and `high` [features], where the graph must give finite torques."""
+        self._bind(low, high)
+        self._warm_up((low + high) / 2)
+        share = np.random.default_rng(0).uniform(-0.25, 1.25, (_NATIVE_PROBES, self._width))
+        self._probes = low + share * (high - low)
+
     def _open(self, data: bytes) -> Any:
+        os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # read once, when the library is loaded
         import onnxruntime as ort
 
         ort.disable_telemetry_events()  # some builds report usage to their maker
