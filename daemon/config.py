@@ -7,7 +7,6 @@ name the file, the key, what was found and what was expected.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from jtqd.estimator.checked import ConfigError, Section, range_text
 from jtqd.estimator.decoder import FieldError, Text, check, choice, decode, limits
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.settings import EstimatorSettings, PlausibilityLimits
+from jtqd.estimator.sha256 import sha256_hex
 from jtqd.models.files import read_yaml, shipped
 
 DEFAULT_CONFIG: Final = "bench.yaml"
@@ -154,6 +154,11 @@ class JointConfig:
     """jtqd does not start without it."""
     joint_data: bytes = field(default=b"", repr=False)
     """The joint file as it was read, for the log."""
+
+    @property
+    def joint_sha256(self) -> str:
+        """Hash of the joint file."""
+        return sha256_hex(self.joint_data)
 
 
 @dataclass(frozen=True)
@@ -349,8 +354,8 @@ class Config:
     @property
     def files_sha256(self) -> str:
         """Hash of the configuration and its joint files together; networks are named in it by theirs."""
-        parts = [self.sha256, *(hashlib.sha256(joint.joint_data).hexdigest() for joint in self.joints)]
-        return hashlib.sha256("".join(parts).encode()).hexdigest()
+        parts = [self.sha256, *(joint.joint_sha256 for joint in self.joints)]
+        return sha256_hex("".join(parts).encode())
 
     @property
     def ring_cycles(self) -> int:
@@ -375,7 +380,7 @@ def load_config(path: Path | None) -> Config:
     return Config(
         path=path,
         text=_text(path, data),
-        sha256=hashlib.sha256(data).hexdigest(),
+        sha256=sha256_hex(data),
         node_id=file.node_id,
         bitrate=file.bitrate,
         period_ns=file.sync.period_us * 1000,
@@ -449,7 +454,7 @@ def _network(section: _Network, path: Path) -> NetworkFile:
         data = file.read_bytes()
     except OSError as error:
         raise ConfigError(f"{file}: cannot be read: {error.strerror}") from None
-    found = hashlib.sha256(data).hexdigest()
+    found = sha256_hex(data)
     if found != expected:
         raise ConfigError(f"{file}: sha256 of the network: found {found}, expected {expected} (from {path})")
     return NetworkFile(file, expected, data)

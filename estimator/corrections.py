@@ -27,8 +27,9 @@ import numpy as np
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.effects.channel_delay import SENSOR
 from jtqd.estimator.effects.effect import Effect, Functions, State, Values
-from jtqd.estimator.effects.functions import Scalar, Whole
 from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.effects.scalar import Scalar
+from jtqd.estimator.effects.whole import Whole
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import DIRECTION_VELOCITY_RAD_S
 from jtqd.estimator.settings import EstimatorSettings

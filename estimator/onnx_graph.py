@@ -12,7 +12,6 @@ A single sample goes through an I/O binding on two preallocated numpy buffers: n
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import os
@@ -26,6 +25,7 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.onnx_weights import read_perceptron
+from jtqd.estimator.sha256 import sha256_hex
 
 _PROBES: Final = (0.25, -0.5)  # two different inputs: the binding must see the second one
 _WARM_UP: Final = 50
@@ -48,7 +48,7 @@ class Verdict(NamedTuple):
     native_error_nm: float | None
 
 
-class NetworkFile:
+class GraphFile:
     """Bytes of a network file with their hash, and what the metadata say.
 
     source: path of an ONNX file, or its bytes; sha256: expected hash of the bytes (hex), not checked when None.
@@ -60,7 +60,7 @@ class NetworkFile:
     def __init__(self, source: bytes | str | os.PathLike[str], sha256: str | None) -> None:
         self.name: Final = "network (bytes)" if isinstance(source, bytes) else os.fspath(source)
         self._data: Final = source if isinstance(source, bytes) else self._read(source)
-        self.sha256: Final = hashlib.sha256(self._data).hexdigest()
+        self.sha256: Final = sha256_hex(self._data)
         if sha256 is not None and sha256.lower() != self.sha256:
             raise self.error(f"found SHA-256 {self.sha256}, expected {sha256}")
 
@@ -89,10 +89,10 @@ class NetworkFile:
             raise self.error(f"cannot be read: {error.strerror or error}") from None
 
 
-class RefereedGraph(NetworkFile):
+class RefereedGraph(GraphFile):
     """A graph of ours that ONNX Runtime has judged in another process; runs natively.
 
-    source, sha256, errors: as `NetworkFile`; verdict: on the very bytes that are read here. NetworkError for a verdict on
+    source, sha256, errors: as `GraphFile`; verdict: on the very bytes that are read here. NetworkError for a verdict on
     other bytes, or on a graph that is not one of ours.
     """
 
@@ -125,10 +125,10 @@ class RefereedGraph(NetworkFile):
         return self._verdict.native_error_nm
 
 
-class OnnxGraph(NetworkFile):
+class OnnxGraph(GraphFile):
     """A loaded graph with `features` inputs.
 
-    source, sha256: as `NetworkFile`; features: names and order of the inputs, which the metadata must repeat; keys:
+    source, sha256: as `GraphFile`; features: names and order of the inputs, which the metadata must repeat; keys:
     metadata that must be there. Raises NetworkError for an unreadable or corrupt file, another hash, shape, type or
     missing metadata. Public: `run_one`, `bound` (after `prepare`: samples go through the binding, not through run()),
     `perceptron` (the same graph for native evaluation, None for a graph that is not one of ours).

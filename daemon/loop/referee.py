@@ -12,6 +12,7 @@ from jtqd.daemon.config import Config
 from jtqd.daemon.shared.child_process import Child, ChildError
 from jtqd.estimator.onnx_graph import Verdict
 
+PROGRAM = "jtqd.estimator.referee"
 _LONGEST_S = 60.0
 
 
@@ -20,7 +21,7 @@ def judged(config: Config) -> list[Verdict | str | None]:
     networks = [joint.network for joint in config.joints]
     if not any(networks):
         return [None] * len(networks)
-    child = Child("jtqd.estimator.referee", name="the check by ONNX Runtime")
+    child = Child(PROGRAM, name="the check by ONNX Runtime")
     try:
         for each in networks:
             if each is not None:
