@@ -64,8 +64,12 @@ def _one(log: Path, method: str, seconds: float, scratch: Path) -> dict[str, Any
     steps = [steps_of(each, config) for each in part.joints]
     logged_s = len(part.joints[0]) * config.period_ns * 1e-9
 
+    estimators = models.estimators()  # compares each network with ONNX Runtime: once per replay, however long
+
     def exact() -> None:
-        ExactReplay(part.origin, models.estimators(), safety).run(part.joints, frames, steps)
+        for each in estimators:
+            each.reset()
+        ExactReplay(part.origin, estimators, safety).run(part.joints, frames, steps)
 
     times = max(1, round(seconds / logged_s))
     joints = longer(part, times)
