@@ -9,7 +9,7 @@ import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.checked import ConfigError
-from jtqd.estimator.corrections import acting_effects, extended_run, needs_torque, plain_joint
+from jtqd.estimator.corrections import acting_effects, plain_joint
 from jtqd.estimator.estimator import ExtendedEstimator, FusedEstimator, JointEstimator
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.network import FusedNetwork, TorqueNetwork
@@ -74,9 +74,6 @@ def estimate_steps(  # noqa: PLR0917 - as `estimate_columns`, and which samples 
     """
     current, motor, velocity, link = _inputs(joint, columns)
     temperature = columns.temperature_c
-    if acting_effects(joint) and not needs_torque(joint):  # all corrections at once
-        current, link = extended_run(joint, settings, dt_s, current, motor, velocity, link, temperature)
-        joint = plain_joint(joint)
     estimator = make_estimator(joint, settings, network)
     return estimator.run(dt_s, current, motor, velocity, link, temperature, network_wanted)
 
