@@ -22,7 +22,7 @@ from jtqd.estimator.checked import ConfigError, count, counted, natural, seconds
 from jtqd.estimator.run import RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, TimeFunction, emulate_run
-from jtqd.sim_can.plant_file import PlantParameters, load_plant
+from jtqd.sim_can.plants import AnyPlant, load_any_plant
 from jtqd.sysid.campaign.plan import Plan, Run, expand, marks_of
 from jtqd.sysid.campaign.plans import Scale, make_plan
 from jtqd.sysid.progress import progress
@@ -38,11 +38,11 @@ _EXAMPLE = (
 
 def emulated(plan: Plan, plant: Path, seed: int) -> dict[str, RunTable]:
     """Return the run tables of a plan on the bench of `plant`, each on a day of its own. Raises ConfigError."""
-    bench = load_plant(plant)
+    bench = load_any_plant(plant)
     return {run.name: emulated_run(bench, seed, day, run) for day, run in enumerate(plan.runs)}
 
 
-def emulated_run(bench: PlantParameters, seed: int, day: int, run: Run) -> RunTable:
+def emulated_run(bench: AnyPlant, seed: int, day: int, run: Run) -> RunTable:
     """Return the table of one run on this day of the seed."""
     points = expand(run)
     commands = (
@@ -65,7 +65,7 @@ def _sampled(values: FloatArray) -> TimeFunction:
 
 def _write_run_files(out: Path, plant: Path, seed: int, numbered: tuple[int, Run]) -> str:
     day, run = numbered
-    write_run(out / f"{run.name}.csv.gz", emulated_run(load_plant(plant), seed, day, run))
+    write_run(out / f"{run.name}.csv.gz", emulated_run(load_any_plant(plant), seed, day, run))
     (out / f"{run.name}.json").write_text(json.dumps(marks_of(run, expand(run)), indent=1) + "\n")
     return run.name
 
@@ -88,7 +88,7 @@ def main(arguments: list[str] | None = None) -> int:
     scale = Scale(options.runs, options.seconds, options.hold, options.seed, joints=joints)
     try:
         plan = make_plan("validate", scale)
-        load_plant(options.plant)
+        load_any_plant(options.plant)
         _claim(options.out, plan, options.plant, options.seed)
         _emulate(options.out, plan, options.plant, options.seed)
     except (ConfigError, OSError) as error:
