@@ -52,10 +52,9 @@ def _zero(_time_s: float) -> float:
 
 
 class EmulatedRun(NamedTuple):
-    """A run, and what no instrument knows: torque_nm [n] in the sensor, joint_torque_nm [n, 2]: τ of each gear, own frames."""
+    """A run and what no instrument knows: the true torque of each gear, [n, 2] in Nm, own frames."""
 
     table: RunTable
-    torque_nm: FloatArray
     joint_torque_nm: FloatArray
 
 
@@ -108,7 +107,7 @@ def emulate(
         source = PlantSource(plant, seed)
         source.begin_day(day)
     rows = np.empty((count, 2 * _SIGNALS + 1))
-    truth = np.empty((count, 3))
+    truth = np.empty((count, 2))
     # velocity targets are joint side here, motor side in the drives
     scale = [
         drive.gear_ratio if c.mode == VELOCITY else 1.0
@@ -132,7 +131,7 @@ def emulate(
             two.temperature_c,
             channel.torque_nm,
         )
-        truth[k] = (source.plant.sensor_torque(), *source.plant.joint_torques())
+        truth[k] = source.plant.joint_torques()
         time_s = k * period_s
         source.command(0, mode_1, scale[0] * target_1(time_s))
         source.command(1, mode_2, scale[1] * target_2(time_s))
@@ -145,7 +144,7 @@ def emulate(
         for number in (1, 2)
     }
     time: FloatArray = np.arange(count, dtype=np.float64) * period_s
-    return EmulatedRun(RunTable(time_s=time, joints=joints), truth[:, 0], truth[:, 1:])
+    return EmulatedRun(RunTable(time_s=time, joints=joints), truth)
 
 
 def _columns(signals: FloatArray, torque: FloatArray, ratings: DriveRatings) -> JointColumns:
