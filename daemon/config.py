@@ -7,7 +7,6 @@ name the file, the key, what was found and what was expected.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -27,6 +26,7 @@ from jtqd.estimator.checked import ConfigError, Section, Verbatim, range_text
 from jtqd.estimator.decoder import FieldError, Text, check, choice, decode, limits
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.settings import EstimatorSettings, PlausibilityLimits
+from jtqd.estimator.sha256 import sha256_hex
 from jtqd.models.files import read_regular, read_yaml, shipped
 
 DEFAULT_CONFIG: Final = "bench.yaml"
@@ -174,6 +174,11 @@ class JointConfig:
     """Which objects of the drive are mapped, with sign and factor."""
     joint_data: bytes = field(default=b"", repr=False)
     """The joint file as it was read, for the log."""
+
+    @property
+    def joint_sha256(self) -> str:
+        """Hash of the joint file."""
+        return sha256_hex(self.joint_data)
 
 
 @dataclass(frozen=True)
@@ -491,8 +496,8 @@ class Config:
     @property
     def files_sha256(self) -> str:
         """Hash of the configuration and its joint files together; networks are named in it by theirs."""
-        parts = [self.sha256, *(hashlib.sha256(joint.joint_data).hexdigest() for joint in self.joints)]
-        return hashlib.sha256("".join(parts).encode()).hexdigest()
+        parts = [self.sha256, *(joint.joint_sha256 for joint in self.joints)]
+        return sha256_hex("".join(parts).encode())
 
     @property
     def sequence_overflow(self) -> int:
@@ -522,7 +527,7 @@ def load_config(path: Path | None) -> Config:
     return Config(
         path=path,
         text=_text(path, data),
-        sha256=hashlib.sha256(data).hexdigest(),
+        sha256=sha256_hex(data),
         node_id=file.node_id,
         bitrate=file.bitrate,
         period_ns=file.sync.period_us * 1000,
@@ -597,7 +602,7 @@ def _whole(values: Mapping[str, float]) -> dict[str, int]:
 def _network(section: _Network, path: Path) -> NetworkFile:
     file, expected = path.parent / section.file, section.sha256.lower()
     data = read_regular(file, _LARGEST_NETWORK, "a network")
-    found = hashlib.sha256(data).hexdigest()
+    found = sha256_hex(data)
     if found != expected:
         raise ConfigError(f"{file}: sha256 of the network: found {found}, expected {expected} (from {path})")
     return NetworkFile(file, expected, data)

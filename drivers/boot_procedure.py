@@ -6,7 +6,6 @@ compared; the values read make the node's configuration hash. No bus, no clock.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
@@ -361,6 +360,8 @@ def reset_during_boot(node: int) -> BootError:
 def configuration_sha256(values: Mapping[Key, int]) -> str:
     """Return the SHA-256 over every value, in the order of the objects."""
     lines = [f"{index:04X}h:{subindex}={value}\n" for (index, subindex), value in sorted(values.items())]
+    import hashlib  # in the boot process alone: it loads OpenSSL, 3.4 MB
+
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 

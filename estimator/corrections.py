@@ -22,13 +22,10 @@ from dataclasses import replace
 from math import expm1, isfinite, nan, tanh
 from typing import Any, Final, NamedTuple
 
-import numpy as np
-
-from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.effects.channel_delay import SENSOR
 from jtqd.estimator.effects.effect import Effect, Functions, State, Values
-from jtqd.estimator.effects.functions import Scalar, Whole
 from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.effects.scalar import Scalar
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import DIRECTION_VELOCITY_RAD_S
 from jtqd.estimator.settings import EstimatorSettings
@@ -88,11 +85,6 @@ def plain_joint(joint: Joint) -> Joint:
         if effect.changes_joint:
             plain = effect.joint(entry.parameters, plain)
     return plain
-
-
-def needs_torque(joint: Joint) -> bool:
-    """Return whether a loss depends on the torque, so that corrections need the estimate of the sample before."""
-    return any("loss_nm" in e.hooks and "torque_nm" in e.needs for e, _ in acting_effects(joint))
 
 
 def torsion_zero(joint: Joint) -> float:
@@ -260,86 +252,3 @@ class ExtendedInputs:
         self._state.current_rate_a_s = self._rate
         for x in self._slips:
             x.share = share  # type: ignore[attr-defined]
-
-
-class SmoothedRun(Whole):
-    """`Smoothed` over a run; share [n], 0 where a sample is not used."""
-
-    __slots__ = ("_share",)
-
-    def __init__(self, share: FloatArray) -> None:
-        self._share: Final = share.tolist()
-
-    def slip(self, d: FloatArray, travel: float) -> FloatArray:  # type: ignore[override]
-        """Return the states [n]."""
-        one = Smoothed()
-        out: list[float] = []
-        for now, share in zip(d.tolist(), self._share, strict=True):
-            one.share = share
-            out.append(one.slip(now, travel) if share else nan)
-        return np.array(out)
-
-
-def extended_run(  # noqa: PLR0917 - a sample, in arrays
-    joint: Joint,
-    settings: EstimatorSettings,
-    dt_s: FloatArray,
-    current_a: FloatArray,
-    motor_position_rad: FloatArray,
-    motor_velocity_rad_s: FloatArray,
-    link_position_rad: FloatArray,
-    temperature_c: FloatArray | None = None,
-) -> tuple[FloatArray, FloatArray]:
-    """Return (i', theta_l') of a run, arrays [n]: twin of ExtendedInputs for joints without `needs_torque`."""
-    assert not needs_torque(joint)
-    pairs = acting_effects(joint)
-    plain = replace(joint, effects=())
-    with np.errstate(all="ignore"):  # what is not finite is put back below
-        good = np.isfinite(current_a + motor_position_rad + motor_velocity_rad_s + link_position_rad)
-        runs = good & np.concatenate(([False], good[:-1])) & (dt_s > 0.0) & (dt_s <= settings.max_gap_s)
-        share = np.where(runs, -np.expm1(-settings.bandwidth_rad_s * dt_s), 1.0) * good
-        v = motor_velocity_rad_s / joint.gear_ratio
-        rate = np.zeros_like(v)
-        if any(
-            effect.name == "channel_delay" for effect, _ in pairs
-        ):  # the one that reads the current's past
-            rate = _rates(settings.link_bandwidth_rad_s, dt_s, current_a, good, runs)
-        s = State(
-            current_a=current_a,
-            current_rate_a_s=rate,
-            direction=np.tanh(v * INVERSE_W0),
-            link_position_rad=link_position_rad,
-            link_velocity_rad_s=v,
-            motor_position_rad=motor_position_rad,
-            temperature_c=np.full_like(v, nan) if temperature_c is None else temperature_c,
-            velocity_rad_s=v,
-        )
-
-        def total(name: str, of: Pairs = pairs) -> Any:
-            hooks = hooks_of(of, name, lambda: SmoothedRun(share))
-            return sum(call(p, s, plain, x) for call, p, x in hooks)
-
-        seeming = seeming_inertia_a(joint) * total("link_rad", at_motor(pairs)) * motor_velocity_rad_s**2
-        s.current_a = current = current_a - total("current_a") + seeming
-        link = link_position_rad - total("link_rad")
-        s.torsion_rad = motor_position_rad / joint.gear_ratio - link - torsion_zero(joint)
-        s.torque_nm = np.full_like(v, nan)  # not used: see needs_torque
-        link = link - total("twist_rad")
-        current = current - total("loss_nm") / (joint.gear_ratio * joint.torque_constant_nm_per_a)
-    return np.where(good, current, current_a), np.where(good, link, link_position_rad)
-
-
-def _rates(
-    rate_rad_s: float, dt_s: FloatArray, current_a: FloatArray, good: BoolArray, runs: BoolArray
-) -> FloatArray:
-    """Return the filtered derivative of the current [n]; good: samples used, runs: those that do not start again."""
-    out = np.zeros_like(current_a)
-    gone = -np.expm1(-rate_rad_s * dt_s)
-    slope = np.diff(current_a, prepend=0.0) / dt_s
-    rate = 0.0
-    rows = zip(gone.tolist(), slope.tolist(), good.tolist(), runs.tolist(), strict=True)
-    for k, (share, now, usable, on) in enumerate(rows):
-        if usable:
-            rate = rate + share * (now - rate) if on else 0.0
-            out[k] = rate
-    return out

@@ -10,14 +10,12 @@ plant alike; each opposes the motion and is continuous everywhere:
 | `AdditiveLossModel` | load, velocity, direction, temperature | `fused` |
 
 The functions on parameter blocks are what runs in a cycle; the classes give them to Python, for one value or (suffix
-_many) for arrays of any shape.
+_many) for arrays of any shape. numpy is loaded where an array comes: the emulated bench has none.
 """
 
 from libc.math cimport NAN, exp, expm1, fabs, fmax, fmin, isnan, tanh
 
 from typing import Final
-
-import numpy as np
 
 from jtqd.estimator.joint import MAX_NODES
 
@@ -95,6 +93,8 @@ cdef class FrictionModel:
 
     def torque_many(self, velocity_rad_s):
         """Return the same for an array of velocities."""
+        import numpy as np
+
         shape, v = _flat(velocity_rad_s)
         out = np.empty(len(v))
         cdef const double[::1] of = v
@@ -238,6 +238,8 @@ cdef class LossModel:
 
     def loss_many(self, current_a, joint_velocity_rad_s):
         """Return the same for two arrays of one shape."""
+        import numpy as np
+
         current_a, joint_velocity_rad_s = np.broadcast_arrays(current_a, joint_velocity_rad_s)
         shape, i = _flat(current_a)
         _, v = _flat(joint_velocity_rad_s)
@@ -377,6 +379,8 @@ cdef class AdditiveLossModel:
 
     def loss_many(self, raw_nm, velocity_rad_s, temperature_c, direction=None):
         """Return the same for arrays [n]; temperature_c in place of h(T), NaN where not known."""
+        import numpy as np
+
         _, raw = _flat(raw_nm)
         _, v = _flat(velocity_rad_s)
         _, temperature = _flat(np.broadcast_to(temperature_c, raw.shape))
@@ -404,5 +408,7 @@ cdef class AdditiveLossModel:
 
 def _flat(values):
     """Return the shape of an array, and its values [n] as contiguous float64."""
+    import numpy as np
+
     array = np.asarray(values, np.float64)
     return array.shape, np.ascontiguousarray(array).reshape(-1)

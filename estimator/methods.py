@@ -9,10 +9,11 @@ import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.checked import ConfigError
-from jtqd.estimator.corrections import acting_effects, extended_run, needs_torque, plain_joint
+from jtqd.estimator.corrections import acting_effects, plain_joint
 from jtqd.estimator.estimator import ExtendedEstimator, FusedEstimator, JointEstimator
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.network import FusedNetwork, TorqueNetwork
+from jtqd.estimator.onnx_graph import Verdict
 from jtqd.estimator.run import EstimateRun, JointColumns
 from jtqd.estimator.sample import Estimator
 from jtqd.estimator.settings import EstimatorSettings
@@ -21,9 +22,15 @@ AnyEstimator = Estimator
 AnyNetwork = TorqueNetwork | FusedNetwork
 
 
-def load_network(method: str, source: bytes | str, sha256: str | None = None) -> AnyNetwork:
-    """Return the network of a method from a file or bytes. Raises NetworkError."""
-    return FusedNetwork(source, sha256) if method == "fused" else TorqueNetwork(source, sha256)
+def load_network(
+    method: str, source: bytes | str, sha256: str | None = None, verdict: Verdict | None = None
+) -> AnyNetwork:
+    """Return the network of a method from a file or bytes. Raises NetworkError.
+
+    verdict: of ONNX Runtime in another process (`AnyNetwork.verdict`); None: it judges here.
+    """
+    kind = FusedNetwork if method == "fused" else TorqueNetwork
+    return kind(source, sha256, verdict)
 
 
 def make_estimator(
@@ -67,9 +74,6 @@ def estimate_steps(  # noqa: PLR0917 - as `estimate_columns`, and which samples 
     """
     current, motor, velocity, link = _inputs(joint, columns)
     temperature = columns.temperature_c
-    if acting_effects(joint) and not needs_torque(joint):  # all corrections at once
-        current, link = extended_run(joint, settings, dt_s, current, motor, velocity, link, temperature)
-        joint = plain_joint(joint)
     estimator = make_estimator(joint, settings, network)
     return estimator.run(dt_s, current, motor, velocity, link, temperature, network_wanted)
 

@@ -16,7 +16,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.envelope import Envelope
 from jtqd.estimator.joint import Fused, Joint
-from jtqd.estimator.onnx_graph import NetworkError, OnnxGraph, finite
+from jtqd.estimator.onnx_graph import NetworkError, OnnxGraph, RefereedGraph, Verdict, finite
 from jtqd.estimator.perceptron import Perceptron
 from jtqd.estimator.settings import EstimatorSettings
 
@@ -128,23 +128,43 @@ FEATURES: Final = (
 _KEYS: Final = ("envelope_low", "envelope_high", "sigma_nm", "joint", "data_sha256")
 
 
+def _graph(
+    source: bytes | str | os.PathLike[str],
+    sha256: str | None,
+    features: tuple[str, ...],
+    keys: tuple[str, ...],
+    verdict: Verdict | None,
+) -> OnnxGraph | RefereedGraph:
+    """Open a graph: in ONNX Runtime, unless it is one of ours and judged already."""
+    if verdict is None or verdict.native_error_nm is None:
+        return OnnxGraph(source, sha256, features, keys)
+    return RefereedGraph(source, sha256, verdict)
+
+
 class TorqueNetwork:
     """Network of the paper, loaded and checked.
 
-    source: path of an ONNX file, or its bytes; sha256: expected hash of the bytes (hex), not checked when None. Metadata,
-    each value JSON: features, envelope_low and envelope_high (range of the training data per feature), sigma_nm (held-out
-    standard deviation), joint (name), data_sha256 (training data).
+    source: path of an ONNX file, or its bytes; sha256: expected hash of the bytes (hex), not checked when None; verdict:
+    of ONNX Runtime in another process on these bytes: a graph of ours then runs without it here. Metadata, each value
+    JSON: features, envelope_low and envelope_high (range of the training data per feature), sigma_nm (held-out standard
+    deviation), joint (name), data_sha256 (training data).
 
     Public: `name`, `sha256`, `envelope_low`, `envelope_high` (6 floats each), `sigma_nm`, `joint`, `data_sha256`,
     `bound` (samples go through a binding, see `OnnxGraph`); `run_one(x0..x5)` torque of one sample [Nm],
-    `run_many([n, 6])` of many.
+    `run_many([n, 6])` of many; `verdict()`.
 
     Raises NetworkError for an unreadable or corrupt file, another hash, shape, type or missing metadata.
     """
 
-    def __init__(self, source: bytes | str | os.PathLike[str], sha256: str | None = None) -> None:
-        graph = OnnxGraph(source, sha256, FEATURES, _KEYS)
+    def __init__(
+        self,
+        source: bytes | str | os.PathLike[str],
+        sha256: str | None = None,
+        verdict: Verdict | None = None,
+    ) -> None:
+        graph = _graph(source, sha256, FEATURES, _KEYS, verdict)
         self._graph: Final = graph
+        self.verdict: Final = graph.verdict
         self.name: Final = graph.name
         self.sha256: Final = graph.sha256
         self.envelope_low: Final = graph.numbers("envelope_low", len(FEATURES))
@@ -216,9 +236,15 @@ class FusedNetwork:
     of one sample [Nm], `run_many([n, 7])` of many.
     """
 
-    def __init__(self, source: bytes | str | os.PathLike[str], sha256: str | None = None) -> None:
-        graph = OnnxGraph(source, sha256, FUSED_FEATURES, _FUSED_KEYS)
+    def __init__(
+        self,
+        source: bytes | str | os.PathLike[str],
+        sha256: str | None = None,
+        verdict: Verdict | None = None,
+    ) -> None:
+        graph = _graph(source, sha256, FUSED_FEATURES, _FUSED_KEYS, verdict)
         self._graph: Final = graph
+        self.verdict: Final = graph.verdict
         self.name: Final = graph.name
         self.sha256: Final = graph.sha256
         try:

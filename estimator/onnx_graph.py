@@ -3,12 +3,15 @@
 The graph takes "x" [N, n] (named features, SI units, normalisation inside) and gives [N, 1] torque [Nm]. Its
 metadata hold one JSON value per key; the caller names the keys that must be there.
 
+    OnnxGraph       opened here: the referee of every graph, and what runs one that is not ours
+    RefereedGraph   one of ours that ONNX Runtime has judged in another process (`Verdict`): runs natively, without the
+                    40 MB of the runtime
+
 A single sample goes through an I/O binding on two preallocated numpy buffers: no array is made per call.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import os
@@ -18,12 +21,13 @@ import threading
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.onnx_weights import read_perceptron
+from jtqd.estimator.sha256 import sha256_hex
 
 _PROBES: Final = (0.25, -0.5)  # two different inputs: the binding must see the second one
 _WARM_UP: Final = 50
@@ -37,14 +41,106 @@ class NetworkError(ValueError):
     """The network file cannot be used; one line that names file, found and expected."""
 
 
-class OnnxGraph:
+class Verdict(NamedTuple):
+    """What ONNX Runtime has found in a file that it accepts.
+
+    native_error_nm: largest difference of native evaluation at the probes; None for a graph that is not one of ours.
+    """
+
+    sha256: str
+    metadata: dict[str, Any]
+    native_error_nm: float | None
+
+
+class GraphFile:
+    """Bytes of a network file with their hash, and what the metadata say.
+
+    source: path of an ONNX file, or its bytes; sha256: expected hash of the bytes (hex), not checked when None.
+    Raises NetworkError for an unreadable file or another hash. Public: `name`, `sha256`, `metadata`.
+    """
+
+    metadata: dict[str, Any]
+
+    def __init__(self, source: bytes | str | os.PathLike[str], sha256: str | None) -> None:
+        self.name: Final = "network (bytes)" if isinstance(source, bytes) else os.fspath(source)
+        self._data: Final = source if isinstance(source, bytes) else self._read(source)
+        self.sha256: Final = sha256_hex(self._data)
+        if sha256 is not None and sha256.lower() != self.sha256:
+            raise self.error(f"found SHA-256 {self.sha256}, expected {sha256}")
+
+    def error(self, text: str) -> NetworkError:
+        """Return the error to raise, with the file's name."""
+        return NetworkError(f"{self.name}: {text}")
+
+    def text(self, key: str) -> str:
+        """Return a text of the metadata."""
+        value = self.metadata[key]
+        if not isinstance(value, str) or not value.isprintable() or not value:
+            raise self.error(f"metadata '{key}': found {value!r}, expected a text of printable characters")
+        return value
+
+    def numbers(self, key: str, count: int) -> tuple[float, ...]:
+        """Return `count` finite numbers of the metadata."""
+        values = self.metadata[key]
+        if not (isinstance(values, list) and len(values) == count and all(map(finite, values))):
+            raise self.error(f"metadata '{key}': found {values!r}, expected {count} finite numbers")
+        return tuple(float(value) for value in values)
+
+    def _read(self, path: str | os.PathLike[str]) -> bytes:
+        try:
+            if stat.S_ISREG(os.stat(path).st_mode):  # a pipe would be waited for
+                return Path(path).read_bytes()
+            reason = "not a regular file"
+        except OSError as error:
+            reason = error.strerror or str(error)
+        except ValueError as error:  # a NUL in the name
+            reason = str(error)
+        raise self.error(f"cannot be read: {reason}")
+
+
+class RefereedGraph(GraphFile):
+    """A graph of ours that ONNX Runtime has judged in another process; runs natively.
+
+    source, sha256, errors: as `GraphFile`; verdict: on the very bytes that are read here. NetworkError for a verdict on
+    other bytes, or on a graph that is not one of ours.
+    """
+
+    def __init__(self, source: bytes | str | os.PathLike[str], sha256: str | None, verdict: Verdict) -> None:
+        super().__init__(source, sha256)
+        if self.sha256 != verdict.sha256:
+            raise self.error(
+                f"was changed while it was checked: found SHA-256 {self.sha256}, checked {verdict.sha256}"
+            )
+        perceptron = read_perceptron(self._data)
+        if perceptron is None or verdict.native_error_nm is None:
+            raise self.error("found a graph that needs ONNX Runtime, expected one of ours")
+        self.metadata = verdict.metadata
+        self.perceptron: Final = perceptron
+        self.bound: Final = False
+        self.run_one: Final = perceptron.run_one
+        self.run_many: Final = perceptron.run_many
+        self._verdict: Final = verdict
+
+    def prepare(self, low: FloatArray, high: FloatArray) -> None:
+        """Return at once: what needs preparation is the runtime."""
+
+    def verdict(self) -> Verdict:
+        """Return the verdict."""
+        return self._verdict
+
+    def native_error_nm(self) -> float:
+        """Return the largest difference [Nm] between native evaluation and ONNX Runtime over the probes."""
+        assert self._verdict.native_error_nm is not None
+        return self._verdict.native_error_nm
+
+
+class OnnxGraph(GraphFile):
     """A loaded graph with `features` inputs.
 
-    source: path of an ONNX file, or its bytes; sha256: expected hash of the bytes (hex), not checked when
-    None; features: names and order of the inputs, which the metadata must repeat; keys: metadata that must be
-    there. Raises NetworkError for an unreadable or corrupt file, another hash, shape, type or missing
-    metadata. Public: `name`, `sha256`, `metadata`, `run_one`, `bound` (after `prepare`: samples go through the
-    binding, not through run()), `perceptron` (the same graph for native evaluation, None for a graph that is not ours).
+    source, sha256: as `GraphFile`; features: names and order of the inputs, which the metadata must repeat; keys:
+    metadata that must be there. Raises NetworkError for an unreadable or corrupt file, another hash, shape, type or
+    missing metadata. Public: `run_one`, `bound` (after `prepare`: samples go through the binding, not through run()),
+    `perceptron` (the same graph for native evaluation, None for a graph that is not one of ours).
     """
 
     def __init__(
@@ -54,16 +150,12 @@ class OnnxGraph:
         features: tuple[str, ...],
         keys: tuple[str, ...],
     ) -> None:
-        self.name: Final = "network (bytes)" if isinstance(source, bytes) else os.fspath(source)
-        data = source if isinstance(source, bytes) else self._read(source)
-        self.sha256: Final = hashlib.sha256(data).hexdigest()
-        if sha256 is not None and sha256.lower() != self.sha256:
-            raise self.error(f"found SHA-256 {self.sha256}, expected {sha256}")
+        super().__init__(source, sha256)
         self._width: Final = len(features)
-        self._session: Final = self._answered(partial(self._open, data))
-        self.perceptron: Final = read_perceptron(data)
+        self._session: Final = self._open(self._data)
+        self.perceptron: Final = read_perceptron(self._data)
         self._output: Final = self._check_graph()
-        self.metadata: Final = self._read_metadata(features, keys)
+        self.metadata = self._read_metadata(features, keys)
         self._x: Final = np.zeros((1, self._width))
         self._y: Final = np.zeros((1, 1))
         self._x_bytes: Final[Any] = self._x.reshape(-1).view(np.uint8).data
@@ -85,6 +177,12 @@ class OnnxGraph:
             return np.zeros(0)
         result: FloatArray = self._session.run(None, {"x": np.ascontiguousarray(features, np.float64)})[0]
         return result[:, 0]
+
+    def verdict(self) -> Verdict:
+        """Return what a `RefereedGraph` of the same bytes needs; after `prepare`."""
+        return Verdict(
+            self.sha256, self.metadata, None if self.perceptron is None else self.native_error_nm()
+        )
 
     def native_error_nm(self) -> float:
         """Return the largest difference [Nm] between native evaluation and ONNX Runtime over the probes."""
@@ -121,36 +219,8 @@ class OnnxGraph:
             raise self.error(f"found no answer within {_LONGEST_S:g} s, expected one: it is not used")
         return results[0]
 
-    def error(self, text: str) -> NetworkError:
-        """Return the error to raise, with the file's name."""
-        return NetworkError(f"{self.name}: {text}")
-
-    def text(self, key: str) -> str:
-        """Return a text of the metadata."""
-        value = self.metadata[key]
-        if not isinstance(value, str) or not value.isprintable() or not value:
-            raise self.error(f"metadata '{key}': found {value!r}, expected a text of printable characters")
-        return value
-
-    def numbers(self, key: str, count: int) -> tuple[float, ...]:
-        """Return `count` finite numbers of the metadata."""
-        values = self.metadata[key]
-        if not (isinstance(values, list) and len(values) == count and all(map(finite, values))):
-            raise self.error(f"metadata '{key}': found {values!r}, expected {count} finite numbers")
-        return tuple(float(value) for value in values)
-
-    def _read(self, path: str | os.PathLike[str]) -> bytes:
-        try:
-            if stat.S_ISREG(os.stat(path).st_mode):  # a pipe would be waited for
-                return Path(path).read_bytes()
-            reason = "not a regular file"
-        except OSError as error:
-            reason = error.strerror or str(error)
-        except ValueError as error:  # a NUL in the name
-            reason = str(error)
-        raise self.error(f"cannot be read: {reason}")
-
     def _open(self, data: bytes) -> Any:
+        os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # read once, when the library is loaded
         import onnxruntime as ort
 
         ort.disable_telemetry_events()  # some builds report usage to their maker
@@ -161,7 +231,11 @@ class OnnxGraph:
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.log_severity_level = 4  # what is wrong comes as an exception; nothing else on stderr
         try:
-            return ort.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+            return self._answered(
+                partial(ort.InferenceSession, data, options, providers=["CPUExecutionProvider"])
+            )
+        except NetworkError:
+            raise
         except Exception as error:  # onnxruntime raises its own types, without a common base
             lines = str(error).strip().splitlines()
             reason = lines[0][:160] if lines else type(error).__name__

@@ -25,7 +25,7 @@ def read_perceptron(data: bytes) -> Perceptron | None:
     """Return the network of an ONNX file of ours (`Gemm, Tanh, ..., Gemm`, plain or gated), None for any other graph."""
     try:
         return _read(data)
-    except (KeyError, IndexError, ValueError, struct.error):
+    except (KeyError, IndexError, ValueError, OverflowError, struct.error):
         return None  # ONNX Runtime, which has loaded the file, evaluates it
 
 

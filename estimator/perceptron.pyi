@@ -4,6 +4,8 @@ from jtqd.estimator.arrays import FloatArray
 
 Layers = Sequence[tuple[FloatArray, FloatArray]]
 
+def tanh_many(values: FloatArray) -> FloatArray: ...
+
 class Perceptron:
     def __init__(self, layers: Layers, gate: Sequence[int] | None = None) -> None: ...
     @staticmethod

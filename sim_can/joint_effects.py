@@ -15,8 +15,8 @@ from typing import Any
 
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.effects.effect import Effect, Functions, State, Values
-from jtqd.estimator.effects.functions import Scalar
 from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.effects.scalar import Scalar
 from jtqd.estimator.joint import Joint
 from jtqd.sim_can.losses import JointFriction
 

@@ -1,8 +1,6 @@
 from collections.abc import Callable
 from typing import Final
 
-from jtqd.estimator.arrays import FloatArray
-
 LOWEST_TABLE_VELOCITY_RAD_S: Final = 0.2
 VELOCITY_STEP_RAD_S: Final = 0.1
 HIGHEST_TABLE_VELOCITY_RAD_S: Final = 3.6
@@ -13,11 +11,11 @@ class LossTable:
     per_torque_step: float
     per_velocity_step: float
     last_row: int
-    forward: FloatArray
-    reverse: FloatArray
+    forward: memoryview
+    reverse: memoryview
     def __init__(
         self,
-        loss: Callable[[FloatArray, FloatArray], FloatArray],
+        loss: Callable[[float, float], float],
         gear_ratio: float,
         torque_constant_nm_per_a: float,
         highest_current_a: float,

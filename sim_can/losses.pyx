@@ -4,11 +4,10 @@ A gear's losses depend on what it transmits, F(τ, v), not on the motor's curren
 current and velocity into a table of that, `JointFriction` adds what the true joint differs from its file. Pure.
 """
 
-from libc.math cimport exp, fabs
+from libc.math cimport NAN, exp, fabs, fmax, fmin
 
+from array import array
 from typing import Final
-
-import numpy as np
 
 LOWEST_TABLE_VELOCITY_RAD_S: Final = 0.2
 """Table I holds for 0.2 to 3 rad/s and up to 5 A. Below 0.2 rad/s an estimator's loss law may be smoothed through zero
@@ -32,8 +31,7 @@ cdef class LossTable:
     teeth). In steady state both are the same and η is Table I's.
 
     Args:
-        loss: loss(currents [A], joint velocities [rad/s]) -> Nm, arrays of one shape, signed like the
-        velocity.
+        loss: loss(current [A], joint velocity [rad/s]) -> Nm, signed like the velocity.
         gear_ratio: G. torque_constant_nm_per_a: Kt of the law (the nominal one, also where the plant's true
         Kt deviates).
         highest_current_a: the law is tabulated for |i| up to this; beyond, the loss stays what it is there.
@@ -49,9 +47,8 @@ cdef class LossTable:
         self.per_velocity_step = 1.0 / VELOCITY_STEP_RAD_S
         self.last_row = round(HIGHEST_TABLE_VELOCITY_RAD_S / VELOCITY_STEP_RAD_S) - 1
         self.columns = TORQUE_STEPS + 1
-        grid = np.linspace(-self.torque_limit, self.torque_limit, TORQUE_STEPS + 1)
-        self.forward = self.forward_rows = _rows(loss, nm_per_a, grid, highest_current_a, +1.0)
-        self.reverse = self.reverse_rows = _rows(loss, nm_per_a, grid, highest_current_a, -1.0)
+        self.forward = self.forward_rows = _rows(loss, nm_per_a, highest_current_a, +1.0)
+        self.reverse = self.reverse_rows = _rows(loss, nm_per_a, highest_current_a, -1.0)
 
     def magnitude(self, double torque_nm, double velocity_rad_s):
         """Return F(τ, v) in Nm, never negative; the sign of v selects the direction (v = 0 counts as forward)."""
@@ -81,22 +78,49 @@ cdef class LossTable:
         return low_value + (x - k) * (high[0] + y * (high[1] - high[0]) - low_value)
 
 
-def _rows(loss, double nm_per_a, grid, double highest, double sign):
+def _rows(loss, double nm_per_a, double highest, double sign):
     """Return the magnitudes of the loss for one direction of motion."""
-    count = round(HIGHEST_TABLE_VELOCITY_RAD_S / VELOCITY_STEP_RAD_S) + 1
-    first = round(LOWEST_TABLE_VELOCITY_RAD_S / VELOCITY_STEP_RAD_S)
-    # three times the range in current, so that the curve covers the torque grid where η is small, too
-    currents = np.linspace(-3.0 * highest, 3.0 * highest, 6 * TORQUE_STEPS + 1)
-    clipped = np.clip(currents, -highest, highest)
-    rows = np.empty((count, len(grid)))
+    cdef int count = round(HIGHEST_TABLE_VELOCITY_RAD_S / VELOCITY_STEP_RAD_S) + 1
+    cdef int first = round(LOWEST_TABLE_VELOCITY_RAD_S / VELOCITY_STEP_RAD_S)
+    cdef int last = 6 * TORQUE_STEPS
+    cdef int k, n, m, columns = TORQUE_STEPS + 1
+    # not numpy's arrays: it would be 11 MB in a process that needs no more of it
+    table = memoryview(array("d", bytes(8 * count * columns))).cast("B").cast("d", (count, columns))
+    cdef double[:, ::1] rows = table
+    cdef double[::1] losses = array("d", bytes(8 * (last + 1)))
+    cdef double[::1] torques = array("d", bytes(8 * (last + 1)))
+    cdef double v, i, clipped, at = NAN, value = NAN, x
     for k in range(first, count):
-        values = loss(clipped, np.full_like(clipped, sign * k * VELOCITY_STEP_RAD_S))
-        # A law may bend back where it is extrapolated; the inverse needs a rising curve.
-        torque = np.maximum.accumulate(nm_per_a * currents - values)
-        rows[k] = np.maximum(sign * np.interp(grid, torque, values), 0.0)
+        v, at = sign * k * VELOCITY_STEP_RAD_S, NAN
+        for n in range(last + 1):
+            # three times the range in current, so that the curve covers the torque grid where η is small, too
+            i = _between(-3.0 * highest, 3.0 * highest, n, last)
+            clipped = fmax(-highest, fmin(i, highest))
+            if clipped != at:
+                at, value = clipped, loss(clipped, v)
+            losses[n], torques[n] = value, nm_per_a * i - value
+            if n:  # a law may bend back where it is extrapolated; the inverse needs a rising curve
+                torques[n] = fmax(torques[n], torques[n - 1])
+        n = 0
+        for m in range(columns):
+            x = _between(-nm_per_a * highest, nm_per_a * highest, m, TORQUE_STEPS)
+            while n < last - 1 and torques[n + 1] <= x:
+                n += 1
+            rows[k, m] = fmax(sign * _on_line(x, &torques[n], &losses[n]), 0.0)
     for k in range(first):
-        rows[k] = np.maximum(rows[first] - (first - k) * (rows[first + 1] - rows[first]), 0.0)
-    return rows
+        for m in range(columns):
+            rows[k, m] = fmax(rows[first, m] - (first - k) * (rows[first + 1, m] - rows[first, m]), 0.0)
+    return table
+
+
+cdef double _between(double low, double high, int n, int steps) noexcept nogil:
+    """Return the n-th of `steps` + 1 numbers from low to high."""
+    return high if n == steps else low + n * ((high - low) / steps)
+
+
+cdef double _on_line(double x, const double *xs, const double *ys) noexcept nogil:
+    """Return the value at x of the line through two points."""
+    return ys[0] + (x - xs[0]) * ((ys[1] - ys[0]) / (xs[1] - xs[0]))
 
 
 cdef class JointFriction:

@@ -98,7 +98,7 @@ def loss_table(side):
     if joint.efficiency is None:
         joint = replace(joint, friction=replace(joint.friction, stribeck_nm=0.0))
     return LossTable(
-        LossModel(joint).loss_many,
+        LossModel(joint).loss,
         joint.gear_ratio,
         joint.torque_constant_nm_per_a,
         side.drive.current_limit_a,

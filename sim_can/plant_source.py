@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from jtqd.estimator.effects.effect import Effect, State, Values
-from jtqd.estimator.effects.functions import Scalar
+from jtqd.estimator.effects.scalar import Scalar
 from jtqd.estimator.joint import Joint
 from jtqd.sim_can.effect_plant import EffectPlant
 from jtqd.sim_can.instruments import Instruments

@@ -28,6 +28,7 @@ from jtqd.daemon.core.joint_safety import safety_of
 from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.loop import realtime
 from jtqd.daemon.loop.input_pdos import JointInputs, input_pdos, joint_temperatures, sensor_index
+from jtqd.daemon.loop.referee import judged
 from jtqd.daemon.reload.order import Order
 from jtqd.daemon.reload.swap import Swap
 from jtqd.daemon.shared.cycle_record import RECORD_SIZE
@@ -40,7 +41,7 @@ from jtqd.drivers.frame_socket import BusError, BusGone, FrameSocket, open_frame
 from jtqd.drivers.nmt import HEARTBEAT_BASE
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.methods import AnyEstimator, load_network, make_estimator
-from jtqd.estimator.onnx_graph import NetworkError
+from jtqd.estimator.onnx_graph import NetworkError, Verdict
 
 _PATIENCE_S = 1.0
 """The supervisor turns twenty times a second; after so long without a turn the watchdog is fed no more."""
@@ -137,12 +138,17 @@ class Stop:
         self.requested = True
 
 
-def build_estimator(config: Config, joint: JointConfig) -> AnyEstimator:
-    """Build the estimator of one joint as configured; raises ConfigError or NetworkError."""
+def build_estimator(config: Config, joint: JointConfig, verdict: Verdict | str | None = None) -> AnyEstimator:
+    """Build the estimator of one joint as configured; raises ConfigError or NetworkError.
+
+    verdict: of `referee.judged` on its network, or why it is refused; None: ONNX Runtime judges in this process.
+    """
     method, network = config.estimator.method, None
     try:
+        if isinstance(verdict, str):
+            raise NetworkError(verdict)
         if joint.network is not None:
-            network = load_network(method, str(joint.network.path), joint.network.sha256)
+            network = load_network(method, str(joint.network.path), joint.network.sha256, verdict)
         return make_estimator(joint.joint, config.estimator, network)
     except (ConfigError, NetworkError) as error:
         key = f"joint_{joint.number}"
@@ -271,7 +277,10 @@ def build_estimators(request: dict[str, Any]) -> tuple[Config, list[AnyEstimator
     config = load_config(Path(request["config"]) if request["config"] else None)
     if config.files_sha256 != request["config_sha256"]:
         raise ConfigError(f"{config.path}: it or one of its joint files was changed during reading")
-    estimators = [build_estimator(config, joint) for joint in config.joints]
+    estimators = [
+        build_estimator(config, joint, verdict)
+        for joint, verdict in zip(config.joints, judged(config), strict=True)
+    ]
     warm_up(estimators)
     return config, estimators
 

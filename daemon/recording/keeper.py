@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import base64
-import hashlib
 import json
 import platform
 import signal
@@ -267,7 +266,7 @@ def _provenance(config: Config, report: dict[str, Any]) -> dict[str, Any]:
         "joints": {
             str(joint.number): {
                 "file": names[joint.joint_path],
-                "file_sha256": hashlib.sha256(joint.joint_data).hexdigest(),
+                "file_sha256": joint.joint_sha256,
                 "network": names[joint.network.path] if joint.network else None,
                 "network_sha256": joint.network.sha256 if joint.network else None,
             }

@@ -10,7 +10,6 @@ are booted, and when another configuration has come into force. Numbers that cha
 from __future__ import annotations
 
 import fcntl
-import hashlib
 import json
 import os
 import platform
@@ -21,6 +20,8 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
+
+from jtqd.estimator.sha256 import sha256_hex
 
 FILE = "about.json"
 SCHEMA = "jtqd.about/1"
@@ -118,7 +119,7 @@ def _locked(directory: Path) -> int:
 def instance_name(bus: str) -> str:
     """Name of the instance as it can stand in a file name: "vcan0", or "unix-tmp-bench-1f3a" with part of a hash."""
     name = re.sub(r"[^A-Za-z0-9_.]+", "-", bus).strip("-")
-    return name if name == bus else f"{name}-{hashlib.sha256(bus.encode()).hexdigest()[:4]}"
+    return name if name == bus else f"{name}-{sha256_hex(bus.encode())[:4]}"
 
 
 class AboutError(Exception):

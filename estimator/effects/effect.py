@@ -162,7 +162,7 @@ class State:
 
 
 class Functions(Protocol):
-    """Elementwise functions for floats (`effects.functions.Scalar`) or arrays (`effects.functions.Whole`).
+    """Elementwise functions for floats (`effects.scalar.Scalar`) or arrays (`effects.whole.Whole`).
 
     slip(d, travel): Maxwell-slip state in -1..1, dz = dd/travel held within; it remembers, so every effect of every
     joint has `Functions` of its own in the loop, and an array is taken in order from z = 0.

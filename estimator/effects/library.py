@@ -49,8 +49,8 @@ NAMES: Final = (
 """What joint files and findings may rely on; the library may hold more, never fewer."""
 
 
-_SHARED: Final = ("library", "effect", "functions", "regression")
-"""Files that hold no effect; `functions` is not loaded for them: it brings numpy, which the supervisor does without."""
+_SHARED: Final = ("library", "effect", "regression", "scalar", "whole")
+"""Files that hold no effect; `whole` is not loaded for them: it brings numpy, which supervisor and bench do without."""
 
 
 def discover() -> dict[str, Effect]:

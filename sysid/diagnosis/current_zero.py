@@ -19,8 +19,8 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.effects.effect import Effect, State, Values
-from jtqd.estimator.effects.functions import Scalar
 from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.effects.scalar import Scalar
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.findings import JointName
 from jtqd.sysid.diagnosis.noise import Sums

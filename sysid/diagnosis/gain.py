@@ -11,8 +11,8 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.effects.effect import Effect, State, Values
-from jtqd.estimator.effects.functions import Whole
 from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.effects.whole import Whole
 from jtqd.estimator.joint import Effect as Effect_parameters
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.dataset import Dataset

@@ -16,7 +16,7 @@ import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.effects.effect import MOTOR, TORSION, Effect, Term, Values
-from jtqd.estimator.effects.functions import Whole
+from jtqd.estimator.effects.whole import Whole
 from jtqd.sysid.diagnosis.findings import JointName
 from jtqd.sysid.diagnosis.signals import Channel, JointSignals, Line, second_difference
 

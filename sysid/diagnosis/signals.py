@@ -65,7 +65,7 @@ class BaseLoss:
         if joint.efficiency is not None:
             highest = max(DRIVING_CURRENT_MAX_A, 9.0)
             table = LossTable(
-                LossModel(joint).loss_many, joint.gear_ratio, joint.torque_constant_nm_per_a, highest
+                LossModel(joint).loss, joint.gear_ratio, joint.torque_constant_nm_per_a, highest
             )
             self._rows = (np.array(table.forward), np.array(table.reverse))
             self._limit = table.torque_limit

@@ -10,6 +10,7 @@ import numpy as np
 
 from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.core import joint as joint_cycle
+from jtqd.daemon.core import schedule
 from jtqd.daemon.core.status import NEEDED
 from jtqd.daemon.shared import cycle_record
 from jtqd.estimator.joint import Joint
@@ -50,6 +51,9 @@ def _header(config: Config) -> str:
         "DEGRADED_CYCLES": NEEDED[DEGRADED],
         "WAIT_NS": config.input_wait_ns,
         "DEADLINE_NS": config.input_deadline_ns,
+        "FOLLOW_STEP_NS": schedule._STEP_NS,
+        "FOLLOW_MARGIN_NS": schedule._MARGIN_NS,
+        "FOLLOW_SHORTEST_NS": schedule._SHORTEST_NS,
         "MOTOR_RAD_PER_COUNT": SCALING["motor_rad_per_count"],
         "MOTOR_RAD_S_PER_UNIT": SCALING["motor_rad_s_per_unit"],
         "LINK_RAD_PER_COUNT": SCALING["link_rad_per_count"],

@@ -11,7 +11,7 @@ from jtqd.daemon.core.cycle import CYCLE_ENDED, Cycle
 from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.loop import process as loop
 from jtqd.daemon.loop import realtime
-from jtqd.daemon.shared.cycle_record import FLAG_PUBLISHED
+from jtqd.daemon.shared.cycle_record import FLAG_COMPLETE, FLAG_PUBLISHED
 from jtqd.drivers.frame_socket import FrameSocket, open_frame_socket
 from jtqd.estimator.methods import AnyEstimator
 from jtqd.estimator.status import PUBLISHED
@@ -80,6 +80,11 @@ class Measured:
         outcome = cycle.go_on(1, end_ns)
         if outcome == CYCLE_ENDED:
             meter.answer_ns.append(cycle.sent_ns - cycle.sync_ns)
+            intake, after_ns = cycle.intake, -1
+            if cycle.flags & FLAG_COMPLETE and intake.sync_stamp_ns:
+                offset_ns = time.time_ns() - time.monotonic_ns()
+                after_ns = cycle.sent_ns + offset_ns - (intake.sync_stamp_ns + intake.last_delay_ns)
+            meter.after_last_ns.append(after_ns)
             one, two = cycle.joints
             if cycle.flags & FLAG_PUBLISHED and one.status in PUBLISHED and two.status in PUBLISHED:
                 meter.published += 1

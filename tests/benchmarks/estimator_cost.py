@@ -1,7 +1,8 @@
 """What the estimator's parts cost in a tight loop: `python -m tests.benchmarks.estimator_cost` prints the table.
 
 CPU time, least of several rounds: warm caches and no sleep in between. In the loop, which sleeps between cycles, the
-same code costs more; the stage table (`python -m tests.benchmarks stages`) shows how much.
+same code costs more: the last lines are both joints' steps after a sleep of 0.9 ms, median and p99; the stage table
+(`python -m tests.benchmarks stages`) shows it in the loop.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from jtqd.estimator.losses import LossModel
 from jtqd.estimator.methods import load_network, make_estimator
 from jtqd.estimator.network import FusedNetwork, TorqueNetwork
 from jtqd.estimator.settings import METHODS, EstimatorSettings
+from tests.benchmarks.measure import quantile
 from tests.benchmarks.table import mark
 from tests.estimator.estimator_helpers import joint1, motion, small_network
 from tests.estimator.fused_configuration import joint_of, network_of
@@ -96,6 +98,41 @@ def costs_us() -> dict[str, float]:
     return costs
 
 
+COLD_LIMIT_US = 8.0
+"""Both joints, network included, after a sleep."""
+_SLEEP_S, _COLD_ROUNDS = 900e-6, 1500
+
+
+def cold_us() -> dict[str, tuple[float, float]]:
+    """Median and p99 [us] of one step of both joints after a sleep, by what evaluates their networks, in turns."""
+
+    def two(method: str, foreign: tuple[bool, bool]) -> tuple[Callable[..., object], ...]:
+        steps = []
+        for n in (1, 2):
+            joint = joint_of(n) if method == "fused" else joint1()
+            network = load_network(method, network_of(n) if method == "fused" else small_network().data)
+            if foreign[n - 1]:
+                network.perceptron = None  # type: ignore[misc]
+            steps.append(make_estimator(joint, EstimatorSettings(method=method), network).step)
+        return tuple(steps)
+
+    cases = {
+        "fused": two("fused", (False, False)),
+        "network": two("network", (False, False)),
+        "fused, one joint by ONNX Runtime": two("fused", (True, False)),
+        "fused, both by ONNX Runtime": two("fused", (True, True)),
+    }
+    times: dict[str, list[float]] = {name: [] for name in cases}
+    for _ in range(_COLD_ROUNDS):
+        for name, (one, other) in cases.items():
+            time.sleep(_SLEEP_S)
+            began = time.perf_counter_ns()
+            one(*_STEP)
+            other(*_STEP)
+            times[name].append((time.perf_counter_ns() - began) / 1e3)
+    return {name: (quantile(each, 0.5), quantile(each, 0.99)) for name, each in times.items()}
+
+
 if __name__ == "__main__":
     costs = costs_us()
     for name, cost in costs.items():
@@ -103,3 +140,7 @@ if __name__ == "__main__":
     for method in ("network", "tob"):
         more = JOINTS * (costs["step, fused"] - costs[f"step, {method}"])
         print(f"{f'fused over {method}, both joints':40s} {more:6.2f} us  {mark(more, FUSED_LIMIT_US)}")
+    print("\nboth joints after a sleep of 0.9 ms, median and p99")
+    for name, (median, p99) in cold_us().items():
+        ours = mark(median, COLD_LIMIT_US) if name in ("fused", "network") else ""
+        print(f"{name:40s} {median:6.1f} {p99:6.1f} us  {ours}")

@@ -8,8 +8,10 @@ from tests.benchmarks import host
 from tests.benchmarks.contender import Process, Task, python
 from tests.benchmarks.fixture import Fixture
 from tests.benchmarks.measure import quantile
-from tests.benchmarks.table import table
+from tests.benchmarks.table import mark, table
 
+BEYOND_LIMIT = 50.0
+"""Missed slots per million above those of the bare loop beside it."""
 _ROUND_S = 60.0
 """Results are collected every minute, so that a long run needs no more memory than a short one."""
 
@@ -40,8 +42,10 @@ def run(fixture: Fixture, *, minutes: float) -> dict[str, Any]:
     finally:
         for process in (*loops.values(), traffic):
             process.end()
+    beyond = [1e6 * each["missed"] / each["slots"] for each in totals.values()]
     return {
         "minutes": minutes,
+        "missed_beyond_per_million": beyond[0] - beyond[1],
         "cpus_busy": load.cpus_busy(),
         "loops": {name: _figures(**total) for name, total in totals.items()},
     }
@@ -75,4 +79,6 @@ def text(result: dict[str, Any]) -> str:
     ]
     head = ["", "slots", "missed", "per million", "late us median", "p99", "p99.9", "max begun"]
     title = f"1 kHz for {result['minutes']:g} min, both on one core at the same time, {result['cpus_busy']:.1f} CPUs busy"
-    return f"{title}\n\n{table(head, rows)}"
+    beyond = result["missed_beyond_per_million"]
+    verdict = f"missed beyond the bare loop's {beyond:6.0f} per million  {mark(beyond, BEYOND_LIMIT)}"
+    return f"{title}\n\n{table(head, rows)}\n\n{verdict}"

@@ -77,6 +77,8 @@ typedef struct {
     struct iovec parts[CAPACITY];
     frame frames[CAPACITY];
     char control[CAPACITY][64];
+    int64_t wait; /* from SYNC to the wake-up for the inputs */
+    bool follows; /* the wake-up follows the arrivals, as jtqd's does */
 } loop_state;
 
 static int64_t now(clockid_t clock)
@@ -130,6 +132,26 @@ static bool complete(const loop_state *s)
         if (!s->inputs[n].fresh)
             return false;
     return true;
+}
+
+/* When the last input came, CLOCK_REALTIME. */
+static int64_t last_stamp(const loop_state *s)
+{
+    int64_t last = 0;
+    for (int n = 0; n < PDOS; n++)
+        if (s->inputs[n].stamp > last)
+            last = s->inputs[n].stamp;
+    return last;
+}
+
+/* daemon/core/schedule.pyx, WakeUp: wake up when 99 of 100 times all inputs have come. */
+static void follow(loop_state *s, int64_t delay)
+{
+    if (delay + FOLLOW_MARGIN_NS > s->wait)
+        s->wait = s->wait + 99 * FOLLOW_STEP_NS < DEADLINE_NS - FOLLOW_MARGIN_NS ? s->wait + 99 * FOLLOW_STEP_NS
+                                                                                : DEADLINE_NS - FOLLOW_MARGIN_NS;
+    else
+        s->wait = s->wait - FOLLOW_STEP_NS > FOLLOW_SHORTEST_NS ? s->wait - FOLLOW_STEP_NS : FOLLOW_SHORTEST_NS;
 }
 
 static int64_t stamp_of(struct msghdr *m)
@@ -252,7 +274,7 @@ static void transmit(loop_state *s, uint32_t id, uint8_t length, const uint8_t *
         perror("send");
 }
 
-static void cycle(loop_state *s, int64_t slot, int64_t *answer)
+static void cycle(loop_state *s, int64_t slot, int64_t *answer, int64_t *after)
 {
     cycle_record *r = (cycle_record *)(s->ring + RING_HEADER + (s->ring_count % RING_SLOTS) * RECORD_SIZE);
     r->frame_count = r->left_out = 0;
@@ -264,7 +286,7 @@ static void cycle(loop_state *s, int64_t slot, int64_t *answer)
     s->counter = s->counter % 240 + 1;
     int64_t sync = now(CLOCK_MONOTONIC), offset = now(CLOCK_REALTIME) - sync;
     transmit(s, 0x080, 1, &s->counter, NULL);
-    sleep_until(sync + WAIT_NS);
+    sleep_until(sync + s->wait);
     int64_t woken = now(CLOCK_MONOTONIC), deadline = sync + DEADLINE_NS;
     for (;;) {
         receive(s, r, false);
@@ -285,6 +307,9 @@ static void cycle(loop_state *s, int64_t slot, int64_t *answer)
     frame sent;
     transmit(s, 0x1A0, 8, pdo, &sent);
     *answer = now(CLOCK_MONOTONIC) - sync;
+    *after = complete(s) ? sync + offset + *answer - last_stamp(s) : -1;
+    if (s->follows && complete(s) && s->sync_stamp)
+        follow(s, last_stamp(s) - s->sync_stamp);
     r->flags |= FLAG_PUBLISHED | (now(CLOCK_MONOTONIC) < slot + PERIOD ? FLAG_BEFORE_NEXT_SYNC : 0);
     if (r->frame_count < FRAME_CAPACITY) {
         r->frames[r->frame_count] = sent;
@@ -349,16 +374,19 @@ static void print_list(const char *name, const int64_t *values, long count)
     printf("], ");
 }
 
-static void run_round(const char *bus, const char *ring, long cycles)
+static void run_round(const char *bus, const char *ring, long cycles, bool follows)
 {
     static loop_state s;
     int64_t *cpu = calloc((size_t)cycles, sizeof *cpu), *answer = calloc((size_t)cycles, sizeof *answer);
+    int64_t *after = calloc((size_t)cycles, sizeof *after);
     memset(&s, 0, sizeof s);
+    s.wait = WAIT_NS;
+    s.follows = follows;
     s.fd = open_bus(bus);
     s.ring = open_ring(ring);
     prepare_messages(&s);
-    struct rusage before, after;
-    getrusage(RUSAGE_SELF, &before);
+    struct rusage begun, ended;
+    getrusage(RUSAGE_SELF, &begun);
     long done = 0;
     int64_t slot = now(CLOCK_MONOTONIC) + 2 * PERIOD, end = slot + cycles * PERIOD;
     while (slot < end) {
@@ -367,7 +395,7 @@ static void run_round(const char *bus, const char *ring, long cycles)
         if (late > PERIOD / 2)
             s.missed++;
         else {
-            cycle(&s, slot, &answer[done]);
+            cycle(&s, slot, &answer[done], &after[done]);
             cpu[done++] = now(CLOCK_PROCESS_CPUTIME_ID);
         }
         slot += PERIOD;
@@ -378,17 +406,19 @@ static void run_round(const char *bus, const char *ring, long cycles)
             s.missed += (uint64_t)skipped;
         }
     }
-    getrusage(RUSAGE_SELF, &after);
+    getrusage(RUSAGE_SELF, &ended);
     close(s.fd);
     munmap(s.ring, RING_HEADER + (size_t)RING_SLOTS * RECORD_SIZE);
     printf("{");
     print_list("cpu_ns", cpu, done);
     print_list("answer_ns", answer, done);
+    print_list("after_last_ns", after, done);
     printf("\"published\": %llu, \"missed\": %llu, \"switches\": %ld}\n", (unsigned long long)s.published,
-           (unsigned long long)s.missed, after.ru_nvcsw - before.ru_nvcsw);
+           (unsigned long long)s.missed, ended.ru_nvcsw - begun.ru_nvcsw);
     fflush(stdout);
     free(cpu);
     free(answer);
+    free(after);
 }
 
 static int replay(const char *in, const char *out)
@@ -442,7 +472,7 @@ int main(int argc, char **argv)
         keep_awake(atoi(argv[2]));
     if (argc == 4 && !strcmp(argv[1], "replay"))
         return replay(argv[2], argv[3]);
-    if (argc != 6 || strcmp(argv[1], "run"))
+    if ((argc != 6 && argc != 7) || strcmp(argv[1], "run"))
         return 2;
     prctl(PR_SET_TIMERSLACK, 1UL, 0, 0, 0);
     mlockall(MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT);
@@ -453,6 +483,6 @@ int main(int argc, char **argv)
     fflush(stdout);
     long cycles;
     while (scanf(" run %ld", &cycles) == 1)
-        run_round(argv[2], argv[5], cycles);
+        run_round(argv[2], argv[5], cycles, argc == 7 && !strcmp(argv[6], "follow"));
     return 0;
 }

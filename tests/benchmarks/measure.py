@@ -32,6 +32,8 @@ class CycleMeter:
 
     cpu_ns: list[int] = field(default_factory=list)
     answer_ns: list[int] = field(default_factory=list)
+    after_last_ns: list[int] = field(default_factory=list)
+    """From the last input's stamp until the estimate was sent; -1 where an input was missing, empty where nobody looks."""
     late_ns: list[int] = field(default_factory=list)
     published: int = 0
 
@@ -51,6 +53,7 @@ class CycleMeter:
         return {
             "cpu_ns": self.cpu_ns,
             "answer_ns": self.answer_ns,
+            "after_last_ns": self.after_last_ns,
             "late_ns": self.late_ns,
             "published": self.published,
             "missed": missed,
@@ -64,6 +67,7 @@ class Samples:
 
     cpu_us: list[float] = field(default_factory=list)
     answer_us: list[float] = field(default_factory=list)
+    after_last_us: list[float] = field(default_factory=list)
     medians_us: list[float] = field(default_factory=list)
     cycles: int = 0
     published: int = 0
@@ -77,6 +81,8 @@ class Samples:
         self.cpu_us += costs
         self.medians_us.append(quantile(costs, 0.5))
         self.answer_us += [value * 1e-3 for value in result["answer_ns"][SETTLE_CYCLES:]]
+        after = result.get("after_last_ns", [])[SETTLE_CYCLES:]
+        self.after_last_us += [value * 1e-3 for value in after if value >= 0]
         self.cycles += len(result["cpu_ns"])
         self.published += result["published"]
         self.missed += result["missed"]
@@ -93,7 +99,10 @@ class Samples:
             "round_median_high_us": max(self.medians_us, default=float("nan")),
             "answer_median_us": quantile(self.answer_us, 0.5),
             "answer_p99_us": quantile(self.answer_us, 0.99),
+            "after_last_median_us": quantile(self.after_last_us, 0.5),
+            "after_last_p99_us": quantile(self.after_last_us, 0.99),
             "cycles": self.cycles,
+            "with_torque_percent": 100.0 * self.published / cycles,
             "published": self.published,
             "missed": self.missed,
             "switches_per_cycle": self.switches / cycles,

@@ -64,8 +64,12 @@ def _one(log: Path, method: str, seconds: float, scratch: Path) -> dict[str, Any
     steps = [steps_of(each, config) for each in part.joints]
     logged_s = len(part.joints[0]) * config.period_ns * 1e-9
 
+    estimators = models.estimators()  # compares each network with ONNX Runtime: once per replay, however long
+
     def exact() -> None:
-        ExactReplay(part.origin, models.estimators(), safety).run(part.joints, frames, steps)
+        for each in estimators:
+            each.reset()
+        ExactReplay(part.origin, estimators, safety).run(part.joints, frames, steps)
 
     times = max(1, round(seconds / logged_s))
     joints = longer(part, times)
@@ -106,13 +110,13 @@ def text(results: list[dict[str, Any]]) -> str:
             each["method"],
             f"{each['arrays_us']:.2f}",
             f"{each['arrays_times']:.0f}",
-            "PASS" if each["arrays_times"] >= TARGET else "under",
             f"{each['exact_us']:.1f}",
             f"{each['exact_times']:.0f}",
+            "PASS" if each["exact_times"] >= TARGET else "under",
         ]
         for each in results
     ]
-    head = ["method", "arrays us", "x real time", f">= {TARGET:.0f}", "exact us", "x real time"]
+    head = ["method", "arrays us", "x real time", "exact us", "x real time", f">= {TARGET:.0f}"]
     count = results[0]["cycles"]
     return (
         f"Replay of two joints at 1 kHz without reading, {count} cycles in arrays [us of CPU a cycle]\n\n"

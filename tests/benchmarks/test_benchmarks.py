@@ -150,7 +150,17 @@ def benchmark(*arguments):
 @needs_gcc
 def test_quick_prints_the_table_and_the_ratios():
     text = benchmark("cycle", "--quick")
-    for wanted in ("jtqd", "usual way", "C  ", "usual way / jtqd", "jtqd / C", "quiet core"):
+    for wanted in (
+        "jtqd",
+        "usual way",
+        "C  ",
+        "C, following",
+        "usual way / jtqd",
+        "jtqd / C, p99",
+        "after last",
+        "points against",
+        "quiet core",
+    ):
         assert wanted in text
 
 

@@ -15,7 +15,7 @@ from jtqd.daemon.config import load_config
 from jtqd.daemon.loop.process import build_estimator, warm_up
 from jtqd.estimator import status as st
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.corrections import ExtendedInputs, acting_effects, needs_torque
+from jtqd.estimator.corrections import ExtendedInputs, acting_effects
 from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.estimator import ExtendedEstimator, FusedEstimator, JointEstimator
 from jtqd.estimator.joint import Joint
@@ -311,8 +311,7 @@ def faulty_run(seed: int, count: int) -> tuple[FloatArray, JointColumns]:
     return time_s, JointColumns(*inputs, temperature_c=temperatures("gaps", seed, count))
 
 
-WITH_TORQUE = {"load_dependent_friction", "kinematic_error"}
-SETS = [*((name,) for name in sorted(ENTRIES)), tuple(sorted(ALL)), tuple(sorted(set(ALL) - WITH_TORQUE))]
+SETS = [*((name,) for name in sorted(ENTRIES)), tuple(sorted(ALL))]
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -337,15 +336,11 @@ def test_step_by_step_is_the_whole_run(method: str, names: tuple[str, ...]) -> N
     assert {moving, st.INVALID, st.STARTING, st.STANDSTILL} <= set(run.status.tolist())
     np.testing.assert_array_equal(run.status, [e.status for e in steps])
     for name in ("torque_nm", "sigma_nm", "physics_nm", "network_nm"):
-        np.testing.assert_allclose(
-            getattr(run, name), [getattr(e, name) for e in steps], rtol=1e-9, atol=1e-9, err_msg=name
-        )
+        np.testing.assert_array_equal(getattr(run, name), [getattr(e, name) for e in steps], err_msg=name)
 
 
 def test_every_effect_was_there() -> None:
     assert set(ALL) == set(EFFECTS)
-    with_torque = {name for name in ALL if needs_torque(extended(PLAIN, (name, ALL[name])))}
-    assert with_torque == WITH_TORQUE
 
 
 # ---- what costs nothing, what is forgotten, what never raises

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -87,6 +88,18 @@ def test_without_aliasing_it_falls_back_to_plain_run(monkeypatch: pytest.MonkeyP
     assert [network.run_one(*row) for row in x.tolist()] == pytest.approx(
         network.run_many(x).tolist(), abs=1e-11
     )
+
+
+def test_the_runtime_has_no_thread_of_its_own() -> None:
+    """Its telemetry would start one; ORT_DISABLE_TELEMETRY is read when the library is loaded."""
+    code = (
+        "import os; from jtqd.estimator.network import TorqueNetwork as N; "
+        "from tests.estimator.estimator_helpers import small_network as s; "
+        "N(s().data); print(len(os.listdir('/proc/self/task')))"
+    )
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    environment.pop("ORT_DISABLE_TELEMETRY", None)
+    assert subprocess.check_output([sys.executable, "-c", code], text=True, env=environment) == "1\n"
 
 
 def test_metadata_and_hash(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from jtqd.estimator.estimator import FusedEstimator, JointEstimator
 from jtqd.estimator.network import FusedNetwork, TorqueNetwork, native_of
 from jtqd.estimator.onnx_graph import NetworkError
 from jtqd.estimator.onnx_weights import read_perceptron
-from jtqd.estimator.perceptron import Perceptron
+from jtqd.estimator.perceptron import Perceptron, tanh_many
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.sysid.train.network import export_network
 from tests.estimator.estimator_helpers import joint1, motion, small_network
@@ -51,6 +51,21 @@ def test_plain_and_gated_against_numpy(widths: tuple[int, ...]) -> None:
     gated = layers(2, *widths[:-1], 3)
     expected = (numpy_answer(gated, x) * x[:, gate]).sum(axis=1)
     assert Perceptron(gated, gate).run_many(x) == pytest.approx(expected, abs=1e-11)
+
+
+def test_the_tangent_is_within_4e_16_odd_and_keeps_nan() -> None:
+    rng = np.random.default_rng(1)
+    x = np.concatenate(
+        [np.linspace(-25.0, 25.0, 100_001), rng.normal(size=50_000), np.logspace(-300, 300, 5000)]
+    )
+    found = tanh_many(x)
+    assert np.max(np.abs(found - [math.tanh(each) for each in x.tolist()])) < 4e-16
+    assert np.array_equal(tanh_many(-x), -found)
+    assert np.max(np.abs(found)) == 1.0
+    edges = tanh_many(np.array([0.0, -0.0, math.inf, -math.inf, math.nan])).tolist()
+    assert edges[:4] == [0.0, 0.0, 1.0, -1.0]
+    assert math.copysign(1.0, edges[1]) == -1.0
+    assert math.isnan(edges[4])
 
 
 def test_what_does_not_fit_is_refused() -> None:

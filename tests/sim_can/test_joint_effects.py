@@ -9,8 +9,8 @@ import pytest
 import yaml
 
 from jtqd.estimator.effects.effect import State
-from jtqd.estimator.effects.functions import Whole
 from jtqd.estimator.effects.library import EFFECTS, NAMES, checked_parameters
+from jtqd.estimator.effects.whole import Whole
 from jtqd.estimator.joint import Effect
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.command import main

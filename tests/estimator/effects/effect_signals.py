@@ -9,7 +9,7 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import Effect, State, Values
-from jtqd.estimator.effects.functions import Whole
+from jtqd.estimator.effects.whole import Whole
 from jtqd.estimator.joint import Effect as Entry
 from jtqd.estimator.joint import Friction, Joint
 

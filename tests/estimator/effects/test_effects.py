@@ -13,8 +13,9 @@ import pytest
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import Effect, State
-from jtqd.estimator.effects.functions import Scalar, Whole
 from jtqd.estimator.effects.library import EFFECTS, GROUPS, NAMES, checked_parameters
+from jtqd.estimator.effects.scalar import Scalar
+from jtqd.estimator.effects.whole import Whole
 from jtqd.estimator.joint import Friction, Joint
 from tests.estimator.effects.effect_signals import HOOKS, PEAKED, PLAIN, at, balances, state
 

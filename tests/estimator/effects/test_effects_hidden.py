@@ -17,8 +17,8 @@ import pytest
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import State
-from jtqd.estimator.effects.functions import Whole
 from jtqd.estimator.effects.library import EFFECTS, checked_parameters
+from jtqd.estimator.effects.whole import Whole
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.observer import first_order_hold

@@ -173,7 +173,7 @@ def test_losses_with_an_efficiency_are_those_of_the_emulated_plant(stribeck_nm: 
     friction = replace(WITH_EFFICIENCY.friction, stribeck_nm=stribeck_nm, stribeck_velocity_rad_s=0.05)
     joint = replace(WITH_EFFICIENCY, friction=friction)
     table = LossTable(
-        LossModel(joint).loss_many,
+        LossModel(joint).loss,
         joint.gear_ratio,
         joint.torque_constant_nm_per_a,
         max(DRIVING_CURRENT_MAX_A, 9.0),
@@ -215,7 +215,7 @@ def zero_signals(true_nm: np.ndarray, velocity: np.ndarray, zero_nm: float) -> J
 def test_the_law_is_the_emulated_plants_of_the_same_file() -> None:
     side = plant_of_joint(JOINT).joints[0]
     table = LossTable(
-        LossModel(JOINT).loss_many,
+        LossModel(JOINT).loss,
         JOINT.gear_ratio,
         JOINT.torque_constant_nm_per_a,
         side.drive.current_limit_a,

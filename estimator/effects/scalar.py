@@ -1,4 +1,4 @@
-"""Elementwise functions for the hooks of effects: `Scalar` sample by sample in the loop, `Whole` for runs.
+"""Elementwise functions for the hooks of effects, sample by sample: in the loop and in the emulated bench. No numpy.
 
 The Maxwell slip is the friction of one elastic contact (Al-Bender, Lampaert, Swevers 2005, IEEE Trans. Automatic
 Control 50): z follows the deflection d, dz = dd/travel, and slips at -1 and 1.
@@ -7,12 +7,7 @@ Control 50): z follows the deflection d, dz = dd/travel, and slips at -1 and 1.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final
-
-import numpy as np
-
-if TYPE_CHECKING:
-    from jtqd.estimator.arrays import FloatArray
+from typing import Final
 
 
 class Scalar:
@@ -57,42 +52,3 @@ class Scalar:
             z = self._z + step
             self._z = 1.0 if z > 1.0 else -1.0 if z < -1.0 else z
         return self._z
-
-
-class Whole:
-    """Functions of arrays [n] in order of time. It remembers nothing: every array starts with z = 0."""
-
-    __slots__ = ()
-
-    sin: Final = np.sin
-    cos: Final = np.cos
-    tanh: Final = np.tanh
-    clip: Final = staticmethod(np.clip)
-
-    @staticmethod
-    def exp(a: FloatArray) -> FloatArray:
-        """Return e^a, infinite without a warning where a float cannot hold it."""
-        with np.errstate(over="ignore"):
-            result: FloatArray = np.exp(a)
-        return result
-
-    @staticmethod
-    def slip(d: FloatArray, travel: float) -> FloatArray:
-        """Return the states [n] of deflections d [n]; NaN: the state stays where it was."""
-        last, z = math.nan, 0.0
-        out: list[float] = []
-        add = out.append
-        # a plain loop: 0.1 us per sample, and the very numbers of `Scalar`
-        for now in np.asarray(d, np.float64).tolist():
-            step = (now - last) / travel
-            if step == step:  # noqa: PLR0124
-                z += step
-                if z > 1.0:
-                    z = 1.0
-                elif z < -1.0:
-                    z = -1.0
-                last = now
-            elif now == now:  # noqa: PLR0124
-                last = now
-            add(z)
-        return np.array(out)

@@ -1,0 +1,139 @@
+"""ONNX Runtime judges in a process of its own: the same refusals, the very bytes, and no runtime in the loop."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import onnx
+import pytest
+from onnx import helper
+
+from jtqd.daemon.config import Config, load_config
+from jtqd.daemon.loop import referee
+from jtqd.daemon.loop.process import build_estimator, build_estimators
+from jtqd.daemon.loop.referee import judged
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.onnx_graph import NetworkError, Verdict
+from tests.estimator.estimator_helpers import small_network
+from tests.estimator.fused_configuration import configured, networks
+
+PROGRAM = """
+import json, sys
+from pathlib import Path
+from jtqd.daemon.config import load_config
+from jtqd.daemon.loop.process import build_estimators
+config = load_config(Path(sys.argv[1]))
+_, estimators = build_estimators({"config": sys.argv[1], "config_sha256": config.files_sha256})
+steps = [each.step(1e-3, 2.0, 0.1 * n, 100.0, 0.001 * n, 25.0) for each in estimators for n in range(50)]
+print(json.dumps([["onnxruntime" in sys.modules, all(each.with_network for each in estimators)], steps]))
+"""
+
+
+def loaded(path: Path) -> tuple[bool, list[list[float]]]:
+    """Whether a loop of this configuration has ONNX Runtime, and what its estimators, all with a network, say."""
+    run = subprocess.run(
+        [sys.executable, "-c", PROGRAM, str(path)], capture_output=True, text=True, check=True
+    )
+    (runtime, used), steps = json.loads(run.stdout)
+    assert used
+    return runtime, steps
+
+
+def foreign(data: bytes) -> bytes:
+    """The same network with the answer negated twice: none of our graphs."""
+    model = onnx.load_from_string(data)
+    last = model.graph.node[-1]
+    answer, last.output[0] = last.output[0], "answer"
+    model.graph.node.append(helper.make_node("Neg", ["answer"], ["negative"]))
+    model.graph.node.append(helper.make_node("Neg", ["negative"], [answer]))
+    return bytes(model.SerializeToString())
+
+
+def refusal(config: Config, joint: int) -> tuple[str, str]:
+    """What is said of a joint's network, judged apart and judged here."""
+    verdicts, said = judged(config), []
+    for verdict in (verdicts[joint], None):
+        with pytest.raises((NetworkError, ConfigError)) as caught:
+            build_estimator(config, config.joints[joint], verdict)
+        said.append(str(caught.value))
+    return said[0], said[1]
+
+
+def test_the_loop_has_no_runtime_unless_a_graph_is_foreign(tmp_path: Path) -> None:
+    ours, mixed = tmp_path / "ours", tmp_path / "mixed"
+    ours.mkdir(), mixed.mkdir()
+    files = networks()
+    without, native = loaded(configured(ours, "fused", files))
+    having, other = loaded(configured(mixed, "fused", {1: foreign(files[1]), 2: files[2]}))
+    assert (without, having) == (False, True)
+    for a, b in zip(native, other, strict=True):
+        assert a == pytest.approx(b, abs=1e-9, nan_ok=True)
+
+
+@pytest.mark.parametrize("method", ["fused", "network"])
+def test_an_estimator_is_the_same_wherever_its_network_was_judged(tmp_path: Path, method: str) -> None:
+    files = (
+        networks()
+        if method == "fused"
+        else {n: small_network().with_metadata(joint=f"joint{n}").data for n in (1, 2)}
+    )
+    path = configured(tmp_path, method, files)
+    config = load_config(path)
+    _, apart = build_estimators({"config": str(path), "config_sha256": config.files_sha256})
+    here = [build_estimator(config, joint) for joint in config.joints]
+    for one, other in zip(apart, here, strict=True):
+        other.reset()
+        for n in range(50):
+            sample = (1e-3, 2.0, 0.1 * n, 100.0, 0.001 * n, 25.0)
+            a, b = one.step(*sample), other.step(*sample)
+            assert a == pytest.approx(b, abs=0.0, nan_ok=True)
+        assert a.network_nm == a.network_nm
+
+
+def test_refusals_have_the_same_words(tmp_path: Path) -> None:
+    files = networks()
+    for number, (bad, word) in enumerate(
+        [
+            (b"no model", "not a usable ONNX model"),
+            (small_network().data, "found input 'x' of shape ['N', 6], expected ['N', 7]"),
+            (files[1], "found a network of joint 'joint1', expected one of 'joint2'"),
+        ]
+    ):
+        directory = tmp_path / str(number)
+        directory.mkdir()
+        apart, here = refusal(load_config(configured(directory, "fused", {1: files[1], 2: bad})), 1)
+        assert word in apart
+        assert apart == here
+
+
+def test_other_bytes_than_the_judged_ones_are_refused(tmp_path: Path) -> None:
+    config = load_config(configured(tmp_path, "fused", networks()))
+    verdict = judged(config)[0]
+    assert isinstance(verdict, Verdict)
+    with pytest.raises(NetworkError, match="was changed while it was checked"):
+        build_estimator(config, config.joints[0], verdict._replace(sha256="0" * 64))
+
+
+def test_a_native_evaluation_that_differs_is_refused(tmp_path: Path) -> None:
+    config = load_config(configured(tmp_path, "fused", networks()))
+    verdict = judged(config)[0]
+    assert isinstance(verdict, Verdict)
+    with pytest.raises(NetworkError, match=r"native evaluation and ONNX Runtime 0\.001 Nm apart"):
+        build_estimator(config, config.joints[0], verdict._replace(native_error_nm=1e-3))
+
+
+def test_a_check_that_dies_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = load_config(configured(tmp_path, "fused", networks()))
+    (tmp_path / "dies.py").write_text("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(referee, "PROGRAM", "dies")
+    for joint, verdict in zip(config.joints, judged(config), strict=True):
+        with pytest.raises(NetworkError) as caught:
+            build_estimator(config, joint, verdict)
+        assert str(caught.value) == (
+            f"{tmp_path}/n{joint.number}.onnx: the check by ONNX Runtime ended with exit status -11 "
+            f"({tmp_path}/c.yaml: 'joint_{joint.number}', estimator.method is fused)"
+        )
