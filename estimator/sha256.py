@@ -15,9 +15,9 @@ def _implementation() -> Any:
     return import_module("hashlib").sha256
 
 
-_SHA256: Final = _implementation()
+sha256: Final = _implementation()
 
 
 def sha256_hex(data: bytes) -> str:
     """Return the SHA-256 of some bytes in hexadecimal."""
-    return str(_SHA256(data).hexdigest())
+    return str(sha256(data).hexdigest())

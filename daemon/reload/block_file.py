@@ -11,7 +11,6 @@ before anything of it is used. `build` is a hash of the program: the layout of a
 
 from __future__ import annotations
 
-import hashlib
 import json
 import struct
 from collections.abc import Sequence
@@ -22,6 +21,7 @@ from typing import Any, Final
 
 from jtqd.estimator.blocks import EstimatorBlocks, blocks_of
 from jtqd.estimator.sample import Estimator
+from jtqd.estimator.sha256 import sha256
 
 _MAGIC: Final = b"jtqdEB\x00\x01"
 _LENGTH: Final = struct.Struct("<I")
@@ -34,13 +34,13 @@ class BlockFileError(Exception):
 @cache
 def build() -> str:
     """Return a hash of the program that writes and reads blocks, as it lies on the disk when first asked."""
-    digest = hashlib.sha256()
+    digest = sha256()
     for package in ("jtqd.estimator", "jtqd.daemon.reload"):
         folder = Path(str(resources.files(package)))
         for path in sorted(each for each in folder.rglob("*") if each.suffix in (".py", ".so")):
             digest.update(f"{package} {path.relative_to(folder)}".encode())
             digest.update(path.read_bytes())
-    return digest.hexdigest()
+    return str(digest.hexdigest())
 
 
 def encoded(estimators: Sequence[Estimator], position: int) -> bytes:

@@ -10,7 +10,6 @@ answers with one JSON line, without real-time priority, and below the other proc
 
 from __future__ import annotations
 
-import hashlib
 import os
 import sys
 from contextlib import suppress
@@ -24,6 +23,7 @@ from jtqd.daemon.reload.shadow import Shadow
 from jtqd.daemon.shared.ring import RingError
 from jtqd.estimator.blocks import blocks_of
 from jtqd.estimator.sample import Estimator
+from jtqd.estimator.sha256 import sha256
 
 _NICE: Final = 10
 
@@ -47,7 +47,7 @@ def prepare(request: dict[str, Any]) -> int:
         raise Refused(objection)
     content = encoded(estimators, shadow.position)
     write(Path(request["swap"]), content)
-    digest = hashlib.sha256(content).hexdigest()
+    digest = sha256(content).hexdigest()
     answer(
         prepared=True,
         bytes=len(content),

@@ -19,7 +19,6 @@ bus, its nodes, the time grid, what is latched - stays where it is.
 
 from __future__ import annotations
 
-import hashlib
 import io
 import time
 from collections import defaultdict, deque
@@ -37,6 +36,7 @@ from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import RingReader
 from jtqd.estimator.blocks import estimator_of, made_of
 from jtqd.estimator.sample import Estimator
+from jtqd.estimator.sha256 import sha256
 
 PATIENCE_S: Final = 20.0
 _MARGIN_NS: Final = 40_000
@@ -135,7 +135,7 @@ class Swap:
             content = encoded(estimators, self._reader.position)
         except ValueError:  # a network that only its runtime evaluates: no estimator to rehearse with
             return
-        order = Order(Path(), len(content), hashlib.sha256(content).hexdigest())
+        order = Order(Path(), len(content), sha256(content).hexdigest())
         for _ in range(_REHEARSALS):
             steps, name = self._all_steps(io.BytesIO(content), order), "read"
             while name != "swap":
@@ -182,7 +182,7 @@ class Swap:
         self._report(swapped=True, cycle=self._cycle.index, missed=self._cycle.grid.missed - self._missed)
 
     def _read(self, source: io.RawIOBase | io.BytesIO, order: Order, content: memoryview) -> Iterator[str]:
-        digest, at = hashlib.sha256(), 0
+        digest, at = sha256(), 0
         while at < len(content):
             count = source.readinto(content[at : at + _CHUNK]) or 0
             if not count:
