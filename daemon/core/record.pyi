@@ -1,11 +1,12 @@
 from jtqd.daemon.shared.ring import Ring
 
 class RecordRing:
-    def __init__(self, ring: Ring) -> None: ...
+    def __init__(self, ring: Ring, joints: int = 2) -> None: ...
 
 class CycleFrames:
     carried: tuple[str, ...]
     state: bytes
+    def __init__(self, joints: int = 2) -> None: ...
     @property
     def count(self) -> int: ...
     @property

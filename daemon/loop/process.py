@@ -30,7 +30,7 @@ from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.loop import realtime
 from jtqd.daemon.loop.input_pdos import JointInputs, input_pdos, joint_temperatures, sensor_index
 from jtqd.daemon.reload.handover import Giver
-from jtqd.daemon.shared.cycle_record import RECORD_SIZE
+from jtqd.daemon.shared.cycle_record import layout_of
 from jtqd.daemon.shared.ring import Ring
 from jtqd.daemon.shared.snapshot import Snapshot
 from jtqd.daemon.shared.systemd import LoopWatchdog, Notifier, watchdog_seconds
@@ -244,7 +244,11 @@ def build_cycle(
     """Build cycle and grid from configuration and boot report; `attach`: on the running loop's shared memory."""
     grid = Grid(0, config.period_ns)
     snapshot = Snapshot(
-        Path(request["snapshot"]), config.period_ns * 1e-9, float(request["worst_load"]), attach=attach
+        Path(request["snapshot"]),
+        config.period_ns * 1e-9,
+        float(request["worst_load"]),
+        len(config.joints),
+        attach=attach,
     )
     intake = Intake(input_pdos(config), joint_temperatures(config))
     for node in {pdo.node_id for pdo in intake.pdos} - {int(node) for node in report["nodes"]}:
@@ -253,7 +257,7 @@ def build_cycle(
         socket,
         intake,
         list(zip(joint_inputs(config, report), estimators, strict=True)),
-        Ring(Path(request["ring"]), config.ring_cycles, RECORD_SIZE, attach=attach),
+        Ring(Path(request["ring"]), config.ring_cycles, layout_of(len(config.joints)).size, attach=attach),
         snapshot,
         safety=safety_of(config),
         node_id=config.node_id,
@@ -267,7 +271,7 @@ def build_cycle(
 
 
 def build_estimators(request: dict[str, Any]) -> tuple[Config, list[AnyEstimator]]:
-    """Load the configuration and warm up the estimators of both joints; raises ConfigError or NetworkError."""
+    """Load the configuration and warm up the estimators of all joints; raises ConfigError or NetworkError."""
     config = load_config(Path(request["config"]) if request["config"] else None)
     if config.files_sha256 != request["config_sha256"]:
         raise ConfigError(f"{config.path}: it or one of its joint files was changed during reading")
