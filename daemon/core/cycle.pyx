@@ -11,7 +11,6 @@ counter and a stale estimate.
 """
 
 from cpython.object cimport PyObject
-from libc.math cimport INFINITY, NAN
 from libc.stdint cimport int64_t, uint8_t, uint32_t
 from libc.string cimport memcpy, memset
 
@@ -22,7 +21,7 @@ from jtqd.daemon.core.bus cimport Bus, bus_of
 from jtqd.daemon.core.clock cimport Clock
 from jtqd.daemon.core.configured_nodes import ConfiguredNodes
 from jtqd.daemon.core.counters cimport LoopCounters
-from jtqd.daemon.core.estimate_pdo cimport Published, encode_into, field_of
+from jtqd.daemon.core.estimate_pdo cimport NOBODY, Published, encode_into
 from jtqd.drivers.frame_socket cimport Frame
 from jtqd.daemon.core.intake cimport Intake, temperature_at
 from jtqd.daemon.core.joint cimport JointCycle
@@ -61,7 +60,6 @@ cdef int64_t BYTE = 255, MOST_WORK_NS = 0xFFFF_FFFF, MOST_LATE_NS = 0x7FFF_FFFF
 
 cdef uint32_t ESTIMATE[MOST_ESTIMATES]
 ESTIMATE[:] = devices.ESTIMATE_BASES
-cdef Published NOBODY = field_of(NAN, INFINITY, OFF)  # of a joint that there is not: the second half of an odd one's PDO
 
 clock = Clock()
 """Of all cycles that are made from here on; tests put another one in its place."""

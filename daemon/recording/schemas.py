@@ -243,11 +243,12 @@ class Topic(NamedTuple):
     schema: str
 
 
-_JOINTS = tuple(
+JOINTS = tuple(
     Topic(number, f"/joint/{joint}/state", "jtqd_msgs/msg/JointEstimate")
     for joint, number in ((1, 1), (2, 2), (3, 8), (4, 9))
 )
-JOINT_1, JOINT_2 = _JOINTS[:2]
+"""Of the joints that a bus may have."""
+JOINT_1, JOINT_2 = JOINTS[:2]
 CAN_FRAMES = Topic(3, "/can/frames", frames_name(2))
 JOINT_STATES = Topic(4, "/joint_states", "sensor_msgs/msg/JointState")
 DIAGNOSTICS = Topic(5, "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
@@ -258,7 +259,7 @@ _OTHERS = (JOINT_STATES, DIAGNOSTICS, EVENTS, LOG)
 
 def joint_topics(joints: int) -> tuple[Topic, ...]:
     """Return /joint/1/state, /joint/2/state, ... of a bus with so many joints."""
-    return _JOINTS[:joints]
+    return JOINTS[:joints]
 
 
 def topics_of(joints: int) -> tuple[Topic, ...]:
