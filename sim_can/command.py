@@ -12,7 +12,7 @@ from jtqd.estimator.checked import ConfigError, count, natural, seconds
 from jtqd.sim_can.eds_entries import EdsChild
 
 if TYPE_CHECKING:
-    from jtqd.sim_can.plant_file import PlantParameters
+    from jtqd.sim_can.plants import AnyPlant
     from jtqd.sim_can.source import Source
 
 # what needs numpy is imported in functions: the EDS child reads meanwhile, and --help is quick
@@ -54,7 +54,7 @@ def parser() -> argparse.ArgumentParser:
         "--plant",
         type=Path,
         metavar="FILE",
-        help=f"plant file (default: {PLANT}), or a joint file for two ideal joints",
+        help=f"plant file (default: {PLANT}), bench file, or a joint file for two ideal joints",
     )
     made.add_argument(
         "--drives",
@@ -133,10 +133,10 @@ def _usage(options: argparse.Namespace) -> str:
 
 def _run(options: argparse.Namespace) -> int:
     from jtqd.models.files import shipped
-    from jtqd.sim_can.plant_file import load_plant
+    from jtqd.sim_can.plants import load_any_plant
 
     if options.cost:
-        return _print_cost(options, load_plant(options.plant or shipped(PLANT)))
+        return _print_cost(options, load_any_plant(options.plant or shipped(PLANT)))
     child = EdsChild(options.drives)  # it reads while this process loads numpy and makes the plant
     try:
         if options.play is not None:
@@ -145,7 +145,7 @@ def _run(options: argparse.Namespace) -> int:
         else:
             from jtqd.sim_can.side_by_side import sources_of
 
-            parameters = load_plant(options.plant or shipped(PLANT))
+            parameters = load_any_plant(options.plant or shipped(PLANT))
             sources = sources_of(parameters, options.seed, options.drives)
             profile = options.profile or parameters.profile
     except BaseException:
@@ -172,7 +172,7 @@ def _serve(options: argparse.Namespace, sources: list[Source], profile: str) -> 
     return run(options.bus, bench, options.bitrate, options.duration)
 
 
-def _print_cost(options: argparse.Namespace, parameters: PlantParameters) -> int:
+def _print_cost(options: argparse.Namespace, parameters: AnyPlant) -> int:
     from jtqd.sim_can.cost import measure
 
     cost = measure(parameters)

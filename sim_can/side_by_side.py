@@ -1,6 +1,6 @@
 """Plants for any number of joints: pairs coupled through a torque sensor, side by side, and a single joint against a load.
 
-Each pair is a plant of its own (`plant.pyx`), so that nothing of one reaches another. A last joint that has no partner turns
+Each pair is a plant of its own, so that nothing of one reaches another. A last joint that has no partner turns
 one that nobody drives: the second joint of its pair, without current and without a node on the bus.
 """
 
@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from jtqd.sim_can.plant_file import PlantParameters
 from jtqd.sim_can.plant_source import PlantSource
+from jtqd.sim_can.plants import AnyPlant
 from jtqd.sim_can.source import ChannelSignal, DriveRatings, DriveSignals, Source
 
 _SEEDS_APART = 1_000_003
@@ -45,7 +45,7 @@ class SingleJoint:
         self._pair.interpolate(drive, period_s)
 
 
-def sources_of(parameters: PlantParameters, seed: int, joints: int) -> list[Source]:
+def sources_of(parameters: AnyPlant, seed: int, joints: int) -> list[Source]:
     """Return the plants of a bench with so many joints; with two it is the one pair of this seed."""
     sources: list[Source] = []
     for number in range((joints + 1) // 2):
