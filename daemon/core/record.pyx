@@ -9,7 +9,7 @@ from libc.string cimport memcpy
 
 import sys
 
-from jtqd.daemon.core.block cimport copied, put_back
+from jtqd.estimator.block cimport copied
 from jtqd.drivers.frame_socket cimport Frame
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared import ring as shared_ring
@@ -95,19 +95,8 @@ cdef class CycleFrames:
         left_out: frames of the cycle that found no room.
     """
 
-    carried = ("state",)
-
     def __init__(self, int joints=2):
         self.layout = _layout(joints)
-
-    @property
-    def state(self):
-        """Frames of slots without a record, as one block."""
-        return copied(&self.held, sizeof(HeldFrames))
-
-    @state.setter
-    def state(self, bytes block):
-        put_back(&self.held, sizeof(HeldFrames), block)
 
     @property
     def slot(self):
