@@ -403,7 +403,9 @@ class _File:
 
     node_id: NodeId
     joint_1: _JointSection
-    joint_2: _JointSection
+    joint_2: _JointSection | None = None
+    joint_3: _JointSection | None = None
+    joint_4: _JointSection | None = None
     bitrate: Annotated[int, limits(ge=10_000, le=1_000_000)] = 1_000_000
     sync: _Sync = _Sync()
     inputs: _Inputs = _Inputs()
@@ -416,9 +418,16 @@ class _File:
     metrics: _Metrics | None = None
 
     def __post_init__(self) -> None:
+        self._check_numbers()
         self._check_inputs()
         self._check_channels()
         self._check_node_ids()
+
+    @property
+    def joints(self) -> tuple[_JointSection, ...]:
+        """Sections `joint_1`, `joint_2`, ... as far as there are any."""
+        every = self.joint_1, self.joint_2, self.joint_3, self.joint_4
+        return tuple(joint for joint in every if joint is not None)
 
     @property
     def wait_us(self) -> float:
@@ -429,6 +438,13 @@ class _File:
     def deadline_us(self) -> float:
         """Time after SYNC at which missing inputs count as missing."""
         return 0.85 * self.sync.period_us if self.inputs.deadline_us is None else self.inputs.deadline_us
+
+    def _check_numbers(self) -> None:
+        """Joints are numbered without a gap: the numbers are those of the estimate PDOs and of the log's topics."""
+        for number in range(1, len(self.joints) + 1):
+            if getattr(self, f"joint_{number}") is None:
+                expected = f"joint_1 to joint_{len(self.joints)} without a gap"
+                raise FieldError("configuration", f"joint_{number}", "none", expected)
 
     def _check_inputs(self) -> None:
         period_us = self.sync.period_us
@@ -443,7 +459,7 @@ class _File:
 
     def _check_channels(self) -> None:
         channels = [] if self.sensor is None else list(range(1, self.sensor.channels + 1))
-        for number, joint in enumerate((self.joint_1, self.joint_2), start=1):
+        for number, joint in enumerate(self.joints, start=1):
             channel = joint.sensor_channel
             if channel is not None and channel not in channels:
                 expected = (
@@ -453,7 +469,7 @@ class _File:
 
     def _check_node_ids(self) -> None:
         users = {self.node_id: "node_id"}
-        nodes = {"joint_1.node": self.joint_1.node, "joint_2.node": self.joint_2.node}
+        nodes = {f"joint_{number}.node": joint.node for number, joint in enumerate(self.joints, start=1)}
         if self.sensor is not None:
             nodes["sensor.node"] = self.sensor.node
         for key, node in nodes.items():
@@ -520,9 +536,9 @@ def load_config(path: Path | None) -> Config:
         path = shipped(DEFAULT_CONFIG)
     mapping, data = read_yaml(path)
     file = decode(_File, Section(mapping, str(path)))
-    one, two = (
+    joints = tuple(
         _joint(path, number, section, file.estimator.method, file.nodes.sdo_timeout_ms)
-        for number, section in enumerate((file.joint_1, file.joint_2), start=1)
+        for number, section in enumerate(file.joints, start=1)
     )
     return Config(
         path=path,
@@ -542,7 +558,7 @@ def load_config(path: Path | None) -> Config:
         reset_communication=file.nodes.reset_communication,
         estimator=file.estimator,
         safety=file.safety,
-        joints=(one, two),
+        joints=joints,
         sensor=None if file.sensor is None else _sensor(file.sensor, file.nodes.sdo_timeout_ms),
         realtime=file.realtime,
         recording=file.recording,

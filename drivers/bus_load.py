@@ -16,7 +16,7 @@ from jtqd.drivers.devices import (
     drive_tpdo1,
     drive_tpdo2,
     drive_tpdo3,
-    estimate_tpdo,
+    estimate_tpdos,
     sensor_tpdo1,
     sensor_tpdo2,
 )
@@ -28,6 +28,7 @@ LIMIT = 0.95
 BITRATE = 1_000_000
 PERIOD_S = 1e-3
 HEARTBEAT_BYTES = 1
+_ESTIMATES = ("jtqd estimate", "jtqd estimate 3, 4")
 
 
 class BusLoadError(ValueError):
@@ -132,11 +133,14 @@ def configured_load(
     bitrate: int = BITRATE,
     period_s: float = PERIOD_S,
 ) -> BusLoad:
-    """Add up drives (node numbers), sensors (node -> channels), SYNC, estimate, heartbeats and `extra`.
+    """Add up drives (node numbers), sensors (node -> channels), SYNC, estimates, heartbeats and `extra`.
 
     `temperatures`: nodes among the drives that send their joint's temperature.
     """
-    rows = [sync_row(sync_counter), pdo_row("jtqd estimate", estimate_tpdo(master))]
+    drives = tuple(drives)
+    rows = [sync_row(sync_counter)]
+    for pdo, who in zip(estimate_tpdos(len(drives), master), _ESTIMATES, strict=False):
+        rows.append(pdo_row(who, pdo))
     rows.append(heartbeat_row("jtqd", master, heartbeat_ms, period_s))
     for node in drives:
         rows.append(pdo_row(f"drive {node} TPDO1", drive_tpdo1(node)))

@@ -18,6 +18,8 @@ JTQD_NODE = 0x20
 COMMANDER_NODE = 0x21
 """Node that may command the drives beside jtqd; they watch its heartbeat by 1016h:2."""
 SYNC_COB_ID = 0x080
+ESTIMATE_BASES = (0x180, 0x280)
+"""Of jtqd's PDOs with the estimates of joints 1 and 2, and of joints 3 and 4."""
 
 # Objects that scale a drive's numbers, with the largest value that makes sense. All must be at least 1.
 DRIVE_SCALING_OBJECTS: dict[Key, tuple[str, int]] = {
@@ -248,12 +250,23 @@ def sensor_tpdo2(node: int) -> PdoMap:
     return PdoMap(0x280 + node, (torque, MappedObject(0x6150, 2, 8, False, "torque_status_2")))
 
 
-def estimate_tpdo(node: int = JTQD_NODE) -> PdoMap:
-    """180h+20h: the estimate (2100h..2103h of jtqd.eds)."""
-    torques = [MappedObject(0x2100, joint, 16, True, f"torque_{joint}") for joint in (1, 2)]
-    sigmas = [MappedObject(0x2101, joint, 8, False, f"sigma_{joint}") for joint in (1, 2)]
-    status = MappedObject(0x2102, 0, 8, False, "status")
-    return PdoMap(0x180 + node, (*torques, *sigmas, status, MappedObject(0x2103, 0, 8, False, "sequence")))
+def estimate_tpdos(joints: int, node: int = JTQD_NODE) -> tuple[PdoMap, ...]:
+    """180h+20h: the estimate of joints 1 and 2; with more than two joints also 280h+20h: of joints 3 and 4.
+
+    2100h..2103h and 2105h of jtqd.eds and jtqd4.eds. The second half of an odd joint's PDO says that there is none.
+    """
+    return tuple(
+        _estimate_tpdo(pair, base + node)
+        for pair, base in zip(range((joints + 1) // 2), ESTIMATE_BASES, strict=False)
+    )
+
+
+def _estimate_tpdo(pair: int, cob_id: int) -> PdoMap:
+    numbers = (2 * pair + 1, 2 * pair + 2)
+    torques = [MappedObject(0x2100, joint, 16, True, f"torque_{joint}") for joint in numbers]
+    sigmas = [MappedObject(0x2101, joint, 8, False, f"sigma_{joint}") for joint in numbers]
+    status = MappedObject((0x2102, 0x2105)[pair], 0, 8, False, "status")
+    return PdoMap(cob_id, (*torques, *sigmas, status, MappedObject(0x2103, 0, 8, False, "sequence")))
 
 
 def drive_scaling(profile: DriveProfile, read: Mapping[Key, int]) -> tuple[DriveScaling, float]:

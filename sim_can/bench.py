@@ -1,9 +1,11 @@
-"""The emulated bench: two drives and a torque sensor around one source. Frames and times in, frames out.
+"""The emulated bench: drives and a torque sensor around their sources. Frames and times in, frames out.
 
 While no master commands the drives the bench moves them itself (`jtqd.sim_can.demo`). No socket, no clock.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 from jtqd.drivers.devices import COMMANDER_NODE, JTQD_NODE, SYNC_COB_ID
 from jtqd.drivers.filters import CanFilter, exact
@@ -11,8 +13,9 @@ from jtqd.drivers.nmt import HEARTBEAT_BASE
 from jtqd.sim_can.canopen_node import CanopenNode
 from jtqd.sim_can.demo import demo_current, demo_velocity
 from jtqd.sim_can.drive_node import OPERATION_ENABLED, DriveNode
-from jtqd.sim_can.sensor_node import SENSOR_NODE, SensorNode
-from jtqd.sim_can.source import CURRENT, OFF, VELOCITY, Source
+from jtqd.sim_can.eds_entries import sensor_node
+from jtqd.sim_can.sensor_node import SensorNode
+from jtqd.sim_can.source import CURRENT, OFF, VELOCITY, DriveSignals, Source
 
 CLOCK_STEP_NS = 100_000_000  # stamps and steady clock never differ by this from SYNC to SYNC, unless CLOCK_REALTIME was set
 LONGEST_STEP_NS = 50_000_000  # a source never jumps further than this, however long SYNC was away
@@ -21,14 +24,15 @@ RESOLUTION_NS = 10_000
 IDLE_STEP_NS = 10_000_000  # step of powered drives once SYNC has been away for LONGEST_STEP_NS
 
 
-def bench_filters() -> tuple[CanFilter, ...]:
+def bench_filters(drives: int = 2) -> tuple[CanFilter, ...]:
     """Return filters for what the bench receives.
 
-    NMT, SYNC, SDO requests, RPDOs 1 and 2 of the drives, heartbeats of jtqd and of the node that commands.
+    NMT, SYNC, SDO requests, RPDOs 1 and 2 of so many drives, heartbeats of jtqd and of the node that commands.
     """
     ids = [0x000, SYNC_COB_ID, HEARTBEAT_BASE + JTQD_NODE, HEARTBEAT_BASE + COMMANDER_NODE]
-    ids += [0x600 + node for node in (1, 2, SENSOR_NODE)]
-    ids += [base + node for base in (0x200, 0x300) for node in (1, 2)]
+    nodes = range(1, drives + 1)
+    ids += [0x600 + node for node in (*nodes, sensor_node(drives))]
+    ids += [base + node for base in (0x200, 0x300) for node in nodes]
     return tuple(exact(can_id) for can_id in ids)
 
 
@@ -37,22 +41,38 @@ def _rounded(time_ns: int) -> int:
 
 
 class Bench:
-    """Nodes 1, 2 (drives) and 3 (sensor) of the bench. `over` turns True when a recorded run has ended.
+    """Nodes 1, 2, ... (drives) and 3 or 5 (sensor) of the bench. `over` turns True when a recorded run has ended.
 
-    The source's time is the measured time since the first SYNC, in steps of RESOLUTION_NS: equal stamps give
+    Args:
+        source: of the first drives; its torque channels are those of the sensor.
+        profile: "demo": while no master commands the drives, the first one of each source follows the built-in motion, the
+            second one its load.
+        more: sources of further drives, with the next channels.
+        with_sensor: there is a sensor node.
+
+    A source's time is the measured time since the first SYNC, in steps of RESOLUTION_NS: equal stamps give
     equal values, and so do stamps that differ by their own inaccuracy.
     """
 
-    def __init__(self, source: Source, profile: str = "demo") -> None:
+    def __init__(
+        self, source: Source, profile: str = "demo", more: Sequence[Source] = (), *, with_sensor: bool = True
+    ) -> None:
         self.source = source
+        self._sources = (source, *more)
         self.over = False
-        self.drives = tuple(DriveNode(source, number, self._hand_over) for number in (0, 1))
-        self.sensor = SensorNode(source)
-        self.nodes: tuple[CanopenNode, ...] = (*self.drives, self.sensor)
+        drives: list[DriveNode] = []
+        for each in self._sources:
+            first = len(drives) + 1
+            drives += [DriveNode(each, n, self._hand_over, first + n) for n in range(len(each.drives))]
+        self.drives = tuple(drives)
+        self.nodes: tuple[CanopenNode, ...] = self.drives
+        if with_sensor:
+            channels = [channel for each in self._sources for channel in each.channels]
+            self.sensor = SensorNode(channels, sensor_node(len(drives)))
+            self.nodes += (self.sensor,)
         self.sync_count = 0
         self._profile = profile
         self._profile_s = 0.0
-        self._gear = source.ratings[0].gear_ratio
         self._first_stamp_ns = 0
         self._last_time_ns = 0  # of the last SYNC, since the first one
         self._last_steady_ns = 0  # steady clock at the last step, for idle steps
@@ -62,8 +82,7 @@ class Bench:
     @property
     def due_ns(self) -> int:
         """Steady time at which `tick` has something to do next."""
-        one, two, three = self.nodes
-        due = min(one.due_ns, two.due_ns, three.due_ns)
+        due = min(node.due_ns for node in self.nodes)
         return min(due, self._idle_due_ns()) if self._moving() else due
 
     def on_frame(self, can_id: int, data: bytes, stamp_ns: int, now_ns: int) -> list[bytes]:
@@ -113,33 +132,46 @@ class Bench:
         return frames
 
     def _advance(self, dt_s: float) -> list[bytes]:
-        if not self.source.advance(dt_s):
-            self.over = True
-            return []
-        one, two = self.drives
-        frames = one.watch() + two.watch()
-        if not one.commanded:
+        for source in self._sources:
+            if not source.advance(dt_s):
+                self.over = True
+                return []
+        frames: list[bytes] = []
+        for drive in self.drives:
+            frames += drive.watch()
+        if not self.drives[0].commanded:
             frames += self._by_itself(dt_s)
         return frames
 
     def _by_itself(self, dt_s: float) -> list[bytes]:
         """Run drives that no master commands: enabled by a recorded run, or by the built-in motion."""
-        one, two = self.drives
-        signals = self.source.drives
-        if signals[0].enabled or signals[1].enabled:
-            frames: list[bytes] = []
-            for drive, signal in zip(self.drives, signals, strict=True):
+        frames: list[bytes] = []
+        if self._played():
+            for drive, signal in zip(self.drives, self._signals(), strict=True):
                 if signal.enabled:
                     frames += drive.run_by_itself(OFF, 0.0)
             return frames
-        if one.machine.state == two.machine.state == OPERATION_ENABLED:
+        if all(drive.machine.state == OPERATION_ENABLED for drive in self.drives):
             self._profile_s += dt_s
         else:
             self._profile_s = 0.0  # start, or start again after a stop, from rest
         if self._profile != "demo":
             return []
         velocity, current = demo_velocity(self._profile_s), demo_current(self._profile_s)
-        return one.run_by_itself(VELOCITY, velocity * self._gear) + two.run_by_itself(CURRENT, current)
+        drives = iter(self.drives)
+        for source in self._sources:
+            gear = source.ratings[0].gear_ratio
+            frames += next(drives).run_by_itself(VELOCITY, velocity * gear)
+            if len(source.drives) > 1:
+                frames += next(drives).run_by_itself(CURRENT, current)
+        return frames
+
+    def _signals(self) -> list[DriveSignals]:
+        return [signals for source in self._sources for signals in source.drives]
+
+    def _played(self) -> bool:
+        """Return whether a recorded run is played."""
+        return any(signals.enabled for signals in self._signals())
 
     def _hand_over(self) -> None:
         for drive in self.drives:
@@ -150,7 +182,6 @@ class Bench:
 
     def _moving(self) -> bool:
         """Return whether drives go on without SYNC: powered ones of a plant do, a recorded run does not."""
-        one, two = self.drives
-        if not self.sync_count or self.source.drives[0].enabled or self.source.drives[1].enabled:
+        if not self.sync_count or self._played():
             return False
-        return one.machine.powered or two.machine.powered
+        return any(drive.machine.powered for drive in self.drives)

@@ -58,7 +58,9 @@ class _EmbeddedHub:
     def __init__(self, path: str, bitrate: int | None, bench: Bench) -> None:
         self._hub = Hub(path, bitrate)
         self._bench = bench
-        self._port = self._hub.attach(self._on_frame, [each.can_id for each in bench_filters()])
+        self._port = self._hub.attach(
+            self._on_frame, [each.can_id for each in bench_filters(len(bench.drives))]
+        )
         self.send = self._port.send
         self.serve = self._hub.serve
         self.close = self._hub.close
@@ -81,7 +83,7 @@ class _Socket:
     """Bus of which the bench is one member: SocketCAN, or a unix bus whose hub runs elsewhere."""
 
     def __init__(self, bus: str, bench: Bench) -> None:
-        self._socket = open_frame_socket(bus, bench_filters())
+        self._socket = open_frame_socket(bus, bench_filters(len(bench.drives)))
         self._bench = bench
         self._down = False
         self.close = self._socket.close

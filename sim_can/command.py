@@ -23,6 +23,7 @@ PLANT = "campaign_plant.yaml"
 
 EXAMPLES = """examples:
   jtq sim --bus vcan0                              two joints and a sensor on SocketCAN
+  jtq sim --bus vcan0 --drives 4                   two such pairs side by side
   jtq sim --bus unix:/tmp/bench --bitrate 1000000  the same on a unix bus with a modelled wire
   jtq sim --bus vcan0 --play models/kinova_gen3/RunTrajectory1.csv.gz --joints 2,4
   jtq sim --cost                                   CPU time of one cycle on this machine
@@ -41,7 +42,8 @@ def parser() -> argparse.ArgumentParser:
     """Return the options of `jtq sim`."""
     made = argparse.ArgumentParser(
         prog="jtq sim",
-        description="Emulated bench: two drives (nodes 1, 2) and a torque sensor (node 3) on a CAN bus.",
+        description="Emulated bench: two drives (nodes 1, 2) and a torque sensor (node 3) on a CAN bus, "
+        "or one to four drives (nodes 1 to 4; with more than two the sensor is node 5).",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -54,6 +56,15 @@ def parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help=f"plant file (default: {PLANT}), bench file, or a joint file for two ideal joints",
     )
+    made.add_argument(
+        "--drives",
+        type=int,
+        choices=(1, 2, 3, 4),
+        default=2,
+        metavar="N",
+        help="1 to 4 (default 2): pairs around a channel of the sensor; one without a partner turns a passive load",
+    )
+    made.add_argument("--no-sensor", action="store_true", help="a bench without torque sensor")
     made.add_argument(
         "--seed", type=natural, default=0, metavar="N", help="seed of noise and days (default 0)"
     )
@@ -115,8 +126,8 @@ def _usage(options: argparse.Namespace) -> str:
     if options.play is None:
         if options.columns is not None or options.joints is not None:
             return "--columns and --joints require --play RUN"
-    elif options.plant is not None or options.profile is not None:
-        return "--plant and --profile cannot be used with --play RUN"
+    elif options.plant is not None or options.profile is not None or options.drives != 2:
+        return "--plant, --profile and --drives cannot be used with --play RUN"
     return ""
 
 
@@ -126,22 +137,22 @@ def _run(options: argparse.Namespace) -> int:
 
     if options.cost:
         return _print_cost(options, load_any_plant(options.plant or shipped(PLANT)))
-    child = EdsChild()  # it reads while this process loads numpy and makes the plant
+    child = EdsChild(options.drives)  # it reads while this process loads numpy and makes the plant
     try:
         if options.play is not None:
-            source: Source = _played(options)
+            sources: list[Source] = [_played(options)]
             profile = "rest"
         else:
-            from jtqd.sim_can.plant_source import PlantSource
+            from jtqd.sim_can.side_by_side import sources_of
 
             parameters = load_any_plant(options.plant or shipped(PLANT))
-            source = PlantSource(parameters, options.seed)
+            sources = sources_of(parameters, options.seed, options.drives)
             profile = options.profile or parameters.profile
     except BaseException:
         child.stop()
         raise
     child.take()
-    return _serve(options, source, profile)
+    return _serve(options, sources, profile)
 
 
 def _played(options: argparse.Namespace) -> Source:
@@ -153,11 +164,12 @@ def _played(options: argparse.Namespace) -> Source:
     return source
 
 
-def _serve(options: argparse.Namespace, source: Source, profile: str) -> int:
+def _serve(options: argparse.Namespace, sources: list[Source], profile: str) -> int:
     from jtqd.sim_can.bench import Bench
     from jtqd.sim_can.bench_loop import run
 
-    return run(options.bus, Bench(source, profile), options.bitrate, options.duration)
+    bench = Bench(sources[0], profile, sources[1:], with_sensor=not options.no_sensor)
+    return run(options.bus, bench, options.bitrate, options.duration)
 
 
 def _print_cost(options: argparse.Namespace, parameters: AnyPlant) -> int:

@@ -16,7 +16,7 @@ from jtqd.drivers.object_dictionary import ObjectStore
 from jtqd.drivers.sdo import VALUE_RANGE, SdoAbort
 from jtqd.sim_can.canopen_node import CURRENT as CURRENT_ERROR
 from jtqd.sim_can.canopen_node import HEARTBEAT_LOST, CanopenNode
-from jtqd.sim_can.eds_entries import entries_of
+from jtqd.sim_can.eds_entries import DRIVE, entries_of
 from jtqd.sim_can.source import CURRENT, OFF, VELOCITY, DriveRatings, DriveSignals, Source
 from jtqd.sim_can.transmit import DriveValue
 
@@ -144,14 +144,14 @@ _INTERPOLATION_UNITS = (-6, 0)  # 60C2h:2: microseconds to seconds
 
 
 class DriveNode(CanopenNode):
-    """Drive `number` (0, 1) of the source as CANopen node number + 1.
+    """Drive `number` (0, 1) of the source as CANopen node `node_id`.
 
     While no master has written 6040h or 6060h (`commanded` False) the bench may run the drive itself:
     `run_by_itself`.
     """
 
-    def __init__(self, source: Source, number: int, on_master: Callable[[], None]) -> None:
-        super().__init__(ObjectStore(entries_of(number + 1), number + 1))
+    def __init__(self, source: Source, number: int, on_master: Callable[[], None], node_id: int) -> None:
+        super().__init__(ObjectStore(entries_of(node_id, DRIVE), node_id))
         self.machine = StateMachine()
         self.commanded = False
         self._source, self._number, self._on_master = source, number, on_master
@@ -250,7 +250,7 @@ class DriveNode(CanopenNode):
             self._source.interpolate(self._number, period_s)
 
     def _take_over(self) -> None:
-        """Give the command to the master for good, of both drives: the demo motion needs both."""
+        """Give the command to the master for good, of all drives: the demo motion needs both of a pair."""
         if not self.commanded:
             self._on_master()
 

@@ -13,24 +13,38 @@ from jtqd.drivers import eds
 from jtqd.drivers.object_dictionary import Entry, entries_from_json, entries_to_json, read_eds
 
 FOLDER = Path(eds.__file__).parent
-FILES = {1: "drive.eds", 2: "drive.eds", 3: "torque_sensor.eds"}
+DRIVE, SENSOR = "drive.eds", "torque_sensor.eds"
 _CHILD_S = 20.0
-_cache: dict[int, list[Entry]] = {}
+_cache: dict[tuple[int, str], list[Entry]] = {}
 
 
-def entries_of(node: int) -> list[Entry]:
-    """Return the entries of node 1, 2 or 3: those a child has read, else read here and kept."""
-    if node not in _cache:
-        _cache[node] = read_eds(FOLDER / FILES[node], node)
-    return _cache[node]
+def sensor_node(drives: int) -> int:
+    """Return the node-ID of the sensor of a bench with so many drives, whose node-IDs are 1, 2, ..."""
+    return 3 if drives <= 2 else 5
+
+
+def files_of(drives: int) -> dict[int, str]:
+    """Return the EDS file of each node of a bench."""
+    return dict.fromkeys(range(1, drives + 1), DRIVE) | {sensor_node(drives): SENSOR}
+
+
+def entries_of(node: int, file: str) -> list[Entry]:
+    """Return the entries of a node: those a child has read, else read here and kept."""
+    if (node, file) not in _cache:
+        _cache[node, file] = read_eds(FOLDER / file, node)
+    return _cache[node, file]
 
 
 class EdsChild:
-    """Child process that reads the EDS files; start it early, `take` its result before the nodes are made."""
+    """Child process that reads the EDS files; start it early, `take` its result before the nodes are made.
 
-    def __init__(self) -> None:
+    drives: number of drives on the bench.
+    """
+
+    def __init__(self, drives: int = 2) -> None:
+        self._files = files_of(drives)
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "jtqd.sim_can.eds_entries"],
+            [sys.executable, "-m", "jtqd.sim_can.eds_entries", str(drives)],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
@@ -45,7 +59,7 @@ class EdsChild:
             return
         if self._process.returncode == 0:
             for node, rows in json.loads(output).items():
-                _cache[int(node)] = entries_from_json(rows)
+                _cache[int(node), self._files[int(node)]] = entries_from_json(rows)
 
     def stop(self) -> None:
         """End the child without its result."""
@@ -54,8 +68,9 @@ class EdsChild:
 
 
 def main() -> int:
-    """Print the entries of all nodes as one JSON object."""
-    print(json.dumps({node: entries_to_json(entries_of(node)) for node in FILES}))
+    """Print the entries of all nodes of a bench with `sys.argv[1]` drives as one JSON object."""
+    files = files_of(int(sys.argv[1]))
+    print(json.dumps({node: entries_to_json(entries_of(node, file)) for node, file in files.items()}))
     return 0
 
 

@@ -1,29 +1,28 @@
-"""Emulated CiA 404 torque sensor with two channels around the torque channels of a `Source`. Pure."""
+"""Emulated CiA 404 torque sensor with two channels around torque channels of `Source`s. Pure."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from jtqd.drivers.object_dictionary import ObjectStore
 from jtqd.drivers.sdo import VALUE_RANGE, SdoAbort
 from jtqd.sim_can.canopen_node import CanopenNode
-from jtqd.sim_can.eds_entries import entries_of
-from jtqd.sim_can.source import Source
+from jtqd.sim_can.eds_entries import SENSOR, entries_of
+from jtqd.sim_can.source import ChannelSignal
 from jtqd.sim_can.transmit import Channel, ChannelValue
 
 AUTOZERO = 0x6F72_657A  # "zero" in 6125h
 MAX_DECIMALS = 9
-SENSOR_NODE = 3
 
 
 class SensorNode(CanopenNode):
-    """Sensor as node 3. Channel 1 is the source's first torque channel; channel 2 is valid only where there is a second."""
+    """Sensor as node `node_id`. Channel 1 is the first of `signals`; channel 2 is valid only where there is a second."""
 
-    def __init__(self, source: Source) -> None:
-        super().__init__(ObjectStore(entries_of(SENSOR_NODE), SENSOR_NODE))
-        self.store.set_number(0x1018, 4, 0x1000 + SENSOR_NODE)
+    def __init__(self, signals: Sequence[ChannelSignal], node_id: int) -> None:
+        super().__init__(ObjectStore(entries_of(node_id, SENSOR), node_id))
+        self.store.set_number(0x1018, 4, 0x1000 + node_id)
         self.store.keep_as_default(0x1018, 4)
         self._channels: list[Channel] = []
         for number in (1, 2):
-            signal = source.channels[number - 1] if number <= len(source.channels) else None
+            signal = signals[number - 1] if number <= len(signals) else None
             channel = Channel(signal, self.store.number(0x6132, number))
             self._channels.append(channel)
             self.getters[0x9130, number] = ChannelValue(channel, 32)

@@ -40,17 +40,17 @@ class DriveRatings:
 
 
 class Source(Protocol):
-    """Measurements of two drives and one or two torque channels. Pure: time comes in as dt_s, nothing here
+    """Measurements of one or two drives and one or two torque channels. Pure: time comes in as dt_s, nothing here
     reads a clock.
     """
 
     @property
     def ratings(self) -> Sequence[DriveRatings]:
-        """Two entries, fixed for the life of the source."""
+        """One or two entries, fixed for the life of the source."""
 
     @property
     def drives(self) -> Sequence[DriveSignals]:
-        """Two entries; the same objects every time, updated by `advance`."""
+        """One entry for each rating; the same objects every time, updated by `advance`."""
 
     @property
     def channels(self) -> Sequence[ChannelSignal]:

@@ -16,8 +16,9 @@ from jtqd.daemon.shared.child_process import Child
 from jtqd.daemon.shared.log_lines import RateLimit
 from jtqd.daemon.shared.snapshot import NOT_OPERATIONAL, SnapshotReader, View
 from jtqd.drivers.bus_load import BusLoad, configured_load
+from jtqd.drivers.eds.own_objects import own_sheet
 
-_OWN_EDS = Path(__file__).resolve().parents[2] / "drivers" / "eds" / "jtqd.eds"
+_EDS = Path(__file__).resolve().parents[2] / "drivers" / "eds"
 
 
 def boot_request(
@@ -58,7 +59,7 @@ def boot_request(
         "bus": bus,
         "nodes": [node for node in nodes if only in (None, node["node"])],
         "master_node": config.node_id,
-        "own_eds": str(_OWN_EDS),
+        "own_eds": str(_EDS / own_sheet(len(config.joints))),
         "heartbeat_ms": config.heartbeat_ms,
         "error_behaviour": config.error_behaviour,
         "reset": config.reset_communication if reset is None else reset,

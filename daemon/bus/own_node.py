@@ -15,10 +15,10 @@ from jtqd.daemon.config import Config
 from jtqd.daemon.core.estimate_pdo import field
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.drivers.boot_procedure import signature
-from jtqd.drivers.eds.own_objects import BUS_FIELDS, COUNTERS, JOINT_PARAMETERS, NODES, VERSION
+from jtqd.drivers.eds.own_objects import BUS_FIELDS, COUNTERS, JOINT_PARAMETERS, PARAMETERS, VERSION, room_for
 from jtqd.drivers.object_dictionary import ObjectStore
 from jtqd.drivers.sdo_server import SdoServer
-from jtqd.estimator.status import STALE
+from jtqd.estimator.status import OFF, STALE
 
 _STANDSTILL_S = 0.2
 """A loop whose snapshot has not moved for so long is not running (it moves every 8 cycles)."""
@@ -30,8 +30,8 @@ class OwnNode:
     """Object dictionary and SDO server.
 
     Args:
-        store: object dictionary from jtqd.eds.
-        config: configuration in force; its joints' parameters are readable in 2202h and 2203h.
+        store: object dictionary from jtqd.eds, or from jtqd4.eds with more than two joints (`own_sheet`).
+        config: configuration in force; its joints' parameters are readable in 2202h, 2203h, 2208h, 2209h.
         reader: snapshot of the loop.
 
     Attributes:
@@ -50,8 +50,11 @@ class OwnNode:
         self.bus: Callable[[], tuple[int, ...]] = lambda: (0,) * len(BUS_FIELDS)
         self.nodes: Callable[[int], tuple[int, int, int]] = lambda _node: (0, 0, 0)
         self.emergencies: Callable[[int], tuple[int, int, int]] = lambda _node: (0, 0, 0)
-        self._watched = [joint.node_id for joint in config.joints]
-        self._watched += [config.sensor.node_id] if config.sensor is not None else []
+        self._joints = len(config.joints)
+        self._room = room_for(self._joints)
+        self._watched = {sub: joint.node_id for sub, joint in enumerate(config.joints, start=1)}
+        if config.sensor is not None:
+            self._watched[self._room + 1] = config.sensor.node_id
         self._connect_objects()
         self.set_parameters(config)
 
@@ -66,11 +69,12 @@ class OwnNode:
 
     def _connect_objects(self) -> None:
         store = self._store
-        for joint in (0, 1):
+        for joint in range(self._room):
             store.on_read(0x2100, joint + 1, partial(self._field, joint, 0))
             store.on_read(0x2101, joint + 1, partial(self._field, joint, 1))
             store.on_read(0x2104, joint + 1, partial(self._latched, joint))
-        store.on_read(0x2102, 0, lambda: self._field(0, 2) | self._field(1, 2) << 4)
+        for pair, index in zip(range(0, self._room, 2), (0x2102, 0x2105), strict=False):
+            store.on_read(index, 0, partial(self._statuses, pair))
         store.on_read(0x2103, 0, lambda: self._reader.read().sync_counter)
         store.on_read(0x2110, 0, lambda: int(self._asked > self._reader.resets_done))
         store.on_write(0x2110, 0, self._reset)
@@ -80,21 +84,27 @@ class OwnNode:
             store.on_read(0x2201, sub, partial(self._work_us, share))
         for sub in range(len(BUS_FIELDS)):
             store.on_read(0x2205, sub + 1, partial(self._bus, sub))
-        for position, node in zip(range(NODES), self._watched, strict=False):
-            store.on_read(0x2206, position + 1, partial(self._node, node))
-            store.on_read(0x2207, position + 1, partial(self._emergency, node))
+        for sub, node in self._watched.items():
+            store.on_read(0x2206, sub, partial(self._node, node))
+            store.on_read(0x2207, sub, partial(self._emergency, node))
 
     def _field(self, joint: int, part: int) -> int:
         """Return torque (0), sigma (1) or status (2) of a joint as on the bus."""
+        if joint >= self._joints:
+            return field(nan, inf, OFF)[part]
         view = self._reader.read()
         if view.cycle == self._last_cycle and time.monotonic() - self._last_change > _STANDSTILL_S:
             return field(nan, inf, STALE)[part]  # the loop stands still: its last estimate is old
         last = view.joints[joint]
         return field(last.torque_nm, last.sigma_nm, last.status)[part]
 
+    def _statuses(self, pair: int) -> int:
+        """Return the status byte of the PDO that begins with joint `pair`."""
+        return self._field(pair, 2) | self._field(pair + 1, 2) << 4
+
     def _latched(self, joint: int) -> int:
         """Return the latched bits of `daemon/shared/cycle_record.py`."""
-        return self._reader.read().joints[joint].latched
+        return self._reader.read().joints[joint].latched if joint < self._joints else 0
 
     def _reset(self, data: bytes) -> None:
         """Release latched faults by 2110h = 1, as `jtq control reset` does."""
@@ -126,13 +136,13 @@ class OwnNode:
         store.set_text(0x100A, 0, VERSION)
         store.set_number(0x1006, 0, config.period_ns // 1000)
         store.set_number(0x1015, 0, config.emcy_inhibit_ms * _MS_TO_INHIBIT)
-        for sub, node in enumerate(self._watched, start=1):
+        for sub, node in self._watched.items():
             store.set_number(0x1016, sub, node << 16 | config.heartbeat_timeout_ms)
         store.set_number(0x1017, 0, config.heartbeat_ms)
         store.set_number(0x1019, 0, config.counter_overflow)
         for sub, word in enumerate(signature(config.sha256), start=1):
             store.set_number(0x1020, sub, word)
         store.set_text(0x2204, 0, config.sha256)
-        for index, joint in zip((0x2202, 0x2203), config.joints, strict=True):
+        for index, joint in zip(PARAMETERS, config.joints, strict=False):
             for sub, name in enumerate(JOINT_PARAMETERS, start=1):
                 store.set_number(index, sub, getattr(joint.joint, name))

@@ -66,7 +66,8 @@ def check_bus(
     yield _sync(traffic, config)
     for pdo in traffic.inputs.values():
         yield _input(pdo, traffic, config)
-    yield _estimate(traffic, config)
+    for cob_id in traffic.estimates:
+        yield _estimate(traffic, config, cob_id)
     yield _success(traffic)
     for node in traffic.nodes.values():
         yield _node(node, traffic, config)
@@ -170,12 +171,12 @@ def _hint(pdo: PdoCount, config: Config) -> str:
     return "frames are lost: check error frames, termination and the interface's txqueuelen"
 
 
-def _estimate(traffic: Traffic, config: Config) -> CheckResult:
-    pdo = traffic.estimate
+def _estimate(traffic: Traffic, config: Config, cob_id: int) -> CheckResult:
+    pdo = traffic.estimates[cob_id]
     if not pdo.frames:
         return CheckResult(pdo.name, SKIP, "no jtqd on the bus")
     per_joint = []
-    for number, count in enumerate(traffic.statuses, start=1):
+    for number, count in traffic.statuses_in(cob_id).items():
         total = max(1, sum(count.values()))
         known = sum(count[code] for code in PUBLISHED) / total
         others = [(n, code) for code, n in count.items() if code not in PUBLISHED]

@@ -102,7 +102,7 @@ def content(reading: Reading) -> dict[str, Any]:
         return result
     return result | {
         "cycle": view.cycle,
-        "joints": [_joint(reading, number) for number in (1, 2)],
+        "joints": [_joint(reading, number) for number in range(1, len(view.joints) + 1)],
         "inputs": [_input(name, each, view) for name, each in zip(about.inputs, view.inputs, strict=False)],
         "work_us": _quantiles(reading.work_us),
         "late_us": _quantiles(reading.late_us),

@@ -18,6 +18,7 @@ from jtqd.daemon.core import estimate_pdo
 from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.loop.input_pdos import input_pdos
 from jtqd.drivers import nmt
+from jtqd.drivers.devices import estimate_tpdos
 from jtqd.drivers.frame import (
     CAN_EFF_FLAG,
     CAN_EFF_MASK,
@@ -76,6 +77,8 @@ class PdoCount:
 
     name: str
     length: int
+    is_input: bool = True
+    """jtqd waits for it."""
     frames: int = 0
     in_cycle: int = 0
     counted: int = 0
@@ -112,7 +115,8 @@ class Traffic:
 
     Attributes:
         inputs: the input PDOs by COB-ID.
-        estimate: jtqd's own PDO.
+        estimates: jtqd's own PDOs by COB-ID: one for each two joints.
+        statuses: of each joint, how often each status was published.
         nodes: by node-ID, jtqd's own included.
         strangers: frames by identifier that no configured node sends.
         errors: error messages of the driver, by class bit.
@@ -122,8 +126,10 @@ class Traffic:
         self._period_ns, self._deadline_ns = config.period_ns, config.input_deadline_ns
         self._overflow = config.sequence_overflow
         self.inputs = {pdo.cob_id: PdoCount(pdo.name, pdo.length) for pdo in input_pdos(config)}
-        self._estimate_id = 0x180 + config.node_id
-        self.estimate = PdoCount(f"{self._estimate_id:03X}h jtqd estimate", 8)
+        self.estimates = {
+            pdo.cob_id: PdoCount(f"{pdo.cob_id:03X}h jtqd estimate", pdo.length, is_input=False)
+            for pdo in estimate_tpdos(len(config.joints), config.node_id)
+        }
         names = {joint.node_id: f"drive {joint.node_id}" for joint in config.joints}
         if config.sensor is not None:
             names[config.sensor.node_id] = f"sensor {config.sensor.node_id}"
@@ -142,7 +148,12 @@ class Traffic:
         self._counter: int | None = None
         self.strangers: Counter[int] = Counter()
         self.errors: Counter[int] = Counter()
-        self.statuses: tuple[Counter[int], Counter[int]] = (Counter(), Counter())
+        self.statuses: tuple[Counter[int], ...] = tuple(Counter() for _ in config.joints)
+
+    def statuses_in(self, cob_id: int) -> dict[int, Counter[int]]:
+        """Return `statuses` of the joints whose estimates this PDO carries, by their numbers."""
+        first = 2 * list(self.estimates).index(cob_id)
+        return dict(enumerate(self.statuses[first : first + 2], start=first + 1))
 
     @property
     def seconds(self) -> float:
@@ -176,10 +187,11 @@ class Traffic:
             self._input(pdo, data, stamp_ns)
         elif can_id == SYNC:
             self._sync(data, stamp_ns)
-        elif can_id == self._estimate_id:
-            self._input(self.estimate, data, stamp_ns)
+        elif can_id in self.estimates:
+            self._input(self.estimates[can_id], data, stamp_ns)
             if len(data) == 8:
-                for count, status in zip(self.statuses, estimate_pdo.decode(data).status, strict=True):
+                codes = estimate_pdo.decode(data).status
+                for count, status in zip(self.statuses_in(can_id).values(), codes, strict=False):
                     count[status] += 1
         elif can_id not in self._known:
             self.strangers[can_id] += 1
@@ -202,7 +214,7 @@ class Traffic:
         pdo.in_cycle += 1
         delay_ns = stamp_ns - self._sync_ns
         pdo.delays.add(delay_ns)
-        if pdo is not self.estimate and delay_ns > self._deadline_ns:
+        if pdo.is_input and delay_ns > self._deadline_ns:
             pdo.late += 1
             pdo.in_cycle += _LATE  # not complete, whatever else comes
 
@@ -211,7 +223,7 @@ class Traffic:
         if self._sync_ns:
             self._close()
             self.sync_jitter.add(abs(stamp_ns - self._sync_ns - self._period_ns))
-        for pdo in (*self.inputs.values(), self.estimate):
+        for pdo in (*self.inputs.values(), *self.estimates.values()):
             pdo.in_cycle = 0
         counter = data[0] if data else None
         if None not in (counter, self._counter):
@@ -229,8 +241,9 @@ class Traffic:
                 complete = False
                 pdo.missing += pdo.in_cycle == 0
                 pdo.twice += pdo.in_cycle % _LATE > 1
-        self.estimate.missing += self.estimate.in_cycle == 0
-        for pdo in (*self.inputs.values(), self.estimate):
+        for pdo in self.estimates.values():
+            pdo.missing += pdo.in_cycle == 0
+        for pdo in (*self.inputs.values(), *self.estimates.values()):
             pdo.counted += pdo.in_cycle % _LATE
         self.complete += complete
 

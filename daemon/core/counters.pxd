@@ -5,6 +5,7 @@ from libc.stdint cimport int64_t, uint8_t, uint16_t, uint64_t
 from jtqd.daemon.core.bus cimport Bus
 from jtqd.daemon.core.intake cimport MOST_INPUTS, Intake
 from jtqd.daemon.core.joint cimport JointState
+from jtqd.daemon.core.record cimport MOST_JOINTS
 
 cdef struct CounterState:
     int64_t bus_errors, overruns, latch_resets
@@ -29,17 +30,18 @@ cdef struct EstimateBlock:
     int64_t cycle
     uint64_t sync_counter
     int64_t sync_realtime_ns, sync_monotonic_ns
-    int64_t status_since[2]
-    ViewBlock joints[2]
-    MeasuredBlock measured[2]
+    int64_t status_since[MOST_JOINTS]
+    ViewBlock joints[MOST_JOINTS]
+    MeasuredBlock measured[MOST_JOINTS]
 
 cdef struct ToldState:
-    int status[2]
-    int64_t since[2]
+    int status[MOST_JOINTS]
+    int64_t since[MOST_JOINTS]
 
 cdef class LastEstimate:
     cdef uint64_t[::1] sequence
     cdef uint8_t[::1] memory
+    cdef int joints
     cdef ToldState now
     cdef void begin_telling(self) noexcept nogil
     cdef void tell(
@@ -63,7 +65,7 @@ cdef class LoopCounters:
     cdef int64_t bits_of[MOST_INPUTS]
     cdef int64_t bits_complete
     cdef void count(self, int flags, int64_t work_ns, int64_t late_ns, int64_t missed) noexcept nogil
-    cdef void count_statuses(self, int one, int two) noexcept nogil
+    cdef void count_status(self, int joint, int status) noexcept nogil
     cdef int flush_all(self, int64_t missed, int64_t sync_ns) except -1
     cdef void flush_nodes(self) noexcept nogil
     cdef void flush_inputs(self, int64_t sync_ns) noexcept nogil
@@ -73,6 +75,5 @@ cdef class LoopCounters:
         int sync_counter,
         int64_t sync_realtime_ns,
         int64_t sync_monotonic_ns,
-        const JointState *one,
-        const JointState *two,
+        JointState **joints,
     ) noexcept nogil

@@ -55,14 +55,16 @@ if (sizeof(InputBlock), sizeof(EstimateBlock), NODES) != (shared.INPUT.size, sha
 
 
 cdef class LastEstimate:
-    """The last estimate of both joints in the snapshot, guarded by its sequence number.
+    """The last estimate of all joints in the snapshot, guarded by its sequence number.
 
     snapshot: whose memory it is.
     """
 
     def __init__(self, snapshot):
-        self.sequence, self.memory = snapshot.sequence, snapshot.estimate
-        self.now.status[0] = self.now.status[1] = -1
+        cdef int n
+        self.sequence, self.memory, self.joints = snapshot.sequence, snapshot.estimate, snapshot.joints
+        for n in range(MOST_JOINTS):
+            self.now.status[n] = -1
 
     def begin(self):
         """Mark the snapshot as inconsistent until the end of `write` (counters and inputs included)."""
@@ -76,13 +78,19 @@ cdef class LastEstimate:
         joints,
         *,
         int64_t sync_monotonic_ns=0,
-        measured=(shared.NOT_MEASURED, shared.NOT_MEASURED),
+        measured=None,
     ):
-        """Publish the last estimate; `joints` are `JointView` tuples, `measured` begin with the fields of `Measured`."""
-        cdef ViewBlock views[2]
-        cdef MeasuredBlock inputs[2]
+        """Publish the last estimate; `joints` are `JointView` tuples, `measured` begin with the fields of `Measured`.
+
+        Without `measured` no input is known.
+        """
+        cdef ViewBlock views[MOST_JOINTS]
+        cdef MeasuredBlock inputs[MOST_JOINTS]
         cdef int n
-        for n in range(2):
+        if len(joints) != self.joints:
+            raise ValueError(f"found {len(joints)} joints, expected {self.joints}")
+        measured = measured or [shared.NOT_MEASURED] * self.joints
+        for n in range(self.joints):
             put_back(&views[n], sizeof(ViewBlock), shared.JOINT.pack(*joints[n]))
             put_back(&inputs[n], sizeof(MeasuredBlock), struct.pack("<6d", *measured[n][:6]))
         self.begin_telling()
@@ -106,7 +114,7 @@ cdef class LastEstimate:
         cdef int n
         told.cycle, told.sync_counter = cycle, sync_counter
         told.sync_realtime_ns, told.sync_monotonic_ns = sync_realtime_ns, sync_monotonic_ns
-        for n in range(2):
+        for n in range(self.joints):
             if joints[n].status != self.now.status[n]:
                 self.now.status[n], self.now.since[n] = joints[n].status, cycle
             told.status_since[n] = self.now.since[n]
@@ -170,7 +178,7 @@ cdef class LoopCounters:
         self.node_heard, self.node_states = snapshot.node_heard, snapshot.node_states
         self.unconfigured, self.restarts = snapshot.unconfigured, snapshot.restarts
         self.last = LastEstimate(snapshot)
-        self.bits_complete = worst_case_bits(1) + worst_case_bits(8)
+        self.bits_complete = worst_case_bits(1) + (snapshot.joints + 1) // 2 * worst_case_bits(8)
         for n in range(intake.count):
             self.bits_of[n] = worst_case_bits(intake.inputs[n].length)
             self.bits_complete += self.bits_of[n]
@@ -191,9 +199,10 @@ cdef class LoopCounters:
         """Count one cycle, with the flags of its record; times in ns, `missed` slots so far."""
         self.count(flags, work_ns, late_ns, missed)
 
-    def statuses(self, int one, int two):
-        """Count the published statuses of joints 1 and 2 in one cycle."""
-        self.count_statuses(one, two)
+    def statuses(self, *codes):
+        """Count the published status of each joint in one cycle, joint 1 first."""
+        for joint, status in enumerate(codes):
+            self.count_status(joint, status)
 
     def flush(self, int64_t missed, int64_t sync_ns):
         """Copy the counts of other objects to the snapshot; `sync_ns` is the cycle's SYNC (CLOCK_MONOTONIC)."""
@@ -221,10 +230,9 @@ cdef class LoopCounters:
         self.work[min(work_ns // WORK_BIN_NS, LAST_WORK_BIN)] += 1
         self.late[min(late // LATE_BIN_NS, LAST_LATE_BIN)] += 1
 
-    cdef void count_statuses(self, int one, int two) noexcept nogil:
-        """As `statuses`."""
-        self.status_cycles[one] += 1
-        self.status_cycles[CODES + two] += 1
+    cdef void count_status(self, int joint, int status) noexcept nogil:
+        """Count the published status of one joint in one cycle."""
+        self.status_cycles[CODES * joint + status] += 1
 
     cdef int flush_all(self, int64_t missed, int64_t sync_ns) except -1:
         """As `flush`."""
@@ -299,14 +307,14 @@ cdef class LoopCounters:
         int sync_counter,
         int64_t sync_realtime_ns,
         int64_t sync_monotonic_ns,
-        const JointState *one,
-        const JointState *two,
+        JointState **joints,
     ) noexcept nogil:
         """Publish the last estimate."""
-        cdef ViewBlock views[2]
-        cdef MeasuredBlock measured[2]
-        views[0], views[1] = _view(one), _view(two)
-        measured[0], measured[1] = _measured(one), _measured(two)
+        cdef ViewBlock views[MOST_JOINTS]
+        cdef MeasuredBlock measured[MOST_JOINTS]
+        cdef int n
+        for n in range(self.last.joints):
+            views[n], measured[n] = _view(joints[n]), _measured(joints[n])
         self.last.tell(cycle, sync_counter, sync_realtime_ns, sync_monotonic_ns, views, measured)
 
 

@@ -1,5 +1,6 @@
 """One cycle of the loop; cycle.pyx."""
 
+from cpython.object cimport PyObject
 from libc.stdint cimport int64_t, uint32_t
 
 from jtqd.daemon.core.bus cimport Bus
@@ -7,9 +8,12 @@ from jtqd.daemon.core.clock cimport Clock
 from jtqd.daemon.core.counters cimport LoopCounters
 from jtqd.drivers.frame_socket cimport Frame
 from jtqd.daemon.core.intake cimport Intake
-from jtqd.daemon.core.joint cimport JointCycle
-from jtqd.daemon.core.record cimport CycleFrames, RecordRing
+from jtqd.daemon.core.joint cimport JointCycle, JointState
+from jtqd.daemon.core.record cimport MOST_JOINTS, CycleFrames, RecordRing
 from jtqd.daemon.core.schedule cimport Grid, NetworkBudget, WakeUp
+
+cdef enum:
+    MOST_ESTIMATES = 2
 
 cdef struct CycleState:
     int64_t index, heartbeat_due
@@ -27,13 +31,17 @@ cdef class Cycle:
     cdef readonly WakeUp wake_up
     cdef readonly CycleFrames frames
     cdef readonly LoopCounters counters
-    cdef JointCycle one, two
+    cdef int count  # of joints
+    cdef PyObject *at[MOST_JOINTS]  # `joints`, which keeps them
+    cdef JointState *states[MOST_JOINTS]  # theirs
     cdef RecordRing records
     cdef Clock clock
     cdef Bus bus
     cdef int counter_overflow
     cdef int64_t heartbeat_cycles
-    cdef Frame estimate_frame, heartbeat_frame
+    cdef int estimates  # PDOs: one for each two joints
+    cdef Frame estimate_frames[MOST_ESTIMATES]
+    cdef Frame heartbeat_frame
     cdef CycleState now
     cpdef int begin(self) except -1
     cpdef int gather(self) except -1
@@ -42,6 +50,7 @@ cdef class Cycle:
     cpdef int record(self) except -1
     cpdef bint hold_back(self) except -1
     cdef void hold(self, const Frame *frame, int64_t stamp_ns) noexcept nogil
+    cdef void take_back(self, int status) noexcept
     cdef int write_snapshot(self) except -1
     cdef bint send_estimate(self) except -1
     cdef int receive(self) except -1

@@ -2,14 +2,15 @@
 
     begin    take what came late, send SYNC
     gather   one wake-up for all inputs, then wait for stragglers until the deadline
-    observe  scale, estimate, decide the status of both joints
-    publish  send the estimate PDO, and every n-th cycle the heartbeat
+    observe  scale, estimate, decide the status of every joint
+    publish  send the estimate PDO, or two of them with more than two joints, and every n-th cycle the heartbeat
     record   hand the cycle to the ring, and every n-th cycle the snapshot
 
 `go_on` goes from slot to slot without the interpreter. No stage raises because of what is on the bus; a bus that is down is a
 counter and a stale estimate.
 """
 
+from cpython.object cimport PyObject
 from libc.stdint cimport int64_t, uint8_t, uint32_t
 from libc.string cimport memset
 
@@ -19,12 +20,12 @@ from jtqd.daemon.core.bus cimport Bus, bus_of
 from jtqd.daemon.core.clock cimport Clock
 from jtqd.daemon.core.configured_nodes import ConfiguredNodes
 from jtqd.daemon.core.counters cimport LoopCounters
-from jtqd.daemon.core.estimate_pdo cimport encode_into
+from jtqd.daemon.core.estimate_pdo cimport NOBODY, Published, encode_into
 from jtqd.drivers.frame_socket cimport Frame
 from jtqd.daemon.core.intake cimport Intake, temperature_at
 from jtqd.daemon.core.joint cimport JointCycle
 from jtqd.daemon.core.joint_safety import JointSafety
-from jtqd.daemon.core.record cimport CycleFrames, Header, Record, RecordRing
+from jtqd.daemon.core.record cimport CycleFrames, Header, RecordRing
 from jtqd.daemon.core.schedule cimport Grid, NetworkBudget, WakeUp
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.drivers import devices, nmt
@@ -53,10 +54,13 @@ cdef int ENDED = CYCLE_ENDED, PASSED = SLOT_PASSED, OVER = RUN_ENDED
 cdef uint32_t COMPLETE = cr.FLAG_COMPLETE, PUBLISHED = cr.FLAG_PUBLISHED, WITHDRAWN = cr.FLAG_WITHDRAWN
 cdef uint32_t BEFORE_NEXT_SYNC = cr.FLAG_BEFORE_NEXT_SYNC, SYNC_CONFIRMED = cr.FLAG_SYNC_CONFIRMED
 cdef uint32_t RESET = cr.FLAG_RESET
-cdef uint32_t SYNC = devices.SYNC_COB_ID, HEARTBEAT = nmt.HEARTBEAT_BASE, ESTIMATE = 0x180
+cdef uint32_t SYNC = devices.SYNC_COB_ID, HEARTBEAT = nmt.HEARTBEAT_BASE
 cdef uint8_t OPERATIONAL = nmt.OPERATIONAL
 cdef int STALE = st.STALE, OFF = st.OFF, LAST_NUMBER = _LAST_NUMBER
 cdef int64_t BYTE = 255, MOST_WORK_NS = 0xFFFF_FFFF, MOST_LATE_NS = 0x7FFF_FFFF
+
+cdef uint32_t ESTIMATE[MOST_ESTIMATES]
+ESTIMATE[:] = devices.ESTIMATE_BASES
 
 clock = Clock()
 """Of all cycles that are made from here on; tests put another one in its place."""
@@ -76,17 +80,18 @@ cdef class Cycle:
     Args:
         socket: frame socket with filters for SYNC, the inputs and the nodes' heartbeats, own echo on.
         intake: the rule that says which frame belongs to which cycle.
-        joints: inputs and estimator of joint 1 and 2.
+        joints: inputs and estimator of each joint, 1 to 4 of them.
         ring, snapshot: shared memory towards recorder and viewers.
-        safety: limits and checks of joint 1 and 2; None for those that need no joint file.
-        node_id: own node-ID; the estimate PDO is 180h + node_id, the heartbeat 700h + node_id.
+        safety: limits and checks of each joint; None for those that need no joint file.
+        node_id: own node-ID; the estimate PDOs are 180h + node_id (joints 1 and 2) and 280h + node_id (joints 3 and 4, where
+            there are more than two), the heartbeat 700h + node_id.
         counter_overflow: SYNC counter runs 1..overflow (1019h); 0: SYNC without counter.
         wait_ns, deadline_ns: from SYNC to the wake-up for the inputs (it follows their arrival) and to the end of the wait.
         heartbeat_cycles: cycles between two heartbeats.
         grid: time grid; its slot is the current cycle's.
 
     Attributes:
-        joints: what is kept of joint 1 and 2.
+        joints: what is kept of each joint.
         configured_nodes: nodes that restarted or are in doubt, until they are configured.
         flags: of the cycle's record.
         sync_ns: when its SYNC was sent, CLOCK_MONOTONIC.
@@ -111,22 +116,32 @@ cdef class Cycle:
         int64_t heartbeat_cycles,
         Grid grid,
     ):
-        limits = safety or (JointSafety(), JointSafety())
+        cdef JointCycle joint
+        cdef int n
+        joints = list(joints)
+        if not 1 <= len(joints) <= MOST_JOINTS:
+            raise ValueError(f"found {len(joints)} joints, expected 1 to {MOST_JOINTS}")
+        limits = safety or [JointSafety() for _ in joints]
         self.socket, self.intake, self.ring, self.snapshot, self.grid = socket, intake, ring, snapshot, grid
-        self.one, self.two = [
+        self.joints = tuple([
             JointCycle(
                 n, inputs, estimator, intake=intake, snapshot=snapshot, period_ns=grid.now.period_ns, safety=limits[n]
             )
             for n, (inputs, estimator) in enumerate(joints)
-        ]
-        self.joints = (self.one, self.two)
+        ])
+        self.count = len(joints)
+        for n in range(self.count):
+            joint = self.joints[n]
+            self.at[n], self.states[n] = <PyObject *> joint, &joint.now
         self.clock, self.bus = clock, bus_of(socket)
-        self.records, self.frames = RecordRing(ring), CycleFrames()
+        self.records, self.frames = RecordRing(ring, self.count), CycleFrames(self.count)
         self.frames.begin(self.records.slot())
-        self.budget, self.wake_up = NetworkBudget(), WakeUp(wait_ns, deadline_ns)
+        self.budget, self.wake_up = NetworkBudget(self.count), WakeUp(wait_ns, deadline_ns)
         self.counters = LoopCounters(snapshot, intake, self.bus)
         self.counter_overflow, self.heartbeat_cycles = counter_overflow, heartbeat_cycles
-        self.estimate_frame = _frame(ESTIMATE + node_id, 8)
+        self.estimates = (self.count + 1) // 2
+        for n in range(self.estimates):
+            self.estimate_frames[n] = _frame(ESTIMATE[n] + node_id, 8)
         self.heartbeat_frame = _frame(HEARTBEAT + node_id, 1)
         self.heartbeat_frame.data[0] = OPERATIONAL
         self.configured_nodes = ConfiguredNodes(snapshot, intake, self.joints)
@@ -268,22 +283,23 @@ cdef class Cycle:
             now.sync_realtime_ns = now.sync_ns + now.realtime_offset_ns
 
     cpdef int observe(self) except -1:
-        """Estimate both joints from the inputs of this cycle; without their networks if there is no time for them."""
+        """Estimate every joint from the inputs of this cycle; without their networks if there is no time for them."""
         cdef int64_t sync_ns = self.now.sync_realtime_ns - self.now.realtime_offset_ns
-        cdef bint starting = self.now.index < FIRST_CYCLES
-        cdef bint wanted = self.budget.first(self.clock.monotonic(), self.grid.end_ns())
-        self.one.observe_at(sync_ns, starting, wanted)
-        wanted = self.budget.second(self.clock.monotonic())
-        self.two.observe_at(sync_ns, starting, wanted)
+        cdef bint starting = self.now.index < FIRST_CYCLES, wanted
+        cdef int n
+        self.budget.begin(self.grid.end_ns())
+        for n in range(self.count):
+            wanted = self.budget.wanted(n, self.clock.monotonic())
+            (<JointCycle> self.at[n]).observe_at(sync_ns, starting, wanted)
 
     cpdef int publish(self) except -1:
-        """Send the estimate PDO, and the heartbeat when it is due. A late estimate is withdrawn."""
+        """Send the estimate PDOs, and the heartbeat when it is due. A late estimate is withdrawn."""
         cdef CycleState *now = &self.now
         cdef int64_t at_ns = self.clock.monotonic()
+        cdef int n
         self.budget.ended(at_ns)
         if at_ns >= self.grid.end_ns():
-            self.one.take_back(STALE)
-            self.two.take_back(STALE)
+            self.take_back(STALE)
             now.flags |= WITHDRAWN
             self.counters.now.overruns += 1
         if self.send_estimate():
@@ -291,7 +307,8 @@ cdef class Cycle:
             if self.clock.monotonic() < self.grid.end_ns():
                 now.flags |= BEFORE_NEXT_SYNC
         now.sent_ns = self.clock.monotonic()
-        self.frames.keep_one(&self.estimate_frame, now.sent_ns + now.realtime_offset_ns)
+        for n in range(self.estimates):
+            self.frames.keep_one(&self.estimate_frames[n], now.sent_ns + now.realtime_offset_ns)
         if now.index >= now.heartbeat_due:
             now.heartbeat_due = now.index + self.heartbeat_cycles
             self.send(&self.heartbeat_frame)
@@ -300,9 +317,9 @@ cdef class Cycle:
         """Write the cycle to the ring, update counters and, every n-th cycle, the snapshot."""
         cdef CycleState *now = &self.now
         cdef Intake intake = self.intake
-        cdef Record *record = self.frames.record
+        cdef int n
         cdef int64_t work_ns = self.clock.monotonic() - now.work_start_ns, missed = self.grid.now.missed
-        record.header = Header(
+        self.frames.record.header[0] = Header(
             now.index,
             now.sync_ns,
             now.sync_realtime_ns,
@@ -319,11 +336,12 @@ cdef class Cycle:
             min(intake.now.rejected_frames - now.rejected_before, BYTE),
             0,
         )
-        record.joints[0], record.joints[1] = self.one.now.sample, self.two.now.sample
-        record.tail = now.index
+        for n in range(self.count):
+            self.frames.record.joints[n] = self.states[n].sample
+            self.counters.count_status(n, self.states[n].status)
+        self.frames.record.tail[0] = now.index
         self.records.commit()
         self.counters.count(now.flags, work_ns, now.late_ns, missed)
-        self.counters.count_statuses(self.one.now.status, self.two.now.status)
         if now.index % SNAPSHOT_EVERY == 0:
             self.write_snapshot()
         now.index += 1
@@ -364,10 +382,15 @@ cdef class Cycle:
 
     def leave(self):
         """Send a last estimate with status off, so that no receiver keeps the last torque."""
-        self.one.take_back(OFF)
-        self.two.take_back(OFF)
+        self.take_back(OFF)
         self.send_estimate()
         self.write_snapshot()
+
+    cdef void take_back(self, int status) noexcept:
+        """Withdraw the estimates of all joints (`JointCycle.withdraw`)."""
+        cdef int n
+        for n in range(self.count):
+            (<JointCycle> self.at[n]).take_back(status)
 
     cdef void hold(self, const Frame *frame, int64_t stamp_ns) noexcept nogil:
         """Of a slot without a record, temperatures go into the next one that there is."""
@@ -379,17 +402,21 @@ cdef class Cycle:
         cdef CycleState *now = &self.now
         self.counters.last.begin_telling()
         self.counters.flush_all(self.grid.now.missed, now.sync_ns)
-        self.counters.tell(
-            now.index, now.counter, now.sync_realtime_ns, now.sync_ns, &self.one.now, &self.two.now
-        )
+        self.counters.tell(now.index, now.counter, now.sync_realtime_ns, now.sync_ns, self.states)
         return 0
 
     cdef bint send_estimate(self) except -1:
-        """Send the estimate PDO of both joints."""
-        encode_into(
-            self.estimate_frame.data, &self.one.now.published, &self.two.now.published, self.now.counter
-        )
-        return self.send(&self.estimate_frame)
+        """Send the estimate PDOs; return whether the socket took all of them."""
+        cdef const Published *second
+        cdef bint sent = True
+        cdef int n
+        for n in range(self.estimates):
+            second = &self.states[2 * n + 1].published if 2 * n + 1 < self.count else &NOBODY
+            encode_into(
+                self.estimate_frames[n].data, &self.states[2 * n].published, second, self.now.counter
+            )
+            sent = self.send(&self.estimate_frames[n]) and sent
+        return sent
 
     cdef int receive(self) except -1:
         """Take what has come; a bus that is down gives nothing and is counted."""

@@ -5,6 +5,8 @@ from libc.stdint cimport uint8_t
 cdef struct Published:  # one joint's part of the PDO
     int torque, sigma, status
 
+cdef Published NOBODY  # of a joint that there is not: the second half of an odd one's PDO
+
 cdef bint has_torque(int status) noexcept nogil
 cdef Published field_of(double torque_nm, double sigma_nm, int status) noexcept nogil
 cdef void encode_into(uint8_t *data, const Published *one, const Published *two, int sequence) noexcept nogil

@@ -1,4 +1,6 @@
-"""The estimate PDO of node 20h (COB-ID 1A0h): eight bytes that never carry a stale or unfounded number.
+"""The estimate PDOs of node 20h: eight bytes for two joints that never carry a stale or unfounded number.
+
+COB-ID 1A0h holds joints 1 and 2; 2A0h, of the same form, joints 3 and 4. A joint that there is not has status 0 (off).
 
     torque_1 I16 0.01 Nm | torque_2 I16 | sigma_1 U8 0.05 Nm | sigma_2 U8 | status U8 (two nibbles) | sequence U8
 
@@ -7,7 +9,7 @@ the field, or with a sigma that is none (not finite, negative), it is 8000h and 
 the interval on the wire is never narrower; 255 beside a torque means more than 12.7 Nm.
 """
 
-from libc.math cimport INFINITY, ceil, nearbyint
+from libc.math cimport INFINITY, NAN, ceil, nearbyint
 from libc.stdint cimport int16_t, uint8_t
 from libc.string cimport memcpy
 
@@ -71,6 +73,9 @@ cdef void encode_into(uint8_t *data, const Published *one, const Published *two,
     data[7] = sequence
 
 
+NOBODY = field_of(NAN, INFINITY, st.OFF)
+
+
 def field(double torque_nm, double sigma_nm, int status):
     """Return the integers (torque, sigma, status) of one joint; an invalid torque or sigma becomes status 15."""
     cdef Published made = field_of(torque_nm, sigma_nm, status)
@@ -78,7 +83,7 @@ def field(double torque_nm, double sigma_nm, int status):
 
 
 def encode(one, two, int sequence):
-    """Encode eight bytes from the `field`s of both joints and the SYNC counter of the inputs."""
+    """Encode eight bytes from the `field`s of two joints and the SYNC counter of the inputs."""
     cdef Published first = Published(one[0], one[1], one[2])
     cdef Published second = Published(two[0], two[1], two[2])
     cdef uint8_t data[8]

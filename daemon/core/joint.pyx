@@ -56,7 +56,7 @@ cdef class JointCycle:
     """State of one joint from cycle to cycle, in the loop or in a replay of its log.
 
     Args:
-        number: 0 for joint 1, 1 for joint 2.
+        number: 0 for joint 1, 1 for joint 2, ...
         inputs: which PDOs are its inputs, and their scaling (`jtqd.daemon.loop.input_pdos.JointInputs`).
         estimator: its estimator; one that is written in Python is called through the interpreter.
         intake: decides which PDOs are fresh.

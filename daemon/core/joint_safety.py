@@ -54,7 +54,7 @@ class JointSafety:
 
 
 def safety_of(config: Config) -> list[JointSafety]:
-    """Return the configured limits and checks of joints 1 and 2."""
+    """Return the configured limits and checks of each joint."""
     return [
         JointSafety(config.safety, config.estimator, joint.joint, config.period_ns) for joint in config.joints
     ]

@@ -5,7 +5,8 @@ from libc.stdint cimport int32_t, int64_t, uint8_t, uint16_t, uint32_t, uint64_t
 from jtqd.drivers.frame_socket cimport Frame
 
 cdef enum:
-    FRAME_CAPACITY = 16
+    MOST_JOINTS = 4
+    MOST_FRAMES = 32  # that a record of any layout holds
 
 cdef struct Header:
     uint64_t cycle
@@ -22,12 +23,16 @@ cdef struct JointBlock:
     double torque_nm, sigma_nm, tob_nm, physics_nm, network_nm, dt_s
     uint16_t statusword, status, sensor_status, input_flags
 
-cdef struct Record:
-    Header header
-    JointBlock joints[2]
-    Frame frames[FRAME_CAPACITY]
-    int64_t stamps_ns[FRAME_CAPACITY]
-    uint64_t tail
+cdef struct Layout:  # `jtqd.daemon.shared.cycle_record.Layout`
+    int joints, frame_capacity
+    Py_ssize_t frames_offset, stamps_offset, tail_offset, size
+
+cdef struct Record:  # one record in the ring's memory
+    Header *header
+    JointBlock *joints
+    Frame *frames
+    int64_t *stamps_ns
+    uint64_t *tail
 
 cdef class RecordRing:
     cdef object memory
@@ -35,19 +40,21 @@ cdef class RecordRing:
     cdef uint8_t[::1] records
     cdef uint64_t *written
     cdef uint64_t slots
-    cdef Record *slot(self) noexcept nogil
+    cdef Layout layout
+    cdef Record slot(self) noexcept nogil
     cdef void commit(self) noexcept nogil
 
 cdef struct HeldFrames:  # of slots without a record
     int64_t count
-    Frame frames[FRAME_CAPACITY]
-    int64_t stamps_ns[FRAME_CAPACITY]
+    Frame frames[MOST_FRAMES]
+    int64_t stamps_ns[MOST_FRAMES]
 
 cdef class CycleFrames:
-    cdef Record *record
+    cdef Layout layout
+    cdef Record record
     cdef readonly int count, left_out
     cdef HeldFrames held
-    cdef void begin(self, Record *record) noexcept nogil
+    cdef void begin(self, Record record) noexcept nogil
     cdef void hold(self, const Frame *frame, int64_t stamp_ns) noexcept nogil
     cdef void keep(self, const Frame *frames, const int64_t *stamps_ns, int count) noexcept nogil
     cdef void keep_one(self, const Frame *frame, int64_t stamp_ns) noexcept nogil

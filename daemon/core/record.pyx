@@ -28,28 +28,9 @@ if sys.byteorder != "little":
 
 def _check_layout():
     """Raise ImportError where C lays the record out in another way than `cycle_record` does."""
-    cdef Record record
-    cdef const char *start = <const char *> &record
-    found = (
-        sizeof(Record),
-        sizeof(Header),
-        sizeof(JointBlock),
-        <const char *> &record.joints[0] - start,
-        <const char *> &record.frames[0] - start,
-        <const char *> &record.stamps_ns[0] - start,
-        <const char *> &record.tail - start,
-        FRAME_CAPACITY,
-    )
-    expected = (
-        cr.RECORD_SIZE,
-        cr.HEADER.size,
-        cr.JOINT.size,
-        cr.HEADER.size,
-        cr.FRAMES_OFFSET,
-        cr.STAMPS_OFFSET,
-        cr.TAIL_OFFSET,
-        cr.FRAME_CAPACITY,
-    )
+    found = sizeof(Header), sizeof(JointBlock), sizeof(Frame), MOST_JOINTS, MOST_FRAMES
+    most = cr.layout_of(cr.MOST_JOINTS)
+    expected = cr.HEADER.size, cr.JOINT.size, 16, cr.MOST_JOINTS, most.frame_capacity
     if found != expected:
         raise ImportError(f"found a cycle record with {found}, expected {expected}")
     fields = Header(1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15), JointBlock(
@@ -63,21 +44,41 @@ def _check_layout():
 _check_layout()
 
 
-cdef class RecordRing:
-    """The ring's memory (`jtqd.daemon.shared.ring.Ring`): the count of records lies in it, and nowhere else."""
+cdef Layout _layout(int joints) except *:
+    """Return the layout for a number of joints; raises ValueError for any but 1..4."""
+    found = cr.layout_of(joints)
+    return Layout(
+        joints, found.frame_capacity, found.frames_offset, found.stamps_offset, found.tail_offset, found.size
+    )
 
-    def __init__(self, ring):
+
+cdef class RecordRing:
+    """The ring's memory (`jtqd.daemon.shared.ring.Ring`): the count of records lies in it, and nowhere else.
+
+    joints: of which a record holds the blocks.
+    """
+
+    def __init__(self, ring, int joints=2):
         cdef Py_ssize_t word = shared_ring.COUNT_WORD
         self.memory = ring
         self.head, self.records, self.slots = ring.words, ring.records, ring.size
         self.written = &self.head[word]
-        if <uint64_t> self.records.shape[0] != self.slots * sizeof(Record):
-            raise ValueError(f"found a ring of {self.records.shape[0]} bytes for {self.slots} cycles")
+        self.layout = _layout(joints)
+        if <uint64_t> self.records.shape[0] != self.slots * self.layout.size:
+            raise ValueError(
+                f"found a ring of {self.records.shape[0]} bytes for {self.slots} cycles of {joints} joints"
+            )
 
-    cdef Record *slot(self) noexcept nogil:
+    cdef Record slot(self) noexcept nogil:
         """Return the memory of the record that the next `commit` publishes."""
-        cdef Py_ssize_t start = (self.written[0] % self.slots) * sizeof(Record)
-        return <Record *> &self.records[start]
+        cdef uint8_t *start = &self.records[(self.written[0] % self.slots) * self.layout.size]
+        return Record(
+            <Header *> start,
+            <JointBlock *> (start + sizeof(Header)),
+            <Frame *> (start + self.layout.frames_offset),
+            <int64_t *> (start + self.layout.stamps_offset),
+            <uint64_t *> (start + self.layout.tail_offset),
+        )
 
     cdef void commit(self) noexcept nogil:
         """Publish the record: one 8-byte store, after all others."""
@@ -87,19 +88,24 @@ cdef class RecordRing:
 cdef class CycleFrames:
     """Frames of a cycle, copied unchanged into its record: 16 bytes each beside their stamps.
 
+    joints: of the record.
+
     Attributes:
         count: frames stored in it.
         left_out: frames of the cycle that found no room.
     """
 
+    def __init__(self, int joints=2):
+        self.layout = _layout(joints)
+
     @property
     def slot(self):
         """The record of the current cycle as it is now."""
-        return copied(self.record, sizeof(Record))
+        return copied(self.record.header, self.layout.size)
 
-    cdef void begin(self, Record *record) noexcept nogil:
+    cdef void begin(self, Record record) noexcept nogil:
         """Store the next frames in this record."""
-        cdef int stored = min(self.held.count, FRAME_CAPACITY)
+        cdef int stored = min(self.held.count, self.layout.frame_capacity)
         self.record = record
         self.count = self.left_out = 0
         self.keep(self.held.frames, self.held.stamps_ns, stored)
@@ -108,14 +114,14 @@ cdef class CycleFrames:
 
     cdef void hold(self, const Frame *frame, int64_t stamp_ns) noexcept nogil:
         """Keep a frame of a slot without a record for the next one that has one."""
-        if self.held.count < FRAME_CAPACITY:
+        if self.held.count < self.layout.frame_capacity:
             self.held.frames[self.held.count] = frame[0]
             self.held.stamps_ns[self.held.count] = stamp_ns
         self.held.count += 1
 
     cdef void keep(self, const Frame *frames, const int64_t *stamps_ns, int count) noexcept nogil:
         """Copy `count` received frames; `stamps_ns` are CLOCK_REALTIME."""
-        cdef int stored = min(count, FRAME_CAPACITY - self.count)
+        cdef int stored = min(count, self.layout.frame_capacity - self.count)
         memcpy(&self.record.frames[self.count], frames, stored * sizeof(Frame))
         memcpy(&self.record.stamps_ns[self.count], stamps_ns, stored * sizeof(int64_t))
         self.count += stored

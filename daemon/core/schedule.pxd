@@ -2,6 +2,8 @@
 
 from libc.stdint cimport int64_t
 
+from jtqd.daemon.core.record cimport MOST_JOINTS
+
 cdef struct GridState:
     int64_t slot_ns, period_ns, missed
 
@@ -23,11 +25,12 @@ cdef struct Cost:  # what one joint's estimate takes with its network, as far as
     bint wanted
 
 cdef struct BudgetState:
-    Cost one, two
-    int64_t end_ns, since_ns
+    Cost costs[MOST_JOINTS]
+    int64_t end_ns, since_ns, left_ns
 
 cdef class NetworkBudget:
     cdef BudgetState now
-    cpdef bint first(self, int64_t now_ns, int64_t next_sync_ns) noexcept
-    cpdef bint second(self, int64_t now_ns) noexcept
+    cdef int joints
+    cpdef void begin(self, int64_t next_sync_ns) noexcept
+    cpdef bint wanted(self, int joint, int64_t now_ns) noexcept
     cpdef void ended(self, int64_t now_ns) noexcept

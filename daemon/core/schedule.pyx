@@ -7,6 +7,7 @@ from libc.stdint cimport int64_t
 
 from typing import Final
 
+from jtqd.daemon.core.record cimport MOST_JOINTS
 
 _STEP_NS: Final = 160
 _MARGIN_NS: Final = 10_000
@@ -111,8 +112,10 @@ cdef class WakeUp:
 cdef class NetworkBudget:
     """Time budget of the networks before the next SYNC; without time the cycle is physics only.
 
-    Call `first`, `second` and `ended` in each cycle, around the estimates of joint 1 and joint 2. Joint 1 comes first and
-    leaves time for joint 2.
+    Call `begin` at the start of the estimates of a cycle, `wanted` before that of each joint and `ended` after the last. A
+    joint leaves time for those that come after it.
+
+    joints: number of them.
 
     How long a joint's estimate takes with its network is learned: the shorter of its last two times, which one stall of the
     machine does not change, at once upwards and slowly downwards. The first slow call of a network cannot be foreseen:
@@ -120,27 +123,37 @@ cdef class NetworkBudget:
     tried again. When inputs come so late that there is no time, it is left out at once.
     """
 
-    def __init__(self):
-        self.now.one.wanted = self.now.two.wanted = True
+    def __init__(self, int joints=2):
+        cdef int n
+        if not 1 <= joints <= MOST_JOINTS:
+            raise ValueError(f"found {joints} joints, expected 1 to {MOST_JOINTS}")
+        self.joints = joints
+        for n in range(joints):
+            self.now.costs[n].wanted = True
 
-    cpdef bint first(self, int64_t now_ns, int64_t next_sync_ns) noexcept:
-        """Return whether joint 1, whose estimate begins, may use its network; `next_sync_ns`: due time of the next SYNC."""
+    cpdef void begin(self, int64_t next_sync_ns) noexcept:
+        """Begin the estimates of a cycle; `next_sync_ns`: due time of the next SYNC."""
         cdef BudgetState *budget = &self.now
-        budget.since_ns, budget.end_ns = now_ns, next_sync_ns - RESERVE_NS
-        budget.one.wanted = now_ns + budget.one.cost_ns + budget.two.cost_ns <= budget.end_ns
-        return budget.one.wanted
+        cdef int n
+        budget.end_ns = next_sync_ns - RESERVE_NS
+        budget.left_ns = 0
+        for n in range(self.joints):
+            budget.left_ns += budget.costs[n].cost_ns
 
-    cpdef bint second(self, int64_t now_ns) noexcept:
-        """Return whether joint 2 may use its network, after joint 1's estimate."""
+    cpdef bint wanted(self, int joint, int64_t now_ns) noexcept:
+        """Return whether joint number `joint` (from 0 on), whose estimate begins, may use its network."""
         cdef BudgetState *budget = &self.now
-        _took(&budget.one, now_ns - budget.since_ns)
+        cdef Cost *cost = &budget.costs[joint]
+        if joint:
+            _took(cost - 1, now_ns - budget.since_ns)
         budget.since_ns = now_ns
-        budget.two.wanted = now_ns + budget.two.cost_ns <= budget.end_ns
-        return budget.two.wanted
+        cost.wanted = now_ns + budget.left_ns <= budget.end_ns
+        budget.left_ns -= cost.cost_ns
+        return cost.wanted
 
     cpdef void ended(self, int64_t now_ns) noexcept:
-        """Note the end of joint 2's estimate."""
-        _took(&self.now.two, now_ns - self.now.since_ns)
+        """Note the end of the last joint's estimate."""
+        _took(&self.now.costs[self.joints - 1], now_ns - self.now.since_ns)
 
 
 cdef void _took(Cost *joint, int64_t spent_ns) noexcept nogil:

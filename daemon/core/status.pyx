@@ -245,7 +245,7 @@ if faults.COUNTED != tuple([1 << _bit for _bit in range(LOW_BYTE)]):
 
 
 cdef class JointTally:
-    """Counts of joint `number` (0 or 1): why its network was dropped, its faults, its squared errors against the sensor.
+    """Counts of joint `number` (from 0 on): why its network was dropped, its faults, its squared errors against the sensor.
 
     tally: where it counts: `counters` and `errors` of a `Snapshot`, or arrays of their layout.
     """
@@ -310,7 +310,7 @@ def drive_status(int statusword):
 
 
 cdef class JointRules:
-    """The rules for joint `number` (0 or 1), one cycle after the other.
+    """The rules for joint `number` (from 0 on), one cycle after the other.
 
     number, tally: where it counts; safety: limits and checks (`JointSafety`); with_network: the estimator uses one.
 

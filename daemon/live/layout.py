@@ -18,12 +18,13 @@ from pathlib import Path
 from typing import Any
 
 from jtqd.daemon.recording import schemas
+from jtqd.daemon.shared.cycle_record import MOST_JOINTS
 from jtqd.estimator.checked import seconds
 
 # ---- user scripts ----
 
 _PREFIX = "/studio_script/"
-JOINT_TOPICS = {1: f"{_PREFIX}joint_1", 2: f"{_PREFIX}joint_2"}
+JOINT_TOPICS = {joint: f"{_PREFIX}joint_{joint}" for joint in range(1, MOST_JOINTS + 1)}
 """Joint -> topic with upper_nm, lower_nm, minus_sigma_nm, residual_nm [Nm]."""
 CYCLE_TOPIC = f"{_PREFIX}cycle"
 """Topic with period_us, work_us, late_us [us]."""
@@ -82,20 +83,20 @@ export default function script(event: Input<"%(frames)s">): Output {
 """
 
 
-def scripts() -> dict[str, dict[str, str]]:
+def scripts(joints: int = 2) -> dict[str, dict[str, str]]:
     """Identifier -> name and source code, as a layout's `userNodes` holds them."""
     made = {
         f"jtqd-joint-{joint}": {
             "name": f"joint_{joint}",
             "sourceCode": _JOINT_SCRIPT % {"state": topic.name, "output": JOINT_TOPICS[joint]},
         }
-        for joint, topic in ((1, schemas.JOINT_1), (2, schemas.JOINT_2))
+        for joint, topic in enumerate(schemas.joint_topics(joints), start=1)
     }
     cycle = _CYCLE_SCRIPT % {"frames": schemas.CAN_FRAMES.name, "output": CYCLE_TOPIC}
     return made | {"jtqd-cycle": {"name": "cycle", "sourceCode": cycle}}
 
 
-_JOINTS = {1: schemas.JOINT_1.name, 2: schemas.JOINT_2.name}
+_JOINTS = {joint: topic.name for joint, topic in enumerate(schemas.joint_topics(MOST_JOINTS), start=1)}
 _FRAMES = schemas.CAN_FRAMES.name
 
 _BLUE, _PALE_BLUE, _ORANGE, _GREEN, _RED, _PURPLE = (
@@ -248,28 +249,34 @@ def _split(direction: str, nodes: Sequence[Node]) -> Node:
     }
 
 
-def _joint_columns(upper: str, lower: str) -> Node:
+def _joint_columns(upper: str, lower: str, joints: int) -> Node:
     return _split(
-        "row", [_split("column", [f"Plot!{upper}{joint}", f"Plot!{lower}{joint}"]) for joint in _JOINTS]
+        "row",
+        [
+            _split("column", [f"Plot!{upper}{joint}", f"Plot!{lower}{joint}"])
+            for joint in range(1, joints + 1)
+        ],
     )
 
 
-def layout(follow_s: float | None = None) -> dict[str, Any]:
+def layout(follow_s: float | None = None, joints: int = 2) -> dict[str, Any]:
     """Return the layout as a tree for `json.dumps`: panels by identifier, user scripts, and how they are arranged.
 
     Args:
         follow_s: plots show this many seconds up to the newest message; None: everything there is.
+        joints: number of them, 1 to 4.
     """
+    topics = {joint: _JOINTS[joint] for joint in range(1, joints + 1)}
     panels: dict[str, dict[str, Any]] = {}
-    for joint in _JOINTS:
+    for joint in topics:
         panels |= _torque_panels(joint) | _stage_panels(joint)
     panels |= _cycle_panels() | _side_panels()
     panels["StateTransitions!status"] = _transitions(
-        "Status", {f"joint {joint}": f"{topic}.status" for joint, topic in _JOINTS.items()}
+        "Status", {f"joint {joint}": f"{topic}.status" for joint, topic in topics.items()}
     )
     panels["StateTransitions!drives"] = _transitions(
         "Drives and sensor",
-        {f"statusword {joint}": f"{topic}.statusword" for joint, topic in _JOINTS.items()}
+        {f"statusword {joint}": f"{topic}.statusword" for joint, topic in topics.items()}
         | {"sensor": f"{_JOINTS[1]}.sensor_status", "event": f"{schemas.EVENTS.name}.kind"},
     )
     if follow_s is not None:
@@ -278,13 +285,13 @@ def layout(follow_s: float | None = None) -> dict[str, Any]:
                 panel["followingViewWidth"] = follow_s
     torque: Node = {
         "direction": "column",
-        "first": _joint_columns("torque", "residual"),
+        "first": _joint_columns("torque", "residual", joints),
         "second": "StateTransitions!status",
         "splitPercentage": 78.0,
     }
     inputs: Node = {
         "direction": "column",
-        "first": _joint_columns("stages", "inputs"),
+        "first": _joint_columns("stages", "inputs", joints),
         "second": "StateTransitions!drives",
         "splitPercentage": 68.0,
     }
@@ -299,7 +306,7 @@ def layout(follow_s: float | None = None) -> dict[str, Any]:
     return {
         "configById": panels,
         "globalVariables": {},
-        "userNodes": scripts(),
+        "userNodes": scripts(joints),
         "playbackConfig": {"speed": 1},
         "layout": {
             "direction": "row",
@@ -332,13 +339,21 @@ def parser() -> argparse.ArgumentParser:
     result.add_argument(
         "--follow", type=seconds, metavar="S", help="plots show the last S seconds (default: everything)"
     )
+    result.add_argument(
+        "--joints",
+        type=int,
+        choices=range(1, MOST_JOINTS + 1),
+        default=2,
+        metavar="N",
+        help="joints of the bus, 1 to 4 (default: 2)",
+    )
     return result
 
 
 def main(argv: list[str] | None = None) -> int:
     """Write the layout; returns the exit status."""
     arguments = parser().parse_args(argv)
-    text = json.dumps(layout(arguments.follow), indent=2) + "\n"
+    text = json.dumps(layout(arguments.follow, arguments.joints), indent=2) + "\n"
     if arguments.out is None:
         sys.stdout.write(text)
         return 0

@@ -34,14 +34,13 @@ from jtqd.daemon.live.gateway import Gateway
 from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.diagnostics import Diagnostics, Node
 from jtqd.daemon.recording.messages import (
-    BLOCK_PARTS,
+    CycleMessages,
     JointStateMessage,
-    cycle_block,
     diagnostics,
     event,
     log,
 )
-from jtqd.daemon.shared import cycle_record
+from jtqd.daemon.recording.recording import SCANNED
 from jtqd.daemon.shared import cycle_record as cycle
 from jtqd.daemon.shared.conditions import Condition, read_conditions
 from jtqd.daemon.shared.notices import Notice, NoticesError, NoticesReader
@@ -58,11 +57,6 @@ _INFO, _WARN = 20, 30
 _QUIET_STATUSES = (1, 2, 6)
 """Starting, valid and standstill are what a healthy joint goes through."""
 
-_SCAN = cycle.selection(
-    ("cycle", "sync_monotonic_ns", "sync_realtime_ns", "flags", "missed", "sync_counter", "frame_count"),
-    ("status",),
-)
-
 
 class Message(NamedTuple):
     """One message on its way to the viewers. `topic` is the channel number of `jtqd.daemon.recording.schemas`."""
@@ -78,7 +72,7 @@ class LiveStream:
     Args:
         bus: name of the bus, for /diagnostics.
         nodes: whose heartbeats /diagnostics shows.
-        names: of joint 1 and 2.
+        names: of the joints.
         gear_ratios: motor revolutions per joint revolution; None where not known.
         period_ns: one set of messages in each such stretch of CLOCK_MONOTONIC [ns].
     """
@@ -93,6 +87,8 @@ class LiveStream:
     ) -> None:
         self._diagnostics = Diagnostics(bus, names, nodes)
         self._overview = JointStateMessage(names, gear_ratios)
+        self._messages = CycleMessages(len(names))
+        self._scan = cycle.selection(*SCANNED, len(names)).unpack_from
         self._period_ns = period_ns
         self._newest = (0, 0)
         self.forget()
@@ -100,31 +96,33 @@ class LiveStream:
     def forget(self) -> None:
         """Forget the last state after a pause without viewers, so that old changes are not reported."""
         self._slot = -1
-        self._statuses: tuple[int, int] | None = None
+        self._statuses: tuple[int, ...] | None = None
         self._missed: int | None = None
 
     def take(self, records: Iterable[bytes]) -> list[Message]:
         """Return the messages of these cycle records, in the order of time."""
         made: list[Message] = []
         for record in records:
-            index, monotonic, realtime, flags, missed, counter, count, *statuses = _SCAN.unpack_from(record)
+            index, monotonic, realtime, flags, missed, counter, count, *statuses = self._scan(record)
             realtime = max(realtime, 0)
             self._newest = (index, realtime)
-            made += self._changes((statuses[0], statuses[1]), missed)
+            made += self._changes(tuple(statuses), missed)
             slot = monotonic // self._period_ns
             if slot == self._slot:
                 continue
             self._slot = slot
-            frames = min(count, cycle.FRAME_CAPACITY)
-            block = cycle_block(record, index, realtime, flags=flags, sync_counter=counter, frames=frames)
-            starts = [start for _, start in BLOCK_PARTS]
-            for (topic, start), end in zip(BLOCK_PARTS, [*starts[1:], len(block)], strict=True):
+            block = self._messages.block(
+                record, index, realtime, flags=flags, sync_counter=counter, frames=count
+            )
+            parts = self._messages.parts
+            starts = [start for _, start in parts]
+            for (topic, start), end in zip(parts, [*starts[1:], len(block)], strict=True):
                 made.append(Message(topic, realtime, block[start + _RECORD_HEAD : end]))
             overview = self._overview.payload(record, realtime)
             made.append(Message(schemas.JOINT_STATES.number, realtime, overview))
         return made
 
-    def _changes(self, statuses: tuple[int, int], missed: int) -> list[Message]:
+    def _changes(self, statuses: tuple[int, ...], missed: int) -> list[Message]:
         made: list[Message] = []
         before, self._statuses = self._statuses, statuses
         for joint, (old, new) in enumerate(zip(before or statuses, statuses, strict=True), start=1):
@@ -209,23 +207,25 @@ class LiveServer:
     Args:
         name: what viewers show.
         address: where it listens.
+        joints: number of them.
 
     Raises:
         RuntimeError, OSError: it cannot listen there.
     """
 
-    def __init__(self, name: str, address: Address) -> None:
+    def __init__(self, name: str, address: Address, joints: int = 2) -> None:
+        texts = schemas.schemas_of(joints)
         self._context = context = foxglove.Context()  # server and channels hold it only weakly
         self._channels = {
             topic.number: foxglove.Channel(
                 topic.name,
                 message_encoding="cdr",
                 schema=foxglove.Schema(
-                    name=topic.schema, encoding="ros2msg", data=schemas.SCHEMAS[topic.schema].encode()
+                    name=topic.schema, encoding="ros2msg", data=texts[topic.schema].encode()
                 ),
                 context=context,
             )
-            for topic in schemas.TOPICS
+            for topic in schemas.topics_of(joints)
         }
         self._server = foxglove.start_server(
             name=name,
@@ -261,7 +261,6 @@ _POLL_S = 0.02
 _DIAGNOSIS_S = 1.0
 _QUANTILES = (0.5, 0.99, 1.0)
 _NICE = 10
-_JOINT_NAMES = ("joint_1", "joint_2")
 
 
 class Stop:
@@ -299,11 +298,13 @@ class Source:
     """
 
     def __init__(self, request: dict[str, Any]) -> None:
-        self._ring = RingReader(Path(request["ring"]), cycle_record.RECORD_SIZE)
+        ratios = request["gear_ratios"]
+        names = [f"joint_{number}" for number in range(1, len(ratios) + 1)]
+        self._ring = RingReader(Path(request["ring"]), cycle.layout_of(len(ratios)).size)
         self._snapshot = SnapshotReader(Path(request["snapshot"]))
         self._directory = Path(request["snapshot"]).parent
         nodes = [Node(int(number), str(name)) for number, name in request["nodes"]]
-        self._stream = LiveStream(request["bus"], nodes, _JOINT_NAMES, request["gear_ratios"])
+        self._stream = LiveStream(request["bus"], nodes, names, ratios)
         self._notices: NoticesReader | None = None
         with suppress(NoticesError):
             self._notices = NoticesReader(Path(request["notices"]))
@@ -360,7 +361,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 1
     try:
         source = Source(request)
-        server = LiveServer(f"jtqd on {request['bus']}", address)
+        server = LiveServer(f"jtqd on {request['bus']}", address, len(request["gear_ratios"]))
     except (ImportError, RingError, SnapshotError, RuntimeError, OSError, ValueError) as error:
         _answer(failed=f"{address.host}:{address.port}: {error}")
         return 1

@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from jtqd.daemon.logs.container import LogError
 from jtqd.daemon.logs.read import Messages, Records, iter_messages, topics_of
+from jtqd.daemon.recording.schemas import FRAMES_NAMES
 
 EXTENDED, REMOTE, ERROR = 0x8000_0000, 0x4000_0000, 0x2000_0000
 """Bits of `can_id` as in Linux: 29-bit identifier, remote frame, error frame."""
-_OURS, _ROS = "jtqd_msgs/msg/CanFrames", ("can_msgs/msg/Frame", "can_msgs/Frame")
+_OURS = FRAMES_NAMES
+_ROS = ("can_msgs/msg/Frame", "can_msgs/Frame")
 
 
 class Frames(NamedTuple):
@@ -31,9 +33,9 @@ class Frames(NamedTuple):
 
 def can_topics(path: Path | Sequence[Path]) -> list[str]:
     """Topics that carry CAN frames. Raises LogError where there is none, OSError."""
-    found = [topic for topic, schema in topics_of(path).items() if schema == _OURS or schema in _ROS]
+    found = [topic for topic, schema in topics_of(path).items() if schema in _OURS or schema in _ROS]
     if not found:
-        raise LogError(f"{path}: found no topic with CAN frames, expected {_OURS} or {_ROS[0]}")
+        raise LogError(f"{path}: found no topic with CAN frames, expected {_OURS[0]} or {_ROS[0]}")
     return sorted(found)
 
 

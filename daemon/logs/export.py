@@ -34,6 +34,7 @@ from jtqd.daemon.logs.read import (
     read_messages,
     topics_of,
 )
+from jtqd.daemon.recording.schemas import JOINTS
 
 _EXAMPLES = """examples:
   jtq export csv run.mcap --out run.csv.gz              the run table: time_s, j1.current_a, ...
@@ -262,7 +263,8 @@ RUN_FIELDS = {
     "temperature_c": "temperature_c",
 }
 """Column of a joint in a run table -> field of its message. What a run calls torque is measured."""
-_JOINT_TOPICS = {1: "/joint/1/state", 2: "/joint/2/state"}
+_JOINT_TOPICS = {joint: topic.name for joint, topic in enumerate(JOINTS, start=1)}
+"""Of the joints that a log may have; every log has the first."""
 _ROW = np.dtype(
     [("cycle", "<u8"), ("sync_monotonic_ns", "<i8"), *((field, "<f8") for field in RUN_FIELDS.values())]
 )
@@ -301,7 +303,9 @@ class RunTable:
     ) -> None:
         self.cycles = self.left_out = 0
         self._path, self._span, self._all = path, {"start_ns": start_ns, "end_ns": end_ns}, all_cycles
-        wanted = {f"j{n}.{column}": (n, field) for n in _JOINT_TOPICS for column, field in RUN_FIELDS.items()}
+        there = topics_of(path)
+        self._topics = {n: topic for n, topic in _JOINT_TOPICS.items() if n == 1 or topic in there}
+        wanted = {f"j{n}.{column}": (n, field) for n in self._topics for column, field in RUN_FIELDS.items()}
         found: set[str] = set()
         count = 0
         for rows in self._rows():
@@ -347,10 +351,10 @@ class RunTable:
             )
 
     def _rows(self) -> Iterator[dict[int, Records]]:
-        """Yield rows (`_ROW`) of both joints, of the same cycles."""
-        rest = {number: np.empty(0, _ROW) for number in _JOINT_TOPICS}
-        for found in iter_topics(self._path, tuple(_JOINT_TOPICS.values()), **self._span):
-            for number, topic in _JOINT_TOPICS.items():
+        """Yield rows (`_ROW`) of all joints, of the same cycles."""
+        rest = {number: np.empty(0, _ROW) for number in self._topics}
+        for found in iter_topics(self._path, tuple(self._topics.values()), **self._span):
+            for number, topic in self._topics.items():
                 if topic in found:
                     rest[number] = np.concatenate([rest[number], _picked(found[topic].records, topic)])
             count = min(map(len, rest.values()))
@@ -361,10 +365,10 @@ class RunTable:
                 yield whole
         self._same_cycles(*rest.values())
 
-    def _same_cycles(self, one: Records, two: Records) -> None:
-        if not np.array_equal(one["cycle"], two["cycle"]):
+    def _same_cycles(self, first: Records, *others: Records) -> None:
+        if not all(np.array_equal(first["cycle"], each["cycle"]) for each in others):
             raise LogError(
-                f"{_named(self._path)}: found cycles of one joint that the other does not have, expected the same"
+                f"{_named(self._path)}: found cycles of one joint that another does not have, expected the same"
             )
 
 

@@ -31,7 +31,7 @@ from jtqd.daemon.loop.input_pdos import JointInputs, input_pdos, joint_temperatu
 from jtqd.daemon.loop.referee import judged
 from jtqd.daemon.reload.order import Order
 from jtqd.daemon.reload.swap import Swap
-from jtqd.daemon.shared.cycle_record import RECORD_SIZE
+from jtqd.daemon.shared.cycle_record import layout_of
 from jtqd.daemon.shared.ring import Ring
 from jtqd.daemon.shared.snapshot import Snapshot
 from jtqd.daemon.shared.systemd import LoopWatchdog, Notifier, watchdog_seconds
@@ -251,7 +251,9 @@ def build_cycle(
 ) -> tuple[Cycle, Grid]:
     """Build cycle and grid from configuration and boot report."""
     grid = Grid(0, config.period_ns)
-    snapshot = Snapshot(Path(request["snapshot"]), config.period_ns * 1e-9, float(request["worst_load"]))
+    snapshot = Snapshot(
+        Path(request["snapshot"]), config.period_ns * 1e-9, float(request["worst_load"]), len(config.joints)
+    )
     intake = Intake(input_pdos(config), joint_temperatures(config))
     for node in {pdo.node_id for pdo in intake.pdos} - {int(node) for node in report["nodes"]}:
         intake.absent(node)
@@ -259,7 +261,7 @@ def build_cycle(
         socket,
         intake,
         list(zip(joint_inputs(config, report), estimators, strict=True)),
-        Ring(Path(request["ring"]), config.ring_cycles, RECORD_SIZE),
+        Ring(Path(request["ring"]), config.ring_cycles, layout_of(len(config.joints)).size),
         snapshot,
         safety=safety_of(config),
         node_id=config.node_id,
@@ -273,7 +275,7 @@ def build_cycle(
 
 
 def build_estimators(request: dict[str, Any]) -> tuple[Config, list[AnyEstimator]]:
-    """Load the configuration and warm up the estimators of both joints; raises ConfigError or NetworkError."""
+    """Load the configuration and warm up the estimators of all joints; raises ConfigError or NetworkError."""
     config = load_config(Path(request["config"]) if request["config"] else None)
     if config.files_sha256 != request["config_sha256"]:
         raise ConfigError(f"{config.path}: it or one of its joint files was changed during reading")

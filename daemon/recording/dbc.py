@@ -18,7 +18,7 @@ from jtqd.drivers.devices import (
     drive_tpdo1,
     drive_tpdo2,
     drive_tpdo3,
-    estimate_tpdo,
+    estimate_tpdos,
     sensor_tpdo1,
     sensor_tpdo2,
 )
@@ -139,18 +139,17 @@ def _pdo_signals(pdo: PdoMap, quantities: Mapping[Key, Quantity]) -> list[_Signa
     return signals
 
 
-def estimate_quantities(cob_id: int) -> dict[Key, Quantity]:
-    """Return the estimate PDO; see `jtqd.daemon.core.estimate_pdo`."""
+def estimate_quantities(pdo: PdoMap, first: int = 1) -> dict[Key, Quantity]:
+    """Return the estimate PDO that begins with joint `first`; see `jtqd.daemon.core.estimate_pdo`."""
     torque = Quantity(TORQUE_UNIT_NM, "Nm", {NO_TORQUE: "no_torque"})
     sigma = Quantity(SIGMA_UNIT_NM, "Nm", {SIGMA_UNKNOWN: "unknown"})
     names = {code: name.lower() for code, name in STATUS_NAMES.items()}
-    status = Quantity(values=names, fields=(("status_1", 4), ("status_2", 4)))
+    status = Quantity(values=names, fields=tuple((f"status_{joint}", 4) for joint in (first, first + 1)))
+    by_index = {0x2100: torque, 0x2101: sigma, 0x2102: status, 0x2105: status}
     return {
-        (cob_id, 0x2100, 1): torque,
-        (cob_id, 0x2100, 2): torque,
-        (cob_id, 0x2101, 1): sigma,
-        (cob_id, 0x2101, 2): sigma,
-        (cob_id, 0x2102, 0): status,
+        (pdo.cob_id, each.index, each.subindex): by_index[each.index]
+        for each in pdo.objects
+        if each.index in by_index
     }
 
 
@@ -162,9 +161,10 @@ def dbc_text(config: Config, report: Mapping[str, Any] | None) -> str:
         report: boot report; `nodes[n].scaling` of each drive and of the sensor. None: the devices are not known, what
             they send is plain integers.
     """
-    own = estimate_tpdo(config.node_id)
-    maps, names = [own], {config.node_id: "jtqd"}
-    quantities = estimate_quantities(own.cob_id)
+    maps, names = list(estimate_tpdos(len(config.joints), config.node_id)), {config.node_id: "jtqd"}
+    quantities: dict[Key, Quantity] = {}
+    for pair, own in enumerate(maps):
+        quantities |= estimate_quantities(own, 2 * pair + 1)
     for joint in config.joints:
         node = joint.node_id
         names[node] = f"drive_{joint.number}"

@@ -1,4 +1,4 @@
-"""Statuses of /diagnostics, once a second: loop, bus, both joints, every node, recorder and disk. Pure.
+"""Statuses of /diagnostics, once a second: loop, bus, every joint, every node, recorder and disk. Pure.
 
 A view of the conditions (`jtqd.daemon.shared.conditions`): the worst one of a subject is its level and its text. A condition
 that shows by a counter counts when the counter has risen since the last message: a slot that was missed an hour ago is in
@@ -58,7 +58,7 @@ class Diagnostics:
 
     Args:
         bus: name of the bus.
-        joints: names of joint 1 and 2.
+        joints: names of the joints.
         nodes: whose heartbeats are watched.
     """
 
@@ -110,7 +110,7 @@ class Diagnostics:
         """Return the statuses of loop, bus, joints and nodes; arguments as of `statuses`."""
         found = [*conditions, *self._risen(view)]
         result = [self._loop(view, work_us, late_us, found), self._bus_status(view, found)]
-        result += [self._joint(view, number, found) for number in (1, 2)]
+        result += [self._joint(view, number, found) for number in range(1, len(view.joints) + 1)]
         result += [self._node(view, node, now_ns, found) for node in self._nodes]
         self._before, self._cycle = dict(view.counters), view.cycle
         return result

@@ -22,6 +22,7 @@ from jtqd.daemon.recording.progress import Account, ProgressFile
 from jtqd.daemon.shared.child_process import Child, ChildError
 from jtqd.daemon.shared.runtime_dir import versions
 from jtqd.daemon.shared.snapshot import SnapshotReader
+from jtqd.drivers.eds.own_objects import own_sheet
 
 _STARTS = 5
 """A recorder that has been started more often than this in a minute waits for `_LONG_PAUSE_S`."""
@@ -206,7 +207,10 @@ def recording_request(
         )
     attachments += [
         {"name": path.name, "media_type": "text/plain", "path": str(path)}
-        for path in sorted(_EDS_DIRECTORY.glob("*.eds"))
+        for path in sorted(
+            _EDS_DIRECTORY / name
+            for name in ("drive.eds", own_sheet(len(config.joints)), "torque_sensor.eds")
+        )
     ]
     settings = config.recording
     return {
@@ -226,6 +230,7 @@ def recording_request(
         "directory": str(directory),
         "prefix": f"jtqd-{instance}",
         "attachments": attachments,
+        "joint_names": [f"joint_{joint.number}" for joint in config.joints],
         "gear_ratios": [joint.joint.gear_ratio for joint in config.joints],
     }
 

@@ -5,7 +5,7 @@ aligned to its own size counted from the first byte after that header (OMG DDSI-
 section 7.4). Every topic's messages have one constant size: strings are filled up with spaces, so that a
 reader may take a whole chunk as one array of records.
 
-The three messages of every cycle are made by one `struct` call. The definitions were laid out for that: whole
+The messages of every cycle are made by one `struct` call. The definitions were laid out for that: whole
 stretches of the cycle record go into the message as they lie in memory (see `jtqd.daemon.shared.cycle_record`).
 """
 
@@ -77,7 +77,7 @@ class CdrBuilder:
         return CDR_HEADER + bytes(self._data)
 
 
-# ---- the three messages of every cycle ----
+# ---- the messages of every cycle ----
 
 _RECORD_HEAD = struct.Struct("<BQHIQQ")
 """MCAP Message record: opcode 05h, length of the rest, channel, sequence, log time, publish time [ns]."""
@@ -88,105 +88,92 @@ _RECORD_REST = 22
 
 _INDEX_AND_MONOTONIC = slice(0, 16)
 _TIMING_AND_COUNTERS = slice(24, cycle.HEADER.size)
-_JOINT_1_BLOCK = slice(cycle.HEADER.size, cycle.HEADER.size + cycle.JOINT.size)
-_JOINT_2_BLOCK = slice(cycle.HEADER.size + cycle.JOINT.size, cycle.FRAMES_OFFSET)
-
 _JOINT_CODE = f"4sII16s16s{cycle.JOINT.size}sBB"
 """header.stamp, frame_id with its padding, cycle, sync_monotonic_ns, all of JointRecord, counter, flags."""
-_FRAMES_CODE = (
-    f"4sII8s16s{cycle.HEADER.size - 24}s{16 * cycle.FRAME_CAPACITY}s{8 * cycle.FRAME_CAPACITY}s"
-    # `s` fills up with zeros what a cycle with fewer frames leaves empty.
-)
 JOINT_ESTIMATE_SIZE = struct.calcsize("<" + _JOINT_CODE)
-CAN_FRAMES_SIZE = struct.calcsize("<" + _FRAMES_CODE)
-
-_BLOCK = struct.Struct("<" + 2 * ("11sIqq" + _JOINT_CODE) + "11sIqq" + _FRAMES_CODE)
-BLOCK_SIZE = _BLOCK.size
-BLOCK_PARTS = (
-    (schemas.JOINT_1.number, 0),
-    (schemas.JOINT_2.number, _RECORD_HEAD.size + JOINT_ESTIMATE_SIZE),
-    (schemas.CAN_FRAMES.number, 2 * (_RECORD_HEAD.size + JOINT_ESTIMATE_SIZE)),
-)
-"""Channel and start of each of the three MCAP Message records within the bytes of `cycle_block`."""
+_FRAME_ID_CAN = _text("can")
 
 
 def _start_of(topic: schemas.Topic, size: int) -> bytes:
     return _START.pack(_OPCODE_MESSAGE, _RECORD_REST + size, topic.number)
 
 
-_START_1 = _start_of(schemas.JOINT_1, JOINT_ESTIMATE_SIZE)
-_START_2 = _start_of(schemas.JOINT_2, JOINT_ESTIMATE_SIZE)
-_START_FRAMES = _start_of(schemas.CAN_FRAMES, CAN_FRAMES_SIZE)
-_FRAME_ID_1 = _text("joint_1") + bytes(4)
-_FRAME_ID_2 = _text("joint_2") + bytes(4)
-_FRAME_ID_CAN = _text("can")
+class CycleMessages:
+    """The messages of every cycle: one of each joint, and the frames; as MCAP Message records in a row.
 
+    joints: number of them.
 
-def cycle_block(
-    record: bytes, index: int, realtime_ns: int, *, flags: int, sync_counter: int, frames: int
-) -> bytes:
-    """Both joint messages and the frames message of one cycle: three MCAP Message records in a row.
-
-    Args:
-        record: the cycle record, `cycle_record.RECORD_SIZE` bytes.
-        index, realtime_ns, flags, sync_counter, frames: of its header, which the caller has read already.
+    Attributes:
+        parts: channel and start of each Message record within the bytes of `block`.
+        size: of these bytes.
     """
-    seconds, nanoseconds = divmod(realtime_ns, _NS)
-    seconds &= _MASK
-    sequence = index & _MASK
-    flags &= 0xFF
-    head = record[_INDEX_AND_MONOTONIC]
-    return _BLOCK.pack(
-        # joint 1
-        _START_1,
-        sequence,
-        realtime_ns,
-        realtime_ns,
-        CDR_HEADER,
-        seconds,
-        nanoseconds,
-        _FRAME_ID_1,
-        head,
-        record[_JOINT_1_BLOCK],
-        sync_counter,
-        flags,
-        # joint 2
-        _START_2,
-        sequence,
-        realtime_ns,
-        realtime_ns,
-        CDR_HEADER,
-        seconds,
-        nanoseconds,
-        _FRAME_ID_2,
-        head,
-        record[_JOINT_2_BLOCK],
-        sync_counter,
-        flags,
-        # frames
-        _START_FRAMES,
-        sequence,
-        realtime_ns,
-        realtime_ns,
-        CDR_HEADER,
-        seconds,
-        nanoseconds,
-        _FRAME_ID_CAN,
-        head,
-        record[_TIMING_AND_COUNTERS],
-        record[cycle.FRAMES_OFFSET : cycle.FRAMES_OFFSET + 16 * frames],
-        record[cycle.STAMPS_OFFSET : cycle.STAMPS_OFFSET + 8 * frames],
-    )
+
+    def __init__(self, joints: int) -> None:
+        layout = cycle.layout_of(joints)
+        capacity = self._capacity = layout.frame_capacity
+        self._frames, self._stamps = layout.frames_offset, layout.stamps_offset
+        # `s` fills up with zeros what a cycle with fewer frames leaves empty.
+        frames_code = f"4sII8s16s{cycle.HEADER.size - 24}s{16 * capacity}s{8 * capacity}s"
+        self.frames_size = struct.calcsize("<" + frames_code)
+        packed = struct.Struct("<" + joints * ("11sIqq" + _JOINT_CODE) + "11sIqq" + frames_code)
+        self._pack, self.size = packed.pack, packed.size
+        topics = schemas.joint_topics(joints)
+        step = _RECORD_HEAD.size + JOINT_ESTIMATE_SIZE
+        self.parts = tuple((topic.number, n * step) for n, topic in enumerate((*topics, schemas.CAN_FRAMES)))
+        self._joints = [
+            (
+                _start_of(topic, JOINT_ESTIMATE_SIZE),
+                _text(f"joint_{n + 1}") + bytes(4),
+                slice(
+                    cycle.HEADER.size + n * cycle.JOINT.size, cycle.HEADER.size + (n + 1) * cycle.JOINT.size
+                ),
+            )
+            for n, topic in enumerate(topics)
+        ]
+        self._start_frames = _start_of(schemas.CAN_FRAMES, self.frames_size)
+
+    def block(
+        self, record: bytes, index: int, realtime_ns: int, *, flags: int, sync_counter: int, frames: int
+    ) -> bytes:
+        """Joint messages and frames message of one cycle: MCAP Message records in a row.
+
+        Args:
+            record: the cycle record, as long as `cycle_record.Layout` says.
+            index, realtime_ns, flags, sync_counter, frames: of its header, which the caller has read already; more frames
+                than there is room for are left out.
+        """
+        seconds, nanoseconds = divmod(realtime_ns, _NS)
+        frames = min(frames, self._capacity)
+        stamp = (index & _MASK, realtime_ns, realtime_ns, CDR_HEADER, seconds & _MASK, nanoseconds)
+        head, end = record[_INDEX_AND_MONOTONIC], (sync_counter, flags & 0xFF)
+        values: list[bytes | int] = []
+        for start, frame_id, joint in self._joints:
+            values += (start, *stamp, frame_id, head, record[joint], *end)
+        return self._pack(
+            *values,
+            self._start_frames,
+            *stamp,
+            _FRAME_ID_CAN,
+            head,
+            record[_TIMING_AND_COUNTERS],
+            record[self._frames : self._frames + 16 * frames],
+            record[self._stamps : self._stamps + 8 * frames],
+        )
+
+
+PAIR = CycleMessages(2)
+"""Of two joints: the messages of most buses."""
+CAN_FRAMES_SIZE, BLOCK_SIZE, BLOCK_PARTS, cycle_block = PAIR.frames_size, PAIR.size, PAIR.parts, PAIR.block
 
 
 # ---- the slow topics ----
 
 
 class JointStateMessage:
-    """sensor_msgs/msg/JointState of the two joints.
+    """sensor_msgs/msg/JointState of all joints.
 
     Args:
-        names: of joint 1 and 2.
+        names: of the joints, joint 1 first.
         gear_ratios: motor revolutions per joint revolution; None: velocity is NaN.
     """
 
@@ -197,27 +184,30 @@ class JointStateMessage:
         # position's length must end at a multiple of 8, where its first float64 begins
         self._constant = constant.align(4).body()[8:]
         padding = -(8 + len(self._constant) + 4) % 8
-        self._pack = struct.Struct(f"<4sII{len(self._constant)}sI{padding}x2dI4x2dI4x2d").pack
+        count = self.joints = len(names)
+        layout = f"<4sII{len(self._constant)}sI{padding}x{count}dI4x{count}dI4x{count}d"
+        self._pack = struct.Struct(layout).pack
         self._per_gear = [1.0 / ratio if ratio else math.nan for ratio in gear_ratios]
 
     def payload(self, record: bytes, realtime_ns: int) -> bytes:
         """Message from one cycle record."""
-        one, two = cycle.joint_of(record, 1), cycle.joint_of(record, 2)
+        count = self.joints
+        joints = [cycle.joint_of(record, n) for n in range(1, count + 1)]
         seconds, nanoseconds = divmod(realtime_ns, _NS)
         return self._pack(
             CDR_HEADER,
             seconds & _MASK,
             nanoseconds,
             self._constant,
-            2,
-            one.link_position_rad,
-            two.link_position_rad,
-            2,
-            one.motor_velocity_rad_s * self._per_gear[0],
-            two.motor_velocity_rad_s * self._per_gear[1],
-            2,
-            one.torque_nm,
-            two.torque_nm,
+            count,
+            *(joint.link_position_rad for joint in joints),
+            count,
+            *(
+                joint.motor_velocity_rad_s * per_gear
+                for joint, per_gear in zip(joints, self._per_gear, strict=True)
+            ),
+            count,
+            *(joint.torque_nm for joint in joints),
         )
 
 

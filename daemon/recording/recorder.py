@@ -25,16 +25,16 @@ from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.diagnostics import Diagnostics, RecorderState
 from jtqd.daemon.recording.journal import INFO, WARN, Journal
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head
-from jtqd.daemon.recording.messages import BLOCK_PARTS, JointStateMessage, diagnostics
+from jtqd.daemon.recording.messages import CycleMessages, JointStateMessage, diagnostics
 from jtqd.daemon.recording.own_files import MEGABYTE, free_run, own_files, sized
 from jtqd.daemon.recording.parts import Parts, Rules
 from jtqd.daemon.recording.progress import Account, ProgressFile
 from jtqd.daemon.recording.recording import FlightRecorder, Recording
 from jtqd.daemon.recording.request import RecorderRequest, RequestError
 from jtqd.daemon.recording.schemas import definitions
-from jtqd.daemon.shared import cycle_record
 from jtqd.daemon.shared.child_process import Child, ChildError
 from jtqd.daemon.shared.conditions import read_conditions
+from jtqd.daemon.shared.cycle_record import layout_of
 from jtqd.daemon.shared.notices import NoticesError, NoticesReader
 from jtqd.daemon.shared.ring import RingError, RingReader
 from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader
@@ -65,11 +65,11 @@ class Session:
         for problem in problems:
             warn(problem)
         self._warn = warn
-        schema_records, channel_records = definitions(request.channel_metadata)
+        schema_records, channel_records = definitions(request.channel_metadata, request.joints)
         head = Head(schema_records, channel_records, attachments)
         in_flight = request.flight_recorder_s is not None
         repeat = _REPEAT_EVERY_IN_MEMORY if in_flight else _REPEAT_EVERY
-        builder = ChunkBuilder(schema_records, channel_records, BLOCK_PARTS, repeat)
+        builder = ChunkBuilder(schema_records, channel_records, CycleMessages(request.joints).parts, repeat)
         self.journal = Journal(builder, warn)
         self.parts = Parts(_rules(request, self.run), head, self.journal, account)
         self._flight: FlightRecorder | None = None
@@ -298,7 +298,7 @@ def _open_ring(request: RecorderRequest, signals: _Signals) -> RingReader:
     deadline = time.monotonic() + request.wait_s
     while True:
         try:
-            return RingReader(request.ring, cycle_record.RECORD_SIZE)
+            return RingReader(request.ring, layout_of(request.joints).size)
         except RingError:
             if time.monotonic() >= deadline or signals.stop:
                 raise

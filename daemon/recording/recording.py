@@ -12,7 +12,7 @@ from typing import Protocol
 from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.journal import ERROR, INFO, WARN, Journal
 from jtqd.daemon.recording.mcap_file import SealedChunk
-from jtqd.daemon.recording.messages import JointStateMessage, cycle_block
+from jtqd.daemon.recording.messages import CycleMessages, JointStateMessage
 from jtqd.daemon.recording.parts import Parts
 from jtqd.daemon.recording.progress import Account
 from jtqd.daemon.shared import cycle_record as cycle
@@ -29,13 +29,16 @@ _STALE = next(code for code, name in schemas.STATUS_NAMES.items() if name == "ST
 
 
 class FaultTrigger:
-    """Trigger of the flight recorder by a joint's status, once per occurrence. Pure."""
+    """Trigger of the flight recorder by a joint's status, once per occurrence. Pure.
 
-    def __init__(self) -> None:
-        self._statuses = (0, 0)
-        self._stale_since: list[int | None] = [None, None]
+    joints: number of them.
+    """
 
-    def changed(self, statuses: tuple[int, int], at_ns: int) -> str:
+    def __init__(self, joints: int = 2) -> None:
+        self._statuses = (0,) * joints
+        self._stale_since: list[int | None] = [None] * joints
+
+    def changed(self, statuses: tuple[int, ...], at_ns: int) -> str:
         """Take new statuses; returns why to save, or nothing."""
         before, self._statuses = self._statuses, statuses
         why = ""
@@ -135,10 +138,11 @@ OVERVIEW_PERIOD_NS = 20_000_000
 MAX_CHUNK_BYTES = 2_000_000
 """A backlog that is caught up at once still becomes chunks of bounded size."""
 
-_SCAN = cycle.selection(
+SCANNED = (
     ("cycle", "sync_monotonic_ns", "sync_realtime_ns", "flags", "missed", "sync_counter", "frame_count"),
     ("status",),
 )
+"""Fields of header and joints that are looked at in every record."""
 
 
 class Sink(Protocol):
@@ -154,7 +158,7 @@ class Recording:
     Args:
         journal: with the builder of the chunks.
         sink: takes them.
-        overview: makes /joint_states.
+        overview: makes /joint_states; it knows the number of joints.
         chunk_ns: length of a chunk in recorded time [ns].
         account: of an earlier recorder of the same run, or a new one; shared with the sink.
 
@@ -181,8 +185,10 @@ class Recording:
         self._chunk_end_ns: int | None = None
         self._newest_ns = 0
         self._overview_slot = -1
-        self._statuses: tuple[int, int] | None = None
-        self._faults = FaultTrigger()
+        self._statuses: tuple[int, ...] | None = None
+        self._faults = FaultTrigger(overview.joints)
+        self._block = CycleMessages(overview.joints).block
+        self._scan = cycle.selection(*SCANNED, overview.joints).unpack_from
         self.missed: int | None = None
         """Slots missed as the newest cycle says; None before the first."""
 
@@ -190,27 +196,18 @@ class Recording:
         """Take one cycle record. Costs about 3 us: this is the path of every cycle."""
         self.account.cycles += 1
         builder = self._builder
-        index, monotonic, realtime, flags, missed, counter, count, status_1, status_2 = _SCAN.unpack_from(
-            record
-        )
+        index, monotonic, realtime, flags, missed, counter, count, *statuses = self._scan(record)
         realtime = max(realtime, 0)
         builder.add_block(
-            cycle_block(
-                record,
-                index,
-                realtime,
-                flags=flags,
-                sync_counter=counter,
-                frames=min(count, cycle.FRAME_CAPACITY),
-            ),
+            self._block(record, index, realtime, flags=flags, sync_counter=counter, frames=count),
             realtime,
         )
         self._pending += 1
         self._newest_ns = monotonic
         self.journal.newest = (index, realtime)
-        statuses = (status_1, status_2)
-        if statuses != self._statuses:
-            self._status_events(statuses, monotonic)
+        found = tuple(statuses)
+        if found != self._statuses:
+            self._status_events(found, monotonic)
         if missed != self.missed:
             self._missed_event(missed)
         slot = monotonic // OVERVIEW_PERIOD_NS
@@ -229,13 +226,12 @@ class Recording:
         settled = account.cycles - self._pending
         return Account(settled, account.written, account.overwritten, account.unwritten, account.let_go)
 
-    def _status_events(self, statuses: tuple[int, int], monotonic: int) -> None:
+    def _status_events(self, statuses: tuple[int, ...], monotonic: int) -> None:
         before, self._statuses = self._statuses, statuses
         self.fault = self._faults.changed(statuses, monotonic) or self.fault
         if before is None:
             return
-        for joint in (1, 2):
-            old, new = before[joint - 1], statuses[joint - 1]
+        for joint, (old, new) in enumerate(zip(before, statuses, strict=True), start=1):
             if old != new:
                 names = [schemas.STATUS_NAMES.get(code, str(code)) for code in (old, new)]
                 self.journal.note(

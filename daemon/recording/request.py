@@ -15,6 +15,7 @@ from typing import Any
 from jtqd.daemon.recording.diagnostics import Node
 from jtqd.daemon.recording.mcap_file import NamedData
 from jtqd.daemon.recording.own_files import RUN_PATTERN
+from jtqd.daemon.shared.cycle_record import MOST_JOINTS
 
 _SOURCES = {"path", "text", "base64"}
 _PATHS = ("progress", "snapshot", "notices")
@@ -44,8 +45,8 @@ class RecorderRequest:
         notices: the supervisor's `jtqd.daemon.shared.notices`, for /events and /log. None: without them.
         bus: name of the bus, for /diagnostics.
         nodes: [node-ID, name] of those in /diagnostics.
-        joint_names: of joint 1 and 2, for /joint_states.
-        gear_ratios: of joint 1 and 2; null where not known.
+        joint_names: of the joints, joint 1 first, for /joint_states; there are as many joints as names.
+        gear_ratios: of the joints; null where not known.
         channel_metadata: topic -> {key: text}, e.g. the PDO map of /can/frames.
     """
 
@@ -68,8 +69,8 @@ class RecorderRequest:
     notices: Path | None = None
     bus: str = ""
     nodes: tuple[Node, ...] = ()
-    joint_names: tuple[str, str] = ("joint_1", "joint_2")
-    gear_ratios: tuple[float | None, float | None] = (None, None)
+    joint_names: tuple[str, ...] = ("joint_1", "joint_2")
+    gear_ratios: tuple[float | None, ...] = (None, None)
     channel_metadata: dict[str, dict[str, str]] | None = None
 
     def __post_init__(self) -> None:
@@ -83,11 +84,16 @@ class RecorderRequest:
             value = getattr(self, key)
             if value is not None and not 0.0 <= value < math.inf:
                 raise RequestError(f"{key}: found {value!r}, expected a number from 0 on")
-        if len(self.joint_names) != 2 or len(self.gear_ratios) != 2:
-            raise RequestError("joint_names and gear_ratios: expected two of each")
+        if not len(self.gear_ratios) == self.joints <= MOST_JOINTS or not self.joints:
+            raise RequestError(f"joint_names and gear_ratios: expected 1 to {MOST_JOINTS}, as many of each")
         for ratio in self.gear_ratios:
             if ratio is not None and not (math.isfinite(ratio) and ratio != 0.0):
                 raise RequestError(f"gear_ratios: found {ratio!r}, expected a number other than 0, or null")
+
+    @property
+    def joints(self) -> int:
+        """Return the number of joints."""
+        return len(self.joint_names)
 
     @classmethod
     def from_file(cls, path: Path) -> RecorderRequest:

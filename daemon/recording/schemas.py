@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from mcap.records import Channel, Schema
 
-from jtqd.daemon.shared.cycle_record import FRAME_CAPACITY
+from jtqd.daemon.shared.cycle_record import MOST_JOINTS, PAIR, layout_of
 
 STATUS_NAMES = {
     0: "OFF",
@@ -114,7 +114,7 @@ uint8 sync_counter              # 1..240, the sequence of the estimate PDO
 uint8 cycle_flags               # see the constants
 """
 
-_CAN_FRAMES = f"""\
+_CAN_FRAMES = """\
 # The frames of one cycle in order of arrival, and the cycle's timing.
 # Only the first `frame_count` entries of `frames` and `stamps_ns` are meant; the others are zero.
 
@@ -133,8 +133,8 @@ uint8 late_frames
 uint8 duplicate_frames
 uint8 rejected_frames           # our identifiers with a wrong length, or 29-bit or remote frames
 uint8 reserved
-jtqd_msgs/CanFrame[{FRAME_CAPACITY}] frames
-int64[{FRAME_CAPACITY}] stamps_ns             # [ns] receive time of each frame by the kernel, CLOCK_REALTIME
+jtqd_msgs/CanFrame[%(capacity)d] frames
+int64[%(capacity)d] stamps_ns             # [ns] receive time of each frame by the kernel, CLOCK_REALTIME
 """
 
 _CAN_FRAME = """\
@@ -176,7 +176,7 @@ uint16 before                   # STATUS_CHANGED: status before
 uint16 after                    # STATUS_CHANGED: status after
 # Values of `kind`
 {_EVENT_CONSTANTS}uint8 kind
-uint8 joint                     # 1 or 2; 0: none in particular
+uint8 joint                     # %(numbers)s; 0: none in particular
 string text
 """
 
@@ -203,19 +203,36 @@ def _complete(text: str, *nested: tuple[str, str]) -> str:
 
 _NESTED_HEADER = (("std_msgs/Header", _HEADER), ("builtin_interfaces/Time", _TIME))
 
-SCHEMAS: dict[str, str] = {
-    "jtqd_msgs/msg/JointEstimate": _complete(_JOINT_ESTIMATE, *_NESTED_HEADER),
-    "jtqd_msgs/msg/CanFrames": _complete(_CAN_FRAMES, *_NESTED_HEADER, ("jtqd_msgs/CanFrame", _CAN_FRAME)),
-    "sensor_msgs/msg/JointState": _complete(_JOINT_STATE, *_NESTED_HEADER),
-    "diagnostic_msgs/msg/DiagnosticArray": _complete(
-        "std_msgs/Header header\ndiagnostic_msgs/DiagnosticStatus[] status\n",
-        *_NESTED_HEADER,
-        ("diagnostic_msgs/DiagnosticStatus", _DIAGNOSTIC_STATUS),
-        ("diagnostic_msgs/KeyValue", "string key\nstring value\n"),
-    ),
-    "jtqd_msgs/msg/Event": _complete(_EVENT, *_NESTED_HEADER),
-    "rcl_interfaces/msg/Log": _complete(_LOG, ("builtin_interfaces/Time", _TIME)),
-}
+
+def schemas_of(joints: int) -> dict[str, str]:
+    """Return the definitions in the log of a bus with so many joints, by name."""
+    capacity = layout_of(joints).frame_capacity
+    frames = _CAN_FRAMES % {"capacity": capacity}
+    event = _EVENT % {"numbers": "1 or 2" if joints == 2 else "from 1 on"}
+    return {
+        "jtqd_msgs/msg/JointEstimate": _complete(_JOINT_ESTIMATE, *_NESTED_HEADER),
+        frames_name(joints): _complete(frames, *_NESTED_HEADER, ("jtqd_msgs/CanFrame", _CAN_FRAME)),
+        "sensor_msgs/msg/JointState": _complete(_JOINT_STATE, *_NESTED_HEADER),
+        "diagnostic_msgs/msg/DiagnosticArray": _complete(
+            "std_msgs/Header header\ndiagnostic_msgs/DiagnosticStatus[] status\n",
+            *_NESTED_HEADER,
+            ("diagnostic_msgs/DiagnosticStatus", _DIAGNOSTIC_STATUS),
+            ("diagnostic_msgs/KeyValue", "string key\nstring value\n"),
+        ),
+        "jtqd_msgs/msg/Event": _complete(event, *_NESTED_HEADER),
+        "rcl_interfaces/msg/Log": _complete(_LOG, ("builtin_interfaces/Time", _TIME)),
+    }
+
+
+def frames_name(joints: int) -> str:
+    """Name of the definition of /can/frames: one with more frames is another type."""
+    capacity = layout_of(joints).frame_capacity
+    return "jtqd_msgs/msg/CanFrames" + ("" if capacity == PAIR.frame_capacity else str(capacity))
+
+
+FRAMES_NAMES = (frames_name(2), frames_name(MOST_JOINTS))
+"""Definitions of /can/frames: up to two joints, and more."""
+SCHEMAS = schemas_of(2)
 
 
 class Topic(NamedTuple):
@@ -226,19 +243,39 @@ class Topic(NamedTuple):
     schema: str
 
 
-JOINT_1 = Topic(1, "/joint/1/state", "jtqd_msgs/msg/JointEstimate")
-JOINT_2 = Topic(2, "/joint/2/state", "jtqd_msgs/msg/JointEstimate")
-CAN_FRAMES = Topic(3, "/can/frames", "jtqd_msgs/msg/CanFrames")
+JOINTS = tuple(
+    Topic(number, f"/joint/{joint}/state", "jtqd_msgs/msg/JointEstimate")
+    for joint, number in ((1, 1), (2, 2), (3, 8), (4, 9))
+)
+"""Of the joints that a bus may have."""
+JOINT_1, JOINT_2 = JOINTS[:2]
+CAN_FRAMES = Topic(3, "/can/frames", frames_name(2))
 JOINT_STATES = Topic(4, "/joint_states", "sensor_msgs/msg/JointState")
 DIAGNOSTICS = Topic(5, "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 EVENTS = Topic(6, "/events", "jtqd_msgs/msg/Event")
 LOG = Topic(7, "/log", "rcl_interfaces/msg/Log")
-TOPICS = (JOINT_1, JOINT_2, CAN_FRAMES, JOINT_STATES, DIAGNOSTICS, EVENTS, LOG)
+_OTHERS = (JOINT_STATES, DIAGNOSTICS, EVENTS, LOG)
 
 
-def definitions(metadata: Mapping[str, Mapping[str, str]] | None) -> tuple[list[Schema], list[Channel]]:
+def joint_topics(joints: int) -> tuple[Topic, ...]:
+    """Return /joint/1/state, /joint/2/state, ... of a bus with so many joints."""
+    return JOINTS[:joints]
+
+
+def topics_of(joints: int) -> tuple[Topic, ...]:
+    """Return all topics in the log of a bus with so many joints."""
+    return *joint_topics(joints), CAN_FRAMES._replace(schema=frames_name(joints)), *_OTHERS
+
+
+TOPICS = topics_of(2)
+
+
+def definitions(
+    metadata: Mapping[str, Mapping[str, str]] | None, joints: int = 2
+) -> tuple[list[Schema], list[Channel]]:
     """Schema and channel records of every topic; `metadata` adds to a topic's own."""
-    numbers = {name: number for number, name in enumerate(SCHEMAS, start=1)}
+    texts = schemas_of(joints)
+    numbers = {name: number for number, name in enumerate(texts, start=1)}
     channels = [
         Channel(
             id=topic.number,
@@ -247,9 +284,9 @@ def definitions(metadata: Mapping[str, Mapping[str, str]] | None) -> tuple[list[
             metadata={str(key): str(text) for key, text in (metadata or {}).get(topic.name, {}).items()},
             schema_id=numbers[topic.schema],
         )
-        for topic in TOPICS
+        for topic in topics_of(joints)
     ]
     return [
         Schema(id=numbers[name], name=name, encoding="ros2msg", data=text.encode())
-        for name, text in SCHEMAS.items()
+        for name, text in texts.items()
     ], channels

@@ -38,7 +38,9 @@ def needs_restart(old: Config, new: Config) -> list[str]:
         for field in fields(Config)
         if field.name not in _FREE and getattr(old, field.name) != getattr(new, field.name)
     ]
-    for before, after in zip(old.joints, new.joints, strict=True):
+    fewer, more = sorted((len(old.joints), len(new.joints)))
+    keys += [f"joint_{number}" for number in range(fewer + 1, more + 1)]
+    for before, after in zip(old.joints, new.joints, strict=False):
         kept = {name: getattr(before, name) for name in _FREE_OF_JOINT}
         if replace(after, **kept) != before:
             names = [

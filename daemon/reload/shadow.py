@@ -76,7 +76,7 @@ class Shadow:
     """
 
     def __init__(self, path: Path, estimators: Sequence[Estimator]) -> None:
-        self._reader = RingReader(path, cr.RECORD_SIZE)
+        self._reader = RingReader(path, cr.layout_of(len(estimators)).size)
         self._joints = [_Joint(estimator) for estimator in estimators]
         self.cycles = 0
 

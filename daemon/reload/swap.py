@@ -71,7 +71,7 @@ class Swap:
 
     def __init__(self, cycle: Cycle, ring: Path, safety: SafetySettings, report: Report) -> None:
         self._cycle, self._safety, self._report = cycle, safety, report
-        self._reader = RingReader(ring, cr.RECORD_SIZE)
+        self._reader = RingReader(ring, cr.layout_of(len(cycle.joints)).size)
         self._steps: Iterator[str] | None = None
         self.next_step = ""
         self._costs_ns: defaultdict[str, deque[int]] = defaultdict(lambda: deque([_FIRST_NS], maxlen=_KEPT))

@@ -153,7 +153,6 @@ def _comparison(each: Comparison, other: bool) -> list[str]:
 # ---- MCAP with the logged states on /joint/N/state and the replay on /joint/N/replay ----
 
 _SCHEMA = "jtqd_msgs/msg/JointEstimate"
-TOPICS = ("/joint/1/state", "/joint/1/replay", "/joint/2/state", "/joint/2/replay")
 _CHUNK_CYCLES = 500
 _REPEAT_EVERY = 60
 _OPCODE_MESSAGE, _RECORD_REST = 0x05, 22
@@ -184,20 +183,22 @@ def write(path: Path, results: list[Result]) -> None:
     runs = len({each.run.number for each in results})
     if runs != 1:
         raise LogError(f"{path}: found logs of {runs} runs, expected those of one for --out")
+    joints = range(1, len(results[0].joints) + 1)
+    topics = [f"/joint/{joint}/{what}" for joint in joints for what in ("state", "replay")]
     schema = Schema(id=1, name=_SCHEMA, encoding="ros2msg", data=SCHEMAS[_SCHEMA].encode())
     channels = [
         Channel(id=number, topic=topic, message_encoding="cdr", metadata={}, schema_id=1)
-        for number, topic in enumerate(TOPICS, start=1)
+        for number, topic in enumerate(topics, start=1)
     ]
     head = Head([schema], channels, _attachments(results))
-    parts = [(number, (number - 1) * _MESSAGE.itemsize) for number in range(1, len(TOPICS) + 1)]
+    parts = [(number, (number - 1) * _MESSAGE.itemsize) for number in range(1, len(topics) + 1)]
     file = McapFile(
         path.with_name(path.name + ACTIVE), head, {"made by": "jtq replay"}, _first_ns(results[0])
     )
     builder = ChunkBuilder([schema], channels, parts, _REPEAT_EVERY)
     try:
         for result in results:
-            _add(file, builder, np.concatenate([_messages(result, n) for n in (0, 1)], axis=1))
+            _add(file, builder, np.concatenate([_messages(result, n) for n in range(len(joints))], axis=1))
         file.finish(path.name)
     except OSError:
         file.abandon(remove=True)
@@ -206,7 +207,7 @@ def write(path: Path, results: list[Result]) -> None:
 
 def _add(file: McapFile, builder: ChunkBuilder, blocks: RecordArray) -> None:
     """Append the messages of n cycles [n, topics]."""
-    data, size = blocks.tobytes(), _MESSAGE.itemsize * len(TOPICS)
+    data, size = blocks.tobytes(), _MESSAGE.itemsize * blocks.shape[1]
     for row, time_ns in enumerate(blocks["log_time"][:, 0].tolist()):
         builder.add_block(data[row * size : (row + 1) * size], time_ns)
         if row % _CHUNK_CYCLES == _CHUNK_CYCLES - 1:
@@ -246,7 +247,7 @@ def _media_type(name: str) -> str:
 
 
 def _messages(result: Result, number: int) -> RecordArray:
-    """Message records of joint `number` (0 or 1): logged and replayed [n, 2]."""
+    """Message records of joint `number` (from 0 on): logged and replayed [n, 2]."""
     logged, replayed = result.run.joints[number], result.joints[number]
     assert _MESSAGE.itemsize == 31 + JOINT_ESTIMATE_SIZE
     out = np.zeros((len(logged), 2), _MESSAGE)

@@ -29,7 +29,7 @@ class Comparison:
     """One joint over n cycles; NaN where nothing was to be compared.
 
     Attributes:
-        joint: 1 or 2.
+        joint: from 1 on.
         cycles: compared.
         pdo_equal: cycles whose torque, sigma and status in the estimate PDO are the same.
         both: cycles with a torque in log and replay.
@@ -65,7 +65,7 @@ class Comparison:
 
 
 def compare(number: int, logged: RecordArray, replayed: RecordArray, taken: BoolArray) -> Comparison:
-    """Compare joint `number` (1 or 2) over the cycles `taken` [n]."""
+    """Compare joint `number` over the cycles `taken` [n]."""
     logged, replayed = logged[taken], replayed[taken]
     both = np.isfinite(logged["torque_nm"]) & np.isfinite(replayed["torque_nm"])
     apart = np.abs(replayed["torque_nm"][both] - logged["torque_nm"][both])
@@ -160,7 +160,7 @@ class Identity:
 
     Attributes:
         cycles: replayed.
-        identical: of these, bit for bit in every number of both joints and in the bytes of the estimate PDO.
+        identical: of these, bit for bit in every number of all joints and in the bytes of the estimate PDOs.
         pdos, pdos_equal: estimate PDOs in the frames of the log, and those of the same bytes.
         unknown: where the state was not known.
         differences: what has no reason.
@@ -211,9 +211,9 @@ def identity(
     tolerance_nm: float = 0.0,
     network_nm: float = 0.0,
 ) -> Identity:
-    """Compare n cycles of both joints, all fields of `replayed`.
+    """Compare n cycles of all joints, all fields of `replayed`.
 
-    `estimate`: bytes of the estimate PDO [n, 8] in the frames and replayed, and whether the log has it [n]; None: the
+    `estimate`: bytes of the estimate PDOs [n, 8 PDOs] in the frames and replayed, and whether they are logged [n]; None: the
     frames were not read. `tolerance_nm`: what rounding may do to a replay in arrays; `network_nm`: what another evaluation
     of the networks may do to their share, in cycles where that share itself differs.
     """
@@ -233,7 +233,7 @@ def identity(
         pdo = ~recorded | (sent == made).all(axis=1)
     unknown: list[Unknown] = []
     differences: list[Difference] = []
-    for n in (0, 1):
+    for n in range(len(logged)):
         parts = _segments(len(cycle), steps[n])
         for first, end, reason in parts:
             settled = _settled(same[n], steps[n].used, first, end) if reason else first
@@ -244,9 +244,10 @@ def identity(
             wrong = np.flatnonzero(~same[n][settled:end]) + settled
             if len(wrong):
                 differences.append(_difference(n, logged[n], replayed[n], wrong, tolerance_nm))
-    every = same[0] & same[1] & pdo
-    if not (pdo | ~same[0] | ~same[1]).all():
-        row = int(np.argmin(pdo | ~same[0] | ~same[1]))
+    numbers: BoolArray = np.logical_and.reduce(same)
+    every = numbers & pdo
+    if not (pdo | ~numbers).all():
+        row = int(np.argmin(pdo | ~numbers))
         differences.append(
             Difference(0, int(cycle[row]), int((~pdo).sum()), "estimate PDO", np.nan, np.nan, 0.0)
         )
@@ -254,7 +255,7 @@ def identity(
     start = 0 if not len(last) else int(last[-1]) + 1
     return Identity(
         len(cycle),
-        int((bits[0] & bits[1] & pdo).sum()),
+        int((np.logical_and.reduce(bits) & pdo).sum()),
         int(recorded.sum()),
         int((recorded & pdo).sum()),
         tuple(sorted(unknown, key=lambda each: (each.first_cycle, each.joint))),

@@ -56,7 +56,7 @@ class _Counters:
     """Counters of the loop in shared memory; not read here."""
 
     counters: array[int] = field(default_factory=lambda: array("Q", [0] * len(COUNTERS)))
-    errors: array[float] = field(default_factory=lambda: array("d", [0.0] * 4))
+    errors: array[float] = field(default_factory=lambda: array("d", [0.0] * 2 * cr.MOST_JOINTS))
 
 
 @dataclass(frozen=True)
@@ -64,12 +64,12 @@ class Replayed:
     """Result over n cycles.
 
     Attributes:
-        joints: of joint 1 and 2, `SAMPLE` [n].
-        estimate: bytes of the estimate PDO [n, 8].
+        joints: of each joint, `SAMPLE` [n].
+        estimate: bytes of the estimate PDOs, one after the other [n, 8 * PDOs].
         temperatures_from_log: cycles whose temperature the frames alone do not tell.
     """
 
-    joints: tuple[RecordArray, RecordArray]
+    joints: tuple[RecordArray, ...]
     estimate: npt.NDArray[np.uint8]
     temperatures_from_log: int
 
@@ -79,7 +79,7 @@ class ExactReplay:
 
     Args:
         origin: configuration and scaling.
-        estimators, safety: of joint 1 and 2.
+        estimators, safety: of each joint.
     """
 
     def __init__(
@@ -103,7 +103,9 @@ class ExactReplay:
                 zip(origin.inputs, estimators, safety, strict=True)
             )
         ]
-        self._time_ns = [1 << 60, 1 << 60]  # any but 0, which would mean that there was no sample yet
+        self._time_ns = [1 << 60] * len(
+            self._joints
+        )  # any but 0, which would mean that there was no sample yet
 
     def run(
         self,
@@ -115,17 +117,15 @@ class ExactReplay:
         """Replay the cycles of one part; `joints` are its states as logged. `progress` is called with the cycles done."""
         count = len(joints[0])
         celsius, happens = self._temperatures(frames, joints)
-        for n in (0, 1):
+        for n in range(len(self._joints)):
             for row, marks in self._marks(n, joints[n], frames, steps[n]).items():
                 happens.setdefault(row, []).extend(marks)
         times = np.array(
             [start + np.cumsum(each.dt_ns) for start, each in zip(self._time_ns, steps, strict=True)]
         )
-        one, two = self._joints
         rows = CycleRows(
             self._intake,
-            one,
-            two,
+            self._joints,
             fresh=[each.fresh for each in frames.pdos],
             values=[each.values for each in frames.pdos],
             celsius=celsius,
@@ -143,8 +143,8 @@ class ExactReplay:
             progress(end)
         if count:
             self._time_ns = times[:, -1].tolist()
-        first_joint, second_joint = (each.view(SAMPLE)[:, 0] for each in rows.samples)
-        return Replayed((first_joint, second_joint), rows.estimates, rows.temperatures_from_log)
+        samples = tuple(each.view(SAMPLE)[:, 0] for each in rows.samples)
+        return Replayed(samples, rows.estimates, rows.temperatures_from_log)
 
     def _temperatures(
         self, frames: Frames, joints: Sequence[RecordArray]

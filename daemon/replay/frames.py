@@ -1,5 +1,5 @@
 """From the raw frames of a log to what each cycle was given: the mapped integers of every input PDO, temperatures, and
-the estimate PDO that went out. Pure, in arrays.
+the estimate PDOs that went out. Pure, in arrays.
 
 The frames of a record are in order of arrival, late ones of the cycle before first. Of an input that counted, the last frame
 with its identifier and length is therefore the one that was used (see `core.intake`); whether it counted is what the
@@ -17,9 +17,9 @@ import numpy.typing as npt
 from jtqd.daemon.loop.input_pdos import InputPdo, JointInputs, input_pdos, joint_temperatures
 from jtqd.daemon.replay.origin import Origin
 from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_POSITION, FLAG_SENSOR
+from jtqd.drivers.devices import estimate_tpdos
 from jtqd.estimator.arrays import BoolArray, FloatArray, IntegerArray, RecordArray
 
-_ESTIMATE_LENGTH = 8
 _HALF, _FULL = 1 << 31, 1 << 32
 
 
@@ -38,7 +38,7 @@ class Frames:
     Attributes:
         pdos: in the order of `input_pdos`.
         temperatures: of each joint that tells one: (cycle row, frame as `struct can_frame`) in order of arrival.
-        estimate: estimate PDO [n, 8]; recorded: it is in the record [n].
+        estimate: estimate PDOs one after the other [n, 8 * PDOs]; recorded: they are in the record [n].
         from_si: inputs whose frame may not be in the record.
     """
 
@@ -91,7 +91,12 @@ def decode(origin: Origin, records: RecordArray, joints: Sequence[RecordArray]) 
             for column, known in zip(values, _counts(index, origin.inputs, joints), strict=True):
                 column[absent] = known[absent]
         pdos.append(Pdo(tuple(values), fresh))
-    recorded, estimate = table.last(0x180 + origin.config.node_id, _ESTIMATE_LENGTH)
+    pairs = [
+        table.last(pdo.cob_id, pdo.length)
+        for pdo in estimate_tpdos(len(origin.config.joints), origin.config.node_id)
+    ]
+    recorded: BoolArray = np.logical_and.reduce([there for there, _ in pairs])
+    estimate = np.concatenate([data for _, data in pairs], axis=1)
     return Frames(
         tuple(pdos),
         tuple(table.every(each.cob_id) for each in joint_temperatures(origin.config)),

@@ -22,6 +22,7 @@ from jtqd.daemon.logs import LogError
 from jtqd.daemon.loop.input_pdos import JointInputs
 from jtqd.daemon.loop.process import joint_inputs
 from jtqd.daemon.shared import cycle_record as cr
+from jtqd.daemon.shared.cycle_record import MOST_JOINTS
 from jtqd.estimator.checked import ConfigError
 from jtqd.models.files import load_yaml
 
@@ -108,7 +109,8 @@ def open_origin(log: Path, attachments: Mapping[str, bytes], directory: Path) ->
         mapping = load_yaml(original)
         files = [
             each
-            for number in (1, 2)
+            for number in range(1, MOST_JOINTS + 1)
+            if number == 1 or f"joint_{number}" in mapping
             for each in _place(log, attachments, provenance, mapping, number, directory)
         ]
         rewritten = directory / CONFIGURATION

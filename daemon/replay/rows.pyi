@@ -14,8 +14,7 @@ class CycleRows:
     def __init__(
         self,
         intake: Intake,
-        one: JointCycle,
-        two: JointCycle,
+        joints: Sequence[JointCycle],
         *,
         fresh: BoolArray | Sequence[BoolArray],
         values: Sequence[Sequence[IntegerArray]],

@@ -1,5 +1,6 @@
 """Cycles of a log through the joints of the loop, without a bus: inputs of many cycles at once, for replay."""
 
+from cpython.object cimport PyObject
 from libc.math cimport isnan
 from libc.stdint cimport int64_t, uint8_t
 from libc.string cimport memcpy
@@ -7,10 +8,10 @@ from libc.string cimport memcpy
 import numpy as np
 
 from jtqd.daemon.core.cycle import STARTING_CYCLES
-from jtqd.daemon.core.estimate_pdo cimport encode_into
+from jtqd.daemon.core.estimate_pdo cimport NOBODY, Published, encode_into
 from jtqd.daemon.core.intake cimport MOST_FIELDS, Intake, Temperature, temperature_at
-from jtqd.daemon.core.joint cimport JointCycle
-from jtqd.daemon.core.record cimport JointBlock
+from jtqd.daemon.core.joint cimport JointCycle, JointState
+from jtqd.daemon.core.record cimport MOST_JOINTS, JointBlock
 from jtqd.estimator import status as st
 
 cdef int64_t FIRST_CYCLES = STARTING_CYCLES
@@ -21,18 +22,18 @@ cdef class CycleRows:
     """Rows of a log: inputs in, records and estimate PDOs out.
 
     Args:
-        intake, one, two: the loop's; the intake decides nothing here, it holds the inputs.
+        intake, joints: the loop's; the intake decides nothing here, it holds the inputs.
         fresh: of each input, whether it counted [inputs, n].
         values: of each input, its integers in the order of its mapping; one array [objects, n] per input.
         celsius: of each joint temperature, as logged [temperatures, n]; NaN where not known.
         cycle, counter: number of the cycle, and its SYNC counter [n].
-        sync_ns: of both joints, when its SYNC went out [2, n].
-        wanted: of both joints, whether there was time for the network [2, n].
+        sync_ns: of each joint, when its SYNC went out [joints, n].
+        wanted: of each joint, whether there was time for the network [joints, n].
         withdrawn: whether the estimate was too late [n].
 
     Attributes:
-        samples: of both joints, blocks of the cycle record [2, n, bytes].
-        estimates: estimate PDOs [n, 8].
+        samples: of each joint, blocks of the cycle record [joints, n, bytes].
+        estimates: estimate PDOs one after the other [n, 8 * PDOs].
         temperatures_from_log: how often the frames did not tell the temperature.
 
     Raises:
@@ -40,7 +41,9 @@ cdef class CycleRows:
     """
 
     cdef Intake intake
-    cdef JointCycle one, two
+    cdef tuple joints
+    cdef int count, pdos
+    cdef JointState *states[MOST_JOINTS]
     cdef const uint8_t[:, ::1] fresh, wanted
     cdef const int64_t[:, :, ::1] values
     cdef const double[:, ::1] celsius
@@ -53,34 +56,48 @@ cdef class CycleRows:
     cdef readonly int64_t temperatures_from_log
 
     def __init__(
-        self, Intake intake, JointCycle one, JointCycle two, *, fresh, values, celsius, cycle, counter, sync_ns, wanted, withdrawn
+        self, Intake intake, joints, *, fresh, values, celsius, cycle, counter, sync_ns, wanted, withdrawn
     ):
+        cdef JointCycle joint
         n = len(cycle)
         laid = np.zeros((intake.count, MOST_FIELDS, n), np.int64)
         for index, columns in enumerate(values):
             laid[index, : len(columns)] = columns
-        self.intake, self.one, self.two = intake, one, two
+        self.intake, self.joints, self.count = intake, tuple(joints), len(joints)
+        self.pdos = (self.count + 1) // 2
+        for index in range(self.count):
+            joint = self.joints[index]
+            self.states[index] = &joint.now
         self.fresh = _checked(fresh, np.uint8, (intake.count, n))
         self.values = laid
         self.celsius = _checked(celsius, np.float64, (intake.temperature_count, n))
         self.cycle, self.counter = _checked(cycle, np.int64, (n,)), _checked(counter, np.int64, (n,))
-        self.sync_ns = _checked(sync_ns, np.int64, (2, n))
-        self.wanted, self.withdrawn = _checked(wanted, np.uint8, (2, n)), _checked(withdrawn, np.uint8, (n,))
-        self.samples, self.estimates = np.zeros((2, n, sizeof(JointBlock)), np.uint8), np.zeros((n, 8), np.uint8)
+        self.sync_ns = _checked(sync_ns, np.int64, (self.count, n))
+        self.wanted, self.withdrawn = _checked(wanted, np.uint8, (self.count, n)), _checked(withdrawn, np.uint8, (n,))
+        self.samples = np.zeros((self.count, n, sizeof(JointBlock)), np.uint8)
+        self.estimates = np.zeros((n, 8 * self.pdos), np.uint8)
         self.to_samples, self.to_estimates = self.samples, self.estimates
 
     def go_on(self, Py_ssize_t first, Py_ssize_t end):
         """Estimate rows first to end - 1; rows come in order."""
         cdef Py_ssize_t row
+        cdef const Published *second
+        cdef JointCycle joint
+        cdef PyObject *at[MOST_JOINTS]
+        cdef int n
+        for n in range(self.count):
+            joint = self.joints[n]
+            at[n] = <PyObject *> joint
         if not 0 <= first <= end <= self.cycle.shape[0]:
             raise ValueError(f"found rows {first} to {end}, there are {self.cycle.shape[0]}")
-        with nogil:
-            for row in range(first, end):
-                self.take(row)
-                self.observe(self.one, 0, row)
-                self.observe(self.two, 1, row)
+        for row in range(first, end):
+            self.take(row)
+            for n in range(self.count):
+                self.observe(<JointCycle> at[n], n, row)
+            for n in range(self.pdos):
+                second = &self.states[2 * n + 1].published if 2 * n + 1 < self.count else &NOBODY
                 encode_into(
-                    &self.to_estimates[row, 0], &self.one.now.published, &self.two.now.published, self.counter[row]
+                    &self.to_estimates[row, 8 * n], &self.states[2 * n].published, second, self.counter[row]
                 )
 
     cdef void take(self, Py_ssize_t row) noexcept nogil:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ from jtqd.daemon.logs import (
     read_topic,
     read_topics,
 )
+from jtqd.daemon.recording.schemas import joint_topics
 from jtqd.daemon.replay.origin import FRAMES, JOINT, Origin, check_fields, open_origin
 from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_POSITION
 from jtqd.estimator.arrays import RecordArray
@@ -129,7 +131,8 @@ def lost_cycles(records: RecordArray, config: Config) -> int:
     return int(_holes(records, config).sum())
 
 
-JOINT_TOPICS = ("/joint/1/state", "/joint/2/state")
+FIRST_TOPIC = joint_topics(1)[0].name
+"""Of the joint that every log has."""
 FRAMES_TOPIC = "/can/frames"
 
 STRETCH_CYCLES = 650_000
@@ -142,11 +145,11 @@ _LEAST_BYTES = 200
 
 @dataclass(frozen=True)
 class Part:
-    """One log, or a piece of a long one: its states of joint 1 and 2, cycle by cycle, both of the same cycles."""
+    """One log, or a piece of a long one: its states of its joints, cycle by cycle, all of the same cycles."""
 
     path: Path
     origin: Origin
-    joints: tuple[RecordArray, RecordArray]
+    joints: tuple[RecordArray, ...]
     piece: bool = False
 
     def frames(self) -> RecordArray:
@@ -173,26 +176,27 @@ class Run:
 
     Attributes:
         parts: their states are views of `joints`.
-        joints: states of joint 1 and 2 over all parts.
+        joints: states of each joint over all parts.
         number: the stretches of one run have the same.
         before: last states of the stretch before, none for the first one.
     """
 
     parts: tuple[Part, ...]
-    joints: tuple[RecordArray, RecordArray]
+    joints: tuple[RecordArray, ...]
     number: int = 0
-    before: tuple[RecordArray, RecordArray] | None = None
+    before: tuple[RecordArray, ...] | None = None
 
     @classmethod
-    def of(
-        cls, parts: Sequence[Part], number: int = 0, before: tuple[RecordArray, RecordArray] | None = None
-    ) -> Run:
+    def of(cls, parts: Sequence[Part], number: int = 0, before: tuple[RecordArray, ...] | None = None) -> Run:
         """Run, or stretch, of parts that follow one another."""
-        one, two = (_joined([part.joints[n] for part in parts]) for n in (0, 1))
+        joints = tuple(_joined(states) for states in zip(*(part.joints for part in parts), strict=True))
         ends = np.cumsum([len(part.joints[0]) for part in parts]).tolist()
         spans = [slice(begin, end) for begin, end in zip([0, *ends[:-1]], ends, strict=True)]
-        views = [replace(part, joints=(one[at], two[at])) for part, at in zip(parts, spans, strict=True)]
-        return cls(tuple(views), (one, two), number, before)
+        views = [
+            replace(part, joints=tuple(each[at] for each in joints))
+            for part, at in zip(parts, spans, strict=True)
+        ]
+        return cls(tuple(views), joints, number, before)
 
     @property
     def origin(self) -> Origin:
@@ -204,22 +208,23 @@ class Run:
         """Return the number of cycles in the logs."""
         return len(self.joints[0])
 
-    def widened(self) -> tuple[tuple[RecordArray, RecordArray], tuple[Steps, Steps], int]:
+    def widened(self) -> tuple[tuple[RecordArray, ...], tuple[Steps, ...], int]:
         """States with those kept of the stretch before in front of them, their time steps, and how many those are."""
-        kept = self.before or (self.joints[0][:0], self.joints[1][:0])
-        one, two = (
+        kept = self.before or tuple(each[:0] for each in self.joints)
+        joints = tuple(
             _joined([old, new] if len(old) else [new]) for old, new in zip(kept, self.joints, strict=True)
         )
-        return (
-            (one, two),
-            (steps_of(one, self.origin.config), steps_of(two, self.origin.config)),
-            len(kept[0]),
-        )
+        return joints, tuple(steps_of(each, self.origin.config) for each in joints), len(kept[0])
 
-    def steps(self) -> tuple[Steps, Steps]:
-        """Return the time steps of both joints over all parts."""
-        (records, _), (one, two), kept = self.widened()
-        return one.part(kept, len(records)), two.part(kept, len(records))
+    def steps(self) -> tuple[Steps, ...]:
+        """Return the time steps of all joints over all parts."""
+        records, steps, kept = self.widened()
+        return tuple(each.part(kept, len(records[0])) for each in steps)
+
+
+def topics_of(origin: Origin) -> tuple[str, ...]:
+    """Return the topics of the joints that a log has."""
+    return tuple(topic.name for topic in joint_topics(len(origin.config.joints)))
 
 
 def _joined(every: Sequence[RecordArray]) -> RecordArray:
@@ -229,7 +234,7 @@ def _joined(every: Sequence[RecordArray]) -> RecordArray:
 def read_part(path: Path, directory: Path) -> Part:
     """Read one log; its files go to `directory`, which must be empty. Raises LogError, OSError."""
     origin = open_origin(path, read_attachments(path), directory)
-    return _part(path, origin, read_topics(path, JOINT_TOPICS))
+    return _part(path, origin, read_topics(path, topics_of(origin)))
 
 
 def read_pieces(path: Path, directory: Path, limit: int = STRETCH_CYCLES) -> Iterator[Part]:
@@ -238,12 +243,13 @@ def read_pieces(path: Path, directory: Path, limit: int = STRETCH_CYCLES) -> Ite
         yield read_part(path, directory)
         return
     origin = open_origin(path, read_attachments(path), directory)
-    kept: dict[str, list[RecordArray]] = {topic: [] for topic in JOINT_TOPICS}
+    topics = topics_of(origin)
+    kept: dict[str, list[RecordArray]] = {topic: [] for topic in topics}
     count, made = 0, False
-    for found in iter_topics(path, JOINT_TOPICS):
+    for found in iter_topics(path, topics):
         for topic, messages in found.items():
             kept[topic].append(messages.records.copy())  # without the room for more
-        count += len(found[JOINT_TOPICS[0]].records) if JOINT_TOPICS[0] in found else 0
+        count += len(found[FIRST_TOPIC].records) if FIRST_TOPIC in found else 0
         if count >= limit and all(kept.values()):
             yield _piece(path, origin, kept)
             count, made = 0, True
@@ -254,12 +260,12 @@ def read_pieces(path: Path, directory: Path, limit: int = STRETCH_CYCLES) -> Ite
 def _most_cycles(path: Path) -> int:
     """Return cycles in a log as its summary says; without one as many as it may have by its size."""
     with LogFile(path) as log:
-        counts = [log.counts.get(n, 0) for n, each in log.channels.items() if each.topic in JOINT_TOPICS]
+        counts = [log.counts.get(n, 0) for n, each in log.channels.items() if each.topic == FIRST_TOPIC]
         return max(counts) if log.counts and counts else path.stat().st_size // _LEAST_BYTES
 
 
 def _piece(path: Path, origin: Origin, kept: dict[str, list[RecordArray]]) -> Part:
-    """A part of what was kept; what one joint has of a cycle in the next chunk, which the other's is in, stays."""
+    """A part of what was kept; what one joint has of a cycle whose others are in the next chunk stays."""
     joined = {}
     for topic, chunks in kept.items():
         if not chunks:
@@ -289,17 +295,18 @@ def _frames_between(path: Path, first: int, last: int) -> RecordArray:
 
 
 def _part(path: Path, origin: Origin, found: dict[str, RecordArray]) -> Part:
-    one, two = (found[topic] for topic in JOINT_TOPICS)
-    for topic, records in zip(JOINT_TOPICS, (one, two), strict=True):
+    for topic, records in found.items():
         check_fields(records, JOINT, path, topic)
-    if not np.array_equal(one["cycle"], two["cycle"]):
-        _, here, there = np.intersect1d(one["cycle"], two["cycle"], return_indices=True)
-        one, two = one[here], two[there]
-    if not len(one):
-        raise LogError(f"{path}: found no cycle with both joints, expected one at least")
-    if np.any(np.diff(one["cycle"].astype(np.int64)) <= 0):
+    joints = tuple(found[topic] for topic in topics_of(origin))
+    cycles = joints[0]["cycle"]
+    if not all(np.array_equal(each["cycle"], cycles) for each in joints):
+        shared = reduce(np.intersect1d, [each["cycle"] for each in joints])
+        joints = tuple(each[np.intersect1d(each["cycle"], shared, return_indices=True)[1]] for each in joints)
+    if not len(joints[0]):
+        raise LogError(f"{path}: found no cycle with every joint, expected one at least")
+    if np.any(np.diff(joints[0]["cycle"].astype(np.int64)) <= 0):
         raise LogError(f"{path}: found cycles that do not increase, expected the order of the run")
-    return Part(path, origin, (one, two))
+    return Part(path, origin, joints)
 
 
 def in_order(logs: Sequence[Path]) -> list[Path]:
@@ -309,7 +316,7 @@ def in_order(logs: Sequence[Path]) -> list[Path]:
 
 def _first_ns(path: Path) -> int:
     """CLOCK_MONOTONIC of the first cycle; 0 where there is none: reading it says so."""
-    found = next(iter_messages(path, JOINT_TOPICS[0]), None)
+    found = next(iter_messages(path, FIRST_TOPIC), None)
     known = found is not None and "sync_monotonic_ns" in (found.records.dtype.names or ())
     return int(found.records["sync_monotonic_ns"][0]) if found is not None and known else 0
 
@@ -320,13 +327,13 @@ class _Open:
 
     number: int
     parts: list[Part]
-    before: tuple[RecordArray, RecordArray] | None = field(default=None)
+    before: tuple[RecordArray, ...] | None = field(default=None)
 
     def close(self, *following: Part) -> Run:
         """Return the stretch so far; the next one begins with `following`."""
         run = Run.of(self.parts, self.number, self.before)
-        one, two = (records[-_KEPT_ROWS:].copy() for records in run.joints)
-        self.before, self.parts = (one, two), list(following)
+        self.before = tuple(records[-_KEPT_ROWS:].copy() for records in run.joints)
+        self.parts = list(following)
         return run
 
 
@@ -376,7 +383,7 @@ def _behind(before: Part, part: Part) -> Part:
             raise LogError(
                 f"{part.path}: found cycle {first}, which {before.path} has too: is it given twice?"
             )
-    return replace(part, joints=(part.joints[0][new], part.joints[1][new]))
+    return replace(part, joints=tuple(each[new] for each in part.joints))
 
 
 def _packed(records: RecordArray) -> bytes:

@@ -50,13 +50,13 @@ _ANY_JOINT = "extended.joint.yaml"
 
 @dataclass(frozen=True)
 class Models:
-    """Models of joint 1 and 2, and the files they come from, with hashes; "as logged" for those of the log."""
+    """Models of the joints, and the files they come from, with hashes; "as logged" for those of the log."""
 
-    joints: tuple[Model, Model]
+    joints: tuple[Model, ...]
     files: tuple[str, ...]
 
     def safety(self, config: Config) -> list[JointSafety]:
-        """Limits of both joints by the log's configuration and these joint files."""
+        """Limits of the joints by the log's configuration and these joint files."""
         return [
             JointSafety(config.safety, each.settings, each.joint, config.period_ns) for each in self.joints
         ]
@@ -76,7 +76,7 @@ def logged_models(origin: Origin) -> Models:
             network = load_network(settings.method, str(each.network.path), each.network.sha256)
         made.append(Model(each.joint, settings, network))
         make_estimator(each.joint, settings, network)  # refused here, and not when the arrays are half done
-    return Models((made[0], made[1]), (AS_LOGGED, AS_LOGGED))
+    return Models(tuple(made), (AS_LOGGED,) * len(made))
 
 
 def other_models(origin: Origin, directory: Path | None, method: str | None) -> Models:
@@ -107,11 +107,12 @@ def other_models(origin: Origin, directory: Path | None, method: str | None) -> 
         made.append(Model(joint, settings, network))
         files.append(", ".join(said) or AS_LOGGED)
     if directory is not None and not taken:
-        names = ", ".join([*_joint_names(1), *_joint_names(2), _ANY_JOINT])
+        every = [name for number in range(1, len(made) + 1) for name in _joint_names(number)]
+        names = ", ".join([*every, _ANY_JOINT])
         raise ConfigError(
             f"{directory}: found no file for these joints, expected one of {names} or a network"
         )
-    return Models((made[0], made[1]), tuple(files))
+    return Models(tuple(made), tuple(files))
 
 
 def _named(path: Path) -> str:
@@ -194,8 +195,8 @@ class Result:
         from_si: inputs whose frame was not in the log, from the SI values beside it (exact only).
         temperatures_from_log: the same of temperatures.
         identity: comparison bit for bit, with the logged models only.
-        comparisons: of joint 1 and 2.
-        joints: estimates of joint 1 and 2, fields as `WHOLE` at least.
+        comparisons: of each joint.
+        joints: estimates of each joint, fields as `WHOLE` at least.
     """
 
     run: Run
@@ -209,8 +210,8 @@ class Result:
     from_si: int
     temperatures_from_log: int
     identity: Identity | None
-    comparisons: tuple[Comparison, Comparison]
-    joints: tuple[RecordArray, RecordArray]
+    comparisons: tuple[Comparison, ...]
+    joints: tuple[RecordArray, ...]
 
     @property
     def good(self) -> bool:
@@ -333,8 +334,10 @@ def _replay_run(
         if exact and not same.explained and any(each.network is not None for each in models.joints):
             limit = NATIVE_LIMIT * min(each.joint.rated_torque_nm for each in models.joints)
             same = identity(logged, found.joints, steps, estimate, network_nm=limit)
-    taken = [_known(run, same, n) for n in (1, 2)]
-    first, second = (compare(n + 1, logged[n], found.joints[n], taken[n]) for n in (0, 1))
+    comparisons = tuple(
+        compare(number, *both, _known(run, same, number))
+        for number, both in enumerate(zip(logged, found.joints, strict=True), start=1)
+    )
     return Result(
         run,
         models.files,
@@ -347,7 +350,7 @@ def _replay_run(
         found.from_si,
         found.temperatures,
         same,
-        (first, second),
+        comparisons,
         found.joints,
     )
 
@@ -370,7 +373,7 @@ def _tell(progress: Progress, before: int, total: int, row: int) -> None:
 class _Exact:
     """Results of all parts, one after the other."""
 
-    joints: tuple[RecordArray, RecordArray]
+    joints: tuple[RecordArray, ...]
     sent: npt.NDArray[np.uint8]
     made: npt.NDArray[np.uint8]
     recorded: npt.NDArray[np.bool_]
@@ -378,18 +381,18 @@ class _Exact:
     temperatures: int
 
 
-def _in_arrays(run: Run, models: Models) -> tuple[_Exact, tuple[Steps, Steps]]:
+def _in_arrays(run: Run, models: Models) -> tuple[_Exact, tuple[Steps, ...]]:
     """In arrays; a later stretch of a run begins with states of the one before, whose estimates are dropped."""
-    records, (one, two), kept = run.widened()
+    records, steps, kept = run.widened()
     safety = models.safety(run.origin.config)
     with ThreadPoolExecutor(len(records)) as pool:  # numpy and ONNX Runtime let go of the interpreter
-        made = list(pool.map(replay_whole, models.joints, safety, records, (one, two)))
+        made = list(pool.map(replay_whole, models.joints, safety, records, steps))
     if kept:
         end = len(records[0])
-        one, two = (cut_before(each.part(kept, end)) for each in (one, two))
+        steps = tuple(cut_before(each.part(kept, end)) for each in steps)
     empty = np.zeros((run.cycles, 8), np.uint8)
     recorded = np.zeros(run.cycles, np.bool_)
-    return _Exact((made[0][kept:], made[1][kept:]), empty, empty, recorded, 0, 0), (one, two)
+    return _Exact(tuple(each[kept:] for each in made), empty, empty, recorded, 0, 0), steps
 
 
 def _exact(run: Run, replayer: ExactReplay, steps: Sequence[Steps], progress: Progress) -> _Exact:
@@ -411,9 +414,8 @@ def _exact(run: Run, replayer: ExactReplay, steps: Sequence[Steps], progress: Pr
         from_si += frames.from_si
         temperatures += result.temperatures_from_log
         done = end
-    first, second = (np.concatenate([each[n] for each in joints]) for n in (0, 1))
     return _Exact(
-        (first, second),
+        tuple(np.concatenate(each) for each in zip(*joints, strict=True)),
         np.concatenate(sent),
         np.concatenate(made),
         np.concatenate(recorded),

@@ -1,10 +1,11 @@
 """The record of one cycle as it lies in shared memory: one fixed-size struct, written by the loop, read by the recorder.
 
-Little endian, 648 bytes, no padding decided by a compiler:
+Little endian, no padding decided by a compiler; how long it is depends on the number of joints (`Layout`):
 
     header   index, times, flags and counters of the cycle
-    joints   two blocks of the same layout: inputs in SI units and every stage of the estimate
-    frames   up to 16 frames as `struct can_frame` with their kernel stamps, in order of arrival
+    joints   one block for each joint: inputs in SI units and every stage of the estimate
+    frames   frames as `struct can_frame` with their kernel stamps, in order of arrival: up to 16 where there are one or two
+             joints (648 bytes with two), up to 32 where there are more
     tail     the index again: a reader that finds head and tail different has met a half-written record
 
 Quantities are NaN where they are not known in that cycle (an input that did not come, a stage that was not computed).
@@ -15,22 +16,53 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Collection
-from typing import NamedTuple
+from functools import cache
+from typing import Final, NamedTuple
+
+MOST_JOINTS: Final = 4
+"""Joints of one bus: two estimate PDOs of two each."""
 
 JOINT_FORMAT = "12d4H"
 HEADER_FORMAT = "QqqIIiI8B"
-FRAME_CAPACITY = 16
 
 HEADER = struct.Struct("<" + HEADER_FORMAT)
 JOINT = struct.Struct("<" + JOINT_FORMAT)
-HEAD = struct.Struct("<" + HEADER_FORMAT + JOINT_FORMAT + JOINT_FORMAT)
-"""Header and both joints in one call: packing them together costs a third of packing them apart."""
-
-FRAMES_OFFSET = HEAD.size
-STAMPS_OFFSET = FRAMES_OFFSET + 16 * FRAME_CAPACITY
-TAIL_OFFSET = STAMPS_OFFSET + 8 * FRAME_CAPACITY
 TAIL = struct.Struct("<Q")
-RECORD_SIZE = TAIL_OFFSET + TAIL.size
+
+
+class Layout(NamedTuple):
+    """Where the parts of a record lie; see `layout_of`."""
+
+    joints: int
+    head: struct.Struct
+    """Header and all joints in one call: packing them together costs a third of packing them apart."""
+    frame_capacity: int
+    """Frames that a record holds."""
+    frames_offset: int
+    stamps_offset: int
+    tail_offset: int
+    size: int
+    """Bytes of a record."""
+
+
+@cache
+def layout_of(joints: int) -> Layout:
+    """Return the layout for a number of joints. Raises ValueError for any but 1..4."""
+    if not 1 <= joints <= MOST_JOINTS:
+        raise ValueError(f"found {joints} joints, expected 1 to {MOST_JOINTS}")
+    head = struct.Struct("<" + HEADER_FORMAT + joints * JOINT_FORMAT)
+    capacity = 16 if joints <= 2 else 32
+    stamps = head.size + 16 * capacity
+    tail = stamps + 8 * capacity
+    return Layout(joints, head, capacity, head.size, stamps, tail, tail + TAIL.size)
+
+
+PAIR: Final = layout_of(2)
+"""Of two joints: the layout of most buses, and of the constants below."""
+HEAD, FRAME_CAPACITY = PAIR.head, PAIR.frame_capacity
+FRAMES_OFFSET, STAMPS_OFFSET, TAIL_OFFSET = PAIR.frames_offset, PAIR.stamps_offset, PAIR.tail_offset
+RECORD_SIZE = PAIR.size
+_BY_SIZE: Final = {layout_of(joints).size: layout_of(joints) for joints in range(1, MOST_JOINTS + 1)}
 
 FLAG_COMPLETE = 0x01
 """Every expected input of this cycle arrived before its deadline."""
@@ -41,7 +73,7 @@ FLAG_BEFORE_NEXT_SYNC = 0x04
 FLAG_SYNC_CONFIRMED = 0x08
 """The SYNC's own echo came back, so `sync_realtime_ns` is its send time on the wire and not the time of the call."""
 FLAG_WITHDRAWN = 0x10
-"""The estimate was not ready before the next SYNC was due: both joints were stale (`JointCycle.withdraw`)."""
+"""The estimate was not ready before the next SYNC was due: all joints were stale (`JointCycle.withdraw`)."""
 FLAG_RESET = 0x20
 """Latched faults were reset just before this cycle's estimate (`JointCycle.reset_latch`)."""
 
@@ -104,8 +136,8 @@ class JointRecord(NamedTuple):
     is no torque: of this cycle, of one not long ago, or latched."""
 
 
-def selection(header: Collection[str], joint: Collection[str]) -> struct.Struct:
-    """Layout that unpacks only these fields, from the start of a record: those of the header, then of joint 1 and 2.
+def selection(header: Collection[str], joint: Collection[str], joints: int = 2) -> struct.Struct:
+    """Layout that unpacks only these fields, from the start of a record: those of the header, then of joint 1 to `joints`.
 
     The values come in the order of the record. Raises ValueError for a field that the record does not have.
     """
@@ -113,7 +145,7 @@ def selection(header: Collection[str], joint: Collection[str]) -> struct.Struct:
     if unknown:
         raise ValueError(f"found {', '.join(sorted(unknown))}, expected fields of Header and JointRecord")
     one_joint = _selected(JOINT_FORMAT, JointRecord._fields, joint)
-    return struct.Struct("<" + _selected(HEADER_FORMAT, Header._fields, header) + 2 * one_joint)
+    return struct.Struct("<" + _selected(HEADER_FORMAT, Header._fields, header) + joints * one_joint)
 
 
 def _selected(layout: str, names: tuple[str, ...], wanted: Collection[str]) -> str:
@@ -131,16 +163,13 @@ def header_of(record: bytes | memoryview) -> Header:
 
 
 def joint_of(record: bytes | memoryview, joint: int) -> JointRecord:
-    """Block of joint 1 or 2 of one record."""
+    """Block of joint `joint`, from 1 on, of one record."""
     return JointRecord._make(JOINT.unpack_from(record, HEADER.size + (joint - 1) * JOINT.size))
 
 
 def frames_of(record: bytes | memoryview) -> list[tuple[bytes, int]]:
     """Frames of one record as (16 bytes of `struct can_frame`, CLOCK_REALTIME stamp in ns), in order of arrival."""
-    count = header_of(record).frame_count
-    stamps = struct.unpack_from(f"<{count}q", record, STAMPS_OFFSET)
-    view = memoryview(record)
-    return [
-        (bytes(view[FRAMES_OFFSET + 16 * n : FRAMES_OFFSET + 16 * n + 16]), stamp)
-        for n, stamp in enumerate(stamps)
-    ]
+    count, layout = header_of(record).frame_count, _BY_SIZE[len(record)]
+    stamps = struct.unpack_from(f"<{count}q", record, layout.stamps_offset)
+    view, start = memoryview(record), layout.frames_offset
+    return [(bytes(view[start + 16 * n : start + 16 * n + 16]), stamp) for n, stamp in enumerate(stamps)]

@@ -159,7 +159,7 @@ class About:
     period_us: int
     deadline_us: float
     heartbeat_ms: int
-    joints: tuple[AboutJoint, AboutJoint]
+    joints: tuple[AboutJoint, ...]
     sensor_node: int | None
     inputs: tuple[str, ...]
     """Names of the input PDOs in the order of the snapshot's `inputs`."""
@@ -200,8 +200,10 @@ def read_about(path: Path) -> About:
         content: Any = json.loads(path.read_text(encoding="utf-8"))
         if content.pop("schema") != SCHEMA:
             raise AboutError(f"{path}: written by another version of jtqd")
-        one, two = (AboutJoint(**each | {"inputs": tuple(each["inputs"])}) for each in content.pop("joints"))
-        return About(joints=(one, two), inputs=tuple(content.pop("inputs")), **content)
+        joints = tuple(
+            AboutJoint(**each | {"inputs": tuple(each["inputs"])}) for each in content.pop("joints")
+        )
+        return About(joints=joints, inputs=tuple(content.pop("inputs")), **content)
     except PermissionError:
         raise
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:

@@ -15,6 +15,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from jtqd.daemon.shared.cycle_record import MOST_JOINTS
+
 STATUS_CODES = 16
 MAX_NODE = 128
 
@@ -144,18 +146,18 @@ class View(NamedTuple):
     sync_realtime_ns: int
     period_s: float
     worst_load: float
-    joints: tuple[JointView, JointView]
+    joints: tuple[JointView, ...]
     counters: dict[str, int]
-    rmse_nm: tuple[float, float]
+    rmse_nm: tuple[float, ...]
     node_states: bytes
     unconfigured: tuple[int, ...]
     """Node-IDs that restarted and wait for their configuration."""
     sync_monotonic_ns: int = 0
     """CLOCK_MONOTONIC of the last cycle's SYNC; 0 before the first."""
-    status_since: tuple[int, int] = (0, 0)
+    status_since: tuple[int, ...] = (0, 0)
     """Cycle since which each joint has its status (seen every 8th cycle)."""
-    measured: tuple[Measured, Measured] = (NOT_MEASURED, NOT_MEASURED)
-    status_cycles: tuple[tuple[int, ...], tuple[int, ...]] = ((0,) * STATUS_CODES, (0,) * STATUS_CODES)
+    measured: tuple[Measured, ...] = (NOT_MEASURED, NOT_MEASURED)
+    status_cycles: tuple[tuple[int, ...], ...] = ((0,) * STATUS_CODES, (0,) * STATUS_CODES)
     """How many cycles each joint has spent in each status code."""
     inputs: tuple[InputView, ...] = ()
     node_heard_ns: tuple[int, ...] = (0,) * MAX_NODE
@@ -182,27 +184,28 @@ def quantiles(bins: tuple[int, ...], bin_ns: int, largest_ns: int, shares: tuple
 
 WORK_BINS, WORK_BIN_NS = 500, 4_000
 LATE_BINS, LATE_BIN_NS = 250, 4_000
-MAX_INPUTS = 8
-"""Two TPDOs of each drive and two sensor channels are six."""
+MAX_INPUTS = 16
+"""Two TPDOs of each of four drives and two sensor channels are ten."""
 
-_MAGIC = 0x4A54_5144_5354_4106  # "JTQDSTA", layout 6
-_HEAD = struct.Struct("<QQdd")
+_MAGIC = 0x4A54_5144_5354_4107  # "JTQDSTA", layout 7
+_HEAD = struct.Struct("<QQddQ")
+"""Magic number, process, period [s], worst load, number of joints."""
 JOINT = struct.Struct("<6dHBBHH")
-_ESTIMATE = struct.Struct("<qQqq2q")
-_MEASURED = struct.Struct("<12d")
+_ESTIMATE = struct.Struct(f"<qQqq{MOST_JOINTS}q")
+_MEASURED = struct.Struct("<6d")
 INPUT = struct.Struct("<12q")
 """An `InputView`."""
-_ORDERS_OFFSET = 32
+_ORDERS_OFFSET = _HEAD.size
 _COUNTERS_OFFSET = _ORDERS_OFFSET + 5 * 8
 _SEQUENCE_OFFSET = _COUNTERS_OFFSET + 8 * len(COUNTERS)
 _ESTIMATE_OFFSET = _SEQUENCE_OFFSET + 8
-ESTIMATE_SIZE = _ESTIMATE.size + 2 * JOINT.size + _MEASURED.size
-_MEASURED_OFFSET = _ESTIMATE_OFFSET + _ESTIMATE.size + 2 * JOINT.size
-_ERRORS_OFFSET = _MEASURED_OFFSET + _MEASURED.size
-_WORK_OFFSET = _ERRORS_OFFSET + 4 * 8
+ESTIMATE_SIZE = _ESTIMATE.size + MOST_JOINTS * (JOINT.size + _MEASURED.size)
+_MEASURED_OFFSET = _ESTIMATE_OFFSET + _ESTIMATE.size + MOST_JOINTS * JOINT.size
+_ERRORS_OFFSET = _MEASURED_OFFSET + MOST_JOINTS * _MEASURED.size
+_WORK_OFFSET = _ERRORS_OFFSET + MOST_JOINTS * 2 * 8
 _LATE_OFFSET = _WORK_OFFSET + 8 * WORK_BINS
 _STATUS_OFFSET = _LATE_OFFSET + 8 * LATE_BINS
-_INPUTS_OFFSET = _STATUS_OFFSET + 8 * 2 * STATUS_CODES
+_INPUTS_OFFSET = _STATUS_OFFSET + 8 * MOST_JOINTS * STATUS_CODES
 _HEARD_OFFSET = _INPUTS_OFFSET + INPUT.size * MAX_INPUTS
 _NODES_OFFSET = _HEARD_OFFSET + 8 * MAX_NODE
 _CONFIGURED_OFFSET = _NODES_OFFSET + MAX_NODE
@@ -226,14 +229,16 @@ class SnapshotError(Exception):
 class Snapshot:
     """Writer's side, one per loop: the memory that `daemon/core/counters.pyx` writes into.
 
+    It has room for four joints; `joints` says how many there are.
+
     Attributes:
         orders: requests of the supervisor and what became of them: [resets asked, done, doubts reported, seen,
             turns of the supervisor].
         counters: memory of the counters, one unsigned 64-bit word each, in the order of `COUNTERS`.
         work: histogram of the work per cycle, `WORK_BIN_NS` per bin, the last bin takes the rest.
         late: histogram of the SYNC's lateness, `LATE_BIN_NS` per bin.
-        errors: sum of squared errors and number of samples of each joint: [sum 1, n 1, sum 2, n 2].
-        status_cycles: cycles that joint 1 has spent in each of the 16 status codes, then joint 2.
+        errors: sum of squared errors and number of samples of each joint: [sum 1, n 1, sum 2, n 2, ...].
+        status_cycles: cycles that joint 1 has spent in each of the 16 status codes, then joint 2, ...
         inputs: one `INPUT` for each input PDO.
         node_states: last heartbeat state of each node-ID.
         node_heard: kernel stamp of that heartbeat [ns].
@@ -243,16 +248,17 @@ class Snapshot:
         configured_for: of each node-ID, the `restarts` after which it was last configured; written by the supervisor.
         doubts: number of times each node-ID was found to be configured otherwise; written by the supervisor.
         sequence: odd while the snapshot is being written.
-        estimate: the last estimate: times, status, `JointView` and `Measured` of both joints.
+        estimate: the last estimate: times, status, `JointView` and `Measured` of all joints.
     """
 
-    def __init__(self, path: Path, period_s: float, worst_load: float) -> None:
+    def __init__(self, path: Path, period_s: float, worst_load: float, joints: int = 2) -> None:
+        self.joints = joints
         temporary = path.with_name(path.name + ".new")
         with open(temporary, "w+b") as file:
             os.fchmod(file.fileno(), 0o640)  # the daemon's group may look
             os.posix_fallocate(file.fileno(), 0, SIZE)  # a full tmpfs refuses here, not by SIGBUS
             self._memory = mmap.mmap(file.fileno(), 0)
-        _HEAD.pack_into(self._memory, 0, _MAGIC, os.getpid(), period_s, worst_load)
+        _HEAD.pack_into(self._memory, 0, _MAGIC, os.getpid(), period_s, worst_load, joints)
         os.replace(temporary, path)
         view = memoryview(self._memory)
         self.orders = view[_ORDERS_OFFSET:_COUNTERS_OFFSET].cast("Q")
@@ -313,22 +319,26 @@ class SnapshotReader:
 
     def _view(self) -> View:
         memory = self._memory
-        _, pid, period_s, worst_load = _HEAD.unpack_from(memory, 0)
+        _, pid, period_s, worst_load, count = _HEAD.unpack_from(memory, 0)
         block = memory[_ESTIMATE_OFFSET:_ERRORS_OFFSET]
         index, sync_counter, realtime_ns, monotonic_ns, *since = _ESTIMATE.unpack_from(block, 0)
-        measured = _MEASURED.unpack_from(block, _MEASURED_OFFSET - _ESTIMATE_OFFSET)
+        numbers = range(count)
         joints = tuple(
-            JointView._make(JOINT.unpack_from(block, _ESTIMATE.size + n * JOINT.size)) for n in range(2)
+            JointView._make(JOINT.unpack_from(block, _ESTIMATE.size + n * JOINT.size)) for n in numbers
+        )
+        first = _MEASURED_OFFSET - _ESTIMATE_OFFSET
+        measured = tuple(
+            Measured._make(_MEASURED.unpack_from(block, first + n * _MEASURED.size)) for n in numbers
         )
         words = struct.unpack_from(f"<{len(COUNTERS)}Q", memory, _COUNTERS_OFFSET)
-        cycles = struct.unpack_from(f"<{2 * STATUS_CODES}Q", memory, _STATUS_OFFSET)
+        cycles = struct.unpack_from(f"<{count * STATUS_CODES}Q", memory, _STATUS_OFFSET)
         inputs = (
             InputView._make(INPUT.unpack_from(memory, _INPUTS_OFFSET + n * INPUT.size))
             for n in range(MAX_INPUTS)
         )
-        sums = struct.unpack_from("<4d", memory, _ERRORS_OFFSET)
+        sums = struct.unpack_from(f"<{2 * count}d", memory, _ERRORS_OFFSET)
         rmse = tuple(
-            (sums[2 * n] / sums[2 * n + 1]) ** 0.5 if sums[2 * n + 1] else float("nan") for n in range(2)
+            (sums[2 * n] / sums[2 * n + 1]) ** 0.5 if sums[2 * n + 1] else float("nan") for n in numbers
         )
         return View(
             pid,
@@ -337,15 +347,15 @@ class SnapshotReader:
             realtime_ns,
             period_s,
             worst_load,
-            (joints[0], joints[1]),
+            joints,
             dict(zip(COUNTERS, words, strict=True)),
-            (rmse[0], rmse[1]),
+            rmse,
             bytes(memory[_NODES_OFFSET:_CONFIGURED_OFFSET]),
             tuple(node for node, flag in enumerate(memory[_UNCONFIGURED_OFFSET:_FACTORS_OFFSET]) if flag),
             monotonic_ns,
-            (since[0], since[1]),
-            (Measured._make(measured[:6]), Measured._make(measured[6:])),
-            (cycles[:STATUS_CODES], cycles[STATUS_CODES:]),
+            tuple(since[:count]),
+            measured,
+            tuple(cycles[n * STATUS_CODES : (n + 1) * STATUS_CODES] for n in numbers),
             tuple(each for each in inputs if any(each)),
             struct.unpack_from(f"<{MAX_NODE}q", memory, _HEARD_OFFSET),
             struct.unpack_from(f"<{MAX_NODE}Q", memory, _RESTARTS_OFFSET),

@@ -15,7 +15,6 @@ from jtqd.daemon.shared.runtime_dir import About, AboutJoint, start_ticks, versi
 def about(config: Config, *, bus: str, instance: str, log_directory: Path | None) -> About:
     """Describe this process: a daemon on `bus` that logs to `log_directory` (None: nowhere)."""
     names = tuple(pdo.name for pdo in input_pdos(config))
-    one, two = (_joint(config, number, joint, names) for number, joint in enumerate(config.joints))
     return About(
         bus=bus,
         instance=instance,
@@ -30,7 +29,7 @@ def about(config: Config, *, bus: str, instance: str, log_directory: Path | None
         period_us=config.period_ns // 1000,
         deadline_us=config.input_deadline_ns / 1000,
         heartbeat_ms=config.heartbeat_ms,
-        joints=(one, two),
+        joints=tuple(_joint(config, number, joint, names) for number, joint in enumerate(config.joints)),
         sensor_node=config.sensor.node_id if config.sensor else None,
         inputs=names,
         log_directory=str(log_directory.resolve()) if log_directory else None,

@@ -53,7 +53,7 @@ _COUNTED = {counter: row for counter, row in SHOWN_BY_COUNTERS.items() if counte
 
 
 def joint_subjects(config: Config) -> tuple[Subject, ...]:
-    """Joint 1 and 2."""
+    """Return the joints, joint 1 first."""
     return tuple(
         Subject(f"joint {joint.number}", joint.node_id, joints=1 << n)
         for n, joint in enumerate(config.joints)

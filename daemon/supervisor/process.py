@@ -101,7 +101,11 @@ def start_bench(config: Config, bus: str, start_child: StartChild) -> Child:
     """Start the emulated bench on `bus` ("unix:PATH"). Raises SupervisorError."""
     path = Path(bus.removeprefix("unix:"))
     path.unlink(missing_ok=True)
-    bench = start_child("jtqd.sim_can", ["--bus", bus], "the emulated bench")
+    arguments = ["--bus", bus]
+    if len(config.joints) != 2:
+        arguments += ["--drives", str(len(config.joints))]
+        arguments += [] if config.sensor else ["--no-sensor"]
+    bench = start_child("jtqd.sim_can", arguments, "the emulated bench")
     deadline = time.monotonic() + _WARM_UP_TIMEOUT_S
     while not path.exists():
         if not bench.alive():

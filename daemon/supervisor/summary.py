@@ -29,7 +29,7 @@ class Summary:
     stale_inputs: int
     work_us: tuple[float, float, float]
     late_us: tuple[float, float, float]
-    rmse_nm: tuple[float, float]
+    rmse_nm: tuple[float, ...]
     counters: dict[str, int]
     refused: tuple[str, ...]
     recording: dict[str, Any] | None
@@ -56,8 +56,8 @@ class Summary:
             "stale_inputs": self.stale_inputs,
             "work_us": dict(zip(("p50", "p99", "max"), map(finite, self.work_us), strict=True)),
             "late_us": dict(zip(("p50", "p99", "max"), map(finite, self.late_us), strict=True)),
-            "rmse_nm": {"joint_1": finite(self.rmse_nm[0]), "joint_2": finite(self.rmse_nm[1])},
-            "deviations": {"joint_1": self._deviations(1), "joint_2": self._deviations(2)},
+            "rmse_nm": {f"joint_{n}": finite(rmse) for n, rmse in enumerate(self.rmse_nm, start=1)},
+            "deviations": {f"joint_{n}": self._deviations(n) for n in range(1, len(self.rmse_nm) + 1)},
             "conditions": [
                 each._asdict() | {"total_s": round(each.total_s, 3), "first_s": round(each.first_s, 3)}
                 for each in self.conditions

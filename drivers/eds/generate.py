@@ -1,25 +1,35 @@
-"""Write drive.eds, torque_sensor.eds and jtqd.eds beside this file: `python -m jtqd.drivers.eds.generate`.
+"""Write drive.eds, torque_sensor.eds, jtqd.eds and jtqd4.eds beside this file: `python -m jtqd.drivers.eds.generate`.
 
 The files are what ships and what a configuration tool reads; the tables at the end of this module are how they are kept
 right, and a test compares the two. From parts up: the description of objects, the writer (CiA 306), objects of the
-communication profile that the sheets share (CiA 301, 1000h..1FFFh), the three sheets. The vendor number is an emulation's,
+communication profile that the sheets share (CiA 301, 1000h..1FFFh), the sheets. The vendor number is an emulation's,
 not one that CiA has assigned: a real drive or sensor brings its own EDS.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from jtqd.drivers.devices import estimate_tpdo
-from jtqd.drivers.eds.own_objects import BUS_FIELDS, COUNTERS, JOINT_PARAMETERS, NODES, VERSION
+from jtqd.drivers.devices import ESTIMATE_BASES, estimate_tpdos
+from jtqd.drivers.eds.own_objects import (
+    BUS_FIELDS,
+    COUNTERS,
+    JOINT_PARAMETERS,
+    PARAMETERS,
+    ROOM,
+    VERSION,
+    own_sheet,
+)
 from jtqd.drivers.pdo import NO_RTR
 
 FOLDER = Path(__file__).parent
 VENDOR = 0x07A1
 REVISION = 0x0001_0000  # major 1 (CANopen behaviour), minor 0
+FOUR_JOINTS = 0x0002_0000  # of jtqd with a second estimate PDO
 I8, I16, I32, U8, U16, U32, REAL32, TEXT = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x09
 VAR, ARRAY, RECORD = 7, 8, 9
 BIT_RATES = (10, 20, 50, 125, 250, 500, 800, 1000)
@@ -431,42 +441,55 @@ def torque_sensor() -> Sheet:
     )
 
 
-def jtqd() -> Sheet:
-    """Return the sheet of the daemon's own node: SYNC producer with the estimate as its only PDO."""
-    joints = [("Joint 1", 0), ("Joint 2", 0)]
-    nodes = [(name, 0) for name in ("Joint 1", "Joint 2", "Sensor")]
+def jtqd(room: int = ROOM[0]) -> Sheet:
+    """Return the sheet of the daemon's own node: SYNC producer with the estimates of up to `room` joints as its PDOs."""
+    revision = REVISION if room == ROOM[0] else FOUR_JOINTS
+    names = [f"Joint {number}" for number in range(1, room + 1)]
+    joints = [(name, 0) for name in names]
+    nodes = [*joints, ("Sensor", 0)]
+    estimates: dict[int, Var | Entries] = {}
+    for number, (pdo, base) in enumerate(zip(estimate_tpdos(room), ESTIMATE_BASES, strict=False), start=1):
+        estimates |= tpdo(number, base, pdo.words, transmission=1, fixed=True)
+    more: dict[int, Var | Entries] = {}
+    if room > ROOM[0]:
+        more[0x2105] = Var(
+            "Estimate status of joints 3 and 4",
+            U8,
+            "ro",
+            0,
+            pdo=True,
+            comment="low nibble joint 3, high nibble joint 4",
+        )
+    for joint, index in enumerate(PARAMETERS[:room], start=1):
+        title = f"Parameters of joint {joint}"
+        more[index] = array(title, REAL32, "ro", [(name, 0.0) for name in JOINT_PARAMETERS])
     objects: dict[int, Var | Entries] = {
         **device(0, "jtqd", "none", VERSION),
         **errors(behaviour_access="const", behaviour=1, inhibit=100),
         0x1005: Var("COB-ID SYNC message", U32, "const", SYNC_PRODUCER + 0x80),
         0x1006: Var("Communication cycle period", U32, "const", 1000, comment="us"),
-        0x1016: array("Consumer heartbeat time", U32, "ro", [(f"Node {n}", 0) for n in range(1, NODES + 1)]),
+        0x1016: array(
+            "Consumer heartbeat time", U32, "ro", [(f"Node {n}", 0) for n in range(1, len(nodes) + 1)]
+        ),
         0x1017: Var("Producer heartbeat time", U16, "const", 100, comment="ms"),
-        **identity(VENDOR, 0x001, REVISION),
+        **identity(VENDOR, 0x001, revision),
         0x1019: Var("Synchronous counter overflow value", U8, "const", 240, low=0, high=240),
         **verify_configuration("ro"),
         **sdo_server(),
-        **tpdo(
-            1,
-            0x180,
-            estimate_tpdo().words,
-            transmission=1,
-            fixed=True,
-        ),
+        **estimates,
         0x2100: array("Estimated torque", I16, "ro", joints, pdo=True),
-        0x2101: array("Standard deviation", U8, "ro", [("Joint 1", 255), ("Joint 2", 255)], pdo=True),
+        0x2101: array("Standard deviation", U8, "ro", [(name, 255) for name in names], pdo=True),
         0x2102: Var(
             "Estimate status", U8, "ro", 0, pdo=True, comment="low nibble joint 1, high nibble joint 2"
         ),
         0x2103: Var("Estimate sequence", U8, "ro", 0, pdo=True, comment="SYNC counter of the inputs, 1..240"),
-        0x2104: array("Latched faults", U16, "ro", [("Joint 1", 0), ("Joint 2", 0)]),
+        0x2104: array("Latched faults", U16, "ro", joints),
         0x2110: Var(
             "Reset latched faults", U8, "rw", 0, low=0, high=1, comment="write 1; read: 1 not done yet"
         ),
         0x2200: array("Counters", U32, "ro", [(name, 0) for name in COUNTERS]),
         0x2201: array("Cycle time", U32, "ro", [("p50_us", 0), ("p99_us", 0), ("max_us", 0)]),
-        0x2202: array("Parameters of joint 1", REAL32, "ro", [(name, 0.0) for name in JOINT_PARAMETERS]),
-        0x2203: array("Parameters of joint 2", REAL32, "ro", [(name, 0.0) for name in JOINT_PARAMETERS]),
+        **more,
         0x2204: Var("Configuration hash", TEXT, "ro", ""),
         0x2205: array("Bus state", U32, "ro", [(name, 0) for name in BUS_FIELDS]),
         0x2206: array("Nodes", U32, "ro", nodes),
@@ -480,14 +503,16 @@ def jtqd() -> Sheet:
         "2206h: NMT state, heartbeat (1 awaited, 2 heard, 3 lost), configured, node-ID; from the lowest byte.",
         "2207h: error code (2 bytes), error register, number of messages.",
     ]
-    return Sheet("jtqd.eds", "joint torque estimator daemon", "jtqd", 0x001, REVISION, "JTQD", objects, note)
+    return Sheet(
+        own_sheet(room), "joint torque estimator daemon", "jtqd", 0x001, revision, "JTQD", objects, note
+    )
 
 
-SHEETS = (drive, torque_sensor, jtqd)
+SHEETS: tuple[Callable[[], Sheet], ...] = (drive, torque_sensor, *(partial(jtqd, room) for room in ROOM))
 
 
 def main() -> int:
-    """Write the three files; there are no arguments."""
+    """Write the files; there are no arguments."""
     if len(sys.argv) > 1:
         print(
             "usage: python -m jtqd.drivers.eds.generate   (writes the data sheets beside this file)",

@@ -1,4 +1,4 @@
-"""Sub-indices of jtqd's own objects 2200h..2207h by name: one list for the data sheet and for the daemon."""
+"""Sub-indices of jtqd's own objects 2200h..2209h by name: one list for the data sheet and for the daemon."""
 
 COUNTERS = (
     "cycles",
@@ -59,8 +59,22 @@ BUS_FIELDS = (
 """Sub-indices 1.. of 2205h (`daemon/bus/errors.py`): state 0 error active, 1 warning, 2 passive, 3 bus-off, 4
 interface down; the controller's two error counters as last reported; then how often each error has occurred."""
 
-NODES = 3
-"""Nodes of a bus: joint 1, joint 2, the sensor. Sub-indices 1.. of 1016h, 2206h and 2207h."""
+ROOM = (2, 4)
+"""Joints for which a data sheet of jtqd has room: jtqd.eds and jtqd4.eds."""
+
+
+def room_for(joints: int) -> int:
+    """Return the room of the data sheet for a bus with so many joints."""
+    return min(room for room in ROOM if room >= joints)
+
+
+def own_sheet(joints: int) -> str:
+    """Return the file name of the data sheet for a bus with so many joints."""
+    return "jtqd.eds" if room_for(joints) == ROOM[0] else f"jtqd{room_for(joints)}.eds"
+
+
+PARAMETERS = (0x2202, 0x2203, 0x2208, 0x2209)
+"""Objects with the parameters of joint 1, 2, 3, 4. Nodes (1016h, 2206h, 2207h) stand in this order: joints, sensor."""
 VERSION = "0.2.0"
 """100Ah."""
 
@@ -72,4 +86,4 @@ JOINT_PARAMETERS = (
     "damping_nms_per_rad",
     "rated_torque_nm",
 )
-"""Sub-indices 1.. of 2202h (joint 1) and 2203h (joint 2): fields of the joint file."""
+"""Sub-indices 1.. of `PARAMETERS`: fields of the joint file."""

@@ -51,10 +51,16 @@ class BenchConfig:
         path = path if path is not None else shipped(DEFAULT_CONFIG)
         mapping = load_yaml(path)
         top = Section(mapping, str(path))
+        joints = [name for name in (f"joint_{number}" for number in range(1, 5)) if top.has(name)]
+        if joints != ["joint_1", "joint_2"]:
+            raise ConfigError(
+                f"{path}: found {', '.join(joints) or 'no joint'}, expected joint_1 and joint_2: a campaign moves two "
+                "joints that are coupled, and no others may be on the bus"
+            )
         sync = top.section("sync", optional=True)
         if sync is not None:
             sync.integer("period_us", low=PERIOD_US, high=PERIOD_US, default=PERIOD_US)
-        sections = [top.required(f"joint_{number}") for number in (1, 2)]
+        sections = [top.required(name) for name in joints]
         files = [load_joint(path.parent / joint.text("file")) for joint in sections]
         nodes = [_node(joint, "drive") for joint in sections]
         sensor = top.section("sensor", optional=True)

@@ -19,7 +19,7 @@ BENCH = yaml.safe_load(shipped("bench.yaml").read_text())
 def write(directory: Path, change: Any) -> Path:
     content = yaml.safe_load(yaml.safe_dump(BENCH))
     change(content)
-    for joint in ("joint_1", "joint_2"):
+    for joint in ("joint_1", "joint_2", "joint_3", "joint_4"):
         if isinstance(content.get(joint), dict):
             content[joint]["file"] = str(shipped(content[joint].get("file", "joint1.yaml")))
             network = content[joint].get("network")
@@ -85,6 +85,31 @@ def drop(key: str) -> Any:
     return change
 
 
+def move(key: str, other: str) -> Any:
+    def change(content: dict[str, Any]) -> None:
+        content[other] = content.pop(key)
+
+    return change
+
+
+@pytest.mark.parametrize("joints", [1, 2, 3, 4])
+def test_a_bus_has_one_to_four_joints(tmp_path: Path, joints: int) -> None:
+    def change(content: dict[str, Any]) -> None:
+        content["sync"] = {"period_us": 2000}
+        del content["inputs"]
+        first = yaml.safe_load(yaml.safe_dump(content["joint_1"]))
+        for number in range(1, 5):
+            content.pop(f"joint_{number}", None)
+            if number <= joints:
+                content[f"joint_{number}"] = yaml.safe_load(yaml.safe_dump({**first, "node": number}))
+        content["sensor"]["node"] = 9
+
+    config = load_config(write(tmp_path, change))
+    assert [(joint.number, joint.node_id) for joint in config.joints] == [
+        (n, n) for n in range(1, joints + 1)
+    ]
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -93,7 +118,9 @@ def drop(key: str) -> Any:
         (put("sync.counter_overflow", 1), ["sync.counter_overflow", "found 1"]),
         (put("estimator.method", "magic"), ["estimator.method", "'magic'", "network"]),
         (put("estimator.bandwidth_rad_s", -5), ["estimator.bandwidth_rad_s", "-5", "rad/s"]),
-        (drop("joint_2"), ["joint_2", "missing"]),
+        (drop("joint_1"), ["joint_1", "missing"]),
+        (move("joint_2", "joint_3"), ["joint_2", "none", "joint_1 to joint_2 without a gap"]),
+        (move("joint_2", "joint_5"), ["joint_5", "unknown"]),
         (put("joint_1.sensor_channel", 2), ["joint_1.sensor_channel", "found 2"]),
         (put("joint_2.node", 1), ["joint_2.node", "found 1", "joint_1.node"]),
         (put("sensor.node", 32), ["sensor.node", "32", "node_id"]),

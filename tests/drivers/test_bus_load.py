@@ -11,7 +11,7 @@ from jtqd.drivers.bus_load import (
     sync_row,
     temperature_row,
 )
-from jtqd.drivers.devices import drive_tpdo1, estimate_tpdo
+from jtqd.drivers.devices import drive_tpdo1, estimate_tpdos
 from jtqd.drivers.pdo import PdoMap
 
 
@@ -65,7 +65,7 @@ def test_event_driven_pdos_have_no_bound(kind):
 
 
 def test_duplicate_identifiers_are_named():
-    rows = (pdo_row("jtqd", estimate_tpdo()), Row(0x1A0, "a foreign node", 1))
+    rows = (pdo_row("jtqd", estimate_tpdos(2)[0]), Row(0x1A0, "a foreign node", 1))
     with pytest.raises(BusLoadError, match="COB-ID 1A0h is used twice: jtqd and a foreign node"):
         check_bus_load(BusLoad(rows))
 

@@ -12,7 +12,7 @@ from jtqd.drivers.devices import (
     drive_tpdo1,
     drive_tpdo2,
     drive_tpdo3,
-    estimate_tpdo,
+    estimate_tpdos,
     parse_key,
     sensor_scaling,
     sensor_tpdo1,
@@ -49,7 +49,7 @@ def test_maps_are_those_of_the_bus_layout():
 
 
 def test_estimate_frame_byte_by_byte():
-    pdo = estimate_tpdo()
+    pdo = estimate_tpdos(2)[0]
     assert pdo.cob_id == 0x1A0
     # -12.34 Nm, none (8000h), sigma 0.05 * 7, unknown, joint 1 valid (2), joint 2 stale (4), SYNC 240
     frame = bytes.fromhex("2E FB  00 80  07 FF  42  F0")

@@ -230,15 +230,39 @@ def test_the_budget_leaves_time_for_the_second_joint() -> None:
     budget = NetworkBudget()
     now = 0
     for _ in range(3):
-        assert budget.first(now, now + MS)
-        assert budget.second(now + 300_000)
+        budget.begin(now + MS)
+        assert budget.wanted(0, now)
+        assert budget.wanted(1, now + 300_000)
         budget.ended(now + 600_000)
         now += MS
     left = MS - RESERVED_NS
-    assert budget.first(now, now + MS)
-    assert not budget.first(now + left - 599_999, now + MS)
-    assert budget.second(now + left - 300_000)
-    assert not budget.second(now + left - 299_999)
+    budget.begin(now + MS)
+    assert budget.wanted(0, now)
+    budget.begin(now + MS)
+    assert not budget.wanted(0, now + left - 599_999)
+    assert budget.wanted(1, now + left - 300_000)
+    budget.begin(now + MS)
+    budget.wanted(0, now)
+    assert not budget.wanted(1, now + left - 299_999)
+
+
+@pytest.mark.parametrize("joints", [1, 2, 3, 4])
+def test_every_joint_leaves_time_for_those_after_it(joints: int) -> None:
+    budget, now = NetworkBudget(joints), 0
+    for _ in range(3):
+        budget.begin(now + MS)
+        for joint in range(joints):
+            assert budget.wanted(joint, now + joint * 100_000)
+        budget.ended(now + joints * 100_000)
+        now += MS
+    latest = now + MS - RESERVED_NS
+    for joint in range(joints):
+        left = (joints - joint) * 100_000
+        for start, wanted in ((latest - left, True), (latest - left + 1, False)):
+            budget.begin(now + MS)
+            for before in range(joint):
+                budget.wanted(before, now)
+            assert budget.wanted(joint, start) is wanted
 
 
 def replay(records: list[bytes], clock: ExactTime) -> Iterator[tuple[float, ...]]:

@@ -108,7 +108,7 @@ def test_rows_are_what_the_joints_make_of_each_cycle(seed: int) -> None:
             samples[n].append(joint.sample)
         pdos += estimate_pdo.encode(joints[0].published, joints[1].published, int(given["counter"][row]))
     again, others = made()
-    rows = CycleRows(again, *others, **given)
+    rows = CycleRows(again, others, **given)
     for first, end in ((0, 1), (1, 700), (700, 700), (700, ROWS)):
         rows.go_on(first, end)
     for n in (0, 1):
@@ -128,8 +128,8 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
         given = log(1)
         given[key] = given[key][..., :-1]
         with pytest.raises(ValueError, match="found an array of shape"):
-            CycleRows(intake, *joints, **given)
-    rows = CycleRows(intake, *joints, **log(1))
+            CycleRows(intake, joints, **given)
+    rows = CycleRows(intake, joints, **log(1))
     for first, end in ((-1, 3), (5, 3), (0, ROWS + 1)):
         with pytest.raises(ValueError, match=f"found rows {first} to {end}"):
             rows.go_on(first, end)

@@ -134,6 +134,7 @@ def bench_config(folder: Path, **changes: object) -> Path:
         ({"sync": {"period_us": 2000}}, ["sync.period_us", "2000"]),
         ({"sensor": {"node": 2, "channels": 1}}, ["bench.yaml", "different node numbers"]),
         ({"joint_1": {"node": 1, "file": "none.yaml"}}, ["none.yaml"]),
+        ({"joint_3": {"node": 4, "file": "none.yaml"}}, ["joint_3", "expected joint_1 and joint_2"]),
     ],
 )
 def test_a_bench_that_cannot_carry_it_is_refused(
