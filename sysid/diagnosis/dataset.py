@@ -159,6 +159,22 @@ def usable_signals(
     return out, reasons
 
 
+def resolution_notes(signals: Sequence[Sequence[JointSignals]]) -> list[str]:
+    """Return what the resolution of the recordings costs, one line per joint: of the run where it costs most."""
+    worst: dict[int, tuple[float, str]] = {}
+    count: dict[int, int] = {}
+    for run in signals:
+        for s in run:
+            if s.coarse:
+                count[s.number] = count.get(s.number, 0) + 1
+                new = s.visible.slowest_hz, f"{s.run}: j{s.number}.{s.coarse}"
+                worst[s.number] = min(worst.get(s.number, new), new)
+    return [
+        text + (f" (so in {counted(count[n], 'run')})" if count[n] > 1 else "")
+        for n, (_, text) in sorted(worst.items())
+    ]
+
+
 def _same_balances(runs: list[list[JointSignals]]) -> None:
     """Leave out the torsion balance of a joint that not every run has: what is stacked must be there in all."""
     lacking = {s.number for run in runs for s in run if s.torsion_nm is None}

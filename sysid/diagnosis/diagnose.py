@@ -16,7 +16,7 @@ from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
 from jtqd.sysid.diagnosis.current_zero import unpowered_columns, with_readings
-from jtqd.sysid.diagnosis.dataset import Dataset, build_dataset, usable_signals
+from jtqd.sysid.diagnosis.dataset import Dataset, build_dataset, resolution_notes, usable_signals
 from jtqd.sysid.diagnosis.evidence import RELEVANT
 from jtqd.sysid.diagnosis.findings import (
     AMBIGUOUS,
@@ -83,7 +83,7 @@ def _diagnosed(
         noise, search, best = _searched(dataset, least)
         refined = refine(dataset, present_effects(best), noise)
     findings = conclude(dataset, search, best, refined, noise, joints, names, numbers)
-    return replace(findings, channel_notes=tuple(reasons))
+    return replace(findings, channel_notes=(*reasons, *resolution_notes(usable)))
 
 
 def one_sensor(runs: Sequence[tuple[str, RunTable]], numbers: Sequence[int]) -> bool:

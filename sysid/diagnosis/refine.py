@@ -198,13 +198,14 @@ def _run_at(
             for balance in (MOTOR, TORSION):
                 channel = Channel(s.number, balance)
                 if channel in left and balance in here:
-                    left[channel] = left[channel] - binned(here[balance], samples)
+                    left[channel] = left[channel] - binned(s.seen(balance, here[balance]), samples)
             for k, name in enumerate(p.free):
                 size = _step_size(p, name)
                 there = _contribution(p, s, {**p.values, name: p.values[name] + size})
                 for balance, value in there.items():
                     slope = (value - here[balance]) / size
-                    columns[Channel(s.number, balance)].append((place + k, binned(slope, samples)))
+                    seen = binned(s.seen(balance, slope), samples)
+                    columns[Channel(s.number, balance)].append((place + k, seen))
         place += len(p.free)
     channels = {}
     for c, d in base.channels.items():

@@ -219,12 +219,12 @@ def run_data(
             residual = s.motor_nm if balance == MOTOR else s.torsion_nm
             if residual is None:
                 continue
-            valid = all_in_bin(s.moving if balance == MOTOR else np.ones(len(residual), bool), samples)
+            valid = all_in_bin(s.usable(balance), samples)
             nuisances = [(k, _nuisance(s, balance, g)) for k, g in enumerate(groups)]
-            there = [(k, binned(c, samples)) for k, c in nuisances if c is not None]
+            there = [(k, binned(s.seen(balance, c), samples)) for k, c in nuisances if c is not None]
             channels[Channel(s.number, balance)] = ChannelData(
                 valid,
-                binned(residual, samples),
+                binned(s.seen(balance, residual), samples),
                 np.empty((len(valid), 0)),
                 np.empty(0, np.intp),
                 np.column_stack([c for _, c in there]),
@@ -249,7 +249,8 @@ def _fill(
                 continue
             for column, p in zip(candidate.columns, candidate.term.basis, strict=True):
                 for balance, value in contribution(candidate.effect, p, s).items():
-                    found[Channel(s.number, balance)].append((column, binned(value, samples)))
+                    seen = binned(s.seen(balance, value), samples)
+                    found[Channel(s.number, balance)].append((column, seen))
     for channel, columns in found.items():
         if columns:
             channels[channel].index = np.array([k for k, _ in columns], np.intp)

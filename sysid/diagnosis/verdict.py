@@ -223,7 +223,7 @@ def _rms_at(dataset: Dataset, present: PresentEffect) -> dict[Channel, float]:
                 continue
             for balance, value in contribution(present.effect, present.values, s).items():
                 channel = Channel(s.number, balance)
-                part = binned(value, dataset.samples)[data.channels[channel].valid]
+                part = binned(s.seen(balance, value), dataset.samples)[data.channels[channel].valid]
                 if balance == "torsion" and len(part):
                     part = part - part.mean()
                 total = sums.setdefault(channel, [0.0, 0.0])
