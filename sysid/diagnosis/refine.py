@@ -216,6 +216,24 @@ def _run_at(
     return RunData(base.name, base.time_s, channels, base.axes)
 
 
+def contributions(dataset: Dataset, present: PresentEffect) -> dict[Channel, list[FloatArray]]:
+    """Return what one cause contributes to each channel, over the valid bins of each run [run][n], Nm; a constant in torsion
+    is none.
+    """
+    out: dict[Channel, list[FloatArray]] = {}
+    for run, data in zip(dataset.signals, dataset.runs, strict=True):
+        for s in run:
+            if present.joint not in ("sensor", s.number):
+                continue
+            for balance, value in contribution(present.effect, present.values, s).items():
+                channel = Channel(s.number, balance)
+                part = binned(s.seen(balance, value), dataset.samples)[data.channels[channel].valid]
+                if balance == TORSION and len(part):
+                    part = part - part.mean()
+                out.setdefault(channel, []).append(part)
+    return out
+
+
 def _unpowered(present: Sequence[PresentEffect], joints: Mapping[int, Joint]) -> list[UnpoweredColumn]:
     """Return what the causes read without power: the derivatives by the free parameters, and off the residual."""
     out: list[UnpoweredColumn] = []

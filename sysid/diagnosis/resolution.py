@@ -1,16 +1,17 @@
 """How finely a recorded channel is resolved, what that costs in an acceleration, and the filter that goes with it.
 
-Recorders keep seven significant digits, single precision, fixed decimals or counts. Of a motor position beyond 1000 rad seven
-digits leave steps of 1 mrad, whose second difference is noise of some newton metres at the joint, and which at the start
-of the run were a hundred times finer. So the steps are estimated from the values, each binade of them for itself (the steps
-of digits and of single precision grow with the value), and where an acceleration of them would be coarse, the balance that
-holds it is looked at below a cutoff only: residual and regressors alike, sample by sample the same linear filter, so
-that nothing is compared with something filtered in another way. The regressors of inertias are filtered further: noise of an
-acceleration that is in residual and regressor alike would be explained by itself.
+Recorders keep seven significant digits, single precision, fixed decimals or counts. Of a motor position beyond 1000 rad
+seven digits leave steps of 1 mrad, whose second difference is noise of some newton metres at the joint, and which at the
+start of the run were a hundred times finer. So the steps are estimated from the values, for each magnitude by itself (the
+steps of digits and of single precision grow with the value). Where an acceleration of them would be coarse, the balance
+that holds it is looked at below a cutoff only: residual and regressors alike through the same linear filter, sample by
+sample, so that nothing is compared with something filtered in another way. The regressors of inertias are filtered further:
+noise of an acceleration that is in residual and regressor alike would be explained by itself.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Final
@@ -68,8 +69,8 @@ def described(x: FloatArray, unit: str) -> str:
 
 
 def noise_of(x: FloatArray) -> FloatArray:
-    """Return the standard deviation of the white noise near each sample [n]: of the steps, or what is quicker than any motion
-    (sixth differences), whichever is more.
+    """Return the standard deviation of the white noise near each sample [n]: of the steps, or what is quicker than any
+    motion (sixth differences), whichever is more.
     """
     steps = steps_of(x)
     out = np.asarray(steps / math.sqrt(12.0))
@@ -82,9 +83,13 @@ def noise_of(x: FloatArray) -> FloatArray:
 
 
 def _magnitudes(x: FloatArray) -> list[BoolArray]:
-    """Return masks of samples between powers of 2 and of 10; one of few samples joins the next larger, the largest the next."""
+    """Return masks of samples between powers of 2 and of 10; one of few samples joins the next larger, the last the one
+    before.
+    """
     size = np.abs(x)
-    order = np.frexp(size)[1].astype(np.int64) * 100 + np.floor(np.log10(np.maximum(size, 1e-30))).astype(np.int64)
+    order = np.frexp(size)[1].astype(np.int64) * 100 + np.floor(np.log10(np.maximum(size, 1e-30))).astype(
+        np.int64
+    )
     out: list[BoolArray] = []
     waiting = np.zeros(len(x), bool)
     for e in np.unique(order):
@@ -110,7 +115,9 @@ def _decimal(values: FloatArray, largest: float) -> float:
 def _single(values: FloatArray) -> float:
     """Return the step of single precision where that is what they have, else 0."""
     short = values.astype(np.float32)
-    return float(np.spacing(np.max(np.abs(short)))) if np.array_equal(short, values) and len(values) > 8 else 0.0
+    return (
+        float(np.spacing(np.max(np.abs(short)))) if np.array_equal(short, values) and len(values) > 8 else 0.0
+    )
 
 
 def _counts(values: FloatArray, largest: float, *, again: bool) -> float:
@@ -128,7 +135,9 @@ def _counts(values: FloatArray, largest: float, *, again: bool) -> float:
     return step if grid else 0.0
 
 
-def acceleration_noise(sigma: FloatArray | float, step_s: float, hz: float, *, of_velocity: bool) -> FloatArray:
+def acceleration_noise(
+    sigma: FloatArray | float, step_s: float, hz: float, *, of_velocity: bool
+) -> FloatArray:
     """Return the rms, below `hz`, of the acceleration taken from samples every step_s with white noise sigma: of a position,
     or of a velocity.
     """
@@ -146,10 +155,16 @@ def cutoff_hz(sigma: FloatArray, step_s: float, most: float, *, of_velocity: boo
     return np.maximum(hz, _SLOWEST_HZ)
 
 
+@functools.lru_cache(maxsize=64)
+def _low_pass(part: float) -> FloatArray:
+    """Return the sections of a Butterworth low-pass; part: of the sampling rate."""
+    return np.asarray(signal.butter(_ORDER, part, fs=1.0, output="sos"))
+
+
 @dataclass(frozen=True)
 class Smoother:
-    """A low-pass without delay whose cutoff depends on the sample: (cutoff [Hz], where it holds [n]) in `parts`; elsewhere the
-    signal as it is. Linear, so the same for residuals and for what explains them.
+    """A low-pass without delay whose cutoff depends on the sample: (cutoff [Hz], where it holds [n]) in `parts`; elsewhere
+    the signal as it is. Linear, so the same for residuals and for what explains them.
     """
 
     step_s: float
@@ -174,7 +189,7 @@ class Smoother:
             return x
         out = np.array(x, np.float64)
         for hz, there in self.parts:
-            sections = signal.butter(_ORDER, hz, fs=1.0 / self.step_s, output="sos")
+            sections = _low_pass(hz * self.step_s)
             reach = min(len(x) - 1, max(12, round(1.0 / (hz * self.step_s))))
             out[there] = signal.sosfiltfilt(sections, x, padlen=reach)[there]
         return out

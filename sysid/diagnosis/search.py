@@ -87,6 +87,8 @@ class Search:
         self._log_n = {c.first: self._rows_that_count(c) for c in candidates}
         self.joints = len({c.joint for c in candidates} - {"sensor"})
         self._cache: dict[tuple[int, ...], Hypothesis] = {}
+        self.rejected: set[tuple[str, object]] = set()
+        """Effects (with joint) that shall not be chosen again (`guards`)."""
 
     def penalty(self, candidate: EffectCandidate) -> float:
         """Return what the candidate costs in BIC: its parameters, and the choice among its terms."""
@@ -136,8 +138,8 @@ class Search:
         return reading_misfit(self._readings, read)
 
     def fits_beside(self, candidate: EffectCandidate, chosen: Sequence[EffectCandidate]) -> bool:
-        """Return whether a candidate may be added: an effect is there once, waves once per order."""
-        if not pinned([*chosen, candidate], self.joints):
+        """Return whether a candidate may be added: an effect is there once, waves once per order, one rejected never."""
+        if candidate.key in self.rejected or not pinned([*chosen, candidate], self.joints):
             return False
         for one in chosen:
             if one.key == candidate.key and (
@@ -160,6 +162,22 @@ class Search:
             beam = sorted(grown.values(), key=lambda h: h.bic)[:_BEAM]
             best = min((best, beam[0]), key=_with_price)
         return self.pruned(best)
+
+    def confirmed(self) -> Hypothesis:
+        """Return the best set of candidates less those that do not help on held-out runs."""
+        best = self.run()
+        while best.chosen:
+            weak = []
+            for c in best.chosen:
+                without = self.hypothesis([o for o in best.chosen if o is not c], best.model)
+                evidence = without.model.deviance - best.model.deviance
+                if self.held_out(best, c) < HELD_OUT * evidence:
+                    weak.append((evidence, c))
+            if not weak:
+                return best
+            weakest = min(weak, key=lambda pair: pair[0])[1]
+            best = self.hypothesis([c for c in best.chosen if c is not weakest], best.model)
+        return best
 
     def children(self, parent: Hypothesis) -> list[Hypothesis]:
         """Return the most promising plausible extensions that lower BIC by ENTER."""

@@ -24,10 +24,9 @@ from jtqd.estimator.effects.effect import MOTOR, Effect, State, Values
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import DRIVING_CURRENT_MAX_A, LossModel
 from jtqd.estimator.run import JointColumns, RunTable
-from jtqd.sysid.diagnosis.resolution import Smoother, acceleration_noise, cutoff_hz, described, noise_of
 from jtqd.sim_can.losses import TORQUE_STEPS, LossTable
 from jtqd.sim_can.plant_file import plant_of_joint
-
+from jtqd.sysid.diagnosis.resolution import Smoother, acceleration_noise, cutoff_hz, described, noise_of
 
 _ALL_VISIBLE: Final = Smoother(1.0)
 
@@ -128,7 +127,7 @@ _SMOOTH_S: Final = 0.005
 _COARSE: Final = 3.0
 """A position whose difference is noisier by this factor than the velocity channel is not used for it."""
 _VISIBLE: Final = 1e-3
-"""Part of the rated torque (rms) that the noise of an acceleration may be worth in a residual; beyond, the balance is filtered."""
+"""Part of the rated torque (rms) that the noise of an acceleration may be worth; beyond, the balance is filtered."""
 _SHARED: Final = 2e-4
 """The same in the regressor of an inertia, where the noise of the residual is once more."""
 _REMEMBERED: Final = 1.2
@@ -169,8 +168,8 @@ class JointSignals:
     coarse: str = ""  # what the resolution of the recording costs, "" for nothing
 
     def seen(self, balance: str, x: FloatArray) -> FloatArray:
-        """Return what of x [n] can be seen in a balance: of the motor's, what is slow enough for its acceleration to be known
-        (`resolution`). Residuals and all that is to explain them go through it.
+        """Return what of x [n] can be seen in a balance: of the motor's, what is slow enough for its acceleration to be
+        known (`resolution`). Residuals and all that is to explain them go through it.
         """
         return self.visible(x) if balance == MOTOR else x
 
@@ -296,11 +295,13 @@ def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: Ba
         off=off,
         of_position=of_position,
         visible=visible,
-        coarse=_cost(joint, time, position if of_position else speed, noise, visible, of_position=of_position),
+        coarse=_cost(
+            joint, time, position if of_position else speed, noise, visible, of_position=of_position
+        ),
     )
 
 
-def _cost(  # noqa: PLR0917
+def _cost(
     joint: Joint,
     time: FloatArray,
     x: FloatArray,
