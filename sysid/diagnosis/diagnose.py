@@ -31,6 +31,7 @@ from jtqd.sysid.diagnosis.leftover import events_left
 from jtqd.sysid.diagnosis.mixed_model import Mixed
 from jtqd.sysid.diagnosis.next_experiment import next_experiment
 from jtqd.sysid.diagnosis.noise import Noise, noise_model, run_sums
+from jtqd.sysid.diagnosis.recordings import piece_notes
 from jtqd.sysid.diagnosis.refine import present_effects, refine
 from jtqd.sysid.diagnosis.regressors import RunData, column_moments
 from jtqd.sysid.diagnosis.search import Hypothesis, Search
@@ -90,7 +91,7 @@ def _diagnosed(
         noise, search, best = _searched(dataset, least)
         refined = refine(dataset, present_effects(best), noise)
     findings = conclude(dataset, search, best, refined, noise, joints, names, numbers, relevance)
-    return replace(findings, channel_notes=(*reasons, *resolution_notes(usable)))
+    return replace(findings, channel_notes=(*reasons, *resolution_notes(usable), *piece_notes(usable)))
 
 
 def one_sensor(runs: Sequence[tuple[str, RunTable]], numbers: Sequence[int]) -> bool:
@@ -175,7 +176,7 @@ def _searched(dataset: Dataset, least_nm: float) -> tuple[Noise, Search, Hypothe
         noise = noise_model(runs, residuals, dataset.step_s)
         sums = [run_sums(run, noise, columns, len(groups)) for run in runs]
         sums = with_readings(sums, dataset.readings, unpowered)
-        mixed = Mixed(sums, columns, sigma)
+        mixed = Mixed(sums, columns, sigma, dataset.pieces)
         effective = mixed.rows / noise.inflation
         search = Search(mixed, candidates, effective, moments, least_nm, dataset.readings, unpowered)
         best = search.confirmed()

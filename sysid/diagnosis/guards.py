@@ -125,7 +125,8 @@ def steadiness(refined: Refined, nothing: Sequence[dict[str, float]]) -> list[fl
     """Return per cause its size in standard errors that its changes give when runs are left out one by one (jackknife):
     what a model error makes is not the same in all runs, however small its residual.
     """
-    steps = np.array(left_out_steps(refined))  # [r, p]
+    first_piece = np.unique(refined.mixed.pieces, return_index=True)[1]
+    steps = np.array(left_out_steps(refined))[first_piece]  # [r, p]
     runs = len(steps)
     spread = (
         np.sqrt((runs - 1.0) / runs * np.sum((steps - steps.mean(axis=0)) ** 2, axis=0)) if runs > 1 else None

@@ -15,12 +15,13 @@ from typing import Final
 
 import numpy as np
 
+from jtqd.estimator.arrays import FloatArray
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.evidence import WITHIN
 from jtqd.sysid.diagnosis.findings import Cause, JointName
 from jtqd.sysid.diagnosis.mixed_model import explained
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
-from jtqd.sysid.diagnosis.search import DEEPEST, Hypothesis, Search
+from jtqd.sysid.diagnosis.search import DEEPEST, Hypothesis, Search, friction_pairs
 from jtqd.sysid.diagnosis.signals import Channel
 
 ENOUGH_RUNS: Final = 4
@@ -66,9 +67,12 @@ class LeaveOneOut:
         """
         if not hypothesis.chosen:
             return True
-        return self.holds(hypothesis) and any(
-            self._reached(self._without(hypothesis, c)) for c in hypothesis.chosen
-        )
+        before = [self._without(hypothesis, c) for c in hypothesis.chosen]
+        before += [
+            self.search.hypothesis([c for c in hypothesis.chosen if c not in pair], hypothesis.model)
+            for pair in friction_pairs(hypothesis.chosen)
+        ]
+        return self.holds(hypothesis) and any(self._reached(h) for h in before)
 
     def rivals(self, best: Hypothesis, cause: EffectCandidate) -> tuple[EffectCandidate, ...]:
         """Return the candidates (one per effect and joint) that in the place of `cause` help on every held-out run and on
@@ -80,8 +84,9 @@ class LeaveOneOut:
         found: dict[tuple[str, object], tuple[float, EffectCandidate]] = {}
         twins = _SCALES if self.search.joints == 1 and cause.effect.name in _SCALES else frozenset()
         for rival in self._grown(base):
-            new = next(c for c in rival.chosen if c not in others)
-            if new.key == cause.key:
+            added = [c for c in rival.chosen if c not in others]
+            new = added[0]
+            if new.key == cause.key or len(added) > 1:
                 continue
             helps = self._helps(rival, base, (new,), least=0.0)
             worse = all(fall < -FALL for fall in self._falls(rival, best, (new, cause)))
@@ -131,7 +136,8 @@ class LeaveOneOut:
         pairs = zip(self.squares(self.search.hypothesis(())), self.squares(best), strict=True)
         for r, (raw, left) in enumerate(pairs):
             for channel in raw:
-                least = float(np.nanmean(floors[channel][r] ** 2))
+                mine = [floors[channel][k] for k in np.flatnonzero(self.search.mixed.pieces == r)]
+                least = float(np.nanmean(np.concatenate(mine) ** 2))
                 before += max(raw[channel] - least, 0.0)
                 after += max(left[channel] - least, 0.0)
         return min(after / max(before, 1e-30), 1.0)
@@ -147,17 +153,18 @@ class LeaveOneOut:
         return out
 
     def _grown(self, parent: Hypothesis) -> list[Hypothesis]:
-        """Return all plausible extensions that lower BIC; by how much is not asked, the runs left out decide."""
+        """Return all plausible extensions that lower BIC; by how much is not asked, the runs left out decide. Coulomb and
+        viscous friction of a joint also come together.
+        """
         totals = [self.search.mixed.marginal(v)[0] for v in (parent.model.variances, self.search.mixed.prior)]
         base = list(parent.model.columns)
         out = []
-        for c in self.search.candidates:
-            if not self.search.fits_beside(c, parent.chosen):
+        for new in self.search.additions(parent.chosen):
+            columns = [k for c in new for k in c.columns]
+            drop = max(explained(total, base, columns) for total in totals)
+            if drop < sum(self.search.penalty(c) for c in new):
                 continue
-            drop = max(explained(total, base, list(c.columns)) for total in totals)
-            if drop < self.search.penalty(c):
-                continue
-            child = self.search.hypothesis((*parent.chosen, c), parent.model)
+            child = self.search.hypothesis((*parent.chosen, *new), parent.model)
             if child.bic < parent.bic and self.search.plausible(child):
                 out.append(child)
         return out
@@ -184,9 +191,11 @@ class LeaveOneOut:
         """
         columns = np.array([k for c in where for k in c.columns], np.intp)
         out = []
-        for run, a, b in zip(self.dataset.runs, self.squares(one), self.squares(other), strict=True):
+        first = [int(np.argmax(self.search.mixed.pieces == r)) for r in range(self.search.mixed.runs)]
+        for k, a, b in zip(first, self.squares(one), self.squares(other), strict=True):
+            run = self.dataset.runs[k]
             there = [c for c, d in run.channels.items() if np.isin(columns, d.index).any()]
-            out.append(sum(1.0 - a[c] / max(b[c], 1e-30) for c in there))
+            out.append(sum(1.0 - a[c] / max(b[c], 1e-30) for c in there if c in a))
         return out
 
     def _score(self, hypothesis: Hypothesis) -> float:
@@ -203,11 +212,11 @@ class LeaveOneOut:
         return self._squares[key]
 
     def _measured(self, hypothesis: Hypothesis) -> list[Squares]:
-        out: list[Squares] = []
+        sums: list[dict[Channel, FloatArray]] = [{} for _ in range(self.search.mixed.runs)]
         columns = list(hypothesis.model.columns)
-        for run, beta in zip(self.dataset.runs, self.search.held_out_beta(hypothesis), strict=True):
+        betas = self.search.of_pieces(self.search.held_out_beta(hypothesis))
+        for r, run, beta in zip(self.search.mixed.pieces, self.dataset.runs, betas, strict=True):
             weight = dict(zip(columns, (float(b) for b in beta), strict=True))
-            squares = {}
             for channel, d in run.channels.items():
                 mine = np.flatnonzero(np.isin(d.index, columns))
                 rest = d.residual - d.regressors[:, mine] @ np.array([weight[int(d.index[k])] for k in mine])
@@ -215,9 +224,9 @@ class LeaveOneOut:
                 if channel.balance == "torsion" and len(rest):
                     rest = rest - rest.mean()
                 if len(rest):
-                    squares[channel] = float(np.mean(rest**2))
-            out.append(squares)
-        return out
+                    more = np.array([float(rest @ rest), float(len(rest))])
+                    sums[r][channel] = sums[r].get(channel, np.zeros(2)) + more
+        return [{c: float(s[0] / s[1]) for c, s in mine.items()} for mine in sums]
 
 
 def _holds_nothing(candidate: EffectCandidate, cause: Cause) -> bool:

@@ -151,7 +151,7 @@ def _linearised(dataset: Dataset, present: Sequence[PresentEffect], noise: Noise
     count = sum(len(p.free) for p in present)
     sums = [run_sums(d, noise, count, len(groups)) for d in data]
     sums = with_readings(sums, dataset.readings, _unpowered(present, dataset.joints))
-    mixed = Mixed(sums, count, np.array([g.sigma for g in groups]))
+    mixed = Mixed(sums, count, np.array([g.sigma for g in groups]), dataset.pieces)
     return _Iterate(tuple(present), mixed, mixed.fit(range(count)), data, mixed.fit(()).deviance)
 
 
