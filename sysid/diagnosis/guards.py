@@ -35,7 +35,9 @@ def nothing_of(best: Hypothesis) -> list[dict[str, float]]:
     return [dict(c.term.combine([0.0] * c.size)) for c in best.chosen]
 
 
-def objections(dataset: Dataset, best: Hypothesis, refined: Refined) -> list[tuple[int, str]]:
+def objections(
+    dataset: Dataset, best: Hypothesis, refined: Refined, *, bounds_only: bool = False
+) -> list[tuple[int, str]]:
     """Return causes (by place) that are none, and why: all at a bound; else the one that does most harm on runs left out;
     else the smaller of two that cancel each other. What is left must be fitted again before it is asked again.
     """
@@ -44,7 +46,7 @@ def objections(dataset: Dataset, best: Hypothesis, refined: Refined) -> list[tup
         (k, beyond_bounds(p, none)) for k, (p, none) in enumerate(zip(refined.present, nothing, strict=True))
     ]
     bound = [(k, why) for k, why in bound if why]
-    if bound or not refined.present:
+    if bound or bounds_only or not refined.present:
         return bound
     falls = held_out_gains(dataset, refined)
     worst = int(np.argmin(falls))

@@ -102,12 +102,15 @@ def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatA
 
 
 def bin_samples(signals: Iterable[JointSignals]) -> int:
-    """Return how many samples make a bin."""
-    total, step = 0.0, 0.0
+    """Return how many samples make a bin: where all is filtered, bins of what the highest cutoff leaves, because whitening
+    would raise again what no filter has let through.
+    """
+    total, step, highest = 0.0, 0.0, 0.0
     for s in signals:
         total += float(s.time_s[-1] - s.time_s[0])
         step = max(step, float(np.median(np.diff(s.time_s))))
-    width = BIN_S * max(1.0, total / LONG_S)
+        highest = max(highest, s.visible.highest_hz)
+    width = max(BIN_S * max(1.0, total / LONG_S), 0.5 / highest)
     return max(1, round(width / step))
 
 

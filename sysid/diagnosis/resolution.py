@@ -34,6 +34,8 @@ _SIXTH: Final = math.sqrt(924.0)
 _ORDER: Final = 3
 _SLOWEST_HZ: Final = 8.0
 """No cutoff is lower: there is the motion itself."""
+_LITTLE: Final = 0.3
+"""Part of a run that may be finer than the rest without bins as short as its own."""
 _STEP: Final = 1.25
 """Cutoffs that differ by less are one."""
 
@@ -182,6 +184,15 @@ class Smoother:
     def slowest_hz(self) -> float:
         """The lowest cutoff, inf without any."""
         return min((hz for hz, _ in self.parts), default=math.inf)
+
+    @property
+    def highest_hz(self) -> float:
+        """The highest cutoff; inf where a part is not filtered that is more than _LITTLE."""
+        if not self.parts:
+            return math.inf
+        count = sum(int(there.sum()) for _, there in self.parts)
+        whole = len(self.parts[0][1])
+        return max(hz for hz, _ in self.parts) if whole - count <= _LITTLE * whole else math.inf
 
     def __call__(self, x: FloatArray) -> FloatArray:
         """Return x [n] filtered."""

@@ -50,6 +50,8 @@ RELEVANCE: Final = 0.005
 """Part of the rated torque, rms over a run, from which what the causes leave matters; the user may set another."""
 UNEXPLAINED_SHARE: Final = 0.05
 """Part of all structure (as squares) that must be left over as well for it to matter."""
+FEW_UNEXPLAINED_SHARE: Final = 0.2
+"""The same with two or three runs, where more of what is left over is the runs' own."""
 
 _MOST_SAID: Final = 4
 """Lines about effects that fit and are not named."""
@@ -74,18 +76,24 @@ def conclude(  # noqa: PLR0917
     relevance: float = RELEVANCE,
 ) -> Findings:
     """Return the findings of one diagnosis; relevance: see RELEVANCE."""
-    best, refined, explained, refused = _guarded(dataset, search, best, refined, noise, joints)
+    few = LeaveOneOut(dataset, search) if search.mixed.runs < ENOUGH_RUNS else None
+    best, refined, explained, refused = _guarded(
+        dataset, search, best, refined, noise, joints, bounds_only=few is not None
+    )
     left = leftover(dataset, refined, noise, joints)
     whole, squares = best, sum(r * r for e in explained for r in e.values())
-    few = LeaveOneOut(dataset, search) if search.mixed.runs < ENOUGH_RUNS else None
     if few is not None:  # what is left over is judged with all that was found, names need more
         best = few.confirmed(whole)
         refined = refine(dataset, present_effects(best), noise)
         best, refined, explained, more = _guarded(dataset, search, best, refined, noise, joints)
-        refused += more
+        refused = more
+        named = leftover(dataset, refined, noise, joints)
+        if named.energy_nm2() < left.energy_nm2():
+            whole, left, squares = best, named, sum(r * r for e in explained for r in e.values())
     limits = {c: relevance * joints[c.joint].rated_torque_nm for c in refined.runs[0].channels}
     matters = any(nm > limits[c] for c, nm in left.worst_nm.items())
-    matters = matters and (left.share(squares) > UNEXPLAINED_SHARE or not whole.chosen)
+    part = UNEXPLAINED_SHARE if few is None else FEW_UNEXPLAINED_SHARE
+    matters = matters and (left.share(squares) > part or not whole.chosen)
     judged = refined
     if matters and few is None:
         best, refined, explained = _proven(dataset, search, best, refined, noise, joints)
@@ -180,6 +188,8 @@ def _guarded(  # noqa: PLR0917
     refined: Refined,
     noise: Noise,
     joints: Mapping[int, Joint],
+    *,
+    bounds_only: bool = False,
 ) -> tuple[Hypothesis, Refined, list[dict[Channel, float]], list[str]]:
     """Return hypothesis, refinement and rms without irrelevant causes and without those that a guard objects to, and the
     objections; with enough runs the search is made again without the first of them.
@@ -187,7 +197,7 @@ def _guarded(  # noqa: PLR0917
     said: list[str] = []
     while True:
         best, refined, rms = _without_negligible(dataset, search, best, refined, noise, joints)
-        found = objections(dataset, best, refined)
+        found = objections(dataset, best, refined, bounds_only=bounds_only)
         if not found:
             return best, refined, rms, said[:_MOST_SAID]
         weak = [best.chosen[k] for k, _ in found]
