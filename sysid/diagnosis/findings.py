@@ -252,11 +252,8 @@ def _cause(cause: Cause) -> dict[str, Any]:
         "joint": cause.joint,
         "class": list(cause.names),
         "parameters": _values(cause.parameters),
-        "evidence": {
-            "delta_bic": cause.delta_bic,
-            "held_out_gain": cause.held_out_gain,
-            "steadiness": cause.steadiness,
-        },
+        "evidence": {"delta_bic": cause.delta_bic, "held_out_gain": cause.held_out_gain},
+        "steadiness": cause.steadiness,
         "rms_nm": cause.rms_nm,
         "balance": cause.balance,
         "explained_share": cause.explained_share,

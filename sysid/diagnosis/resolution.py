@@ -48,6 +48,8 @@ def steps_of(x: FloatArray) -> FloatArray:
     out = np.zeros(len(x))
     for there in _magnitudes(x):
         values = np.unique(x[there])
+        if len(values) <= 8:  # at rest or commanded: they show no step
+            continue
         largest = max(float(np.max(np.abs(values))), 1e-12)
         out[there] = max(
             _decimal(values, largest),
@@ -118,7 +120,7 @@ def _single(values: FloatArray) -> float:
     """Return the step of single precision where that is what they have, else 0."""
     short = values.astype(np.float32)
     return (
-        float(np.spacing(np.max(np.abs(short)))) if np.array_equal(short, values) and len(values) > 8 else 0.0
+        float(np.spacing(np.max(np.abs(short)))) if np.array_equal(short, values) else 0.0
     )
 
 

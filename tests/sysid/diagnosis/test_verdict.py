@@ -94,7 +94,7 @@ def test_what_a_file_has_too_little_of_is_reported_whole(monkeypatch: pytest.Mon
     known = (Effect("torque_ripple", {"amplitude_nm": 0.2}), Effect("sensor_gain", {"gain": 1.01}))
     asked: list[list[str]] = []
 
-    def stand_in(runs: object, joints: dict[int, Joint], numbers: tuple[int, ...]) -> Findings:
+    def stand_in(runs: object, joints: dict[int, Joint], numbers: tuple[int, ...], _: float) -> Findings:
         asked.append([e.name for e in joints[1].effects])
         return findings(CAUSE, (RIPPLE,), reasons=(f"diagnosis {len(asked)}",))
 
