@@ -6,6 +6,7 @@ import argparse
 import datetime as dt
 import importlib.util
 import json
+import math
 import os
 import sys
 import tempfile
@@ -51,7 +52,7 @@ def main(argv: list[str]) -> int:
         for run in runs:
             for note in run.notes:
                 print(f"{BY}: {run.name}: {note}", file=sys.stderr)
-        findings = diagnosed(runs, joints)
+        findings = diagnosed(runs, joints, options.relevance)
         mapping = _write(options.out, findings, joints, {run.name: run.sha256 for run in runs})
     except UsageError as error:
         print(f"{BY}: {error}", file=sys.stderr)
@@ -69,8 +70,10 @@ def main(argv: list[str]) -> int:
     return 0 if findings.verdict == NO_GAP else 3
 
 
-def diagnosed(runs: Sequence[RunFile], joints: Mapping[int, Joint]) -> Findings:
-    """Check the channels and diagnose what may be used; the findings list what may not."""
+def diagnosed(
+    runs: Sequence[RunFile], joints: Mapping[int, Joint], relevance: float | None = None
+) -> Findings:
+    """Check the channels and diagnose what may be used; the findings list what may not. relevance: see `diagnose`."""
     checked = check_runs([(run.name, run.table) for run in runs], joints)
     for line in (*checked.refused, *checked.notes):
         print(f"{BY}: {line}", file=sys.stderr)
@@ -88,7 +91,8 @@ def diagnosed(runs: Sequence[RunFile], joints: Mapping[int, Joint]) -> Findings:
         from jtqd.sysid.diagnosis.diagnose import diagnose
 
         left = {number: joint for number, joint in joints.items() if number not in checked.lost}
-        findings = diagnose(checked.runs, left)
+        given = {} if relevance is None else {"relevance": relevance}
+        findings = diagnose(checked.runs, left, **given)
     return _with_channels(findings, checked, notes)
 
 
@@ -149,10 +153,27 @@ def parser() -> argparse.ArgumentParser:
         "--columns", type=Path, metavar="FILE", help="column map for other names, units and signs"
     )
     parser.add_argument(
+        "--relevance",
+        type=_percent,
+        metavar="PERCENT",
+        help="of the rated torque, rms over a run: what is left over matters from here on (default 0.5)",
+    )
+    parser.add_argument(
         "--force", action="store_true", help="replace the results of an earlier diagnosis in DIR"
     )
     parser.add_argument("--json", action="store_true", help="print findings.json instead of the summary")
     return parser
+
+
+def _percent(text: str) -> float:
+    """Return a percentage above 0 and up to 100 as a part. Raises argparse.ArgumentTypeError."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value <= 100.0:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected percent above 0 and up to 100")
+    return value / 100.0
 
 
 def _check_out(directory: Path, force: bool) -> None:

@@ -43,7 +43,7 @@ _PASSES: Final = 2
 
 
 def diagnose(
-    runs: Sequence[tuple[str, RunTable]], joints: Mapping[int, Joint], relevance: float = RELEVANCE
+    runs: Sequence[tuple[str, RunTable]], joints: Mapping[int, Joint], *, relevance: float = RELEVANCE
 ) -> Findings:
     """Return what the joint files' simulation gets wrong in these runs.
 
@@ -55,7 +55,7 @@ def diagnose(
     """
     numbers = tuple(sorted(n for n in joints if any(n in table.joints for _, table in runs)))
     if len(numbers) > 1 and not one_sensor(runs, numbers):
-        return combined([diagnose(runs, {n: joints[n]}, relevance) for n in numbers])
+        return combined([diagnose(runs, {n: joints[n]}, relevance=relevance) for n in numbers])
     applied = {n: with_effects_applied(joint) for n, joint in joints.items()}
     findings = _diagnosed(runs, applied, numbers, relevance)
     for n in numbers:

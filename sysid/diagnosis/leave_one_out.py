@@ -63,8 +63,8 @@ class LeaveOneOut:
         return best
 
     def _ladders(self) -> list[Hypothesis]:
-        """Return the sets that hold of what is fitted to a joint first: friction, inertia and load-dependent friction. One
-        of them may show only with the others, as each is wrong in a file that nobody measured.
+        """Return the sets that are worth it of what is fitted to a joint first: friction, inertia, load-dependent friction.
+        One of them may show only with the others, as each is wrong in a file that nobody measured.
         """
         terms: dict[tuple[str, object], EffectCandidate] = {}
         for c in self.search.candidates:
@@ -75,9 +75,19 @@ class LeaveOneOut:
             for chosen in itertools.combinations(terms.values(), size):
                 if len({c.joint for c in chosen}) == 1:
                     h = self.search.hypothesis(chosen)
-                    if self.search.plausible(h) and self.holds(h):
+                    if self.search.plausible(h) and self._worth(h):
                         out.append(h)
         return out
+
+    def _worth(self, hypothesis: Hypothesis) -> bool:
+        """Return whether a set takes away much on each held-out run, and each of its candidates more than it costs: harm
+        on one run is outweighed by what it does on the others.
+        """
+        chosen = hypothesis.chosen
+        if min(self._falls(hypothesis, self.search.hypothesis(()), chosen)) < LARGE_FALL:
+            return False
+        each = [self._falls(hypothesis, self._without(hypothesis, c), (c,)) for c in chosen]
+        return all(min(falls) > -2.0 * FALL and sum(falls) > 2.0 * FALL for falls in each)
 
     def holds(self, hypothesis: Hypothesis) -> bool:
         """Return whether each candidate, and all together, help on every held-out run."""

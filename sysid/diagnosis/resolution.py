@@ -119,9 +119,7 @@ def _decimal(values: FloatArray, largest: float) -> float:
 def _single(values: FloatArray) -> float:
     """Return the step of single precision where that is what they have, else 0."""
     short = values.astype(np.float32)
-    return (
-        float(np.spacing(np.max(np.abs(short)))) if np.array_equal(short, values) else 0.0
-    )
+    return float(np.spacing(np.max(np.abs(short)))) if np.array_equal(short, values) else 0.0
 
 
 def _counts(values: FloatArray, largest: float, *, again: bool) -> float:
