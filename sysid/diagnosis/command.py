@@ -27,7 +27,7 @@ from jtqd.sysid.runs.files import ColumnMap, RunError, RunFile, read_runs
 from jtqd.sysid.runs.joints import UsageError, check_joint_files, joint_files, joints_of
 
 BY: Final = "jtq diagnose"
-_NEEDED: Final = ("matplotlib", "jinja2")
+_NEEDED: Final = ("matplotlib", "jinja2", "scipy")
 FINDINGS: Final = "findings.json"
 REPORT: Final = "report.html"
 PLAN: Final = "next_experiment.plan.yaml"
