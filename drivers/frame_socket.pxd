@@ -32,7 +32,7 @@ cdef class FrameReceiver:
     cdef void read_control(self, int i) noexcept nogil
 
 cdef class FrameSocket:
-    cdef public int64_t tx_dropped, rx_dropped, rx_dropped_before
+    cdef public int64_t tx_dropped, rx_dropped
     cdef readonly str bus
     cdef readonly int fd
     cdef readonly bytearray frames

@@ -36,7 +36,6 @@ class FrameSocket:
     frames: bytearray
     tx_dropped: int
     rx_dropped: int
-    rx_dropped_before: int
     def __init__(
         self,
         sock: socket.socket,

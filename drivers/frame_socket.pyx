@@ -202,7 +202,6 @@ cdef class FrameSocket:
         tx_dropped: frames not sent because the transmit queue was full.
         rx_dropped: frames lost because this socket was read too late. On a unix bus an upper bound, since the hub cannot
             see which of them a filter would have refused.
-        rx_dropped_before: on AF_CAN added to what the kernel counts.
     """
 
     def __cinit__(self, sock, str bus, *, bint unix, bint receive_own, bint error_frames, int capacity):
@@ -272,7 +271,7 @@ cdef class FrameSocket:
             for i in range(n):
                 self.read_marks(i)
         else:
-            self.rx_dropped = self.receiver.overflow + self.rx_dropped_before
+            self.rx_dropped = self.receiver.overflow
             for i in range(n):  # MSG_CONFIRM: sent by this very socket (net/can/raw.c, raw_rcv)
                 self.own_c[i] = (
                     self.receive_own and self.receiver.messages[i].msg_hdr.msg_flags & MSG_CONFIRM != 0

@@ -62,7 +62,7 @@ cdef class FusedEstimator(Estimator):
     cdef void estimate(self, const FusedObserved *seen, const Sample *x, bint network_wanted, Values *out) noexcept nogil
 
 cdef class ExtendedEstimator(Estimator):
-    cdef Estimator inner
-    cdef object inputs
-    cdef double torque
+    cdef readonly Estimator inner
+    cdef readonly object inputs
+    cdef public double torque
     cdef readonly tuple corrected

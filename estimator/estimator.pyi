@@ -1,6 +1,7 @@
-from typing import Final
+from typing import Final, Self
 
 from jtqd.estimator.arrays import FloatArray, QuadrantArray
+from jtqd.estimator.corrections import ExtendedInputs
 from jtqd.estimator.joint import Joint, Torsion
 from jtqd.estimator.network import FusedNetworkModel, NetworkModel
 from jtqd.estimator.run import EstimateRun, ObservedRun
@@ -15,16 +16,37 @@ class JointEstimator(Estimator):
     def __init__(
         self, joint: Joint, settings: EstimatorSettings, network: NetworkModel | None = None
     ) -> None: ...
+    def blocks(self) -> tuple[bytes, bytes]: ...
+    @classmethod
+    def of_blocks(
+        cls, joint: Joint, settings: EstimatorSettings, law: bytes | memoryview, state: bytes | memoryview
+    ) -> Self: ...
 
 class FusedEstimator(Estimator):
     def __init__(
         self, joint: Joint, settings: EstimatorSettings, network: FusedNetworkModel | None = None
     ) -> None: ...
+    def blocks(self) -> tuple[bytes, bytes]: ...
+    @classmethod
+    def of_blocks(
+        cls, joint: Joint, settings: EstimatorSettings, law: bytes | memoryview, state: bytes | memoryview
+    ) -> Self: ...
     def run_observed(self, seen: ObservedRun) -> EstimateRun: ...
 
 class ExtendedEstimator(Estimator):
     corrected: tuple[float, float]
-    def __init__(self, joint: Joint, settings: EstimatorSettings, inner: Estimator) -> None: ...
+    torque: float
+    def __init__(
+        self,
+        joint: Joint,
+        settings: EstimatorSettings,
+        inner: Estimator,
+        inputs: ExtendedInputs | None = None,
+    ) -> None: ...
+    @property
+    def inner(self) -> Estimator: ...
+    @property
+    def inputs(self) -> ExtendedInputs: ...
 
 def observe_run(
     joint: Joint,

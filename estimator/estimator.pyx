@@ -12,6 +12,7 @@ loss went through the same filter, so the physics estimate as a whole is 1/g old
 
 from libc.math cimport NAN, fabs, fmin
 
+from jtqd.estimator.block cimport copied, put_back
 from jtqd.estimator.fusion cimport Fused, fill_fusion, fuse_paths, keep, share_by_speed
 from jtqd.estimator.losses cimport (
     AdditiveLossModel,
@@ -78,6 +79,13 @@ cdef fill_network(NetworkLaw *law, network, joint):
     return None
 
 
+cdef int check_complete(const NetworkLaw *law) except -1:
+    """Raises ValueError where a network is used that is no part of the block."""
+    if law.used and not law.native:
+        raise ValueError("found a network that is evaluated by its file's runtime, expected one that is evaluated natively")
+    return 0
+
+
 # The paper's estimator ------------------------------------------------------------------------------------------------
 
 
@@ -125,6 +133,27 @@ cdef class JointEstimator(Estimator):
     def reset(self):
         """Forget the past: the next step starts."""
         restart_guard(&self.state.guard)
+
+    def blocks(self):
+        """Return (parameters, state): one block each, of which `of_blocks` makes an estimator that goes on as this one would.
+
+        Raises ValueError for a network that is not evaluated natively: it is no part of them.
+        """
+        check_complete(&self.law.network)
+        return copied(&self.law, sizeof(JointLaw)), copied(&self.state, sizeof(JointState))
+
+    @classmethod
+    def of_blocks(cls, joint, settings, law, state):
+        """Return an estimator of the `blocks` of one of this class; joint, settings: what it was made of.
+
+        Raises ValueError for blocks of another layout.
+        """
+        cdef JointEstimator made = cls.__new__(cls)
+        made.joint, made.settings, made.width = joint, settings, len(FEATURES)
+        put_back(&made.law, sizeof(JointLaw), law)
+        put_back(&made.state, sizeof(JointState), state)
+        check_complete(&made.law.network)
+        return made
 
     cdef void advance(self, const Sample *x, bint network_wanted, Values *out) noexcept nogil:
         """Set `out` to the estimate at this sample."""
@@ -243,6 +272,27 @@ cdef class FusedEstimator(Estimator):
         """Forget the past: the next step starts."""
         restart_guard(&self.state.guard)
         self.state.half = 0.0
+
+    def blocks(self):
+        """Return (parameters, state): one block each, of which `of_blocks` makes an estimator that goes on as this one would.
+
+        Raises ValueError for a network that is not evaluated natively: it is no part of them.
+        """
+        check_complete(&self.law.network)
+        return copied(&self.law, sizeof(FusedLaw)), copied(&self.state, sizeof(FusedState))
+
+    @classmethod
+    def of_blocks(cls, joint, settings, law, state):
+        """Return an estimator of the `blocks` of one of this class; joint, settings: what it was made of.
+
+        Raises ValueError for blocks of another layout.
+        """
+        cdef FusedEstimator made = cls.__new__(cls)
+        made.joint, made.settings, made.width = joint, settings, len(FUSED_FEATURES)
+        put_back(&made.law, sizeof(FusedLaw), law)
+        put_back(&made.state, sizeof(FusedState), state)
+        check_complete(&made.law.network)
+        return made
 
     cdef void advance(self, const Sample *x, bint network_wanted, Values *out) noexcept nogil:
         """Set `out` to the estimate at this sample."""
@@ -387,14 +437,14 @@ def observe_run(
 cdef class ExtendedEstimator(Estimator):
     """Estimator of a joint with effects: corrected inputs (`ExtendedInputs`) into the estimator of the plain joint.
 
-    joint: with its effects; inner: estimator of `plain_joint(joint)`. `corrected`: current [A] and link position [rad]
-    that the inner one was given last.
+    joint: with its effects; inner: estimator of `plain_joint(joint)`; inputs: the corrections, None for new ones.
+    `corrected`: current [A] and link position [rad] that the inner one was given last; `torque`: its last estimate [Nm].
     """
 
-    def __init__(self, joint, settings, Estimator inner):
+    def __init__(self, joint, settings, Estimator inner, inputs=None):
         self.joint, self.settings, self.inner = joint, settings, inner
         self.width = inner.width
-        self.inputs = ExtendedInputs(joint, settings)
+        self.inputs = inputs or ExtendedInputs(joint, settings)
         self.corrected = (nan, nan)
         self.torque = NAN
 

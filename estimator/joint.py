@@ -28,6 +28,9 @@ QUADRANTS: Final = ("i_pos_w_pos", "i_neg_w_neg", "i_neg_w_pos", "i_pos_w_neg")
 EFFECT_NAMES: Final = frozenset(EFFECTS)
 MAX_NODES: Final = 64
 """Most numbers of a list in section `fused`."""
+MAX_LINK_ORDERS: Final = 6
+MAX_HARDENINGS: Final = 8
+MAX_SLIPS: Final = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,8 +130,10 @@ class Torsion:
     """Torque from both encoders: tau = K d + K3 d^3 + D d' + H z, d = theta_m/G - theta_l - zero - kinematic error [rad].
 
     z follows d through a Maxwell-slip element, dz = dd/travel held in [-1, 1]: elastic hysteresis of half width H.
-    Kinematic error: sum over orders n per motor revolution of c cos(n theta_m) + s sin(n theta_m). The ranges hold in
-    files; a fit may look beyond them.
+    Kinematic error: sum over orders n per motor revolution of c cos(n theta_m) + s sin(n theta_m). What a joint may have
+    beyond that, and files may leave out: link_orders_per_rev: the same over theta_l, error of the link encoder over its own
+    turn; hardening: the spring is stiffer by hardening_nm_per_rad beyond |d| = hardening_rad, added up; slips_nm,
+    slips_travel_rad: further slip elements. The ranges hold in files; a fit may look beyond them.
     """
 
     stiffness_nm_per_rad: Annotated[float, limits("Nm/rad", gt=0.0)]
@@ -140,11 +145,27 @@ class Torsion:
     hysteresis_nm: Annotated[float, limits("Nm", ge=0.0)] = 0.0
     hysteresis_travel_rad: Annotated[float, limits("rad", gt=0.0)] = 1e-4
     damping_nms_per_rad: Annotated[float, limits("Nms/rad", ge=0.0)] = 0.0
+    link_orders_per_rev: Annotated[tuple[float, ...], limits("1/rev", length=(0, MAX_LINK_ORDERS))] = ()
+    link_cos_rad: Annotated[tuple[float, ...], limits("rad")] = ()
+    link_sin_rad: Annotated[tuple[float, ...], limits("rad")] = ()
+    hardening_rad: Annotated[tuple[float, ...], limits("rad", length=(0, MAX_HARDENINGS))] = ()
+    hardening_nm_per_rad: Annotated[tuple[float, ...], limits("Nm/rad")] = ()
+    slips_nm: Annotated[tuple[float, ...], limits("Nm", length=(0, MAX_SLIPS))] = ()
+    slips_travel_rad: Annotated[tuple[float, ...], limits("rad")] = ()
 
     def __post_init__(self) -> None:
-        for key in ("cos_rad", "sin_rad"):
-            orders = len(self.orders_per_motor_rev)
-            _check_length("fused.torsion", key, getattr(self, key), orders, "orders_per_motor_rev")
+        for first, *others in (
+            ("orders_per_motor_rev", "cos_rad", "sin_rad"),
+            ("link_orders_per_rev", "link_cos_rad", "link_sin_rad"),
+            ("hardening_rad", "hardening_nm_per_rad"),
+            ("slips_nm", "slips_travel_rad"),
+        ):
+            for key in others:
+                _check_length("fused.torsion", key, getattr(self, key), len(getattr(self, first)), first)
+        for key, least in (("hardening_rad", 0.0), ("slips_nm", 0.0), ("slips_travel_rad", 1e-9)):
+            if any(value < least for value in getattr(self, key)):
+                expected = f"numbers {'>' if least else '>='} 0"
+                raise FieldError("fused.torsion", key, list(getattr(self, key)), expected)
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,7 +294,12 @@ class Joint:
 def _plain(value: Any) -> Any:
     if is_dataclass(value):
         items = ((each.name, getattr(value, each.name)) for each in fields(value))
-        return {name: _plain(item) for name, item in items if item is not None}
+        # what a torsion may leave out is not written
+        return {
+            name: _plain(item)
+            for name, item in items
+            if item is not None and not (item == () and isinstance(value, Torsion))
+        }
     if isinstance(value, tuple):
         return [_plain(each) for each in value]
     return dict(value) if isinstance(value, Mapping) else value

@@ -25,16 +25,33 @@ cdef struct FusedObserved:  # as Observed, and the filtered waves; open: what th
 cdef struct Wave:
     double order, cos, sin
 
+cdef enum: MOST_LINK_ORDERS = 6
+cdef enum: MOST_HARDENINGS = 8
+cdef enum: MOST_SLIPS = 7  # with the one of `hysteresis_nm`
+
+cdef struct Hardening:  # of the spring beyond a deflection
+    double deflection, stiffness
+
+cdef struct Slip:
+    double half_nm, inverse_travel
+
+cdef struct Bounds:  # of a slip's z
+    double low, high
+
 cdef struct FusedObserverLaw:
     double gear, inverse_gear, kt, inertia_rate, rate, link_rate
-    double stiffness, cubic, zero, damping, hysteresis, inverse_travel, torsion_limit
+    double stiffness, cubic, zero, damping, torsion_limit
     Wave two, four  # kinematic error at the ripple orders, which costs no further cos and sin
-    int others
+    int others, link_waves, hardenings, slips
     Wave other[MOST_NODES]
+    Wave link_wave[MOST_LINK_ORDERS]
+    Hardening hardening[MOST_HARDENINGS]
+    Slip slip[MOST_SLIPS]
 
 cdef struct FusedObserverState:
     Inputs last, z
-    double d, low, high
+    double d
+    Bounds bounds[MOST_SLIPS]
     double link, link_velocity
 
 cdef struct GuardLaw:

@@ -28,7 +28,7 @@ The guard decides about starts, gaps, garbage and standstill, sample by sample:
 | else | VALID |
 """
 
-from libc.math cimport NAN, cos, expm1, fabs, fmax, fmin, isfinite, isinf, sin
+from libc.math cimport NAN, copysign, cos, expm1, fabs, fmax, fmin, isfinite, isinf, sin
 
 from jtqd.estimator.losses cimport FrictionModel, direction_of, friction_torque
 from jtqd.estimator.sample cimport Sample
@@ -211,15 +211,15 @@ class FusedObservedSample(NamedTuple):
     open_nm: float = 0.0
 
 
-cdef double _other_waves(const FusedObserverLaw *law, double angle) noexcept nogil:
-    """Return the part [rad] of the kinematic error whose orders are not RIPPLE_ORDERS."""
+cdef double _sum_of_waves(const Wave *wave, int count, double angle) noexcept nogil:
+    """Return the sum of waves over an angle [rad]: kinematic error of orders that are not RIPPLE_ORDERS, link encoder."""
     cdef double error = 0.0, a
     cdef int n
-    for n in range(law.others):
-        a = law.other[n].order * angle
+    for n in range(count):
+        a = wave[n].order * angle
         if isinf(a):
             return NAN
-        error += law.other[n].cos * cos(a) + law.other[n].sin * sin(a)
+        error += wave[n].cos * cos(a) + wave[n].sin * sin(a)
     return error
 
 
@@ -242,7 +242,9 @@ cdef Inputs _inputs(const FusedObserverLaw *law, const Sample *x) noexcept nogil
         - law.four.sin * to.sin4
     )
     if law.others:
-        to.d -= _other_waves(law, x.motor_position_rad)
+        to.d -= _sum_of_waves(law.other, law.others, x.motor_position_rad)
+    if law.link_waves:
+        to.d -= _sum_of_waves(law.link_wave, law.link_waves, x.link_position_rad)
     to.u = x.current_a * law.kt + law.inertia_rate * x.motor_velocity_rad_s
     to.v = x.motor_velocity_rad_s * law.inverse_gear
     to.direction = direction_of(to.v)
@@ -251,24 +253,56 @@ cdef Inputs _inputs(const FusedObserverLaw *law, const Sample *x) noexcept nogil
 
 cdef void _torsion(const FusedObserverLaw *law, FusedObserverState *s, double d, double dt, FusedObserved *out) noexcept nogil:
     """Move the slip to the filtered deflection d [rad], dt after the last one, and set the torsion's outputs there."""
-    cdef double step = d - s.d, half
+    cdef double step = d - s.d, size = fabs(d), beyond = 0.0
+    cdef int k
     s.d = d
     out.torsion_nm = d * (law.stiffness + law.cubic * d * d) + law.damping * step / dt
+    for k in range(law.hardenings):
+        beyond += law.hardening[k].stiffness * fmax(size - law.hardening[k].deflection, 0.0)
+    if law.hardenings:
+        out.torsion_nm += copysign(beyond, d)
     out.open_nm = 0.0
-    if law.hysteresis == 0.0:
-        return
+    for k in range(law.slips):
+        _slip(&law.slip[k], &s.bounds[k], step, out)
+
+
+cdef void _slip(const Slip *law, Bounds *z, double step, FusedObserved *out) noexcept nogil:
+    """Move a slip by a step of the deflection [rad]; add what it holds, and what its bounds leave open."""
     step *= law.inverse_travel
-    s.low += step
-    s.high += step
-    if s.high > 1.0:
-        s.high = 1.0
-        s.low = fmin(s.low, 1.0)
-    elif s.low < -1.0:
-        s.low = -1.0
-        s.high = fmax(s.high, -1.0)
-    half = 0.5 * law.hysteresis
-    out.torsion_nm += half * (s.low + s.high)
-    out.open_nm = half * (s.high - s.low)
+    z.low += step
+    z.high += step
+    if z.high > 1.0:
+        z.high = 1.0
+        z.low = fmin(z.low, 1.0)
+    elif z.low < -1.0:
+        z.low = -1.0
+        z.high = fmax(z.high, -1.0)
+    out.torsion_nm += law.half_nm * (z.low + z.high)
+    out.open_nm += law.half_nm * (z.high - z.low)
+
+
+def slipped(d_rad, double travel_rad):
+    """Return z [n] of a Maxwell-slip element that follows d [n], and half the width [n] that its bounds leave open.
+
+    Where it began is not known: z is the middle of its bounds, -1 and 1 at first and after each NaN, where z is 0.
+    """
+    cdef const double[::1] d = np.ascontiguousarray(d_rad, np.float64)
+    middle, width = np.zeros(len(d)), np.zeros(len(d))
+    cdef double[::1] z = middle, w = width
+    cdef Slip law = Slip(0.5, 1.0 / travel_rad)
+    cdef Bounds bounds
+    cdef FusedObserved out
+    cdef double before = NAN, step
+    cdef Py_ssize_t k
+    for k in range(d.shape[0]):
+        step = d[k] - before
+        before = d[k]
+        out.torsion_nm = out.open_nm = 0.0
+        if step != step:  # nothing was observed here or before
+            bounds, step = Bounds(-1.0, 1.0), 0.0
+        _slip(&law, &bounds, step, &out)
+        z[k], w[k] = out.torsion_nm, out.open_nm
+    return middle, width
 
 
 cdef void _set_outputs(const FusedObserverLaw *law, const FusedObserverState *s, FusedObserved *out) noexcept nogil:
@@ -281,7 +315,9 @@ cdef void _set_outputs(const FusedObserverLaw *law, const FusedObserverState *s,
 
 cdef void _start_fused(const FusedObserverLaw *law, FusedObserverState *s, const Sample *x, FusedObserved *out) noexcept nogil:
     """Set the states of a joint that has always moved at this speed with this torsion; the slip is unknown."""
-    s.low, s.high = -1.0, 1.0
+    cdef int k
+    for k in range(law.slips):
+        s.bounds[k] = Bounds(-1.0, 1.0)
     s.last = s.z = _inputs(law, x)
     s.link = x.link_position_rad
     s.link_velocity = s.z.v
@@ -322,17 +358,29 @@ cdef int fill_fused_observer(FusedObserverLaw *law, joint, torsion, double bandw
     law.inertia_rate = joint.rotor_inertia_kgm2 * bandwidth
     law.rate, law.link_rate = bandwidth, link_bandwidth
     law.torsion_limit = RAW_LIMIT * joint.rated_torque_nm
-    law.stiffness = law.cubic = law.zero = law.damping = law.hysteresis = law.inverse_travel = 0.0
+    law.stiffness = law.cubic = law.zero = law.damping = 0.0
     law.two = law.four = Wave(0.0, 0.0, 0.0)
-    law.others = 0
+    law.others = law.link_waves = law.hardenings = law.slips = 0
     if torsion is None:
         return 0
     law.stiffness = torsion.stiffness_nm_per_rad
     law.cubic = torsion.cubic_nm_per_rad3
     law.zero = torsion.zero_rad
     law.damping = torsion.damping_nms_per_rad
-    law.hysteresis = torsion.hysteresis_nm
-    law.inverse_travel = 1.0 / torsion.hysteresis_travel_rad
+    if torsion.hysteresis_nm:
+        _add_slip(law, torsion.hysteresis_nm, torsion.hysteresis_travel_rad)
+    for torque, travel in zip(torsion.slips_nm, torsion.slips_travel_rad, strict=True):
+        _add_slip(law, torque, travel)
+    for deflection, stiffness in zip(torsion.hardening_rad, torsion.hardening_nm_per_rad, strict=True):
+        if law.hardenings == MOST_HARDENINGS:
+            raise ValueError(f"found more than {MOST_HARDENINGS} hardenings of the spring")
+        law.hardening[law.hardenings] = Hardening(deflection, stiffness)
+        law.hardenings += 1
+    for order, c, s in zip(torsion.link_orders_per_rev, torsion.link_cos_rad, torsion.link_sin_rad, strict=True):
+        if law.link_waves == MOST_LINK_ORDERS:
+            raise ValueError(f"found more than {MOST_LINK_ORDERS} orders of the link encoder's error")
+        law.link_wave[law.link_waves] = Wave(order, c, s)
+        law.link_waves += 1
     for order, c, s in zip(torsion.orders_per_motor_rev, torsion.cos_rad, torsion.sin_rad, strict=True):
         if order == RIPPLE_ORDERS[0]:
             law.two = Wave(order, law.two.cos + c, law.two.sin + s)
@@ -343,6 +391,14 @@ cdef int fill_fused_observer(FusedObserverLaw *law, joint, torsion, double bandw
                 raise ValueError(f"found more than {MOST_NODES} orders of the kinematic error")
             law.other[law.others] = Wave(order, c, s)
             law.others += 1
+    return 0
+
+
+cdef int _add_slip(FusedObserverLaw *law, double torque, double travel) except -1:
+    if law.slips == MOST_SLIPS:
+        raise ValueError(f"found more than {MOST_SLIPS} slips")
+    law.slip[law.slips] = Slip(0.5 * torque, 1.0 / travel)
+    law.slips += 1
     return 0
 
 
@@ -365,7 +421,8 @@ cdef class FusedObserver:
     """Observer of method `fused` for one joint: motor torque, velocity, torsion torque and ripple angles of one age.
 
         d       = g/(s+g) (theta_m/G - theta_l - zero - e(theta_m))          e: kinematic error
-        tau_t   = K d + K3 d^3 + D d' + H z,   z = (lo + hi)/2,   open = H (hi - lo)/2
+        tau_t   = K d + K3 d^3 + D d' + H z,   z = (lo + hi)/2,   open = H (hi - lo)/2      and more slips, a spring that
+                                                                                            hardens: joint.Torsion
         dlo = dhi = dd/travel, each held in [-1, 1]          Maxwell slip, between bounds: -1 and 1 at each start
         c_n, s_n = g/(s+g) cos(n theta_m), g/(s+g) sin(n theta_m)     n = RIPPLE_ORDERS
         direction = g/(s+g) tanh(w/(G w0))                   of friction, as tau_raw knows it

@@ -12,7 +12,7 @@ from jtqd.estimator.checked import ConfigError, count, natural, seconds
 from jtqd.sim_can.eds_entries import EdsChild
 
 if TYPE_CHECKING:
-    from jtqd.sim_can.plant_file import PlantParameters
+    from jtqd.sim_can.plants import AnyPlant
     from jtqd.sim_can.source import Source
 
 # what needs numpy is imported in functions: the EDS child reads meanwhile, and --help is quick
@@ -52,7 +52,7 @@ def parser() -> argparse.ArgumentParser:
         "--plant",
         type=Path,
         metavar="FILE",
-        help=f"plant file (default: {PLANT}), or a joint file for two ideal joints",
+        help=f"plant file (default: {PLANT}), bench file, or a joint file for two ideal joints",
     )
     made.add_argument(
         "--seed", type=natural, default=0, metavar="N", help="seed of noise and days (default 0)"
@@ -122,10 +122,10 @@ def _usage(options: argparse.Namespace) -> str:
 
 def _run(options: argparse.Namespace) -> int:
     from jtqd.models.files import shipped
-    from jtqd.sim_can.plant_file import load_plant
+    from jtqd.sim_can.plants import load_any_plant
 
     if options.cost:
-        return _print_cost(options, load_plant(options.plant or shipped(PLANT)))
+        return _print_cost(options, load_any_plant(options.plant or shipped(PLANT)))
     child = EdsChild()  # it reads while this process loads numpy and makes the plant
     try:
         if options.play is not None:
@@ -134,7 +134,7 @@ def _run(options: argparse.Namespace) -> int:
         else:
             from jtqd.sim_can.plant_source import PlantSource
 
-            parameters = load_plant(options.plant or shipped(PLANT))
+            parameters = load_any_plant(options.plant or shipped(PLANT))
             source = PlantSource(parameters, options.seed)
             profile = options.profile or parameters.profile
     except BaseException:
@@ -160,7 +160,7 @@ def _serve(options: argparse.Namespace, source: Source, profile: str) -> int:
     return run(options.bus, Bench(source, profile), options.bitrate, options.duration)
 
 
-def _print_cost(options: argparse.Namespace, parameters: PlantParameters) -> int:
+def _print_cost(options: argparse.Namespace, parameters: AnyPlant) -> int:
     from jtqd.sim_can.cost import measure
 
     cost = measure(parameters)

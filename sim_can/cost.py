@@ -9,8 +9,8 @@ from dataclasses import asdict, dataclass
 from jtqd.drivers.devices import SYNC_COB_ID, drive_tpdo1, drive_tpdo2, sensor_tpdo1
 from jtqd.drivers.pdo import PdoMap
 from jtqd.sim_can.bench import Bench
-from jtqd.sim_can.plant_file import PlantParameters
 from jtqd.sim_can.plant_source import PlantSource
+from jtqd.sim_can.plants import AnyPlant
 
 CYCLE_NS = 1_000_000
 BLOCK = 50
@@ -55,7 +55,7 @@ def _mapping_writes(index: int, pdo: PdoMap) -> list[tuple[int, int, int, int]]:
     ]
 
 
-def measure(parameters: PlantParameters, cycles: int = 4000) -> Cost:
+def measure(parameters: AnyPlant, cycles: int = 4000) -> Cost:
     """Run the demo motion for `cycles` SYNCs and measure; three benches, so that no part is a difference of
     two others.
     """

@@ -69,6 +69,25 @@ class RunToRun:
         """Whether one day differs from another."""
         return self != RunToRun()
 
+    @property
+    def nominal_day(self) -> Day:
+        """The day without any difference."""
+        return NOMINAL_DAY
+
+    def day(self, seed: int, n: int) -> Day:
+        """Day n = 0, 1, 2, ... of a bench with this seed; every value lies within its half width."""
+        if not self.varies:
+            return NOMINAL_DAY
+        # a text as seed: the noise generator of the same seed must not give the same numbers
+        start = random.Random(f"run to run {seed}")
+        u = [2.0 * ((start.random() + n * step) % 1.0) - 1.0 for step in _STEPS]
+        return Day(
+            viscous=(self.viscous * u[0], self.viscous * u[1]),
+            temperature_k=(self.temperature_k * u[2], self.temperature_k * u[3]),
+            link_zero_rad=(self.link_zero_rad * u[4], self.link_zero_rad * u[5]),
+            sensor_zero_nm=self.sensor_zero_nm * u[6],
+        )
+
 
 class Day(NamedTuple):
     """One day; the defaults are the nominal day. Pairs are of joint 1 and joint 2."""
@@ -80,18 +99,3 @@ class Day(NamedTuple):
 
 
 NOMINAL_DAY = Day()
-
-
-def day(widths: RunToRun, seed: int, n: int) -> Day:
-    """Day n = 0, 1, 2, ... of a bench with this seed; every value lies within its half width."""
-    if not widths.varies:
-        return NOMINAL_DAY
-    # a text as seed: the noise generator of the same seed must not give the same numbers
-    start = random.Random(f"run to run {seed}")
-    u = [2.0 * ((start.random() + n * step) % 1.0) - 1.0 for step in _STEPS]
-    return Day(
-        viscous=(widths.viscous * u[0], widths.viscous * u[1]),
-        temperature_k=(widths.temperature_k * u[2], widths.temperature_k * u[3]),
-        link_zero_rad=(widths.link_zero_rad * u[4], widths.link_zero_rad * u[5]),
-        sensor_zero_nm=widths.sensor_zero_nm * u[6],
-    )

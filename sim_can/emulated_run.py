@@ -14,10 +14,8 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.run import JointColumns, RunTable
-from jtqd.sim_can.days import NOMINAL_DAY, Day
-from jtqd.sim_can.days import day as day_of
-from jtqd.sim_can.plant_file import PlantParameters
 from jtqd.sim_can.plant_source import PlantSource
+from jtqd.sim_can.plants import AnyDay, AnyPlant
 from jtqd.sim_can.source import CURRENT, OFF, VELOCITY, DriveRatings
 
 SENSOR_NM_PER_UNIT = 0.001  # 6132h:1 = 3 decimal digits
@@ -53,16 +51,36 @@ def _zero(_time_s: float) -> float:
     return 0.0
 
 
+class EmulatedRun(NamedTuple):
+    """A run and what no instrument knows: the true torque of each gear, [n, 2] in Nm, own frames."""
+
+    table: RunTable
+    joint_torque_nm: FloatArray
+
+
 def emulate_run(
-    plant: PlantParameters,
+    plant: AnyPlant,
     commands: tuple[JointCommand, JointCommand],
     duration_s: float,
     seed: int = 0,
     period_s: float = 0.001,
     *,
-    day: int | Day | None = None,
+    day: int | AnyDay | None = None,
 ) -> RunTable:
-    """Run both joints from rest for duration_s and return what was measured every period_s.
+    """Return the table of `emulate`: what was measured, and nothing else."""
+    return emulate(plant, commands, duration_s, seed, period_s, day=day).table
+
+
+def emulate(
+    plant: AnyPlant,
+    commands: tuple[JointCommand, JointCommand],
+    duration_s: float,
+    seed: int = 0,
+    period_s: float = 0.001,
+    *,
+    day: int | AnyDay | None = None,
+) -> EmulatedRun:
+    """Run both joints from rest for duration_s; return what was measured every period_s, and the true torques beside it.
 
     Args:
         plant: the bench. commands: of joint 1 and joint 2; targets are evaluated once per period, at its
@@ -72,8 +90,9 @@ def emulate_run(
         the plant's `run_to_run`; or the values themselves; None: the nominal day, without any drift.
 
     Returns:
-        RunTable with joints 1 and 2, n = round(duration_s / period_s) rows from time 0; link_velocity is None
-        (a drive does not measure it), torque_nm is the one sensor's in both joints.
+        A table with joints 1 and 2, n = round(duration_s / period_s) rows from time 0; link_velocity is None
+        (a drive does not measure it), torque_nm is the one sensor's in both joints. The true torques are those at
+        the same times.
 
     Raises:
         ValueError: duration or period not positive and finite.
@@ -81,17 +100,18 @@ def emulate_run(
     if not (0.0 < period_s < math.inf and period_s <= duration_s < math.inf):
         raise ValueError(f"a run of {duration_s} s in steps of {period_s} s")
     count = round(duration_s / period_s)
-    if day is None or isinstance(day, Day):
-        source = PlantSource(plant, seed)
-        source.begin_day(NOMINAL_DAY if day is None else day)
+    if isinstance(day, int):
+        source = PlantSource(plant, seed, noise_seed=f"{seed} day {day}")
+        source.begin_day(plant.run_to_run.day(seed, day))
     else:
-        source = PlantSource(plant, seed, noise_seed=f"{seed} day {int(day)}")
-        source.begin_day(day_of(plant.run_to_run, seed, int(day)))
+        source = PlantSource(plant, seed)
+        source.begin_day(day)
     rows = np.empty((count, 2 * _SIGNALS + 1))
+    truth = np.empty((count, 2))
     # velocity targets are joint side here, motor side in the drives
     scale = [
-        side.joint.gear_ratio if c.mode == VELOCITY else 1.0
-        for side, c in zip(plant.joints, commands, strict=True)
+        drive.gear_ratio if c.mode == VELOCITY else 1.0
+        for drive, c in zip(source.ratings, commands, strict=True)
     ]
     one, two = source.drives
     channel = source.channels[0]
@@ -111,6 +131,7 @@ def emulate_run(
             two.temperature_c,
             channel.torque_nm,
         )
+        truth[k] = source.plant.joint_torques()
         time_s = k * period_s
         source.command(0, mode_1, scale[0] * target_1(time_s))
         source.command(1, mode_2, scale[1] * target_2(time_s))
@@ -123,7 +144,7 @@ def emulate_run(
         for number in (1, 2)
     }
     time: FloatArray = np.arange(count, dtype=np.float64) * period_s
-    return RunTable(time_s=time, joints=joints)
+    return EmulatedRun(RunTable(time_s=time, joints=joints), truth)
 
 
 def _columns(signals: FloatArray, torque: FloatArray, ratings: DriveRatings) -> JointColumns:

@@ -2,14 +2,8 @@
 
 cimport cython
 
+from jtqd.sim_can.noise cimport Noise
 from jtqd.sim_can.signals cimport ChannelSignal, DriveSignals
-
-@cython.final
-cdef class Noise:
-    cdef object uniform
-    cdef double left
-    cdef bint one_left
-    cdef double normal(self) except? -1.0
 
 @cython.final
 cdef class Encoders:
@@ -33,3 +27,4 @@ cdef class Instruments:
     cdef readonly tuple encoders, drives
     cdef readonly TorqueSensor sensor
     cdef readonly ChannelSignal channel
+    cdef double zero_nm

@@ -1,11 +1,10 @@
-from collections.abc import Callable
+from typing import Any
 
+from jtqd.sim_can.drive_file import SensorParameters
+from jtqd.sim_can.noise import Noise
 from jtqd.sim_can.plant import Plant
-from jtqd.sim_can.plant_file import JointPlant, PlantParameters, SensorParameters
+from jtqd.sim_can.plant_file import JointPlant, PlantParameters
 from jtqd.sim_can.signals import ChannelSignal, DriveSignals
-
-class Noise:
-    def __init__(self, uniform: Callable[[], float]) -> None: ...
 
 class Encoders:
     link_zero_rad: float
@@ -24,6 +23,7 @@ class Instruments:
     drives: tuple[DriveSignals, DriveSignals]
     sensor: TorqueSensor
     channel: ChannelSignal
+    def begin_day(self, day: Any) -> None: ...
     def __init__(self, parameters: PlantParameters, noise: Noise) -> None: ...
     def read(
         self,

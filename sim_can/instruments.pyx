@@ -1,30 +1,10 @@
 """Encoders, current measurement and torque sensor of the bench: what they make of the truth. Pure."""
 
-from libc.math cimport M_PI, cos, exp, log, rint, sin, sqrt
+from libc.math cimport M_PI, exp, rint
 
+from jtqd.sim_can.noise cimport Noise
 from jtqd.sim_can.plant cimport Plant
 from jtqd.sim_can.signals cimport ChannelSignal, DriveSignals
-
-
-cdef class Noise:
-    """Normal noise of standard deviation 1 from uniform numbers in [0, 1), two at a time (Box and Muller 1958).
-
-    uniform: `random` of a `random.Random`; the numbers are those of its `gauss`. Not numpy's, which would be 7 MB in a
-    process that has to stay small.
-    """
-
-    def __init__(self, uniform):
-        self.uniform = uniform
-
-    cdef double normal(self) except? -1.0:
-        cdef double angle, radius
-        if self.one_left:
-            self.one_left = False
-            return self.left
-        angle = self.uniform() * (2.0 * M_PI)
-        radius = sqrt(-2.0 * log(1.0 - <double>self.uniform()))
-        self.left, self.one_left = sin(angle) * radius, True
-        return cos(angle) * radius
 
 
 cdef class Encoders:
@@ -84,6 +64,12 @@ cdef class Instruments:
         self.sensor = TorqueSensor(parameters.sensor, noise)
         self.drive_1, self.drive_2, self.channel = DriveSignals(), DriveSignals(), ChannelSignal()
         self.drives = (self.drive_1, self.drive_2)
+        self.zero_nm = parameters.sensor.offset_nm
+
+    def begin_day(self, day):
+        """Set the zeros of another day (`days.Day`)."""
+        self.encoders_1.link_zero_rad, self.encoders_2.link_zero_rad = day.link_zero_rad
+        self.sensor.offset_nm = self.zero_nm + day.sensor_zero_nm
 
     def read(self, Plant plant not None, double dt_s, double torque_nm, errors):
         """Sample everything, dt_s after the last time.

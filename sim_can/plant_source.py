@@ -15,13 +15,17 @@ from typing import Any, NamedTuple
 from jtqd.estimator.effects.effect import Effect, State, Values
 from jtqd.estimator.effects.functions import Scalar
 from jtqd.estimator.joint import Joint
-from jtqd.sim_can.days import NOMINAL_DAY, Day, day
 from jtqd.sim_can.effect_plant import EffectPlant
-from jtqd.sim_can.instruments import Instruments, Noise
+from jtqd.sim_can.instruments import Instruments
 from jtqd.sim_can.joint_effects import effects_of
+from jtqd.sim_can.noise import Noise
 from jtqd.sim_can.plant import Plant
 from jtqd.sim_can.plant_file import JointPlant, PlantParameters
+from jtqd.sim_can.plants import AnyDay, AnyPlant
 from jtqd.sim_can.source import OFF, DriveRatings
+from jtqd.sim_can.towing.bench_file import TowedJoint, TowingBench
+from jtqd.sim_can.towing.instruments import Instruments as TowingInstruments
+from jtqd.sim_can.towing.plant import TowingPlant
 
 Errors = tuple[float, float, float]
 """What motor encoder [rad, motor side], link encoder [rad] and current [A] read above the truth."""
@@ -194,7 +198,7 @@ class Readings:
         return error
 
 
-def ratings_of(side: JointPlant) -> DriveRatings:
+def ratings_of(side: JointPlant | TowedJoint) -> DriveRatings:
     """Return the ratings in the drive's own objects: nominal values, as a drive knows no others."""
     return DriveRatings(
         gear_ratio=side.joint.gear_ratio,
@@ -206,15 +210,36 @@ def ratings_of(side: JointPlant) -> DriveRatings:
     )
 
 
-def _plant_of(parameters: PlantParameters) -> tuple[Plant, Readings | None]:
-    """Return the plant of these joints and, with effects, the errors of its instruments.
+class _Simulated:
+    """Plant of joint files, its instruments, and their errors by effects. Raises ConfigError as `EffectPlant` does."""
 
-    Raises ConfigError for effects with which no joint could work.
-    """
-    if not parameters.has_effects:
-        return Plant(parameters), None
-    plant = EffectPlant(parameters)
-    return plant, Readings(plant)
+    def __init__(self, parameters: PlantParameters, noise: Noise) -> None:
+        self._readings: Readings | None = None
+        if parameters.has_effects:
+            self.plant: Plant = EffectPlant(parameters)
+            self._readings = Readings(self.plant)
+        else:
+            self.plant = Plant(parameters)
+        self.instruments = Instruments(parameters, noise)
+
+    def read(self, dt_s: float) -> None:
+        """Sample everything, dt_s after the last time."""
+        torque_nm, errors = self.plant.sensor_torque(), None
+        if self._readings is not None:
+            errors, torque_nm = self._readings.read(torque_nm, dt_s)
+        self.instruments.read(self.plant, dt_s, torque_nm, errors)
+
+
+class _Towing:
+    """Bench with laws of its own, and its instruments."""
+
+    def __init__(self, parameters: TowingBench, noise: Noise) -> None:
+        self.plant = TowingPlant(parameters)
+        self.instruments = TowingInstruments(parameters, noise)
+
+    def read(self, dt_s: float) -> None:
+        """Sample everything, dt_s after the last time."""
+        self.instruments.read(self.plant, dt_s, self.plant.sensor_torque())
 
 
 class PlantSource:
@@ -224,36 +249,35 @@ class PlantSource:
     both were off it is the next day, unless the run goes on (`resume`). `noise_seed`: of the noise, where it is not `seed`.
     """
 
-    def __init__(self, parameters: PlantParameters, seed: int = 0, noise_seed: str | None = None) -> None:
-        self.plant, self._readings = _plant_of(parameters)
+    def __init__(self, parameters: AnyPlant, seed: int = 0, noise_seed: str | None = None) -> None:
         self.ratings = tuple(ratings_of(side) for side in parameters.joints)
         noise = Noise(random.Random(seed if noise_seed is None else noise_seed).random)
-        self._instruments = Instruments(parameters, noise)
+        made: _Simulated | _Towing = (
+            _Towing(parameters, noise)
+            if isinstance(parameters, TowingBench)
+            else _Simulated(parameters, noise)
+        )
+        self.plant: Plant | TowingPlant = made.plant
+        self._instruments, self._read = made.instruments, made.read
         self.drives = self._instruments.drives
         self.channels = (self._instruments.channel,)
-        self._zero_nm = parameters.sensor.offset_nm
         self._widths = parameters.run_to_run
         self._seed = seed
         self._modes = [OFF, OFF]
         self._ran = self._resumed = False
         self.day_number = 0
-        self.begin_day(day(self._widths, seed, 0))
+        self.begin_day(self._widths.day(seed, 0))
 
-    def begin_day(self, values: Day = NOMINAL_DAY) -> None:
-        """Set friction, temperature and zeros of another day. The joints stay where they are."""
+    def begin_day(self, values: AnyDay | None = None) -> None:
+        """Set what another day brings (None: the nominal day's). The joints stay where they are."""
+        values = self._widths.nominal_day if values is None else values
         self.plant.begin_day(values)
-        for encoders, zero in zip(self._instruments.encoders, values.link_zero_rad, strict=True):
-            encoders.link_zero_rad = zero
-        self._instruments.sensor.offset_nm = self._zero_nm + values.sensor_zero_nm
+        self._instruments.begin_day(values)
 
     def advance(self, dt_s: float) -> bool:
         """Integrate by dt_s and sample everything. An emulated run has no end: always True."""
-        plant = self.plant
-        plant.step(dt_s)
-        torque_nm, errors = plant.sensor_torque(), None
-        if self._readings is not None:
-            errors, torque_nm = self._readings.read(torque_nm, dt_s)
-        self._instruments.read(plant, dt_s, torque_nm, errors)
+        self.plant.step(dt_s)
+        self._read(dt_s)
         return True
 
     def command(self, drive: int, mode: int, target: float) -> None:
@@ -264,7 +288,7 @@ class PlantSource:
                 self.plant.begin_run()
                 if self._ran and self._widths.varies:
                     self.day_number += 1
-                    self.begin_day(day(self._widths, self._seed, self.day_number))
+                    self.begin_day(self._widths.day(self._seed, self.day_number))
             modes[drive] = mode
             self._ran, self._resumed = True, False
         self.plant.command(drive, mode, target)

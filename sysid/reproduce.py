@@ -1,7 +1,8 @@
 """`jtq reproduce`: run the paper's whole procedure and ours: campaigns, fits, training, evaluation, report.
 
 Every step is a `jtq` command of its own, printed before it runs, so that it can be repeated alone. Campaigns go on where
-they were interrupted; fits and training give the same files from the same runs.
+they were interrupted; fits and training give the same files from the same runs. With `--plant` the bench is another one
+(docs/benches.md), and its campaigns are emulated without a bus, with the true torques beside the runs.
 """
 
 from __future__ import annotations
@@ -29,11 +30,15 @@ _OUTSIDE_PLANT: Final = "campaign_plant_outside.yaml"
 _FINDINGS: Final = 3
 _OTHER_DAYS: Final = 7
 """Added to the seed: days and trajectories that no campaign has."""
+_VALIDATION_DAYS: Final = 1000
+"""Added to the seed of emulated runs that judge."""
+_EMULATED: Final = "jtqd.sysid.campaign.emulated"
 TRAINED: Final = "trained"
 """Folder in models/ with what this command has made; beside the configuration in a directory of its own."""
 _EXAMPLES: Final = """examples:
   jtq reproduce --out reproduction            everything, about 85 minutes, of which 41 are motion of the bench
-  jtq reproduce --out /tmp/quick --quick      the same steps in a few minutes, with too few runs for good figures"""
+  jtq reproduce --out /tmp/quick --quick      the same steps in a few minutes, with too few runs for good figures
+  jtq reproduce --plant models/plants/typical.yaml --out typical     another bench, without a bus"""
 
 
 class Step(NamedTuple):
@@ -59,7 +64,7 @@ def main(argv: list[str]) -> int:
         make_directory(out)
         (out / "models").mkdir(parents=True, exist_ok=True)
         _write_outside_plan(out / "outside.plan.yaml", options.seed, 2 if options.quick else 6)
-        for step in steps(out, options.bus, options.quick, options.seed):
+        for step in steps(out, options.bus, options.quick, options.seed, options.plant):
             print(f"$ {step.text}", file=sys.stderr, flush=True)
             status = _run(step)
             if status and not (status == _FINDINGS and step.findings_are_fine):
@@ -124,6 +129,12 @@ def parser() -> argparse.ArgumentParser:
         help="sim, or sim:vcan0: the emulated bench on SocketCAN (default sim)",
     )
     parser.add_argument(
+        "--plant",
+        type=Path,
+        metavar="FILE",
+        help="plant or bench file: every campaign is emulated on it without a bus, none outside its range",
+    )
+    parser.add_argument(
         "--quick", action="store_true", help="small campaigns and short training, to test the steps"
     )
     parser.add_argument(
@@ -132,8 +143,8 @@ def parser() -> argparse.ArgumentParser:
     return parser
 
 
-def steps(out: Path, bus: str, quick: bool, seed: int) -> Iterator[Step]:
-    """Yield the commands in their order."""
+def steps(out: Path, bus: str, quick: bool, seed: int, plant: Path | None = None) -> Iterator[Step]:
+    """Yield the commands in their order; plant: another bench than the shipped one, without a bus."""
     runs, models, work = out / "campaigns", out / "models", out / "work"
     work.mkdir(exist_ok=True)
     common = ("--bus", bus, "--seed", str(seed))
@@ -146,8 +157,18 @@ def steps(out: Path, bus: str, quick: bool, seed: int) -> Iterator[Step]:
         if quick
         else ("--runs", "96", "--seconds", "8", "--hold", "1.6"),
     }
+
+    def campaign(kind: str) -> Step:
+        where = ("--out", str(runs / kind), *sizes[kind])
+        if plant is None:
+            return Step(("campaign", kind, *common, *where), True)
+        # runs that judge are of days that no fit has seen
+        days = seed + (_VALIDATION_DAYS if kind == "validate" else 0)
+        arguments = ("--kind", kind, "--plant", str(plant), "--seed", str(days), *where)
+        return Step(arguments, module=_EMULATED)
+
     for kind in ("excitation", "efficiency"):
-        yield Step(("campaign", kind, *common, "--out", str(runs / kind), *sizes[kind]), True)
+        yield campaign(kind)
     for n in ("1", "2"):
         first, fitted, last = shipped(f"joint{n}.yaml"), work / f"joint{n}.yaml", models / f"joint{n}.yaml"
         number = ("--number", n)
@@ -163,19 +184,22 @@ def steps(out: Path, bus: str, quick: bool, seed: int) -> Iterator[Step]:
             ("train", str(runs / "excitation"), *joints, "--network", network, "--seed", str(seed),
              "--out", str(models), *short)
         )  # fmt: skip
-    yield Step(("campaign", "validate", *common, "--out", str(runs / "validate"), *sizes["validate"]), True)
-    plan, plant = str(out / "outside.plan.yaml"), str(shipped(_OUTSIDE_PLANT))
-    yield Step(("campaign", plan, *common, "--plant", plant, "--out", str(runs / "outside")), True)
+    yield campaign("validate")
+    outside: tuple[str, ...] = ()
+    if plant is None:
+        plan, stronger = str(out / "outside.plan.yaml"), str(shipped(_OUTSIDE_PLANT))
+        outside = ("--outside", str(runs / "outside"))
+        yield Step(("campaign", plan, *common, "--plant", stronger, "--out", outside[1]), True)
     yield Step(
-        ("evaluate", str(runs / "validate"), "--outside", str(runs / "outside"), "--models", str(models),
-         "--out", str(out / "report")),
+        ("evaluate", str(runs / "validate"), *outside, "--models", str(models), "--out", str(out / "report")),
         True,
-    )  # fmt: skip
+    )
     # How often an interval covers takes more days than a bus has time for.
     days = ("2", "6", "1.0") if quick else ("384", "8", "1.6")
     size = tuple(x for pair in zip(("--runs", "--seconds", "--hold"), days, strict=True) for x in pair)
     other = ("--seed", str(seed + _OTHER_DAYS))
-    yield Step(("--out", str(out / "days"), *size, *other), module="jtqd.sysid.campaign.emulated")
+    bench = () if plant is None else ("--plant", str(plant))
+    yield Step(("--out", str(out / "days"), *bench, *size, *other), module=_EMULATED)
     yield Step(
         ("evaluate", str(out / "days"), "--models", str(models), "--out", str(out / "report_days")), True
     )

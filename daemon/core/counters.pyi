@@ -5,8 +5,6 @@ from jtqd.daemon.shared.snapshot import Snapshot
 from jtqd.drivers.frame_socket import FrameSocket
 
 class LastEstimate:
-    carried: tuple[str, ...]
-    state: bytes
     def __init__(self, snapshot: Snapshot) -> None: ...
     def begin(self) -> None: ...
     def write(
@@ -21,8 +19,6 @@ class LastEstimate:
     ) -> None: ...
 
 class LoopCounters:
-    carried: tuple[str, ...]
-    state: bytes
     @property
     def last(self) -> LastEstimate: ...
     def __init__(self, snapshot: Snapshot, intake: Intake, socket: FrameSocket) -> None: ...

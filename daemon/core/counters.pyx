@@ -7,7 +7,7 @@ from libc.stdint cimport int64_t, uint8_t, uint64_t
 
 import struct
 
-from jtqd.daemon.core.block cimport copied, put_back
+from jtqd.estimator.block cimport copied, put_back
 from jtqd.daemon.core.bus cimport Bus, bus_of
 from jtqd.daemon.core.intake cimport MOST_INPUTS, NODES, Input, Intake, NodeState
 from jtqd.daemon.core.joint cimport JointState
@@ -60,20 +60,9 @@ cdef class LastEstimate:
     snapshot: whose memory it is.
     """
 
-    carried = ("state",)
-
     def __init__(self, snapshot):
         self.sequence, self.memory = snapshot.sequence, snapshot.estimate
         self.now.status[0] = self.now.status[1] = -1
-
-    @property
-    def state(self):
-        """All of it as one block."""
-        return copied(&self.now, sizeof(ToldState))
-
-    @state.setter
-    def state(self, bytes block):
-        put_back(&self.now, sizeof(ToldState), block)
 
     def begin(self):
         """Mark the snapshot as inconsistent until the end of `write` (counters and inputs included)."""
@@ -170,8 +159,6 @@ cdef class LoopCounters:
         last: the last estimate.
     """
 
-    carried = ("state", "last")
-
     def __init__(self, snapshot, Intake intake, socket):
         cdef int n
         if intake.count > shared.MAX_INPUTS:
@@ -187,15 +174,6 @@ cdef class LoopCounters:
         for n in range(intake.count):
             self.bits_of[n] = worst_case_bits(intake.inputs[n].length)
             self.bits_complete += self.bits_of[n]
-
-    @property
-    def state(self):
-        """All of it as one block."""
-        return copied(&self.now, sizeof(CounterState))
-
-    @state.setter
-    def state(self, bytes block):
-        put_back(&self.now, sizeof(CounterState), block)
 
     @property
     def bus_errors(self):

@@ -11,11 +11,10 @@ counter and a stale estimate.
 """
 
 from libc.stdint cimport int64_t, uint8_t, uint32_t
-from libc.string cimport memcpy, memset
+from libc.string cimport memset
 
 from typing import Final
 
-from jtqd.daemon.core.block cimport copied, put_back
 from jtqd.daemon.core.bus cimport Bus, bus_of
 from jtqd.daemon.core.clock cimport Clock
 from jtqd.daemon.core.configured_nodes import ConfiguredNodes
@@ -94,18 +93,6 @@ cdef class Cycle:
         sent_ns: when its estimate had been handed to the socket.
     """
 
-    carried = (
-        "state",
-        "intake",
-        "grid",
-        "joints",
-        "budget",
-        "wake_up",
-        "frames",
-        "counters",
-        "configured_nodes",
-    )
-
     def __init__(
         self,
         socket,
@@ -141,15 +128,6 @@ cdef class Cycle:
         self.heartbeat_frame = _frame(HEARTBEAT + node_id, 1)
         self.heartbeat_frame.data[0] = OPERATIONAL
         self.configured_nodes = ConfiguredNodes(snapshot, intake, self.joints)
-
-    @property
-    def state(self):
-        """What it knows besides its parts, as one block."""
-        return copied(&self.now, sizeof(CycleState))
-
-    @state.setter
-    def state(self, bytes block):
-        put_back(&self.now, sizeof(CycleState), block)
 
     @property
     def index(self):
@@ -366,15 +344,6 @@ cdef class Cycle:
         self.now.index += 1
         return True
 
-    def between(self, const uint8_t[::1] frames, stamps_ns, own, int count):
-        """Take frames received while no cycle was open; arguments as `Intake.drain`."""
-        cdef Frame frame
-        cdef int n
-        self.intake.drain(frames, stamps_ns, own, count)
-        for n in range(count):
-            memcpy(&frame, &frames[16 * n], sizeof(Frame))
-            self.hold(&frame, stamps_ns[n])
-
     def skip(self, int64_t slots):
         """Skip missed slots: the index follows the grid, so that a gap in the log shows them."""
         self.now.index += slots
@@ -390,11 +359,6 @@ cdef class Cycle:
             if joint.reset_latch():
                 self.now.next_flags = RESET
                 self.counters.now.latch_resets += 1
-
-    def use_own(self):
-        """Use the estimators and limits built here, after the state of another loop was restored."""
-        for joint in self.joints:
-            joint.use(joint.estimator, joint.safety)
 
     def leave(self):
         """Send a last estimate with status off, so that no receiver keeps the last torque."""

@@ -15,8 +15,6 @@ class Pdo(Protocol):
     def name(self) -> str: ...
 
 class InputState:
-    carried: tuple[str, ...]
-    state: bytes
     fresh: bool
     values: tuple[int, ...]
     stamp_ns: int
@@ -51,8 +49,6 @@ class InputState:
     def long(self) -> int: ...
 
 class JointTemperature:
-    carried: tuple[str, ...]
-    state: bytes
     celsius: float
     def __init__(self, cob_id: int, node_id: int, name: str, life_cycles: int) -> None: ...
     @property
@@ -71,8 +67,6 @@ class JointTemperature:
 UNKNOWN: Final[JointTemperature]
 
 class Gaps:
-    carried: tuple[str, ...]
-    state: bytes
     wanted: bool
     @property
     def count(self) -> int: ...
@@ -87,8 +81,6 @@ class Gaps:
     def pass_slot(self) -> None: ...
 
 class NodeTrust:
-    carried: tuple[str, ...]
-    state: bytes
     def __init__(self, pdos: Sequence[InputState]) -> None: ...
     @property
     def heartbeats(self) -> dict[int, int]: ...
@@ -112,11 +104,8 @@ class NodeTrust:
     def doubt(self, node_id: int) -> None: ...
 
 class Intake:
-    state: bytes
     sync_stamp_ns: int
     def __init__(self, pdos: Sequence[Pdo], temperatures: Sequence[JointTemperature] = ()) -> None: ...
-    @property
-    def carried(self) -> tuple[str, ...]: ...
     @property
     def pdos(self) -> tuple[Pdo, ...]: ...
     @property

@@ -35,7 +35,6 @@ from libc.string cimport memcmp, memcpy, memset
 
 from typing import Final
 
-from jtqd.daemon.core.block cimport copied, put_back
 from jtqd.drivers.frame_socket cimport Frame
 from jtqd.drivers import devices, nmt
 from jtqd.drivers import frame as can_frame
@@ -87,8 +86,6 @@ cdef class InputState:
     pdo: an `InputPdo` (`jtqd.daemon.loop.input_pdos`): `cob_id`, `length`, `layout`, `node_id`, `name`.
     """
 
-    carried = ("state",)
-
     def __init__(self, pdo):
         cdef int offset = 0
         letters = pdo.layout.format.lstrip("<")
@@ -102,15 +99,6 @@ cdef class InputState:
             offset += _SIZES[letter]
         self.input.wanted = 1
         self.input.band_low_ns = NEVER
-
-    @property
-    def state(self):
-        """All of it as one block."""
-        return copied(&self.input, sizeof(Input))
-
-    @state.setter
-    def state(self, bytes block):
-        put_back(&self.input, sizeof(Input), block)
 
     @property
     def unpack(self):
@@ -289,22 +277,11 @@ cdef class JointTemperature:
         rejected: frames with this identifier and a wrong length, or 29-bit or remote frames.
     """
 
-    carried = ("state",)
-
     def __init__(self, uint32_t cob_id, int node_id, name, int64_t life_cycles):
         self.name = name
         self.known.cob_id, self.known.node_id, self.known.life_cycles = cob_id, node_id, life_cycles
         self.known.until = NEVER
         self.known.celsius = NAN
-
-    @property
-    def state(self):
-        """All of it as one block."""
-        return copied(&self.known, sizeof(Temperature))
-
-    @state.setter
-    def state(self, bytes block):
-        put_back(&self.known, sizeof(Temperature), block)
 
     @property
     def cob_id(self):
@@ -386,17 +363,6 @@ cdef class Gaps:
         length: slots of the present gap.
     """
 
-    carried = ("state",)
-
-    @property
-    def state(self):
-        """All of it as one block."""
-        return copied(&self.now, sizeof(GapState))
-
-    @state.setter
-    def state(self, bytes block):
-        put_back(&self.now, sizeof(GapState), block)
-
     @property
     def count(self):
         return self.now.count
@@ -462,8 +428,6 @@ cdef class NodeTrust:
         restarts: boot-up messages of each node that has sent one.
     """
 
-    carried = ("state",)
-
     def __init__(self, pdos):
         cdef InputState state
         self.states_of = tuple(pdos)
@@ -476,15 +440,6 @@ cdef class NodeTrust:
             self.inputs[self.count] = &state.input
             self.count += 1
         self.now.wanted = self.count
-
-    @property
-    def state(self):
-        """All of it as one block."""
-        return copied(&self.now, sizeof(NodeState))
-
-    @state.setter
-    def state(self, bytes block):
-        put_back(&self.now, sizeof(NodeState), block)
 
     @property
     def wanted(self):
@@ -613,20 +568,6 @@ cdef class Intake:
             self.temperature_of[temperature.known.cob_id] = self.temperature_count
             self.temperature_count += 1
         self.nodes, self.gaps = NodeTrust(self.states), Gaps()
-
-    @property
-    def carried(self):
-        """Attributes that another loop goes on with (`jtqd.daemon.reload.carry`)."""
-        return ("state", "states", "nodes", "gaps", *(["temperatures"] if self.temperatures else []))
-
-    @property
-    def state(self):
-        """What it knows besides its parts, as one block."""
-        return copied(&self.now, sizeof(IntakeState))
-
-    @state.setter
-    def state(self, bytes block):
-        put_back(&self.now, sizeof(IntakeState), block)
 
     @property
     def last_delay_ns(self):

@@ -9,14 +9,10 @@ from jtqd.estimator.methods import AnyEstimator
 STAMP_ACCURACY_NS: Final = 5000
 
 class Unwrap:
-    carried: tuple[str, ...]
-    state: bytes
     def __init__(self, offset: int = 0) -> None: ...
     def counts(self, raw: int) -> int: ...
 
 class JointCycle:
-    carried: tuple[str, ...]
-    state: bytes
     inputs: Any
     estimator: AnyEstimator
     def __init__(

@@ -6,7 +6,7 @@ from libc.stdint cimport int64_t
 from dataclasses import replace
 from typing import Final
 
-from jtqd.daemon.core.block cimport copied, put_back
+from jtqd.estimator.block cimport copied
 from jtqd.daemon.core.estimate_pdo cimport Published, field_of, has_torque
 from jtqd.daemon.core.intake cimport Input, InputState, Intake, JointTemperature
 from jtqd.daemon.core.intake import UNKNOWN
@@ -35,19 +35,8 @@ cdef class Unwrap:
     offset: whole ranges that it had rolled over before the first sample [counts].
     """
 
-    carried = ("state",)
-
     def __init__(self, int64_t offset=0):
         self.now.offset = offset
-
-    @property
-    def state(self):
-        """All of it as one block."""
-        return copied(&self.now, sizeof(UnwrapState))
-
-    @state.setter
-    def state(self, bytes block):
-        put_back(&self.now, sizeof(UnwrapState), block)
 
     def counts(self, int64_t raw):
         """Return continuous counts; correct if two samples are less than 2^31 counts apart."""
@@ -83,8 +72,6 @@ cdef class JointCycle:
         view: its block of the snapshot, a `JointView`.
     """
 
-    carried = ("state", "inputs", "motor", "link", "rules")
-
     def __init__(self, int number, inputs, estimator, *, Intake intake, snapshot, int64_t period_ns, safety=None):
         cdef JointTemperature temperature
         cdef JointBlock nothing = JointBlock(
@@ -104,15 +91,6 @@ cdef class JointCycle:
         self.now.status = STARTING
         self.now.sample = nothing
         self.now.published = field_of(NAN, INFINITY, STARTING)
-
-    @property
-    def state(self):
-        """What it knows besides its parts, as one block."""
-        return copied(&self.now, sizeof(JointState))
-
-    @state.setter
-    def state(self, bytes block):
-        put_back(&self.now, sizeof(JointState), block)
 
     @property
     def inputs(self):

@@ -4,8 +4,6 @@ class RecordRing:
     def __init__(self, ring: Ring) -> None: ...
 
 class CycleFrames:
-    carried: tuple[str, ...]
-    state: bytes
     @property
     def count(self) -> int: ...
     @property

@@ -9,7 +9,7 @@ from libc.string cimport memcpy
 
 import sys
 
-from jtqd.daemon.core.block cimport copied, put_back
+from jtqd.estimator.block cimport copied
 from jtqd.drivers.frame_socket cimport Frame
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared import ring as shared_ring
@@ -91,17 +91,6 @@ cdef class CycleFrames:
         count: frames stored in it.
         left_out: frames of the cycle that found no room.
     """
-
-    carried = ("state",)
-
-    @property
-    def state(self):
-        """Frames of slots without a record, as one block."""
-        return copied(&self.held, sizeof(HeldFrames))
-
-    @state.setter
-    def state(self, bytes block):
-        put_back(&self.held, sizeof(HeldFrames), block)
 
     @property
     def slot(self):

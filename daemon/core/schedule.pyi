@@ -4,8 +4,6 @@ RESERVED_NS: Final = 40000
 FORGET_CYCLES: Final = 1024
 
 class Grid:
-    carried: tuple[str, ...]
-    state: bytes
     slot_ns: int
     period_ns: int
     missed: int
@@ -14,8 +12,6 @@ class Grid:
     def too_late(self, now_ns: int) -> bool: ...
 
 class WakeUp:
-    carried: tuple[str, ...]
-    state: bytes
     def __init__(self, wait_ns: int, deadline_ns: int) -> None: ...
     @property
     def wait_ns(self) -> int: ...
@@ -24,8 +20,6 @@ class WakeUp:
     def follow(self, last_delay_ns: int) -> None: ...
 
 class NetworkBudget:
-    carried: tuple[str, ...]
-    state: bytes
     def __init__(self) -> None: ...
     def first(self, now_ns: int, next_sync_ns: int) -> bool: ...
     def second(self, now_ns: int) -> bool: ...

@@ -7,7 +7,6 @@ from libc.stdint cimport int64_t
 
 from typing import Final
 
-from jtqd.daemon.core.block cimport copied, put_back
 
 _STEP_NS: Final = 160
 _MARGIN_NS: Final = 10_000
@@ -34,19 +33,8 @@ cdef class Grid:
         missed: slots skipped so far.
     """
 
-    carried = ("state",)
-
     def __init__(self, int64_t start_ns, int64_t period_ns):
         self.now = GridState(start_ns, period_ns, 0)
-
-    @property
-    def state(self):
-        """All of it as one block."""
-        return copied(&self.now, sizeof(GridState))
-
-    @state.setter
-    def state(self, bytes block):
-        put_back(&self.now, sizeof(GridState), block)
 
     @property
     def slot_ns(self):
@@ -101,19 +89,8 @@ cdef class WakeUp:
         deadline_ns: from SYNC to the end of the wait for inputs; the wake-up never comes later.
     """
 
-    carried = ("state",)
-
     def __init__(self, int64_t wait_ns, int64_t deadline_ns):
         self.now = WakeUpState(wait_ns, deadline_ns)
-
-    @property
-    def state(self):
-        """All of it as one block."""
-        return copied(&self.now, sizeof(WakeUpState))
-
-    @state.setter
-    def state(self, bytes block):
-        put_back(&self.now, sizeof(WakeUpState), block)
 
     @property
     def wait_ns(self):
@@ -143,19 +120,8 @@ cdef class NetworkBudget:
     tried again. When inputs come so late that there is no time, it is left out at once.
     """
 
-    carried = ("state",)
-
     def __init__(self):
         self.now.one.wanted = self.now.two.wanted = True
-
-    @property
-    def state(self):
-        """All of it as one block."""
-        return copied(&self.now, sizeof(BudgetState))
-
-    @state.setter
-    def state(self, bytes block):
-        put_back(&self.now, sizeof(BudgetState), block)
 
     cpdef bint first(self, int64_t now_ns, int64_t next_sync_ns) noexcept:
         """Return whether joint 1, whose estimate begins, may use its network; `next_sync_ns`: due time of the next SYNC."""

@@ -19,8 +19,6 @@ class JointCounts(Protocol):
     errors: Any
 
 class JointStatus:
-    carried: tuple[str, ...]
-    state: bytes
     def __init__(self, settings: SafetySettings) -> None: ...
     @property
     def latched(self) -> int: ...
@@ -42,7 +40,6 @@ class JointTally:
 def drive_status(statusword: int) -> int | None: ...
 
 class JointRules:
-    carried: tuple[str, ...]
     def __init__(self, number: int, tally: JointCounts, safety: JointSafety, with_network: bool) -> None: ...
     @property
     def status(self) -> JointStatus: ...

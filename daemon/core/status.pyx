@@ -28,7 +28,6 @@ from libc.stdint cimport int64_t, uint64_t
 
 from typing import Final
 
-from jtqd.daemon.core.block cimport copied, put_back
 from jtqd.daemon.core.estimate_pdo cimport has_torque
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared import faults
@@ -114,23 +113,12 @@ cdef class JointStatus:
         news, latches: faults that began, and how often one was latched, since whoever counts them set these to 0.
     """
 
-    carried = ("state",)
-
     def __init__(self, settings):
         self.use(settings)
         self.now.held = STARTING
         self.now.asked = VALID
         self.now.needed = WAITS[STARTING]
         self.now.factor = 1
-
-    @property
-    def state(self):
-        """All of it as one block."""
-        return copied(&self.now, sizeof(StatusState))
-
-    @state.setter
-    def state(self, bytes block):
-        put_back(&self.now, sizeof(StatusState), block)
 
     @property
     def latched(self):
@@ -329,8 +317,6 @@ cdef class JointRules:
     Attributes:
         status: what is held and what is latched.
     """
-
-    carried = ("status",)
 
     def __init__(self, int number, tally, safety, bint with_network):
         self.tally = JointTally(number, tally)

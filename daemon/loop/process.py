@@ -3,9 +3,8 @@
 Started by the supervisor as `python -m jtqd.daemon.loop.process` with a JSON request as its only argument. It answers on
 standard output with one JSON line when it is ready, reads the boot report as one JSON line from standard input, runs, and
 ends with one JSON line of results. It has no second thread, logs nothing while it runs, and shares only memory with
-other processes.
-
-The successor of a running loop is a process of its own with the same cycle: `jtqd.daemon.reload.successor`.
+other processes. After SIGUSR2 it reads an order to swap its estimators, and answers it, each as one JSON line
+(`daemon/reload/swap.py`).
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, TextIO
 
 from jtqd.daemon.config import Config, JointConfig, load_config
 from jtqd.daemon.core.counters import frame_counts
@@ -29,7 +28,8 @@ from jtqd.daemon.core.joint_safety import safety_of
 from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.loop import realtime
 from jtqd.daemon.loop.input_pdos import JointInputs, input_pdos, joint_temperatures, sensor_index
-from jtqd.daemon.reload.handover import Giver
+from jtqd.daemon.reload.order import Order
+from jtqd.daemon.reload.swap import Swap
 from jtqd.daemon.shared.cycle_record import RECORD_SIZE
 from jtqd.daemon.shared.ring import Ring
 from jtqd.daemon.shared.snapshot import Snapshot
@@ -47,32 +47,35 @@ _SLOTS = 8
 
 
 class Duties:
-    """Duties in the pause after a cycle: the watchdog, orders of the supervisor, a hand-over.
+    """Duties in the pauses of the loop: the watchdog, orders of the supervisor, new estimators.
 
-    Call it in the pause after every `slots()` cycles; True: the bus belongs to the successor, leave it silently. Costs one
-    look at shared memory and now and then a datagram (docs/deployment.md).
+    Call it in the pause after every `slots()` cycles. Costs one look at shared memory and now and then a datagram
+    (docs/deployment.md).
 
     Args:
         cycle: the loop's.
         watchdog: to be fed.
-        giver: hands the bus over when SIGUSR2 has asked for it.
-        report: tells the supervisor why a hand-over came to nothing.
+        swap: loads new estimators when SIGUSR2 has announced an order.
+        orders: where the supervisor writes orders, one JSON line each.
     """
 
-    def __init__(
-        self, cycle: Cycle, watchdog: LoopWatchdog, giver: Giver, report: Callable[[str], None]
-    ) -> None:
+    def __init__(self, cycle: Cycle, watchdog: LoopWatchdog, swap: Swap, orders: TextIO = sys.stdin) -> None:
         self._cycle, self._orders = cycle, cycle.snapshot.orders
         self._advanced, self._index = watchdog.advanced, cycle.index
-        self._giver, self._report = giver, report
-        self._wanted = self._giving = False
+        self._swap, self._ordered_from = swap, orders
+        self._announced = False
         signal.signal(signal.SIGUSR2, self._on_signal)
 
     def slots(self) -> int:
-        """Return how many slots may pass before the next call: a hand-over needs each pause."""
-        return 1 if self._wanted or self._giving else _SLOTS
+        """Return how many slots may pass before the next call: a swap wants each pause."""
+        return 1 if self._announced or self._swap.active else _SLOTS
 
-    def __call__(self) -> bool:
+    @property
+    def after_sync(self) -> Callable[[], None] | None:
+        """Return what wants the pause between SYNC and the wake-up for the inputs."""
+        return self._swap.after_sync if self._swap.active else None
+
+    def __call__(self) -> None:
         """Run the duties after some cycles."""
         index = self._cycle.index
         self._advanced(index - self._index)
@@ -82,17 +85,11 @@ class Duties:
             self._reset()
         if orders[2] != orders[3]:
             self._doubt()
-        if self._wanted:
-            self._wanted, self._giving = False, True
-            self._giver.begin()
-        return self._giving and self._give()
-
-    def _give(self) -> bool:
-        given = self._giver.step()
-        if given is None:
-            self._giving = False
-            self._report(self._giver.refused or "")
-        return bool(given)
+        if self._swap.active:
+            self._swap.after_cycle()
+        elif self._announced:
+            self._announced = False
+            self._take_order()
 
     def _reset(self) -> None:
         number = self._orders[0]
@@ -104,8 +101,15 @@ class Duties:
         self._cycle.configured_nodes.doubt()
         self._orders[3] = number
 
+    def _take_order(self) -> None:
+        if not select.select([self._ordered_from], [], [], 0)[0]:
+            return  # somebody else's signal
+        line = self._ordered_from.readline()
+        if line:  # else the supervisor has gone
+            self._swap.begin(Order.from_mapping(json.loads(line)))
+
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        self._wanted = True
+        self._announced = True
 
 
 _WARM_UP_STEPS = 300
@@ -191,37 +195,28 @@ def run(
     grid: Grid,
     stop: Callable[[], bool],
     end_ns: int | None = None,
-    *,
-    after: Callable[[], bool] | None = None,
-    after_sync: Callable[[], None] | None = None,
-    slots: Callable[[], int] = lambda: 1,
-) -> bool:
-    """Cycle until `stop()`, `end_ns` (CLOCK_MONOTONIC) or until `after()`, called in the pause after a cycle, is true.
+    duties: Duties | None = None,
+) -> None:
+    """Cycle until `stop()` or `end_ns`.
 
     Args:
         cycle, grid: state of the loop; the first cycle is that of the grid's slot.
         stop: asked before a cycle.
-        end_ns: no cycle begins from here on; None: without end.
-        after: see `jtqd.daemon.loop.process`.
-        after_sync: called once, when the first SYNC has been sent and nobody waits for anything yet.
-        slots: how many slots may pass before `stop` and `after` are asked again.
-
-    Returns:
-        True when `after` ended it: the bus belongs to somebody else.
+        end_ns: no cycle begins from here on (CLOCK_MONOTONIC); None: without end.
+        duties: called in the pause after a cycle, and asked how many slots may pass before the next time.
     """
     passed = False
     while not stop():
-        outcome = cycle.go_on(1 if after_sync or passed else slots(), end_ns or 0, after_sync)
+        slots = 1 if passed or duties is None else duties.slots()
+        outcome = cycle.go_on(slots, end_ns or 0, None if duties is None else duties.after_sync)
         if outcome == RUN_ENDED:
             break
-        passed = outcome == SLOT_PASSED  # then `after` waits for the very next cycle
+        passed = outcome == SLOT_PASSED  # then the duties wait for the very next cycle
         if passed:
             continue
-        after_sync = None
-        if after is not None and after():
-            return True
+        if duties is not None:
+            duties()
         cycle.skip(grid.advance(time.monotonic_ns()))
-    return False
 
 
 def answer(**content: Any) -> None:
@@ -238,14 +233,10 @@ def build_cycle(
     report: dict[str, Any],
     socket: FrameSocket,
     estimators: list[AnyEstimator],
-    *,
-    attach: bool = False,
 ) -> tuple[Cycle, Grid]:
-    """Build cycle and grid from configuration and boot report; `attach`: on the running loop's shared memory."""
+    """Build cycle and grid from configuration and boot report."""
     grid = Grid(0, config.period_ns)
-    snapshot = Snapshot(
-        Path(request["snapshot"]), config.period_ns * 1e-9, float(request["worst_load"]), attach=attach
-    )
+    snapshot = Snapshot(Path(request["snapshot"]), config.period_ns * 1e-9, float(request["worst_load"]))
     intake = Intake(input_pdos(config), joint_temperatures(config))
     for node in {pdo.node_id for pdo in intake.pdos} - {int(node) for node in report["nodes"]}:
         intake.absent(node)
@@ -253,7 +244,7 @@ def build_cycle(
         socket,
         intake,
         list(zip(joint_inputs(config, report), estimators, strict=True)),
-        Ring(Path(request["ring"]), config.ring_cycles, RECORD_SIZE, attach=attach),
+        Ring(Path(request["ring"]), config.ring_cycles, RECORD_SIZE),
         snapshot,
         safety=safety_of(config),
         node_id=config.node_id,
@@ -287,32 +278,17 @@ def serve(request: dict[str, Any]) -> int:
     socket = open_frame_socket(request["bus"], loop_filters(config), receive_own=True)
     cycle, grid = build_cycle(config, request, json.loads(line), socket, estimators)
     refused = realtime.prepare(config.realtime.priority, config.realtime.cpu, config.realtime.lock_memory)
-    duties, giver = make_duties(cycle, request)
+    swap = Swap(cycle, Path(request["ring"]), config.safety, answer)
+    swap.rehearse(estimators)  # which stay as they are until the end: to free a runtime's session takes long
+    duties = Duties(cycle, LoopWatchdog(Notifier(), cycle.grid.period_ns, watchdog_seconds()), swap)
     realtime.freeze()
     answer(running=True, refused=refused)
     grid.slot_ns = time.monotonic_ns() + 2 * config.period_ns
     duration_s = request.get("duration_s")
-    giver.end_ns = None if duration_s is None else grid.slot_ns + round(duration_s * 1e9)
-    return finish(
-        cycle,
-        lambda: run(cycle, grid, lambda: stop.requested, giver.end_ns, after=duties, slots=duties.slots),
-    )
-
-
-def make_duties(cycle: Cycle, request: dict[str, Any]) -> tuple[Duties, Giver]:
-    """Create watchdog, orders and hand-over of this loop."""
-    watchdog = LoopWatchdog(Notifier(), cycle.grid.period_ns, watchdog_seconds())
-    giver = Giver(cycle, Path(request["successor"]))
-    return Duties(cycle, watchdog, giver, lambda why: answer(not_handed_over=why)), giver
-
-
-def finish(cycle: Cycle, go: Callable[[], bool]) -> int:
-    """Run, leave the bus unless it is a successor's by then, report the end. Returns the exit status."""
+    end_ns = None if duration_s is None else grid.slot_ns + round(duration_s * 1e9)
     error = None
     try:
-        if go():
-            answer(handed_over=True)
-            return 0
+        run(cycle, grid, lambda: stop.requested, end_ns, duties)
         cycle.leave()
     except BusGone as gone:
         error = str(gone)

@@ -1,8 +1,8 @@
 """Joint files, networks and estimator settings anew, in a running daemon, without a late or missing cycle.
 
-The supervisor checks the configuration, starts a successor of the loop (`daemon/reload/successor.py`), and when that stands
-by, has the running loop hand over (`daemon/reload/handover.py`). Whatever is wrong until then is said, and nothing has
-changed. What the bus, the nodes or the shared memory depend on needs a restart.
+The supervisor checks the configuration, has a child prepare the estimators (`daemon/reload/prepare.py`), and then orders the
+loop to swap its own for them (`daemon/reload/swap.py`). Whatever is wrong until then is said, and nothing has changed.
+What the bus, the nodes or the shared memory depend on needs a restart.
 """
 
 from __future__ import annotations
@@ -11,17 +11,17 @@ import json
 import signal
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 from jtqd.daemon.config import Config, load_config
+from jtqd.daemon.reload.order import FILE, Order
 from jtqd.daemon.shared.child_process import Child, ChildError
 from jtqd.estimator.checked import ConfigError
 
-SOCKET = "handover"
-"""Name of the successor's socket in the runtime directory."""
-READY_S, HAND_OVER_S = 60.0, 30.0
+PREPARED_S = 60.0
 _FREE = ("path", "text", "sha256", "estimator", "joints")
 """Of a configuration; of its joints, see `_FREE_OF_JOINT`."""
 _FREE_OF_JOINT = ("joint_path", "joint", "joint_data", "network")
@@ -56,7 +56,6 @@ class Reload:
 
     Args:
         request: the running loop's, see `daemon/loop/process.py`.
-        report: of the boot, with the scaling of the devices.
         start_child: makes a child process from (module, arguments, name).
         check: further checks of a configuration; raises ReloadError.
     """
@@ -64,26 +63,25 @@ class Reload:
     def __init__(
         self,
         request: dict[str, Any],
-        report: dict[str, Any],
         start_child: Callable[[str, list[str], str], Child],
         check: Callable[[Config], None],
     ) -> None:
-        self._request, self._report = request, report
+        self._path = Path(request["ring"]).with_name(FILE)
+        self._request = request | {"swap": str(self._path)}
         self._start_child, self._check = start_child, check
         self._child: Child | None = None
         self._config: Config | None = None
-        self._stage = ""
         self._until_s = 0.0
-        self._stands: dict[str, Any] = {}
+        self._prepared: dict[str, Any] = {}
 
     @property
     def running(self) -> bool:
         """Return whether a reload is running."""
-        return self._child is not None
+        return self._config is not None
 
     def start(self, config: Config, path: Path | None) -> None:
-        """Check the files and start the successor. Raises ReloadError."""
-        if self._child is not None:
+        """Check the files and start to prepare the estimators. Raises ReloadError."""
+        if self.running:
             raise ReloadError("another reload is under way")
         try:
             new = load_config(path)
@@ -94,64 +92,65 @@ class Reload:
         if fixed:
             raise ReloadError(f"{new.path}: changed: {', '.join(fixed)}: needs a restart")
         self._config = new
-        request = self._request | {
-            "config_sha256": new.files_sha256,
-            "handover": str(Path(self._request["ring"]).with_name(SOCKET)),
-        }
-        self._child = self._start_child("jtqd.daemon.reload.successor", [json.dumps(request)], "the new loop")
-        self._stage, self._until_s = "to be built", time.monotonic() + READY_S
+        request = self._request | {"config_sha256": new.files_sha256}
+        self._child = self._start_child(
+            "jtqd.daemon.reload.prepare", [json.dumps(request)], "the preparation of estimators"
+        )
+        self._until_s = time.monotonic() + PREPARED_S
 
     @property
     def outputs(self) -> list[int]:
         """Return the descriptors for select."""
         return self._child.outputs if self._child is not None else []
 
-    def poll(self, loop: Child) -> tuple[Child, Config, dict[str, Any]] | None:
-        """Continue the reload; return the new loop, its configuration and the change after the hand-over.
+    def poll(self, loop: Child) -> None:
+        """Continue the reload: when the estimators are prepared, give `loop` its order.
 
         Raises:
-            ReloadError: nothing came of it, and `loop` goes on.
+            ReloadError: nothing came of it.
         """
         child = self._child
         if child is None:
-            return None
+            return
         alive = child.alive()
         answer = child.poll_answer()
         if answer is None:
             if not alive:
-                raise self._failed(f"the new loop ended with exit status {child.process.returncode}")
+                raise self._failed(f"{child.name} ended with exit status {child.process.returncode}")
             if time.monotonic() > self._until_s:
-                raise self._failed(f"the new loop took too long {self._stage}")
-            return None
-        if "failed" in answer:
+                raise self._failed(f"{child.name} took longer than {PREPARED_S:g} s")
+        elif "failed" in answer:
             raise self._failed(str(answer["failed"]))
-        if answer.get("ready"):
-            child.tell(self._report)
-        elif answer.get("standing_by"):
-            self._stands = answer
-            self._stage, self._until_s = "to take over", time.monotonic() + HAND_OVER_S
+        else:
+            self._child, self._prepared = None, answer
+            loop.tell(Order(self._path, answer["bytes"], answer["sha256"]).to_mapping())
             loop.process.send_signal(signal.SIGUSR2)
-        elif "took_over" in answer:
-            assert self._config is not None
-            self._child = None
-            return child, self._config, self._stands | answer
-        return None
 
-    def refused(self, why: str) -> ReloadError:
-        """Handle a refusal of the running loop."""
-        return self._failed(why)
+    def answered(self, answer: dict[str, Any]) -> tuple[Config, dict[str, Any]]:
+        """Take the loop's answer to the order; return the configuration in force and what has changed.
+
+        Raises:
+            ReloadError: it goes on with the old estimators.
+        """
+        config = self._config
+        if config is None or "not_swapped" in answer:
+            raise self._failed(str(answer.get("not_swapped")))
+        self._end()
+        return config, self._prepared | answer
 
     def abandon(self) -> None:
         """Abandon the reload at the end of the daemon."""
-        if self._child is not None:
-            self._failed("jtqd is ending")
+        self._end()
 
     def _failed(self, why: str) -> ReloadError:
-        child, self._child = self._child, None
-        if child is not None and child.alive():
-            child.process.kill()  # it has sent nothing on the bus; the running loop sees its socket close
-            try:
-                child.answer(1.0)
-            except ChildError:
-                pass
+        self._end()
         return ReloadError(why)
+
+    def _end(self) -> None:
+        child, self._child, self._config = self._child, None, None
+        if child is not None and child.alive():
+            child.process.kill()
+            with suppress(ChildError):
+                child.answer(1.0)
+        with suppress(OSError):
+            self._path.unlink(missing_ok=True)

@@ -38,19 +38,15 @@ class Ring:
         path: file on a tmpfs, created anew (an older one is replaced: its reader keeps the old memory).
         slots: number of records kept.
         record_size: bytes of one record.
-        attach: go on with the ring that another writer has made.
 
     Attributes:
         words: 64-bit words of the header page.
         records: memory of all records.
         size: number of records kept.
-
-    Raises:
-        RingError: `attach`, and there is no ring of these numbers.
     """
 
-    def __init__(self, path: Path, slots: int, record_size: int, *, attach: bool = False) -> None:
-        self._memory = _existing(path, slots, record_size) if attach else _created(path, slots, record_size)
+    def __init__(self, path: Path, slots: int, record_size: int) -> None:
+        self._memory = _created(path, slots, record_size)
         view = memoryview(self._memory)
         # One 8-byte store. `struct.pack_into` writes zeros first: the reader would at times see a count of 0.
         self.words = view[:_HEADER_SIZE].cast("Q")
@@ -81,15 +77,6 @@ def _created(path: Path, slots: int, record_size: int) -> mmap.mmap:
         memory = mmap.mmap(file.fileno(), 0)
     _LAYOUT.pack_into(memory, 0, _MAGIC, slots, record_size)
     os.replace(temporary, path)
-    return memory
-
-
-def _existing(path: Path, slots: int, record_size: int) -> mmap.mmap:
-    with open(path, "r+b") as file:
-        memory = mmap.mmap(file.fileno(), 0)
-    wanted = (_MAGIC, slots, record_size)
-    if len(memory) != _HEADER_SIZE + slots * record_size or _LAYOUT.unpack_from(memory, 0) != wanted:
-        raise RingError(f"{path}: not a ring of {slots} records of {record_size} bytes")
     return memory
 
 
@@ -131,6 +118,10 @@ class RingReader:
     def backlog(self) -> int:
         """Return the number of records written and not yet read."""
         return self._count() - self.position
+
+    def seek(self, position: int) -> None:
+        """Go on with the record that was the position-th to be written, from 0 on."""
+        self.position, self._newest = position, -1
 
     def read(self, limit: int = 1024) -> Batch:
         """Copy at most `limit` records; count those that were overwritten before they could be copied."""

@@ -226,8 +226,6 @@ class SnapshotError(Exception):
 class Snapshot:
     """Writer's side, one per loop: the memory that `daemon/core/counters.pyx` writes into.
 
-    With `attach` it takes over the memory that another loop has made, as it is; from `own` on it is this process's.
-
     Attributes:
         orders: requests of the supervisor and what became of them: [resets asked, done, doubts reported, seen].
         counters: memory of the counters, one unsigned 64-bit word each, in the order of `COUNTERS`.
@@ -247,15 +245,14 @@ class Snapshot:
         estimate: the last estimate: times, status, `JointView` and `Measured` of both joints.
     """
 
-    def __init__(self, path: Path, period_s: float, worst_load: float, *, attach: bool = False) -> None:
-        self._head = (period_s, worst_load)
-        if attach:
-            with open(path, "r+b") as file:
-                self._memory = mmap.mmap(file.fileno(), 0)
-            if len(self._memory) != SIZE or _WORD.unpack_from(self._memory, 0)[0] != _MAGIC:
-                raise SnapshotError(f"{path}: not a status snapshot of this version")
-        else:
-            self._create(path)
+    def __init__(self, path: Path, period_s: float, worst_load: float) -> None:
+        temporary = path.with_name(path.name + ".new")
+        with open(temporary, "w+b") as file:
+            os.fchmod(file.fileno(), 0o640)  # the daemon's group may look
+            os.posix_fallocate(file.fileno(), 0, SIZE)  # a full tmpfs refuses here, not by SIGBUS
+            self._memory = mmap.mmap(file.fileno(), 0)
+        _HEAD.pack_into(self._memory, 0, _MAGIC, os.getpid(), period_s, worst_load)
+        os.replace(temporary, path)
         view = memoryview(self._memory)
         self.orders = view[_ORDERS_OFFSET:_COUNTERS_OFFSET].cast("Q")
         self.counters = view[_COUNTERS_OFFSET:_SEQUENCE_OFFSET].cast("Q")
@@ -273,19 +270,6 @@ class Snapshot:
         self.doubts = view[_DOUBTS_OFFSET:SIZE]
         self.sequence = view[_SEQUENCE_OFFSET:_ESTIMATE_OFFSET].cast("Q")
         self.estimate = view[_ESTIMATE_OFFSET:_ERRORS_OFFSET]
-
-    def _create(self, path: Path) -> None:
-        temporary = path.with_name(path.name + ".new")
-        with open(temporary, "w+b") as file:
-            os.fchmod(file.fileno(), 0o640)  # the daemon's group may look
-            os.posix_fallocate(file.fileno(), 0, SIZE)  # a full tmpfs refuses here, not by SIGBUS
-            self._memory = mmap.mmap(file.fileno(), 0)
-        self.own()
-        os.replace(temporary, path)
-
-    def own(self) -> None:
-        """Make this process the loop."""
-        _HEAD.pack_into(self._memory, 0, _MAGIC, os.getpid(), *self._head)
 
     def factors(self, node_id: int) -> tuple[float, ...]:
         """Four scaling factors that the supervisor has noted for a node (`note_factors`); zeros where none."""

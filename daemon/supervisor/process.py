@@ -26,7 +26,7 @@ from jtqd.daemon.live.address import Address
 from jtqd.daemon.live.keeper import LiveKeeper
 from jtqd.daemon.loop.realtime import stolen_s
 from jtqd.daemon.recording.keeper import Keeper, recording_request
-from jtqd.daemon.reload.files import SOCKET, Reload, ReloadError
+from jtqd.daemon.reload.files import Reload, ReloadError
 from jtqd.daemon.shared.child_process import Child, ChildError, ChildSilence
 from jtqd.daemon.shared.conditions import JOINT, PDO, THE_MACHINE, Conditions, ConditionsFile
 from jtqd.daemon.shared.log_lines import ERROR, WARNING, EventLog, OperatorLog
@@ -322,7 +322,7 @@ class Supervisor:
         self._node = node = self._bus_service.own
         self._bus_service.begin(time.monotonic())
         self._report = report
-        self._service.open(reader, Reload(self._loop_request(), report, self._child, self._check_reloaded))
+        self._service.open(reader, Reload(self._loop_request(), self._child, self._check_reloaded))
         began_s, self._stolen = time.monotonic(), StolenTime(self._conditions)
         result = self._watch(loop, node, reader, bench)
         stolen = self._stolen.total_s()
@@ -377,7 +377,6 @@ class Supervisor:
             "snapshot": str(self._snapshot),
             "worst_load": self._load.worst,
             "duration_s": self._duration_s,
-            "successor": str(self._directory / SOCKET),
         }
 
     # Run -----------------------------------------------------------------------------------------------------------------
@@ -395,9 +394,9 @@ class Supervisor:
                 answer = loop.poll_answer()
                 if answer is not None and answer.get("done"):
                     return answer
-                if answer is not None and "not_handed_over" in answer:
-                    self._service.not_handed_over(str(answer["not_handed_over"]))
-                if not loop.alive() and not self._service.reloading:
+                if answer is not None:
+                    self._service.swapped(answer)
+                if not loop.alive():
                     final = loop.poll_answer()
                     return final or {"error": f"the loop ended with exit status {loop.process.returncode}"}
                 if bench is not None and not bench.alive():
@@ -422,7 +421,7 @@ class Supervisor:
                 self._stolen.observe(now)
                 self._serve(view, now)
                 self._report_conditions(now)
-                loop = self._loop_now(loop, view, node.recorder_lost, stopping=stopping > 0.0)
+                self._service.serve(loop, view, node.recorder_lost)
                 display.turn(now)
 
     def _report_conditions(self, now: float) -> None:
@@ -446,13 +445,6 @@ class Supervisor:
             len(self._report["nodes"]) > known
         ):  # absent at the start: without its scaling the log cannot be understood
             self._record(self._report, again=True)
-
-    def _loop_now(self, loop: Child, view: View, recorder_lost: int, *, stopping: bool) -> Child:
-        """Serve systemd, operators and reloads; return the loop, or its successor."""
-        now = self._service.serve(loop, view, recorder_lost)
-        if stopping and now is not loop:
-            now.process.send_signal(signal.SIGTERM)  # it took over just when the order to end came
-        return now
 
     def _stopped(self) -> bool:
         return self._stop

@@ -163,15 +163,15 @@ class Service:
         """Request a reload (SIGHUP). During a reload another one follows, as the files may have changed."""
         self._reload_wanted = True
 
-    def serve(self, loop: Child, view: View, recorder_lost: int) -> Child:
-        """Run the due services; return the running loop, which changes with a reload."""
+    def serve(self, loop: Child, view: View, recorder_lost: int) -> None:
+        """Run the due services."""
         if self._reload_wanted and not self.reloading:
             self._reload_wanted = False
             try:
                 self._start_reload()
             except ReloadError as error:
                 self._reload_failed(error)
-        loop = self._poll_reload(loop)
+        self._poll_reload(loop)
         if self._control is not None:
             self._control.serve()
         now = time.monotonic()
@@ -185,17 +185,22 @@ class Service:
         if self._config.metrics_file is not None and now >= self._metrics_due:
             self._metrics_due = now + _METRICS_PERIOD_S
             self._write_metrics(view, recorder_lost)
-        return loop
 
     @property
     def reloading(self) -> bool:
-        """Return whether a hand-over may be running, so that an ended loop may have a successor."""
+        """Return whether a reload is running."""
         return self._reload is not None and self._reload.running
 
-    def not_handed_over(self, why: str) -> None:
-        """Take the running loop's reason for having kept the bus."""
-        if self._reload is not None and self._reload.running:
-            self._reload_failed(self._reload.refused(why))
+    def swapped(self, answer: dict[str, Any]) -> None:
+        """Take the loop's answer to the order to swap its estimators."""
+        if self._reload is None or not self._reload.running:
+            return
+        try:
+            self._config, about = self._reload.answered(answer)
+        except ReloadError as error:
+            self._reload_failed(error)
+        else:
+            self._reloaded(about)
 
     def stopping(self, why: str = "") -> None:
         """Report the begin of the shutdown."""
@@ -263,28 +268,26 @@ class Service:
         self._reload.start(self._config, self._config.path)
         self._notifier.send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
-    def _poll_reload(self, loop: Child) -> Child:
+    def _poll_reload(self, loop: Child) -> None:
         if self._reload is None:
-            return loop
+            return
         try:
-            done = self._reload.poll(loop)
+            self._reload.poll(loop)
         except ReloadError as error:
             self._reload_failed(error)
-            return loop
-        if done is None:
-            return loop
-        new, self._config, about = done
+
+    def _reloaded(self, about: dict[str, Any]) -> None:
         try:
             self._renew(self._config)
-        except OSError as error:  # the loop has taken over all the same
+        except OSError as error:  # the loop has new estimators all the same
             self._log(f"reloaded, but the runtime directory is not writable: {error.strerror}", ERROR)
-        missed = self._missed() - int(about["missed_before"])
+        cycle, missed, cycles = about["cycle"], about["missed"], about["cycles"]
         self._outcome.append(
             {
                 "ok": True,
-                "cycle": about["took_over"],
+                "cycle": cycle,
                 "missed": missed,
-                "shadowed_cycles": about["cycles"],
+                "shadowed_cycles": cycles,
                 "changes": about["changes"],
             }
         )
@@ -294,17 +297,12 @@ class Service:
             if change["rms_change_nm"] is not None
         )
         self._log(
-            f"reloaded {self._config.path}: in force from cycle {about['took_over']} on, "
+            f"reloaded {self._config.path}: in force from cycle {cycle} on, "
             f"{missed} cycle{'s' if missed != 1 else ''} missed; "
-            f"on the last {about['cycles']} cycles the estimates change: {changes or 'nothing to compare'}",
+            f"on the last {cycles} cycles the estimates change: {changes or 'nothing to compare'}",
             NOTICE,
         )
         self._notifier.send("READY=1")
-        return new
-
-    def _missed(self) -> int:
-        assert self._reader is not None
-        return self._reader.read().counters["missed"]
 
     def _reload_failed(self, error: ReloadError) -> None:
         self._outcome.append({"ok": False, "error": str(error)})

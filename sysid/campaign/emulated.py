@@ -1,8 +1,8 @@
 """`python -m jtqd.sysid.campaign.emulated`: runs of a campaign on the emulated bench without a bus, faster than real time.
 
-Run tables and marks as a campaign leaves them, each run on a day of its own. No bus, no loop, no missing cycles: for
-questions that need hundreds of days, such as how often an interval covers. What jtqd itself would have recorded comes
-from `jtq campaign --bus sim`.
+Run tables and marks as a campaign leaves them, each run on a day of its own, and the true torques beside each
+(NAME.truth.npz). No bus, no loop, no missing cycles: for questions that need hundreds of days, such as how often an interval
+covers. What jtqd itself would have recorded comes from `jtq campaign --bus sim`.
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError, count, counted, natural, seconds
 from jtqd.estimator.run import RunTable
 from jtqd.models.files import load_joint, shipped
-from jtqd.sim_can.emulated_run import JointCommand, TimeFunction, emulate_run
-from jtqd.sim_can.plant_file import PlantParameters, load_plant
+from jtqd.sim_can.emulated_run import EmulatedRun, JointCommand, TimeFunction, emulate
+from jtqd.sim_can.plants import AnyPlant, load_any_plant
 from jtqd.sysid.campaign.plan import Plan, Run, expand, marks_of
-from jtqd.sysid.campaign.plans import Scale, make_plan
+from jtqd.sysid.campaign.plans import KINDS, Scale, make_plan
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.files import write_run
+from jtqd.sysid.runs.truth import write_truth
 
 PLANT: Final = "campaign_plant.yaml"
 _RECIPE: Final = "emulated_runs.json"
@@ -38,19 +39,24 @@ _EXAMPLE = (
 
 def emulated(plan: Plan, plant: Path, seed: int) -> dict[str, RunTable]:
     """Return the run tables of a plan on the bench of `plant`, each on a day of its own. Raises ConfigError."""
-    bench = load_plant(plant)
+    bench = load_any_plant(plant)
     return {run.name: emulated_run(bench, seed, day, run) for day, run in enumerate(plan.runs)}
 
 
-def emulated_run(bench: PlantParameters, seed: int, day: int, run: Run) -> RunTable:
+def emulated_run(bench: AnyPlant, seed: int, day: int, run: Run) -> RunTable:
     """Return the table of one run on this day of the seed."""
+    return emulated_with_truth(bench, seed, day, run).table
+
+
+def emulated_with_truth(bench: AnyPlant, seed: int, day: int, run: Run) -> EmulatedRun:
+    """Return one run on this day of the seed, with the true torques."""
     points = expand(run)
     commands = (
         JointCommand.velocity(_sampled(points.velocity_rad_s)),
         JointCommand.current(_sampled(points.current_a)),
     )
     one, two = commands if points.velocity_joint == 1 else (commands[1], commands[0])
-    return emulate_run(bench, (one, two), len(points) / _HZ, seed, day=day)
+    return emulate(bench, (one, two), len(points) / _HZ, seed, day=day)
 
 
 def _sampled(values: FloatArray) -> TimeFunction:
@@ -65,7 +71,10 @@ def _sampled(values: FloatArray) -> TimeFunction:
 
 def _write_run_files(out: Path, plant: Path, seed: int, numbered: tuple[int, Run]) -> str:
     day, run = numbered
-    write_run(out / f"{run.name}.csv.gz", emulated_run(load_plant(plant), seed, day, run))
+    made = emulated_with_truth(load_any_plant(plant), seed, day, run)
+    path = out / f"{run.name}.csv.gz"
+    write_run(path, made.table)
+    write_truth(path, {1: made.joint_torque_nm[:, 0], 2: made.joint_torque_nm[:, 1]})
     (out / f"{run.name}.json").write_text(json.dumps(marks_of(run, expand(run)), indent=1) + "\n")
     return run.name
 
@@ -78,17 +87,32 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="output directory; created or continued"
     )
+    parser.add_argument(
+        "--kind", choices=KINDS, default="validate", help="kind of campaign (default validate)"
+    )
     parser.add_argument("--plant", type=Path, default=shipped(PLANT), help=f"bench (default {PLANT})")
     parser.add_argument("--runs", type=count, metavar="N", help="Fourier runs (default 24)")
     parser.add_argument("--seconds", type=seconds, metavar="S", help="length of a Fourier run (default 12)")
     parser.add_argument("--hold", type=seconds, metavar="S", help="hold of a constant point (default 2.1)")
+    parser.add_argument(
+        "--evaluations", type=count, metavar="N", help="of each search of an excitation (default 1000)"
+    )
+    parser.add_argument("--quick", action="store_true", help="a small campaign of the kind")
     parser.add_argument("--seed", type=natural, default=0, help="of trajectories and days (default 0)")
     options = parser.parse_args(arguments)
     joints = (load_joint(shipped("joint1.yaml")), load_joint(shipped("joint2.yaml")))
-    scale = Scale(options.runs, options.seconds, options.hold, options.seed, joints=joints)
+    scale = Scale(
+        options.runs,
+        options.seconds,
+        options.hold,
+        options.seed,
+        options.evaluations,
+        options.quick,
+        joints=joints,
+    )
     try:
-        plan = make_plan("validate", scale)
-        load_plant(options.plant)
+        plan = make_plan(options.kind, scale)
+        load_any_plant(options.plant)
         _claim(options.out, plan, options.plant, options.seed)
         _emulate(options.out, plan, options.plant, options.seed)
     except (ConfigError, OSError) as error:

@@ -41,6 +41,7 @@ from jtqd.sysid.evaluate.scores import (
     ratio,
     standstill,
 )
+from jtqd.sysid.evaluate.truth import TruthTables, truth_tables
 from jtqd.sysid.fit.efficiency_report import TITLES as QUADRANT_TITLES
 from jtqd.sysid.fit.plateaus import Plateau
 from jtqd.sysid.runs.checks import RunIssue
@@ -70,7 +71,8 @@ class Evaluation:
 
     plateaus: of runs at constant velocity; variable, constant_tables: errors over the samples of runs of either kind;
     intervals: of ours, under "variable", "constant" and "all"; jumps, passages: largest ones by method; picture: the run
-    of the figure like the paper's Fig. 16; loop_time: what steps cost, None where it was not measured.
+    of the figure like the paper's Fig. 16; loop_time: what steps cost, None where it was not measured;
+    truth: against the true torque, None where no run has it.
     """
 
     models: tuple[JointModels, ...]
@@ -86,6 +88,7 @@ class Evaluation:
     outside: tuple[Outside, ...]
     picture: Samples | None
     loop_time: LoopTime | None = None
+    truth: TruthTables | None = None
     targets: tuple[Target, ...] = field(default=())
 
     @property
@@ -155,6 +158,7 @@ def evaluate(
         outside=tuple(outside_scores(_samples(beyond), _envelopes(models))),
         picture=_picture(parts["variable"], modes),
         loop_time=measured,
+        truth=truth_tables(every),
     )
     return replace(result, targets=targets(result))
 
@@ -169,7 +173,7 @@ def _judge(
             if each.number not in run.columns:
                 continue
             columns = run.columns[each.number]
-            one = take_samples(run.name, each, run.table.time_s, columns)
+            one = take_samples(run.name, each, run.table.time_s, columns, run.truth.get(each.number))
             if not one.scored.any():
                 findings.append(
                     RunIssue("nothing_to_score", f"{run.name}: j{each.number}: {_why_nothing(one)}")

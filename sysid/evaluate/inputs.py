@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -23,6 +24,7 @@ from jtqd.sysid.evaluate.methods import JointModels, run_hashes
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.checks import RunIssue, check_channels
 from jtqd.sysid.runs.files import ColumnMap, RunError, RunFile, read_run, run_paths
+from jtqd.sysid.runs.truth import read_truth
 
 _CELL_S: Final = 0.01
 _CLEAR: Final = 3.0
@@ -62,7 +64,10 @@ _NEEDED = ("current_a", "motor_position_rad", "link_position_rad", "torque_nm")
 
 
 class JudgedRun(NamedTuple):
-    """One run: columns by joint number, complete and checked; velocity_joint None: not known; `by`: marks or data."""
+    """One run: columns by joint number, complete and checked; velocity_joint None: not known; `by`: marks or data.
+
+    truth: true torque [n] by joint, empty where the run has none.
+    """
 
     name: str
     sha256: str
@@ -70,6 +75,7 @@ class JudgedRun(NamedTuple):
     columns: Mapping[int, JointColumns]
     velocity_joint: int | None
     by: str
+    truth: Mapping[int, FloatArray] = MappingProxyType({})
 
 
 class Inputs(NamedTuple):
@@ -151,7 +157,17 @@ def _judged(
     marked = by_marks(_marks(path))
     number = marked if marked is not None else by_data(file.table)
     by = "unknown" if number is None else "data" if marked is None else "marks"
-    return JudgedRun(name, file.sha256, file.table, usable, number, by), findings
+    truth: Mapping[int, FloatArray] = {}
+    try:
+        truth = read_truth(path)
+        if any(len(values) != len(file.table.time_s) for values in truth.values()):
+            raise ValueError(
+                f"{path}: found true torques of another length than the run's {len(file.table.time_s)} rows"
+            )
+    except ValueError as error:
+        findings.append(RunIssue("truth", f"{error}: not scored against the true torque"))
+        truth = {}
+    return JudgedRun(name, file.sha256, file.table, usable, number, by, truth), findings
 
 
 def _check(name: str, file: RunFile, number: int, joint: Joint) -> list[RunIssue]:

@@ -239,7 +239,7 @@ class Samples:
     velocity's [rad/s, joint side] makes the quadrant (index into QUADRANTS); estimate_nm, sigma_nm, status: by method;
     scored: all methods move and have a value; standing: all have a value and stand still; missing: settled, but some
     method has no value; temperature_c: NaN where the run has none; bare_nm: the paper's network by itself, without the
-    guard around it, NaN where there is none.
+    guard around it, NaN where there is none. true_nm: the gear's torque itself, where the run is emulated and has it.
     """
 
     run: str
@@ -258,13 +258,20 @@ class Samples:
     standing: Flags
     missing: Flags
     bare_nm: FloatArray
+    true_nm: FloatArray | None = None
 
     def error_nm(self, method: str) -> FloatArray:
         """Estimate less sensor [n] [Nm]."""
         return self.estimate_nm[method] - self.sensor_nm
 
 
-def take_samples(run: str, models: JointModels, time_s: FloatArray, columns: JointColumns) -> Samples:
+def take_samples(
+    run: str,
+    models: JointModels,
+    time_s: FloatArray,
+    columns: JointColumns,
+    true_nm: FloatArray | None = None,
+) -> Samples:
     """Estimate one joint of a run by every method.
 
     columns: all inputs and the sensor [n]; finite (`RunTable` is). Raises ConfigError and ValueError as the estimators.
@@ -296,4 +303,5 @@ def take_samples(run: str, models: JointModels, time_s: FloatArray, columns: Joi
         standing=published & standing,
         missing=settled & ~published,
         bare_nm=np.full_like(sensor, np.nan) if paper is None else paper.network_nm,
+        true_nm=true_nm,
     )

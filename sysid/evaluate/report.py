@@ -14,6 +14,7 @@ from jtqd.sysid.evaluate.constant import PlateauScore, speed_groups
 from jtqd.sysid.evaluate.evaluation import Evaluation, RunRecord, Target, mse, worse_runs
 from jtqd.sysid.evaluate.methods import OURS, PAPERS, TITLES, JointModels
 from jtqd.sysid.evaluate.scores import PAPER_MSE_NM2, Coverage, ErrorTables, IntervalTables, Row, ratio
+from jtqd.sysid.evaluate.truth import TruthTables
 from jtqd.sysid.fit.efficiency_report import TITLES as QUADRANT_TITLES
 from jtqd.sysid.report import page
 from jtqd.sysid.report.figures import page_svg
@@ -45,6 +46,7 @@ def as_mapping(result: Evaluation) -> dict[str, Any]:
         "jumps": {"at": result.jumps, "passage": result.passages},
         "outside": list(result.outside),
         "loop_time": result.loop_time,
+        "truth": None if result.truth is None else _truth(result.truth),
         "picture": None
         if result.picture is None
         else {"run": result.picture.run, "number": result.picture.number},
@@ -171,6 +173,15 @@ def _intervals(table: IntervalTables) -> dict[str, Any]:
     }
 
 
+def _truth(truth: TruthTables) -> dict[str, Any]:
+    return {
+        "now": {number: _row(one) for number, one in truth.now.items()},
+        "aligned": {number: _row(one) for number, one in truth.aligned.items()},
+        "intervals": None if truth.intervals is None else _intervals(truth.intervals),
+        "standstill": {number: vars(one) for number, one in truth.standstill.items()},
+    }
+
+
 def _plain(value: Any) -> Any:
     """Named tuples and mappings as dicts with text keys, sequences as lists, numbers that are not finite as None."""
     if hasattr(value, "_asdict"):
@@ -213,6 +224,7 @@ def text_lines(result: Evaluation, mapping: Mapping[str, Any]) -> list[str]:
         "C. 90 % interval of our method: coverage of the sensor value, in %",
         *_text_intervals(result),
         "",
+        *_text_truth(result),
         "D. targets",
         *_targets(result.targets),
     ]
@@ -308,6 +320,41 @@ def _text_intervals(result: Evaluation) -> list[str]:
             f"  standstill j{number}, {share}: the interval contained the sensor value in {held or 'no sample'}"
         )
     return lines
+
+
+def _text_truth(result: Evaluation) -> list[str]:
+    """Return the table against the true torque; nothing where no run has it."""
+    truth = result.truth
+    if truth is None:
+        return []
+    methods = result.methods
+    rows = [
+        [f"j{number} {text}", *(_rmse(scores, method) for method in methods)]
+        for text, part in (("now", truth.now), ("aligned", truth.aligned))
+        for number, scores in part.items()
+    ]
+    lines = [
+        "against the true torque: RMSE in motion in % of rated torque (now: the estimate's age is an error)"
+    ]
+    lines += table(["", *(_SHORT[m] for m in methods)], rows)
+    if truth.intervals is not None:
+        cells = [
+            [f"j{number} 90 %", *_coverages(truth.intervals, number)] for number in truth.intervals.joints
+        ]
+        lines += table(["", "all", "i>0 w>0", "i<0 w<0", "i<0 w>0", "i>0 w<0"], cells)
+    for number, one in truth.standstill.items():
+        held = ", ".join(
+            f"{_SHORT[m]} {100 * c.share:.1f} % (half width {one.half_width_nm[m]:.2f} Nm)"
+            for m, c in one.coverage.items()
+        )
+        lines.append(
+            f"  standstill j{number}: the interval contained the true torque in {held or 'no sample'}"
+        )
+    return [*lines, ""]
+
+
+def _rmse(scores: Row, method: str) -> str:
+    return _cell(scores[method].rmse_rated_percent if method in scores else None, ".2f")
 
 
 def _coverages(tables: IntervalTables, number: int) -> list[str]:

@@ -32,7 +32,8 @@ from jtqd.estimator.joint import AdditiveLoss, Friction, Fused, FusedSigma, Tors
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.sysid.fit.losses import LossFit, fit_loss
 from jtqd.sysid.fit.signals import RunSignals
-from jtqd.sysid.fit.torsion import fit_torsion, torsion_torque
+from jtqd.sysid.fit.torsion import fit_torsion
+from jtqd.sysid.fit.torsion_signals import torsion_torque
 
 COVERAGE: Final = 0.9
 GAUSS: Final = 1.6448536269514722

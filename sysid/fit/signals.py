@@ -36,7 +36,7 @@ class RunSignals:
 
     name: of the run, the unit of every split; seen: outputs of the observer, with `torsion_nm` the filtered torsion
     angle [rad]; sensor_nm: torque sensor through the estimator's filter; moving: status valid and settled;
-    standing: status standstill.
+    standing: status standstill; positions: of the encoders as read, None where they are not known.
     """
 
     name: str
@@ -44,6 +44,14 @@ class RunSignals:
     sensor_nm: FloatArray
     moving: BoolArray
     standing: BoolArray
+    motor_position_rad: FloatArray | None = None
+    link_position_rad: FloatArray | None = None
+    bandwidth_rad_s: float = EstimatorSettings().bandwidth_rad_s
+
+    def waves(self, angle_rad: FloatArray, order: float) -> FloatArray:
+        """Return cos and sin [n, 2] of a multiple of an angle [n], through the estimator's filter."""
+        parts = (np.cos(order * angle_rad), np.sin(order * angle_rad))
+        return np.column_stack([low_pass(part, self.seen.dt_s, self.bandwidth_rad_s) for part in parts])
 
     @property
     def temperature_c(self) -> float:
@@ -78,4 +86,7 @@ def run_signals(
         low_pass(sensor, dt, settings.bandwidth_rad_s),
         settled & (seen.status == VALID),
         settled & (seen.status == STANDSTILL),
+        np.asarray(motor, np.float64),
+        np.asarray(link, np.float64),
+        settings.bandwidth_rad_s,
     )

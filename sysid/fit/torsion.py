@@ -8,21 +8,23 @@ encoder's cannot be told apart in one run; their mean over the runs is the torsi
 
 z is d through a Maxwell-slip element; its travel is the best of a grid. A hysteresis is written only when it removes a
 twentieth of the residual variance and dissipates (H > 0); a damping when it dissipates (D > 0). Without the damping
-the slip would take its part: ripple of 100 rad/s loses as much in either.
+the slip would take its part: ripple of 100 rad/s loses as much in either. What joints have beyond that is added by
+`torsion_extensions` where runs left out confirm it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isnan
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Torsion
-from jtqd.estimator.observer import RIPPLE_ORDERS
+from jtqd.estimator.observer import RIPPLE_ORDERS, slipped
 from jtqd.sysid.fit.signals import RunSignals
+from jtqd.sysid.fit.torsion_extensions import extended
+from jtqd.sysid.fit.torsion_signals import rate_of
 
 _EVERY: Final = 5
 _ORDERS: Final = tuple(float(order) for order in RIPPLE_ORDERS)
@@ -60,7 +62,7 @@ def fit_torsion(runs: Sequence[RunSignals]) -> Torsion:
     if best.hysteresis_nm > 0.0:
         best = _fit(runs, largest, best.offsets, best.travel_rad)
     c2, s2, c4, s4, zero = best.offsets.tolist()
-    return Torsion(
+    plain = Torsion(
         stiffness_nm_per_rad=best.stiffness,
         cubic_nm_per_rad3=best.cubic,
         zero_rad=zero,
@@ -71,6 +73,7 @@ def fit_torsion(runs: Sequence[RunSignals]) -> Torsion:
         hysteresis_travel_rad=best.travel_rad,
         damping_nms_per_rad=best.damping,
     )
+    return extended(runs, plain)
 
 
 class _Found(NamedTuple):
@@ -113,31 +116,6 @@ def _fit(
     )
 
 
-def slipped(d_rad: FloatArray, travel_rad: float) -> tuple[FloatArray, FloatArray]:
-    """Return z [n] of a Maxwell-slip element that follows d [n] as FusedObserver's does, and half the width [n] left open.
-
-    Where it began is not known: z is the middle of its bounds, -1 and 1 at first and after each NaN, where z is 0.
-    """
-    middle, width = np.zeros_like(d_rad), np.zeros_like(d_rad)
-    before, low, high = np.nan, -1.0, 1.0
-    for k, now in enumerate((d_rad / travel_rad).tolist()):
-        step = now - before
-        before = now
-        if isnan(step):  # nothing was observed here or before
-            low, high = -1.0, 1.0
-        else:
-            low, high = min(max(low + step, -1.0), 1.0), min(max(high + step, -1.0), 1.0)
-        middle[k], width[k] = 0.5 * (low + high), 0.5 * (high - low)
-    return middle, width
-
-
-def rate_of(d_rad: FloatArray, run: RunSignals) -> FloatArray:
-    """Return d' [n, rad/s] of a filtered deflection, as FusedObserver forms it: over the step before; 0 beside a gap."""
-    dt_s = run.seen.dt_s
-    rate = np.diff(d_rad, prepend=np.nan) / np.where(dt_s > 0.0, dt_s, np.nan)
-    return np.nan_to_num(rate, nan=0.0)
-
-
 def _equations(
     runs: Sequence[RunSignals], offsets: FloatArray, largest: float, travel_rad: float | None
 ) -> tuple[FloatArray, FloatArray]:
@@ -175,18 +153,3 @@ def _noise_of(x: FloatArray, y: FloatArray, shared: int) -> float:
     """Return the residual variance with one zero for all runs [Nm^2]."""
     w = np.linalg.lstsq(x[:, :shared], y, rcond=None)[0]
     return float(np.mean((y - x[:, :shared] @ w) ** 2))
-
-
-def torsion_torque(torsion: Torsion, run: RunSignals) -> tuple[FloatArray, FloatArray]:
-    """Return tau_t and open [n] of observed signals, as FusedObserver gives them.
-
-    Raises ValueError for a kinematic error of other orders than RIPPLE_ORDERS, whose waves the signals hold.
-    """
-    if torsion.orders_per_motor_rev != _ORDERS:
-        raise ValueError(f"found a torsion of orders {torsion.orders_per_motor_rev}, expected {_ORDERS}")
-    pairs = np.column_stack((torsion.cos_rad, torsion.sin_rad)).ravel()  # c2, s2, c4, s4 as the waves
-    d = run.seen.torsion_nm - torsion.zero_rad - run.seen.waves @ pairs
-    result: FloatArray = d * (torsion.stiffness_nm_per_rad + torsion.cubic_nm_per_rad3 * d * d)
-    result = result + torsion.damping_nms_per_rad * rate_of(d, run)
-    z, width = slipped(d, torsion.hysteresis_travel_rad)
-    return result + torsion.hysteresis_nm * z, torsion.hysteresis_nm * width

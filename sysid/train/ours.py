@@ -28,7 +28,8 @@ from jtqd.estimator.settings import EstimatorSettings
 from jtqd.sysid.fit.fused import conformal_scale, folds, loss_and_width
 from jtqd.sysid.fit.losses import fit_loss
 from jtqd.sysid.fit.signals import RunSignals
-from jtqd.sysid.fit.torsion import fit_torsion, torsion_torque
+from jtqd.sysid.fit.torsion import fit_torsion
+from jtqd.sysid.fit.torsion_signals import torsion_torque
 from jtqd.sysid.train.network import IR_VERSION, OPSET, Trained, folded_layers, hidden_output, train
 from jtqd.sysid.train.paper import TrainedNetwork, digest_of, thinned
 

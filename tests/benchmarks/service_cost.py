@@ -1,8 +1,8 @@
-"""`service`: what systemd and a reload cost the loop in the pause after a cycle: watchdog, orders, telling, taking over."""
+"""`service`: what systemd and a reload cost the loop in its pauses: watchdog, orders, the steps of a swap of estimators."""
 
 from __future__ import annotations
 
-import json
+import hashlib
 import socket
 import statistics
 import time
@@ -10,11 +10,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from jtqd.daemon.config import SafetySettings, load_config
 from jtqd.daemon.core.cycle import Cycle
-from jtqd.daemon.loop.process import Duties
-from jtqd.daemon.reload import handover
-from jtqd.daemon.reload.carry import Fill, Walk
-from jtqd.daemon.reload.handover import Giver
+from jtqd.daemon.loop.process import Duties, build_estimator
+from jtqd.daemon.reload.block_file import encoded
+from jtqd.daemon.reload.order import Order
+from jtqd.daemon.reload.prepare import write
+from jtqd.daemon.reload.swap import Swap
+from jtqd.daemon.shared.cycle_record import RECORD_SIZE
+from jtqd.daemon.shared.ring import RingReader
 from jtqd.daemon.shared.systemd import LoopWatchdog, Notifier
 from tests.daemon.loop.cycle_helpers import inputs, make, turn
 
@@ -22,19 +26,19 @@ LIMIT_NS = 1_000.0
 """Of the duties, on average per cycle."""
 WATCHDOG_S = 2.0
 PERIOD_NS = 1_000_000
+BEHIND = 100
+"""Cycles that the new estimators have not seen when the loop takes them."""
+SLEEP_S = 900e-6
 
 
 def run(directory: Path, *, rounds: int = 9, cycles: int = 4000) -> dict[str, Any]:
-    """Times in us: one datagram to the manager, the duties of a cycle (ns), and the steps of a hand-over."""
+    """Times in us: one datagram to the manager, the duties of a cycle (ns), and the steps of a swap."""
     manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     manager.bind(str(directory / "notify"))
     manager.setblocking(False)
     notifier = Notifier({"NOTIFY_SOCKET": str(directory / "notify")})
-    for name in ("a", "b"):
-        (directory / name).mkdir()
-    one, _, _ = make(directory / "a", lambda _: inputs())
-    other, _, _ = make(directory / "b", lambda _: inputs())
-    turn(one, 50)
+    cycle, _, _ = make(directory, lambda _: inputs(), slots=4096)
+    turn(cycle, 50)
 
     def datagram() -> None:
         notifier.send("WATCHDOG=1")
@@ -42,14 +46,11 @@ def run(directory: Path, *, rounds: int = 9, cycles: int = 4000) -> dict[str, An
 
     # Sending alone: the manager's side is not ours.
     sent = _median_us(datagram, 500, only=lambda: notifier.send("WATCHDOG=1"), after=lambda: manager.recv(64))
-    duties = Duties(
-        one,
-        LoopWatchdog(notifier, PERIOD_NS, WATCHDOG_S),
-        Giver(one, directory / "handover"),
-        lambda why: None,
-    )
+    reports: list[dict[str, Any]] = []
+    swap = Swap(cycle, directory / "ring", SafetySettings(), lambda **report: reports.append(report))
+    duties = Duties(cycle, LoopWatchdog(notifier, PERIOD_NS, WATCHDOG_S), swap)
     per_cycle = min(_per_call_ns(duties, manager, cycles) for _ in range(rounds))
-    return {"datagram_us": sent, "duties_ns": per_cycle} | _hand_over(one, other)
+    return {"datagram_us": sent, "duties_ns": per_cycle} | _swap(directory, cycle, swap, reports)
 
 
 def _per_call_ns(duties: Duties, manager: socket.socket, cycles: int) -> float:
@@ -77,38 +78,30 @@ def _median_us(
     return statistics.median(times) / 1000
 
 
-def _hand_over(one: Cycle, other: Cycle, count: int = 200) -> dict[str, float]:
-    walk, fill = Walk(one), Fill(other)
-    listing = []
-    while walk.left:
-        began = time.perf_counter_ns()
-        found = json.dumps({"found": walk.step(6)})
-        listing.append(time.perf_counter_ns() - began)
-        fill.learn(json.loads(found)["found"])
-    whole = []
+def _swap(
+    directory: Path, cycle: Cycle, swap: Swap, reports: list[dict[str, Any]], count: int = 20
+) -> dict[str, Any]:
+    """Swaps to the shipped estimators, BEHIND cycles behind, one step after each sleep of most of a period."""
+    config = load_config(None)
+    new = [build_estimator(config, joint) for joint in config.joints]
+    swap.rehearse(new)
+    steps: dict[str, list[float]] = {}
     for _ in range(count):
-        again = Walk(one)
-        while again.step(6):
-            pass
-        began = time.perf_counter_ns()
-        json.dumps({"state": handover.state_of(one, again), "end_ns": None}).encode()
-        whole.append(time.perf_counter_ns() - began)
-    handover.install(other, fill, json.loads(json.dumps(handover.state_of(one, walk))))
-    tell, take = [], []
-    for _ in range(count):
-        turn(one, 1)
-        began = time.perf_counter_ns()
-        message = json.dumps({"state": handover.state_of(one, walk), "end_ns": None}).encode()
-        told = time.perf_counter_ns()
-        handover.install(other, fill, json.loads(message)["state"])
-        tell.append(told - began)
-        take.append(time.perf_counter_ns() - told)
+        position = RingReader(directory / "ring", RECORD_SIZE).backlog
+        content = encoded(new, position)
+        write(directory / "estimators", content)
+        turn(cycle, BEHIND)
+        swap.begin(Order(directory / "estimators", len(content), hashlib.sha256(content).hexdigest()))
+        while swap.active:
+            time.sleep(SLEEP_S)
+            name, began = swap.next_step, time.perf_counter_ns()
+            swap.take_step()
+            steps.setdefault(name, []).append((time.perf_counter_ns() - began) / 1000)
+    assert all("swapped" in each for each in reports), reports
     return {
-        "list_us": max(listing) / 1000,
-        "whole_us": statistics.median(whole) / 1000,
-        "tell_us": statistics.median(tell) / 1000,
-        "take_us": statistics.median(take) / 1000,
-        "message_bytes": len(message),
+        "file_bytes": len(content),
+        "steps_us": {name: [statistics.median(each), max(each)] for name, each in steps.items()},
+        "steps": {name: len(each) / count for name, each in steps.items()},
     }
 
 
@@ -117,13 +110,14 @@ def text(result: dict[str, Any]) -> str:
     verdict = "PASS" if result["duties_ns"] <= LIMIT_NS else "over"
     return "\n".join(
         (
-            "service: in the pause after a cycle",
+            "service: in the pauses of the loop",
             f"  duties, watchdog every {WATCHDOG_S * 0.1:g} s   {result['duties_ns']:8.0f} ns per cycle   "
             f"(at most {LIMIT_NS:.0f}: {verdict})",
             f"  one datagram to systemd        {result['datagram_us']:8.1f} us",
-            f"  hand-over: list, longest step  {result['list_us']:8.0f} us, once per cycle, a few cycles",
-            f"  hand-over: tell what changed   {result['tell_us']:8.0f} us ({result['message_bytes']} bytes), "
-            f"{result['tell_us'] / result['whole_us']:.2f} of what telling everything takes",
-            f"  hand-over: take                {result['take_us']:8.0f} us, in the new loop",
+            f"  swap of both estimators ({result['file_bytes']} bytes, {BEHIND} cycles behind), steps after a sleep:",
+            *(
+                f"    {name:8} {result['steps'][name]:6.0f} times  median {median:6.0f} us  longest {longest:6.0f} us"
+                for name, (median, longest) in result["steps_us"].items()
+            ),
         )
     )

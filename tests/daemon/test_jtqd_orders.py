@@ -14,7 +14,6 @@ import pytest
 
 from jtqd.daemon.shared.child_process import Child
 from jtqd.daemon.supervisor.process import wait_for
-from jtqd.drivers.bus_socket import reachable
 from jtqd.drivers.filters import exact
 from jtqd.drivers.frame_socket import open_frame_socket
 from tests.daemon.slow_bench import slow_configuration
@@ -81,12 +80,23 @@ def loaded(process: subprocess.Popen[str], library: str) -> bool:
     return library in Path(f"/proc/{process.pid}/maps").read_text()
 
 
-def booting(process: subprocess.Popen[str]) -> bool:
+PREPARE = b"jtqd.daemon.reload.prepare"
+
+
+def child_of(process: subprocess.Popen[str], module: bytes) -> int | None:
+    """Process-ID of the daemon's child that runs this module, if there is one."""
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    try:
-        return any(b"jtqd.drivers.boot" in Path(f"/proc/{pid}/cmdline").read_bytes() for pid in children)
-    except OSError:
-        return False
+    for pid in children:
+        try:
+            if module in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"):
+                return int(pid)
+        except OSError:
+            continue
+    return None
+
+
+def booting(process: subprocess.Popen[str]) -> bool:
+    return child_of(process, b"jtqd.drivers.boot") is not None
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -168,8 +178,7 @@ def test_reloads_at_once(bench: str, run_directory: Path, configuration: Path) -
     time.sleep(1.0)
     told = []
     first = control("reload", bench, deep)
-    with reachable(next(deep.iterdir()) / "handover") as address:
-        until(lambda: first.poll() is not None or os.path.lexists(address))
+    until(lambda: first.poll() is not None or child_of(process, PREPARE))
     for _ in range(30):
         process.send_signal(signal.SIGHUP)
     second = control("reload", bench, deep)
@@ -185,6 +194,36 @@ def test_reloads_at_once(bench: str, run_directory: Path, configuration: Path) -
     assert "Traceback" not in err
     reloads = len(re.findall("in force from cycle", err)) + len(re.findall("not reloaded", err))
     assert 2 <= reloads <= 3, err
+
+
+def test_a_reload_whose_preparation_is_killed_is_refused_and_the_next_one_is_not(
+    bench: str, run_directory: Path, configuration: Path
+) -> None:
+    process = started("--bus", bench, "--config", str(configuration), directory=run_directory)
+    until(lambda: list(run_directory.glob("*/control")))
+    loop = child_of(process, b"jtqd.daemon.loop.process")
+    time.sleep(1.0)
+    asker = control("reload", bench, run_directory)
+    until(lambda: child_of(process, PREPARE))
+    pid = child_of(process, PREPARE)
+    assert pid is not None
+    os.kill(pid, signal.SIGKILL)
+    out, _ = asker.communicate(timeout=60)
+    assert json.loads(out) == {
+        "ok": False,
+        "error": "the preparation of estimators ended with exit status -9",
+    }
+    out, _ = control("reload", bench, run_directory).communicate(timeout=60)
+    assert json.loads(out)["ok"], out
+    assert json.loads(out)["missed"] == 0
+    assert child_of(process, b"jtqd.daemon.loop.process") == loop, "it is the loop that goes on"
+    assert not list(run_directory.glob("*/estimators"))
+    process.send_signal(signal.SIGHUP)
+    os.kill(loop or 0, signal.SIGUSR2)  # somebody else's: there is no order
+    time.sleep(3.0)
+    process.terminate()
+    status, err = ended(process, run_directory)
+    assert (status, err.count("in force from cycle"), err.count("not reloaded")) == (0, 2, 1), err
 
 
 def test_a_child_is_not_waited_for_when_we_are_told_to_end() -> None:

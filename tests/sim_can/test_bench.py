@@ -13,7 +13,6 @@ from jtqd.drivers.frame import FRAME
 from jtqd.drivers.nmt import RESET_COMMUNICATION, RESET_NODE, START
 from jtqd.models.files import shipped
 from jtqd.sim_can.bench import bench_filters
-from jtqd.sim_can.days import day
 from jtqd.sim_can.drive_control import DriveControl
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sim_can.plant_source import PlantSource
@@ -361,7 +360,7 @@ def test_temperature_comes_on_entering_operational_and_every_500_ms():
 def test_bench_tells_the_joints_temperature_of_the_day():
     player = mapped_player(PlantSource(CAMPAIGN, seed=5))
     player.sync()
-    for node, above in zip((1, 2), day(CAMPAIGN.run_to_run, 5, 0).temperature_k, strict=True):
+    for node, above in zip((1, 2), CAMPAIGN.run_to_run.day(5, 0).temperature_k, strict=True):
         assert player.read(node, 0x3001) == round(10 * (25.0 + above))
 
 
@@ -372,7 +371,7 @@ def test_each_run_of_a_campaign_is_another_day():
     """The sensor's zero by 9130h:1 before, during and after runs of both drives; noise 0.02 Nm, 50 SYNCs."""
     silent = replace(CAMPAIGN, sensor=replace(CAMPAIGN.sensor, noise_nm=0.0))
     player = mapped_player(PlantSource(silent, seed=4))
-    zeros = [day(CAMPAIGN.run_to_run, 4, n).sensor_zero_nm for n in range(3)]
+    zeros = [CAMPAIGN.run_to_run.day(4, n).sensor_zero_nm for n in range(3)]
 
     def zero():
         for k in range(5):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jtqd.models.files import shipped
-from jtqd.sim_can.days import NOMINAL_DAY, Day, RunToRun, Thermal, day
+from jtqd.sim_can.days import NOMINAL_DAY, Day, RunToRun, Thermal
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant import Plant, joint_friction
 from jtqd.sim_can.plant_file import load_plant
@@ -36,7 +36,7 @@ def values(of_day):
 @pytest.mark.parametrize("seed", range(8))
 def test_days_are_spread_evenly_over_their_widths(seed):
     """Every 10 days in a row: values in each third, mean within 0.3; 60 days: uniform to 6 %."""
-    table = np.array([values(day(WIDTHS, seed, n)) for n in range(60)])
+    table = np.array([values(WIDTHS.day(seed, n)) for n in range(60)])
     assert table.shape == (60, 7)
     assert np.max(np.abs(table)) <= 1.0
     for first in range(0, 51, 5):
@@ -60,19 +60,19 @@ def test_two_zeros_are_spread_evenly_together(joint, sign):
     edge = np.quantile(np.abs(whole), 0.9)
     shares = []
     for seed in range(60):
-        table = np.array([values(day(WIDTHS, seed, n)) for n in range(48)])
+        table = np.array([values(WIDTHS.day(seed, n)) for n in range(48)])
         shares.append(np.mean(np.abs(table[:, 6] + 0.4 * sign * table[:, 4 + joint]) <= edge))
     assert np.std(shares) < 0.036
     assert np.mean(shares) == pytest.approx(0.9, abs=0.01)
 
 
 def test_days_belong_to_their_seed_and_number():
-    assert day(WIDTHS, 3, 5) == day(WIDTHS, 3, 5)
-    assert day(WIDTHS, 3, 5) != day(WIDTHS, 3, 6)
-    assert day(WIDTHS, 3, 5) != day(WIDTHS, 4, 5)
-    assert day(RunToRun(), 3, 5) == NOMINAL_DAY == Day()
-    only_zero = day(RunToRun(sensor_zero_nm=0.3), 3, 5)
-    assert only_zero == Day(sensor_zero_nm=day(WIDTHS, 3, 5).sensor_zero_nm)
+    assert WIDTHS.day(3, 5) == WIDTHS.day(3, 5)
+    assert WIDTHS.day(3, 5) != WIDTHS.day(3, 6)
+    assert WIDTHS.day(3, 5) != WIDTHS.day(4, 5)
+    assert RunToRun().day(3, 5) == NOMINAL_DAY == Day()
+    only_zero = RunToRun(sensor_zero_nm=0.3).day(3, 5)
+    assert only_zero == Day(sensor_zero_nm=WIDTHS.day(3, 5).sensor_zero_nm)
 
 
 @pytest.mark.parametrize("step_s", [0.001, 0.05, 0.7])
@@ -155,7 +155,7 @@ MOTION = (
 
 
 def test_emulated_run_of_a_day_has_its_zeros_and_temperature():
-    of_day = day(CAMPAIGN.run_to_run, 7, 3)
+    of_day = CAMPAIGN.run_to_run.day(7, 3)
     table = emulate_run(CAMPAIGN, REST, 2.0, 7, day=3)
     # 2000 rows of noise: 0.02 Nm / sqrt(2000), 6 urad / sqrt(2000) and the rounding to 12 urad
     assert np.mean(table.joints[1].torque_nm) == pytest.approx(of_day.sensor_zero_nm, abs=0.002)
@@ -202,7 +202,7 @@ def test_another_day_begins_when_a_drive_is_enabled_after_both_were_off():
     def zero():
         return source._instruments.sensor.offset_nm
 
-    days = [day(CAMPAIGN.run_to_run, 9, n).sensor_zero_nm for n in range(4)]
+    days = [CAMPAIGN.run_to_run.day(9, n).sensor_zero_nm for n in range(4)]
     source.advance(0.0)
     assert zero() == days[0]  # the first run's day, before it is enabled, too
     for drive, mode, number in (

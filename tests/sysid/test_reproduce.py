@@ -134,3 +134,15 @@ def test_quick_reproduction_from_nothing(tmp_path):
     assert (tmp_path / "report" / "evaluation.html").stat().st_size > 10_000
     assert (tmp_path / "report_days" / "evaluation.html").stat().st_size > 10_000
     assert load_config(tmp_path / "models" / "bench.yaml").estimator.method == "fused"
+
+
+def test_another_plant_needs_no_bus_and_is_judged_on_other_days(tmp_path):
+    plant = shipped("plants/typical.yaml")
+    made = list(steps(tmp_path, "sim", True, 3, plant))
+    assert not any(step.arguments[0] == "campaign" for step in made)
+    emulated = [step.arguments for step in made if step.module == "jtqd.sysid.campaign.emulated"]
+    assert all(str(plant) in arguments for arguments in emulated)
+    seeds = [arguments[arguments.index("--seed") + 1] for arguments in emulated]
+    assert len(emulated) == 4
+    assert seeds[0] == seeds[1]
+    assert len({*seeds}) == 3

@@ -56,16 +56,13 @@ def main_pid():
     return int(show("MainPID"))
 
 
-LOOPS = {b"jtqd.daemon.loop.process", b"jtqd.daemon.reload.successor"}
-
-
 def loops(exclude=()):
-    """Process-IDs of loop processes: the first one, or the successor of a reload."""
+    """Process-IDs of loop processes."""
     found = []
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
             command = process.joinpath("cmdline").read_bytes().split(b"\0")
-            if LOOPS & set(command) and int(process.name) not in exclude:
+            if b"jtqd.daemon.loop.process" in command and int(process.name) not in exclude:
                 found.append(int(process.name))
     return found
 
@@ -362,14 +359,15 @@ def good_reload():
     assert steps == {1}, steps  # every SYNC has its turn
     watch.close()
     assert main_pid() == pid
-    (new,) = loops()
-    assert new != loop
-    assert os.sched_getscheduler(new) == os.SCHED_FIFO
+    assert loops() == [loop]
+    assert os.sched_getscheduler(loop) == os.SCHED_FIFO
     estimates(20)
     line = re.findall(r"reloaded .*", journal(40))[-1]
     joint.write_text(text)
+    done = len(re.findall("in force from cycle", journal(1000)))
     os.kill(pid, signal.SIGHUP)  # the same by signal
-    until(lambda: loops() not in ([new], []) and len(loops()) == 1, 60, "a reload by SIGHUP")
+    until(lambda: len(re.findall("in force from cycle", journal(1000))) > done, 60, "a reload by SIGHUP")
+    assert loops() == [loop]
     estimates(20)
     return {"reload": seconds}, {"said": line, "SYNCs seen meanwhile": len(counters)}
 

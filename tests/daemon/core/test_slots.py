@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from jtqd.daemon.core.cycle import CYCLE_ENDED, RUN_ENDED, SLOT_PASSED
+from jtqd.daemon.core.cycle import CYCLE_ENDED, RUN_ENDED, SLOT_PASSED, Cycle
 from jtqd.daemon.loop import process
 from jtqd.daemon.shared import cycle_record as cr
 from tests.daemon.loop.cycle_helpers import ExactTime, inputs, make
@@ -82,34 +83,42 @@ def test_a_slot_that_comes_too_late_passes(tmp_path: Path, clock: ExactTime) -> 
     assert (socket.syncs, cycle.index) == (1, 2)
 
 
-def test_after_is_asked_after_some_slots_and_soon_after_one_that_passed(
+class Duties:
+    """In place of the loop's."""
+
+    def __init__(self, cycle: Cycle) -> None:
+        self.cycle = cycle
+        self.asked: list[int] = []
+        self.synced: list[int] = []
+
+    def slots(self) -> int:
+        return 8
+
+    @property
+    def after_sync(self) -> Callable[[], None] | None:
+        return None if self.asked else lambda: self.synced.append(self.cycle.index)
+
+    def __call__(self) -> None:
+        self.asked.append(self.cycle.index)
+
+
+def test_duties_are_called_after_some_slots_and_soon_after_one_that_passed(
     tmp_path: Path, clock: ExactTime
 ) -> None:
     """The eighth slot is missed: the ninth cycle is followed at once."""
     cycle, _, _ = made(tmp_path, clock, {7: PERIOD_NS + PERIOD_NS * 3 // 5})
-    asked: list[int] = []
-    synced: list[int] = []
-
-    def after() -> bool:
-        asked.append(cycle.index)
-        return len(asked) == 4
-
-    assert process.run(
-        cycle,
-        cycle.grid,
-        lambda: False,
-        after=after,
-        after_sync=lambda: synced.append(cycle.index),
-        slots=lambda: 8,
-    )
-    assert synced == [0], "once, while the first cycle is open"
-    assert asked[0] == 1
-    gaps = [b - a for a, b in itertools.pairwise(asked)]
+    duties: Any = Duties(cycle)
+    process.run(cycle, cycle.grid, lambda: len(duties.asked) == 4, duties=duties)
+    assert duties.synced[:7] == [*range(7)], "each SYNC until it is not wanted any more"
+    assert max(duties.synced) < duties.asked[0]
+    gaps = [b - a for a, b in itertools.pairwise(duties.asked)]
     assert max(gaps) <= 9
-    assert asked != [1, 9, 17, 25], "the missed slot has moved them"
+    assert duties.asked != [8, 16, 24, 32], "the missed slot has moved them"
 
 
 def test_a_stop_is_heard_before_the_next_slots(tmp_path: Path, clock: ExactTime) -> None:
     cycle, socket, _ = made(tmp_path, clock)
-    assert not process.run(cycle, cycle.grid, lambda: socket.syncs >= 16, slots=lambda: 8)
+    duties: Any = Duties(cycle)
+    process.run(cycle, cycle.grid, lambda: socket.syncs >= 16, duties=duties)
     assert socket.syncs == 16
+    assert duties.asked == [8, 16]

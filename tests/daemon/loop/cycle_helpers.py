@@ -134,6 +134,21 @@ def inputs(
     ]
 
 
+def moving(sync: int) -> list[bytes]:
+    """Both joints turn at about 4 rad/s of the motor, every cycle is different; inputs are missing now and then."""
+    turned = 400 * sync
+    frames = [
+        frame(0x181, I32.pack(turned, turned // 10)),
+        frame(0x281, MOTION.pack(4000 + 7 * (sync % 300), 100 + sync % 97, ENABLED)),
+        frame(0x182, I32.pack(-turned, -turned // 10)),
+        frame(0x282, MOTION.pack(-4000 - 5 * (sync % 200), 90 - sync % 61, ENABLED)),
+        frame(0x183, SENSOR.pack(9000 + sync, 0)),
+    ]
+    if sync % 41 == 0:
+        del frames[1]
+    return frames
+
+
 def make(
     tmp_path: Path,
     script: Callable[[int], list[bytes]],

@@ -9,7 +9,8 @@ import pytest
 
 from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.reload.files import needs_restart
-from jtqd.daemon.reload.successor import Shadow
+from jtqd.daemon.reload.shadow import Shadow, follow
+from jtqd.daemon.shared import cycle_record as cr
 from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import INVALID, VALID, Estimate
@@ -136,3 +137,15 @@ def test_it_tells_how_far_the_new_estimates_are_from_the_old_ones(
     shadow = Shadow(tmp_path / "ring", other)
     shadow.catch_up()
     assert shadow.changes()["joint_1"]["rms_change_nm"] > 0.5
+
+
+def test_a_cycle_without_time_for_the_network_is_one_in_the_shadow_too() -> None:
+    record = cr.JointRecord(1.0, 0.1, 2.0, 0.01, 3.0, 25.0, *(math.nan,) * 5, 0.001, 0x27, VALID, 0, 0)
+    twin = Twin(Estimate(1.0, 0.1, VALID, 1.0, 1.0, math.nan))
+    both = cr.FLAG_POSITION | cr.FLAG_MOTION
+    for flags in (both, both | cr.FLAG_NETWORK_SKIPPED):
+        assert follow(twin, record._replace(input_flags=flags)) is twin.answer  # type: ignore[arg-type]
+    sample = (0.001, 1.0, 0.1, 2.0, 0.01, 25.0)
+    assert twin.given == [(*sample, True), (*sample, False)]
+    for flags in (0, cr.FLAG_POSITION, cr.FLAG_MOTION):
+        assert follow(twin, record._replace(input_flags=flags)) is None  # type: ignore[arg-type]

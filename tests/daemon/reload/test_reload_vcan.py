@@ -128,7 +128,7 @@ class Run:
 @pytest.mark.socketcan
 @pytest.mark.skipif(not os.environ.get("JTQD_BENCH_TIME_TRAVEL"), reason="needs exact time")
 def test_a_reload_of_the_same_files_leaves_no_trace_on_the_bus(tmp_path: Path) -> None:
-    """Two hand-overs in one run; the estimates are those of a run without any, to the byte."""
+    """Two swaps in one run; the estimates are those of a run without any, to the byte."""
     plain, reloaded = Run(tmp_path / "plain"), Run(tmp_path / "reloaded")
     plain.run()
     replies: list[tuple[int, dict[str, Any]]] = []
@@ -140,7 +140,7 @@ def test_a_reload_of_the_same_files_leaves_no_trace_on_the_bus(tmp_path: Path) -
     for run in (plain, reloaded):
         run.check_bus()
     assert reloaded.estimates() == plain.estimates()
-    for run in (plain, reloaded):  # these tell of nanoseconds, and a hand-over has its own
+    for run in (plain, reloaded):  # these tell of nanoseconds, and a swap has its own
         del run.summary["counters"]["work_max_ns"], run.summary["counters"]["late_max_ns"]
     assert reloaded.summary["counters"] == plain.summary["counters"]
     # A part of the log for each set of files.

@@ -21,7 +21,6 @@ from tests.slow.faults.ears import Ears
 
 _NAMES = {
     "jtqd.daemon.loop.process": "loop",
-    "jtqd.daemon.reload.successor": "loop",
     "jtqd.daemon.recording.recorder": "recorder",
 }
 _MARKS = 200

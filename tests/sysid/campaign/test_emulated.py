@@ -28,7 +28,7 @@ def test_tables_and_marks_are_those_of_the_plan(directory: Path) -> None:
     runs = make_plan("validate", Scale(2, 4.0, 0.3, 5, joints=joints)).runs
     assert {path.name for path in directory.iterdir()} == {
         "emulated_runs.json",
-        *(f"{run.name}.{ending}" for run in runs for ending in ("csv.gz", "json")),
+        *(f"{run.name}.{ending}" for run in runs for ending in ("csv.gz", "json", "truth.npz")),
     }
     day, run = len(runs) - 1, runs[-1]
     table = read_run(directory / f"{run.name}.csv.gz").table

@@ -9,11 +9,12 @@ import pytest
 
 from jtqd.estimator.estimator import observe_run
 from jtqd.estimator.joint import Torsion
-from jtqd.estimator.observer import first_order_hold, low_pass
+from jtqd.estimator.observer import first_order_hold, low_pass, slipped
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.status import STANDSTILL
 from jtqd.sysid.fit.signals import UNIT_TORSION, RunSignals, run_signals
-from jtqd.sysid.fit.torsion import TorsionError, fit_torsion, slipped, torsion_torque
+from jtqd.sysid.fit.torsion import TorsionError, fit_torsion
+from jtqd.sysid.fit.torsion_signals import torsion_torque
 from tests.estimator.estimator_helpers import joint1
 from tests.estimator.fused_helpers import TORSION, twisted
 from tests.sysid.fit.fused_signals import FUSED, STIFF, Nuisance, made_run, one_way, smooth_loss
@@ -49,9 +50,11 @@ def test_its_torque_is_the_sensor_s() -> None:
         assert abs(np.mean(off)) < 0.35  # the run's own zero of the sensor stays
 
 
-def test_torque_of_other_orders_is_refused() -> None:
+def test_torque_of_other_orders_is_refused_where_positions_are_not_known() -> None:
     run = runs_of(15, 1)[0]
-    with pytest.raises(ValueError, match=r"found a torsion of orders \(2.0, 6.0\), expected \(2.0, 4.0\)"):
+    with pytest.raises(
+        ValueError, match=r"found a torsion of order 6, expected one of 2 and 4: no positions"
+    ):
         torsion_torque(replace(STIFF, orders_per_motor_rev=(2.0, 6.0)), run)
 
 

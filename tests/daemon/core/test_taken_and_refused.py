@@ -1,4 +1,4 @@
-"""What the compiled classes take and refuse: blocks of state, layouts of PDOs, identifiers, sizes of shared memory."""
+"""What the compiled classes take and refuse: layouts of PDOs, identifiers, sizes of shared memory."""
 
 from __future__ import annotations
 
@@ -10,19 +10,17 @@ from typing import Any
 
 import pytest
 
-from jtqd.daemon.config import SafetySettings
 from jtqd.daemon.core.intake import Intake, JointTemperature
-from jtqd.daemon.core.joint import JointCycle, Unwrap
+from jtqd.daemon.core.joint import JointCycle
 from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.core.record import RecordRing
-from jtqd.daemon.core.schedule import Grid, NetworkBudget, WakeUp
-from jtqd.daemon.core.status import JointRules, JointStatus
+from jtqd.daemon.core.status import JointRules
 from jtqd.daemon.loop.input_pdos import InputPdo
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import Ring
 from jtqd.daemon.shared.snapshot import COUNTERS
 from jtqd.estimator.status import INVALID
-from tests.daemon.loop.cycle_helpers import I32, SENSOR, ExactTime, frame, inputs, make, turn
+from tests.daemon.loop.cycle_helpers import I32, SENSOR, frame, inputs, make, turn
 
 PDO = InputPdo(0x181, 8, I32, 1, "181h")
 
@@ -92,54 +90,6 @@ def test_a_ring_of_other_records_is_refused(tmp_path: Path) -> None:
     RecordRing(Ring(tmp_path / "ring", 8, cr.RECORD_SIZE))
     with pytest.raises(ValueError, match="found a ring of 512 bytes for 8 cycles"):
         RecordRing(Ring(tmp_path / "other", 8, 64))
-
-
-def parts() -> list[Any]:
-    intake = Intake([PDO], [JointTemperature(0x381, 1, "381h", 5)])
-    return [
-        intake,
-        intake.states[0],
-        intake.temperatures[0],
-        intake.nodes,
-        intake.gaps,
-        Unwrap(3 << 32),
-        JointStatus(SafetySettings()),
-        Grid(5, 7),
-        WakeUp(1, 2),
-        NetworkBudget(),
-    ]
-
-
-@pytest.mark.parametrize("number", range(len(parts())), ids=[type(each).__name__ for each in parts()])
-def test_a_block_goes_back_as_it_came_and_another_one_is_refused(number: int) -> None:
-    first, second = parts()[number], parts()[number]
-    block = bytes(n % 251 for n in range(len(first.state)))
-    before = first.state
-    second.state = before
-    assert second.state == before
-    first.state = block
-    assert first.state == block
-    with pytest.raises(ValueError, match=f"found a block of {len(block) - 1} bytes, expected {len(block)}"):
-        first.state = block[1:]
-
-
-def test_all_that_a_cycle_knows_goes_over_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every class under a cycle says what is carried, and a copy of it all goes on alike."""
-    ExactTime().install(monkeypatch)
-    cycle, _, _ = make(tmp_path, lambda n: inputs() if n % 7 else inputs()[1:])
-    turn(cycle, 50)
-    for thing in (
-        cycle,
-        cycle.intake,
-        *cycle.joints,
-        cycle.grid,
-        cycle.budget,
-        cycle.wake_up,
-        cycle.counters,
-    ):
-        for name in thing.carried:
-            assert hasattr(thing, name), f"{type(thing).__name__}.{name}"
-        assert isinstance(thing.state, bytes)
 
 
 def test_an_estimator_that_raises_is_invalid_and_the_loop_goes_on(

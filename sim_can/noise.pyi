@@ -1,0 +1,4 @@
+from collections.abc import Callable
+
+class Noise:
+    def __init__(self, uniform: Callable[[], float]) -> None: ...

@@ -1,0 +1,16 @@
+"""Towing benches with laws of their own, stand-ins for the real world (docs/benches.md).
+
+Nothing here comes from the estimator, the effect library or the simulation of a joint file, so that what is judged on these
+benches is not judged by its own equations. From a joint file: name, gear ratio, and the nominal values that a drive knows.
+
+| module | what it has |
+|---|---|
+| `bench_file` | bench files as values: `TowingBench` |
+| `waves` | sums of cosines over an angle: ripple, errors of gear and encoders |
+| `friction` | bristle friction |
+| `gear` | hardening spring, slips, transmission error |
+| `warmth` | temperatures of grease and housing |
+| `plant` | one joint, and two of them with the sensor between |
+| `instruments` | encoders, current measurement, sensor |
+| `days` | what differs from one day to the next |
+"""
