@@ -152,6 +152,7 @@ class Search:
         """Return the best set of candidates."""
         best = self.hypothesis(())
         beam = [best]
+        seen = [best]
         for _ in range(DEEPEST):
             grown: dict[tuple[int, ...], Hypothesis] = {}
             for parent in beam:
@@ -161,7 +162,9 @@ class Search:
                 break
             beam = sorted(grown.values(), key=lambda h: h.bic)[:_BEAM]
             best = min((best, beam[0]), key=_with_price)
-        return self.pruned(best)
+            seen.append(min(grown.values(), key=_with_price))
+        # what two that came together leave when one of them goes must be worth its effects, too
+        return min((self.pruned(best), *seen), key=_with_price)
 
     def confirmed(self) -> Hypothesis:
         """Return the best set of candidates less those that do not help on held-out runs."""
