@@ -66,8 +66,8 @@ def beyond_bounds(p: PresentEffect, nothing: dict[str, float]) -> str:
     """
     for name, value in p.values.items():
         q = parameter(p.effect, name)
-        if name == "phase_rad" or q.fixed:
-            continue
+        if name == "phase_rad" or q.fixed or (name not in p.free and q.low <= value <= q.high):
+            continue  # what is not free is switched off: no size of it was asked for
         room = _AT_BOUND * (q.high - q.low if np.isfinite(q.high - q.low) else max(abs(value), 1.0))
         room = min(room, 1e-3 * abs(value - nothing.get(name, 0.0)))
         if not q.low + room < value < q.high - room:

@@ -44,3 +44,8 @@ def test_a_reference_temperature_out_of_range_is_an_objection_and_no_error() -> 
     )
     assert "reference_c 811.2" in found
     assert JOINT.name
+
+
+def test_a_part_of_an_effect_that_is_switched_off_is_at_no_bound() -> None:
+    values = {"amplitude_nm": 0.374, "share": 0.0, "phase_rad": 0.95}
+    assert not said("sensor_crosstalk", values, {"amplitude_nm": 0.0, "share": 0.0, "phase_rad": 0.0})
