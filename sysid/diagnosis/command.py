@@ -6,6 +6,7 @@ import argparse
 import datetime as dt
 import importlib.util
 import json
+import math
 import os
 import shlex
 import sys
@@ -29,7 +30,7 @@ from jtqd.sysid.runs.files import RunError, RunFile, read_runs
 from jtqd.sysid.runs.joints import UsageError, check_joint_files, joint_files, joints_of
 
 BY: Final = "jtq diagnose"
-_NEEDED: Final = ("matplotlib", "jinja2")
+_NEEDED: Final = ("matplotlib", "jinja2", "scipy")
 FINDINGS: Final = "findings.json"
 REPORT: Final = "report.html"
 PLAN: Final = "next_experiment.plan.yaml"
@@ -57,7 +58,7 @@ def main(argv: list[str]) -> int:
         for run in runs:
             for note in run.notes:
                 print(f"{BY}: {run.name}: {note}", file=sys.stderr)
-        findings = diagnosed(runs, with_limits(joints, options.limits), scope)
+        findings = diagnosed(runs, with_limits(joints, options.limits), scope, options.relevance)
         findings = replace(findings, joint_files=joints, next_experiment=_with_command(options, findings))
         mapping = _write(options.out, findings, joints, {run.name: run.sha256 for run in runs})
     except UsageError as error:
@@ -95,8 +96,13 @@ def _with_command(options: argparse.Namespace, findings: Findings) -> dict[str, 
     return {**experiment, "command": f"jtq campaign {plan} --bus {options.bus}{config} --out RUNS"}
 
 
-def diagnosed(runs: Sequence[RunFile], joints: Mapping[int, Joint], scope: Scope = EVERYTHING) -> Findings:
-    """Check the channels and diagnose what may be used; the findings list what may not."""
+def diagnosed(
+    runs: Sequence[RunFile],
+    joints: Mapping[int, Joint],
+    scope: Scope = EVERYTHING,
+    relevance: float | None = None,
+) -> Findings:
+    """Check the channels and diagnose what may be used; the findings list what may not. relevance: see `diagnose`."""
     checked = check_runs([(run.name, run.table) for run in runs], joints)
     for line in (*checked.refused, *checked.notes):
         print(f"{BY}: {line}", file=sys.stderr)
@@ -114,7 +120,8 @@ def diagnosed(runs: Sequence[RunFile], joints: Mapping[int, Joint], scope: Scope
         from jtqd.sysid.diagnosis.diagnose import diagnose
 
         left = {number: joint for number, joint in joints.items() if number not in checked.lost}
-        findings = diagnose(checked.runs, left, scope)
+        given = {} if relevance is None else {"relevance": relevance}
+        findings = diagnose(checked.runs, left, scope, **given)
     return _with_channels(findings, checked, notes)
 
 
@@ -204,6 +211,12 @@ def parser() -> argparse.ArgumentParser:
         "--bus", default="can0", metavar="BUS", help="bus for the printed command (default can0)"
     )
     parser.add_argument(
+        "--relevance",
+        type=_percent,
+        metavar="PERCENT",
+        help="of the rated torque, rms over a run: what is left over matters from here on (default 0.5)",
+    )
+    parser.add_argument(
         "--force", action="store_true", help="replace the results of an earlier diagnosis in DIR"
     )
     parser.add_argument("--json", action="store_true", help="print findings.json instead of the summary")
@@ -231,6 +244,17 @@ def motion_limits(text: str) -> dict[str, Any]:
     except ConfigError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
     return found
+
+
+def _percent(text: str) -> float:
+    """Return a percentage above 0 and up to 100 as a part. Raises argparse.ArgumentTypeError."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value <= 100.0:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected percent above 0 and up to 100")
+    return value / 100.0
 
 
 def _check_out(directory: Path, force: bool) -> None:

@@ -22,6 +22,7 @@ from jtqd.sysid.diagnosis.current_zero import Readings, readings
 from jtqd.sysid.diagnosis.events import Events
 from jtqd.sysid.diagnosis.findings import JointName
 from jtqd.sysid.diagnosis.noise import saturated_residuals
+from jtqd.sysid.diagnosis.recordings import recordings
 from jtqd.sysid.diagnosis.regressors import (
     EffectCandidate,
     Family,
@@ -67,6 +68,7 @@ class Dataset:
         candidates: of the library, columns numbered. unexplained: what none of them explains, per channel and run [n].
         families: of nuisances. unknown_lines: those among them at orders or frequencies of no effect.
         readings: per run what the current reads without power.
+        pieces: number of the recording that each run is a piece of (None: each is one).
         events: what is not valid in `runs` only because it is an event, per channel and run [n].
     """
 
@@ -79,6 +81,7 @@ class Dataset:
     families: list[Family]
     unknown_lines: list[Line]
     readings: Sequence[Readings] = ()
+    pieces: Sequence[int] | None = None
     events: Mapping[Channel, Sequence[BoolArray]] = field(default_factory=dict)
 
     @property
@@ -145,11 +148,12 @@ def usable_signals(
     out = [with_one_sensor(run) for run in out]
     if not out:
         return [], reasons or ["found no usable run"]
-    if len(out) < FEWEST_RUNS:
+    count = max(recordings(out)) + 1
+    if count < FEWEST_RUNS:
+        found = counted(count, "usable run") + (" in pieces of one recording" if count < len(out) else "")
         return [], [
             *reasons,
-            f"found {counted(len(out), 'usable run')}, expected at least {FEWEST_RUNS}: a gain is measured on held-out "
-            "runs",
+            f"found {found}, expected at least {FEWEST_RUNS}: a gain is measured on held-out runs",
         ]
     moving = sum(float(s.moving.sum()) * float(np.median(np.diff(s.time_s))) for run in out for s in run)
     if moving < SHORTEST_MOVING_S:
@@ -158,6 +162,22 @@ def usable_signals(
             f"found {moving:.1f} s in motion in all runs, expected at least {SHORTEST_MOVING_S:.0f} s",
         ]
     return out, reasons
+
+
+def resolution_notes(signals: Sequence[Sequence[JointSignals]]) -> list[str]:
+    """Return what the resolution of the recordings costs, one line per joint: of the run where it costs most."""
+    worst: dict[int, tuple[float, str]] = {}
+    count: dict[int, int] = {}
+    for run in signals:
+        for s in run:
+            if s.coarse:
+                count[s.number] = count.get(s.number, 0) + 1
+                new = s.visible.slowest_hz, f"{s.run}: j{s.number}.{s.coarse}"
+                worst[s.number] = min(worst.get(s.number, new), new)
+    return [
+        text + (f" (so in {counted(count[n], 'run')})" if count[n] > 1 else "")
+        for n, (_, text) in sorted(worst.items())
+    ]
 
 
 def _same_balances(runs: list[list[JointSignals]]) -> None:
@@ -196,7 +216,10 @@ def build_dataset(
     runs = [run_data(run, candidates, samples, groups) for run in signals]
     leave = gain_columns(candidates)
     unexplained = {c: saturated_residuals(runs, c, leave) for c in runs[0].channels}
-    return Dataset(signals, runs, candidates, samples, step, unexplained, groups, lines, readings(signals))
+    pieces = recordings(signals)
+    return Dataset(
+        signals, runs, candidates, samples, step, unexplained, groups, lines, readings(signals), pieces
+    )
 
 
 def library_candidates(

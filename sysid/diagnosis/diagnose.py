@@ -5,6 +5,7 @@ tables -> signals -> binned dataset -> noise -> search -> refinement -> (events 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
@@ -16,7 +17,7 @@ from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
 from jtqd.sysid.diagnosis.current_zero import unpowered_columns, with_readings
-from jtqd.sysid.diagnosis.dataset import Dataset, build_dataset, usable_signals
+from jtqd.sysid.diagnosis.dataset import Dataset, build_dataset, resolution_notes, usable_signals
 from jtqd.sysid.diagnosis.evidence import RELEVANT
 from jtqd.sysid.diagnosis.findings import (
     AMBIGUOUS,
@@ -30,45 +31,55 @@ from jtqd.sysid.diagnosis.leftover import events_left
 from jtqd.sysid.diagnosis.mixed_model import Mixed
 from jtqd.sysid.diagnosis.next_experiment import next_experiment
 from jtqd.sysid.diagnosis.noise import Noise, noise_model, run_sums
+from jtqd.sysid.diagnosis.recordings import piece_notes
 from jtqd.sysid.diagnosis.refine import present_effects, refine
 from jtqd.sysid.diagnosis.regressors import RunData, column_moments
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope
-from jtqd.sysid.diagnosis.search import HELD_OUT, Hypothesis, Search
+from jtqd.sysid.diagnosis.search import Hypothesis, Search
 from jtqd.sysid.diagnosis.signals import Channel
-from jtqd.sysid.diagnosis.verdict import conclude
+from jtqd.sysid.diagnosis.verdict import RELEVANCE, conclude
 
 _WORST_FIRST: Final = (UNEXPLAINED, AMBIGUOUS, CAUSE, INSUFFICIENT, NO_GAP)
 _PASSES: Final = 2
 
 
 def diagnose(
-    runs: Sequence[tuple[str, RunTable]], joints: Mapping[int, Joint], scope: Scope = EVERYTHING
+    runs: Sequence[tuple[str, RunTable]],
+    joints: Mapping[int, Joint],
+    scope: Scope = EVERYTHING,
+    *,
+    relevance: float = RELEVANCE,
 ) -> Findings:
     """Return what the joint files' simulation gets wrong in these runs.
 
-    runs: (name, table); joints: nominal joint per number; scope: what may be named. Never raises for what is in the
-    tables: data that cannot serve give the verdict insufficient_data with its reasons. Joints with a sensor each are
-    diagnosed one by one. Where a cause has the name of an effect that a file already has, the diagnosis is made again
-    without that effect, so that what is reported is the whole of it.
+    runs: (name, table); joints: nominal joint per number; scope: what may be named; relevance: part of the rated torque,
+    rms over a run, from which what the causes leave matters. Never raises for what is in the tables: data that cannot
+    serve give the verdict insufficient_data with its reasons. Joints with a sensor each are diagnosed one by one. Where a
+    cause has the name of an effect that a file already has, the diagnosis is made again without that effect, so that what
+    is reported is the whole of it.
     """
     numbers = tuple(sorted(n for n in joints if any(n in table.joints for _, table in runs)))
     if len(numbers) > 1 and not one_sensor(runs, numbers):
-        return combined([diagnose(runs, {n: joints[n]}, scope) for n in numbers])
+        return combined([diagnose(runs, {n: joints[n]}, scope, relevance=relevance) for n in numbers])
     applied = {n: with_effects_applied(joint) for n, joint in joints.items()}
-    findings = _diagnosed(runs, applied, numbers, scope)
+    findings = _diagnosed(runs, applied, numbers, scope, relevance)
     for n in numbers:
         new = {c.name for c in findings.causes if c.joint in (n, "sensor")}
         kept = tuple(e for e in applied[n].effects if e.name not in new)
         if len(kept) < len(applied[n].effects):
             applied[n] = replace(applied[n], effects=kept)
     if any(len(with_effects_applied(joints[n]).effects) > len(applied[n].effects) for n in numbers):
-        whole = _diagnosed(runs, applied, numbers, scope)
+        whole = _diagnosed(runs, applied, numbers, scope, relevance)
         findings = replace(whole, gaps=findings.gaps)
     return findings
 
 
 def _diagnosed(
-    runs: Sequence[tuple[str, RunTable]], joints: Mapping[int, Joint], numbers: tuple[int, ...], scope: Scope
+    runs: Sequence[tuple[str, RunTable]],
+    joints: Mapping[int, Joint],
+    numbers: tuple[int, ...],
+    scope: Scope,
+    relevance: float,
 ) -> Findings:
     names = tuple(name for name, _ in runs)
     usable, reasons = usable_signals(runs, joints, numbers)
@@ -85,8 +96,8 @@ def _diagnosed(
         dataset = dataset.without_events(events)
         noise, search, best = _searched(dataset, least)
         refined = refine(dataset, present_effects(best), noise)
-    findings = conclude(dataset, search, best, refined, noise, joints, names, numbers)
-    return replace(findings, channel_notes=tuple(reasons))
+    findings = conclude(dataset, search, best, refined, noise, joints, names, numbers, relevance)
+    return replace(findings, channel_notes=(*reasons, *resolution_notes(usable), *piece_notes(usable)))
 
 
 def one_sensor(runs: Sequence[tuple[str, RunTable]], numbers: Sequence[int]) -> bool:
@@ -119,6 +130,12 @@ def combined(parts: Sequence[Findings]) -> Findings:
         channel_notes=tuple(dict.fromkeys(note for f in parts for note in f.channel_notes)),
         next_experiment=plans[0] if plans else None,
         traces=tuple(t for f in parts for t in f.traces),
+        explained_share=math.nan if leading is None else leading.explained_share,
+        left_over=max(
+            (f.left_over for f in parts if f.left_over is not None),
+            key=lambda left: (left.matters, left.of_rated),
+            default=None,
+        ),
     )
 
 
@@ -165,29 +182,13 @@ def _searched(dataset: Dataset, least_nm: float) -> tuple[Noise, Search, Hypothe
         noise = noise_model(runs, residuals, dataset.step_s)
         sums = [run_sums(run, noise, columns, len(groups)) for run in runs]
         sums = with_readings(sums, dataset.readings, unpowered)
-        mixed = Mixed(sums, columns, sigma)
+        mixed = Mixed(sums, columns, sigma, dataset.pieces)
         effective = mixed.rows / noise.inflation
         search = Search(mixed, candidates, effective, moments, least_nm, dataset.readings, unpowered)
-        best = _without_unconfirmed(search, search.run())
+        best = search.confirmed()
         if k + 1 < _PASSES:
             residuals = {c: unexplained_residual(runs, best, c) for c in residuals}
     return noise, search, best
-
-
-def _without_unconfirmed(search: Search, best: Hypothesis) -> Hypothesis:
-    """Return the hypothesis without candidates that do not help on held-out runs."""
-    while best.chosen:
-        weak = []
-        for c in best.chosen:
-            without = search.hypothesis([o for o in best.chosen if o is not c], best.model)
-            evidence = without.model.deviance - best.model.deviance
-            if search.held_out(best, c) < HELD_OUT * evidence:
-                weak.append((evidence, c))
-        if not weak:
-            return best
-        weakest = min(weak, key=lambda pair: pair[0])[1]
-        best = search.hypothesis([c for c in best.chosen if c is not weakest], best.model)
-    return best
 
 
 def unexplained_residual(runs: Sequence[RunData], best: Hypothesis, channel: Channel) -> list[FloatArray]:

@@ -46,6 +46,10 @@ class Cause:
     held_out_gain: float  # share of the held-out residual energy that it takes away
     rms_nm: float  # of its contribution over the runs, in the balance where it is largest
     balance: str  # "motor" or "torsion": where it is largest
+    explained_share: float = float("nan")  # of all that is structure in these runs, as squares
+    steadiness: float = float(
+        "nan"
+    )  # its size in standard errors over the runs left out (`guards.steadiness`)
 
 
 @dataclass(frozen=True)
@@ -129,6 +133,21 @@ class Trace:
 
 
 @dataclass(frozen=True)
+class LeftOver:
+    """What the causes leave that is structure, in the balance and run where it is most: rms [Nm], part of the rated torque,
+    share of all structure; from `relevant_nm` on it matters.
+    """
+
+    joint: int
+    balance: str
+    rms_nm: float
+    of_rated: float
+    share: float
+    relevant_nm: float
+    matters: bool
+
+
+@dataclass(frozen=True)
 class Findings:
     """All of it. gaps: largest excess first; causes: largest first; reasons: lines for people."""
 
@@ -146,6 +165,8 @@ class Findings:
     joint_files: Mapping[int, Joint] = field(
         default_factory=dict, repr=False
     )  # to compare the found values with
+    explained_share: float = float("nan")
+    left_over: LeftOver | None = None
 
 
 _NO_GAP_MEASURED: Final[dict[str, Any]] = {
@@ -174,6 +195,8 @@ def to_mapping(
         "gap": _gap(findings.gaps[0]) if findings.gaps else _NO_GAP_MEASURED,
         "causes": [_cause(each, findings.joint_files) for each in findings.causes],
         "gain": _NO_GAIN_MEASURED if findings.gain is None else _gain(findings.gain),
+        "explained_share": findings.explained_share,
+        "left_over": None if findings.left_over is None else _left_over(findings.left_over),
         "next_experiment": _without_table(findings.next_experiment),
         "reasons": findings.reasons,
         "joints": findings.joints,
@@ -240,8 +263,22 @@ def _cause(cause: Cause, joints: Mapping[int, Joint]) -> dict[str, Any]:
         "class": list(cause.names),
         "parameters": _values(cause, joints),
         "evidence": {"delta_bic": cause.delta_bic, "held_out_gain": cause.held_out_gain},
+        "steadiness": cause.steadiness,
         "rms_nm": cause.rms_nm,
         "balance": cause.balance,
+        "explained_share": cause.explained_share,
+    }
+
+
+def _left_over(left: LeftOver) -> dict[str, Any]:
+    return {
+        "joint": left.joint,
+        "balance": left.balance,
+        "rms_nm": left.rms_nm,
+        "percent_of_rated": 100.0 * left.of_rated,
+        "share": left.share,
+        "relevant_nm": left.relevant_nm,
+        "matters": left.matters,
     }
 
 
@@ -302,6 +339,12 @@ def summary_lines(findings: Findings) -> list[str]:
         if findings.verdict != NO_GAP:
             lines += [f"  {each.share:4.0%} of it {_where(each)}" for each in gap.localisation[:3]]
     lines += [_summary_cause(each, findings.joint_files) for each in findings.causes]
+    left = findings.left_over
+    if left is not None and (findings.causes or left.matters):
+        lines.append(
+            f"left over: {left.rms_nm:.3g} Nm rms ({left.of_rated:.2%} of rated) at joint {left.joint}, {left.balance} "
+            f"balance; from {left.relevant_nm:.3g} Nm on it matters"
+        )
     gain = findings.gain
     if gain is not None and math.isfinite(gain.rmse_before_nm):
         low, high = gain.ci95

@@ -31,19 +31,20 @@ def held_out_gain(dataset: Dataset, refined: Refined, seed: int = 0) -> Gain:
     rmse_before - rmse_after [Nm], bootstrap over runs.
     """
     steps = left_out_steps(refined)
-    squares: dict[Channel, list[tuple[float, float, int]]] = {}
-    for run, left, step in zip(dataset.runs, refined.runs, steps, strict=True):
+    pieces = refined.mixed.pieces
+    squares: dict[Channel, FloatArray] = {}
+    for place, run, left, step in zip(pieces, dataset.runs, refined.runs, steps, strict=True):
         for channel, d in left.channels.items():
             before = run.channels[channel].residual[d.valid]
             after = (d.residual - d.regressors @ step[d.index])[d.valid]
             if channel.balance == "torsion" and len(before):
                 before, after = before - before.mean(), after - after.mean()
-            squares.setdefault(channel, []).append(
-                (float(before @ before), float(after @ after), len(before))
-            )
-    drops = {c: _rms(np.array(s), 0) - _rms(np.array(s), 1) for c, s in squares.items()}
+            rows = squares.setdefault(channel, np.zeros((refined.mixed.runs, 3)))
+            rows[place] += (float(before @ before), float(after @ after), len(before))
+    drops = {c: _rms(s, 0) - _rms(s, 1) for c, s in squares.items()}
     channel = max(drops, key=lambda c: drops[c])
-    table = np.array(squares[channel])
+    table = squares[channel]
+    names = [dataset.runs[int(np.argmax(pieces == r))].name for r in range(len(table))]
     rng = np.random.default_rng(seed)
     picks = rng.integers(0, len(table), size=(_BOOTSTRAPS, len(table)))
     sums = table[picks].sum(axis=1)
@@ -57,8 +58,8 @@ def held_out_gain(dataset: Dataset, refined: Refined, seed: int = 0) -> Gain:
         (float(low), float(high)),
         *free,
         tuple(
-            RunGain(run.name, _rms(row, 0), _rms(row, 1))
-            for run, row in zip(dataset.runs, table[:, None, :], strict=True)
+            RunGain(name, _rms(row, 0), _rms(row, 1))
+            for name, row in zip(names, table[:, None, :], strict=True)
             if row[0, 2] > 0.0
         ),
     )
@@ -98,11 +99,12 @@ def _rms(table: FloatArray, column: int) -> float:
 
 
 def left_out_steps(refined: Refined) -> list[FloatArray]:
-    """Return per run the change of the free parameters when this run is left out."""
+    """Return per piece of a run the change of the free parameters when the run is left out."""
     marginals, _ = refined.mixed.marginal_runs(refined.variances)
     total = marginals.sum(axis=0)
     k = refined.mixed.columns
-    return [solve(total - m, k)[0] for m in marginals]
+    of_runs = [solve(total - m, k)[0] for m in marginals]
+    return [of_runs[r] for r in refined.mixed.pieces]
 
 
 WINDOW_S: Final = 0.5

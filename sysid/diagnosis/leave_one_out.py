@@ -10,23 +10,30 @@ each held-out run, not by their sum.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
 
+from jtqd.estimator.arrays import FloatArray
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.evidence import WITHIN
 from jtqd.sysid.diagnosis.findings import Cause, JointName
 from jtqd.sysid.diagnosis.mixed_model import explained
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
-from jtqd.sysid.diagnosis.search import DEEPEST, Hypothesis, Search
+from jtqd.sysid.diagnosis.search import DEEPEST, Hypothesis, Search, friction_pairs
 from jtqd.sysid.diagnosis.signals import Channel
 
 ENOUGH_RUNS: Final = 4
 """From here on the sum over runs left out decides, as everywhere else."""
 FALL: Final = 0.05
 """Part of the squared error of every held-out run that an effect must take away."""
+LARGE_FALL: Final = 0.3
+"""A fall that needs no other confirmation: the deviance asks for quick parts of the torque, where models err first."""
+_LADDER: Final = ("coulomb_friction", "viscous_friction", "rotor_inertia", "load_dependent_friction")
+_NEARLY: Final = 0.5
+"""Part of an interval's width from its end within which a value is as good as inside, with so few runs."""
 ENOUGH_LEFT: Final = 0.2
 """Part of the error that effects could explain at all which may be left over on held-out runs without a word."""
 _SCALES: Final = frozenset({"torque_constant", "sensor_gain"})
@@ -44,9 +51,9 @@ class LeaveOneOut:
 
     def confirmed(self, found: Hypothesis) -> Hypothesis:
         """Return the set that was found where it holds, else the best by the error on held-out runs that does."""
-        best = self.search.hypothesis(())
         if self._reached(found):
             return found
+        best = min((self.search.hypothesis(()), *self._ladders()), key=self._score)
         for _ in range(DEEPEST):
             grown = {tuple(c.first for c in h.chosen): h for h in self._children(best)}
             better = [h for h in grown.values() if self._score(h) < self._score(best) and self.holds(h)]
@@ -54,6 +61,33 @@ class LeaveOneOut:
                 break
             best = min(better, key=self._score)
         return best
+
+    def _ladders(self) -> list[Hypothesis]:
+        """Return the sets that are worth it of what is fitted to a joint first: friction, inertia, load-dependent friction.
+        One of them may show only with the others, as each is wrong in a file that nobody measured.
+        """
+        terms: dict[tuple[str, object], EffectCandidate] = {}
+        for c in self.search.candidates:
+            if c.effect.name in _LADDER:
+                terms.setdefault(c.key, c)
+        out = []
+        for size in range(2, len(_LADDER) + 1):
+            for chosen in itertools.combinations(terms.values(), size):
+                if len({c.joint for c in chosen}) == 1:
+                    h = self.search.hypothesis(chosen)
+                    if self.search.plausible(h) and self._worth(h):
+                        out.append(h)
+        return out
+
+    def _worth(self, hypothesis: Hypothesis) -> bool:
+        """Return whether a set takes away much on each held-out run, and each of its candidates more than it costs: harm
+        on one run is outweighed by what it does on the others.
+        """
+        chosen = hypothesis.chosen
+        if min(self._falls(hypothesis, self.search.hypothesis(()), chosen)) < LARGE_FALL:
+            return False
+        each = [self._falls(hypothesis, self._without(hypothesis, c), (c,)) for c in chosen]
+        return all(min(falls) > -2.0 * FALL and sum(falls) > 2.0 * FALL for falls in each)
 
     def holds(self, hypothesis: Hypothesis) -> bool:
         """Return whether each candidate, and all together, help on every held-out run."""
@@ -66,9 +100,12 @@ class LeaveOneOut:
         """
         if not hypothesis.chosen:
             return True
-        return self.holds(hypothesis) and any(
-            self._reached(self._without(hypothesis, c)) for c in hypothesis.chosen
-        )
+        before = [self._without(hypothesis, c) for c in hypothesis.chosen]
+        before += [
+            self.search.hypothesis([c for c in hypothesis.chosen if c not in pair], hypothesis.model)
+            for pair in friction_pairs(hypothesis.chosen)
+        ]
+        return self.holds(hypothesis) and any(self._reached(h) for h in before)
 
     def rivals(self, best: Hypothesis, cause: EffectCandidate) -> tuple[EffectCandidate, ...]:
         """Return the candidates (one per effect and joint) that in the place of `cause` help on every held-out run and on
@@ -80,8 +117,9 @@ class LeaveOneOut:
         found: dict[tuple[str, object], tuple[float, EffectCandidate]] = {}
         twins = _SCALES if self.search.joints == 1 and cause.effect.name in _SCALES else frozenset()
         for rival in self._grown(base):
-            new = next(c for c in rival.chosen if c not in others)
-            if new.key == cause.key:
+            added = [c for c in rival.chosen if c not in others]
+            new = added[0]
+            if new.key == cause.key or len(added) > 1:
                 continue
             helps = self._helps(rival, base, (new,), least=0.0)
             worse = all(fall < -FALL for fall in self._falls(rival, best, (new, cause)))
@@ -131,7 +169,8 @@ class LeaveOneOut:
         pairs = zip(self.squares(self.search.hypothesis(())), self.squares(best), strict=True)
         for r, (raw, left) in enumerate(pairs):
             for channel in raw:
-                least = float(np.nanmean(floors[channel][r] ** 2))
+                mine = [floors[channel][k] for k in np.flatnonzero(self.search.mixed.pieces == r)]
+                least = float(np.nanmean(np.concatenate(mine) ** 2))
                 before += max(raw[channel] - least, 0.0)
                 after += max(left[channel] - least, 0.0)
         return min(after / max(before, 1e-30), 1.0)
@@ -147,17 +186,18 @@ class LeaveOneOut:
         return out
 
     def _grown(self, parent: Hypothesis) -> list[Hypothesis]:
-        """Return all plausible extensions that lower BIC; by how much is not asked, the runs left out decide."""
+        """Return all plausible extensions that lower BIC; by how much is not asked, the runs left out decide. Coulomb and
+        viscous friction of a joint also come together.
+        """
         totals = [self.search.mixed.marginal(v)[0] for v in (parent.model.variances, self.search.mixed.prior)]
         base = list(parent.model.columns)
         out = []
-        for c in self.search.candidates:
-            if not self.search.fits_beside(c, parent.chosen):
+        for new in self.search.additions(parent.chosen):
+            columns = [k for c in new for k in c.columns]
+            drop = max(explained(total, base, columns) for total in totals)
+            if drop < sum(self.search.penalty(c) for c in new):
                 continue
-            drop = max(explained(total, base, list(c.columns)) for total in totals)
-            if drop < self.search.penalty(c):
-                continue
-            child = self.search.hypothesis((*parent.chosen, c), parent.model)
+            child = self.search.hypothesis((*parent.chosen, *new), parent.model)
             if child.bic < parent.bic and self.search.plausible(child):
                 out.append(child)
         return out
@@ -172,8 +212,11 @@ class LeaveOneOut:
     ) -> bool:
         if not new:
             return True
+        fall = min(self._falls(hypothesis, without, new))
+        if fall < least:
+            return False
         drops = self.search.held_out_deviances(without) - self.search.held_out_deviances(hypothesis)
-        return bool(np.all(drops > 0.0)) and min(self._falls(hypothesis, without, new)) >= least
+        return fall >= LARGE_FALL or bool(np.all(drops > 0.0))
 
     def _without(self, hypothesis: Hypothesis, candidate: EffectCandidate) -> Hypothesis:
         return self.search.hypothesis([c for c in hypothesis.chosen if c is not candidate], hypothesis.model)
@@ -184,9 +227,11 @@ class LeaveOneOut:
         """
         columns = np.array([k for c in where for k in c.columns], np.intp)
         out = []
-        for run, a, b in zip(self.dataset.runs, self.squares(one), self.squares(other), strict=True):
+        first = [int(np.argmax(self.search.mixed.pieces == r)) for r in range(self.search.mixed.runs)]
+        for k, a, b in zip(first, self.squares(one), self.squares(other), strict=True):
+            run = self.dataset.runs[k]
             there = [c for c, d in run.channels.items() if np.isin(columns, d.index).any()]
-            out.append(sum(1.0 - a[c] / max(b[c], 1e-30) for c in there))
+            out.append(sum(1.0 - a[c] / max(b[c], 1e-30) for c in there if c in a))
         return out
 
     def _score(self, hypothesis: Hypothesis) -> float:
@@ -203,11 +248,11 @@ class LeaveOneOut:
         return self._squares[key]
 
     def _measured(self, hypothesis: Hypothesis) -> list[Squares]:
-        out: list[Squares] = []
+        sums: list[dict[Channel, FloatArray]] = [{} for _ in range(self.search.mixed.runs)]
         columns = list(hypothesis.model.columns)
-        for run, beta in zip(self.dataset.runs, self.search.held_out_beta(hypothesis), strict=True):
+        betas = self.search.of_pieces(self.search.held_out_beta(hypothesis))
+        for r, run, beta in zip(self.search.mixed.pieces, self.dataset.runs, betas, strict=True):
             weight = dict(zip(columns, (float(b) for b in beta), strict=True))
-            squares = {}
             for channel, d in run.channels.items():
                 mine = np.flatnonzero(np.isin(d.index, columns))
                 rest = d.residual - d.regressors[:, mine] @ np.array([weight[int(d.index[k])] for k in mine])
@@ -215,15 +260,18 @@ class LeaveOneOut:
                 if channel.balance == "torsion" and len(rest):
                     rest = rest - rest.mean()
                 if len(rest):
-                    squares[channel] = float(np.mean(rest**2))
-            out.append(squares)
-        return out
+                    more = np.array([float(rest @ rest), float(len(rest))])
+                    sums[r][channel] = sums[r].get(channel, np.zeros(2)) + more
+        return [{c: float(s[0] / s[1]) for c, s in mine.items()} for mine in sums]
 
 
 def _holds_nothing(candidate: EffectCandidate, cause: Cause) -> bool:
-    """Return whether the intervals of all its parameters hold the values without it."""
+    """Return whether the intervals of all its parameters hold the values without it, or nearly (_NEARLY)."""
     nothing = candidate.term.combine([0.0] * candidate.size)
     free = {
         name: v.ci95 for name, v in cause.parameters.items() if v.ci95[1] > v.ci95[0] and name != "phase_rad"
     }
-    return all(low <= nothing.get(name, 0.0) <= high for name, (low, high) in free.items())
+    room = {name: _NEARLY * (high - low) for name, (low, high) in free.items()}
+    return all(
+        low - room[name] <= nothing.get(name, 0.0) <= high + room[name] for name, (low, high) in free.items()
+    )

@@ -13,21 +13,24 @@ from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.events import (
+    BLOCK_S,
     MOST_OF_THE_TIME,
     Burst,
     EventLimits,
     Events,
+    block_means,
     bursts,
     wandering,
 )
 from jtqd.sysid.diagnosis.noise import Noise
 from jtqd.sysid.diagnosis.refine import Refined
-from jtqd.sysid.diagnosis.regressors import LINE
+from jtqd.sysid.diagnosis.regressors import LINE, RunData
 from jtqd.sysid.diagnosis.signals import Channel, Line
 from jtqd.sysid.diagnosis.structure import (
     SIGNIFICANT,
     AxisMap,
     axis_maps,
+    axis_values,
     frequency_lines,
     order_lines,
     sharpened,
@@ -45,8 +48,8 @@ _HZ_RATIO: Final = 25.0
 
 @dataclass(frozen=True)
 class Leftover:
-    """maps: all axes of all channels; found: those whose structure is significant and large enough to matter; limits: by
-    what a channel's events are judged.
+    """maps: all axes of all channels; found: those whose structure is significant and large enough to be told; limits: by
+    what a channel's events are judged; worst_nm: rms of what is structure in the run that has most of it, per channel.
     """
 
     maps: tuple[AxisMap, ...]
@@ -54,6 +57,7 @@ class Leftover:
     bursts: tuple[Burst, ...]
     lines: tuple[Line, ...]
     limits: Mapping[Channel, EventLimits] = field(default_factory=dict)
+    worst_nm: Mapping[Channel, float] = field(default_factory=dict)
 
     @property
     def significant(self) -> bool:
@@ -182,7 +186,51 @@ def leftover(dataset: Dataset, refined: Refined, noise: Noise, joints: Mapping[i
         c: EventLimits(noise.ar[c], dataset.step_s, _JUMP * joints[c.joint].rated_torque_nm, wander[c])
         for c in whole
     }
-    return Leftover(tuple(maps), significant, burst, lines, limits)
+    worst = _worst_runs(refined.runs, whole, dataset.step_s, significant, found, burst, lines)
+    return Leftover(tuple(maps), significant, burst, lines, limits, worst)
+
+
+def _worst_runs(  # noqa: PLR0917
+    runs: Sequence[RunData],
+    whole: Mapping[Channel, Sequence[FloatArray]],
+    step_s: float,
+    maps: Sequence[AxisMap],
+    events: Mapping[Channel, Events],
+    bursts: Sequence[Burst],
+    lines: Sequence[Line],
+) -> dict[Channel, float]:
+    """Return the rms of the structure in the run that has most of it [Nm]: of the largest map, event, wandering or line."""
+    energy: dict[Channel, float] = {}
+
+    def at_least(channel: Channel, nm2: float) -> None:
+        energy[channel] = max(energy.get(channel, 0.0), nm2)
+
+    for m in maps:
+        chance = float(np.nansum(m.mean_nm**2 * m.count)) / max(float(m.count.sum()), 1.0)
+        part = m.energy_nm2 / max(chance, 1e-30)  # the rest of the means' energy is chance
+        for run in runs:
+            values = axis_values(run.axes[m.channel.joint], m.axis)
+            place = np.clip(np.searchsorted(m.edges, values, side="right") - 1, 0, len(m.mean_nm) - 1)
+            here = m.mean_nm[place][run.channels[m.channel].valid]
+            if np.isfinite(here).any():
+                at_least(m.channel, part * float(np.nanmean(here**2)))
+    for channel, found in events.items():
+        usual = float(
+            np.nanmedian([np.nanmean(x[~m] ** 2) for x, m in zip(whole[channel], found.masks, strict=True)])
+        )
+        for x, mask in zip(whole[channel], found.masks, strict=True):
+            count = max(int(np.isfinite(x).sum()), 1)
+            at_least(channel, float(np.nansum(x[mask] ** 2 - usual)) / count)
+    block = max(2, round(BLOCK_S / step_s))
+    for b in bursts:
+        if b.what == "seconds":
+            for x in whole[b.channel]:
+                mean, use = block_means(x, block)
+                if use.any():
+                    at_least(b.channel, float(np.mean(mean[use] ** 2)))
+    for line in lines:
+        at_least(line.channel, 0.5 * line.amplitude_nm**2)
+    return {c: float(np.sqrt(e)) for c, e in energy.items()}
 
 
 def _without_rare_events(parts: Sequence[FloatArray], found: Events | None) -> list[FloatArray]:

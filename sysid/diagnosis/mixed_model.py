@@ -28,7 +28,7 @@ _RIDGE: Final = 1e-10
 @dataclass(frozen=True)
 class Model:
     """Result of one model: columns chosen, coefficients, their covariance, variances of the families, criterion
-    -2 log likelihood (constant left out), nuisances of each run [r, q].
+    -2 log likelihood (constant left out), nuisances of each piece of a run [r, q].
     """
 
     columns: tuple[int, ...]
@@ -41,12 +41,20 @@ class Model:
 
 
 class Mixed:
-    """Normal equations of all runs; columns P, nuisance families Q."""
+    """Normal equations of all runs; columns P, nuisance families Q. Pieces of one recording are one run: they have one zero
+    and one friction of the day, and are left out together.
+    """
 
-    def __init__(self, sums: Sequence[Sums], columns: int, prior_sigma: FloatArray) -> None:
+    def __init__(
+        self, sums: Sequence[Sums], columns: int, prior_sigma: FloatArray, pieces: Sequence[int] | None = None
+    ) -> None:
+        """Sum up: pieces: number of the run of each of the sums, where several are of one run."""
         self.columns = columns
         self.prior = prior_sigma**2
-        self.grams = np.array([s.gram for s in sums])
+        self.pieces = np.arange(len(sums)) if pieces is None else np.array(pieces, np.intp)
+        grams = np.array([s.gram for s in sums])
+        self.grams = np.zeros((int(self.pieces.max()) + 1, *grams.shape[1:]))
+        np.add.at(self.grams, self.pieces, grams)
         self.rows = sum(s.rows for s in sums)
         self._p = slice(0, columns)
         self._q = slice(columns, columns + len(prior_sigma))
@@ -61,6 +69,7 @@ class Mixed:
         """Return the same with these runs only."""
         out = object.__new__(Mixed)
         out.columns, out.prior, out.grams = self.columns, self.prior, self.grams[list(runs)]
+        out.pieces = np.arange(len(runs))
         out.rows = self.rows * len(runs) // max(len(self.grams), 1)
         out._p, out._q, out._fixed_index = self._p, self._q, self._fixed_index
         return out
@@ -118,7 +127,7 @@ class Mixed:
         # the prior run is part of the criterion, else variances could be bought for nothing
         log += _PRIOR_RUNS * float(np.sum(np.log(variances) + self.prior / variances))
         squares = float(contrast @ total @ contrast)
-        return Model(tuple(chosen), beta, covariance, variances, squares + log, squares, u)
+        return Model(tuple(chosen), beta, covariance, variances, squares + log, squares, u[self.pieces])
 
 
 def solve(total: FloatArray, k: int) -> tuple[FloatArray, FloatArray]:

@@ -151,7 +151,7 @@ def _linearised(dataset: Dataset, present: Sequence[PresentEffect], noise: Noise
     count = sum(len(p.free) for p in present)
     sums = [run_sums(d, noise, count, len(groups)) for d in data]
     sums = with_readings(sums, dataset.readings, _unpowered(present, dataset.joints))
-    mixed = Mixed(sums, count, np.array([g.sigma for g in groups]))
+    mixed = Mixed(sums, count, np.array([g.sigma for g in groups]), dataset.pieces)
     return _Iterate(tuple(present), mixed, mixed.fit(range(count)), data, mixed.fit(()).deviance)
 
 
@@ -198,13 +198,14 @@ def _run_at(
             for balance in (MOTOR, TORSION):
                 channel = Channel(s.number, balance)
                 if channel in left and balance in here:
-                    left[channel] = left[channel] - binned(here[balance], samples)
+                    left[channel] = left[channel] - binned(s.seen(balance, here[balance]), samples)
             for k, name in enumerate(p.free):
                 size = _step_size(p, name)
                 there = _contribution(p, s, {**p.values, name: p.values[name] + size})
                 for balance, value in there.items():
                     slope = (value - here[balance]) / size
-                    columns[Channel(s.number, balance)].append((place + k, binned(slope, samples)))
+                    seen = binned(s.seen(balance, slope), samples)
+                    columns[Channel(s.number, balance)].append((place + k, seen))
         place += len(p.free)
     channels = {}
     for c, d in base.channels.items():
@@ -213,6 +214,24 @@ def _run_at(
         x = np.column_stack([v for _, v in found]) if found else np.empty((len(d.valid), 0))
         channels[c] = ChannelData(d.valid, left[c], x, index, d.nuisances, d.families)
     return RunData(base.name, base.time_s, channels, base.axes)
+
+
+def contributions(dataset: Dataset, present: PresentEffect) -> dict[Channel, list[FloatArray]]:
+    """Return what one cause contributes to each channel, over the valid bins of each run [run][n], Nm; a constant in torsion
+    is none.
+    """
+    out: dict[Channel, list[FloatArray]] = {}
+    for run, data in zip(dataset.signals, dataset.runs, strict=True):
+        for s in run:
+            if present.joint not in ("sensor", s.number):
+                continue
+            for balance, value in contribution(present.effect, present.values, s).items():
+                channel = Channel(s.number, balance)
+                part = binned(s.seen(balance, value), dataset.samples)[data.channels[channel].valid]
+                if balance == TORSION and len(part):
+                    part = part - part.mean()
+                out.setdefault(channel, []).append(part)
+    return out
 
 
 def _unpowered(present: Sequence[PresentEffect], joints: Mapping[int, Joint]) -> list[UnpoweredColumn]:

@@ -102,12 +102,15 @@ def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatA
 
 
 def bin_samples(signals: Iterable[JointSignals]) -> int:
-    """Return how many samples make a bin."""
-    total, step = 0.0, 0.0
+    """Return how many samples make a bin: where all is filtered, bins of what the highest cutoff leaves, because whitening
+    would raise again what no filter has let through.
+    """
+    total, step, highest = 0.0, 0.0, 0.0
     for s in signals:
         total += float(s.time_s[-1] - s.time_s[0])
         step = max(step, float(np.median(np.diff(s.time_s))))
-    width = BIN_S * max(1.0, total / LONG_S)
+        highest = max(highest, s.visible.highest_hz)
+    width = max(BIN_S * max(1.0, total / LONG_S), 0.5 / highest)
     return max(1, round(width / step))
 
 
@@ -219,12 +222,12 @@ def run_data(
             residual = s.motor_nm if balance == MOTOR else s.torsion_nm
             if residual is None:
                 continue
-            valid = all_in_bin(s.moving if balance == MOTOR else np.ones(len(residual), bool), samples)
+            valid = all_in_bin(s.usable(balance), samples)
             nuisances = [(k, _nuisance(s, balance, g)) for k, g in enumerate(groups)]
-            there = [(k, binned(c, samples)) for k, c in nuisances if c is not None]
+            there = [(k, binned(s.seen(balance, c), samples)) for k, c in nuisances if c is not None]
             channels[Channel(s.number, balance)] = ChannelData(
                 valid,
-                binned(residual, samples),
+                binned(s.seen(balance, residual), samples),
                 np.empty((len(valid), 0)),
                 np.empty(0, np.intp),
                 np.column_stack([c for _, c in there]),
@@ -249,7 +252,8 @@ def _fill(
                 continue
             for column, p in zip(candidate.columns, candidate.term.basis, strict=True):
                 for balance, value in contribution(candidate.effect, p, s).items():
-                    found[Channel(s.number, balance)].append((column, binned(value, samples)))
+                    seen = binned(s.seen(balance, value), samples)
+                    found[Channel(s.number, balance)].append((column, seen))
     for channel, columns in found.items():
         if columns:
             channels[channel].index = np.array([k for k, _ in columns], np.intp)

@@ -87,6 +87,8 @@ class Search:
         self._log_n = {c.first: self._rows_that_count(c) for c in candidates}
         self.joints = len({c.joint for c in candidates} - {"sensor"})
         self._cache: dict[tuple[int, ...], Hypothesis] = {}
+        self.rejected: set[tuple[str, object]] = set()
+        """Effects (with joint) that shall not be chosen again (`guards`)."""
 
     def penalty(self, candidate: EffectCandidate) -> float:
         """Return what the candidate costs in BIC: its parameters, and the choice among its terms."""
@@ -136,8 +138,8 @@ class Search:
         return reading_misfit(self._readings, read)
 
     def fits_beside(self, candidate: EffectCandidate, chosen: Sequence[EffectCandidate]) -> bool:
-        """Return whether a candidate may be added: an effect is there once, waves once per order."""
-        if not pinned([*chosen, candidate], self.joints):
+        """Return whether a candidate may be added: an effect is there once, waves once per order, one rejected never."""
+        if candidate.key in self.rejected or not pinned([*chosen, candidate], self.joints):
             return False
         for one in chosen:
             if one.key == candidate.key and (
@@ -150,6 +152,7 @@ class Search:
         """Return the best set of candidates."""
         best = self.hypothesis(())
         beam = [best]
+        seen = [best]
         for _ in range(DEEPEST):
             grown: dict[tuple[int, ...], Hypothesis] = {}
             for parent in beam:
@@ -159,7 +162,25 @@ class Search:
                 break
             beam = sorted(grown.values(), key=lambda h: h.bic)[:_BEAM]
             best = min((best, beam[0]), key=_with_price)
-        return self.pruned(best)
+            seen.append(min(grown.values(), key=_with_price))
+        # what two that came together leave when one of them goes must be worth its effects, too
+        return min((self.pruned(best), *seen), key=_with_price)
+
+    def confirmed(self) -> Hypothesis:
+        """Return the best set of candidates less those that do not help on held-out runs."""
+        best = self.run()
+        while best.chosen:
+            weak = []
+            for c in best.chosen:
+                without = self.hypothesis([o for o in best.chosen if o is not c], best.model)
+                evidence = without.model.deviance - best.model.deviance
+                if self.held_out(best, c) < HELD_OUT * evidence:
+                    weak.append((evidence, c))
+            if not weak:
+                return best
+            weakest = min(weak, key=lambda pair: pair[0])[1]
+            best = self.hypothesis([c for c in best.chosen if c is not weakest], best.model)
+        return best
 
     def children(self, parent: Hypothesis) -> list[Hypothesis]:
         """Return the most promising plausible extensions that lower BIC by ENTER."""
@@ -167,22 +188,29 @@ class Search:
         totals = [self.mixed.marginal(v)[0] for v in (parent.model.variances, self.mixed.prior)]
         base = list(parent.model.columns)
         scored = []
-        for candidate in self.candidates:
-            if self.fits_beside(candidate, parent.chosen):
-                drop = max(explained(total, base, list(candidate.columns)) for total in totals)
-                scored.append((drop - self.penalty(candidate), candidate))
+        for new in self.additions(parent.chosen):
+            columns = [k for c in new for k in c.columns]
+            drop = max(explained(total, base, columns) for total in totals)
+            scored.append((drop - sum(self.penalty(c) for c in new), new))
         scored.sort(key=lambda pair: -pair[0])
         out = []
         tried = 0
-        for drop, candidate in scored:
+        for drop, new in scored:
             if drop < ENTER * 0.5 or tried >= _TRIED:
                 break
-            child = self.hypothesis((*parent.chosen, candidate), parent.model)
+            child = self.hypothesis((*parent.chosen, *new), parent.model)
             if self.plausible(child):
                 tried += 1
-                if child.bic < parent.bic - ENTER:
+                if child.bic < parent.bic - ENTER * len(new):
                     out.append(child)
         return out
+
+    def additions(self, chosen: Sequence[EffectCandidate]) -> list[tuple[EffectCandidate, ...]]:
+        """Return what may be added to a set: each candidate that fits beside it, and Coulomb with viscous friction of one
+        joint, of which the one may only show with the other (a file with too much of one and too little of the other).
+        """
+        fitting = [c for c in self.candidates if self.fits_beside(c, chosen)]
+        return [*((c,) for c in fitting), *friction_pairs(fitting)]
 
     def pruned(self, best: Hypothesis) -> Hypothesis:
         """Return the set without candidates that are no longer worth their place."""
@@ -216,11 +244,22 @@ class Search:
         total = grams.sum(axis=0)
         return [solve(total - gram, len(hypothesis.model.columns))[0] for gram in grams]
 
+    def of_pieces(self, per_run: Sequence[FloatArray]) -> list[FloatArray]:
+        """Return the same for each piece of the runs."""
+        return [per_run[r] for r in self.mixed.pieces]
+
     def _per_run(self, hypothesis: Hypothesis) -> tuple[FloatArray, FloatArray]:
         """Return per run the normal equations of a set of candidates and the log determinants [r]."""
         marginals, logs = self.mixed.marginal_runs(hypothesis.model.variances)
         places = np.array([*hypothesis.model.columns, marginals.shape[1] - 1], np.intp)
         return marginals[:, places[:, None], places[None, :]], logs
+
+
+def friction_pairs(candidates: Sequence[EffectCandidate]) -> list[tuple[EffectCandidate, EffectCandidate]]:
+    """Return Coulomb and viscous friction of each joint that has both."""
+    viscous = {c.joint: c for c in candidates if c.effect.name == "viscous_friction"}
+    coulomb = [c for c in candidates if c.effect.name == "coulomb_friction" and c.joint in viscous]
+    return [(c, viscous[c.joint]) for c in coulomb]
 
 
 def _with_price(hypothesis: Hypothesis) -> float:

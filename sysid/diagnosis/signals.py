@@ -20,12 +20,15 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
-from jtqd.estimator.effects.effect import Effect, State, Values
+from jtqd.estimator.effects.effect import MOTOR, Effect, State, Values
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import DRIVING_CURRENT_MAX_A, LossModel
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sim_can.losses import TORQUE_STEPS, LossTable
 from jtqd.sim_can.plant_file import plant_of_joint
+from jtqd.sysid.diagnosis.resolution import Smoother, acceleration_noise, cutoff_hz, described, noise_of
+
+_ALL_VISIBLE: Final = Smoother(1.0)
 
 
 class Channel(NamedTuple):
@@ -123,6 +126,16 @@ _AFTER_REST_S: Final = 0.03
 _SMOOTH_S: Final = 0.005
 _COARSE: Final = 3.0
 """A position whose difference is noisier by this factor than the velocity channel is not used for it."""
+_VISIBLE: Final = 1e-3
+"""Part of the rated torque (rms) that the noise of an acceleration may be worth; beyond, the balance is filtered."""
+_SHARED: Final = 2e-4
+"""The same in the regressor of an inertia, where the noise of the residual is once more."""
+_REMEMBERED: Final = 1.2
+"""Periods of its cutoff after which a filter has forgotten a standstill."""
+_FINE_HZ: Final = 15.0
+"""A position whose acceleration is known up to here needs no velocity channel, whose filter and delay nobody knows."""
+_FINEST_HZ: Final = 80.0
+"""Averages over bins do the rest above it."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +164,24 @@ class JointSignals:
         True  # the acceleration is a second difference of the position, else one of the velocity
     )
     sensor_temperature_c: FloatArray | None = None  # None: that of this joint (`with_one_sensor`)
+    visible: Smoother = _ALL_VISIBLE
+    coarse: str = ""  # what the resolution of the recording costs, "" for nothing
+
+    def seen(self, balance: str, x: FloatArray) -> FloatArray:
+        """Return what of x [n] can be seen in a balance: of the motor's, what is slow enough for its acceleration to be
+        known (`resolution`). Residuals and all that is to explain them go through it.
+        """
+        return self.visible(x) if balance == MOTOR else x
+
+    def usable(self, balance: str) -> BoolArray:
+        """Return the samples that a balance can be judged at [n]: the motor's where friction has a direction; none within
+        the reach of a filter from the ends.
+        """
+        out = self.moving.copy() if balance == MOTOR else np.ones(len(self.time_s), bool)
+        if self.visible.parts:
+            wide = max(1, round(_REMEMBERED / self.visible.slowest_hz / self.visible.step_s))
+            out[:wide] = out[-wide:] = False
+        return out
 
     def state_of(self, effect: Effect, p: Values) -> State:
         """Return what the hooks of an effect with parameters p use: the one sensor has one temperature, for every joint's
@@ -197,14 +228,16 @@ def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: Ba
     assert columns.torque_nm is not None
     assert columns.motor_position_rad is not None or columns.motor_velocity_rad_s is not None
     time = table.time_s
-    speed = _motor_speed(time, raw, columns)
+    speed = _motor_speed(time, raw, columns, joint)
     position = columns.motor_position_rad
     if position is None:
         position = np.concatenate(([0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(time))))
-    velocity = speed / joint.gear_ratio
     of_position = raw.motor_position_rad is not None and speed is not raw.motor_velocity_rad_s
     # of the position where the velocity is that of the position too
-    acceleration = second_difference(position, time) if of_position else np.gradient(speed, time)
+    whole = second_difference(position, time) if of_position else np.gradient(speed, time)
+    noise = noise_of(position if of_position else speed)
+    visible = _smoother(joint, time, noise, _VISIBLE, of_position=of_position)
+    acceleration, velocity = visible(whole), visible(speed) / joint.gear_ratio
     both = _two_encoders(raw, joint.gear_ratio)
     link = columns.link_position_rad if columns.link_position_rad is not None else position / joint.gear_ratio
     link_acceleration = acceleration / joint.gear_ratio
@@ -217,15 +250,16 @@ def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: Ba
     gear_torque = sensor + joint.link_inertia_kgm2 * link_acceleration
     calm_torque, calm_current = smooth(gear_torque, wide), smooth(columns.current_a, wide)
     calm_sensor = smooth(sensor, wide)
-    moving = _moving(time, velocity)
+    moving = _moving(time, velocity, visible.slowest_hz)
+    shared = _smoother(joint, time, noise, _SHARED, of_position=of_position)(whole)
     state = State(
         current_a=calm_current,
         current_rate_a_s=np.gradient(calm_current, time),
         direction=np.where(np.abs(velocity) > 1e-6, np.sign(velocity), 0.0),
-        link_acceleration_rad_s2=link_acceleration,
+        link_acceleration_rad_s2=link_acceleration + (shared - acceleration) / joint.gear_ratio,
         link_position_rad=link,
         link_velocity_rad_s=velocity,
-        motor_acceleration_rad_s2=acceleration,
+        motor_acceleration_rad_s2=shared,
         motor_position_rad=position,
         temperature_c=_or_nan(columns.temperature_c, len(time)),
         time_s=time - time[0],
@@ -236,7 +270,7 @@ def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: Ba
         coupling_position_rad=link if number != 2 else -link,
     )
     motor_torque = joint.gear_ratio * (
-        joint.torque_constant_nm_per_a * columns.current_a - joint.rotor_inertia_kgm2 * acceleration
+        joint.torque_constant_nm_per_a * columns.current_a - joint.rotor_inertia_kgm2 * whole
     )
     motor = motor_torque - base.loss(gear_torque, velocity) - gear_torque
     torsion = bent = None
@@ -260,7 +294,44 @@ def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: Ba
         twist_rad=bent,
         off=off,
         of_position=of_position,
+        visible=visible,
+        coarse=_cost(
+            joint, time, position if of_position else speed, noise, visible, of_position=of_position
+        ),
     )
+
+
+def _cost(
+    joint: Joint,
+    time: FloatArray,
+    x: FloatArray,
+    noise: FloatArray,
+    visible: Smoother,
+    *,
+    of_position: bool,
+) -> str:
+    """Return what the noise of position or velocity costs the motor balance, in words."""
+    if not visible.parts:
+        return ""
+    name, unit = ("motor_position_rad", "rad") if of_position else ("motor_velocity_rad_s", "rad/s")
+    worst = float(np.max(noise))
+    found = described(x, unit) or f"noise of {worst:.2g} {unit} rms"
+    hz, step = visible.slowest_hz, float(np.median(np.diff(time)))
+    known = float(acceleration_noise(worst, step, hz, of_velocity=not of_position))
+    torque = joint.gear_ratio * joint.rotor_inertia_kgm2 * known
+    return (
+        f"{name}: found {found}: acceleration known to {known:.2g} rad/s2 ({torque:.2g} Nm at the joint) below {hz:.0f} Hz; "
+        "the motor balance is judged below it"
+    )
+
+
+def _smoother(
+    joint: Joint, time: FloatArray, noise: FloatArray, part: float, *, of_position: bool
+) -> Smoother:
+    """Return the smoother after which the noise of the motor's acceleration is worth `part` of the rated torque (rms)."""
+    step = float(np.median(np.diff(time)))
+    most = part * joint.rated_torque_nm / (joint.gear_ratio * joint.rotor_inertia_kgm2)
+    return Smoother.of(cutoff_hz(noise, step, most, of_velocity=not of_position), step, _FINEST_HZ)
 
 
 def _zero(apart: FloatArray, torque: FloatArray) -> float:
@@ -284,13 +355,16 @@ def _or_nan(column: FloatArray | None, count: int) -> FloatArray:
     return np.full(count, np.nan) if column is None else column
 
 
-def _motor_speed(time: FloatArray, raw: JointColumns, columns: JointColumns) -> FloatArray:
+def _motor_speed(time: FloatArray, raw: JointColumns, columns: JointColumns, joint: Joint) -> FloatArray:
     """Return the velocity of the motor [rad/s]: of its position where that is fine enough, else the channel itself."""
     assert columns.motor_velocity_rad_s is not None
     if raw.motor_position_rad is None:
         return columns.motor_velocity_rad_s
     derived: FloatArray = np.gradient(raw.motor_position_rad, time)
     if raw.motor_velocity_rad_s is None:
+        return derived
+    steps = noise_of(raw.motor_position_rad)
+    if _smoother(joint, time, steps, _VISIBLE, of_position=True).slowest_hz >= _FINE_HZ:
         return derived
     noise = [float(np.std(np.diff(v, 2))) for v in (derived, raw.motor_velocity_rad_s)]
     return derived if noise[0] <= _COARSE * max(noise[1], 1e-9) else raw.motor_velocity_rad_s
@@ -308,10 +382,11 @@ def second_difference(x: FloatArray, time: FloatArray) -> FloatArray:
     return np.pad(inner, 2, mode="edge")
 
 
-def _moving(time: FloatArray, velocity: FloatArray) -> BoolArray:
-    """Return True where the joint moves and has done so, and will, for _AFTER_REST_S."""
+def _moving(time: FloatArray, velocity: FloatArray, slowest_hz: float) -> BoolArray:
+    """Return True where the joint moves and has done so, and will, for _AFTER_REST_S, or as long as a filter remembers."""
     slow = np.abs(velocity) < SLOWEST_RAD_S
-    wide = max(1, round(_AFTER_REST_S / max(float(np.median(np.diff(time))), 1e-9)))
+    apart = max(_AFTER_REST_S, _REMEMBERED / slowest_hz)
+    wide = max(1, round(apart / max(float(np.median(np.diff(time))), 1e-9)))
     near = np.convolve(slow, np.ones(2 * wide + 1), "same") > 0.5
     result: BoolArray = ~near
     return result

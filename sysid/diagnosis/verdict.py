@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -21,22 +23,38 @@ from jtqd.sysid.diagnosis.findings import (
     Findings,
     Gap,
     JointName,
+    LeftOver,
     Value,
 )
 from jtqd.sysid.diagnosis.gain import held_out_gain, left_out_steps
 from jtqd.sysid.diagnosis.gaps import channel_gaps, traces
+from jtqd.sysid.diagnosis.guards import STEADY, nothing_of, objections, steadiness
 from jtqd.sysid.diagnosis.leave_one_out import ENOUGH_RUNS, LeaveOneOut
 from jtqd.sysid.diagnosis.leftover import Leftover, leftover
 from jtqd.sysid.diagnosis.next_experiment import MOST_KINDS, next_experiment
 from jtqd.sysid.diagnosis.noise import Noise
-from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, parameter, present_effects, refine
-from jtqd.sysid.diagnosis.regressors import EffectCandidate, binned, contribution
+from jtqd.sysid.diagnosis.refine import (
+    PresentEffect,
+    Refined,
+    contributions,
+    parameter,
+    present_effects,
+    refine,
+)
+from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.search import Hypothesis, Search
 from jtqd.sysid.diagnosis.signals import Channel
 from jtqd.sysid.fit.friction import student_975
 
-UNEXPLAINED_SHARE: Final = 0.2
-"""When what is left over holds more than this part of the structured gap, the causes found do not name it."""
+RELEVANCE: Final = 0.005
+"""Part of the rated torque, rms over a run, from which what the causes leave matters; the user may set another."""
+UNEXPLAINED_SHARE: Final = 0.05
+"""Part of all structure (as squares) that must be left over as well for it to matter."""
+FEW_UNEXPLAINED_SHARE: Final = 0.2
+"""The same with two or three runs, where more of what is left over is the runs' own."""
+
+_MOST_SAID: Final = 4
+"""Lines about effects that fit and are not named."""
 
 INACCURATE: Final = 0.06
 """Half width of the 95 % interval, as part of an effect's size, for what the equations here simplify (smoothing, first
@@ -55,16 +73,30 @@ def conclude(  # noqa: PLR0917
     joints: Mapping[int, Joint],
     names: tuple[str, ...],
     numbers: tuple[int, ...],
+    relevance: float = RELEVANCE,
 ) -> Findings:
-    """Return the findings of one diagnosis."""
-    best, refined, explained = _without_negligible(dataset, search, best, refined, noise, joints)
+    """Return the findings of one diagnosis; relevance: see RELEVANCE."""
+    few = LeaveOneOut(dataset, search) if search.mixed.runs < ENOUGH_RUNS else None
+    best, refined, explained, refused = _guarded(
+        dataset, search, best, refined, noise, joints, bounds_only=few is not None
+    )
     left = leftover(dataset, refined, noise, joints)
     whole, squares = best, sum(r * r for e in explained for r in e.values())
-    few = LeaveOneOut(dataset, search) if search.mixed.runs < ENOUGH_RUNS else None
     if few is not None:  # what is left over is judged with all that was found, names need more
         best = few.confirmed(whole)
         refined = refine(dataset, present_effects(best), noise)
-        best, refined, explained = _without_negligible(dataset, search, best, refined, noise, joints)
+        best, refined, explained, more = _guarded(dataset, search, best, refined, noise, joints)
+        refused = more
+        named = leftover(dataset, refined, noise, joints)
+        if named.energy_nm2() < left.energy_nm2():
+            whole, left, squares = best, named, sum(r * r for e in explained for r in e.values())
+    limits = {c: relevance * joints[c.joint].rated_torque_nm for c in refined.runs[0].channels}
+    matters = any(nm > limits[c] for c, nm in left.worst_nm.items())
+    part = UNEXPLAINED_SHARE if few is None else FEW_UNEXPLAINED_SHARE
+    matters = matters and (left.share(squares) > part or not whole.chosen)
+    judged = refined
+    if matters and few is None:
+        best, refined, explained = _proven(dataset, search, best, refined, noise, joints)
     gain = held_out_gain(dataset, refined)
     classes = [
         few.rivals(best, candidate) if few is not None else equivalence_class(search, best, candidate)
@@ -76,34 +108,35 @@ def conclude(  # noqa: PLR0917
     causes = [
         _cause(search, best, refined, k, classes[k], *_largest(explained[k])) for k in range(len(classes))
     ]
-    if few is None:
-        whole, squares = best, sum(r * r for e in explained for r in e.values())
-    share = left.share(squares)
+    energies = [sum(r * r for r in e.values()) for e in explained]
+    total = max(sum(energies) + left.energy_nm2(), 1e-30)
+    steady = steadiness(refined, nothing_of(best))
+    causes = [
+        replace(c, explained_share=e / total, steadiness=t)
+        for c, e, t in zip(causes, energies, steady, strict=True)
+    ]
+    rated = {n: joint.rated_torque_nm for n, joint in joints.items()}
+    rest = _left_over(left, limits, rated, left.energy_nm2() / total, matters=matters)
     unsure = [] if few is None else few.unsure(whole, best, classes, causes)
     doubt = few.doubt(unsure) if few is not None and unsure else ""
     reasons: list[str] = []
-    if left.significant and (share > UNEXPLAINED_SHARE or not whole.chosen):
+    if matters:
         verdict = UNEXPLAINED
-        if whole.chosen:
-            closest = ", ".join(f"{c.effect.name} of {_owner(c.joint)}" for c in whole.chosen)
-            effects, are = ("effect", "it is") if len(whole.chosen) == 1 else ("effects", "they are")
-            reasons.append(
-                f"the closest {effects} of the library ({closest}) would leave {share:.0%} of the structured gap, "
-                f"so {are} not named as its cause"
-            )
-        causes = []
-        left, refined = _least_left(dataset, left, refined, noise, joints)
+        reasons += _closest(whole, causes, left.share(squares))
+        left, judged = _least_left(dataset, left, judged, noise, joints)
     elif not causes:
         verdict = INSUFFICIENT if doubt else NO_GAP
         reasons += [doubt] if doubt else []
     else:
         verdict = CAUSE if all(len(c.names) == 1 for c in causes) and not doubt else AMBIGUOUS
-    reasons += left.reasons if verdict == UNEXPLAINED else []
+    reasons += left.reasons if matters else []
     causes.sort(key=lambda c: -c.rms_nm)
-    gaps = channel_gaps(dataset, refined, left if verdict == UNEXPLAINED else None)
+    gaps = channel_gaps(dataset, judged if matters else refined, left if matters else None)
+    if not reasons:
+        reasons = [s for s in (_reason(verdict, causes, gaps), doubt) if s]
     return Findings(
         verdict,
-        tuple(reasons or [s for s in (_reason(verdict, causes, gaps), doubt) if s]),
+        tuple(reasons + refused),
         names,
         numbers,
         gaps,
@@ -111,8 +144,92 @@ def conclude(  # noqa: PLR0917
         candidate_table(search, best, rivals),
         gain if causes else None,
         next_experiment=_settling_experiment(verdict, causes, unsure, joints, dataset),
-        traces=traces(dataset, refined),
+        traces=traces(dataset, judged if matters else refined),
+        explained_share=sum(energies) / total if causes else math.nan,
+        left_over=rest,
     )
+
+
+def _left_over(
+    left: Leftover,
+    limits: Mapping[Channel, float],
+    rated: Mapping[int, float],
+    share: float,
+    *,
+    matters: bool,
+) -> LeftOver:
+    """Return what is left over in the channel where it is most, against its limit [Nm]."""
+    sizes = {c: left.worst_nm.get(c, 0.0) for c in limits}
+    worst = max(sizes, key=lambda c: sizes[c] / limits[c] if limits[c] > 0.0 else sizes[c])
+    size = sizes[worst]
+    return LeftOver(
+        worst.joint, worst.balance, size, size / rated[worst.joint], share, limits[worst], matters
+    )
+
+
+def _closest(whole: Hypothesis, causes: Sequence[Cause], share: float) -> list[str]:
+    """Return what to say of effects that were found although something matters that they leave."""
+    named = {(c.name, c.joint) for c in causes}
+    others = ", ".join(f"{c.effect.name} of {_owner(c.joint)}" for c in whole.chosen if c.key not in named)
+    if not others:
+        return []
+    one = len(whole.chosen) - len(named) == 1
+    effects, are = ("effect", "it is") if one else ("effects", "they are")
+    return [
+        f"the closest {effects} of the library ({others}) would leave {share:.0%} of the structured gap, "
+        f"so {are} not named as its cause"
+    ]
+
+
+def _guarded(  # noqa: PLR0917
+    dataset: Dataset,
+    search: Search,
+    best: Hypothesis,
+    refined: Refined,
+    noise: Noise,
+    joints: Mapping[int, Joint],
+    *,
+    bounds_only: bool = False,
+) -> tuple[Hypothesis, Refined, list[dict[Channel, float]], list[str]]:
+    """Return hypothesis, refinement and rms without irrelevant causes and without those that a guard objects to, and the
+    objections; with enough runs the search is made again without the first of them.
+    """
+    said: list[str] = []
+    while True:
+        best, refined, rms = _without_negligible(dataset, search, best, refined, noise, joints)
+        found = objections(dataset, best, refined, bounds_only=bounds_only)
+        if not found:
+            return best, refined, rms, said[:_MOST_SAID]
+        weak = [best.chosen[k] for k, _ in found]
+        again = not said and search.mixed.runs >= ENOUGH_RUNS
+        for c, (_, why) in zip(weak, found, strict=True):
+            said.append(f"{c.effect.name} of {_owner(c.joint)} fits but is not named: {why}")
+            search.rejected.add(c.key)
+        rest = [c for c in best.chosen if c not in weak]
+        best = search.confirmed() if again else search.hypothesis(rest, best.model)
+        refined = refine(dataset, present_effects(best), noise)
+
+
+def _proven(  # noqa: PLR0917
+    dataset: Dataset,
+    search: Search,
+    best: Hypothesis,
+    refined: Refined,
+    noise: Noise,
+    joints: Mapping[int, Joint],
+) -> tuple[Hypothesis, Refined, list[dict[Channel, float]]]:
+    """Return the same with those causes only that are certain whatever is left over (`guards.STEADY`)."""
+    while best.chosen:
+        steady = steadiness(refined, nothing_of(best))
+        weakest = min(range(len(steady)), key=lambda k: steady[k])
+        if steady[weakest] >= STEADY:
+            break
+        least = max(steady[weakest], 0.25 * STEADY)
+        best = search.hypothesis(
+            [c for c, t in zip(best.chosen, steady, strict=True) if t > least], best.model
+        )
+        refined = refine(dataset, present_effects(best), noise)
+    return _without_negligible(dataset, search, best, refined, noise, joints)
 
 
 def _least_left(
@@ -216,21 +333,9 @@ def _without_negligible(  # noqa: PLR0917
 
 
 def _rms_at(dataset: Dataset, present: PresentEffect) -> dict[Channel, float]:
-    """Return the rms of one cause's contribution in each channel, Nm, over valid bins; a constant in torsion is none."""
-    sums: dict[Channel, list[float]] = {}
-    for run, data in zip(dataset.signals, dataset.runs, strict=True):
-        for s in run:
-            if present.joint not in ("sensor", s.number):
-                continue
-            for balance, value in contribution(present.effect, present.values, s).items():
-                channel = Channel(s.number, balance)
-                part = binned(value, dataset.samples)[data.channels[channel].valid]
-                if balance == "torsion" and len(part):
-                    part = part - part.mean()
-                total = sums.setdefault(channel, [0.0, 0.0])
-                total[0] += float(part @ part)
-                total[1] += len(part)
-    return {c: float(np.sqrt(a / n)) for c, (a, n) in sums.items() if n}
+    """Return the rms of one cause's contribution in each channel, Nm, over valid bins."""
+    found = {c: np.concatenate(parts) for c, parts in contributions(dataset, present).items()}
+    return {c: float(np.sqrt(np.mean(x * x))) for c, x in found.items() if len(x)}
 
 
 def _largest(rms: Mapping[Channel, float]) -> tuple[float, str]:

@@ -128,7 +128,11 @@ def verdict_sentence(findings: Findings) -> str:
     if findings.verdict == INSUFFICIENT:
         return "These runs are not sufficient to assess the simulation."
     if findings.verdict == UNEXPLAINED:
-        return f"The simulation has a gap that no effect of the library explains: {_unexplained(worst)}."
+        rest = f"a gap that no effect of the library explains: {_unexplained(worst)}."
+        if not findings.causes:
+            return f"The simulation has {rest}"
+        found = listed(_known_phrases(findings.causes))
+        return f"A part of the simulation error has a certain cause, {found}; beside it there is {rest}"
     known = _known_phrases([c for c in findings.causes if len(c.names) <= 1])
     classes = [cause_phrase(c) for c in findings.causes if len(c.names) > 1]
     if not known and not classes:

@@ -138,7 +138,7 @@ def reason_of(runs: list[tuple[str, RunTable]], joints: dict[int, Joint]) -> str
 def test_data_that_cannot_serve_are_said_to_be_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "next_experiment", lambda *_, **__: None)
     joints = {1: JOINT}
-    runs = [(f"run{k}", bench_run(phase=k, numbers=(1,))) for k in range(2)]
+    runs = [(f"run{k}", bench_run(phase=0.7 * k, numbers=(1,))) for k in range(2)]
     assert "found 1 usable run, expected" in reason_of(runs[:1], joints)
     assert "found no joint" in reason_of(runs, {3: JOINT})
     slow = [(name, every(table, 25)) for name, table in runs]

@@ -1,0 +1,146 @@
+"""Why an effect that fits is still no cause: what a person would object to before believing it.
+
+The search asks whether an effect lowers the deviance of the whitened residual. That is not all: a parameter may lie at the
+end of what is physically possible (where the fit wants more than there can be), two effects may be large and cancel each
+other, an effect may raise the plain error of the torque on runs that it was not fitted to, or its size may change from run
+to run by as much as it is itself. Each guard names what it found, one line; none means that nothing speaks against it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.effects.effect import TORSION
+from jtqd.sysid.diagnosis.dataset import Dataset
+from jtqd.sysid.diagnosis.gain import left_out_steps
+from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, contributions, parameter
+from jtqd.sysid.diagnosis.search import Hypothesis
+
+_AT_BOUND: Final = 1e-6
+"""Part of a range within which a value lies at its end."""
+_FACTOR: Final = {"torque_constant_nm_per_a": 2.0, "gain": 2.0}
+"""By how much a value may differ from the file's, either way: more is another motor or another unit, not an error."""
+_CANCELLED: Final = 0.3
+"""Two effects whose sum is smaller than this part of each cancel each other."""
+STEADY: Final = 20.0
+"""Size of an effect in standard errors over the runs left out, from which it is proven beside what is left over."""
+
+
+def nothing_of(best: Hypothesis) -> list[dict[str, float]]:
+    """Return per chosen candidate the parameters at which it is no effect."""
+    return [dict(c.term.combine([0.0] * c.size)) for c in best.chosen]
+
+
+def objections(
+    dataset: Dataset, best: Hypothesis, refined: Refined, *, bounds_only: bool = False
+) -> list[tuple[int, str]]:
+    """Return causes (by place) that are none, and why: all at a bound; else the one that does most harm on runs left out;
+    else the smaller of two that cancel each other. What is left must be fitted again before it is asked again.
+    """
+    nothing = nothing_of(best)
+    bound = [
+        (k, beyond_bounds(p, none)) for k, (p, none) in enumerate(zip(refined.present, nothing, strict=True))
+    ]
+    bound = [(k, why) for k, why in bound if why]
+    if bound or bounds_only or not refined.present:
+        return bound
+    falls = held_out_gains(dataset, refined)
+    worst = int(np.argmin(falls))
+    if falls[worst] <= 0.0:
+        return [(worst, "it raises the error on runs left out")]
+    pair = cancelling(dataset, refined.present)
+    if pair is None:
+        return []
+    other = refined.present[pair[1]]
+    at = "the sensor" if other.joint == "sensor" else f"joint {other.joint}"
+    return [(pair[0], f"it cancels {other.effect.name} of {at}")]
+
+
+def beyond_bounds(p: PresentEffect, nothing: dict[str, float]) -> str:
+    """Return which parameter lies outside of, or at the end of, what is plausible, "" for none; nothing: the values at which
+    the effect is none (a joint file's own value may be at the end).
+    """
+    for name, value in p.values.items():
+        q = parameter(p.effect, name)
+        if name == "phase_rad" or q.fixed or (name not in p.free and q.low <= value <= q.high):
+            continue  # what is not free is switched off: no size of it was asked for
+        room = _AT_BOUND * (q.high - q.low if np.isfinite(q.high - q.low) else max(abs(value), 1.0))
+        room = min(room, 1e-3 * abs(value - nothing.get(name, 0.0)))
+        if not q.low + room < value < q.high - room:
+            return f"{name} {value:.4g} {q.unit} is at the end of what is plausible ({q.low:g} to {q.high:g})"
+        usual, factor = nothing.get(name, 0.0), _FACTOR.get(name, np.inf)
+        if usual > 0.0 and not usual / factor < value < usual * factor:
+            return f"{name} {value:.4g} {q.unit} is not physical: the file has {usual:.4g}"
+    return ""
+
+
+def cancelling(dataset: Dataset, present: Sequence[PresentEffect]) -> tuple[int, int] | None:
+    """Return two causes that are large and cancel each other in the channel where they are largest, the smaller first."""
+    parts = [contributions(dataset, p) for p in present]
+    sizes = [{c: _rms(x) for c, x in part.items()} for part in parts]
+    for a in range(len(present)):
+        for b in range(a):
+            for c in sizes[a].keys() & sizes[b].keys():
+                if sizes[a][c] < max(sizes[a].values()) or sizes[b][c] < max(sizes[b].values()):
+                    continue
+                together = _rms([x + y for x, y in zip(parts[a][c], parts[b][c], strict=True)])
+                if together < _CANCELLED * min(sizes[a][c], sizes[b][c]):
+                    return (a, b) if sizes[a][c] < sizes[b][c] else (b, a)
+    return None
+
+
+def held_out_gains(dataset: Dataset, refined: Refined) -> list[float]:
+    """Return per cause by how much it lowers the plain squared error of the balances it acts in, each run with the
+    parameters of all others, as a part of what is there without it; at or below zero it is better left out.
+    """
+    steps = left_out_steps(refined)
+    out, first = [], 0
+    for p in refined.present:
+        mine = list(range(first, first + len(p.free)))
+        first += len(p.free)
+        here = contributions(dataset, p)
+        without, within = 0.0, 0.0
+        for c, parts in here.items():
+            for r, (run, step) in enumerate(zip(refined.runs, steps, strict=True)):
+                d = run.channels[c]
+                left = (d.residual - d.regressors @ step[d.index])[d.valid]
+                own = [k for k, i in enumerate(d.index) if i in mine]
+                part = parts[r] + (d.regressors[:, own] @ step[d.index[own]])[d.valid]
+                if c.balance == TORSION and len(left):
+                    left, part = left - left.mean(), part - part.mean()
+                within += float(left @ left)
+                without += float((left + part) @ (left + part))
+        out.append(1.0 - within / without if without > 0.0 else 0.0)
+    return out
+
+
+def _rms(parts: Sequence[FloatArray]) -> float:
+    whole = np.concatenate(parts) if parts else np.zeros(1)
+    return float(np.sqrt(np.mean(whole**2))) if len(whole) else 0.0
+
+
+def steadiness(refined: Refined, nothing: Sequence[dict[str, float]]) -> list[float]:
+    """Return per cause its size in standard errors that its changes give when runs are left out one by one (jackknife):
+    what a model error makes is not the same in all runs, however small its residual.
+    """
+    first_piece = np.unique(refined.mixed.pieces, return_index=True)[1]
+    steps = np.array(left_out_steps(refined))[first_piece]  # [r, p]
+    runs = len(steps)
+    spread = (
+        np.sqrt((runs - 1.0) / runs * np.sum((steps - steps.mean(axis=0)) ** 2, axis=0)) if runs > 1 else None
+    )
+    out, first = [], 0
+    for p, none in zip(refined.present, nothing, strict=True):
+        ratios = []
+        for k, name in enumerate(p.free):
+            size = abs(p.values[name] - none.get(name, 0.0))
+            leading = name not in ("phase_rad", "reference_c")
+            if leading and spread is not None:
+                ratios.append(size / max(float(spread[first + k]), 1e-30))
+        out.append(max(ratios, default=0.0))
+        first += len(p.free)
+    return out

@@ -1,0 +1,51 @@
+"""Guards: what fits and is no cause all the same."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import pytest
+
+from jtqd.estimator.effects.library import EFFECTS
+from jtqd.sysid.diagnosis.guards import beyond_bounds
+from jtqd.sysid.diagnosis.refine import PresentEffect, free_names
+from tests.sysid.diagnosis.diagnose_helpers import JOINT
+
+
+def said(name: str, values: Mapping[str, float], nothing: Mapping[str, float]) -> str:
+    effect = EFFECTS[name]
+    return beyond_bounds(PresentEffect(effect, 1, values, free_names(effect, values)), dict(nothing))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "nothing", "why"),
+    [
+        ("rotor_inertia_kgm2", 1e-9, 6e-5, "rotor_inertia_kgm2 1e-09 kg m2 is at the end"),
+        ("link_inertia_kgm2", -0.02, 0.1, "link_inertia_kgm2 -0.02 kg m2 is at the end"),
+        ("torque_constant_nm_per_a", 0.00126, 0.0585, "not physical: the file has 0.0585"),
+        ("torque_constant_nm_per_a", 0.061, 0.0585, ""),
+        ("viscous_nms_per_rad", 0.0, 2.0, "viscous_nms_per_rad 0 Nms/rad is at the end"),
+        ("viscous_nms_per_rad", 0.05, 2.0, ""),
+    ],
+)
+def test_ends_of_what_is_plausible(name: str, value: float, nothing: float, why: str) -> None:
+    effect = next(
+        e.name for e in EFFECTS.values() if any(p.key.endswith(name) for p in e.parameters if p.key)
+    )
+    found = said(effect, {name: value}, {name: nothing})
+    assert (why in found) if why else not found
+
+
+def test_a_reference_temperature_out_of_range_is_an_objection_and_no_error() -> None:
+    found = said(
+        "torque_constant_temperature",
+        {"per_k": 1e-4, "reference_c": 811.2124},
+        {"per_k": 0.0, "reference_c": 25.0},
+    )
+    assert "reference_c 811.2" in found
+    assert JOINT.name
+
+
+def test_a_part_of_an_effect_that_is_switched_off_is_at_no_bound() -> None:
+    values = {"amplitude_nm": 0.374, "share": 0.0, "phase_rad": 0.95}
+    assert not said("sensor_crosstalk", values, {"amplitude_nm": 0.0, "share": 0.0, "phase_rad": 0.0})

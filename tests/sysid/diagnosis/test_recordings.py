@@ -1,0 +1,91 @@
+"""Pieces of one recording are known as such and count once; runs that only resemble each other are not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from jtqd.estimator.run import JointColumns, RunTable
+from jtqd.sysid.diagnosis.dataset import build_dataset, usable_signals
+from jtqd.sysid.diagnosis.diagnose import diagnose
+from jtqd.sysid.diagnosis.findings import INSUFFICIENT
+from jtqd.sysid.diagnosis.mixed_model import Mixed
+from jtqd.sysid.diagnosis.noise import Sums
+from jtqd.sysid.diagnosis.recordings import piece_notes, recordings
+from jtqd.sysid.diagnosis.signals import JointSignals
+from tests.sysid.diagnosis.diagnose_helpers import JOINT, bench_run
+
+JOINTS = {1: JOINT, 2: JOINT}
+HALF = 1503
+
+
+def cut(table: RunTable, rows: slice, *, from_zero: bool = False) -> RunTable:
+    def part(columns: JointColumns) -> JointColumns:
+        values = {f.name: getattr(columns, f.name) for f in fields(columns)}
+        return JointColumns(**{name: None if x is None else x[rows] for name, x in values.items()})
+
+    time = table.time_s[rows]
+    joints = {n: part(c) for n, c in table.joints.items()}
+    return RunTable(time - time[0] if from_zero else time, joints)
+
+
+def signals(*runs: tuple[str, RunTable]) -> Sequence[Sequence[JointSignals]]:
+    found, _ = usable_signals([*runs, ("other", bench_run(seconds=6.0, phase=1.1))], JOINTS, (1, 2))
+    return found
+
+
+@pytest.mark.parametrize("from_zero", [False, True], ids=["stamps go on", "stamps begin again"])
+def test_pieces_go_on_where_another_ends(from_zero: bool) -> None:
+    whole = bench_run(seconds=6.0)
+    pieces = [cut(whole, slice(0, HALF)), cut(whole, slice(HALF, None), from_zero=from_zero)]
+    found = signals(("a", pieces[0]), ("b", pieces[1]))
+    assert recordings(found) == [0, 0, 1]
+    assert piece_notes(found) == ["a, b: pieces of one recording: they count as one run"]
+
+
+def test_a_gap_in_the_stamps_is_still_one_recording() -> None:
+    whole = bench_run(seconds=6.0)
+    found = signals(("a", cut(whole, slice(0, HALF))), ("b", cut(whole, slice(HALF + 100, None))))
+    assert recordings(found) == [0, 0, 1]
+
+
+def test_the_reader_names_its_pieces() -> None:
+    runs = [("a.csv (1 of 2)", bench_run()), ("a.csv (2 of 2)", bench_run(phase=2.0))]
+    assert recordings(signals(*runs)) == [0, 0, 1]
+
+
+def test_runs_with_motions_of_their_own_are_runs() -> None:
+    found = signals(("a", bench_run()), ("b", bench_run(phase=0.7)), ("c", bench_run()))
+    assert recordings(found) == [0, 1, 2, 3]
+    assert piece_notes(found) == []
+
+
+def test_pieces_of_one_recording_are_no_two_runs() -> None:
+    whole = bench_run(seconds=9.0)
+    pieces = [(f"a{k}", cut(whole, slice(1500 * k, 1500 * (k + 1)))) for k in range(3)]
+    findings = diagnose(pieces, JOINTS)
+    assert findings.verdict == INSUFFICIENT
+    assert "found 1 usable run in pieces of one recording, expected at least 2" in findings.reasons[-1]
+
+
+def test_pieces_share_their_nuisances_and_are_left_out_together() -> None:
+    rng = np.random.default_rng(0)
+    sums = []
+    for _ in range(4):
+        x = rng.normal(size=(50, 3))
+        sums.append(Sums(x.T @ x, 50))
+    apart, together = Mixed(sums, 1, np.ones(1)), Mixed(sums, 1, np.ones(1), [0, 0, 1, 2])
+    assert (apart.runs, together.runs) == (4, 3)
+    assert together.grams[0] == pytest.approx(sums[0].gram + sums[1].gram)
+    found = together.fit([0]).nuisances
+    assert len(found) == 4, "one row per piece"
+    assert found[0] == pytest.approx(found[1])
+
+
+def test_a_dataset_knows_its_pieces() -> None:
+    whole = bench_run(seconds=6.0)
+    found = signals(("a", cut(whole, slice(0, HALF))), ("b", cut(whole, slice(HALF, None))))
+    assert build_dataset([list(run) for run in found], JOINTS).pieces == [0, 0, 1]
