@@ -16,7 +16,7 @@ import numpy as np
 
 from jtqd.sysid.diagnosis.signals import SLOWEST_RAD_S, JointSignals
 
-_NAMED: Final = re.compile(r"(?P<of>.+) \(\d+ of \d+\)")
+_NAMED: Final = re.compile(r"(?P<of>.+) \((?P<piece>\d+) of (?P<all>\d+)\)")
 _STEPS: Final = 3.0
 """Sampling steps between two pieces that were cut apart without a loss."""
 _LOST_S: Final = 1.0
@@ -34,7 +34,8 @@ def recordings(runs: Sequence[Sequence[JointSignals]]) -> list[int]:
     root = list(range(count))
     for a in range(count):
         for b in range(count):
-            if a != b and (_same_name(runs[a][0].run, runs[b][0].run) or _goes_on(runs[a], runs[b])):
+            names = runs[a][0].run, runs[b][0].run
+            if a != b and (_same_name(*names) or (_may_follow(*names) and _goes_on(runs[a], runs[b]))):
                 old, new = max(root[a], root[b]), min(root[a], root[b])
                 root = [new if r == old else r for r in root]
     order = sorted(set(root))
@@ -55,6 +56,14 @@ def piece_notes(runs: Sequence[Sequence[JointSignals]]) -> list[str]:
 def _same_name(a: str, b: str) -> bool:
     one, two = _NAMED.fullmatch(a), _NAMED.fullmatch(b)
     return one is not None and two is not None and one["of"] == two["of"]
+
+
+def _may_follow(a: str, b: str) -> bool:
+    """Return whether run b may go on where a ends: of a recording in pieces only the last one ends, and the first begins."""
+    one, two = _NAMED.fullmatch(a), _NAMED.fullmatch(b)
+    ends = one is None or one["piece"] == one["all"]
+    begins = two is None or two["piece"] == "1"
+    return ends and begins
 
 
 def _goes_on(before: Sequence[JointSignals], after: Sequence[JointSignals]) -> bool:

@@ -13,7 +13,7 @@ from hypothesis import strategies as hst
 
 from jtqd.daemon.core.cycle import Cycle
 from tests.slow.fuzz.bus_in_time import BusInTime, Script
-from tests.slow.fuzz.frames import FrameReport, Oracle, fuzz_frames, make_cycle
+from tests.slow.fuzz.frames import EveryCycle, FrameReport, Oracle, fuzz_frames, make_cycle
 from tests.slow.fuzz.service import fuzz_service
 from tests.slow.fuzz.traffic import INPUT_IDS, STRICT, frame, genuine
 
@@ -127,16 +127,15 @@ def test_minimal_examples(tmp_path_factory: pytest.TempPathFactory, cycles: list
     oracle = Oracle()
     left = 160 + len(cycles)
 
-    def after() -> bool:
+    def after() -> None:
         nonlocal left
         left -= 1
         oracle.judge(cycle, bus, "example", strict=True)
-        return left <= 0
 
     from jtqd.daemon.loop.process import run
 
     with bus.installed_in_loop():
-        run(cycle, cycle.grid, lambda: False, after=after)
+        run(cycle, cycle.grid, lambda: left <= 0, duties=EveryCycle(after))
     assert not oracle.findings, oracle
     assert oracle.valid > 150
 

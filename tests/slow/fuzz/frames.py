@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -158,6 +159,21 @@ def make_cycle(directory: Path, script: Script) -> tuple[Cycle, BusInTime]:
     return cycle, bus
 
 
+class EveryCycle:
+    """Duties of the loop that are `call` after every cycle, and nothing else."""
+
+    after_sync = None
+
+    def __init__(self, call: Callable[[], None]) -> None:
+        self._call = call
+
+    def slots(self) -> int:
+        return 1
+
+    def __call__(self) -> None:
+        self._call()
+
+
 def fuzz_frames(
     directory: Path, seed: int, count: int, *, kinds: tuple[str, ...] | None = None
 ) -> FrameReport:
@@ -169,7 +185,7 @@ def fuzz_frames(
     supervisor = SnapshotReader(directory / "snapshot", supervisor=True)
     waiting: dict[int, int] = {}
 
-    def after() -> bool:
+    def after() -> None:
         nonlocal base_kb
         report.cycles += 1
         if not bus.down:
@@ -184,12 +200,11 @@ def fuzz_frames(
                 del waiting[node]
         if not base_kb and bus.given > end // 5:
             base_kb = rss_kb()
-        return bus.given >= end
 
     with bus.installed_in_loop():
         while bus.given < end:
             try:
-                run(cycle, cycle.grid, lambda: False, after=after)
+                run(cycle, cycle.grid, lambda: bus.given >= end, duties=EveryCycle(after))
             except Exception as error:
                 import traceback
 

@@ -57,6 +57,17 @@ def test_the_reader_names_its_pieces() -> None:
     assert recordings(signals(*runs)) == [0, 0, 1]
 
 
+def test_the_middle_of_one_recording_does_not_go_on_in_another() -> None:
+    """Two logs with the same motion and a gap at the same time: the clock of each begins at zero."""
+    whole = bench_run(seconds=6.0)
+    runs = [
+        (f"{name} ({k} of 2)", cut(whole, rows))
+        for name in ("a.mcap", "b.mcap")
+        for k, rows in ((1, slice(0, HALF)), (2, slice(HALF + 150, None)))
+    ]
+    assert recordings(signals(*runs)) == [0, 0, 1, 1, 2]
+
+
 def test_runs_with_motions_of_their_own_are_runs() -> None:
     found = signals(("a", bench_run()), ("b", bench_run(phase=0.7)), ("c", bench_run()))
     assert recordings(found) == [0, 1, 2, 3]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jtqd.estimator.checked import ConfigError
@@ -86,6 +86,7 @@ positive = st.floats(1e-9, 1e9)
 any_float = st.floats(allow_nan=False, allow_infinity=False)
 
 
+@settings(deadline=None)
 @given(positive, positive, any_float, any_float, st.floats(0.0, 1e12))
 def test_numbers_of_any_size_come_back_exactly(a: float, b: float, p: float, q: float, c: float) -> None:
     """YAML 1.1 takes 7e-5 for text and 1_0 for a number; what is written must be neither."""
