@@ -332,7 +332,7 @@ def main(argv: list[str], go: Callable[[dict[str, Any]], int] = serve) -> int:
         answer(failed=str(error), configuration=not isinstance(error, BusError))
         return 1
     except OSError as error:
-        answer(failed=f"shared memory: {error.strerror or error}")
+        answer(failed=f"{error.filename or 'shared memory'}: {error.strerror or error}")
         return 1
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import re
 import shutil
@@ -21,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jtqd.estimator import EstimatorSettings, load_network, make_estimator
+from jtqd.estimator import EstimatorSettings, load_network, make_estimator, onnx_graph
 from jtqd.models.files import load_joint, shipped
 
 STORED = Path(__file__).with_name("instructions.json")
@@ -83,6 +84,7 @@ def main() -> int:
     parser.add_argument("--work", choices=METHODS, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.work:
+        onnx_graph._LONGEST_S = math.inf  # type: ignore[misc]  # valgrind takes fifty times as long
         work(options.work)
         return 0
     counts = {method: round(count(method), 1) for method in METHODS}

@@ -93,10 +93,10 @@ def test_without_aliasing_it_falls_back_to_plain_run(monkeypatch: pytest.MonkeyP
 def test_the_runtime_has_no_thread_of_its_own() -> None:
     """Its telemetry would start one; ORT_DISABLE_TELEMETRY is read when the library is loaded."""
     code = (
-        "import os; from jtqd.estimator.network import TorqueNetwork as N; "
+        "import os, time; from jtqd.estimator.network import TorqueNetwork as N; "
         "from tests.estimator.estimator_helpers import small_network as s; "
-        "N(s().data); print(len(os.listdir('/proc/self/task')))"
-    )
+        "N(s().data); time.sleep(0.5); print(len(os.listdir('/proc/self/task')))"
+    )  # the threads that load it have ended, and need a moment to go
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     environment.pop("ORT_DISABLE_TELEMETRY", None)
     assert subprocess.check_output([sys.executable, "-c", code], text=True, env=environment) == "1\n"

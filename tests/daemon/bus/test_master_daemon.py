@@ -49,7 +49,7 @@ def test_any_master_reads_every_object_of_the_data_sheet(node: Any) -> None:
     assert len(read) > 120
     assert read[0x1000, 0] == 0
     assert read[0x1005, 0] == 0x4000_0080, "producer of SYNC 080h"
-    assert (read[0x1006, 0], read[0x1019, 0]) == (1000, 240)
+    assert (read[0x1006, 0], read[0x1019, 0]) == (1000, 0)
     assert read[0x1008, 0] == "jtqd"
     assert read[0x1014, 0] == 0x0A0
     assert read[0x1015, 0] == 100, "10 ms"
