@@ -206,13 +206,13 @@ def test_child_reads_the_same_entries_as_the_parser_here():
     from jtqd.sim_can import eds_entries
 
     here = {
-        node: eds_entries.read_eds(eds_entries.FOLDER / name, node)
-        for node, name in eds_entries.FILES.items()
+        (node, name): eds_entries.read_eds(eds_entries.FOLDER / name, node)
+        for node, name in eds_entries.files_of(2).items()
     }
     eds_entries._cache.clear()
     child = eds_entries.EdsChild()
     child.take()
-    assert {node: eds_entries._cache[node] for node in here} == here
+    assert {key: eds_entries._cache[key] for key in here} == here
 
 
 def test_bench_process_does_without_the_eds_parser(running):
