@@ -160,8 +160,9 @@ class ReturningNodes:
                 return None
             node, self._child, self.busy = self.busy, None, 0
             # One that has restarted meanwhile, but for the boot's own reset, may have lost what was written to it.
-            self._restarts += _boot_ups(answer, node)
-            if view.restarts[node] != self._restarts:
+            # Where the loop has heard fewer (a boot-up message was lost to it), its own count is what it compares with.
+            most, self._restarts = self._restarts + _boot_ups(answer, node), view.restarts[node]
+            if view.restarts[node] > most:
                 self._refuse(
                     node,
                     f"node {node} restarted during its configuration: configuring again",
