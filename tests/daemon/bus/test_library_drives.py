@@ -137,6 +137,7 @@ def test_devices_differ(manners: tuple[str, ...]) -> None:
         assert bench.stop(jtqd) == 0
 
 
+@pytest.mark.native
 def test_objects_of_the_makers_own(bench: LibraryBench) -> None:
     """Joint 1 by its drive's mA, counted backwards, and rpm; joint 2, with the same motion, by CiA 402."""
     objects = {
