@@ -12,6 +12,7 @@ before anything of it is used. `build` is a hash of the program: the layout of a
 from __future__ import annotations
 
 import json
+import os
 import struct
 from collections.abc import Sequence
 from functools import cache
@@ -37,10 +38,19 @@ def build() -> str:
     digest = sha256()
     for package in ("jtqd.estimator", "jtqd.daemon.reload"):
         folder = Path(str(resources.files(package)))
-        for path in sorted(each for each in folder.rglob("*") if each.suffix in (".py", ".so")):
+        for path in sources(folder):
             digest.update(f"{package} {path.relative_to(folder)}".encode())
             digest.update(path.read_bytes())
     return str(digest.hexdigest())
+
+
+def sources(folder: Path) -> list[Path]:
+    """Return the modules under a folder in order. Folders of byte code are left out: they come and go while we read."""
+    found = []
+    for place, folders, files in os.walk(folder):
+        folders[:] = [each for each in folders if each != "__pycache__"]
+        found += [Path(place, each) for each in files if each.endswith((".py", ".so"))]
+    return sorted(found)
 
 
 def encoded(estimators: Sequence[Estimator], position: int) -> bytes:

@@ -1,6 +1,7 @@
 """The file between the preparing process and the loop: what it holds, and what is refused."""
 
 import json
+import os
 import stat
 import struct
 from pathlib import Path
@@ -70,6 +71,24 @@ def test_blocks_of_another_program_are_refused(monkeypatch: pytest.MonkeyPatch) 
     bare = json.dumps(header).encode()
     with pytest.raises(BlockFileError, match="the program has changed"):
         decoded(memoryview(data[:8] + struct.pack("<I", len(bare)) + bare + data[12 + length :]))
+
+
+def test_folders_of_byte_code_are_no_part_of_the_program(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another process makes or removes them while a daemon starts: one that goes between two looks must not stop it."""
+    for name in ("b.py", "a/c.so", "a/notes.txt", "__pycache__/b.py", "a/__pycache__/c.py"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    looked_into = os.scandir
+
+    def scandir(path: str) -> "os._ScandirIterator[str]":
+        if str(path).endswith("__pycache__"):
+            raise FileNotFoundError(2, "No such file or directory", path)
+        return looked_into(path)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    assert block_file.sources(tmp_path) == [tmp_path / "a/c.so", tmp_path / "b.py"]
 
 
 def test_it_is_for_its_owner_alone_and_follows_no_link(tmp_path: Path) -> None:
