@@ -81,8 +81,12 @@ def load_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 def read_yaml(path: str | os.PathLike[str]) -> tuple[dict[str, Any], bytes]:
     """Return the root mapping of a YAML file and the very bytes it was read from. Raises ConfigError."""
-    name = os.fspath(path)
     data = read_regular(path, _LARGEST_YAML, "a YAML file written by hand")
+    return parse_yaml(data, os.fspath(path)), data
+
+
+def parse_yaml(data: bytes, name: str) -> dict[str, Any]:
+    """Return the root mapping of a YAML text; `name` is the file's, for messages. Raises ConfigError."""
     try:
         content = yaml.load(data, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
@@ -97,7 +101,7 @@ def read_yaml(path: str | os.PathLike[str]) -> tuple[dict[str, Any], bytes]:
     if not isinstance(content, dict):
         kind = "an empty file" if content is None else type(content).__name__
         raise ConfigError(f"{name}: found {kind}, expected a mapping of keys to values")
-    return content, data
+    return content
 
 
 _PLAIN: Final = (

@@ -45,7 +45,9 @@ def parser() -> argparse.ArgumentParser:
         epilog="example: jtq plot logs/jtqd-sim-20261121T080000Z.mcap --joint 1 --out joint1.png",
     )
     parser.add_argument("log", type=Path, help="MCAP file of jtqd")
-    parser.add_argument("--joint", type=int, choices=(1, 2), default=1)
+    parser.add_argument(
+        "--joint", type=int, choices=range(1, 5), default=1, metavar="N", help="1 to 4 (default 1)"
+    )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="FILE", help="figure to write (png, svg, pdf)"
     )
@@ -97,14 +99,21 @@ def draw(log: Records, joint: int, path: Path) -> float:
     above.fill_between(
         time_s, torque - sigma, torque + sigma, color="#9ec5e8", linewidth=0, label="estimate ± sigma"
     )
-    above.plot(time_s, sensor, color="#222222", linewidth=1.0, label="torque sensor")
+    with_sensor = bool(np.isfinite(sensor).any())
+    if with_sensor:
+        above.plot(time_s, sensor, color="#222222", linewidth=1.0, label="torque sensor")
     above.plot(time_s, torque, color="#1f6fb4", linewidth=0.8, label="estimate")
     moving = np.isin(status, (VALID, DEGRADED))
     error = np.where(moving, torque - sensor, np.nan)
     below.plot(time_s, error, color="#b4431f", linewidth=0.6)
     below.axhline(0.0, color="#222222", linewidth=0.6)
     rmse = float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else float("nan")
-    above.set_title(f"joint {joint}: estimate and sensor, RMSE {rmse:.2f} Nm in motion", fontsize=10)
+    title = (
+        f"estimate and sensor, RMSE {rmse:.2f} Nm in motion"
+        if with_sensor
+        else "estimate; the log has no reference"
+    )
+    above.set_title(f"joint {joint}: {title}", fontsize=10)
     above.set_ylabel("joint torque [Nm]")
     below.set_ylabel("difference [Nm]")
     below.set_xlabel("time [s]")

@@ -126,7 +126,7 @@ def _kept(
     state = replace(state, status=FAILED)
     lost = int((recorded.summary.get("recording") or {}).get("lost", 0))
     try:
-        logged = log_to_run(log, nodes=config.nodes, sensor=config.sensor is not None)
+        logged = log_to_run(log, all_needed=True, nodes=config.nodes, sensor=config.sensor is not None)
     except LogError as error:
         _keep(log, out, run.name, ".failed.mcap")
         return Attempt(replace(state, reason=str(error)), again=True)

@@ -27,7 +27,7 @@ from jtqd.sysid.progress import waiting
 from jtqd.sysid.runs.checks import CheckedRuns, check_runs
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import RunError, RunFile, read_runs
-from jtqd.sysid.runs.joints import UsageError, check_joint_files, joint_files, joints_of
+from jtqd.sysid.runs.joints import UsageError, check_joint_files, joint_files, joints_of, named_joints
 
 BY: Final = "jtq diagnose"
 _NEEDED: Final = ("matplotlib", "jinja2", "scipy")
@@ -51,7 +51,7 @@ def main(argv: list[str]) -> int:
         files = joint_files(options.joint, columns)
         check_joint_files(files)
         _check_out(options.out, options.force)
-        runs = read_runs(options.runs, columns, in_pieces=True)
+        runs = read_runs(options.runs, columns, in_pieces=True, joints=named_joints(files))
         joints = joints_of(files, runs)
         known = () if columns is None else columns.known_loads
         scope = scope_of(options.without, options.given, joints, known)

@@ -109,7 +109,7 @@ def read_inputs(
     for path in progress(paths, "reading runs"):
         name = path.name if all(path.name != run.name for run in runs) else str(path)
         try:
-            file = read_run(path, mapping)
+            file = read_run(path, mapping, joints=[each.number for each in models])
         except RunError as error:
             findings.append(RunIssue("unreadable", f"{error}: run left out"))
             continue

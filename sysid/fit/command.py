@@ -42,7 +42,7 @@ from jtqd.sysid.progress import progress
 from jtqd.sysid.report.figures import check_picture
 from jtqd.sysid.runs.checks import channel_findings
 from jtqd.sysid.runs.files import RunError, RunFile, read_runs
-from jtqd.sysid.runs.joints import joint_number
+from jtqd.sysid.runs.joints import joint_number, only
 
 
 def fit_parser(kind: str, description: str, examples: str) -> argparse.ArgumentParser:
@@ -137,7 +137,7 @@ def efficiency_main(argv: list[str]) -> int:
             check_output(options.out)
         if options.plot is not None:
             check_picture(options.plot)
-        runs = read_runs(options.runs, options.columns)
+        runs = read_runs(options.runs, options.columns, joints=only(options.number))
         number = joint_number(options.number, joint, runs)
         result = analyse(joint, runs, number, options)
         written = None if result.findings else _new_joint(joint, result, options)
@@ -280,7 +280,7 @@ def friction_main(argv: list[str]) -> int:
         joint = load_joint(options.joint)
         if options.out is not None:
             check_output(options.out)
-        runs = read_runs(options.runs, options.columns)
+        runs = read_runs(options.runs, options.columns, joints=only(options.number))
         number = joint_number(options.number, joint, runs)
         found = channel_findings(runs, number, joint)
         if found:
@@ -353,7 +353,7 @@ def losses_main(argv: list[str]) -> int:
         joint = load_joint(options.joint)
         if options.out is not None:
             check_output(options.out)
-        runs = read_runs(options.runs, options.columns)
+        runs = read_runs(options.runs, options.columns, joints=only(options.number))
         number = joint_number(options.number, joint, runs)
         findings = channel_findings(runs, number, joint)
         if findings:

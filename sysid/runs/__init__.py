@@ -25,7 +25,7 @@ from jtqd.sysid.runs.files import (
     run_paths,
     write_run,
 )
-from jtqd.sysid.runs.joints import joint_files, joint_number, joints_of
+from jtqd.sysid.runs.joints import joint_files, joint_number, joints_of, named_joints, only
 
 __all__ = [
     "CheckedRun",
@@ -40,6 +40,8 @@ __all__ = [
     "joint_files",
     "joint_number",
     "joints_of",
+    "named_joints",
+    "only",
     "read_pieces",
     "read_run",
     "read_runs",

@@ -106,13 +106,19 @@ def run_paths(arguments: Sequence[Path]) -> list[Path]:
 
 
 def read_runs(
-    arguments: Sequence[Path], columns: ColumnMap | Path | None = None, *, in_pieces: bool = False
+    arguments: Sequence[Path],
+    columns: ColumnMap | Path | None = None,
+    *,
+    in_pieces: bool = False,
+    joints: Sequence[int] | None = None,
 ) -> list[RunFile]:
     """Read all runs of files and directories (`run_paths`); a progress bar on a terminal.
 
     columns: a column map or its file. Names are unique: the file's, or its path where two files share a name.
     in_pieces: a recording with gaps gives one run for each piece between them, "a.csv (1 of 3)", not an error; the parts of
     one run of jtqd are one recording.
+    joints: numbers of those that are wanted of a log, where a row needs the inputs of all of them; None: all that it has. A
+    table gives the joints that it has.
 
     Raises:
         RunError: as `read_run` and `run_paths`, or the same data given twice, which would count it twice.
@@ -124,9 +130,9 @@ def read_runs(
     groups = _recordings(paths) if in_pieces else [(path,) for path in paths]
     for path, *parts in progress(groups, "reading runs"):
         if parts:
-            read = _checked(_read_log(path, *parts), whole=False)
+            read = _checked(_read_log(path, *parts, joints=joints), whole=False)
         else:
-            read = read_pieces(path, mapping) if in_pieces else [read_run(path, mapping)]
+            read = _checked(_content(path, mapping, joints), whole=not in_pieces)
         same = next((other.name for other in runs if other.sha256 == read[0].sha256), None)
         if same is not None:
             raise RunError(f"{path}: found the same data as in {same}, expected every run once")
@@ -141,12 +147,15 @@ def read_runs(
     return runs
 
 
-def read_run(path: Path | str, columns: ColumnMap | None = None) -> RunFile:
+def read_run(
+    path: Path | str, columns: ColumnMap | None = None, *, joints: Sequence[int] | None = None
+) -> RunFile:
     """Read one run by the ending of its name; without a column map a table must use the run table's own column names.
 
-    columns: for tables; a log of jtqd has its own names. Raises RunError, also for a recording with gaps.
+    columns: for tables; a log of jtqd has its own names. joints: of a log, as in `read_runs`. Raises RunError, also for a
+    recording with gaps.
     """
-    [run] = _checked(_content(Path(path), columns), whole=True)
+    [run] = _checked(_content(Path(path), columns, joints), whole=True)
     return run
 
 
@@ -181,13 +190,13 @@ class _Content:
     columns: ColumnMap | None = None
 
 
-def _content(path: Path, columns: ColumnMap | None) -> _Content:
+def _content(path: Path, columns: ColumnMap | None, joints: Sequence[int] | None = None) -> _Content:
     if not path.is_file():
         found = "something that is no file" if path.exists() else "no such file"
         found = "a directory" if path.is_dir() else found
         raise RunError(f"{path}: found {found}, expected a run file ({', '.join(TABLES + LOGS)})")
     if path.name.endswith(LOGS):
-        return _read_log(path)
+        return _read_log(path, joints=joints)
     if path.name.endswith(".parquet"):
         return _read_parquet(path, columns)
     if path.name.endswith(TABLES):
@@ -487,7 +496,7 @@ def _is_number(value: object) -> bool:
     return True
 
 
-def _read_log(path: Path, *parts: Path) -> _Content:
+def _read_log(path: Path, *parts: Path, joints: Sequence[int] | None = None) -> _Content:
     """Read a log, or all parts of one run; the hash is that of all files one after another."""
     from jtqd.daemon.logs import LogError
     from jtqd.sysid.runs.logs import log_to_run
@@ -496,13 +505,14 @@ def _read_log(path: Path, *parts: Path) -> _Content:
     if parts:
         sha256 = hashlib.sha256(b"".join(_bytes(each)[0] for each in (path, *parts))).hexdigest()
     try:
-        logged = log_to_run((path, *parts) if parts else path)
+        logged = log_to_run((path, *parts) if parts else path, joints=joints)
     except LogError as error:
         text = str(error)
         raise RunError(text if text.startswith(str(path)) else f"{path}: {text}") from None
     except OSError as error:
         raise RunError(f"{path}: cannot be read: {error.strerror or error}") from None
     notes = [f"{len(parts) + 1} parts of one run: {path.name} to {parts[-1].name}"] if parts else []
+    notes += [f"joint {number} left out: {why}" for number, why in logged.left_out.items()]
     if logged.missed or logged.incomplete:
         by = ", ".join(f"{count} of {name}" for name, count in logged.incomplete_by.items() if count)
         notes.append(

@@ -30,7 +30,7 @@ def joint_files(arguments: Sequence[str], columns: ColumnMap | None) -> dict[int
     if not arguments:
         if columns is not None and columns.joint_files:
             return dict(columns.joint_files)
-        raise UsageError("--joint: missing, expected FILE for both joints, or 1=FILE and 2=FILE")
+        raise UsageError("--joint: missing, expected FILE for all joints, or 1=FILE, 2=FILE, ...")
     files: dict[int, Path] = {}
     for text in arguments:
         match = _JOINT.fullmatch(text)
@@ -49,6 +49,16 @@ def joint_files(arguments: Sequence[str], columns: ColumnMap | None) -> dict[int
             "--joint: found a file for all joints beside one for a single joint, expected either"
         )
     return files
+
+
+def named_joints(files: Mapping[int, Path]) -> list[int] | None:
+    """Return the joints that `joint_files` names; None for a file that serves all."""
+    return None if ALL_JOINTS in files else sorted(files)
+
+
+def only(option: int | None) -> list[int] | None:
+    """Return the joint of --number as the only one to be read from a log; None without the option."""
+    return None if option is None else [option]
 
 
 def check_joint_files(files: Mapping[int, Path]) -> None:

@@ -1,29 +1,47 @@
-"""jtqd's log of a run as a run table: what the estimator was given, cycle by cycle, and what is missing of it."""
+"""jtqd's log of a run as a run table: what the estimator was given, cycle by cycle, and what is missing of it.
+
+A log has one to four joints, and a reference for those that a channel of the torque sensor belongs to. The frames of the
+bus, which are most of a log, are looked through for temperatures chunk by chunk and not kept.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import contextlib
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jtqd.daemon.logs import LogError, Records, read_topics
+from jtqd.daemon.logs import LogError, LogFile, Records, iter_topics, log_parts, topics_of
 from jtqd.drivers.devices import NOT_MEASURED, TEMPERATURE_C_PER_UNIT, drive_tpdo3
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import counted
+from jtqd.estimator.checked import ConfigError, counted
 from jtqd.estimator.run import JointColumns, RunTable
+from jtqd.models.files import parse_yaml
 
-ALL_INPUTS: Final = 7
-"""input_flags of the log: both PDOs of the drive and the sensor's are of this cycle."""
 DRIVE_INPUTS: Final = 3
+"""input_flags of the log: both PDOs of the drive are of this cycle."""
 _ENABLED_MASK, _ENABLED = 0x6F, 0x27  # 6041h: "operation enabled" of CiA 402
 _NO_POWER: Final = ((0x4F, 0x40), (0x6F, 0x21), (0x6F, 0x23))
 """Mask and value of 6041h: switch on disabled, ready to switch on, switched on."""
 _INPUTS: Final = ("current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad")
-_TOPICS: Final = ("/joint/1/state", "/joint/2/state", "/can/frames")
+_STATE: Final = np.dtype(
+    [
+        ("cycle", "<u8"),
+        ("sync_monotonic_ns", "<i8"),
+        *((name, "<f8") for name in (*_INPUTS, "sensor_torque_nm")),
+        ("statusword", "<u2"),
+        ("input_flags", "<u2"),
+    ]
+)
+"""What is kept of a joint's messages."""
+_TOPIC: Final = re.compile(r"/joint/(\d+)/state")
+_FRAMES: Final = "/can/frames"
+_CONFIGURATION: Final = "configuration.yaml"
 _NS: Final = 1e-9
 
 Flags = NDArray[np.bool_]
@@ -34,12 +52,12 @@ class LoggedRun:
     """The run table of a log and the account of its cycles: rows + incomplete + missed are all slots of SYNC.
 
     Attributes:
-        table: joints 1 and 2; torque_nm is None where the log has no value of the sensor at all, temperature_c where
-            the drive sent none.
+        table: torque_nm is None where the log has no value of the sensor at all, temperature_c where the drive sent none.
         missed: slots without a cycle (missed by the loop, or left silent on purpose).
         incomplete: cycles left out because an input was not fresh.
         incomplete_by: the same by input, e.g. {"joint 2": 3, "sensor": 1}; a cycle may miss several.
         longest_gap_s: longest time between two rows.
+        left_out: joints of the log that are not in the table, and why.
     """
 
     table: RunTable
@@ -47,6 +65,7 @@ class LoggedRun:
     incomplete: int
     incomplete_by: Mapping[str, int]
     longest_gap_s: float
+    left_out: Mapping[int, str] = field(default_factory=dict)
 
     @property
     def lost_share(self) -> float:
@@ -56,77 +75,198 @@ class LoggedRun:
 
 
 def log_to_run(
-    log: Path | Sequence[Path], *, nodes: tuple[int, int] = (1, 2), sensor: bool = True
+    log: Path | Sequence[Path],
+    *,
+    joints: Sequence[int] | None = None,
+    all_needed: bool = False,
+    nodes: Sequence[int] | None = None,
+    sensor: bool = True,
 ) -> LoggedRun:
-    """Read both joints of a log from the first to the last cycle in which both drives are in "operation enabled".
+    """Read joints of a log from the first to the last cycle in which all their drives are in "operation enabled".
 
     The commander sends its first set-point in the cycle after the first of these, and ends with a quick stop: no other
-    clock is needed to know when the motion was.
+    clock is needed to know when the motion was. The cycles of a joint that is read alone are its own, whatever others did.
 
     Args:
         log: MCAP of jtqd, or the parts of one run, or their directory.
-        nodes: node-IDs of drive 1 and 2, for their temperatures.
-        sensor: a row needs the sensor's value; False: the bench has none, torque_nm is None.
+        joints: numbers of those that are wanted; None: all. Those whose drive was never enabled, or that lack an input
+            in the whole motion, are left out and named, as long as one is left.
+        all_needed: then the log is refused instead.
+        nodes: node-IDs of the drives in the order of the log's joints, for their temperatures; None: by the
+            configuration that is attached to the log, without one 1, 2, ...
+        sensor: a row needs the sensor's value, where a joint has a channel of it; False: the bench has none,
+            torque_nm is None.
 
     Raises:
-        LogError: no such cycle, an input that never came, or topics that do not belong together.
+        LogError: no such joint or cycle, an input that never came, or topics that do not belong together.
         OSError: the file cannot be read.
     """
-    *states, frames = read_topics(log, _TOPICS).values()
-    log = log if isinstance(log, Path) else log[0]  # names the run where something is wrong
-    for state in states:
-        if not np.array_equal(state["cycle"], frames["cycle"]):
-            raise LogError(f"{log}: found cycles in one topic that are not in the other, expected the same")
-    span = _span(states, log)
-    temperatures = [_temperature(frames, node, span) for node in nodes]
-    one, two = (state[span] for state in states)
-    present = {f"joint {n}": _complete(state, n, log) for n, state in ((1, one), (2, two))}
-    if sensor:
-        present["sensor"] = _with_sensor(one, two)
-    if not present.get("sensor", np.ones(1)).any():
-        del present["sensor"]  # a dead sensor must not take the drives' columns with it
-        sensor = False
+    name = log if isinstance(log, Path) else log[0]  # names the run where something is wrong
+    there = sorted(int(found[1]) for found in map(_TOPIC.fullmatch, topics_of(log)) if found)
+    if not there:
+        raise LogError(f"{name}: found no message on /joint/1/state, expected one per cycle")
+    wanted = list(dict.fromkeys(there if joints is None else joints))
+    have = ", ".join(map(str, there))
+    left_out = {
+        number: f"found no joint {number}, the log has {have}" for number in wanted if number not in there
+    }
+    if left_out and (all_needed or len(left_out) == len(wanted)):
+        raise LogError(f"{name}: {'; '.join(left_out.values())}")
+    nodes = nodes or _nodes(log, there)
+    node_of = dict(zip(there, nodes, strict=False))
+    states, readings = _read(
+        log, name, {number: node_of.get(number, number) for number in wanted if number in there}
+    )
+    left_out |= {number: why for number, state in states.items() if (why := _unusable(number, state))}
+    if left_out and (all_needed or len(left_out) == len(wanted)):
+        raise LogError(f"{name}: {'; '.join(left_out.values())}")
+    states = {number: state for number, state in states.items() if number not in left_out}
+    span = _span(states, name)
+    temperatures = {number: _temperature(readings[number], span) for number in states}
+    states = {number: state[span] for number, state in states.items()}
+    present = {f"joint {number}": _complete(number, state, name) for number, state in states.items()}
+    with_sensor = _with_sensor(states.values()) if sensor else None
+    if with_sensor is not None:  # a dead sensor must not take the drives' columns with it
+        present["sensor"] = with_sensor
     used: Flags = np.logical_and.reduce(list(present.values()))
     if np.count_nonzero(used) < 2:
         raise LogError(
-            f"{log}: found {counted(int(np.count_nonzero(used)), 'complete cycle')}, expected at least 2"
+            f"{name}: found {counted(int(np.count_nonzero(used)), 'complete cycle')}, expected at least 2"
         )
-    stamps = one["sync_monotonic_ns"][used].astype(np.int64)
+    one = next(iter(states.values()))
+    stamps = one["sync_monotonic_ns"][used]
     cycles = one["cycle"].astype(np.int64)
-    table = RunTable(
-        (stamps - stamps[0]) * _NS,
-        {
-            n: _columns(state[used], sensor, temperature if temperature is None else temperature[used])
-            for n, state, temperature in zip((1, 2), (one, two), temperatures, strict=True)
-        },
-    )
+    columns = {
+        number: _columns(
+            state[used],
+            with_sensor is not None,
+            None if (temperature := temperatures[number]) is None else temperature[used],
+        )
+        for number, state in states.items()
+    }
+    table = RunTable((stamps - stamps[0]) * _NS, columns)
     return LoggedRun(
         table=table,
         missed=int(cycles[-1] - cycles[0]) + 1 - len(cycles),
         incomplete=int(np.count_nonzero(~used)),
-        incomplete_by={name: int(np.count_nonzero(~flags)) for name, flags in present.items()},
+        incomplete_by={each: int(np.count_nonzero(~flags)) for each, flags in present.items()},
         longest_gap_s=float(np.diff(table.time_s).max()),
+        left_out=left_out,
     )
 
 
-def _span(states: list[Records], log: Path) -> slice:
+def _nodes(log: Path | Sequence[Path], there: Sequence[int]) -> list[int]:
+    """Return the node-IDs of the drives by the attached configuration; the joints' numbers where it cannot be read."""
+    mapping: Mapping[str, Any] = {}
+    with LogFile(log_parts(log)[0]) as file:
+        for index in file.attachments:
+            if index.name == _CONFIGURATION:
+                with contextlib.suppress(ConfigError, LogError):
+                    mapping = parse_yaml(file.attachment(index), _CONFIGURATION)
+    sections = [mapping.get(f"joint_{number}") for number in there]
+    found = [each.get("node") if isinstance(each, dict) else None for each in sections]
+    return [node if isinstance(node, int) else number for node, number in zip(found, there, strict=True)]
+
+
+Readings = tuple[NDArray[np.int64], FloatArray]
+"""Temperatures [degC] of a drive, and the cycles they came in, counted from the first one of the log [n]."""
+
+
+def _read(
+    log: Path | Sequence[Path], name: Path, nodes: Mapping[int, int]
+) -> tuple[dict[int, Records], dict[int, Readings]]:
+    """Return states and temperatures of the joints, in one pass; all have the same cycles."""
+    topics = {number: f"/joint/{number}/state" for number in nodes}
+    states: dict[int, list[Records]] = {number: [] for number in nodes}
+    readings: dict[int, list[Readings]] = {number: [] for number in nodes}
+    cycles: list[NDArray[Any]] = []
+    count = 0
+    for found in iter_topics(log, (*topics.values(), _FRAMES)):
+        for number, topic in topics.items():
+            if topic in found:
+                records = found[topic].records
+                kept = np.empty(len(records), _STATE)
+                for field_name in _STATE.names or ():
+                    kept[field_name] = records[field_name]
+                states[number].append(kept)
+        if _FRAMES in found:
+            frames = found[_FRAMES].records
+            for number, (rows, values) in _temperatures(frames, nodes).items():
+                readings[number].append((rows + count, values))
+            cycles.append(frames["cycle"].copy())
+            count += len(frames)
+    for topic, parts in ((_FRAMES, cycles), *((topics[n], parts) for n, parts in states.items())):
+        if not parts:
+            raise LogError(f"{name}: found no message on {topic}, expected one per cycle")
+    counted_cycles = np.concatenate(cycles)
+    whole = {number: np.concatenate(parts) for number, parts in states.items()}
+    for state in whole.values():
+        if not np.array_equal(state["cycle"], counted_cycles):
+            raise LogError(f"{name}: found cycles in one topic that are not in the other, expected the same")
+    empty = (np.empty(0, np.int64), np.empty(0))
+    joined = {
+        number: (np.concatenate([rows for rows, _ in parts]), np.concatenate([each for _, each in parts]))
+        if parts
+        else empty
+        for number, parts in readings.items()
+    }
+    return whole, joined
+
+
+def _temperatures(frames: Records, nodes: Mapping[int, int]) -> dict[int, Readings]:
+    """Return what the drives' TPDO3 say in these cycles: rows and values [degC] by joint, for those that say anything."""
+    raw = frames["frames"]
+    stored = np.arange(raw.shape[1]) < frames["frame_count"][:, None]
+    stored &= raw["length"] >= 2
+    found = {}
+    for number, node in nodes.items():
+        rows, places = np.nonzero(stored & (raw["id"] == drive_tpdo3(node).cob_id))
+        if not len(rows):
+            continue
+        counts = np.ascontiguousarray(raw["data"][rows, places][:, :2]).view("<i2")[:, 0]
+        good = counts != NOT_MEASURED
+        found[number] = rows[good], counts[good] * TEMPERATURE_C_PER_UNIT
+    return found
+
+
+def _enabled(state: Records) -> Flags:
+    """Return cycles [n] in which the drive is in "operation enabled", by a fresh statusword."""
+    found: Flags = (state["statusword"] & _ENABLED_MASK) == _ENABLED
+    return found & _fresh(state)
+
+
+def _fresh(state: Records) -> Flags:
+    found: Flags = (state["input_flags"] & DRIVE_INPUTS) == DRIVE_INPUTS
+    return found
+
+
+def _unusable(number: int, state: Records) -> str:
+    """Return why a joint has no run in this log; "" where it has one."""
+    enabled = np.flatnonzero(_enabled(state))
+    if len(enabled) < 2:
+        cycles = counted(len(enabled), "cycle")
+        return f"found {cycles} of joint {number} in 'operation enabled', expected at least 2"
+    there = state[enabled[0] : enabled[-1] + 1]
+    for name in _INPUTS:
+        if not np.isfinite(there[name]).any():
+            return f"j{number}.{name}: found no value in {counted(len(there), 'cycle')}, expected one in each"
+    return ""
+
+
+def _span(states: Mapping[int, Records], log: Path) -> slice:
     """From the first to the last cycle that counts; what is stale in between is looked at later."""
-    counts = np.ones(len(states[0]), np.bool_)
-    for state in states:
-        counts &= (state["statusword"] & _ENABLED_MASK) == _ENABLED
-        counts &= (state["input_flags"] & DRIVE_INPUTS) == DRIVE_INPUTS
-    rows = np.flatnonzero(counts)
+    rows = np.flatnonzero(np.logical_and.reduce([_enabled(state) for state in states.values()]))
     if len(rows) < 2:
         raise LogError(
-            f"{log}: found {counted(len(rows), 'cycle')} of the motion with both drives in 'operation enabled', "
-            "expected at least 2"
+            f"{log}: found {counted(len(rows), 'cycle')} of the motion with all drives (joints "
+            f"{', '.join(map(str, states))}) in 'operation enabled', expected at least 2; each joint alone has more"
         )
     return slice(int(rows[0]), int(rows[-1]) + 1)
 
 
-def _complete(state: Records, number: int, log: Path) -> Flags:
+def _complete(number: int, state: Records, log: Path) -> Flags:
     """Return cycles [n] with all four inputs of a joint; LogError for one that never came."""
-    there: Flags = (state["input_flags"] & DRIVE_INPUTS) == DRIVE_INPUTS
+    there = _fresh(state)
     for name in _INPUTS:
         finite = np.isfinite(state[name])
         if not finite.any():
@@ -137,10 +277,12 @@ def _complete(state: Records, number: int, log: Path) -> Flags:
     return there
 
 
-def _with_sensor(one: Records, two: Records) -> Flags:
-    """Return cycles [n] in which every joint that has the sensor at all has it."""
-    flags = [np.isfinite(state["sensor_torque_nm"]) for state in (one, two)]
-    have = [each for each in flags if each.any()] or flags
+def _with_sensor(states: Iterable[Records]) -> Flags | None:
+    """Return cycles [n] in which every joint that has the sensor at all has it; None where none has."""
+    flags = [np.isfinite(state["sensor_torque_nm"]) for state in states]
+    have = [each for each in flags if each.any()]
+    if not have:
+        return None
     result: Flags = np.logical_and.reduce(have)
     return result
 
@@ -164,21 +306,16 @@ def _powered(statusword: NDArray[Any]) -> FloatArray | None:
     return np.where(off, 0.0, 1.0) if off.any() else None
 
 
-def _temperature(frames: Records, node: int, span: slice) -> FloatArray | None:
+def _temperature(readings: Readings, span: slice) -> FloatArray | None:
     """Temperature [n] of a drive's joint over the cycles of `span` [degC] by its TPDO3, held between two; None without any.
 
     Before the first frame of the span that frame's value holds: the one before it was sent while the drive was off, and an
     emulated day begins when the drives are enabled. Where the span has no frame, the last one before it counts.
     """
-    raw = frames["frames"]
-    stored = np.arange(raw.shape[1]) < frames["frame_count"][:, None]
-    at = stored & (raw["id"] == drive_tpdo3(node).cob_id) & (raw["length"] >= 2)
-    rows, places = np.nonzero(at)
-    counts = np.ascontiguousarray(raw["data"][rows, places][:, :2]).view("<i2")[:, 0]
-    rows, values = rows[counts != NOT_MEASURED], counts[counts != NOT_MEASURED] * TEMPERATURE_C_PER_UNIT
+    rows, values = readings
     if not len(rows):
         return None
-    cycles = np.arange(len(frames))[span]
+    cycles = np.arange(span.start, span.stop)
     last = np.searchsorted(rows, cycles, side="right") - 1
     first = min(int(np.searchsorted(rows, cycles[0])), int(last[-1]))
     return np.asarray(values[np.maximum(last, max(first, 0))], np.float64)

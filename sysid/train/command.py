@@ -23,7 +23,7 @@ from jtqd.sysid.fit.torsion import TorsionError
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.checks import channel_findings
 from jtqd.sysid.runs.files import RunError, RunFile, read_runs
-from jtqd.sysid.runs.joints import joint_number
+from jtqd.sysid.runs.joints import joint_number, only
 from jtqd.sysid.train.ours import train_fused
 from jtqd.sysid.train.paper import TrainedNetwork, paper_block, split_by_sample, train_paper
 
@@ -152,7 +152,7 @@ def main(argv: list[str]) -> int:
         missing = [name for name in ("torch", "onnx", "matplotlib") if importlib.util.find_spec(name) is None]
         if missing:
             raise ConfigError(f"{', '.join(missing)}: not installed: pip install 'jtqd[train]'")
-        runs = read_runs(options.runs, options.columns)
+        runs = read_runs(options.runs, options.columns, joints=only(options.number))
         numbers = [joint_number(options.number, joint, runs) for joint in joints]
         findings = [
             finding

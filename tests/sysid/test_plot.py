@@ -9,6 +9,7 @@ import pytest
 from jtqd.daemon.logs import LogError
 from jtqd.estimator.status import DEGRADED, NAMES, STALE, STANDSTILL, VALID
 from jtqd.sysid import plot as plot_command
+from tests.daemon.logs.campaign_log import Joint, regular, write_log
 
 pytest.importorskip("matplotlib")
 ROWS = [  # status, estimate, sensor
@@ -110,3 +111,11 @@ def test_the_legend_covers_no_data(log, tmp_path, monkeypatch):
     ((axes, legend, whole),) = seen
     assert legend.x0 >= axes.x1
     assert legend.x1 <= whole.x1
+
+
+def test_joint_four_without_a_reference_is_drawn(tmp_path, capsys):
+    """From a log of four joints; there is nothing to compare with, and the RMSE says so."""
+    cycles = regular(30, lambda n: tuple(Joint(sensor_nm=float("nan")) for _ in range(4)))
+    path = write_log(tmp_path / "a.mcap", cycles, 4)
+    assert plot_command.main([str(path), "--joint", "4", "--out", str(tmp_path / "a.png"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["rmse_nm"] == {"joint_4": None}

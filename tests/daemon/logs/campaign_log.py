@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jtqd.daemon.recording.journal import Journal
-from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, SealedChunk
-from jtqd.daemon.recording.messages import BLOCK_PARTS, JointStateMessage
+from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData, SealedChunk
+from jtqd.daemon.recording.messages import CycleMessages, JointStateMessage
 from jtqd.daemon.recording.progress import Account
 from jtqd.daemon.recording.recording import Recording
 from jtqd.daemon.recording.schemas import definitions
@@ -31,11 +31,11 @@ class Joint(NamedTuple):
 
 
 class Cycle(NamedTuple):
-    """One cycle: its number, when its SYNC was sent, both joints, and what came as (COB-ID, data)."""
+    """One cycle: its number, when its SYNC was sent, the joints, and what came as (COB-ID, data)."""
 
     index: int
     time_ns: int
-    joints: tuple[Joint, Joint]
+    joints: tuple[Joint, ...]
     frames: Sequence[tuple[int, bytes]] = ()
 
 
@@ -50,12 +50,14 @@ class _OneFile:
         self._file.append(chunk)
 
 
-def write_log(path: Path, cycles: Iterable[Cycle]) -> Path:
-    """An MCAP file of these cycles."""
-    schemas, channels = definitions(None)
-    file = McapFile(path, Head(schemas, channels, []), {"run": "test", "part": "1"}, 1)
-    journal = Journal(ChunkBuilder(schemas, channels, BLOCK_PARTS, 60), print)
-    overview = JointStateMessage(("a", "b"), (1.0, 1.0))
+def write_log(path: Path, cycles: Iterable[Cycle], joints: int = 2, configuration: str = "") -> Path:
+    """An MCAP file of these cycles, each of so many joints; `configuration` is attached to it."""
+    schemas, channels = definitions(None, joints)
+    attached = [NamedData("configuration.yaml", "application/yaml", configuration.encode())]
+    head = Head(schemas, channels, attached if configuration else [])
+    file = McapFile(path, head, {"run": "test", "part": "1"}, 1)
+    journal = Journal(ChunkBuilder(schemas, channels, CycleMessages(joints).parts, 60), print)
+    overview = JointStateMessage("abcd"[:joints], (1.0,) * joints)
     recording = Recording(journal, _OneFile(file), overview, 500_000_000, Account())
     for cycle in cycles:
         recording.add(_record(cycle))
@@ -64,7 +66,7 @@ def write_log(path: Path, cycles: Iterable[Cycle]) -> Path:
     return path
 
 
-def regular(count: int, joints: Callable[[int], tuple[Joint, Joint]], start: int = 100) -> list[Cycle]:
+def regular(count: int, joints: Callable[[int], tuple[Joint, ...]], start: int = 100) -> list[Cycle]:
     """`count` cycles, 1 ms apart, the first numbered `start`."""
     return [Cycle(start + n, 7_000_000_000 + n * 1_000_000, joints(n)) for n in range(count)]
 
@@ -75,17 +77,18 @@ def temperature(node: int, celsius: float) -> tuple[int, bytes]:
 
 
 def _record(cycle: Cycle) -> bytes:
-    record = bytearray(cr.RECORD_SIZE)
+    layout = cr.layout_of(len(cycle.joints))
+    record = bytearray(layout.size)
     nan = math.nan
     blocks: list[float] = []
     for joint in cycle.joints:
         numbers = [*joint[:5], nan, nan, nan, nan, nan, nan, 1e-3]  # no temperature, no stage of an estimate
         blocks += [*numbers, joint.statusword, 0, 0, joint.input_flags]
     counts = (cycle.index % 240 + 1, len(cycle.frames), 0, 0, 0, 0, 0, 0)
-    cr.HEAD.pack_into(
+    layout.head.pack_into(
         record, 0, cycle.index, cycle.time_ns, START_NS + cycle.time_ns, 15, 0, 0, 0, *counts, *blocks
     )
     for n, (can_id, data) in enumerate(cycle.frames):
-        struct.pack_into("<IB3x8s", record, cr.FRAMES_OFFSET + 16 * n, can_id, len(data), data)
-    cr.TAIL.pack_into(record, cr.TAIL_OFFSET, cycle.index)
+        struct.pack_into("<IB3x8s", record, layout.frames_offset + 16 * n, can_id, len(data), data)
+    cr.TAIL.pack_into(record, layout.tail_offset, cycle.index)
     return bytes(record)

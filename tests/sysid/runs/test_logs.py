@@ -199,10 +199,93 @@ def test_logs_without_a_motion_are_refused_in_one_line(tmp_path: Path) -> None:
     ):
         path = write_log(tmp_path / f"{name}.mcap", regular(30, wanted))
         with pytest.raises(LogError) as caught:
-            log_to_run(path)
+            log_to_run(path, all_needed=True)
         assert len(str(caught.value).splitlines()) == 1
         for word in [str(path), *words]:
             assert word in str(caught.value)
+
+
+def four(n: int) -> tuple[Joint, ...]:
+    """Joints 1 to 4; a sensor at joint 3 only."""
+    return tuple(
+        Joint(
+            0.1 * n * k,
+            k + n,
+            2.0 * n * k,
+            0.01 * n * k,
+            3.0 + n if k == 3 else NAN,
+            input_flags=7 if k == 3 else 3,
+        )
+        for k in (1, 2, 3, 4)
+    )
+
+
+def test_one_to_four_joints_and_the_reference_of_those_that_have_one(tmp_path: Path) -> None:
+    for count in (1, 3, 4):
+        cycles = regular(50, lambda n, count=count: four(n)[:count])  # type: ignore[misc]
+        logged = log_to_run(write_log(tmp_path / f"{count}.mcap", cycles, count))
+        assert list(logged.table.joints) == list(range(1, count + 1))
+        for number, columns in logged.table.joints.items():
+            assert columns.current_a is not None
+            assert columns.current_a.tolist() == [0.1 * n * number for n in range(50)]
+            assert (columns.torque_nm is not None) == (number == 3)
+        assert (logged.missed, logged.incomplete, dict(logged.left_out)) == (0, 0, {})
+    assert logged.table.joints[3].torque_nm is not None
+    assert logged.table.joints[3].torque_nm.tolist() == [3.0 + n for n in range(50)]
+
+
+def test_one_joint_alone_has_its_own_cycles(tmp_path: Path) -> None:
+    """Joint 4 is enabled before the others and loses inputs at other times."""
+
+    def wanted(n: int) -> tuple[Joint, ...]:
+        *others, last = four(n)
+        if not 20 <= n < 40:
+            others = [each._replace(statusword=OFF) for each in others]
+        return (*others, last._replace(input_flags=1) if n == 30 else last)
+
+    path = write_log(tmp_path / "a.mcap", regular(60, wanted), 4)
+    together, alone = log_to_run(path), log_to_run(path, joints=[4])
+    assert (len(together.table.time_s), together.incomplete_by["joint 4"]) == (19, 1)
+    assert list(alone.table.joints) == [4]
+    assert len(alone.table.time_s) == 59
+    assert alone.table.joints[4].current_a is not None
+    assert alone.table.joints[4].current_a[0] == 0.0
+    assert len(log_to_run(path, joints=[2, 3]).table.time_s) == 20
+
+
+def test_a_joint_that_was_never_enabled_is_left_out_and_named(tmp_path: Path) -> None:
+    def wanted(n: int) -> tuple[Joint, ...]:
+        one, two, three, last = four(n)
+        return one._replace(statusword=OFF), two._replace(link_position_rad=NAN), three, last
+
+    path = write_log(tmp_path / "a.mcap", regular(120, wanted), 4)
+    logged = log_to_run(path)
+    assert list(logged.table.joints) == [3, 4]
+    assert "operation enabled" in logged.left_out[1]
+    assert "j2.link_position_rad" in logged.left_out[2]
+    [run] = read_runs([path])
+    assert [note.split(":")[0] for note in run.notes] == ["joint 1 left out", "joint 2 left out"]
+    for joints_wanted, needed, words in (
+        ([1], False, "operation enabled"),
+        ([3, 5], True, "found no joint 5, the log has 1, 2, 3, 4"),
+        (None, True, "j2.link_position_rad"),
+    ):
+        with pytest.raises(LogError, match=words):
+            log_to_run(path, joints=joints_wanted, all_needed=needed)
+    assert list(log_to_run(path, joints=[3, 5]).table.joints) == [3]
+
+
+def test_the_temperature_of_a_joint_is_that_of_the_node_in_the_attached_configuration(tmp_path: Path) -> None:
+    cycles = regular(40, four)
+    cycles[5] = cycles[5]._replace(frames=[temperature(1, 31.0), temperature(12, 35.5)])
+    configuration = "joint_1: {node: 11}\njoint_2: {node: 12}\njoint_3: {node: 1}\njoint_4: {}\n"
+    table = log_to_run(write_log(tmp_path / "a.mcap", cycles, 4, configuration)).table
+    found = {number: columns.temperature_c for number, columns in table.joints.items()}
+    assert found[2] is not None
+    assert found[3] is not None
+    assert (found[2][0], found[3][0]) == (35.5, 31.0)
+    assert found[1] is None
+    assert found[4] is None
 
 
 def test_the_account_holds_for_any_losses(tmp_path: Path) -> None:
