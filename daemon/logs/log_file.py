@@ -44,6 +44,8 @@ from jtqd.daemon.recording.own_files import ACTIVE
 
 _FLAT_PIECE = 8 << 20
 """[byte] messages outside chunks are read in pieces of this size."""
+_INDEX_ENTRY = 16
+"""[byte] the least that a message takes of a file: its entry in a message index."""
 
 
 class Batch(NamedTuple):
@@ -204,6 +206,12 @@ class LogFile:
                 self._define(opcode, data[start + HEAD.size : end])
 
     @property
+    def expected(self) -> dict[int, int]:
+        """Channel -> messages as the summary says, as far as the file is long enough for them."""
+        most = self._source.size // _INDEX_ENTRY
+        return {channel: min(count, most) for channel, count in self.counts.items()}
+
+    @property
     def start_ns(self) -> int:
         """First log time; 0 without messages."""
         if self._chunks:
@@ -335,23 +343,22 @@ def _indexed(data: bytes, channel: int, entries: NDArray[np.uint64]) -> Batch | 
     offsets = entries[:, 1].astype(np.int64)
     if not len(offsets):
         return Batch(channel, data, offsets, entries[:, 0], entries[:, 0])
-    if offsets.min() < 0 or offsets.max() > len(data) - HEAD.size - MESSAGE_BODY:
-        return None
-    if len(offsets) > 1 and (np.diff(offsets) <= 0).any():  # by time, in some writers' files
+    if len(offsets) > 1 and (offsets[1:] <= offsets[:-1]).any():  # by time, in some writers' files
         order = np.argsort(offsets)
         offsets, entries = offsets[order], entries[order]
+    if offsets[0] < 0 or offsets[-1] > len(data) - HEAD.size - MESSAGE_BODY:
+        return None
     heads = heads_at(data, offsets)
+    log_times = entries[:, 0]
+    if not (heads["log_time"] == log_times).all():
+        return None
     lengths = heads["length"]
-    good = (
-        (heads["opcode"] == Opcode.MESSAGE)
-        & (heads["channel"] == channel)
-        & (heads["log_time"] == entries[:, 0])
-    )
+    good = (heads["opcode"] == Opcode.MESSAGE) & (heads["channel"] == channel)
     good &= (lengths >= MESSAGE_BODY) & (lengths <= len(data))
     ends = offsets + HEAD.size + lengths.astype(np.int64)
     if not good.all() or ends[-1] > len(data) or (ends[:-1] > offsets[1:]).any():
         return None
-    return Batch(channel, data, offsets, entries[:, 0], lengths - MESSAGE_BODY)
+    return Batch(channel, data, offsets, log_times, lengths - MESSAGE_BODY)
 
 
 def _within(batch: Batch, first: int, last: int) -> Batch:

@@ -79,7 +79,7 @@ def read_messages(
     collectors = {topic: _Collector(topic, parts[0]) for topic in topics}
     for part in _pieces(parts, topics, start_ns, end_ns):
         collector = collectors[part.topic]
-        collector.begin(part.path, part.schema)
+        collector.begin(part.path, part.schema, part.expected)
         collector.add(part.batch)
     span = "" if start_ns is None and end_ns is None else " in that time"
     for topic, collector in collectors.items():
@@ -127,6 +127,8 @@ class _Piece(NamedTuple):
     topic: str
     schema: Schema
     batch: Batch
+    expected: int
+    """Messages of the topic in the file, as it says."""
 
 
 def _pieces(
@@ -136,14 +138,16 @@ def _pieces(
     filtered = _DuplicateFilter() if len(parts) > 1 else None
     for path in parts:
         with LogFile(path) as log:
+            expected = log.expected if start_ns is None and end_ns is None else {}
             wanted = {
-                number: (channel.topic, _schema(log, path, channel))
+                number: (channel.topic, _schema(log, path, channel), expected.get(number, 0))
                 for number, channel in log.channels.items()
                 if channel.topic in topics
             }
             for batch in log.batches(list(wanted), start_ns, end_ns):
-                topic, schema = wanted[batch.channel]
-                yield _Piece(path, topic, schema, batch if filtered is None else filtered.new(topic, batch))
+                topic, schema, promised = wanted[batch.channel]
+                fresh = batch if filtered is None else filtered.new(topic, batch)
+                yield _Piece(path, topic, schema, fresh, promised)
         if filtered is not None:
             filtered.next_part()
 
@@ -235,17 +239,24 @@ class _Collector:
 
     def __init__(self, topic: str, path: Path) -> None:
         self._topic, self._path = topic, path
+        self._file: Path | None = None
+        self._promised = _FIRST_ROWS
         self._schema: Schema | None = None
         self._types = Types("")
         self._layout: Layout | None = None
         self._length = 0
         self._decoder: _Decoder | None = None
         self._rows: NDArray[Any] | None = None
-        self._times = np.empty(_FIRST_ROWS, np.uint64)
+        self._times = np.empty(0, np.uint64)
         self.count = 0
 
-    def begin(self, path: Path, schema: Schema) -> None:
-        """The next batches are from this file and of this schema. Raises LogError where it differs from that before."""
+    def begin(self, path: Path, schema: Schema, expected: int = 0) -> None:
+        """The next batches are from this file and of this schema. Raises LogError where it differs from that before.
+
+        expected: messages in the file, to make room for them at once.
+        """
+        if path != self._file:
+            self._file, self._promised = path, max(_FIRST_ROWS, self.count + expected)
         if self._schema is not None:
             if schema.data != self._schema.data:
                 raise LogError(
@@ -317,11 +328,11 @@ class _Collector:
     def _put(self, rows: NDArray[Any], times: NDArray[np.uint64]) -> None:
         end = self.count + len(rows)
         if self._rows is None:
-            self._rows = np.empty(max(_FIRST_ROWS, len(rows)), rows.dtype)
+            self._rows = np.empty(max(self._promised, end), rows.dtype)
         if end > len(self._rows):
-            self._rows = _grown(self._rows, end, self.count)
+            self._rows = _grown(self._rows, max(end, self._promised), self.count)
         if end > len(self._times):
-            self._times = _grown(self._times, end, self.count)
+            self._times = _grown(self._times, max(end, self._promised), self.count)
         self._rows[self.count : end] = rows
         self._times[self.count : end] = times
         self.count = end

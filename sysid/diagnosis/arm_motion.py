@@ -317,6 +317,14 @@ def motions(kinds: Iterable[str], room: Room) -> list[Motion]:
     return [motion for kind in kinds for motion in KINDS[kind][1](room, kind)]
 
 
+MOTION_FILE: Final = "next_experiment.motion.csv"
+
+
+def joint_motion_file(number: int) -> str:
+    """Return the name of the motion of a joint where several have one."""
+    return f"next_experiment.joint{number}.motion.csv"
+
+
 def csv_text(made: Sequence[Motion]) -> str:
     """Return all runs as one CSV table at RATE_HZ: run, time_s, position_rad, velocity_rad_s, joint side."""
     lines = ["run,time_s,position_rad,velocity_rad_s"]

@@ -20,6 +20,7 @@ from jtqd.estimator.checked import ConfigError, counted, make_directory
 from jtqd.estimator.joint import Joint, MotionLimits
 from jtqd.estimator.run import RunTableError
 from jtqd.sysid.campaign.plan import Plan
+from jtqd.sysid.diagnosis.arm_motion import MOTION_FILE, joint_motion_file
 from jtqd.sysid.diagnosis.extended_joint import FILE, write_extended
 from jtqd.sysid.diagnosis.findings import INSUFFICIENT, NO_GAP, Findings, summary_lines, to_mapping
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, scope_of
@@ -34,8 +35,12 @@ _NEEDED: Final = ("matplotlib", "jinja2", "scipy")
 FINDINGS: Final = "findings.json"
 REPORT: Final = "report.html"
 PLAN: Final = "next_experiment.plan.yaml"
-MOTION: Final = "next_experiment.motion.csv"
-_OWN: Final = (FINDINGS, REPORT, PLAN, MOTION, FILE, *(f"extended.joint{n}.yaml" for n in range(1, 8)))
+_JOINTS: Final = range(1, 8)
+_OWN: Final = (
+    *(FINDINGS, REPORT, PLAN, MOTION_FILE, FILE),
+    *(f"extended.joint{n}.yaml" for n in _JOINTS),
+    *(joint_motion_file(n) for n in _JOINTS),
+)
 """All names that a diagnosis may write."""
 
 
@@ -158,7 +163,7 @@ def parser() -> argparse.ArgumentParser:
             "  jtq diagnose rig/*.csv --columns columns.yaml --joint 3=arm3.yaml --without sensor_drift \\\n"
             "      --limits travel_rad=-0.5:0.5,velocity_rad_s=1 --out diagnosis\n\n"
             f"DIR/{REPORT} is for people, DIR/{FINDINGS} for programs, DIR/{FILE} the joint file with the effects found;\n"
-            f"DIR/{PLAN}, when there is one, is for `jtq campaign`, DIR/{MOTION} for the controller\n"
+            f"DIR/{PLAN}, when there is one, is for `jtq campaign`, DIR/{MOTION_FILE} for the controller\n"
             "of an arm. Exit status: 0 no gap; 3 any other verdict; 1 failure; 2 usage."
         ),
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -282,9 +287,12 @@ def _write(
         fresh = Path(made)
         names = write_extended(fresh, joints, findings, sha256=sha256, date=date)
         experiment = findings.next_experiment
+        tables = {joint_motion_file(n): text for n, text in ((experiment or {}).get("tables") or {}).items()}
         if experiment and experiment.get("table"):
-            names.append(MOTION)
-            (fresh / MOTION).write_text(experiment["table"], encoding="utf-8")
+            tables[MOTION_FILE] = experiment["table"]
+        for name, text in tables.items():
+            names.append(name)
+            (fresh / name).write_text(text, encoding="utf-8")
         if experiment and experiment.get("plan"):
             names.append(PLAN)
             plan = Plan.from_mapping(experiment["plan"], PLAN)

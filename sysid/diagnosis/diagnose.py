@@ -29,7 +29,7 @@ from jtqd.sysid.diagnosis.findings import (
 )
 from jtqd.sysid.diagnosis.leftover import events_left
 from jtqd.sysid.diagnosis.mixed_model import Mixed
-from jtqd.sysid.diagnosis.next_experiment import next_experiment
+from jtqd.sysid.diagnosis.next_experiment import each_joint, next_experiment
 from jtqd.sysid.diagnosis.noise import Noise, noise_model, run_sums
 from jtqd.sysid.diagnosis.recordings import piece_notes
 from jtqd.sysid.diagnosis.refine import present_effects, refine
@@ -113,11 +113,13 @@ def one_sensor(runs: Sequence[tuple[str, RunTable]], numbers: Sequence[int]) -> 
 
 
 def combined(parts: Sequence[Findings]) -> Findings:
-    """Return the findings of several joints as one: the verdict that asks for most, the gain of the largest cause."""
+    """Return the findings of several joints as one: the verdict that asks for most, the gain of the largest cause, the next
+    experiment of every joint that has one.
+    """
     verdict = min((f.verdict for f in parts), key=_WORST_FIRST.index)
     with_gain = [f for f in parts if f.gain is not None]
     leading = max(with_gain, key=lambda f: f.causes[0].rms_nm) if with_gain else None
-    plans = [f.next_experiment for f in parts if f.next_experiment is not None]
+    plans = {f.joints[0]: f.next_experiment for f in parts if f.joints and f.next_experiment is not None}
     return Findings(
         verdict,
         tuple(f"joint {n}: {reason}" for f in parts for n in f.joints[:1] for reason in f.reasons),
@@ -128,7 +130,7 @@ def combined(parts: Sequence[Findings]) -> Findings:
         tuple(sorted((c for f in parts for c in f.candidates), key=lambda c: -c.delta_bic)),
         None if leading is None else leading.gain,
         channel_notes=tuple(dict.fromkeys(note for f in parts for note in f.channel_notes)),
-        next_experiment=plans[0] if plans else None,
+        next_experiment=each_joint(plans) if plans else None,
         traces=tuple(t for f in parts for t in f.traces),
         explained_share=math.nan if leading is None else leading.explained_share,
         left_over=max(

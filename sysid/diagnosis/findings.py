@@ -253,7 +253,7 @@ def _place(place: Place) -> dict[str, Any]:
 
 def _without_table(experiment: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
     """The positions of a motion are a file of their own."""
-    return experiment and {key: value for key, value in experiment.items() if key != "table"}
+    return experiment and {k: value for k, value in experiment.items() if k not in {"table", "tables"}}
 
 
 def _cause(cause: Cause, joints: Mapping[int, Joint]) -> dict[str, Any]:

@@ -526,10 +526,11 @@ def next_experiment(
     signals: Sequence[JointSignals] = (),
 ) -> dict[str, Any]:
     """Return what would settle it: {"why": text, "plan": mapping of jtq.plan/1} for two joints on a towing bench, and
-    {"why": text, "plan": None, "motion": ..} for one joint, which is moved by itself (`arm_motion`).
+    {"why": text, "plan": None, "motion": ..} for one joint, which is moved by itself (`arm_motion`). Three and more are an
+    arm: each gets a motion of its own (`each_joint`).
 
     classes: names of effects that the runs cannot distinguish, one sequence per class; a sequence of one name asks to make
-    that effect visible. joints: files of the joints in the runs, one or two, whose ratings the plan keeps. why: what the
+    that effect visible. joints: files of the joints in the runs, whose ratings the plan keeps. why: what the
     diagnosis says before it. velocity_rad_s: the fastest motion allowed. temperature: whether the runs have one; without
     it the plan does not supervise it. signals: of one joint, its runs so far: where it may go. Raises ValueError without
     a joint.
@@ -539,6 +540,13 @@ def next_experiment(
     if len(joints) == 1:
         [(number, joint)] = joints.items()
         return _of_one_joint(classes, kinds, number, why, room_of(joint, signals))
+    if len(joints) > 2:
+        return each_joint(
+            {
+                number: _of_one_joint(classes, kinds, number, why, room_of(joint, ()))
+                for number, joint in joints.items()
+            }
+        )
     reach = reach_of(joints, velocity_rad_s=velocity_rad_s, temperature=temperature)
     runs = tuple(run for kind in kinds for run in EXPERIMENTS[kind].runs(reach))
     plan = Plan("next_" + "_".join(kinds), replace(reach.limits, travel_rad=1e3), runs)
@@ -548,6 +556,37 @@ def next_experiment(
     return {"why": _text(classes, kinds, why, plan), "plan": plan.to_mapping()}
 
 
+_TOWING: Final = (
+    "On a towing bench diagnose both joints together: the plan is then a campaign, and a sensor fault is in the "
+    "balances of both joints, a joint fault in one."
+)
+
+
+def each_joint(experiments: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the experiments of joints that are moved one by one, by their numbers, as one.
+
+    A single one is returned as it is; several are {"why": all of them, "plan": None, "motion": None, "joints": [{"joint",
+    "why", "motion"}, ..], "tables": {number: CSV}}, tables for those with a motion. Raises ValueError without any.
+    """
+    if not experiments:
+        raise ValueError("found no experiment, expected at least one")
+    if len(experiments) == 1:
+        [only] = experiments.values()
+        return dict(only)
+    numbers = sorted(experiments)
+    said = [f"Joint {n}: {experiments[n]['why'].replace(f' {_TOWING}', '')}" for n in numbers]
+    return {
+        "why": " ".join(said),
+        "plan": None,
+        "motion": None,
+        "joints": [
+            {"joint": n, "why": experiments[n]["why"], "motion": experiments[n].get("motion")}
+            for n in numbers
+        ],
+        "tables": {n: experiments[n]["table"] for n in numbers if experiments[n].get("table")},
+    }
+
+
 def _of_one_joint(
     classes: Sequence[Sequence[str]], kinds: Sequence[str], number: int, why: str, room: Room | None
 ) -> dict[str, Any]:
@@ -555,10 +594,7 @@ def _of_one_joint(
     parts = _begun(classes, why)
     parts += [f"{kind}: {KINDS[kind][0]}." for kind in kinds]
     parts += [note for pair, note in _BY_HAND.items() if any(pair <= set(names) for names in classes)]
-    parts.append(
-        "On a towing bench diagnose both joints together: the plan is then a campaign, and a sensor fault is in the "
-        "balances of both joints, a joint fault in one."
-    )
+    parts.append(_TOWING)
     if room is None:
         parts.append(
             "No motion is planned: neither these runs nor motion_limits of the joint file (or --limits) say where it may go."

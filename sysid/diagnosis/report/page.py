@@ -9,6 +9,7 @@ import yaml
 
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.effects.effect import Effect
+from jtqd.sysid.diagnosis.arm_motion import MOTION_FILE, joint_motion_file
 from jtqd.sysid.diagnosis.findings import AMBIGUOUS, CAUSE, INSUFFICIENT, UNEXPLAINED, Findings
 from jtqd.sysid.diagnosis.report import views
 from jtqd.sysid.diagnosis.report.pictures import pictures, trace_rows
@@ -19,7 +20,6 @@ from jtqd.sysid.report.numbers import number
 
 TEMPLATE: Final = "report.html.j2"
 PLAN_FILE: Final = "next_experiment.plan.yaml"
-MOTION_FILE: Final = "next_experiment.motion.csv"
 
 
 def render(findings: Findings, made: str = "", effects: Mapping[str, Effect] | None = None) -> str:
@@ -54,7 +54,6 @@ def render(findings: Findings, made: str = "", effects: Mapping[str, Effect] | N
         "pictures": drawn,
         "closed": sum(1 for each in drawn if not each.opened),
         "traces": trace_rows(findings),
-        "motion_file": MOTION_FILE,
         "next": _next(findings),
     }
     return page.render("jtqd.sysid.diagnosis.report", TEMPLATE, content)
@@ -82,27 +81,30 @@ def _next(findings: Findings) -> dict[str, Any] | None:
     if findings.next_experiment is None:
         return None
     plan = findings.next_experiment.get("plan")
+    made = _motions(findings.next_experiment)
     return {
         "why": findings.next_experiment["why"],
         "file": PLAN_FILE,
         "command": findings.next_experiment.get("command")
         or f"jtq campaign {PLAN_FILE} --bus can0 --out RUNS",
-        "motion": _motion(findings.next_experiment.get("motion")),
-        "amount": _amount(plan, findings.next_experiment.get("motion")),
+        "motions": [(file, _runs_of(motion)) for file, motion in made],
+        "amount": plan_amount(plan)
+        if plan is not None
+        else _runs_text([run["duration_s"] for _, motion in made for run in motion["runs"]]),
         "yaml": "" if plan is None else yaml.safe_dump(plan, sort_keys=False, allow_unicode=True),
     }
 
 
-def _amount(plan: Mapping[str, Any] | None, motion: Mapping[str, Any] | None) -> str:
-    if plan is not None:
-        return plan_amount(plan)
-    return "" if motion is None else _runs_text([run["duration_s"] for run in motion["runs"]])
+def _motions(experiment: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
+    """File and content of every motion of a joint alone."""
+    found = [(MOTION_FILE, experiment.get("motion"))]
+    found += [(joint_motion_file(each["joint"]), each["motion"]) for each in experiment.get("joints", ())]
+    return [(file, motion) for file, motion in found if motion]
 
 
-def _motion(motion: Mapping[str, Any] | None) -> list[tuple[str, str, str]]:
+def _runs_of(motion: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """Name, what is done beside it, and length of every run of one joint."""
-    runs = [] if motion is None else motion["runs"]
-    return [(run["name"], run["what"], f"{number(run['duration_s'])} s") for run in runs]
+    return [(run["name"], run["what"], f"{number(run['duration_s'])} s") for run in motion["runs"]]
 
 
 def plan_amount(plan: Mapping[str, Any]) -> str:
@@ -117,6 +119,8 @@ def plan_amount(plan: Mapping[str, Any]) -> str:
 
 
 def _runs_text(durations_s: Sequence[float]) -> str:
+    if not durations_s:
+        return ""
     seconds, count = sum(durations_s), len(durations_s)
     length = f"{number(seconds)} s" if seconds < 120.0 else f"{number(seconds / 60.0, 2)} minutes"
     return f"{count} run{'s' if count > 1 else ''}, {length} of motion"

@@ -9,7 +9,7 @@ from jtqd.estimator.joint import MotionLimits
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.arm_motion import KINDS, RATE_HZ, Room, csv_text, motions, room_of
-from jtqd.sysid.diagnosis.next_experiment import EXPERIMENTS, next_experiment
+from jtqd.sysid.diagnosis.next_experiment import EXPERIMENTS, each_joint, next_experiment
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
 
 JOINT = load_joint(shipped("joint1.yaml"))
@@ -126,6 +126,21 @@ def test_one_joint_gets_a_motion_and_no_towing_plan() -> None:
         "Why. Proposed to distinguish torque_constant from sensor_gain: load_at_both"
     )
     assert "a payload may add no more than the rest" in made["why"]
+
+
+def test_every_joint_of_an_arm_gets_a_motion_of_its_own() -> None:
+    """Three joints, one of them without a room; no towing plan."""
+    limits = MotionLimits((-0.2, 0.4), velocity_rad_s=0.3, acceleration_rad_s2=1.0, torque_nm=10.0)
+    free = replace(JOINT, motion_limits=limits)
+    made = next_experiment([("hysteresis",)], {2: free, 3: JOINT, 4: free}, "Why.")
+    assert made["plan"] is made["motion"] is None
+    assert [each["joint"] for each in made["joints"]] == [2, 3, 4]
+    assert [each["motion"] and each["motion"]["joint"] for each in made["joints"]] == [2, None, 4]
+    assert set(made["tables"]) == {2, 4}
+    assert made["tables"][4] == next_experiment([("hysteresis",)], {4: free}, "Why.")["table"]
+    assert all(f"Joint {n}: Why." in made["why"] for n in (2, 3, 4))
+    assert "towing" not in made["why"]
+    assert each_joint({2: {"why": "one"}}) == {"why": "one"}
 
 
 def test_the_same_room_gives_the_same_table() -> None:

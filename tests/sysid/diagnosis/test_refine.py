@@ -299,7 +299,9 @@ def test_joints_together_put_the_largest_first() -> None:
     assert [g.joint for g in found.gaps] == [2, 1]
     assert found.gain is not None
     assert found.gain.split == "joint 2", "of the largest cause"
-    assert found.next_experiment == {"why": "first"}
+    assert found.next_experiment is not None
+    assert found.next_experiment["why"] == "Joint 1: first Joint 2: second"
+    assert [each["joint"] for each in found.next_experiment["joints"]] == [1, 2]
 
 
 def test_an_amplitude_is_positive_and_its_phase_within_a_turn() -> None:
