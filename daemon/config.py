@@ -535,6 +535,7 @@ def load_config(path: Path | None) -> Config:
     if path is None:
         path = shipped(DEFAULT_CONFIG)
     mapping, data = read_yaml(path)
+    _check_one_sensor(path, mapping)
     file = decode(_File, Section(mapping, str(path)))
     joints = tuple(
         _joint(path, number, section, file.estimator.method, file.nodes.sdo_timeout_ms)
@@ -564,6 +565,19 @@ def load_config(path: Path | None) -> Config:
         recording=file.recording,
         metrics_file=None if file.metrics is None else Path(file.metrics.file),
     )
+
+
+_ONE_SENSOR: Final = "one section 'sensor': a bus has one sensor node with 1 or 2 channels (docs/arm.md)"
+
+
+def _check_one_sensor(path: Path, mapping: Mapping[str, object]) -> None:
+    """Refuse a second sensor node by what it is, not as an unknown key. Raises ConfigError."""
+    for key, value in mapping.items():
+        more = (
+            isinstance(key, str) and key.startswith(("sensor_", "sensors")) and isinstance(value, dict | list)
+        )
+        if more or (key == "sensor" and isinstance(value, list)):
+            raise ConfigError(f"{path}: key '{key}': found a second sensor or a list, expected {_ONE_SENSOR}")
 
 
 def _sensor(section: _SensorSection, sdo_timeout_ms: int) -> SensorConfig:

@@ -55,7 +55,7 @@ class BenchConfig:
         if joints != ["joint_1", "joint_2"]:
             raise ConfigError(
                 f"{path}: found {', '.join(joints) or 'no joint'}, expected joint_1 and joint_2: a campaign moves two "
-                "joints that are coupled, and no others may be on the bus"
+                "joints that are coupled, and no others may be on the bus; logs of other motions are read by jtq diagnose"
             )
         sync = top.section("sync", optional=True)
         if sync is not None:
