@@ -31,12 +31,12 @@ from jtqd.daemon.logs import (
 from jtqd.daemon.logs.can_frames import iter_frames
 from jtqd.daemon.logs.container import ChunkError, Source, message_index, unpack_data
 from jtqd.daemon.logs.export import main as export
-from jtqd.daemon.logs.log_file import _indexed
+from jtqd.daemon.logs.log_file import LogFile, _indexed
 from jtqd.daemon.recording.schemas import SCHEMAS
 from jtqd.daemon.replay.command import main as replay
 from jtqd.daemon.replay.session import ReplayOptions
 from jtqd.daemon.replay.session import replay as replayed
-from tests.daemon.logs.log_files import ATTACHMENTS, cycles, foreign, ours, record_starts
+from tests.daemon.logs.log_files import ATTACHMENTS, cycles, foreign, ours, record_starts, write_log
 from tests.daemon.recording.recorder_bench import record_of as cycle_record
 from tests.daemon.recording.recorder_bench import session_on
 from tests.daemon.replay import replay_helpers
@@ -548,3 +548,16 @@ def test_a_recorder_that_did_not_report_its_last_chunks(tmp_path):
         (tmp_path / "both").mkdir(exist_ok=True)
         written.rename(tmp_path / "both" / f"test-20250102T030405Z-{part:04d}.mcap")
     assert read_topic(tmp_path / "both", "/joint/2/state")["cycle"].tolist() == list(range(4000))
+
+
+@pytest.mark.parametrize("promised", [0, 1, 10**5])
+def test_a_summary_that_promises_too_few_or_too_many_messages_changes_nothing(
+    tmp_path, monkeypatch, promised
+):
+    parts = [tmp_path / f"{n}.mcap" for n in (1, 2)]
+    for n, part in enumerate(parts):
+        write_log(part, list(cycles(2100, seed=n)))
+    whole = read_topic(parts, "/joint/1/state")
+    monkeypatch.setattr(LogFile, "expected", dict.fromkeys(range(1, 20), promised))
+    assert read_topic(parts, "/joint/1/state").tobytes() == whole.tobytes()
+    assert len(whole) == 4200

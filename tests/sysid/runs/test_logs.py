@@ -157,6 +157,16 @@ def test_temperature_holds_between_its_frames_and_before_the_first_one(tmp_path:
     assert log_to_run(tmp_path / "a.mcap", nodes=(1, 2)).table.joints[1].temperature_c is None
 
 
+def test_a_temperature_belongs_to_its_cycle_in_any_chunk(tmp_path: Path) -> None:
+    """A chunk holds 0.5 s; the second temperature comes in the third one."""
+    cycles = regular(1300, joints)
+    for at, value in ((100, 25.0), (1200, 29.0)):
+        cycles[at] = cycles[at]._replace(frames=[temperature(1, value)])
+    table = log_to_run(write_log(tmp_path / "a.mcap", cycles)).table
+    assert table.joints[1].temperature_c is not None
+    assert table.joints[1].temperature_c.tolist() == [25.0] * 1200 + [29.0] * 100
+
+
 def test_a_temperature_from_before_the_motion_counts(tmp_path: Path) -> None:
     def wanted(n: int) -> tuple[Joint, Joint]:
         one, two = joints(n)
