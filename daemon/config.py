@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
+from jtqd.daemon.profiles import with_profiles
 from jtqd.daemon.shared import faults
 from jtqd.drivers.devices import (
     CIA_402,
@@ -174,6 +175,8 @@ class JointConfig:
     """Which objects of the drive are mapped, with sign and factor."""
     joint_data: bytes = field(default=b"", repr=False)
     """The joint file as it was read, for the log."""
+    profile: str | None = None
+    """Of the drive's family."""
 
     @property
     def joint_sha256(self) -> str:
@@ -368,6 +371,8 @@ class _JointSection:
     sdo_timeout_ms: _SdoTimeout | None = None
     objects: _Objects = _Objects()
     network: _Network | None = None
+    profile: Text | None = None
+    """Of the drive's family: its values have been put below those of the section (`with_profiles`)."""
 
     def __post_init__(self) -> None:
         _check_given("joint", self.given, DRIVE_SCALING_OBJECTS)
@@ -535,7 +540,7 @@ def load_config(path: Path | None) -> Config:
     if path is None:
         path = shipped(DEFAULT_CONFIG)
     mapping, data = read_yaml(path)
-    file = decode(_File, Section(mapping, str(path)))
+    file = decode(_File, Section(with_profiles(mapping, path), str(path)))
     joints = tuple(
         _joint(path, number, section, file.estimator.method, file.nodes.sdo_timeout_ms)
         for number, section in enumerate(file.joints, start=1)
@@ -608,6 +613,7 @@ def _joint(path: Path, number: int, section: _JointSection, method: str, sdo_tim
         sdo_timeout_ms=section.sdo_timeout_ms or sdo_timeout_ms,
         objects=section.objects.of_drive(f"joint_{number}", path),
         joint_data=data,
+        profile=section.profile,
     )
 
 
