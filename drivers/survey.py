@@ -217,9 +217,13 @@ class BusSurvey:
         except SdoTimeout:
             return None
 
+    def access(self, node: int, answer_s: float = _ANSWER_S) -> SdoClient:
+        """Return the SDO client of one node; it waits `answer_s` for an answer, and repeats nothing within it."""
+        return SdoClient(FrameChannel(self._socket, node), answer_s, answer_s)
+
     def numbers(self, node: int, keys: Iterable[Key]) -> dict[Key, int]:
         """Read further numbers of one node; those that it does not have are left out."""
-        access = SdoClient(FrameChannel(self._socket, node), _ANSWER_S)
+        access = self.access(node)
         found = {key: _number(access, key) for key in keys}
         return {key: number for key, number in found.items() if number is not None}
 
