@@ -19,7 +19,7 @@ from jtqd.models.files import shipped
 
 
 def test_the_bench_by_hand():
-    """SYNC 55 (65 with a counter byte), four drive PDOs of 135, sensor 105, estimate 135, four heartbeats of 65 in 100 cycles."""
+    """SYNC 55 (65 with a counter byte), four drive PDOs of 135, sensor 105, estimate 135, four heartbeats of 65 in 100."""
     load = configured_load((1, 2), {3: (1,)})
     bits = 55 + 4 * 135 + 105 + 135 + 4 * 65 / 100
     assert load.worst == pytest.approx(bits / 1000)
