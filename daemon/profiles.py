@@ -11,7 +11,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -234,18 +233,6 @@ def _has(mapping: Any, key: str) -> bool:
             return False
         mapping = mapping[name]
     return True
-
-
-def ratio_options(gear_ratio: float | None) -> dict[str, float]:
-    """Return a gear ratio as the two options of a profile.
-
-    >>> ratio_options(50.5)
-    {'gear_ratio_numerator': 101, 'gear_ratio_denominator': 2}
-    """
-    if gear_ratio is None:
-        return {}
-    exact = Fraction(gear_ratio).limit_denominator(1_000_000)
-    return {"gear_ratio_numerator": exact.numerator, "gear_ratio_denominator": exact.denominator}
 
 
 def table(family: Family) -> Iterator[str]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 
-from jtqd.daemon.profiles import INIT, Family, ratio_options
+from jtqd.daemon.profiles import INIT, Family
 from jtqd.drivers.devices import CIA_402, COMMANDER_NODE, JTQD_NODE, parse_key
 from jtqd.drivers.sdo import Key, label
 from jtqd.drivers.survey import (
@@ -167,7 +167,10 @@ def _filled(
     number: int, node: int, survey: Survey | None, wanted: Wanted, family: Family
 ) -> dict[str, Value]:
     """Return what a profile leaves to the drive and to the operator. Raises DraftError."""
-    options: dict[str, float] = ratio_options(wanted.gear_ratio)
+    options: dict[str, float] = {}
+    if wanted.gear_ratio is not None:
+        numerator, denominator = ratio(wanted.gear_ratio)
+        options = {"gear_ratio_numerator": numerator, "gear_ratio_denominator": denominator}
     for name in ("encoder_counts", "link_encoder_counts"):
         if (counts := getattr(wanted, name)) is not None:
             options[name] = counts
