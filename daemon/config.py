@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from jtqd.daemon.profiles import with_profiles
+from jtqd.daemon.profiles import path_of, with_profiles
 from jtqd.daemon.shared import faults
 from jtqd.drivers.devices import (
     CIA_402,
@@ -177,6 +177,9 @@ class JointConfig:
     """The joint file as it was read, for the log."""
     profile: str | None = None
     """Of the drive's family."""
+    profile_path: Path | None = None
+    profile_data: bytes = field(default=b"", repr=False)
+    """The profile as it was read, for the log."""
 
     @property
     def joint_sha256(self) -> str:
@@ -516,8 +519,9 @@ class Config:
 
     @property
     def files_sha256(self) -> str:
-        """Hash of the configuration and its joint files together; networks are named in it by theirs."""
+        """Hash of the configuration, its joint files and profiles together; networks are named in it by theirs."""
         parts = [self.sha256, *(joint.joint_sha256 for joint in self.joints)]
+        parts += [sha256_hex(joint.profile_data) for joint in self.joints if joint.profile]
         return sha256_hex("".join(parts).encode())
 
     @property
@@ -587,6 +591,7 @@ def _joint(path: Path, number: int, section: _JointSection, method: str, sdo_tim
     """Read what a section `joint_N` names: the joint file and, where the method uses one, the network."""
     network = None if section.network is None else _network(section.network, path)
     joint_path = path.parent / section.file
+    profile_path = None if section.profile is None else path_of(section.profile, path.parent)
     mapping, data = read_yaml(joint_path)
     joint = Joint.from_mapping(mapping, str(joint_path))
     if method == "network" and network is None:
@@ -614,6 +619,8 @@ def _joint(path: Path, number: int, section: _JointSection, method: str, sdo_tim
         objects=section.objects.of_drive(f"joint_{number}", path),
         joint_data=data,
         profile=section.profile,
+        profile_path=profile_path,
+        profile_data=b"" if profile_path is None else read_yaml(profile_path)[1],
     )
 
 

@@ -182,14 +182,19 @@ def of_vendor(vendor: int | None) -> Family | None:
     return next((family for family in shipped() if family.vendor == vendor), None)
 
 
-def named(name: str, beside: Path | None = None) -> Family:
-    """Return a profile that ships, or NAME.yaml in the directory `beside`. Raises ConfigError."""
+def path_of(name: str, beside: Path | None = None) -> Path:
+    """Return the file of a profile that ships, or NAME.yaml in the directory `beside`. Raises ConfigError."""
     if name in names():
-        return load(_FOLDER / f"{name}.yaml")
+        return _FOLDER / f"{name}.yaml"
     if beside is not None and name.endswith(".yaml"):
-        return load(beside / name)
+        return beside / name
     expected = "one of " + ", ".join(map(repr, names())) + ", or a file NAME.yaml"
     raise ConfigError(f"profile: found {name!r}, expected {expected}")
+
+
+def named(name: str, beside: Path | None = None) -> Family:
+    """Return a profile by its name, see `path_of`. Raises ConfigError."""
+    return load(path_of(name, beside))
 
 
 def with_profiles(mapping: Mapping[str, Any], path: Path) -> dict[str, Any]:

@@ -201,6 +201,10 @@ def _place(  # noqa: PLR0917
     (directory / file).write_bytes(data)
     section["file"] = file
     hashes = [hashlib.sha256(data).hexdigest()]
+    profile = provenance["joints"][str(number)].get("profile")
+    if isinstance(profile, str):  # as it was then, also where one of that name ships
+        section["profile"] = f"{key}.profile.yaml"
+        (directory / section["profile"]).write_bytes(_attachment(log, attachments, profile))
     network = section.get("network")
     if not isinstance(network, dict):
         return hashes

@@ -22,6 +22,8 @@ from jtqd.daemon import profiles
 from jtqd.daemon.bus.boot import boot_request
 from jtqd.daemon.cli import init, probe
 from jtqd.daemon.config import load_config
+from jtqd.daemon.recording import keeper
+from jtqd.daemon.replay.origin import CONFIGURATION, PROVENANCE, open_origin
 from jtqd.drivers.boot import BootReport, boot
 from jtqd.drivers.boot_request import parse_request
 from jtqd.drivers.devices import DriveScaling
@@ -153,6 +155,40 @@ def test_a_profile_of_ones_own_lies_beside_the_configuration(tmp_path: Path) -> 
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump({"title": "t", "vendor": 1, "lines": [line]}))
     (joint,) = load_config(configuration(tmp_path, profile="mine.yaml")).joints
     assert joint.objects.current.factor == 0.25
+
+
+def test_the_log_keeps_the_profile_and_a_replay_reads_it_as_it_was(tmp_path: Path) -> None:
+    line = {
+        "key": "objects.current.factor",
+        "value": 0.25,
+        "why": "w",
+        "source": "s",
+        "state": "tried on the bus",
+    }
+    profile = tmp_path / "mine.yaml"
+    profile.write_text(yaml.safe_dump({"title": "t", "vendor": 1, "lines": [line]}))
+    config = load_config(configuration(tmp_path, profile="mine.yaml"))
+    attached = {name: data for name, _, data in keeper._attached_files(config)}
+    assert attached["mine.yaml"] == profile.read_bytes()
+    factors = dict.fromkeys(
+        ("motor_rad_per_count", "motor_rad_s_per_unit", "link_rad_per_count", "ampere_per_unit"), 1.0
+    )
+    provenance = keeper._provenance(config, {"nodes": {"1": {"scaling": factors, "gear_ratio": 100.0}}})
+    attached |= {CONFIGURATION: config.text.encode(), PROVENANCE: json.dumps(provenance).encode()}
+    profile.unlink()
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    origin = open_origin(tmp_path / "a.mcap", attached, empty)
+    assert origin.config.joints[0].objects.current.factor == 0.25
+    changed = load_config(configuration(write_again(tmp_path, line), profile="mine.yaml"))
+    assert changed.sha256 == config.sha256
+    assert changed.files_sha256 != config.files_sha256
+
+
+def write_again(directory: Path, line: dict[str, Any]) -> Path:
+    text = yaml.safe_dump({"title": "t", "vendor": 1, "lines": [line | {"value": 0.5}]})
+    (directory / "mine.yaml").write_text(text)
+    return directory
 
 
 # On a bus -----------------------------------------------------------------------------------------------------------
