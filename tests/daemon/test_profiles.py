@@ -173,6 +173,7 @@ def test_the_log_keeps_the_profile_and_a_replay_reads_it_as_it_was(tmp_path: Pat
     factors = dict.fromkeys(
         ("motor_rad_per_count", "motor_rad_s_per_unit", "link_rad_per_count", "ampere_per_unit"), 1.0
     )
+    factors["ampere_per_unit"] = -0.25  # a drive that counts backwards
     provenance = keeper._provenance(config, {"nodes": {"1": {"scaling": factors, "gear_ratio": 100.0}}})
     attached |= {CONFIGURATION: config.text.encode(), PROVENANCE: json.dumps(provenance).encode()}
     profile.unlink()
