@@ -20,7 +20,7 @@ from tests.paths import ROOT
 
 PACKAGES = ("daemon", "drivers", "estimator", "models", "sim_can", "sysid")
 PAGE = ROOT / "docs" / "architecture.md"
-ROW = re.compile(r"^\| `([a-z_./]+)` \|[^|]*\|([^|]*)\|([^|]*)\|$", re.MULTILINE)
+ROW = re.compile(r"^\| `([a-z0-9_./]+)` \|[^|]*\|([^|]*)\|([^|]*)\|$", re.MULTILINE)
 
 
 @cache
