@@ -6,15 +6,15 @@ Cyclone DDS is configured by this XML alone: CYCLONEDDS_URI, which may open othe
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from jtqd.daemon.config import HIGHEST_DOMAIN, LOOPBACK
 from jtqd.estimator.checked import ConfigError
 
 NEEDED = "the package cyclonedds: pip install 'jtqd[ros2]'"
 _VARIABLE = "ROS_DOMAIN_ID"
-_ON_LOOPBACK = '<Peers><Peer address="127.0.0.1"/></Peers>'
-"""Nodes whose discovery range is LOCALHOST (ROS 2 from Iron on) do not listen to multicast."""
+_ANNOUNCED_S = 2.0
+"""Between two announcements to the nodes of this machine: for so long a node that is new may have to wait."""
 
 
 def installed() -> bool:
@@ -36,17 +36,27 @@ def domain_id(configured: int | None, environment: Mapping[str, str]) -> int:
     return int(text)
 
 
-def domain_xml(interface: str) -> str:
+def domain_xml(interface: str, addresses: Sequence[str]) -> str:
     """Return Cyclone DDS's configuration for one network interface.
 
-    Each participant of a host has a number of its own, and so ports of its own (`auto`), as in ROS 2: others of the host
-    find it without multicast. 32 is what rmw_cyclonedds looks for.
+    Each participant of a machine has a number of its own, and so ports of its own (`auto`), as in ROS 2, so that others find
+    it without multicast; 32 is rmw_cyclonedds's limit. On loopback this is how nodes are found that use other interfaces,
+    as they do in ROS 2 by default: announcements to this machine's own addresses never leave it. Cyclone DDS 11.0 ignores
+    announcements to 127.0.0.1 where it does not use that interface itself (its pull request 2457).
+
+    Args:
+        interface: its name.
+        addresses: of this machine's interfaces (IPv4).
     """
-    peers = _ON_LOOPBACK if interface == LOOPBACK else ""
+    discovery = (
+        "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
+    )
+    if interface == LOOPBACK:
+        peers = "".join(f'<Peer address="{address}" PruneDelay="inf"/>' for address in addresses)
+        discovery += f"<SPDPInterval>{_ANNOUNCED_S:g}s</SPDPInterval><Peers>{peers}</Peers>"
     return (
         '<CycloneDDS><Domain Id="any">'
         f'<General><Interfaces><NetworkInterface name="{interface}"/></Interfaces></General>'
-        "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
-        f"<MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>{peers}</Discovery>"
+        f"<Discovery>{discovery}</Discovery>"
         "</Domain></CycloneDDS>"
     )

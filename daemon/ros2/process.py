@@ -17,10 +17,12 @@ REQUEST is JSON: {"ring", "snapshot": paths, "domain_id", "interface", "rate_hz"
 
 from __future__ import annotations
 
+import fcntl
 import json
 import math
 import os
 import socket
+import struct
 import sys
 import time
 from collections.abc import Iterator
@@ -59,6 +61,20 @@ _QUANTILES = (0.5, 0.99, 1.0)
 _NICE = 10
 
 
+_SIOCGIFADDR = 0x8915
+
+
+def own_addresses() -> list[str]:
+    """Return the IPv4 addresses of this machine, one per interface that has any."""
+    found = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
+        for _, name in socket.if_nameindex():
+            with suppress(OSError):  # it has none
+                request = struct.pack("256s", name.encode()[:15])
+                found.append(socket.inet_ntoa(fcntl.ioctl(asked, _SIOCGIFADDR, request)[20:24]))
+    return found
+
+
 class Writers:
     """One DDS writer per topic.
 
@@ -71,7 +87,7 @@ class Writers:
     """
 
     def __init__(self, domain_id: int, interface: str) -> None:
-        self._domain = Domain(domain_id, domain_xml(interface))
+        self._domain = Domain(domain_id, domain_xml(interface, own_addresses()))
         # rmw takes a participant without an enclave for none of ROS
         participant = DomainParticipant(domain_id, Qos(Policy.Userdata(b"enclave=/;")))
         self._writers: dict[type[Message], DataWriter[Any]] = {

@@ -2,7 +2,8 @@
 
 Its types come from the .msg files and ROS 2's definitions, made as rmw_cyclonedds makes them: XTypes, final, `byte` as
 uint8. By default it looks for others as that middleware does with ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST. It prints one
-line of JSON for each writer that it discovers and for each message, as they come.
+line of JSON for each writer that it discovers and for each message, as they come. XML may be the name of another of
+`DISCOVERY`.
 """
 
 import json
@@ -23,11 +24,15 @@ from rosbags.interfaces import Nodetype
 
 from tests.daemon.ros2.ros_types import dds_name, types_of
 
-LOCALHOST = (
-    "<CycloneDDS><Domain><General><AllowMulticast>false</AllowMulticast></General><Discovery>"
-    "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
-    '<Peers><Peer address="localhost"/></Peers></Discovery></Domain></CycloneDDS>'
-)
+_AUTO = "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
+DISCOVERY = {
+    "LOCALHOST": "<CycloneDDS><Domain><General><AllowMulticast>false</AllowMulticast></General><Discovery>"
+    f'{_AUTO}<Peers><Peer address="localhost"/></Peers></Discovery></Domain></CycloneDDS>',
+    "SUBNET": f"<CycloneDDS><Domain><Discovery>{_AUTO}</Discovery></Domain></CycloneDDS>",
+    "ROS_LOCALHOST_ONLY": '<CycloneDDS><Domain><General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>'
+    "</General></Domain></CycloneDDS>",
+}
+"""As rmw_cyclonedds configures ROS_AUTOMATIC_DISCOVERY_RANGE (SUBNET is the default), and before it ROS_LOCALHOST_ONLY=1."""
 TOPICS = {
     "rt/joint_states": "sensor_msgs/msg/JointState",
     "rt/joint_torque_states": "jtqd_msgs/msg/JointTorqueState",
@@ -62,9 +67,9 @@ def say(**content):
     print(json.dumps(content), flush=True)
 
 
-def main(domain, seconds=3600.0, xml=LOCALHOST):
+def main(domain, seconds=3600.0, xml="LOCALHOST"):
     domain, end = int(domain), time.monotonic() + float(seconds)
-    own = Domain(domain, xml)
+    own = Domain(domain, DISCOVERY.get(xml, xml))
     participant = DomainParticipant(domain)
     best_effort = Qos(Policy.Reliability.BestEffort)
     reliable = Qos(Policy.Reliability.Reliable(duration(milliseconds=100)), Policy.History.KeepLast(1000))
@@ -72,7 +77,7 @@ def main(domain, seconds=3600.0, xml=LOCALHOST):
         name: DataReader(
             participant,
             Topic(participant, name, struct_of(kind)),
-            best_effort if "torque" in name else reliable,
+            best_effort if "diagnostics" in name else reliable,
         )
         for name, kind in TOPICS.items()
     }
@@ -86,7 +91,8 @@ def main(domain, seconds=3600.0, xml=LOCALHOST):
                 say(writer=each.topic_name, type=each.type_name, qos=policies, data=data)
         for name, reader in readers.items():
             for message in reader.take(100):
-                say(topic=name, at=time.time(), message=plain(message))
+                if hasattr(message, "__idl__"):  # else it says that the last writer is gone
+                    say(topic=name, message=plain(message))
         time.sleep(0.005)
     del own
 

@@ -157,10 +157,14 @@ def test_a_domain_that_is_none_is_refused(text):
         network.domain_id(None, {"ROS_DOMAIN_ID": text})
 
 
-def test_on_loopback_nodes_without_multicast_are_looked_for_as_well():
-    assert 'NetworkInterface name="lo"' in network.domain_xml("lo")
-    assert '<Peer address="127.0.0.1"/>' in network.domain_xml("lo")
-    assert "Peer " not in network.domain_xml("eth0")
+def test_announcements_to_single_addresses_are_for_the_loopback_alone():
+    on_loopback, on_ethernet = (
+        network.domain_xml(name, ["127.0.0.1", "192.0.2.2"]) for name in ("lo", "eth0")
+    )
+    assert 'NetworkInterface name="lo"' in on_loopback
+    assert '<Peer address="127.0.0.1"' in on_loopback
+    assert '<Peer address="192.0.2.2"' in on_loopback
+    assert "Peer " not in on_ethernet
 
 
 def test_section_of_the_configuration(tmp_path):
