@@ -190,17 +190,20 @@ def main(arguments: list[str] | None = None) -> int:
         os.nice(_NICE)
     domain_id, interface, rate_hz = request["domain_id"], request["interface"], request["rate_hz"]
     where = f"domain {domain_id}, interface {interface}"
-    if interface not in (name for _, name in socket.if_nameindex()):
-        answer(failed=f"{where}: there is no such network interface")
-        return 1
     try:
         source = Source(request)
+        if interface not in (name for _, name in socket.if_nameindex()):
+            answer(failed=f"{where}: there is no such network interface")
+            return 1
         writers = Writers(domain_id, interface)
+    except (RingError, SnapshotError) as error:
+        answer(failed=str(error))
+        return 1
+    except OSError as error:  # a service whose unit forbids them
+        answer(failed=f"{where}: no network sockets: {error.strerror or error}")
+        return 1
     except DDSException as error:
         answer(failed=f"{where}: Cyclone DDS: {error.msg or error}")
-        return 1
-    except (RingError, SnapshotError, OSError) as error:
-        answer(failed=str(error))
         return 1
     answer(publishing=f"/{', /'.join(TOPICS.values())} at {rate_hz:g} Hz, {where}")
     try:

@@ -160,6 +160,19 @@ def test_an_interface_that_is_not_there_is_said(memory):
         assert publisher.process.wait(5) == 1
 
 
+def test_a_unit_that_forbids_network_sockets_is_said(memory):
+    forbidden = (
+        "import socket, sys\n"
+        "def refused(*_): raise OSError(97, 'Address family not supported by protocol')\n"
+        "socket.if_nameindex = refused\n"
+        "from jtqd.daemon.ros2.process import main\n"
+        "sys.exit(main([sys.argv[1]]))"
+    )
+    with Process("-c", forbidden, _request(memory)) as publisher:
+        assert "no network sockets: Address family not supported by protocol" in publisher.first()["failed"]
+        assert publisher.process.wait(5) == 1
+
+
 def test_without_a_loop_it_says_so(memory):
     with Process("-m", "jtqd.daemon.ros2.process", _request(memory, ring="/none")) as publisher:
         assert "/none" in publisher.first()["failed"]
