@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import platform
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -125,7 +126,7 @@ def _run(arguments: argparse.Namespace, stop_requests: list[int]) -> int:
         wants_ros2 = arguments.ros2 or config.ros2 is not None
         if wants_ros2 and not ros2.installed():
             who = "--ros2" if arguments.ros2 else f"{config.path}: key 'ros2':"
-            print(f"jtqd: {who} needs {ros2.NEEDED}", file=sys.stderr)
+            print(f"jtqd: {who} needs {ros2.needed(platform.machine())}", file=sys.stderr)
             return 1
         supervisor = Supervisor(
             config,

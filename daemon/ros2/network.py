@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from jtqd.daemon.config import HIGHEST_DOMAIN, LOOPBACK
 from jtqd.estimator.checked import ConfigError
 
-NEEDED = "the package cyclonedds: pip install 'jtqd[ros2]'"
+_WHEELS_FOR = "x86_64"
 _VARIABLE = "ROS_DOMAIN_ID"
 _ANNOUNCED_S = 2.0
 """Between two announcements to the nodes of this machine: for so long a node that is new may have to wait."""
@@ -20,6 +20,15 @@ _ANNOUNCED_S = 2.0
 def installed() -> bool:
     """Return whether the package that the publisher needs is installed."""
     return importlib.util.find_spec("cyclonedds") is not None
+
+
+def needed(machine: str) -> str:
+    """Return what is missing and how it is installed, for a machine as `platform.machine` names it."""
+    if machine == _WHEELS_FOR:
+        return "the package cyclonedds: pip install 'jtqd[ros2]'"
+    return (
+        f"the package cyclonedds, of which there is no wheel for {machine}: docs/ros2.md says how it is built"
+    )
 
 
 def domain_id(configured: int | None, environment: Mapping[str, str]) -> int:

@@ -238,6 +238,7 @@ class Supervisor:
         """Set as long as nodes that we have started are on the bus."""
         self._load = checked_load(config)
         self._log_directory = log_directory(record)
+        self._ros2 = Ros2Keeper(self._child, config.ros2 or Ros2Settings()) if ros2 else None
         try:
             self._directory, self._lock = claim(bus)
         except BlockingIOError as error:
@@ -252,7 +253,6 @@ class Supervisor:
         self._children: list[Child] = []
         self._recorder = Keeper(self._child, self._directory, self._snapshot)
         self._live = None if live is None else LiveKeeper(self._child, live)
-        self._ros2 = Ros2Keeper(self._child, config.ros2 or Ros2Settings()) if ros2 else None
         self._log = OperatorLog()
         self._log_event = EventLog(self._log)
         self._conditions = Conditions()

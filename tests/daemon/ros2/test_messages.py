@@ -157,6 +157,11 @@ def test_a_domain_that_is_none_is_refused(text):
         network.domain_id(None, {"ROS_DOMAIN_ID": text})
 
 
+def test_where_no_wheel_is_it_says_so():
+    assert network.needed("x86_64") == "the package cyclonedds: pip install 'jtqd[ros2]'"
+    assert "no wheel for aarch64: docs/ros2.md" in network.needed("aarch64")
+
+
 def test_announcements_to_single_addresses_are_for_the_loopback_alone():
     on_loopback, on_ethernet = (
         network.domain_xml(name, ["127.0.0.1", "192.0.2.2"]) for name in ("lo", "eth0")

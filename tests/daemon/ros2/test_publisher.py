@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import platform
 import re
 import signal
 import sys
@@ -258,6 +259,7 @@ def test_other_gear_ratios_restart_it(kept):
 
 def test_without_the_package_the_daemon_refuses_in_one_line(monkeypatch, capsys, tmp_path):
     monkeypatch.setitem(sys.modules, "cyclonedds", None)
+    monkeypatch.setattr(platform, "machine", lambda: "x86_64")
     assert jtqd.main(["--bus", "sim", "--record", "none", "--ros2"]) == 1
     said = capsys.readouterr()
     assert said.err == "jtqd: --ros2 needs the package cyclonedds: pip install 'jtqd[ros2]'\n"
@@ -270,10 +272,12 @@ def test_without_the_package_the_daemon_refuses_in_one_line(monkeypatch, capsys,
     assert capsys.readouterr().err == key
 
 
-def test_a_domain_that_is_none_is_refused_with_status_2(monkeypatch, capsys):
+def test_a_domain_that_is_none_is_refused_with_status_2(monkeypatch, capsys, tmp_path):
     monkeypatch.setenv("ROS_DOMAIN_ID", "many")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     assert jtqd.main(["--bus", "sim", "--record", "none", "--ros2"]) == 2
     assert "jtqd: ROS_DOMAIN_ID: found 'many'" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_whole_daemon(tmp_path):
