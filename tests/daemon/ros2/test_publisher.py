@@ -8,8 +8,10 @@ import re
 import signal
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 
@@ -280,6 +282,16 @@ def test_a_domain_that_is_none_is_refused_with_status_2(monkeypatch, capsys, tmp
     assert not list(tmp_path.iterdir())
 
 
+def publisher_of(directory):
+    """Process-ID of the publisher that reads this directory."""
+    for entry in filter(str.isdigit, os.listdir("/proc")):
+        with suppress(OSError):  # it has just ended
+            line = Path(f"/proc/{entry}/cmdline").read_bytes()
+            if b"jtqd.daemon.ros2.process" in line and str(directory).encode() in line:
+                return int(entry)
+    raise AssertionError("there is no publisher")
+
+
 def test_a_whole_daemon(tmp_path):
     """The emulated bench: torques arrive, the publisher is killed and comes back, the loop misses nothing for it."""
     environment = {
@@ -292,14 +304,7 @@ def test_a_whole_daemon(tmp_path):
         states = reader.wait_for("joint_torque_states", 20, timeout_s=60)
         assert states[-1]["name"] == ["joint_1", "joint_2"]
         assert all(0.0 < state["age"] < 0.1 for state in states[10:])
-        mine = b"jtqd.daemon.ros2.process"
-        (pid,) = (
-            int(entry)
-            for entry in os.listdir("/proc")
-            if entry.isdigit()
-            and mine in (line := open(f"/proc/{entry}/cmdline", "rb").read())  # noqa: SIM115
-            and str(tmp_path).encode() in line
-        )
+        pid = publisher_of(tmp_path)
         os.kill(pid, signal.SIGKILL)
         count = len(reader.messages("joint_torque_states"))
         reader.wait_for("joint_torque_states", count + 5)
