@@ -46,9 +46,11 @@ def test_texts_do_not_overlap(close: bool) -> None:
         if text.get_visible() and text.get_text().strip() and text not in beyond
     ]
     boxes = [(text.get_text(), text.get_window_extent()) for text in texts]
+    panels = [axes for axes in figure.axes if "plateaus" in axes.get_title(loc="left")]
+    edges = {axes.get_title(loc="left"): axes.get_window_extent().x1 for axes in panels}
     plt.close(figure)
-    titles = [text for text, _ in boxes if "plateaus" in text]
-    assert len(titles) == 4
+    assert len(edges) == 4
+    assert all(box.x1 <= edges.get(text, box.x1) for text, box in boxes), "a title beyond its panel"
     width, height = figure.get_size_inches() * figure.dpi
     for text, box in boxes:
         assert -1 <= box.x0 <= box.x1 <= width + 1, text
