@@ -94,7 +94,7 @@ def parser() -> argparse.ArgumentParser:
         type=Path,
         required=True,
         metavar="DIR",
-        help="joint1.yaml, joint1.onnx (the paper's network), joint1.fused.onnx (ours), and so on for each joint",
+        help="joint1.yaml (or joint_1.yaml), joint1.onnx (the paper's network), joint1.fused.onnx (ours); so for each joint",
     )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="directory of the report; created if missing"

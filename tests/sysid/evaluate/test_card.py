@@ -151,6 +151,7 @@ def test_the_command_writes_page_pictures_and_values(
     base = tmp_path
     write_models(base / "models")
     (base / "models" / "joint2.yaml").unlink()
+    (base / "models" / "joint1.yaml").rename(base / "models" / "joint_1.yaml")  # as jtq init names it
     (base / "models" / "joint1.fused.onnx").unlink()
     (base / "runs").mkdir()
     for day in range(2):
@@ -172,6 +173,9 @@ def test_the_command_writes_page_pictures_and_values(
     picture = (base / "out" / "card_joint1.png").read_bytes()
     assert picture.startswith(b"\x89PNG")
     assert not (base / "out" / "evaluation.html").exists()
+    (base / "models" / "joint1.yaml").write_bytes((base / "models" / "joint_1.yaml").read_bytes())
+    assert main([*arguments, "--card"]) == 1
+    assert "found joint_1.yaml and joint1.yaml, expected one" in capsys.readouterr().err
     with pytest.raises(SystemExit) as refused:
         main([*arguments, "--card", "--outside", str(base / "runs")])
     assert refused.value.code == 2
