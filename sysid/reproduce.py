@@ -150,10 +150,10 @@ def steps(out: Path, bus: str, quick: bool, seed: int, plant: Path | None = None
     common = ("--bus", bus, "--seed", str(seed))
     sizes = {
         "efficiency": ("--quick",) if quick else ("--hold", "1.2"),
-        "excitation": ("--runs", "8", "--seconds", "10", "--evaluations", "160")
+        "excitation": ("--runs", "8", "--seconds", "6", "--evaluations", "160")
         if quick
         else ("--runs", "96", "--seconds", "12", "--evaluations", "400"),
-        "validate": ("--runs", "4", "--seconds", "6", "--hold", "1.0")
+        "validate": ("--runs", "2", "--seconds", "6", "--hold", "1.0")
         if quick
         else ("--runs", "96", "--seconds", "8", "--hold", "1.6"),
     }
@@ -178,7 +178,7 @@ def steps(out: Path, bus: str, quick: bool, seed: int, plant: Path | None = None
             ("fit", "losses", str(runs / "excitation"), "--joint", str(fitted), *number, "--out", str(last))
         )
     joints = ("--joint", str(models / "joint1.yaml"), "--joint", str(models / "joint2.yaml"))
-    short = ("--iterations", "60") if quick else ()
+    short = ("--iterations", "30") if quick else ()
     for network in ("paper", "ours"):
         yield Step(
             ("train", str(runs / "excitation"), *joints, "--network", network, "--seed", str(seed),

@@ -39,7 +39,7 @@ def main(argv: list[str]) -> int:
         )
     missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
     if missing:
-        print(f"{BY}: {', '.join(missing)} not installed: pip install 'jtqd[train]'", file=sys.stderr)
+        print(f"{BY}: {', '.join(missing)} not installed: pip install 'jtqd[analysis]'", file=sys.stderr)
         return 1
     try:
         models = load_models(options.models, options.joint)
