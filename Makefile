@@ -1,4 +1,5 @@
 # make demo    set up and run the daemon for 20 s on the emulated bench
+# make hidden-effect   hide a physical effect in the emulated bench and find its name
 # make test    set up, check the style, lint, type-check and run every test but the long ones; CI runs this
 # Variables: PYTHON (interpreter for the virtual environment)
 
@@ -8,7 +9,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo dist deb test test-here test-hidden test-guest test-native test-sanitized test-all bench bench-kernel fuzz soak soak-exact lint format clean
+.PHONY: help setup demo hidden-effect dist deb test test-here test-hidden test-guest test-native test-sanitized test-all bench bench-kernel fuzz soak soak-exact lint format clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
@@ -17,6 +18,9 @@ setup: $(VENV)/.installed-dev ## .venv with the development tools
 
 demo: $(VENV)/.installed ## 20 s of jtqd on the emulated bench
 	$(BIN)/jtqd --bus sim --duration 20
+
+hidden-effect: $(VENV)/.installed-analysis ## hide an effect in the emulated bench and find it, without a bus: hidden/
+	$(BIN)/python -m examples.hidden_effect --effect torque_constant --bus none --out hidden --picture hidden/before_after.png
 
 test: lint ## everything but the tests marked campaign
 	$(BIN)/python -m jtqd.sim_can.bench_kernel build --unless-vcan
@@ -103,6 +107,11 @@ COMPILED := $(shell find daemon drivers estimator models sim_can sysid -name '*.
 $(VENV)/.installed: pyproject.toml setup.py $(COMPILED) $(VENV)/.created
 	@echo "installing jtqd into $(VENV)"
 	@$(PIP) install -e .
+	@touch $@
+
+$(VENV)/.installed-analysis: pyproject.toml $(VENV)/.installed
+	@echo "installing scipy and matplotlib"
+	@$(BIN)/python .ci/extras analysis > $(VENV)/analysis.txt && $(PIP) install -r $(VENV)/analysis.txt
 	@touch $@
 
 $(VENV)/.installed-dev: pyproject.toml $(VENV)/.installed

@@ -1,5 +1,6 @@
 """Hide an effect in the emulated bench, find it over the bus, and measure what the extended model gains in jtqd.
 
+    python -m examples.hidden_effect --effect torque_constant --bus none --out DIR --picture hidden.png
     python -m examples.hidden_effect --effect torque_constant --out DIR
     python -m jtqd.sim_can.bench_kernel run --time-travel --out DIR -- \\
         python -m examples.hidden_effect --effect torque_constant --bus sim:vcan0 --out DIR
@@ -16,6 +17,7 @@ The secret bench differs from the nominal joint files by one effect of joint 1 a
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import math
 import subprocess
@@ -44,6 +46,8 @@ from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Plan
 from jtqd.sysid.campaign.plans import variable_runs
 from jtqd.sysid.fit.joint_writer import write_joint
 from jtqd.sysid.measured.bus import published_torque, reference_torque, sync_time
+from jtqd.sysid.report.figures import STYLE, check_picture
+from jtqd.sysid.report.page import LIGHT
 from jtqd.sysid.runs.files import RunError, read_run, write_run
 
 NUMBERS: Final = (1, 2)
@@ -59,6 +63,7 @@ NO_BUS: Final = "none"
 _FINDINGS: Final = 3
 _STDERR: Final = 2
 _METHODS: Final = ("efficiency", "tob")
+_NEEDED: Final = ("scipy", "matplotlib", "jinja2")
 Row = tuple[str, float, float]
 """Label of an error, and its value before and after [Nm]."""
 
@@ -172,12 +177,78 @@ def _log_errors(log: Path, number: int, bandwidth_rad_s: float) -> FloatArray:
     return np.asarray(error[on & (state["status"] == VALID) & np.isfinite(error)], np.float64)
 
 
+def draw(path: Path, run_file: Path, result: Mapping[str, Any], extended: Path, method: str) -> None:
+    """Draw the estimate of one fresh run with the nominal and with the extended joint file, and their errors.
+
+    Needs matplotlib. Raises RunError, ConfigError, OSError.
+    """
+    import matplotlib as mpl
+
+    mpl.use("Agg")  # files only; a display is not needed
+    from matplotlib import pyplot as plt
+
+    table, settings = read_run(run_file).table, EstimatorSettings(method=method)
+    joints = {"before": load_joint(nominal_file(SECRET_JOINT)), "after": load_joint(extended)}
+    found = next(iter(result["causes"]), None)
+    named = "nothing" if found is None else f"{' or '.join(found['class'])} of joint {found['joint']}"
+    with mpl.rc_context(STYLE | {"savefig.facecolor": LIGHT["paper"], "font.size": 9.0}):
+        figure, (above, below) = plt.subplots(
+            2, 1, figsize=(9.0, 4.2), sharex=True, layout="constrained", height_ratios=(1.3, 1.0)
+        )
+        for name, joint in joints.items():
+            columns = table.joint(SECRET_JOINT, joint.gear_ratio)
+            assert columns.torque_nm is not None
+            steps = np.diff(table.time_s, prepend=table.time_s[0])
+            sensor = low_pass(columns.torque_nm, steps, settings.bandwidth_rad_s)
+            estimate = estimate_columns(joint, settings, None, table.time_s, columns)
+            moving = np.where(estimate.status == VALID, 1.0, np.nan)
+            error = (estimate.torque_nm - sensor) * moving
+            label = f"{name}: {float(np.sqrt(np.nanmean(error**2))):.2f} Nm rms"
+            if name == "before":
+                above.plot(table.time_s, sensor, color=LIGHT["ink"], linewidth=1.2, label="torque sensor")
+            above.plot(
+                table.time_s,
+                estimate.torque_nm * moving,
+                color=LIGHT[name],
+                linewidth=0.9,
+                label=f"{name} the diagnosis",
+            )
+            below.plot(table.time_s, error, color=LIGHT[name], linewidth=0.8, label=label)
+        above.set_title(
+            f"hidden: {result['hidden']['name']} of joint {SECRET_JOINT}; found: {named}",
+            loc="left",
+            fontsize=11,
+        )
+        above.set_ylabel("joint torque [Nm]")
+        below.set_ylabel("estimate - sensor [Nm]")
+        below.set_xlabel("time of a run that the diagnosis has not seen [s]")
+        below.axhline(0.0, color=LIGHT["soft"], linewidth=0.6)
+        for axis in (above, below):
+            axis.margins(x=0)
+            axis.legend(loc="upper left", bbox_to_anchor=(1.005, 1.0), frameon=False)
+        figure.savefig(path, dpi=110)
+        plt.close(figure)
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run all steps and print the table; exit status 0 done, 1 failure, 2 usage."""
     options = _parser().parse_args(arguments)
+    missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
+    if missing:
+        print(
+            f"hidden_effect: {', '.join(missing)} not installed: pip install 'jtqd[analysis]'",
+            file=sys.stderr,
+        )
+        return 1
     try:
         options.out.mkdir(parents=True, exist_ok=True)
+        if options.picture is not None:
+            check_picture(options.picture)
         result = run(options)
+        if options.picture is not None:
+            fresh = sorted((options.out / "fresh_nominal").glob("*.csv.gz"))[0]
+            extended = options.out / "diagnosis" / f"extended.joint{SECRET_JOINT}.yaml"
+            draw(options.picture, fresh, result, extended, options.method)
     except (StepError, ConfigError, RunError, LogError) as error:
         print(f"hidden_effect: {error}", file=sys.stderr)
         return 1
@@ -333,6 +404,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--fresh-runs", type=count, default=4, metavar="N", help="fresh runs (default 4)")
     add("--seconds", type=seconds, default=16.0, metavar="S", help="length of a run (default 16)")
     add("--seed", type=natural, default=0, help="of motions, days and noise (default 0)")
+    add("--picture", type=Path, metavar="FILE", help="draw the estimate before and after (png, svg)")
     add("--json", action="store_true", help="print the result as JSON")
     return parser
 

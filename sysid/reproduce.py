@@ -37,7 +37,7 @@ TRAINED: Final = "trained"
 """Folder in models/ with what this command has made; beside the configuration in a directory of its own."""
 _EXAMPLES: Final = """examples:
   jtq reproduce --out reproduction            everything, about 85 minutes, of which 41 are motion of the bench
-  jtq reproduce --out /tmp/quick --quick      the same steps in a few minutes, with too few runs for good figures
+  jtq reproduce --out /tmp/quick --quick      the same steps with shorter runs, too few for good figures
   jtq reproduce --plant models/plants/typical.yaml --out typical     another bench, without a bus"""
 
 
@@ -150,10 +150,10 @@ def steps(out: Path, bus: str, quick: bool, seed: int, plant: Path | None = None
     common = ("--bus", bus, "--seed", str(seed))
     sizes = {
         "efficiency": ("--quick",) if quick else ("--hold", "1.2"),
-        "excitation": ("--runs", "8", "--seconds", "10", "--evaluations", "160")
+        "excitation": ("--runs", "8", "--seconds", "8", "--evaluations", "160")
         if quick
         else ("--runs", "96", "--seconds", "12", "--evaluations", "400"),
-        "validate": ("--runs", "4", "--seconds", "6", "--hold", "1.0")
+        "validate": ("--runs", "2", "--seconds", "6", "--hold", "1.0")
         if quick
         else ("--runs", "96", "--seconds", "8", "--hold", "1.6"),
     }
@@ -178,7 +178,7 @@ def steps(out: Path, bus: str, quick: bool, seed: int, plant: Path | None = None
             ("fit", "losses", str(runs / "excitation"), "--joint", str(fitted), *number, "--out", str(last))
         )
     joints = ("--joint", str(models / "joint1.yaml"), "--joint", str(models / "joint2.yaml"))
-    short = ("--iterations", "60") if quick else ()
+    short = ("--iterations", "30") if quick else ()
     for network in ("paper", "ours"):
         yield Step(
             ("train", str(runs / "excitation"), *joints, "--network", network, "--seed", str(seed),

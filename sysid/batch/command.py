@@ -60,7 +60,7 @@ def main(argv: list[str]) -> int:
     """Run a batch; returns the exit status."""
     options = parser().parse_args(argv)
     if importlib.util.find_spec("jinja2") is None:
-        return _error("jinja2 is not installed: pip install 'jtqd[train]'")
+        return _error("jinja2 is not installed: pip install 'jtqd[analysis]'")
     try:
         groups, active = find_groups(
             options.logs, options.group_by or _GROUP_BY[options.command], _KINDS[options.command]

@@ -49,7 +49,7 @@ def main(argv: list[str]) -> int:
     options = parser().parse_args(argv)
     missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
     if missing:
-        print(f"{BY}: {', '.join(missing)} not installed: pip install 'jtqd[train]'", file=sys.stderr)
+        print(f"{BY}: {', '.join(missing)} not installed: pip install 'jtqd[analysis]'", file=sys.stderr)
         return 1
     try:
         columns = None if options.columns is None else ColumnMap.load(options.columns)

@@ -8,16 +8,18 @@ import importlib.util
 import json
 import os
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from jtqd.estimator.checked import ConfigError, make_directory
 from jtqd.estimator.onnx_graph import NetworkError
+from jtqd.sysid.evaluate.card import BASELINE, Card, make_card, method_of
 from jtqd.sysid.evaluate.evaluation import Evaluation, evaluate
 from jtqd.sysid.evaluate.inputs import Inputs, read_inputs
 from jtqd.sysid.evaluate.loop_time import loop_time
-from jtqd.sysid.evaluate.methods import JointModels, load_models
+from jtqd.sysid.evaluate.methods import JointModels, load_models, take_samples
 from jtqd.sysid.evaluate.report import as_mapping, text_lines
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.checks import RunIssue
@@ -29,10 +31,15 @@ _NEEDED: Final = ("matplotlib", "jinja2", "onnx")
 
 def main(argv: list[str]) -> int:
     """Evaluate and write; exit status 0 done, 1 failure (a trained-on run included), 2 usage, 3 done with findings."""
-    options = parser().parse_args(argv)
+    arguments = parser()
+    options = arguments.parse_args(argv)
+    if options.card and options.outside:
+        arguments.error(
+            "--card: found --outside as well, expected all runs as RUNS: the card sorts them by load"
+        )
     missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
     if missing:
-        print(f"{BY}: {', '.join(missing)} not installed: pip install 'jtqd[train]'", file=sys.stderr)
+        print(f"{BY}: {', '.join(missing)} not installed: pip install 'jtqd[analysis]'", file=sys.stderr)
         return 1
     try:
         models = load_models(options.models, options.joint)
@@ -40,6 +47,8 @@ def main(argv: list[str]) -> int:
         inputs = read_inputs(options.runs, models, options.columns)
         if not inputs.runs and inputs.findings:
             raise RunError("\n".join(finding.text for finding in inputs.findings))
+        if options.card:
+            return _card(options, models, inputs)
         outside = Inputs((), (), ())
         if options.outside:
             outside = read_inputs(options.outside, models, options.columns)
@@ -66,7 +75,8 @@ def parser() -> argparse.ArgumentParser:
         epilog=(
             "examples:\n"
             "  jtq evaluate campaigns/validate --models models --out report\n"
-            "  jtq evaluate campaigns/validate --models models --outside campaigns/outside --out report --json\n\n"
+            "  jtq evaluate campaigns/validate --models models --outside campaigns/outside --out report --json\n"
+            "  jtq evaluate my_runs --models arm --card --out card\n\n"
             "DIR/evaluation.html is the report, DIR/evaluation.json the same for programs. Exit status: 0 done; 1 failure,\n"
             "or a training run of a model was given; 2 usage; 3 done, but a run was left out or there are findings."
         ),
@@ -84,7 +94,7 @@ def parser() -> argparse.ArgumentParser:
         type=Path,
         required=True,
         metavar="DIR",
-        help="joint1.yaml, joint1.onnx (the paper's network), joint1.fused.onnx (ours), and so on for each joint",
+        help="joint1.yaml (or joint_1.yaml), joint1.onnx (the paper's network), joint1.fused.onnx (ours); so for each joint",
     )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="directory of the report; created if missing"
@@ -108,6 +118,12 @@ def parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--columns", type=Path, metavar="FILE", help="column map for other names, units and signs"
+    )
+    parser.add_argument(
+        "--card",
+        action="store_true",
+        help="instead of the comparison: accuracy of the best method of each joint by speed, load and temperature, and "
+        "what to measure next (card.html, card.json, card_jointN.png)",
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON instead of the table")
     return parser
@@ -136,22 +152,71 @@ def _silent(models: tuple[JointModels, ...]) -> list[RunIssue]:
     ]
 
 
+def _card(options: argparse.Namespace, models: tuple[JointModels, ...], inputs: Inputs) -> int:
+    """Write card.json, card.html and a picture per joint; the card on standard output. Returns the exit status."""
+    from jtqd.sysid.evaluate.card_figure import write_png
+    from jtqd.sysid.evaluate.card_page import card_html, card_lines, card_mapping
+
+    cards: list[Card] = []
+    findings = [*_silent(models), *inputs.findings]
+    for each in models:
+        method = method_of(each)
+        one = replace(each, methods=tuple(dict.fromkeys((BASELINE, method))))
+        samples = [
+            take_samples(run.name, one, run.table.time_s, run.columns[each.number])
+            for run in progress(inputs.runs, f"estimating joint {each.number}")
+            if each.number in run.columns
+        ]
+        card = make_card(samples, each.joint, method)
+        if card is None:
+            findings.append(
+                RunIssue(
+                    "nothing_to_score", f"j{each.number}: found no sample in motion with a value: no card"
+                )
+            )
+        else:
+            cards.append(card)
+    if not cards:
+        raise RunError("\n".join(finding.text for finding in findings))
+    mapping = card_mapping(cards, findings)
+    text = json.dumps(mapping, indent=1, allow_nan=False)
+    files = {each.number: each.files for each in models}
+    _write_whole(
+        options.out, {"card.json": f"{text}\n", "card.html": card_html(cards, files, findings, _made())}
+    )
+    for card in cards:
+        write_png(card, options.out / f"card_joint{card.number}.png")
+    lines = [line for card in cards for line in (*card_lines(card), "")]
+    lines += [f"{each.kind}: {each.text}" for each in findings]
+    print(text if options.json else "\n".join(lines).rstrip())
+    for note in inputs.notes:
+        print(f"{BY}: {note}", file=sys.stderr)
+    print(f"{BY}: wrote {options.out / 'card.html'}", file=sys.stderr)
+    return 3 if findings else 0
+
+
 def _write(options: argparse.Namespace, result: Evaluation) -> None:
-    """evaluation.json and evaluation.html, each whole or not at all; then the table or the JSON on standard output."""
+    """evaluation.json and evaluation.html; then the table or the JSON on standard output."""
     from jtqd.sysid.evaluate.report import report_html
 
     mapping = as_mapping(result)
     text = json.dumps(mapping, indent=1, allow_nan=False)
-    made = f"{BY}, {dt.datetime.now().astimezone():%Y-%m-%d %H:%M}"
-    for name, content in (
-        ("evaluation.json", f"{text}\n"),
-        ("evaluation.html", report_html(result, mapping, made)),
-    ):
-        temporary = options.out / f".{name}.part"
-        try:
-            temporary.write_text(content, encoding="utf-8")
-            os.replace(temporary, options.out / name)
-        finally:
-            temporary.unlink(missing_ok=True)
+    page = report_html(result, mapping, _made())
+    _write_whole(options.out, {"evaluation.json": f"{text}\n", "evaluation.html": page})
     print(text if options.json else "\n".join(text_lines(result, mapping)))
     print(f"{BY}: wrote {options.out / 'evaluation.html'}", file=sys.stderr)
+
+
+def _made() -> str:
+    return f"{BY}, {dt.datetime.now().astimezone():%Y-%m-%d %H:%M}"
+
+
+def _write_whole(directory: Path, contents: Mapping[str, str]) -> None:
+    """Write files by their names, each whole or not at all."""
+    for name, content in contents.items():
+        temporary = directory / f".{name}.part"
+        try:
+            temporary.write_text(content, encoding="utf-8")
+            os.replace(temporary, directory / name)
+        finally:
+            temporary.unlink(missing_ok=True)

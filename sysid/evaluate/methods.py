@@ -1,8 +1,9 @@
 """Load the methods that are compared from a directory of models, and estimate one joint of a run with each.
 
-DIR holds jointN.yaml (joint file), jointN.onnx (the paper's network) and jointN.fused.onnx (ours). What is missing
-leaves its methods out, by name. Joint files name the runs that they were made from in `provenance` (every mapping of a
-section's `sha256`), networks in the metadata key `runs` and in a card jointN.json or jointN.fused.json beside them.
+DIR holds jointN.yaml or joint_N.yaml (joint file; the second as `jtq init` writes it), jointN.onnx (the paper's network)
+and jointN.fused.onnx (ours). What is missing leaves its methods out, by name. Joint files name the runs that they were made
+from in `provenance` (every mapping of a section's `sha256`), networks in the metadata key `runs` and in a card jointN.json
+or jointN.fused.json beside them.
 
 Only samples at which all methods move and have a value are scored, the same ones for each: a method must not look better
 because it was silent where the others were wrong.
@@ -181,21 +182,27 @@ def load_models(directory: Path, numbers: Sequence[int] = ()) -> tuple[JointMode
         raise ConfigError(
             f"--models {directory}: found no directory, expected one with joint1.yaml, joint1.onnx, ..."
         )
-    there = sorted(
-        int(match.group(1))
-        for path in directory.iterdir()
-        if (match := re.fullmatch(r"joint(\d)\.yaml", path.name))
-    )
+    there: dict[int, Path] = {}
+    for path in sorted(directory.iterdir()):
+        match = re.fullmatch(r"joint_?(\d)\.yaml", path.name)
+        if match is None:
+            continue
+        number = int(match.group(1))
+        if number in there:
+            raise ConfigError(
+                f"--models {directory}: found {path.name} and {there[number].name}, expected one of them"
+            )
+        there[number] = path
     absent = [number for number in numbers if number not in there]
     if absent or not there:
         wanted = " and ".join(f"joint{number}.yaml" for number in absent) or "joint1.yaml"
-        have = ", ".join(f"joint{number}.yaml" for number in there) or "no joint file"
+        have = ", ".join(there[number].name for number in sorted(there)) or "no joint file"
         raise ConfigError(f"--models {directory}: found {have}, expected {wanted}")
-    return tuple(_joint_models(directory, number) for number in (sorted(set(numbers)) or there))
+    return tuple(_joint_models(there[number], number) for number in sorted(set(numbers) or there))
 
 
-def _joint_models(directory: Path, number: int) -> JointModels:
-    path = directory / f"joint{number}.yaml"
+def _joint_models(path: Path, number: int) -> JointModels:
+    directory = path.parent
     joint = load_joint(path)
     files = {path.name: hashlib.sha256(path.read_bytes()).hexdigest()}
     training = joint_training_runs(path.name, joint)

@@ -51,7 +51,7 @@ def as_mapping(result: Evaluation) -> dict[str, Any]:
         if result.picture is None
         else {"run": result.picture.run, "number": result.picture.number},
     }
-    plain: dict[str, Any] = _plain(mapping)
+    plain: dict[str, Any] = plain_values(mapping)
     return plain
 
 
@@ -182,14 +182,14 @@ def _truth(truth: TruthTables) -> dict[str, Any]:
     }
 
 
-def _plain(value: Any) -> Any:
+def plain_values(value: Any) -> Any:
     """Named tuples and mappings as dicts with text keys, sequences as lists, numbers that are not finite as None."""
     if hasattr(value, "_asdict"):
         value = value._asdict()
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain_values(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain_values(item) for item in value]
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     return value

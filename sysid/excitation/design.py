@@ -68,7 +68,7 @@ def minimise(criterion: Criterion, dimension: int, *, evaluations: int, rng: np.
     try:
         from scipy.optimize import differential_evolution
     except ImportError:
-        raise ConfigError("excitation design: scipy is not installed: pip install 'jtqd[train]'") from None
+        raise ConfigError("excitation design: scipy is not installed: pip install 'jtqd[analysis]'") from None
     generations = max(2, int((1.0 - POLISHING) * evaluations) // POPULATION)
     evolved = differential_evolution(
         lambda genomes: criterion(genomes.T),

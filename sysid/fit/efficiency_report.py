@@ -206,12 +206,25 @@ _RATIOS: Final = {"joint_over_motor": "τ_j / (G Kt i)", "motor_over_joint": "G 
 MOST_CURVES: Final = 8
 """As many velocities as the paper has; of more, this many are drawn as curves, evenly chosen. Points are all drawn."""
 
+_TICK: Final = 0.04
+"""Of the bar's length: room of one velocity."""
+
 
 def draw_fit(points: Sequence[EtaPoint], fit: EfficiencyFit, title: str, path: Path) -> None:
     """Draw the measured points and the fit to `path` (png, svg, pdf by its ending). Needs matplotlib."""
     import matplotlib as mpl
 
     mpl.use("Agg")  # files only; a display is not needed
+    from matplotlib import pyplot as plt
+
+    figure = fit_figure(points, fit, title)
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
+
+
+def fit_figure(points: Sequence[EtaPoint], fit: EfficiencyFit, title: str) -> Any:
+    """Return the figure of `draw_fit`: a panel per quadrant, of two lines each above it."""
+    import matplotlib as mpl
     from matplotlib import pyplot as plt
 
     speeds = [abs(point.plateau.velocity.value) for point in points]
@@ -233,11 +246,10 @@ def draw_fit(points: Sequence[EtaPoint], fit: EfficiencyFit, title: str, path: P
         mpl.cm.ScalarMappable(norm, colours), ax=axes, label="|ω_m| / G [rad/s]", pad=0.015, aspect=40
     )
     groups = _groups(speeds)
-    if len(groups) <= 2 * MOST_CURVES:
+    if float(np.min(np.diff([0.0, *groups]))) >= _TICK * max(groups):
         bar.set_ticks(groups, labels=[f"{speed:.1f}" for speed in groups])
     figure.suptitle(title, fontsize=13, x=0.01, ha="left")
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
+    return figure
 
 
 def _panel(axis: Any, points: Sequence[EtaPoint], fit: EfficiencyFit, name: str, colour: Any) -> None:
@@ -278,8 +290,8 @@ def _panel_title(fit: EfficiencyFit, name: str, count: int) -> str:
     text = TITLES[name].replace("w", "ω_m", 1)
     if name in fit.quadrants:
         paper = f" (paper {getattr(TABLE_I, name).rmse:.4f})" if fit.convention == TABLE_I.convention else ""
-        return f"{text}; {count} plateaus, RMSE {fit.quadrants[name].rmse:.4f}{paper}"
-    return f"{text}; {count} plateaus, not fitted"
+        return f"{text}\n{count} plateaus, RMSE {fit.quadrants[name].rmse:.4f}{paper}"
+    return f"{text}\n{count} plateaus, not fitted"
 
 
 def _groups(speeds: Sequence[float]) -> list[float]:

@@ -26,7 +26,7 @@ NOT_HERE = {
     "sudo ip link set can0 txqueuelen 1000 up": "other tests use the interface",
     "jtq sim --bus vcan0 --profile rest": "started by the fixture",
 }
-FINDINGS = {"jtq doctor": {0, 1, 3}, "jtq check": {0, 3}, "jtq diagnose": {0, 3}}
+FINDINGS = {"jtq doctor": {0, 1, 3}, "jtq check": {0, 3}, "jtq diagnose": {0, 3}, "jtq evaluate": {0, 3}}
 """Exit statuses that are fine; 0 alone for all others. The guest is no good machine, which `doctor` rightly says."""
 IN_A_SECOND_TERMINAL = ("jtq status", "cc ", "./receive_estimate")
 INTERFACE = os.environ.get("JTQD_CAN_INTERFACE", "vcan0")

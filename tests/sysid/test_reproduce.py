@@ -13,6 +13,7 @@ import yaml
 from jtqd.daemon.config import load_config
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid import reproduce as reproduce_command
+from jtqd.sysid.campaign import command as campaign_command
 from jtqd.sysid.campaign.plan import check_plan, load_plan
 from jtqd.sysid.reproduce import steps, write_config
 
@@ -40,6 +41,15 @@ def test_every_step_comes_after_what_it_reads(tmp_path):
         "jtqd.sysid.campaign.emulated",
         "evaluate",
     ]
+
+
+@pytest.mark.parametrize("kind", ["efficiency", "excitation", "validate"])
+def test_quick_campaigns_are_plans_that_can_be_driven(tmp_path, capsys, kind):
+    (step,) = (s for s in steps(tmp_path, "sim", True, 0) if s.arguments[:2] == ("campaign", kind))
+    size = [word for word in step.arguments[2:] if word != "160"]
+    if "--evaluations" in size:
+        size.insert(size.index("--evaluations") + 1, "1")
+    assert campaign_command.main([kind, *size, "--dry-run"]) == 0, capsys.readouterr().err
 
 
 def test_nothing_is_trained_on_what_judges(tmp_path):

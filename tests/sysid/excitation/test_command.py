@@ -85,7 +85,7 @@ def test_command_without_scipy_refuses_in_one_line(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "scipy.optimize", None)
     assert excitation_command.main(["--count", "1", "--evaluations", "100"]) == 1
     said = capsys.readouterr().err
-    assert said == "jtq excitation: excitation design: scipy is not installed: pip install 'jtqd[train]'\n"
+    assert said == "jtq excitation: excitation design: scipy is not installed: pip install 'jtqd[analysis]'\n"
 
 
 @pytest.mark.parametrize("value", ["nan", "0", "-1", "many", "1e23"])

@@ -1,0 +1,393 @@
+"""Accuracy of one method of one joint on held-out runs by speed, load and temperature, and what to measure next.
+
+No file and no clock. Speed is |v| of the joint; load is the sensor's torque along the motion, tau sign(v), in parts of rated
+torque: positive where the motor drives the load, negative where the load drives the motor. A bin is `known` with at
+least two runs and 0.2 s of data: one run is one zero of the sensor and one temperature.
+
+Share of the zeros: mean square of a run's mean error over that of all errors. What is constant within a run is no function
+of speed or load, and no fit removes it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.checked import counted
+from jtqd.estimator.joint import Joint
+from jtqd.sysid.evaluate.methods import TITLES, JointModels, Samples
+from jtqd.sysid.evaluate.scores import (
+    NOMINAL,
+    Block,
+    Coverage,
+    Score,
+    Standstill,
+    covered,
+    score,
+    standstill,
+)
+
+SCHEMA: Final = "jtq.accuracy/1"
+BASELINE: Final = "tob"
+LOAD_STEP: Final = 0.25
+"""Of rated torque."""
+TEMPERATURE_STEP_K: Final = 5.0
+SPEED_BINS: Final = 6
+ENOUGH_RUNS: Final = 2
+ENOUGH_S: Final = 0.2
+RUNS_FOR_INTERVAL: Final = 10
+WARM_K: Final = 10.0
+"""Range of temperature from which on its influence can be seen."""
+PLACE: Final = 1.5
+"""RMSE of a bin over that of all samples, from which on the bin is named."""
+ZEROS: Final = 0.5
+COVERAGE_OFF: Final = 0.03
+"""Beside two standard errors."""
+_UNLIMITED: Final = 1e6
+"""As `MotionLimits` says it."""
+_SERIES: Final = tuple(m * 10.0**p for p in range(-4, 4) for m in (1.0, 2.0, 5.0))
+
+
+class Bin(NamedTuple):
+    """From `low` to `high`: seconds and runs of data; score, RMSE of each run [Nm] and coverage of the 90 % interval."""
+
+    low: float
+    high: float
+    seconds: float
+    runs: int
+    error: Score | None
+    by_run_nm: tuple[float, ...]
+    interval: Coverage | None
+
+    @property
+    def known(self) -> bool:
+        """Whether the figures say something of the joint and not of one run."""
+        return self.runs >= ENOUGH_RUNS and self.seconds >= ENOUGH_S
+
+
+class Advice(NamedTuple):
+    """What to measure or do next, and why; `key` for programs."""
+
+    key: str
+    text: str
+
+
+class Card(NamedTuple):
+    """Everything on the card of one joint.
+
+    speed [rad/s], load [parts of rated torque], temperature [degC]: bins; empty where it was not measured. cells: by load
+    (rows, as `load`) and speed (columns, as `speed`). baseline: score of the classical TOB on the same samples, None where
+    that is the method. mean_nm: standard deviation of the runs' mean errors; zeros: their share of the mean square.
+    limit_rad_s: highest speed that counts; given: whether the joint file's motion_limits say so.
+    """
+
+    number: int
+    joint: str
+    rated_nm: float
+    method: str
+    runs: int
+    seconds: float
+    error: Score
+    baseline: Score | None
+    mean_nm: float
+    zeros: float
+    interval: Coverage
+    standstill: Standstill
+    speed: tuple[Bin, ...]
+    load: tuple[Bin, ...]
+    temperature: tuple[Bin, ...]
+    cells: tuple[tuple[Bin, ...], ...]
+    limit_rad_s: float
+    given: bool
+    advice: tuple[Advice, ...] = ()
+
+
+def method_of(models: JointModels) -> str:
+    """Return the best method that jtqd can run with these files: the last one of TITLES."""
+    return models.methods[-1]
+
+
+def make_card(samples: Sequence[Samples], joint: Joint, method: str) -> Card | None:
+    """Return the card of one joint from its runs; None where no run has a sample in motion."""
+    own = [each for each in samples if method in each.estimate_nm and each.scored.any()]
+    overall, interval = _error(own, method), covered(own, method, NOMINAL)
+    if overall is None or interval is None:
+        return None
+    means = np.array([float(np.mean(each.error_nm(method)[each.scored])) for each in own])
+    weights = np.array([np.count_nonzero(each.scored) for each in own], np.float64)
+    limit, given = _speed_limit(own, joint)
+    speeds, loads, warmth = speed_edges(limit), load_edges(own), temperature_edges(own)
+    card = Card(
+        number=own[0].number,
+        joint=joint.name,
+        rated_nm=joint.rated_torque_nm,
+        method=method,
+        runs=len(own),
+        seconds=sum(_seconds(each, each.scored) for each in own),
+        error=overall,
+        baseline=None if method == BASELINE else _error(own, BASELINE),
+        mean_nm=float(np.std(means, ddof=1)) if len(means) > 1 else math.nan,
+        zeros=float(weights @ means**2 / weights.sum()) / overall.mse_nm2 if overall.mse_nm2 else 0.0,
+        interval=interval,
+        standstill=standstill(samples)[own[0].number],
+        speed=tuple(_bin(own, method, edge, _within(_speed, edge)) for edge in _pairs(speeds)),
+        load=tuple(_bin(own, method, edge, _within(_load, edge)) for edge in _pairs(loads)),
+        temperature=tuple(_bin(own, method, edge, _within(_temperature, edge)) for edge in _pairs(warmth)),
+        cells=tuple(
+            tuple(
+                _bin(own, method, fast, _both(_within(_speed, fast), _within(_load, heavy)))
+                for fast in _pairs(speeds)
+            )
+            for heavy in _pairs(loads)
+        ),
+        limit_rad_s=limit,
+        given=given,
+    )
+    return card._replace(advice=tuple(_advice(card)))
+
+
+def speed_edges(limit_rad_s: float) -> tuple[float, ...]:
+    """Return edges 0, ..., limit: 1, 2, 5, 10, ... between, SPEED_BINS of bins."""
+    inner = [value for value in _SERIES if value < 0.85 * limit_rad_s][-(SPEED_BINS - 1) :]
+    return (0.0, *inner, limit_rad_s)
+
+
+def load_edges(samples: Sequence[Samples]) -> tuple[float, ...]:
+    """Return edges in parts of rated torque: -1 to 1, and as far beyond as runs reach (at most 2)."""
+    most = max(float(np.quantile(np.abs(_load(each)[each.scored]), 0.999)) for each in samples)
+    steps = round(min(2.0, max(1.0, math.ceil(most / LOAD_STEP - 0.2) * LOAD_STEP)) / LOAD_STEP)
+    return tuple(LOAD_STEP * k for k in range(-steps, steps + 1))
+
+
+def temperature_edges(samples: Sequence[Samples]) -> tuple[float, ...]:
+    """Return edges at multiples of 5 K around what was measured; empty where nothing was."""
+    every = np.concatenate([each.temperature_c[each.scored] for each in samples])
+    every = every[np.isfinite(every)]
+    if not len(every):
+        return ()
+    low, high = np.quantile(every, (0.001, 0.999)).tolist()
+    first, last = math.floor(low / TEMPERATURE_STEP_K), math.floor(high / TEMPERATURE_STEP_K) + 1
+    stride = -(-(last - first) // 8)
+    return tuple(TEMPERATURE_STEP_K * k for k in range(first, last + stride, stride))
+
+
+def _speed_limit(samples: Sequence[Samples], joint: Joint) -> tuple[float, bool]:
+    limits = joint.motion_limits
+    if limits is not None and limits.velocity_rad_s < _UNLIMITED:
+        return limits.velocity_rad_s, True
+    seen = max(float(np.quantile(_speed(each)[each.scored], 0.999)) for each in samples)
+    return float(f"{seen:.2g}"), False
+
+
+Take = Callable[[Samples], FloatArray]
+Keep = Callable[[Samples], NDArray[np.bool_]]
+
+
+def _speed(each: Samples) -> FloatArray:
+    found: FloatArray = np.abs(each.velocity_rad_s)
+    return found
+
+
+def _load(each: Samples) -> FloatArray:
+    found: FloatArray = each.sensor_nm * np.sign(each.velocity_rad_s) / each.rated_nm
+    return found
+
+
+def _temperature(each: Samples) -> FloatArray:
+    return each.temperature_c
+
+
+def _within(take: Take, edges: tuple[float, float]) -> Keep:
+    return lambda each: (take(each) >= edges[0]) & (take(each) < edges[1])
+
+
+def _both(one: Keep, other: Keep) -> Keep:
+    return lambda each: one(each) & other(each)
+
+
+def _pairs(edges: Sequence[float]) -> list[tuple[float, float]]:
+    return list(itertools.pairwise(edges))
+
+
+def _seconds(each: Samples, mask: NDArray[np.bool_]) -> float:
+    steps = np.diff(each.time_s, prepend=each.time_s[0])
+    return float(steps[mask].sum())
+
+
+def _error(samples: Sequence[Samples], method: str, keep: Keep | None = None) -> Score | None:
+    masks = [each.scored if keep is None else each.scored & keep(each) for each in samples]
+    if any(method not in each.estimate_nm for each in samples):
+        return None
+    return score(
+        [Block(each.error_nm(method)[mask], each.rated_nm) for each, mask in zip(samples, masks, strict=True)]
+    )
+
+
+def _bin(samples: Sequence[Samples], method: str, edges: tuple[float, float], keep: Keep) -> Bin:
+    there = [each for each in samples if (each.scored & keep(each)).any()]
+    each_run = [_error([each], method, keep) for each in there]
+    return Bin(
+        *edges,
+        seconds=sum(_seconds(each, each.scored & keep(each)) for each in there),
+        runs=len(there),
+        error=_error(there, method, keep),
+        by_run_nm=tuple(one.rmse_nm for one in each_run if one is not None),
+        interval=covered(there, method, NOMINAL, keep),
+    )
+
+
+def _advice(card: Card) -> list[Advice]:
+    """Return what is worth most first: what is wrong before what is not known."""
+    rules = (_method, _interval, _zeros, _place, _loads, _speeds, _corners, _warmth, _standing, _runs)
+    return [Advice(rule.__name__.strip("_"), text) for rule in rules if (text := rule(card))]
+
+
+def _method(card: Card) -> str:
+    if card.method in ("physics", "fused"):
+        return ""
+    return (
+        f"These files give no more than {TITLES[card.method]}, which does not know the losses of the gear by load: run "
+        "jtq fit losses on runs of this joint, then this card on other ones."
+    )
+
+
+def _interval(card: Card) -> str:
+    share, se = card.interval.share, card.interval.se
+    allowed = COVERAGE_OFF + (2.0 * se if math.isfinite(se) else 0.1)
+    if abs(share - NOMINAL) <= allowed:
+        return ""
+    words = "too small" if share < NOMINAL else "larger than it need be"
+    return (
+        f"The 90 % interval holds the sensor in {100.0 * share:.0f} % of the samples, so sigma is {words}: fit again "
+        "(jtq fit losses) with runs of as many days as a controller will see."
+    )
+
+
+def _zeros(card: Card) -> str:
+    if card.runs < ENOUGH_RUNS or card.zeros < ZEROS:
+        return ""
+    return (
+        f"{100.0 * card.zeros:.0f} % of the mean square error is constant within a run and differs from run to run "
+        f"({card.mean_nm:.2g} Nm): zeros of sensor, current or encoders, or friction of the day. Take the sensor's zero "
+        "unloaded before each run; jtq diagnose says which of them it is. More speeds and loads will not lower it."
+    )
+
+
+def _place(card: Card) -> str:
+    """Name the worst bin that is known and clearly above the whole."""
+    found = [
+        (each.error.rmse_nm / card.error.rmse_nm, text)
+        for each, text in (
+            *((each, f"at {each.low:g} to {each.high:g} rad/s") for each in card.speed),
+            *((each, f"at {load_name(each.low, each.high)}") for each in card.load),
+            *((each, f"at {each.low:g} to {each.high:g} °C") for each in card.temperature),
+        )
+        if each.known and each.error is not None
+    ]
+    ratio, text = max(found, default=(0.0, ""))
+    if ratio < PLACE:
+        return ""
+    return (
+        f"The error is {ratio:.1f} times the average {text}: jtq diagnose on these runs names the cause; more runs "
+        "there help the fit only when there were few."
+    )
+
+
+def _loads(card: Card) -> str:
+    """Name the loads up to rated torque that are not known, by who drives."""
+    texts = []
+    for title, bins in (
+        ("motor drives the load", [each for each in card.load if each.low >= 0.0]),
+        ("load drives the motor", [_mirrored(each) for each in reversed(card.load) if each.high <= 0.0]),
+    ):
+        within = [each for each in bins if each.high <= 1.0 + 1e-9]
+        gaps = ranges([each for each in within if not each.known])
+        if gaps:
+            spans = " and ".join(f"{100.0 * low:.0f} to {100.0 * high:.0f} %" for low, high in gaps)
+            texts.append(f"{title}: {spans}")
+    if not texts:
+        return ""
+    return f"Loads of rated torque without two runs ({'; '.join(texts)}): measure there, or keep the joint out of there."
+
+
+def _speeds(card: Card) -> str:
+    gaps = ranges([each for each in card.speed if not each.known])
+    if gaps:
+        spans = " and ".join(f"{low:g} to {high:g} rad/s" for low, high in gaps)
+        return f"Speeds without two runs: {spans}."
+    if not card.given:
+        return (
+            f"No run is faster than {card.limit_rad_s:g} rad/s, and the joint file names no motion_limits: whether that is "
+            "all of its range is not known here."
+        )
+    return ""
+
+
+def _corners(card: Card) -> str:
+    """Name speed and load that are known each, but not together; the largest product of them."""
+    found = [
+        (cell.high * max(abs(heavy.low), abs(heavy.high)), fast, heavy)
+        for heavy, row in zip(card.load, card.cells, strict=True)
+        for fast, cell in zip(card.speed, row, strict=True)
+        if heavy.known and fast.known and not cell.known
+    ]
+    if not found:
+        return ""
+    _, fast, heavy = max(found, key=lambda item: item[0])
+    return (
+        f"{counted(len(found), 'combination')} of speed and load that were measured apart were not measured together, the "
+        f"hardest: {fast.low:g} to {fast.high:g} rad/s at {load_name(heavy.low, heavy.high)}."
+    )
+
+
+def _warmth(card: Card) -> str:
+    if not card.temperature:
+        return "The runs have no temperature: a warm gear has another friction. Record it (the drive's, or a sensor's)."
+    known = [each for each in card.temperature if each.known]
+    if known and known[-1].high - known[0].low > WARM_K:
+        return ""
+    low, high = card.temperature[0].low, card.temperature[-1].high
+    return f"All runs lie between {low:g} and {high:g} °C: begin with the joint cold, and repeat after an hour of work."
+
+
+def _standing(card: Card) -> str:
+    if card.standstill.coverage.get(card.method) is not None:
+        return ""
+    return "The joint never stands still under load: hold it for some seconds, there friction leaves only an interval."
+
+
+def _runs(card: Card) -> str:
+    if card.runs >= RUNS_FOR_INTERVAL:
+        return ""
+    known = "" if not math.isfinite(card.interval.se) else f" (now ± {100.0 * card.interval.se:.0f} points)"
+    return (
+        f"{counted(card.runs, 'run')}: the coverage of the interval is known from {RUNS_FOR_INTERVAL} runs on{known}, "
+        "each after a new start or on another day."
+    )
+
+
+def load_name(low: float, high: float) -> str:
+    """Return a bin of load in words: "50 to 75 % of rated torque, load drives"."""
+    ends = sorted((abs(low), abs(high)))
+    return f"{100.0 * ends[0]:.0f} to {100.0 * ends[1]:.0f} % of rated torque, {'motor' if high > 0.0 else 'load'} drives"
+
+
+def ranges(bins: Sequence[Bin]) -> list[tuple[float, float]]:
+    """Return neighbouring bins as one range each."""
+    found: list[tuple[float, float]] = []
+    for each in bins:
+        if found and math.isclose(found[-1][1], each.low):
+            found[-1] = (found[-1][0], each.high)
+        else:
+            found.append((each.low, each.high))
+    return found
+
+
+def _mirrored(each: Bin) -> Bin:
+    return each._replace(low=0.0 - each.high, high=0.0 - each.low)
