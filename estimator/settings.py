@@ -40,6 +40,13 @@ class EstimatorSettings:
     def __post_init__(self) -> None:
         check(self, "estimator")
 
+    def sensor_zero_nm(self, rated_torque_nm: float) -> float:
+        """Return what a comparison with a torque sensor holds beside sigma, as a standard deviation: the sensor's zero.
+
+        Of method fused; sigma of the others never falls below `sigma_floor` anyway.
+        """
+        return self.sigma_floor * rated_torque_nm if self.method == "fused" else 0.0
+
 
 @dataclass(frozen=True, slots=True)
 class PlausibilityLimits:
