@@ -135,7 +135,8 @@ class Torsion:
     Kinematic error: sum over orders n per motor revolution of c cos(n theta_m) + s sin(n theta_m). What a joint may have
     beyond that, and files may leave out: link_orders_per_rev: the same over theta_l, error of the link encoder over its own
     turn; hardening: the spring is stiffer by hardening_nm_per_rad beyond |d| = hardening_rad, added up; slips_nm,
-    slips_travel_rad: further slip elements; zero_limit_rad: a link encoder that is off by more on a day is defect. The ranges hold in files; a fit may look beyond them.
+    slips_travel_rad: further slip elements; zero_limit_rad: a link encoder that is off by more on a
+    day is defect. The ranges hold in files; a fit may look beyond them.
     """
 
     stiffness_nm_per_rad: Annotated[float, limits("Nm/rad", gt=0.0)]
@@ -322,7 +323,11 @@ def _plain(value: Any) -> Any:
         return {
             name: _plain(item)
             for name, item in items
-            if item is not None and not (isinstance(value, Torsion) and (item == () or name == "zero_limit_rad" and item == ZERO_LIMIT_RAD))
+            if item is not None
+            and not (
+                isinstance(value, Torsion)
+                and (item == () or (name == "zero_limit_rad" and item == ZERO_LIMIT_RAD))
+            )
         }
     if isinstance(value, tuple):
         return [_plain(each) for each in value]

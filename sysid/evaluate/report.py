@@ -316,9 +316,7 @@ def _text_intervals(result: Evaluation) -> list[str]:
     for number, one in result.standstill.items():
         held = ", ".join(f"{_SHORT[m]} {100 * c.share:.1f} %" for m, c in one.coverage.items())
         share = f"{100 * one.share:.0f} % of the samples"
-        lines.append(
-            f"  standstill j{number}, {share}: the interval contained it in {held or 'no sample'}"
-        )
+        lines.append(f"  standstill j{number}, {share}: the interval contained it in {held or 'no sample'}")
     return lines
 
 

@@ -23,7 +23,6 @@ from jtqd.estimator.settings import EstimatorSettings
 from jtqd.sysid.evaluate.methods import Samples
 from jtqd.sysid.evaluate.scores import IntervalTables, Row, Standstill, interval_tables, row, standstill
 
-
 _OURS: Final = ("physics", "fused")
 """Methods whose sigma is that of the torque, without the sensor's zero."""
 

@@ -19,7 +19,14 @@ from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.network import FusedNetwork
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import Estimate
-from tests.estimator.fused_helpers import SIGMA, TRAINED_C, FakeNetwork, everywhere, fused_joint, fused_network
+from tests.estimator.fused_helpers import (
+    SIGMA,
+    TRAINED_C,
+    FakeNetwork,
+    everywhere,
+    fused_joint,
+    fused_network,
+)
 
 FUSED = EstimatorSettings(method="fused")
 JOINT = fused_joint()

@@ -50,7 +50,14 @@ def driven(
     link = motor / 100.0 - torque / K + link_zero_rad
     noise = np.random.default_rng(4).normal(0.0, 6e-6, len(t))
     rotor = NARROW.rotor_inertia_kgm2 * 100.0 * np.gradient(v, t) / NARROW.torque_constant_nm_per_a
-    return (np.full(len(t), 1e-3), raw / GAIN + rotor, motor, 100.0 * v, link + noise, np.full(len(t), 25.0)), torque
+    return (
+        np.full(len(t), 1e-3),
+        raw / GAIN + rotor,
+        motor,
+        100.0 * v,
+        link + noise,
+        np.full(len(t), 25.0),
+    ), torque
 
 
 def tracked(columns: Columns, joint: Joint = NARROW) -> tuple[EstimateRun, Zeros]:
@@ -99,7 +106,9 @@ def test_friction_is_no_zero_and_motion_one_way_tells_them_apart_not_at_all() ->
 
 
 def test_a_push_of_10_nm_is_no_zero() -> None:
-    columns, _ = driven(load=lambda t: 8.0 * np.sin(1.7 * t) + np.where(t > 2.0, 10.0, 0.0), link_zero_rad=1e-4)
+    columns, _ = driven(
+        load=lambda t: 8.0 * np.sin(1.7 * t) + np.where(t > 2.0, 10.0, 0.0), link_zero_rad=1e-4
+    )
     assert tracked(columns)[1].link_rad == pytest.approx(1e-4, abs=1.2e-5)
 
 
