@@ -359,7 +359,8 @@ def fit_of_days() -> FusedFit:
 def test_runs_of_other_days_are_estimated_as_well_as_sigma_says(fit_of_days: FusedFit) -> None:
     """Other motions, eight other days with their zeros and friction, errors as they are: each day 0.5 Nm RMS of up to 30 Nm.
 
-    Against the true torque, without the sensor's zero. 80 % or more of all moving samples are in the 90 % interval (eight days are few), 95 % of the standing ones in theirs.
+    Against the true torque, without the sensor's zero. 80 % or more of all moving samples are in the 90 % interval (eight
+    days are few), 95 % of the standing ones in theirs.
     """
     ours = replace(joint(1), fused=fit_of_days.fused)
     moving_inside, standing_inside = [], []
