@@ -1,6 +1,6 @@
 """The estimators of a joint; the equations stand in estimator.pyx."""
 
-from jtqd.estimator.fusion cimport FusionLaw
+from jtqd.estimator.fusion cimport Fused, FusionLaw
 from jtqd.estimator.losses cimport AdditiveLaw, EfficiencyLaw
 from jtqd.estimator.observer cimport (
     FusedObserved,
@@ -15,6 +15,7 @@ from jtqd.estimator.observer cimport (
 from jtqd.estimator.perceptron cimport PerceptronLaw
 from jtqd.estimator.sample cimport Estimator, Sample, Values
 from jtqd.estimator.validity cimport FusedTrustLaw, TrustLaw, UncertaintyLaw
+from jtqd.estimator.zeros cimport ZerosLaw, ZerosState
 
 cdef struct NetworkLaw:
     bint used
@@ -46,6 +47,7 @@ cdef struct FusedLaw:
     FusionLaw fusion
     FusedTrustLaw trust
     NetworkLaw network
+    ZerosLaw zeros
     double physics_scale[4]
     double network_scale[4]
     double stand_share, stand_floor, limit, network_limit, fade, inverse_fade
@@ -55,10 +57,16 @@ cdef struct FusedState:
     FusedObserverState observer
     double temperature, thermal
     double half
+    double lowered_s  # for how long the status still is, after the paths disagreed
+    ZerosState zeros
 
 cdef class FusedEstimator(Estimator):
     cdef FusedLaw law
     cdef FusedState state
+    cdef void learn_zeros(
+        self, const FusedObserved *seen, const Sample *x, const Fused *physics, double loss, int status
+    ) noexcept nogil
+    cdef bint foreign(self, const Fused *physics, double dt) noexcept nogil
     cdef void estimate(self, const FusedObserved *seen, const Sample *x, bint network_wanted, Values *out) noexcept nogil
 
 cdef class ExtendedEstimator(Estimator):

@@ -7,8 +7,10 @@ from jtqd.estimator.network import FusedNetworkModel, NetworkModel
 from jtqd.estimator.run import EstimateRun, ObservedRun
 from jtqd.estimator.sample import Estimator
 from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.zeros import Zeros
 
 STANDSTILL_SIGMAS: Final = 3.0
+LOWERED_S: Final = 0.1
 
 def quadrants(raw_nm: FloatArray, velocity_rad_s: FloatArray) -> QuadrantArray: ...
 
@@ -31,6 +33,8 @@ class FusedEstimator(Estimator):
     def of_blocks(
         cls, joint: Joint, settings: EstimatorSettings, law: bytes | memoryview, state: bytes | memoryview
     ) -> Self: ...
+    @property
+    def zeros(self) -> Zeros | None: ...
     def run_observed(self, seen: ObservedRun) -> EstimateRun: ...
 
 class ExtendedEstimator(Estimator):

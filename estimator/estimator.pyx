@@ -10,10 +10,10 @@
 loss went through the same filter, so the physics estimate as a whole is 1/g old.
 """
 
-from libc.math cimport NAN, fabs, fmin
+from libc.math cimport NAN, fabs, fmin, sqrt
 
 from jtqd.estimator.block cimport copied, put_back
-from jtqd.estimator.fusion cimport Fused, fill_fusion, fuse_paths, keep, share_by_speed
+from jtqd.estimator.fusion cimport Fused, fill_fusion, fuse_paths, keep, share_by_speed, widening
 from jtqd.estimator.losses cimport (
     AdditiveLossModel,
     Loss,
@@ -44,6 +44,16 @@ from jtqd.estimator.validity cimport (
     standing,
     trust,
 )
+from jtqd.estimator.zeros cimport (
+    beyond,
+    drop_block,
+    fill_zeros,
+    gather,
+    local_stiffness,
+    restart_zeros,
+    update_zeros,
+    zeros_of,
+)
 
 from math import nan
 from typing import Final
@@ -52,15 +62,24 @@ import numpy as np
 
 from jtqd.estimator import status as st
 from jtqd.estimator.corrections import ExtendedInputs
+from jtqd.estimator.fusion import FOREIGN_SIGMAS
 from jtqd.estimator.network import FEATURES, FUSED_FEATURES, checked_fused, checked_network, native_of
 from jtqd.estimator.run import EstimateRun, ObservedRun
 from jtqd.estimator.sample import columns
 from jtqd.estimator.validity import FADE_START
+from jtqd.estimator.zeros import MOVING_RAD_S, ONE_WAY
 
 STANDSTILL_SIGMAS: Final = 3.0
 """Half width of the standstill interval in standard deviations, where torsion narrows what friction leaves open."""
 
-cdef double STANDSTILL_WIDTH = STANDSTILL_SIGMAS
+LOWERED_S: Final = 0.1
+"""So long the status stays lowered after the two paths have disagreed: it must not flicker."""
+
+_SLOPE_NM: Final = 0.5
+"""Step of the motor torque over which the slope of the loss is taken."""
+
+cdef double STANDSTILL_WIDTH = STANDSTILL_SIGMAS, FOREIGN = FOREIGN_SIGMAS, LOWERED = LOWERED_S, STEP = _SLOPE_NM
+cdef double MOVING = MOVING_RAD_S, ONE_SIDED = ONE_WAY
 cdef int STARTING = st.STARTING, VALID = st.VALID, DEGRADED = st.DEGRADED, STANDSTILL = st.STANDSTILL
 cdef int INVALID = st.INVALID
 
@@ -248,6 +267,8 @@ cdef class FusedEstimator(Estimator):
         )
         self.law.loss = (<AdditiveLossModel>AdditiveLossModel(fused.loss)).law
         fill_fusion(&self.law.fusion, fused.sigma, fused.torsion is not None)
+        self.law.fusion.reference = 0.0  # sigma is that of the torque, not of a comparison with a sensor
+        fill_zeros(&self.law.zeros, joint, fused.sigma, fused.torsion, settings.track_zeros)
         network_scale = fused.sigma.scale if network is None else network.sigma_scale
         for k in range(4):
             self.law.physics_scale[k], self.law.network_scale[k] = fused.sigma.scale[k], network_scale[k]
@@ -271,7 +292,13 @@ cdef class FusedEstimator(Estimator):
     def reset(self):
         """Forget the past: the next step starts."""
         restart_guard(&self.state.guard)
-        self.state.half = 0.0
+        self.state.half = self.state.lowered_s = 0.0
+        restart_zeros(&self.law.zeros, &self.state.zeros)
+
+    @property
+    def zeros(self):
+        """What is known of the joint's zeros (`Zeros`); None where they are not tracked."""
+        return zeros_of(&self.law.zeros, &self.state.zeros) if self.law.zeros.used else None
 
     def blocks(self):
         """Return (parameters, state): one block each, of which `of_blocks` makes an estimator that goes on as this one would.
@@ -297,6 +324,12 @@ cdef class FusedEstimator(Estimator):
     cdef void advance(self, const Sample *x, bint network_wanted, Values *out) noexcept nogil:
         """Set `out` to the estimate at this sample."""
         cdef FusedObserved seen
+        cdef Sample corrected
+        if self.law.zeros.used:
+            corrected = x[0]
+            corrected.link_position_rad -= self.state.zeros.link_rad
+            corrected.current_a -= self.state.zeros.current_a
+            x = &corrected
         self.observed = observe_fused(
             &self.law.guard, &self.state.guard, &self.law.observer, &self.state.observer, x, &seen
         )
@@ -305,6 +338,37 @@ cdef class FusedEstimator(Estimator):
             self.estimate(&seen, x, network_wanted, out)
         else:
             self.state.half = 0.0
+            drop_block(&self.state.zeros)
+
+    cdef void learn_zeros(
+        self, const FusedObserved *seen, const Sample *x, const Fused *physics, double loss, int status
+    ) noexcept nogil:
+        """Take a sample into the zeros, where it tells something of them."""
+        cdef const FusedLaw *law = &self.law
+        cdef FusedState *s = &self.state
+        cdef double v = seen.joint_velocity_rad_s, raw = seen.raw_nm
+        cdef Loss next
+        if status != VALID or fabs(v) < MOVING or fabs(seen.direction) < ONE_SIDED:
+            drop_block(&s.zeros)
+        elif gather(&s.zeros, x.dt_s, physics.apart, seen.direction, v, seen.torsion_nm, physics.variance):
+            next = additive_loss(&law.loss, raw + STEP, v, s.thermal, seen.direction)
+            update_zeros(
+                &law.zeros, &s.zeros, local_stiffness(&law.observer, s.observer.d), (next.nm - loss) / STEP
+            )
+
+    cdef bint foreign(self, const Fused *physics, double dt) noexcept nogil:
+        """Return whether the two paths are not of this joint file: they disagree, or the link's zero is impossible."""
+        cdef FusedState *s = &self.state
+        if fabs(physics.apart) > FOREIGN * sqrt(physics.variance):
+            s.lowered_s = LOWERED
+        elif s.lowered_s > 0.0:
+            s.lowered_s -= dt
+        if s.lowered_s > 0.0:
+            return True
+        return self.law.zeros.used and (
+            s.zeros.left_nm * s.zeros.left_nm > FOREIGN * FOREIGN * self.law.fusion.torsion
+            or beyond(&self.law.zeros, &s.zeros)
+        )
 
     cdef void estimate(self, const FusedObserved *seen, const Sample *x, bint network_wanted, Values *out) noexcept nogil:
         """Set `out`, whose status is the guard's, to the estimate of an observed sample."""
@@ -321,6 +385,9 @@ cdef class FusedEstimator(Estimator):
         loss = additive_loss(&law.loss, raw, v, s.thermal, seen.direction)
         s.half = keep(loss.half, s.half, x.dt_s)
         physics = fuse_paths(&law.fusion, raw, loss.nm, s.half, v, seen.torsion_nm, seen.open_nm)
+        lowered = self.foreign(&physics, x.dt_s)
+        if law.zeros.used:
+            self.learn_zeros(seen, x, &physics, loss.nm, out.status)
         out.torque_nm = out.physics_nm = physics.value
         scale = law.physics_scale[quadrant]
         self.features[0], self.features[1], self.features[2] = v, raw, seen.torsion_nm - (raw - loss.nm)
@@ -339,17 +406,25 @@ cdef class FusedEstimator(Estimator):
                         weight = fmin(weight, (law.network_limit - size) * law.inverse_fade)
                     out.torque_nm += weight * share_by_speed(v) * correction
                     scale += weight * (law.network_scale[quadrant] - scale)
-            if weight < 1.0 and out.status != STANDSTILL:
-                out.status = DEGRADED
+            if weight < 1.0:
+                lowered = True
         out.sigma_nm = scale * physics.sigma
-        if out.status == STANDSTILL:
-            out.sigma_nm = fmin(
-                law.stand_share * loss.half + law.stand_floor, STANDSTILL_WIDTH * scale * physics.sigma
-            )
+        wider = widening(&physics, s.zeros.left_nm)
+        if wider > 0.0:
+            out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + wider * wider)
+        if lowered:
+            out.status = DEGRADED
+        elif out.status == STANDSTILL:
+            out.sigma_nm = fmin(law.stand_share * loss.half + law.stand_floor, STANDSTILL_WIDTH * out.sigma_nm)
         publish_within(out, law.limit)
 
     def run_observed(self, seen):
-        """Return the estimates of an `ObservedRun` (observed with the joint's own torsion) as an `EstimateRun`."""
+        """Return the estimates of an `ObservedRun` (observed with the joint's own torsion) as an `EstimateRun`.
+
+        Raises ValueError where zeros are tracked: they act on what is observed, use `run`.
+        """
+        if self.law.zeros.used:
+            raise ValueError("found an estimator that tracks zeros, expected one without, or a run of samples")
         n = len(seen.raw_nm)
         values, features, status = np.full((5, n), NAN), np.full((n, self.width), NAN), seen.status.copy()
         rows = np.column_stack(
@@ -367,7 +442,7 @@ cdef class FusedEstimator(Estimator):
         cdef Py_ssize_t k
         cdef int m
         sample = Sample(NAN, NAN, NAN, NAN, NAN, NAN)
-        self.state.half = 0.0
+        self.state.half = self.state.lowered_s = 0.0
         with nogil:
             for k in range(row.shape[0]):
                 if asked[k] != VALID and asked[k] != STANDSTILL:

@@ -6,6 +6,7 @@ cdef struct FusionLaw:
 
 cdef struct Fused:
     double alpha, value, sigma
+    double apart, variance  # torsion less current, and its variance; 0 and 1 without torsion
 
 cdef int fill_fusion(FusionLaw *law, sigma, bint with_torsion) except -1
 cdef double share_by_speed(double velocity) noexcept nogil
@@ -13,6 +14,8 @@ cdef double keep(double half, double before, double dt) noexcept nogil
 cdef Fused fuse_paths(
     const FusionLaw *law, double raw, double loss, double half, double velocity, double torsion, double open_nm
 ) noexcept nogil
+
+cdef double widening(const Fused *fused, double left_nm) noexcept nogil
 
 cdef class Fusion:
     cdef FusionLaw law

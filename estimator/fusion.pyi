@@ -6,6 +6,8 @@ from jtqd.estimator.joint import FusedSigma
 SLOW_RAD_S: Final = 0.05
 FAST_RAD_S: Final = 0.2
 HOLD_S: Final = 0.05
+DISAGREE_SIGMAS: Final = 3.0
+FOREIGN_SIGMAS: Final = 4.0
 
 def turning(velocity_rad_s: FloatArray) -> FloatArray: ...
 def held(half_nm: FloatArray, dt_s: FloatArray, running: BoolArray) -> FloatArray: ...

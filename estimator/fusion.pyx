@@ -5,13 +5,14 @@
     alpha = s_c^2/(s_c^2 + s_t^2)          physics = tau_c + alpha (tau_t - tau_c)
     s_c^2 = a^2 + (b v)^2 + (c tau_raw)^2 + half^2        half: what friction leaves open near v = 0
     s_t^2 = e^2 + (f tau_t)^2 + open^2     open: what the slip leaves open until its bounds have met
-    sigma^2 = s_c^2 s_t^2/(s_c^2 + s_t^2) + reference^2
+    sigma^2 = s_c^2 s_t^2/(s_c^2 + s_t^2) + reference^2      reference: of the sensor of a comparison; 0 for the torque itself
+    widened by max(alpha, 1 - alpha) (|tau_t - tau_c| - DISAGREE_SIGMAS sqrt(s_c^2 + s_t^2)) where that is above 0
 
 Towards standstill `half` grows to the half width of the friction interval and the torsion takes over: continuous,
 and the value there no longer depends on which way friction happens to point.
 """
 
-from libc.math cimport fabs, sqrt
+from libc.math cimport fabs, fmax, sqrt
 
 from typing import Final
 
@@ -24,7 +25,14 @@ FAST_RAD_S: Final = 0.2
 HOLD_S: Final = 0.05
 """Time constant with which the friction interval is forgotten after a reversal."""
 
+DISAGREE_SIGMAS: Final = 3.0
+"""Distance of the two paths in its own standard deviations from which what is more counts as an error of the fusion."""
+
+FOREIGN_SIGMAS: Final = 4.0
+"""Distance from which the status is lowered: at least one of the paths is not what the joint file says."""
+
 cdef double SLOW = SLOW_RAD_S, FAST = FAST_RAD_S, HOLD = HOLD_S
+cdef double DISAGREE = DISAGREE_SIGMAS, INTERVAL = 1.0 / 1.6448536269514722  # half width of the 90 % interval in sigmas
 cdef double INVERSE_RANGE = 1.0 / (FAST_RAD_S - SLOW_RAD_S)
 
 
@@ -92,10 +100,24 @@ cdef Fused fuse_paths(
     cdef double value = raw - loss
     cdef double t, alpha
     if not law.with_torsion:
-        return Fused(0.0, value, sqrt(c + law.reference))
+        return Fused(0.0, value, sqrt(c + law.reference), 0.0, 1.0)
     t = law.torsion + law.torsion_load * torsion * torsion + open_nm * open_nm
     alpha = c / (c + t)
-    return Fused(alpha, value + alpha * (torsion - value), sqrt(alpha * t + law.reference))
+    return Fused(alpha, value + alpha * (torsion - value), sqrt(alpha * t + law.reference), torsion - value, c + t)
+
+
+cdef double widening(const Fused *fused, double left_nm) noexcept nogil:
+    """Return what a disagreement of the paths adds to sigma [Nm]; left_nm: known zero of the torsion that is not taken off.
+
+    Which path is wrong is not known: the worse for the fused value counts. Both are errors of a known size, not of a
+    known variance: the 90 % interval, not sigma, is to hold them.
+    """
+    cdef double more = fabs(fused.apart) - DISAGREE * sqrt(fused.variance)
+    cdef double zero = fused.alpha * left_nm
+    if more > 0.0:
+        more *= fmax(fused.alpha, 1.0 - fused.alpha)
+        return INTERVAL * sqrt(more * more + zero * zero)
+    return INTERVAL * zero
 
 
 cdef class Fusion:

@@ -31,6 +31,8 @@ MAX_NODES: Final = 64
 MAX_LINK_ORDERS: Final = 6
 MAX_HARDENINGS: Final = 8
 MAX_SLIPS: Final = 6
+ZERO_LIMIT_RAD: Final = 2e-3
+"""Torque of more than half the rated one on the shipped joints, and seven arc minutes: no encoder that is mounted well."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +135,8 @@ class Torsion:
     Kinematic error: sum over orders n per motor revolution of c cos(n theta_m) + s sin(n theta_m). What a joint may have
     beyond that, and files may leave out: link_orders_per_rev: the same over theta_l, error of the link encoder over its own
     turn; hardening: the spring is stiffer by hardening_nm_per_rad beyond |d| = hardening_rad, added up; slips_nm,
-    slips_travel_rad: further slip elements. The ranges hold in files; a fit may look beyond them.
+    slips_travel_rad: further slip elements; zero_limit_rad: a link encoder that is off by more on a
+    day is defect. The ranges hold in files; a fit may look beyond them.
     """
 
     stiffness_nm_per_rad: Annotated[float, limits("Nm/rad", gt=0.0)]
@@ -152,6 +155,7 @@ class Torsion:
     hardening_nm_per_rad: Annotated[tuple[float, ...], limits("Nm/rad")] = ()
     slips_nm: Annotated[tuple[float, ...], limits("Nm", length=(0, MAX_SLIPS))] = ()
     slips_travel_rad: Annotated[tuple[float, ...], limits("rad")] = ()
+    zero_limit_rad: Annotated[float, limits("rad", gt=0.0)] = ZERO_LIMIT_RAD
 
     def __post_init__(self) -> None:
         for first, *others in (
@@ -319,7 +323,11 @@ def _plain(value: Any) -> Any:
         return {
             name: _plain(item)
             for name, item in items
-            if item is not None and not (item == () and isinstance(value, Torsion))
+            if item is not None
+            and not (
+                isinstance(value, Torsion)
+                and (item == () or (name == "zero_limit_rad" and item == ZERO_LIMIT_RAD))
+            )
         }
     if isinstance(value, tuple):
         return [_plain(each) for each in value]

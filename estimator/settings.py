@@ -21,7 +21,7 @@ class EstimatorSettings:
     sigma_floor, torque_limit: parts of the rated torque (largest trusted difference between network and
     physics, sigma that nothing undercuts, largest believable torque); friction_uncertainty: standard
     deviation of friction as a part of it; load_uncertainty: of the classical observer, which knows no
-    efficiency, as a part of the load.
+    efficiency, as a part of the load; track_zeros: of link encoder and current, method fused (`zeros`).
     """
 
     method: Annotated[str, choice(METHODS)] = "network"
@@ -35,9 +35,17 @@ class EstimatorSettings:
     load_uncertainty: Annotated[float, limits(ge=0.0, le=1.0)] = 0.15
     sigma_floor: Annotated[float, limits(ge=0.0, le=1.0)] = 0.005
     torque_limit: Annotated[float, limits(ge=1.0, le=10.0)] = 3.0
+    track_zeros: bool = False
 
     def __post_init__(self) -> None:
         check(self, "estimator")
+
+    def sensor_zero_nm(self, rated_torque_nm: float) -> float:
+        """Return what a comparison with a torque sensor holds beside sigma, as a standard deviation: the sensor's zero.
+
+        Of method fused; sigma of the others never falls below `sigma_floor` anyway.
+        """
+        return self.sigma_floor * rated_torque_nm if self.method == "fused" else 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,9 +26,17 @@ class JointSafety:
         torque_limit_nm: a torque beyond it is never published.
         network_limit_nm: a network further from physics than this has been dropped by the estimator.
         deviation_cycles: length of the fault `deviation`, 0 where it is not latched.
+        sensor_zero_nm: of the torque sensor, beside sigma: standard deviation.
     """
 
-    __slots__ = ("deviation_cycles", "network_limit_nm", "plausibility", "settings", "torque_limit_nm")
+    __slots__ = (
+        "deviation_cycles",
+        "network_limit_nm",
+        "plausibility",
+        "sensor_zero_nm",
+        "settings",
+        "torque_limit_nm",
+    )
 
     def __init__(
         self,
@@ -41,12 +49,14 @@ class JointSafety:
         self.plausibility: Plausibility | None = None
         self.torque_limit_nm, self.network_limit_nm = TORQUE_RANGE_NM, inf
         self.deviation_cycles = 0
+        self.sensor_zero_nm = 0.0
         if self.settings.latch & faults.DEVIATION:
             self.deviation_cycles = max(1, round(self.settings.deviation_s * 1e9 / period_ns))
         if joint is None or estimator is None:
             return
         self.torque_limit_nm = min(TORQUE_RANGE_NM, estimator.torque_limit * joint.rated_torque_nm)
         self.network_limit_nm = estimator.network_limit * joint.rated_torque_nm
+        self.sensor_zero_nm = estimator.sensor_zero_nm(joint.rated_torque_nm)
         if self.settings.plausibility is not None:
             self.plausibility = Plausibility(
                 joint, estimator.torque_limit, self.settings.plausibility, period_ns * 1e-9

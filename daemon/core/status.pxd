@@ -37,7 +37,7 @@ cdef class JointRules:
     cdef readonly JointStatus status
     cdef Plausibility plausibility
     cdef bint is_checked, with_network
-    cdef double torque_limit_nm, network_limit_nm, deviation_sigmas
+    cdef double torque_limit_nm, network_limit_nm, deviation_sigmas, sensor_variance
     cdef int64_t deviation_cycles, deviates
     cdef int judge(
         self,

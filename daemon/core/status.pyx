@@ -23,7 +23,7 @@ The statuses have an order, from good to bad:
 No clock and no randomness: the same statuses and faults give the same answer again, in the loop and from a log.
 """
 
-from libc.math cimport INFINITY, fabs, isnan
+from libc.math cimport INFINITY, fabs, isnan, sqrt
 from libc.stdint cimport int64_t, uint64_t
 
 from typing import Final
@@ -329,6 +329,7 @@ cdef class JointRules:
         self.plausibility, self.is_checked = safety.plausibility, safety.plausibility is not None
         self.torque_limit_nm, self.network_limit_nm = safety.torque_limit_nm, safety.network_limit_nm
         self.deviation_cycles, self.deviation_sigmas = safety.deviation_cycles, safety.settings.deviation_sigmas
+        self.sensor_variance = safety.sensor_zero_nm**2
         self.deviates = 0
         self.status.use(safety.settings)
 
@@ -399,7 +400,7 @@ cdef class JointRules:
         if self.with_network and (estimate.status == DEGRADED or network - network != 0.0):
             self.tally.network(estimate, network_wanted, self.network_limit_nm)
         if self.deviation_cycles:
-            if fabs(torque - sensor_nm) <= self.deviation_sigmas * sigma:
+            if fabs(torque - sensor_nm) <= self.deviation_sigmas * sqrt(sigma * sigma + self.sensor_variance):
                 self.deviates = 0
             elif not isnan(sensor_nm):
                 self.deviates += 1

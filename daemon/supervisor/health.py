@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from math import inf, isfinite
+from math import hypot, inf, isfinite
 from typing import NamedTuple
 
 from jtqd.daemon.config import Config
@@ -87,12 +87,15 @@ class Deviation:
         self._since_s = inf
         self._last_s = -inf
 
-    def update(self, seen: JointView, now_s: float) -> bool:
-        """Take a reading; True while the estimate is too far. A reading without a number is passed over."""
+    def update(self, seen: JointView, now_s: float, sensor_zero_nm: float = 0.0) -> bool:
+        """Take a reading; True while the estimate is too far. A reading without a number is passed over.
+
+        sensor_zero_nm: of the torque sensor, beside sigma: standard deviation.
+        """
         difference = abs(seen.torque_nm - seen.sensor_nm)
         if seen.status not in st.PUBLISHED or not isfinite(difference) or not seen.sigma_nm > 0.0:
             return self.present
-        sigmas = difference / seen.sigma_nm
+        sigmas = difference / hypot(seen.sigma_nm, sensor_zero_nm)
         changes = sigmas < NEAR_SIGMAS if self.present else sigmas > DEVIATION_SIGMAS
         if not changes:
             self._since_s = inf
@@ -235,6 +238,9 @@ class Health:
         """Take the limits of a configuration that has come into force."""
         limit = config.estimator.network_limit
         self._network_limits_nm = [limit * joint.joint.rated_torque_nm for joint in config.joints]
+        self._sensor_zeros_nm = [
+            config.estimator.sensor_zero_nm(joint.joint.rated_torque_nm) for joint in config.joints
+        ]
 
     def observe(
         self, view: View, now_s: float, *, absent: Collection[int] = (), cycles_lost: int = 0
@@ -265,11 +271,12 @@ class Health:
         for counter, (name, subject) in _COUNTED.items():
             self._observe_counter(name, subject, view.counters[counter], now_s)
         self._observe_counter("cycles_lost", THE_RECORDER, cycles_lost, now_s, str(cycles_lost))
-        for joint, seen, limit_nm in zip(self._joints, view.joints, self._network_limits_nm, strict=True):
+        limits = zip(self._joints, view.joints, self._network_limits_nm, self._sensor_zeros_nm, strict=True)
+        for joint, seen, limit_nm, zero_nm in limits:
             self._observe_inputs(joint, seen, view, now_s)
             self._observe_status(joint, seen, limit_nm, now_s)
             if advanced:
-                far = joint.deviation.update(seen, now_s)
+                far = joint.deviation.update(seen, now_s, zero_nm)
                 text = (
                     f"{seen.torque_nm:.2f} Nm against {seen.sensor_nm:.2f} Nm, sigma {seen.sigma_nm:.2f} Nm"
                 )

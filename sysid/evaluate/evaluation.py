@@ -41,7 +41,7 @@ from jtqd.sysid.evaluate.scores import (
     ratio,
     standstill,
 )
-from jtqd.sysid.evaluate.truth import TruthTables, truth_tables
+from jtqd.sysid.evaluate.truth import TruthTables, for_intervals, truth_tables
 from jtqd.sysid.fit.efficiency_report import TITLES as QUADRANT_TITLES
 from jtqd.sysid.fit.plateaus import Plateau
 from jtqd.sysid.runs.checks import RunIssue
@@ -146,9 +146,11 @@ def evaluate(
         variable=error_tables(parts["variable"], modes),
         constant_tables=error_tables(parts["constant"], modes),
         intervals={
-            name: table for name, part in parts.items() if (table := interval_tables(part)) is not None
+            name: table
+            for name, part in parts.items()
+            if (table := interval_tables([for_intervals(each) for each in part])) is not None
         },
-        standstill=standstill(every),
+        standstill=standstill([for_intervals(each) for each in every]),
         jumps={method: jump for method in methods if (jump := largest_jump(every, method)) is not None},
         passages={
             method: jump

@@ -153,14 +153,14 @@ class JointModels:
                 runs[method] = estimate_columns(
                     self.joint, settings, self.networks.get(method), time_s, columns
                 )
-        settings = EstimatorSettings(method=OURS)
+        settings = EstimatorSettings(method=OURS, track_zeros=False)  # one observer serves both
         torsion = None if self.joint.fused is None else self.joint.fused.torsion
         dt = np.diff(time_s, prepend=time_s[0])
         current, motor, velocity, link = (getattr(columns, name) for name in _INPUTS)
         seen = observe_run(
             self.joint, settings, torsion, dt, current, motor, velocity, link, columns.temperature_c
         )
-        for method in ("physics", OURS):  # one observer serves both
+        for method in ("physics", OURS):
             if method in self.methods:
                 network = self.networks.get(method)
                 estimator = FusedEstimator(self.joint, settings, network)  # type: ignore[arg-type]
@@ -246,7 +246,8 @@ class Samples:
     velocity's [rad/s, joint side] makes the quadrant (index into QUADRANTS); estimate_nm, sigma_nm, status: by method;
     scored: all methods move and have a value; standing: all have a value and stand still; missing: settled, but some
     method has no value; temperature_c: NaN where the run has none; bare_nm: the paper's network by itself, without the
-    guard around it, NaN where there is none. true_nm: the gear's torque itself, where the run is emulated and has it.
+    guard around it, NaN where there is none. true_nm: the gear's torque itself, where the run is emulated and has it;
+    reference_nm: standard deviation of the sensor's zero, as the joint file has it.
     """
 
     run: str
@@ -266,6 +267,7 @@ class Samples:
     missing: Flags
     bare_nm: FloatArray
     true_nm: FloatArray | None = None
+    reference_nm: float = 0.0
 
     def error_nm(self, method: str) -> FloatArray:
         """Estimate less sensor [n] [Nm]."""
@@ -311,4 +313,5 @@ def take_samples(
         missing=settled & ~published,
         bare_nm=np.full_like(sensor, np.nan) if paper is None else paper.network_nm,
         true_nm=true_nm,
+        reference_nm=0.0 if models.joint.fused is None else models.joint.fused.sigma.reference_nm,
     )

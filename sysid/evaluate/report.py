@@ -221,7 +221,7 @@ def text_lines(result: Evaluation, mapping: Mapping[str, Any]) -> list[str]:
         "B. variable velocity: mean square error in Nm²",
         *_variable(result),
         "",
-        "C. 90 % interval of our method: coverage of the sensor value, in %",
+        "C. 90 % interval of our method: coverage of the true torque where a run has it, else of the sensor, in %",
         *_text_intervals(result),
         "",
         *_text_truth(result),
@@ -316,9 +316,7 @@ def _text_intervals(result: Evaluation) -> list[str]:
     for number, one in result.standstill.items():
         held = ", ".join(f"{_SHORT[m]} {100 * c.share:.1f} %" for m, c in one.coverage.items())
         share = f"{100 * one.share:.0f} % of the samples"
-        lines.append(
-            f"  standstill j{number}, {share}: the interval contained the sensor value in {held or 'no sample'}"
-        )
+        lines.append(f"  standstill j{number}, {share}: the interval contained it in {held or 'no sample'}")
     return lines
 
 

@@ -4,6 +4,8 @@ Runs of `python -m jtqd.sysid.campaign.emulated` have the torque of each gear be
 has noise, a zero of the day and the links' inertia in it; an interval that holds the sensor may be too wide for the torque.
 
 `now`: the estimate against the torque at the same instant, with the estimate's own age as an error, as a controller sees it.
+Intervals are scored against the torque where a run has it: sigma is that of the torque (`for_intervals`).
+
 `aligned`: against the torque passed through the estimator's filter, as the tables against the sensor do.
 """
 
@@ -11,13 +13,35 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
+from jtqd.estimator.estimator import STANDSTILL_SIGMAS
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.sysid.evaluate.methods import Samples
 from jtqd.sysid.evaluate.scores import IntervalTables, Row, Standstill, interval_tables, row, standstill
+
+_OURS: Final = ("physics", "fused")
+"""Methods whose sigma is that of the torque, without the sensor's zero."""
+
+
+def for_intervals(samples: Samples) -> Samples:
+    """Return samples whose `sensor_nm` an interval is to hold: the true torque, aligned, where the run has it.
+
+    Else the sensor, and sigma of ours grows by the sensor's zero, which the comparison contains: at standstill, where sigma
+    is a half width of STANDSTILL_SIGMAS, by as many.
+    """
+    if samples.true_nm is not None:
+        dt = np.diff(samples.time_s, prepend=samples.time_s[0])
+        return replace(samples, sensor_nm=low_pass(samples.true_nm, dt, EstimatorSettings().bandwidth_rad_s))
+    wider = samples.reference_nm * np.where(samples.standing, STANDSTILL_SIGMAS, 1.0)
+    sigma = {
+        method: np.hypot(values, wider) if method in _OURS else values
+        for method, values in samples.sigma_nm.items()
+    }
+    return replace(samples, sigma_nm=sigma)
 
 
 @dataclass(frozen=True)
@@ -36,10 +60,8 @@ def truth_tables(samples: Sequence[Samples]) -> TruthTables | None:
     for each in samples:
         if each.true_nm is None:
             continue
-        dt = np.diff(each.time_s, prepend=each.time_s[0])
-        passed = low_pass(each.true_nm, dt, EstimatorSettings().bandwidth_rad_s)
         now.append(replace(each, sensor_nm=each.true_nm))
-        aligned.append(replace(each, sensor_nm=passed))
+        aligned.append(for_intervals(each))
     if not now:
         return None
     numbers = sorted({each.number for each in now})

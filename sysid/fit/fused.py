@@ -5,7 +5,7 @@ fit on the others, and the parameters that are written are those of all runs tog
 
 With residuals e_c = tau_raw - loss - sensor and e_t = tau_t - sensor on runs not seen:
 
-    reference^2 = covariance of the two paths' run means: what both share is the sensor's zero
+    reference^2 = covariance of the two paths' run means, less its standard error: what both share is the sensor's zero
     e_c^2 - reference^2 ~ current^2 + (viscous v)^2 + (load tau_raw)^2
     e_t^2 - reference^2 - open^2 ~ torsion^2 + (load tau_t)^2
     scale_q = 90 % quantile of |error|/sigma in quadrant q, over 1.645: split conformal prediction by runs
@@ -68,7 +68,10 @@ def fit_sigma(runs: Sequence[PathResiduals]) -> FusedSigma:
         raise ValueError(f"found {len(runs)} held-out runs with motion, expected at least 3")
     current = np.array([run.current_error_nm.mean() for run in runs])
     torsion = np.array([run.torsion_error_nm.mean() for run in runs])
-    shared = max(float(np.mean((current - current.mean()) * (torsion - torsion.mean()))), _FLOOR_NM**2)
+    products = (current - current.mean()) * (torsion - torsion.mean())
+    # less its standard error: what is not surely the sensor's stays in the sigma of the torque
+    doubt = float(np.std(products)) / np.sqrt(len(runs))
+    shared = max(float(np.mean(products)) - doubt, _FLOOR_NM**2)
     fast = [np.abs(run.velocity_rad_s) > _FAST_RAD_S for run in runs]
     if not any(map(np.any, fast)):
         raise ValueError(f"found no held-out sample above {_FAST_RAD_S} rad/s, expected some")

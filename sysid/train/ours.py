@@ -84,7 +84,7 @@ def export_gated(trained: Trained, waves: int, metadata: Mapping[str, Any]) -> b
 
 Table = np.ndarray[tuple[int, int], np.dtype[np.bool_]]
 
-_SETTINGS: Final = EstimatorSettings(method="fused")
+_SETTINGS: Final = EstimatorSettings(method="fused", track_zeros=False)
 HIDDEN: Final = (16, 16)
 _CORE: Final = 3
 """Features that set the gains (speed, motor torque, torsion less current); the others are the waves."""

@@ -19,7 +19,14 @@ from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.network import FusedNetwork
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import Estimate
-from tests.estimator.fused_helpers import TRAINED_C, FakeNetwork, everywhere, fused_joint, fused_network
+from tests.estimator.fused_helpers import (
+    SIGMA,
+    TRAINED_C,
+    FakeNetwork,
+    everywhere,
+    fused_joint,
+    fused_network,
+)
 
 FUSED = EstimatorSettings(method="fused")
 JOINT = fused_joint()
@@ -38,6 +45,7 @@ PLAIN = replace(
     ),
 )
 """Torsion torque is K (theta_m/G - theta_l) without more."""
+NARROW = replace(PLAIN, fused=replace(PLAIN.fused, sigma=SIGMA))  # type: ignore[type-var]
 
 
 def estimator(network: Any = None, joint: Joint = PLAIN, **settings: Any) -> FusedEstimator:
@@ -62,12 +70,15 @@ def steady(  # noqa: PLR0917 - a state and how it is held
     return last
 
 
-def physics(i: float, v: float, torsion_nm: float, temperature_c: float = 25.0) -> tuple[float, float, float]:
-    """(value, sigma before its scale, half) of both paths at a constant state."""
-    assert PLAIN.fused is not None
-    model = AdditiveLossModel(PLAIN.fused.loss)
+def physics(
+    i: float, v: float, torsion_nm: float, temperature_c: float = 25.0, joint: Joint = PLAIN
+) -> tuple[float, float, float]:
+    """(value, sigma before its scale, half) of both paths at a constant state; sigma without the sensor's zero."""
+    assert joint.fused is not None
+    model = AdditiveLossModel(joint.fused.loss)
     loss, half = model.loss(GAIN * i, v, model.thermal(temperature_c))
-    return (*Fusion(PLAIN.fused.sigma, True).fuse(GAIN * i, loss, half, v, torsion_nm), half)
+    sigma = replace(joint.fused.sigma, reference_nm=0.0)
+    return (*Fusion(sigma, True).fuse(GAIN * i, loss, half, v, torsion_nm), half)
 
 
 # ---- values
@@ -172,9 +183,9 @@ def test_the_network_fades_at_standstill() -> None:
 
 def test_standstill_value_and_sigma() -> None:
     """The middle of the friction interval, drawn to the torsion; the smaller of both half widths."""
-    for torsion_nm in (5.0, 40.0):
-        got = steady(estimator(says(3.0)), 2.0, 0.0, torsion_nm=torsion_nm)
-        value, sigma, half = physics(2.0, 0.0, torsion_nm)
+    for torsion_nm in (7.0, 18.0):
+        got = steady(estimator(says(3.0), NARROW), 2.0, 0.0, torsion_nm=torsion_nm)
+        value, sigma, half = physics(2.0, 0.0, torsion_nm, joint=NARROW)
         assert half > 2.0
         assert got.status == st.STANDSTILL
         assert got.torque_nm == pytest.approx(value, abs=1e-9)
@@ -210,6 +221,57 @@ def test_more_than_three_times_rated_is_invalid() -> None:
         assert math.isnan(got.torque_nm) == math.isnan(got.sigma_nm) == (value > 120.0)
         seen.add(got.status)
     assert seen == {st.VALID, st.INVALID}
+
+
+# ---- two views that disagree
+
+
+def test_views_apart_widen_sigma_at_once_and_lower_the_status() -> None:
+    """3 standard deviations of their distance are free, the interval holds what is more; from 4 on the status is 3."""
+    value, sigma, _ = physics(3.0, 1.0, 5.0, joint=NARROW)
+    loss = AdditiveLossModel(NARROW.fused.loss).loss(GAIN * 3.0, 1.0, 0.0)[0]  # type: ignore[union-attr]
+    current = GAIN * 3.0 - loss
+    c, t = (0.2**2 + 0.1**2 + (0.02 * GAIN * 3.0) ** 2), 0.35**2
+    for sigmas, status in ((2.5, st.VALID), (3.5, st.VALID), (4.5, st.DEGRADED), (-9.0, st.DEGRADED)):
+        torsion_nm = current
+        for _ in range(20):  # s_t grows with the torsion
+            torsion_nm = current + sigmas * math.sqrt(c + t + (0.015 * torsion_nm) ** 2)
+        e = estimator(joint=NARROW)
+        steady(e, 3.0, 1.0, torsion_nm=torsion_nm, count=1)
+        got = e.step(0.001, 3.0, 100.0 * (0.001 + torsion_nm / K), 100.0, 0.001, 25.0)
+        value, sigma, _ = physics(3.0, 1.0, torsion_nm, joint=NARROW)
+        assert (got.status, got.torque_nm) == (status, pytest.approx(value, abs=1e-6))
+        distance = math.sqrt(c + t + (0.015 * torsion_nm) ** 2)
+        worse = max(abs(value - current), abs(value - torsion_nm)) / abs(torsion_nm - current)
+        more = max(0.0, abs(sigmas) - 3.0) * distance * worse
+        assert got.sigma_nm == pytest.approx(math.hypot(sigma, more / 1.6448536269514722), abs=1e-6)
+        if abs(sigmas) > 5.0:
+            assert abs(torsion_nm - got.torque_nm) < 1.645 * got.sigma_nm + 3.0 * distance
+
+
+def test_the_status_stays_lowered_for_a_moment() -> None:
+    e = estimator(joint=NARROW)
+    agreed = physics(3.0, 1.0, 5.0, joint=NARROW)[0]
+    for _ in range(8):
+        agreed = physics(3.0, 1.0, agreed, joint=NARROW)[0]
+    steady(e, 3.0, 1.0, torsion_nm=agreed + 20.0, count=40)
+    lowered = [e.step(0.001, 3.0, 100.0 * agreed / K, 100.0, 0.0, 25.0).status for _ in range(400)]
+    assert lowered[0] == st.DEGRADED
+    assert lowered[-1] == st.VALID
+    back = lowered.index(st.VALID)
+    assert 100 <= back < 150
+    assert set(lowered[back:]) == {st.VALID}
+
+
+def test_what_is_degraded_is_degraded_at_standstill() -> None:
+    """No trust in the network, and two views apart: status 3, and a standard deviation in place of an interval."""
+    cold = steady(estimator(says(3.0), NARROW), 2.0, 0.0, 10.0, temperature_c=TRAINED_C[0] - 5.0)
+    assert cold.status == st.DEGRADED
+    value, sigma, _ = physics(2.0, 0.0, 10.0, TRAINED_C[0] - 5.0, NARROW)
+    assert (cold.torque_nm, cold.sigma_nm) == (pytest.approx(value), pytest.approx(sigma))
+    apart = steady(estimator(joint=NARROW), 2.0, 0.0, 90.0)
+    assert apart.status == st.DEGRADED
+    assert apart.sigma_nm > 10.0
 
 
 ABSURD = [

@@ -1,0 +1,35 @@
+"""Zeros of the link encoder and of the current as slow states; the equations stand in zeros.pyx."""
+
+from jtqd.estimator.observer cimport FusedObserverLaw
+
+cdef enum:
+    ZERO_STATES = 5  # link zero [rad], current zero [A], friction [Nm], viscous [Nms/rad], gain
+
+cdef struct ZerosLaw:
+    bint used
+    double prior[ZERO_STATES]  # variances
+    double drift[ZERO_STATES]  # variance per second
+    double stiffness, torque_per_ampere, limit
+
+cdef struct Gathered:  # sums over the samples of a block
+    double dt, y, direction, velocity, torsion, variance
+    int samples
+
+cdef struct ZerosState:
+    double x[ZERO_STATES]
+    double p[ZERO_STATES][ZERO_STATES]
+    double link_rad, current_a  # what is taken off the readings
+    double left_nm  # what is known of the link zero and not yet taken off, as torque
+    double apart_s  # for how long the views are farther apart than can be
+    Gathered block
+
+cdef int fill_zeros(ZerosLaw *law, joint, sigma, torsion, bint used) except -1
+cdef void restart_zeros(const ZerosLaw *law, ZerosState *s) noexcept nogil
+cdef void drop_block(ZerosState *s) noexcept nogil
+cdef bint gather(
+    ZerosState *s, double dt, double y, double direction, double velocity, double torsion, double variance
+) noexcept nogil
+cdef double local_stiffness(const FusedObserverLaw *law, double deflection) noexcept nogil
+cdef void update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, double slope) noexcept nogil
+cdef bint beyond(const ZerosLaw *law, const ZerosState *s) noexcept nogil
+cdef zeros_of(const ZerosLaw *law, const ZerosState *s)

@@ -1,0 +1,201 @@
+"""Zeros of the link encoder and of the current of one day, from the difference of the two views: a small Kalman filter.
+
+    y = tau_t - tau_c = -K(d) e - G Kt (1 - dL/draw) i0 - s f - v u + tau_t g + noise
+
+| state | what it is | its part of y |
+|---|---|---|
+| e | zero of the link encoder [rad] | even: the same in both directions, more where the spring is stiffer |
+| i0 | zero of the current [A] | even: less when driving than when back-driven |
+| f | friction of the day against the file [Nm] | odd: with the direction s of the motion |
+| u | viscous friction of the day [Nms/rad] | odd: with the velocity |
+| g | gain of the current against the stiffness | with the torque |
+
+f, u and g are there so that they are not taken for a zero; nothing is corrected by them. A load, whatever its size, is in
+both views alike: it is not in y. Friction cannot be told from a zero before the joint has moved in both directions: until then the
+covariance of e stays as wide as f, and nothing is corrected (below). e and i0 are told apart by little: what is common to both goes by their
+prior widths, and the standard deviation of e never falls below what i0 leaves open.
+
+Samples count in motion only, with the friction on one side: |v| > MOVING_RAD_S, |s| > ONE_WAY. They are averaged over blocks of BLOCK
+samples, and a block counts as BLOCK_S/CORRELATION_S of an independent sample of variance s_c^2 + s_t^2: ripple and errors
+of the encoders are not white.
+
+What is taken off the readings is x w(|x|/sigma_x): nothing below DOUBT standard deviations, all of it above SURE, linear between (firm
+shrinkage, Gao and Bruce 1997): on a day without a zero worth it nothing is changed. It follows with SLEW_S: the estimate must not jump.
+"""
+
+from libc.math cimport fabs, fmax, sqrt
+from libc.string cimport memset
+
+from typing import Final, NamedTuple
+
+MOVING_RAD_S: Final = 0.05
+ONE_WAY: Final = 0.9
+BLOCK: Final = 16
+"""Samples of a block."""
+CORRELATION_S: Final = 0.3
+"""So long the difference of the views keeps its error; chosen, with the rest, on runs that no figure is reported on."""
+DOUBT: Final = 2.0
+SURE: Final = 4.0
+SLEW_S: Final = 0.25
+LARGEST_LINK: Final = 0.3
+"""Prior standard deviation of the link zero as a torque, part of the rated one."""
+CURRENT_SHARE: Final = 0.2
+"""Prior standard deviation of the current zero as a torque, part of the current path's: the rest is friction."""
+LEAST_GAIN: Final = 0.01
+"""Prior standard deviation of the gain, where the paths' sigmas say less."""
+DRIFT_S: Final = 600.0
+"""In so long a zero or a friction may change by a tenth of its prior width: grease warms, encoders do not."""
+JUMP: Final = 4.0
+JUMP_S: Final = 0.3
+"""Views that are apart by more than JUMP standard deviations for so long: the encoder has slipped, its zero is unknown again."""
+
+cdef int SAMPLES = BLOCK
+cdef double CORRELATION = CORRELATION_S, INVERSE_SLEW = 1.0 / SLEW_S
+cdef double JUMP_SIGMAS = JUMP, LONGEST_S = JUMP_S
+cdef double LOW = DOUBT, HIGH = SURE, INVERSE_RANGE = 1.0 / (SURE - DOUBT)
+
+
+class Zeros(NamedTuple):
+    """What is known of the zeros of a joint, and its standard deviations; 0 and the prior width where nothing is.
+
+    link_rad, current_a: what the readings are off by; link_used_rad, current_used_a: what is taken off them; plausible: whether
+    the link's zero is within the joint file's limit.
+    """
+
+    link_rad: float
+    link_sigma_rad: float
+    link_used_rad: float
+    current_a: float
+    current_sigma_a: float
+    current_used_a: float
+    plausible: bool
+
+
+cdef int fill_zeros(ZerosLaw *law, joint, sigma, torsion, bint used) except -1:
+    """Set the parameters from a joint and its sections fused.sigma and fused.torsion (None: not used)."""
+    memset(law, 0, sizeof(ZerosLaw))
+    law.used = used and torsion is not None
+    if not law.used:
+        return 0
+    law.stiffness = torsion.stiffness_nm_per_rad
+    law.torque_per_ampere = joint.gear_ratio * joint.torque_constant_nm_per_a
+    law.limit = torsion.zero_limit_rad
+    law.prior[0] = (LARGEST_LINK * joint.rated_torque_nm / law.stiffness) ** 2
+    law.prior[1] = (CURRENT_SHARE * sigma.current_nm / law.torque_per_ampere) ** 2
+    law.prior[2] = sigma.current_nm**2
+    law.prior[3] = sigma.viscous_nms_per_rad**2
+    law.prior[4] = sigma.load**2 + sigma.torsion_load**2 + LEAST_GAIN**2
+    # the link's prior is as wide as a zero may be; it drifts like the rest of its path
+    law.drift[0] = (0.1 * sigma.torsion_nm / law.stiffness) ** 2 / DRIFT_S
+    for n in range(1, ZERO_STATES):
+        law.drift[n] = 0.01 * law.prior[n] / DRIFT_S
+    return 0
+
+
+cdef void restart_zeros(const ZerosLaw *law, ZerosState *s) noexcept nogil:
+    """Forget all: nothing is known of the zeros."""
+    cdef int n
+    memset(s, 0, sizeof(ZerosState))
+    for n in range(ZERO_STATES):
+        s.p[n][n] = law.prior[n]
+
+
+cdef void drop_block(ZerosState *s) noexcept nogil:
+    """Forget the samples of a block that is not complete: one of them does not count."""
+    if s.block.samples:
+        memset(&s.block, 0, sizeof(Gathered))
+
+
+cdef bint gather(
+    ZerosState *s, double dt, double y, double direction, double velocity, double torsion, double variance
+) noexcept nogil:
+    """Add a sample to the block; return whether it is complete and `update_zeros` is due.
+
+    y: tau_t - tau_c [Nm]; variance: of y [Nm^2].
+    """
+    cdef Gathered *b = &s.block
+    b.dt += dt
+    b.y += y
+    b.direction += direction
+    b.velocity += velocity
+    b.torsion += torsion
+    b.variance += variance
+    b.samples += 1
+    return b.samples == SAMPLES
+
+
+cdef double local_stiffness(const FusedObserverLaw *law, double d) noexcept nogil:
+    """Return d tau_t/d d [Nm/rad] of the spring at a deflection [rad], without slips."""
+    cdef double stiffness = law.stiffness + 3.0 * law.cubic * d * d
+    cdef int k
+    for k in range(law.hardenings):
+        if fabs(d) > law.hardening[k].deflection:
+            stiffness += law.hardening[k].stiffness
+    return stiffness
+
+
+cdef double _used(double x, double variance) noexcept nogil:
+    """Return what is taken off of a zero x: firm shrinkage."""
+    cdef double w = (fabs(x) / sqrt(variance) - LOW) * INVERSE_RANGE
+    if w >= 1.0:
+        return x
+    return x * w if w > 0.0 else 0.0
+
+
+cdef void update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, double slope) noexcept nogil:
+    """Take the complete block; stiffness: local, of the spring; slope: dL/draw of the loss."""
+    cdef Gathered b = s.block
+    cdef double h[ZERO_STATES]
+    cdef double ph[ZERO_STATES]
+    cdef double share = 1.0 / SAMPLES, innovation, variance, gain, way, left
+    cdef int m, n
+    memset(&s.block, 0, sizeof(Gathered))
+    h[0], h[1] = -stiffness, -law.torque_per_ampere * (1.0 - slope)
+    h[2], h[3], h[4] = -b.direction * share, -b.velocity * share, b.torsion * share
+    # the views were corrected: what was taken off belongs to what is seen
+    innovation = b.y * share + h[0] * s.link_rad + h[1] * s.current_a
+    variance = b.variance * share * CORRELATION / b.dt
+    for n in range(ZERO_STATES):
+        s.p[n][n] += law.drift[n] * b.dt
+        innovation -= h[n] * s.x[n]
+    s.apart_s = s.apart_s + b.dt if fabs(innovation) > JUMP_SIGMAS * sqrt(b.variance * share) else 0.0
+    if s.apart_s > LONGEST_S:
+        for n in range(ZERO_STATES):
+            s.p[0][n] = s.p[n][0] = 0.0
+        s.p[0][0] = law.prior[0]
+    for n in range(ZERO_STATES):
+        ph[n] = 0.0
+        for m in range(ZERO_STATES):
+            ph[n] += s.p[n][m] * h[m]
+        variance += h[n] * ph[n]
+    for n in range(ZERO_STATES):
+        gain = ph[n] / variance
+        s.x[n] += gain * innovation
+        for m in range(n + 1):
+            s.p[n][m] -= gain * ph[m]
+            s.p[m][n] = s.p[n][m]
+    way = b.dt * INVERSE_SLEW
+    if way > 1.0:
+        way = 1.0
+    s.link_rad += way * (_used(s.x[0], s.p[0][0]) - s.link_rad)
+    s.current_a += way * (_used(s.x[1], s.p[1][1]) - s.current_a)
+    # beyond what is doubt about the zero: of a joint without one nothing is left, on average
+    left = s.x[0] - s.link_rad
+    s.left_nm = law.stiffness * sqrt(fmax(0.0, left * left - s.p[0][0]))
+
+
+cdef bint beyond(const ZerosLaw *law, const ZerosState *s) noexcept nogil:
+    """Return whether the link's zero is one that no healthy joint has: beyond the file's limit, and that for sure."""
+    return fabs(s.x[0]) > law.limit and fabs(s.x[0]) > HIGH * sqrt(s.p[0][0])
+
+
+cdef zeros_of(const ZerosLaw *law, const ZerosState *s):
+    return Zeros(
+        s.x[0],
+        sqrt(s.p[0][0]),
+        s.link_rad,
+        s.x[1],
+        sqrt(s.p[1][1]),
+        s.current_a,
+        not beyond(law, s),
+    )
