@@ -19,8 +19,11 @@ from jtqd.drivers.devices import (
     SENSOR_SCALING_OBJECTS,
     DriveObject,
     DriveObjects,
+    drive_layout,
     parse_key,
 )
+from jtqd.drivers.layout import LayoutError, chosen, maps_of_json, pdo_of_words
+from jtqd.drivers.pdo import PdoError, PdoMap
 from jtqd.drivers.sdo import Key, label
 from jtqd.estimator.checked import ConfigError, Section, Verbatim, range_text
 from jtqd.estimator.decoder import FieldError, Text, check, choice, decode, limits
@@ -172,6 +175,8 @@ class JointConfig:
     """Silence of the drive after which an SDO request is repeated."""
     objects: DriveObjects
     """Which objects of the drive are mapped, with sign and factor."""
+    tpdos: tuple[PdoMap, ...]
+    """TPDOs that carry them: wanted ones, and after the boot those in force (`as_booted`)."""
     joint_data: bytes = field(default=b"", repr=False)
     """The joint file as it was read, for the log."""
 
@@ -345,13 +350,47 @@ class _Objects:
                 raise ConfigError(
                     f"{where}.{each.name}.type': expected I32: a position rolls over at 32 bits"
                 )
-        objects = DriveObjects(**found)
-        bits = objects.motor_velocity.bits + objects.current.bits + objects.statusword.bits
+        return DriveObjects(**found)
+
+
+@dataclass(frozen=True)
+class _Tpdo:
+    """One TPDO in section `joint_N.tpdos`: parameters 1800h and 1A00h, 1801h and 1A01h, ..."""
+
+    number: Annotated[int, limits(ge=1, le=4)]
+    cob_id: Annotated[int, limits(ge=0x181, le=0x4FF)]
+    objects: tuple[Annotated[int, limits(ge=0, le=0xFFFF_FFFF)], ...]
+    """Mapping entries 0xIIIISSLL."""
+
+
+def _tpdos(joint: str, path: Path, section: _JointSection, objects: DriveObjects) -> tuple[PdoMap, ...]:
+    """Return the TPDOs that shall carry the objects. Raises ConfigError for what they lack, or cannot be."""
+    if not section.tpdos:
+        second = (objects.motor_velocity, objects.current, objects.statusword)
+        bits = sum(each.bits for each in second if each is not None)
         if bits > _PDO_BITS:
             raise ConfigError(
-                f"{where}': found {bits} bits of velocity, current and statusword, expected at most {_PDO_BITS}: one PDO"
+                f"{path}: key '{joint}.objects': found {bits} bits of velocity, current and statusword, "
+                f"expected at most {_PDO_BITS}: one PDO"
             )
-        return objects
+        return drive_layout(section.node, objects)
+    where = f"{path}: key '{joint}.tpdos'"
+    try:
+        maps = tuple(
+            pdo_of_words(section.node, each.number, each.cob_id, each.objects, 1, objects)
+            for each in section.tpdos
+        )
+        used = chosen(objects, maps)
+    except (PdoError, LayoutError) as error:
+        raise ConfigError(f"{where}: {error}") from None
+    for name, taken in (("number", {3}), ("cob_id", {0x380 + section.node})):
+        values = [getattr(pdo, name) for pdo in maps]
+        reserved = taken if section.temperature else set()
+        if len({*values, *reserved}) != len(values) + len(reserved):
+            shown = ", ".join(str(value) if name == "number" else f"{value:03X}h" for value in values)
+            rule = ", TPDO3 is that of the temperature" if reserved else ""
+            raise ConfigError(f"{where}: found {name} {shown}, expected each once{rule}")
+    return used
 
 
 @dataclass(frozen=True)
@@ -367,6 +406,7 @@ class _JointSection:
     mandatory: bool = True
     sdo_timeout_ms: _SdoTimeout | None = None
     objects: _Objects = _Objects()
+    tpdos: tuple[_Tpdo, ...] = ()
     network: _Network | None = None
 
     def __post_init__(self) -> None:
@@ -526,6 +566,23 @@ class Config:
         return self.recording.ring_cycles
 
 
+def as_booted(config: Config, nodes: Mapping[str, Mapping[str, Any]]) -> Config:
+    """Return the configuration with the TPDOs that the drives have.
+
+    nodes: of the boot report, or of a log's provenance, by node-ID; a drive that is not in it (it was absent) keeps those
+    that are wanted. Raises PdoError, LayoutError, KeyError or TypeError for what is no such report.
+    """
+
+    def of(joint: JointConfig) -> JointConfig:
+        booted = nodes.get(str(joint.node_id))
+        if booted is None or "tpdos" not in booted:
+            return joint
+        maps = maps_of_json(joint.node_id, booted["tpdos"], joint.objects)
+        return replace(joint, tpdos=chosen(joint.objects, maps))
+
+    return replace(config, joints=tuple(of(joint) for joint in config.joints))
+
+
 def load_config(path: Path | None) -> Config:
     """Read and check a configuration; None is the shipped bench configuration.
 
@@ -580,6 +637,7 @@ def _sensor(section: _SensorSection, sdo_timeout_ms: int) -> SensorConfig:
 
 def _joint(path: Path, number: int, section: _JointSection, method: str, sdo_timeout_ms: int) -> JointConfig:
     """Read what a section `joint_N` names: the joint file and, where the method uses one, the network."""
+    objects = section.objects.of_drive(f"joint_{number}", path)
     network = None if section.network is None else _network(section.network, path)
     joint_path = path.parent / section.file
     mapping, data = read_yaml(joint_path)
@@ -606,7 +664,8 @@ def _joint(path: Path, number: int, section: _JointSection, method: str, sdo_tim
         temperature=section.temperature,
         mandatory=section.mandatory,
         sdo_timeout_ms=section.sdo_timeout_ms or sdo_timeout_ms,
-        objects=section.objects.of_drive(f"joint_{number}", path),
+        objects=objects,
+        tpdos=_tpdos(f"joint_{number}", path, section, objects),
         joint_data=data,
     )
 

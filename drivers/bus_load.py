@@ -6,15 +6,14 @@ configuration above 95 % of it is refused: what is left must carry SDO, EMCY and
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from jtqd.drivers.devices import (
     EVENT_MS,
     JTQD_NODE,
     SYNC_COB_ID,
-    drive_tpdo1,
-    drive_tpdo2,
+    drive_layout,
     drive_tpdo3,
     estimate_tpdos,
     sensor_tpdo1,
@@ -122,7 +121,7 @@ def heartbeat_row(who: str, node: int, heartbeat_ms: int, period_s: float = PERI
 
 
 def configured_load(
-    drives: Iterable[int],
+    drives: Iterable[int] | Mapping[int, Sequence[PdoMap]],
     sensors: Mapping[int, tuple[int, ...]],
     *,
     sync_counter: bool = True,
@@ -135,16 +134,16 @@ def configured_load(
 ) -> BusLoad:
     """Add up drives (node numbers), sensors (node -> channels), SYNC, estimates, heartbeats and `extra`.
 
+    `drives` may hold their TPDOs by node; without, they are as jtqd maps them.
     `temperatures`: nodes among the drives that send their joint's temperature.
     """
-    drives = tuple(drives)
+    layouts = drives if isinstance(drives, Mapping) else {node: drive_layout(node) for node in drives}
     rows = [sync_row(sync_counter)]
-    for pdo, who in zip(estimate_tpdos(len(drives), master), _ESTIMATES, strict=False):
+    for pdo, who in zip(estimate_tpdos(len(layouts), master), _ESTIMATES, strict=False):
         rows.append(pdo_row(who, pdo))
     rows.append(heartbeat_row("jtqd", master, heartbeat_ms, period_s))
-    for node in drives:
-        rows.append(pdo_row(f"drive {node} TPDO1", drive_tpdo1(node)))
-        rows.append(pdo_row(f"drive {node} TPDO2", drive_tpdo2(node)))
+    for node, tpdos in layouts.items():
+        rows += [pdo_row(f"drive {node} TPDO{pdo.number}", pdo) for pdo in tpdos]
         rows.append(heartbeat_row(f"drive {node}", node, heartbeat_ms, period_s))
     rows += [temperature_row(node, period_s) for node in temperatures]
     for node, channels in sensors.items():

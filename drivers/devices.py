@@ -89,20 +89,22 @@ class DriveObject:
 
 @dataclass(frozen=True)
 class DriveObjects:
-    """Objects of a drive's two synchronous TPDOs; those of CiA 402 unless the configuration names others.
+    """Objects of a drive's synchronous TPDOs; those of CiA 402 unless the configuration names others.
 
-    The first PDO holds both positions, of 32 bits each; the second one velocity, current and statusword, together 8 bytes.
+    None: the drive has no such object, for example only one encoder. Where jtqd maps them (`drive_layout`) the first PDO
+    holds the positions, of 32 bits each; the second one velocity, current and statusword, together 8 bytes at most.
     """
 
     motor_position: DriveObject = DriveObject(0x6064)
-    link_position: DriveObject = DriveObject(0x60E4, 1)
-    motor_velocity: DriveObject = DriveObject(0x606C)
+    link_position: DriveObject | None = DriveObject(0x60E4, 1)
+    motor_velocity: DriveObject | None = DriveObject(0x606C)
     current: DriveObject = DriveObject(0x6078, bits=16)
     statusword: DriveObject = DriveObject(0x6041, bits=16, signed=False)
 
     def scaled_by(self) -> dict[str, tuple[Key, ...]]:
-        """Return the scaling objects of each quantity; none for one with a factor of its own."""
-        return {name: () if getattr(self, name).factor else keys for name, keys in _SCALED_BY.items()}
+        """Return the scaling objects of each quantity that the drive has; none for one with a factor of its own."""
+        found = ((name, getattr(self, name), keys) for name, keys in _SCALED_BY.items())
+        return {name: () if each.factor else keys for name, each, keys in found if each is not None}
 
 
 _SCALED_BY: dict[str, tuple[Key, ...]] = {
@@ -123,6 +125,7 @@ class DriveProfile:
         objects: which of its objects are mapped.
         given: scaling objects by the configuration, which are then not read.
         temperature: it has 3001h, and shall send it by TPDO3.
+        layout: TPDOs that shall carry its quantities; empty: TPDO1 and TPDO2 as jtqd maps them.
     """
 
     node_id: int
@@ -130,14 +133,15 @@ class DriveProfile:
     given: Mapping[Key, int] = field(default_factory=dict)
     temperature: bool = False
     objects: DriveObjects = CIA_402
+    layout: tuple[PdoMap, ...] = ()
     profile_number = 402
 
     @property
     def tpdos(self) -> tuple[PdoMap, ...]:
-        """TPDO1 and TPDO2, and TPDO3 with the temperature."""
+        """TPDOs of the quantities, and TPDO3 with the temperature."""
         node, objects = self.node_id, self.objects
-        every = drive_tpdo1(node, objects), drive_tpdo2(node, objects), drive_tpdo3(node)
-        return every if self.temperature else every[:2]
+        layout = self.layout or drive_layout(node, objects)
+        return (*layout, drive_tpdo3(node)) if self.temperature else layout
 
     @property
     def scaling_objects(self) -> tuple[Key, ...]:
@@ -190,7 +194,7 @@ Profile = DriveProfile | SensorProfile
 
 @dataclass(frozen=True)
 class DriveScaling:
-    """Factors from a drive's numbers to SI: 6064h, 606Ch (motor side), 60E4h:1 (joint side), 6078h."""
+    """Factors from a drive's numbers to SI: 6064h, 606Ch (motor side), 60E4h:1 (joint side), 6078h; 0 for none."""
 
     motor_rad_per_count: float
     motor_rad_s_per_unit: float
@@ -203,6 +207,11 @@ class SensorScaling:
     """Nm per unit of 9130h/7130h, by channel."""
 
     nm_per_unit: Mapping[int, float]
+
+
+def drive_layout(node: int, objects: DriveObjects = CIA_402) -> tuple[PdoMap, ...]:
+    """Return the TPDOs into which jtqd maps a drive's quantities."""
+    return drive_tpdo1(node, objects), drive_tpdo2(node, objects)
 
 
 def drive_tpdo1(node: int, objects: DriveObjects = CIA_402) -> PdoMap:
@@ -218,7 +227,9 @@ def drive_tpdo2(node: int, objects: DriveObjects = CIA_402) -> PdoMap:
 def _mapped(objects: DriveObjects, *names: str) -> tuple[MappedObject, ...]:
     found = ((getattr(objects, name), name) for name in names)
     return tuple(
-        MappedObject(each.index, each.subindex, each.bits, each.signed, name) for each, name in found
+        MappedObject(each.index, each.subindex, each.bits, each.signed, name)
+        for each, name in found
+        if each is not None
     )
 
 
@@ -279,7 +290,9 @@ def drive_scaling(profile: DriveProfile, read: Mapping[Key, int]) -> tuple[Drive
             raise mismatch(profile.node_id, key, name, expected=f"1..{highest}", found=str(values[key]))
     turn = 2.0 * math.pi
 
-    def factor(each: DriveObject, of_cia_402: Callable[[], float]) -> float:
+    def factor(each: DriveObject | None, of_cia_402: Callable[[], float]) -> float:
+        if each is None:
+            return 0.0
         return each.sign * (of_cia_402() if each.factor is None else each.factor)
 
     scaling = DriveScaling(

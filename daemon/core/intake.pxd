@@ -5,7 +5,7 @@ from libc.stdint cimport int8_t, int64_t, uint8_t, uint32_t
 from jtqd.drivers.frame_socket cimport Frame
 
 cdef enum:
-    MOST_INPUTS = 16  # PDOs that the loop waits for, and as many temperatures
+    MOST_INPUTS = 20  # PDOs that the loop waits for, and as many temperatures
     MOST_FIELDS = 8
     NODES = 128
     IDENTIFIERS = 2048  # of 11 bits

@@ -73,7 +73,7 @@ cdef int TEMPERATURE_BYTES = 2
 cdef int NOT_MEASURED = devices.NOT_MEASURED
 cdef double C_PER_UNIT = devices.TEMPERATURE_C_PER_UNIT
 
-_SIZES: Final = {"b": 1, "h": 2, "i": 4, "q": 8, "B": 1, "H": 2, "I": 4}
+_SIZES: Final = {"b": 1, "h": 2, "i": 4, "q": 8, "B": 1, "H": 2, "I": 4, "Q": 8}
 """Bytes of the objects that a PDO may carry, by their letters in `struct`; a small letter is a signed one."""
 
 

@@ -8,6 +8,9 @@ from jtqd.daemon.core.record cimport JointBlock
 from jtqd.daemon.core.status cimport JointRules
 from jtqd.estimator.sample cimport Estimator
 
+cdef enum:
+    MOST_TPDOS = 4  # of a drive
+
 cdef struct UnwrapState:
     int64_t last, offset
 
@@ -30,13 +33,20 @@ cdef class JointCycle:
     cdef Estimator core
     cdef readonly JointRules rules
     cdef readonly Unwrap motor, link
-    cdef Input *position
-    cdef Input *motion
+    cdef int input_count
+    cdef Input *input[MOST_TPDOS]  # of its drive, and which flags of the record stand for them
+    cdef int flags[MOST_TPDOS]
+    cdef const int64_t *motor_count
+    cdef const int64_t *link_count
+    cdef const int64_t *motor_speed
+    cdef const int64_t *current_count
+    cdef const int64_t *statusword
     cdef Input *sensor  # NULL without reference
     cdef Temperature *temperature
     cdef int64_t period_ns
     cdef Scale scale
     cdef JointState now
+    cdef int find_inputs(self, inputs) except -1
     cdef void observe_at(self, int64_t sync_ns, bint starting, bint network_wanted) noexcept nogil
     cdef void estimate(self, int64_t sync_ns, bint starting, bint network_wanted, int flags) noexcept nogil
     cdef void miss(self, int flags) noexcept nogil

@@ -82,8 +82,7 @@ cdef class JointCycle:
         self.estimator = estimator
         self.intake, self.pdos, self.period_ns = intake, intake.pdos, period_ns
         self.inputs = inputs
-        self.position = _input(intake, inputs.position, 2)
-        self.motion = _input(intake, inputs.motion, 3)
+        self.find_inputs(inputs)
         self.sensor = NULL if inputs.sensor is None else _input(intake, inputs.sensor, 2)
         temperature = UNKNOWN if inputs.temperature is None else intake.temperatures[inputs.temperature]
         self.temperature = &temperature.known  # the intake, or the module, keeps it
@@ -91,6 +90,30 @@ cdef class JointCycle:
         self.now.status = STARTING
         self.now.sample = nothing
         self.now.published = field_of(NAN, INFINITY, STARTING)
+
+    cdef int find_inputs(self, inputs) except -1:
+        """Find the drive's PDOs and the numbers in them; the flags of a record count all PDOs of a kind as one."""
+        cdef int position, motion
+        positions, motions = inputs.positions, inputs.motion
+        both = sorted(positions | motions)
+        if not 0 < len(both) <= MOST_TPDOS:
+            raise ValueError(f"found {len(both)} PDOs of a drive, expected 1 to {MOST_TPDOS}")
+        for index in both:
+            position, motion = POSITION if index in positions else 0, MOTION if index in motions else 0
+            self.flags[self.input_count] = position | motion
+            self.input[self.input_count] = _input(self.intake, index, 1)
+            self.input_count += 1
+        self.motor_count = _number_at(self.intake, inputs.places["motor_position"])
+        self.link_count = _number_at(self.intake, inputs.places["link_position"])
+        self.motor_speed = _number_at(self.intake, inputs.places["motor_velocity"])
+        self.current_count = _number_at(self.intake, inputs.places["current"])
+        self.statusword = _number_at(self.intake, inputs.places["statusword"])
+        return 0
+
+    @property
+    def node_id(self):
+        """Node-ID of its drive."""
+        return self.input[0].node_id
 
     @property
     def inputs(self):
@@ -176,7 +199,7 @@ cdef class JointCycle:
         inputs, pdos = self.inputs, self.pdos
         if not any(factors):
             return
-        if pdos[inputs.position].node_id == node_id:
+        if self.node_id == node_id:
             motor, speed, link, ampere = factors
             self.inputs = replace(
                 inputs,
@@ -215,11 +238,12 @@ cdef class JointCycle:
         self.now.sample.temperature_c = self.temperature.celsius
         if not isnan(self.temperature.celsius):
             flags |= TEMPERATURE
-        if self.position.fresh:
-            flags |= POSITION
-        if self.motion.fresh:
-            flags |= MOTION
-        if self.position.fresh and self.motion.fresh:
+        cdef int n, missing = 0
+        for n in range(self.input_count):
+            if not self.input[n].fresh:
+                missing |= self.flags[n]
+        flags |= (POSITION | MOTION) & ~missing
+        if not missing:
             self.estimate(sync_ns, starting, network_wanted, flags)
         else:
             self.miss(flags)
@@ -230,12 +254,12 @@ cdef class JointCycle:
         cdef JointBlock *record = &self.now.sample
         cdef Sample sample
         cdef Values e = Values(NAN, NAN, NAN, NAN, NAN, INVALID)
-        cdef int status, statusword = <int> self.motion.values[2]
+        cdef int status, statusword = <int> self.statusword[0]
         sample.dt_s = self.since_last(sync_ns)
-        sample.current_a = self.motion.values[1] * scale.ampere
-        sample.motor_position_rad = _counts(&self.motor.now, self.position.values[0]) * scale.motor_rad
-        sample.motor_velocity_rad_s = self.motion.values[0] * scale.motor_rad_s
-        sample.link_position_rad = _counts(&self.link.now, self.position.values[1]) * scale.link_rad
+        sample.current_a = self.current_count[0] * scale.ampere
+        sample.motor_position_rad = _counts(&self.motor.now, self.motor_count[0]) * scale.motor_rad
+        sample.motor_velocity_rad_s = self.motor_speed[0] * scale.motor_rad_s
+        sample.link_position_rad = _counts(&self.link.now, self.link_count[0]) * scale.link_rad
         sample.temperature_c = record.temperature_c
         self.core.advance(&sample, network_wanted, &e)
         status = self.rules.judge(
@@ -290,8 +314,14 @@ cdef class JointCycle:
 
 
 cdef Input *_input(Intake intake, int index, int count) except NULL:
-    """Return the PDO of this index; raises ValueError when it does not hold `count` objects."""
+    """Return the PDO of this index; raises ValueError when it does not hold at least `count` objects."""
     cdef InputState state = intake.states[index]
-    if state.input.field_count != count:
+    if state.input.field_count < count:
         raise ValueError(f"{state.pdo.name}: found {state.input.field_count} objects, expected {count}")
     return &state.input
+
+
+cdef const int64_t *_number_at(Intake intake, place) except NULL:
+    """Return where a number lies when its PDO has come (`jtqd.drivers.layout.Place`); raises ValueError when it has no such entry."""
+    cdef Input *state = _input(intake, place.pdo, place.entry + 1)
+    return &state.values[<int> place.entry]

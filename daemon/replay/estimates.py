@@ -177,7 +177,7 @@ class ExactReplay:
         for row in steps.begins.tolist():
             marks.setdefault(row, []).append(joint.begin_again)
         for row, _ in steps.breaks:
-            found = offsets(frames.pdos[each.position], records, each, row)
+            found = offsets(frames.pdos, records, each, row)
             marks.setdefault(row, []).append(partial(joint.resume, *found))
         return marks
 

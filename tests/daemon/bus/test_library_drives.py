@@ -137,6 +137,24 @@ def test_devices_differ(manners: tuple[str, ...]) -> None:
         assert bench.stop(jtqd) == 0
 
 
+@pytest.mark.parametrize("fixed", ["mapping", "valid"])
+def test_a_fixed_mapping_is_used_as_it_is(fixed: str) -> None:
+    """Quantities in three of four TPDOs, one of them on another COB-ID: read from the drive, also after its power cycle."""
+    with a_bench("--fixed", fixed) as bench:
+        jtqd = bench.start()
+        assert bench.until(bench.both_used), bench.said()
+        assert "its mapping is used as it is: TPDO1 (181h), TPDO2 (381h), TPDO4 (481h)" in bench.said()
+        assert bench.until(
+            lambda: any(torque and abs(torque) > 2.0 for pair in bench.torques_nm for torque in pair)
+        )
+        bench.order("off 1")
+        assert bench.until(lambda: bench.joint_stale(0))
+        bench.listen_anew()
+        bench.order("on 1")
+        assert bench.until(bench.both_used), bench.said()
+        assert bench.stop(jtqd) == 0
+
+
 @pytest.mark.native
 def test_objects_of_the_makers_own(bench: LibraryBench) -> None:
     """Joint 1 by its drive's mA, counted backwards, and rpm; joint 2, with the same motion, by CiA 402."""
