@@ -15,7 +15,7 @@ from typing import Annotated, Any, Final
 from jtqd.daemon.shared import faults
 from jtqd.drivers.devices import (
     CIA_402,
-    DRIVE_SCALING_OBJECTS,
+    EVERY_SCALING_OBJECT,
     SENSOR_SCALING_OBJECTS,
     DriveObject,
     DriveObjects,
@@ -25,6 +25,7 @@ from jtqd.drivers.devices import (
 from jtqd.drivers.layout import LayoutError, chosen, maps_of_json, pdo_of_words
 from jtqd.drivers.pdo import PdoError, PdoMap
 from jtqd.drivers.sdo import Key, label
+from jtqd.drivers.units import AT_JOINT, BY_TORQUE, SCALES, SHAFTS
 from jtqd.estimator.checked import ConfigError, Section, Verbatim, range_text
 from jtqd.estimator.decoder import FieldError, Text, check, choice, decode, limits
 from jtqd.estimator.joint import Joint
@@ -285,6 +286,8 @@ def _check_unit_words(words: Mapping[str, float]) -> None:
 
 
 _TYPES: Final = {"I16": (16, True), "I32": (32, True), "U16": (16, False), "U32": (32, False)}
+_TORQUE: Final = 0x6077
+"""In 1/1000 of 6076h."""
 _Index = Annotated[int, limits(ge=0x1000, le=0xFFFF)]
 _SubIndex = Annotated[int, limits(ge=0, le=254)]
 
@@ -299,6 +302,10 @@ class _Object:
     sign: Annotated[int, limits(ge=-1, le=1)] = 1
     factor: Annotated[float, limits(gt=0.0)] | None = None
     """SI units (rad, rad/s, A) per unit; without it the drive's scaling objects count."""
+    by: Text | None = None
+    """Which scaling object; `drivers/units.py` has those of each quantity."""
+    shaft: Annotated[str, choice(SHAFTS)] | None = None
+    """Where the drive counts by 6092h, 60A8h, 60A9h."""
 
     def __post_init__(self) -> None:
         if self.sign == 0:
@@ -314,7 +321,37 @@ class _Object:
             signed,
             self.sign,
             self.factor,
+            BY_TORQUE if self.by is None and self.factor is None and self.index == _TORQUE else self.by or "",
+            self.shaft or AT_JOINT,
         )
+
+    def check(self, name: str, standard: DriveObject, where: str) -> None:
+        """Raise ConfigError for what cannot be mapped or scaled."""
+        chosen = self.of_drive(standard)
+        if name == "statusword":
+            if chosen.bits != standard.bits or self.sign != 1 or self.factor or self.by or self.shaft:
+                raise ConfigError(f"{where}': expected an object of type U16, no sign, no factor")
+            return
+        scales = SCALES[name]
+        another = (chosen.index, chosen.subindex) != (standard.index, standard.subindex)
+        if self.by is not None and self.by not in scales:
+            raise ConfigError(f"{where}.by': found '{self.by}', expected one of {', '.join(scales)}")
+        if self.by is not None and self.factor is not None:
+            raise ConfigError(f"{where}.by': found both by and factor, expected one of them")
+        if another and chosen.factor is None and not chosen.by:
+            unit = "A" if name == "current" else "rad/s" if "velocity" in name else "rad"
+            raise ConfigError(
+                f"{where}.factor': missing, expected {unit} per unit, or 'by': "
+                f"CiA 402 scales {label(standard.index, standard.subindex)} alone"
+            )
+        if self.shaft is not None and not (self.by and scales[self.by].at_shaft and name.startswith("motor")):
+            raise ConfigError(f"{where}.shaft': expected only for the motor by 6092h, 60A8h or 60A9h")
+        if "position" in name and (chosen.bits, chosen.signed) != (32, True):
+            raise ConfigError(f"{where}.type': expected I32: a position rolls over at 32 bits")
+
+
+_OPTIONAL: Final = ("link_position", "motor_velocity")
+"""Quantities that a drive need not have."""
 
 
 @dataclass(frozen=True)
@@ -322,35 +359,30 @@ class _Objects:
     """Section `joint_N.objects`."""
 
     motor_position: _Object = _Object()
-    link_position: _Object = _Object()
-    motor_velocity: _Object = _Object()
+    link_position: _Object | None = _Object()
+    motor_velocity: _Object | None = _Object()
     current: _Object = _Object()
     statusword: _Object = _Object()
+
+    @classmethod
+    def from_section(cls, section: Section) -> _Objects:
+        """Read the section; `false` for a quantity that the drive does not have. Raises ConfigError."""
+        absent = {name: None for name in _OPTIONAL if section.raw(name, None) is False}
+        return decode(cls, section, **absent)
 
     def of_drive(self, joint: str, path: Path) -> DriveObjects:
         """Return the objects of the drive. Raises ConfigError for what cannot be mapped or scaled."""
         where = f"{path}: key '{joint}.objects"
-        found = {}
+        found: dict[str, DriveObject | None] = {}
         for each in fields(self):
-            standard: DriveObject = getattr(CIA_402, each.name)
-            chosen = found[each.name] = getattr(self, each.name).of_drive(standard)
-            another = (chosen.index, chosen.subindex) != (standard.index, standard.subindex)
-            if each.name == "statusword":
-                if chosen.bits != standard.bits or chosen.sign != 1 or chosen.factor is not None:
-                    raise ConfigError(
-                        f"{where}.statusword': expected an object of type U16, no sign, no factor"
-                    )
-            elif another and chosen.factor is None:
-                unit = "A" if each.name == "current" else "rad/s" if "velocity" in each.name else "rad"
-                raise ConfigError(
-                    f"{where}.{each.name}.factor': missing, expected {unit} per unit: "
-                    f"CiA 402 scales {label(standard.index, standard.subindex)} alone"
-                )
-            if "position" in each.name and (chosen.bits, chosen.signed) != (32, True):
-                raise ConfigError(
-                    f"{where}.{each.name}.type': expected I32: a position rolls over at 32 bits"
-                )
-        return DriveObjects(**found)
+            written: _Object | None = getattr(self, each.name)
+            found[each.name] = None
+            if written is not None:
+                standard: DriveObject = getattr(CIA_402, each.name)
+                found[each.name] = written.of_drive(standard)
+                written.check(each.name, standard, f"{where}.{each.name}")
+        made: dict[str, Any] = found
+        return DriveObjects(**made)
 
 
 @dataclass(frozen=True)
@@ -410,7 +442,7 @@ class _JointSection:
     network: _Network | None = None
 
     def __post_init__(self) -> None:
-        _check_given("joint", self.given, DRIVE_SCALING_OBJECTS)
+        _check_given("joint", self.given, EVERY_SCALING_OBJECT)
 
 
 @dataclass(frozen=True)
@@ -652,7 +684,7 @@ def _joint(path: Path, number: int, section: _JointSection, method: str, sdo_tim
             raise ConfigError(
                 f"{joint_path}: key '{needed}': missing, expected because estimator.method is {method}"
             )
-    return JointConfig(
+    made = JointConfig(
         number=number,
         node_id=section.node,
         identity=section.identity,
@@ -668,10 +700,27 @@ def _joint(path: Path, number: int, section: _JointSection, method: str, sdo_tim
         tpdos=_tpdos(f"joint_{number}", path, section, objects),
         joint_data=data,
     )
+    _check_encoders(path, number, made, method)
+    return made
 
 
 def _whole(values: Mapping[str, float]) -> dict[str, int]:
     return {name: int(value) for name, value in values.items()}
+
+
+def _check_encoders(path: Path, number: int, joint: JointConfig, method: str) -> None:
+    """Refuse what needs the link position of a drive that has none. Raises ConfigError."""
+    if joint.objects.link_position is not None:
+        return
+    torsion = method == "fused" and joint.joint.fused is not None and joint.joint.fused.torsion is not None
+    if torsion or joint.network is not None:
+        what = (
+            "estimates from the torsion of the gear" if torsion else "uses a network with the link position"
+        )
+        raise ConfigError(
+            f"{path}: key 'joint_{number}.objects.link_position': found false, expected a link position because "
+            f"estimator.method {method} {what}; tob and efficiency do without"
+        )
 
 
 def _network(section: _Network, path: Path) -> NetworkFile:

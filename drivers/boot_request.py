@@ -12,7 +12,8 @@ a drive asks for TPDO3 with 3001h; a node that is not `mandatory` may be absent.
 the nodes keep theirs. "reset": NMT reset communication comes first. `sdo_timeout_ms`: silence of the node after which a
 request is repeated.
 `objects` of a drive: fields of `devices.DriveObjects`, each with those of `DriveObject`, or null; `tpdos`: TPDOs that
-shall carry them (`layout.tpdos_as_json`), without it TPDO1 and TPDO2 as jtqd maps them.
+shall carry them (`layout.tpdos_as_json`), without it TPDO1 and TPDO2 as jtqd maps them. `torque_constant_nm_per_a`: for a
+current by its torque (6077h).
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ from jtqd.drivers.devices import (
 from jtqd.drivers.layout import maps_of_json, tpdos_as_json
 from jtqd.drivers.pdo import PdoError, PdoMap
 from jtqd.drivers.sdo import ANSWER_S, Key
+from jtqd.drivers.units import BY_TORQUE
 
 _TOP = {
     "bus",
@@ -51,7 +53,7 @@ _TOP = {
 }
 _SYNC = {"cob_id", "counter_overflow", "check_foreign"}
 _NODE = {"node", "kind", "identity", "channels", "given", "unit_words", "temperature", "mandatory"}
-_NODE |= {"sdo_timeout_ms", "objects", "tpdos"}
+_NODE |= {"sdo_timeout_ms", "objects", "tpdos", "torque_constant_nm_per_a"}
 _OPTIONAL_TIMEOUT_S = 0.5
 """An optional node is not waited for any longer: it is booted again when it appears."""
 
@@ -151,7 +153,13 @@ def _profile(raw: object, where: str) -> Profile:
         temperature = _boolean(node, "temperature", default=False, where=where)
         objects = _objects(node.get("objects"), f"{where}.objects")
         layout = _layout(node.get("tpdos", []), number, objects, f"{where}.tpdos")
-        return DriveProfile(number, identity, given, temperature, objects, layout)
+        constant = node.get("torque_constant_nm_per_a", 0.0)
+        by_torque = objects.current.by == BY_TORQUE and not objects.current.factor
+        if isinstance(constant, bool) or not isinstance(constant, int | float) or constant <= 0.0 < by_torque:
+            raise RequestError(
+                f"{where}.torque_constant_nm_per_a: found {constant!r}, expected a number above 0"
+            )
+        return DriveProfile(number, identity, given, temperature, objects, layout, float(constant))
     if kind != "sensor":
         raise RequestError(f"{where}.kind: found {kind!r}, expected 'drive' or 'sensor'")
     channels = node.get("channels", [1])

@@ -20,6 +20,10 @@ cdef class Unwrap:
 cdef struct Scale:  # SI per count or unit
     double motor_rad, motor_rad_s, link_rad, ampere, sensor_nm
 
+cdef struct Derived:  # velocity of a drive that tells none
+    int64_t last_ns
+    double last_rad, rad_s
+
 cdef struct JointState:
     int64_t last_ns
     int status, latched  # as published, and at the last estimate
@@ -36,15 +40,18 @@ cdef class JointCycle:
     cdef int input_count
     cdef Input *input[MOST_TPDOS]  # of its drive, and which flags of the record stand for them
     cdef int flags[MOST_TPDOS]
+    cdef Input *motor_position  # the one that carries the motor position
     cdef const int64_t *motor_count
-    cdef const int64_t *link_count
-    cdef const int64_t *motor_speed
+    cdef const int64_t *link_count  # NULL without a link encoder
+    cdef const int64_t *motor_speed  # NULL where it is derived
     cdef const int64_t *current_count
     cdef const int64_t *statusword
     cdef Input *sensor  # NULL without reference
     cdef Temperature *temperature
     cdef int64_t period_ns
     cdef Scale scale
+    cdef double gear_ratio
+    cdef Derived derived
     cdef JointState now
     cdef int find_inputs(self, inputs) except -1
     cdef void observe_at(self, int64_t sync_ns, bint starting, bint network_wanted) noexcept nogil
@@ -52,4 +59,6 @@ cdef class JointCycle:
     cdef void miss(self, int flags) noexcept nogil
     cdef int reference(self) noexcept nogil
     cdef double since_last(self, int64_t sync_ns) noexcept nogil
+    cdef int64_t on_grid(self, int64_t dt_ns) noexcept nogil
+    cdef bint derive(self, int64_t sync_ns) noexcept nogil
     cdef void take_back(self, int status) noexcept nogil

@@ -211,11 +211,14 @@ def replay_whole(model: Model, safety: JointSafety, records: RecordArray, steps:
     """
     rows: npt.NDArray[np.intp] | slice = slice(None) if steps.used.all() else np.flatnonzero(steps.used)
     flags, word, cycle = (records[name][rows] for name in ("input_flags", "statusword", "cycle"))
+    motor, link = records["motor_position_rad"][rows].copy(), records["link_position_rad"][rows].copy()
+    if np.isnan(link).all():  # one encoder: as `JointCycle`
+        link = motor / model.joint.gear_ratio
     columns = JointColumns(
         current_a=records["current_a"][rows].copy(),
-        motor_position_rad=records["motor_position_rad"][rows].copy(),
+        motor_position_rad=motor,
         motor_velocity_rad_s=records["motor_velocity_rad_s"][rows].copy(),
-        link_position_rad=records["link_position_rad"][rows].copy(),
+        link_position_rad=link,
         temperature_c=np.where(flags & FLAG_TEMPERATURE, records["temperature_c"][rows], np.nan),
     )
     values = {name: np.full(len(records), np.nan) for name in _STAGES}

@@ -38,6 +38,8 @@ MASTER = 0x20
 PRE_OPERATIONAL, OPERATIONAL = 127, 5
 SAVE = b"save"
 MOTOR_COUNTS, LINK_COUNTS, GEAR = 65536, 524288, 100
+RATED_MNM, TORQUE_CONSTANT = 100, 0.062
+"""Of the drive that tells torque as well as current: 1 A at the top of its swing."""
 _WRONG_STATE, _UNSUPPORTED, _NOT_MAPPABLE, _TOO_LONG = 0x08000022, 0x06010000, 0x06040041, 0x06040042
 _RANGE, _NOT_STORED = 0x06090030, 0x08000020
 _SIZES = {UNSIGNED8: "B", UNSIGNED16: "H", UNSIGNED32: "I", INTEGER16: "h", INTEGER32: "i"}
@@ -439,7 +441,7 @@ class _Local(canopen.LocalNode):  # type: ignore[misc]
 
 
 class StrictDrive(StrictNode):
-    """A CiA 402 drive whose motor swings to and fro; its maker's own objects count mA, backwards, and rpm."""
+    """A CiA 402 drive whose motor swings to and fro; it counts its torque backwards, mA and rpm, too."""
 
     device_type = 0x00020192
     process: ClassVar = {
@@ -451,6 +453,8 @@ class StrictDrive(StrictNode):
         (0x6064, 0): (INTEGER32, 0, "ro"),
         (0x606C, 0): (INTEGER32, 0, "ro"),
         (0x6075, 0): (UNSIGNED32, 5000, "rw"),
+        (0x6076, 0): (UNSIGNED32, RATED_MNM, "rw"),
+        (0x6077, 0): (INTEGER16, 0, "ro"),
         (0x6078, 0): (INTEGER16, 0, "ro"),
         (0x608F, 0): (UNSIGNED8, 2, "const"),
         (0x608F, 1): (UNSIGNED32, MOTOR_COUNTS, "ro"),
@@ -480,6 +484,7 @@ class StrictDrive(StrictNode):
             0x6061: 9,
             0x6064: round(MOTOR_COUNTS * turns),
             0x606C: round(MOTOR_COUNTS * per_s),
+            0x6077: round(-TORQUE_CONSTANT * math.sin(phase) * 1e6 / RATED_MNM),
             0x6078: round(200 * math.sin(phase)),
             0x60E4: round(LINK_COUNTS * turns / GEAR),
         }[index]

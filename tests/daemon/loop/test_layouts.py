@@ -2,36 +2,20 @@
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 
-from jtqd.daemon.config import Config, as_booted, load_config
-from jtqd.daemon.core.intake import Intake
-from jtqd.daemon.core.joint import JointCycle
-from jtqd.daemon.loop.input_pdos import JointInputs, drive_places, input_pdos, names_of_inputs, sensor_index
-from jtqd.daemon.replay.estimates import _Counters
+from jtqd.daemon.config import Config, as_booted
+from jtqd.daemon.loop.input_pdos import input_pdos, names_of_inputs, sensor_index
 from jtqd.daemon.replay.rows import CycleRows
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.drivers.layout import tpdos_as_json
 from jtqd.estimator.checked import ConfigError
-from jtqd.estimator.estimator import JointEstimator
-from jtqd.estimator.settings import EstimatorSettings
-from jtqd.models.files import load_joint, shipped
-from tests.daemon.loop.cycle_helpers import SCALE
+from tests.daemon.loop.one_drive import MS, NUMBER_OF, OneDrive, config_with
 
-MS = 1_000_000
-NUMBER_OF = {
-    "motor_position": lambda k: 400 * k - 2**31 + 5000,
-    "link_position": lambda k: 40 * k,
-    "motor_velocity": lambda k: -4000 - 7 * (k % 300),
-    "current": lambda k: 100 - k % 97,
-    "statusword": lambda k: 0x27,
-}
 SCATTERED = [
     {"number": 1, "cob_id": 0x381, "objects": [0x60410010, 0x60640020]},
     {"number": 2, "cob_id": 0x281, "objects": [0x60610008, 0x606C0020, 0x60780010]},
@@ -43,54 +27,8 @@ ONE_AND_ONE = [
 ]
 
 
-def config_with(directory: Path, tpdos: Any, **more: Any) -> Config:
-    content = yaml.safe_load(shipped("bench.yaml").read_text())
-    content["estimator"] = {"method": "efficiency"}
-    for number in (1, 2):
-        content[f"joint_{number}"]["file"] = str(shipped(f"joint{number}.yaml"))
-        del content[f"joint_{number}"]["network"]
-        content[f"joint_{number}"]["temperature"] = False
-    content["joint_1"] |= {"tpdos": tpdos, **more}
-    path = directory / "c.yaml"
-    path.write_text(yaml.safe_dump(content))
-    return load_config(path)
-
-
-class _Drive:
-    """Drive 1 of a configuration in front of a joint's cycle."""
-
-    def __init__(self, config: Config) -> None:
-        self.config, joint = config, config.joints[0]
-        self.intake = Intake(input_pdos(config))
-        self.intake.absent(2)
-        self.intake.absent(3)
-        inputs = JointInputs(drive_places(0, joint.tpdos, joint.objects), None, **SCALE)
-        estimator = JointEstimator(load_joint(shipped("joint1.yaml")), EstimatorSettings(method="efficiency"))
-        self.cycle = JointCycle(0, inputs, estimator, intake=self.intake, snapshot=_Counters(), period_ns=MS)
-
-    def frames(self, k: int) -> list[bytes]:
-        made = []
-        for pdo in self.config.joints[0].tpdos:
-            values = [NUMBER_OF[name](k) if name else 0x55 for name in pdo.names]
-            data = pdo.layout.pack(*values)
-            made.append(struct.pack("<IB3x8s", pdo.cob_id, len(data), data))
-        return made
-
-    def step(self, k: int, missing: int | None = None) -> cr.JointRecord:
-        """One cycle; `missing`: TPDO that does not come."""
-        at = (k + 1) * MS
-        self.intake.begin(k % 240 + 1)
-        frames = [struct.pack("<IB3x8s", 0x80, 0, bytes([k % 240 + 1]))]
-        frames += [frame for n, frame in enumerate(self.frames(k)) if n != missing]
-        own = [True] + [False] * (len(frames) - 1)
-        self.intake.take(b"".join(frames), [at + n for n in range(len(frames))], own, len(frames))
-        self.intake.close()
-        self.cycle.observe(at, False)
-        return cr.JointRecord._make(self.cycle.sample)
-
-
 def run(config: Config, count: int = 400) -> bytes:
-    drive = _Drive(config)
+    drive = OneDrive(config)
     return b"".join(cr.JOINT.pack(*drive.step(k)) for k in range(count))
 
 
@@ -114,7 +52,7 @@ def test_estimates_are_the_same_bit_for_bit_wherever_the_numbers_lie(tmp_path: P
 def test_any_pdo_that_is_missing_makes_the_joint_stale(tmp_path: Path, tpdos: Any, flags: list[int]) -> None:
     both = cr.FLAG_POSITION | cr.FLAG_MOTION
     for missing, expected in enumerate(flags):
-        drive = _Drive(config_with(tmp_path, tpdos))
+        drive = OneDrive(config_with(tmp_path, tpdos))
         for k in range(20):
             assert drive.step(k).input_flags & both == both
         record = drive.step(20, missing)
@@ -198,7 +136,7 @@ def test_a_layout_that_cannot_be_is_refused_in_one_line(
 def test_a_replay_of_rows_reads_the_same_places(tmp_path: Path) -> None:
     """What a replay puts into the intake's fields is what the loop has read from the frames."""
     config = config_with(tmp_path, SCATTERED)
-    live, again = _Drive(config), _Drive(config)
+    live, again = OneDrive(config), OneDrive(config)
     count = 50
     logged = b"".join(cr.JOINT.pack(*live.step(k)) for k in range(count))
     values = [
