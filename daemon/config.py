@@ -22,7 +22,7 @@ from jtqd.drivers.devices import (
     drive_layout,
     parse_key,
 )
-from jtqd.drivers.layout import LayoutError, chosen, maps_of_json, pdo_of_words
+from jtqd.drivers.layout import BY_ITSELF, LayoutError, chosen, maps_of_json, pdo_of_words
 from jtqd.drivers.pdo import PdoError, PdoMap
 from jtqd.drivers.sdo import Key, label
 from jtqd.drivers.units import AT_JOINT, BY_TORQUE, SCALES, SHAFTS
@@ -178,6 +178,8 @@ class JointConfig:
     """Which objects of the drive are mapped, with sign and factor."""
     tpdos: tuple[PdoMap, ...]
     """TPDOs that carry them: wanted ones, and after the boot those in force (`as_booted`)."""
+    max_age_ms: float
+    """For how long a frame of a TPDO with transmission type 0, 254 or 255 counts; 0: such a TPDO is not used."""
     joint_data: bytes = field(default=b"", repr=False)
     """The joint file as it was read, for the log."""
 
@@ -393,6 +395,8 @@ class _Tpdo:
     cob_id: Annotated[int, limits(ge=0x181, le=0x4FF)]
     objects: tuple[Annotated[int, limits(ge=0, le=0xFFFF_FFFF)], ...]
     """Mapping entries 0xIIIISSLL."""
+    type: Annotated[int, limits(ge=0, le=255)] = 1
+    """Transmission type: 1, or 0, 254, 255 with `max_age_ms`."""
 
 
 def _tpdos(joint: str, path: Path, section: _JointSection, objects: DriveObjects) -> tuple[PdoMap, ...]:
@@ -407,9 +411,16 @@ def _tpdos(joint: str, path: Path, section: _JointSection, objects: DriveObjects
             )
         return drive_layout(section.node, objects)
     where = f"{path}: key '{joint}.tpdos'"
+    for each in section.tpdos:
+        if each.type != 1 and each.type not in BY_ITSELF:
+            raise ConfigError(f"{where}: found type {each.type}, expected 1, 0, 254 or 255")
+        if each.type in BY_ITSELF and section.max_age_ms is None:
+            raise ConfigError(
+                f"{path}: key '{joint}.max_age_ms': missing, expected ms because TPDO{each.number} has type {each.type}"
+            )
     try:
         maps = tuple(
-            pdo_of_words(section.node, each.number, each.cob_id, each.objects, 1, objects)
+            pdo_of_words(section.node, each.number, each.cob_id, each.objects, each.type, objects)
             for each in section.tpdos
         )
         used = chosen(objects, maps)
@@ -439,6 +450,8 @@ class _JointSection:
     sdo_timeout_ms: _SdoTimeout | None = None
     objects: _Objects = _Objects()
     tpdos: tuple[_Tpdo, ...] = ()
+    max_age_ms: Annotated[float, limits("ms", ge=0.1, le=1000.0)] | None = None
+    """For how long a frame of a TPDO that the drive sends by itself counts."""
     network: _Network | None = None
 
     def __post_init__(self) -> None:
@@ -698,6 +711,7 @@ def _joint(path: Path, number: int, section: _JointSection, method: str, sdo_tim
         sdo_timeout_ms=section.sdo_timeout_ms or sdo_timeout_ms,
         objects=objects,
         tpdos=_tpdos(f"joint_{number}", path, section, objects),
+        max_age_ms=section.max_age_ms or 0.0,
         joint_data=data,
     )
     _check_encoders(path, number, made, method)

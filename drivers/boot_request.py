@@ -13,7 +13,7 @@ the nodes keep theirs. "reset": NMT reset communication comes first. `sdo_timeou
 request is repeated.
 `objects` of a drive: fields of `devices.DriveObjects`, each with those of `DriveObject`, or null; `tpdos`: TPDOs that
 shall carry them (`layout.tpdos_as_json`), without it TPDO1 and TPDO2 as jtqd maps them. `torque_constant_nm_per_a`: for a
-current by its torque (6077h).
+current by its torque (6077h). `by_itself`: TPDOs of transmission types 0, 254 and 255 are accepted.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _TOP = {
 }
 _SYNC = {"cob_id", "counter_overflow", "check_foreign"}
 _NODE = {"node", "kind", "identity", "channels", "given", "unit_words", "temperature", "mandatory"}
-_NODE |= {"sdo_timeout_ms", "objects", "tpdos", "torque_constant_nm_per_a"}
+_NODE |= {"sdo_timeout_ms", "objects", "tpdos", "torque_constant_nm_per_a", "by_itself"}
 _OPTIONAL_TIMEOUT_S = 0.5
 """An optional node is not waited for any longer: it is booted again when it appears."""
 
@@ -154,12 +154,13 @@ def _profile(raw: object, where: str) -> Profile:
         objects = _objects(node.get("objects"), f"{where}.objects")
         layout = _layout(node.get("tpdos", []), number, objects, f"{where}.tpdos")
         constant = node.get("torque_constant_nm_per_a", 0.0)
+        itself = _boolean(node, "by_itself", default=False, where=where)
         by_torque = objects.current.by == BY_TORQUE and not objects.current.factor
         if isinstance(constant, bool) or not isinstance(constant, int | float) or constant <= 0.0 < by_torque:
             raise RequestError(
                 f"{where}.torque_constant_nm_per_a: found {constant!r}, expected a number above 0"
             )
-        return DriveProfile(number, identity, given, temperature, objects, layout, float(constant))
+        return DriveProfile(number, identity, given, temperature, objects, layout, float(constant), itself)
     if kind != "sensor":
         raise RequestError(f"{where}.kind: found {kind!r}, expected 'drive' or 'sensor'")
     channels = node.get("channels", [1])

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from jtqd.drivers.boot_error import BootError
 from jtqd.drivers.devices import EVENT_DRIVEN, EVENT_MS, TEMPERATURE, DriveProfile, Profile
-from jtqd.drivers.layout import LayoutError, chosen, pdo_of_words
+from jtqd.drivers.layout import BY_ITSELF, LayoutError, chosen, pdo_of_words
 from jtqd.drivers.pdo import CAN_ID, EXTENDED, INVALID, NO_RTR, PdoError, PdoMap
 from jtqd.drivers.sdo import label
 from jtqd.drivers.sdo_client import NodeObjects
@@ -84,7 +84,7 @@ class TpdoSetup:
             and count == len(pdo.words)
             and all(objects.number((mapping, n), 4) == word for n, word in enumerate(pdo.words, 1))
             and objects.number((communication, 2), 1) == pdo.transmission_type
-            and (pdo.transmission_type not in EVENT_DRIVEN or self._timers_as_wanted(communication))
+            and (not _is_temperature(pdo) or self._timers_as_wanted(communication))
         )
 
     def _timers_as_wanted(self, communication: int) -> bool:
@@ -103,7 +103,7 @@ class TpdoSetup:
             objects.write((mapping, entry), word, 4)
         objects.write((mapping, 0), len(pdo.words), 1)
         objects.write((communication, 2), pdo.transmission_type, 1)
-        if pdo.transmission_type in EVENT_DRIVEN:
+        if _is_temperature(pdo):
             self._set_timers(communication)
         # the device's own RTR bit is kept: some accept one value only
         valid = cob_id & NO_RTR | pdo.cob_id
@@ -218,16 +218,40 @@ class TpdoSetup:
         except BootError as error:
             self._notes.append(f"TPDO{number} is not needed and stays on ({error.detail})")
 
+    def _asked_for(self, pdo: PdoMap) -> tuple[int, ...]:
+        """Return the types that the profile itself wants for a TPDO of this number."""
+        return tuple(
+            each.transmission_type
+            for each in self._profile.tpdos
+            if each.number == pdo.number and each.transmission_type in BY_ITSELF
+        )
+
+    def _by_itself(self, pdo: PdoMap, refused: BootError) -> bool:
+        """Accept a TPDO that the drive sends by itself, where the profile allows it; raises `refused`."""
+        profile = self._profile
+        if pdo.transmission_type not in BY_ITSELF:
+            raise refused.explained(
+                f"TPDO{pdo.number} has transmission type {pdo.transmission_type}"
+            ) from refused
+        if not (isinstance(profile, DriveProfile) and profile.by_itself):
+            text = f"TPDO{pdo.number} has transmission type {pdo.transmission_type}: joint_N.max_age_ms allows it"
+            raise refused.explained(text) from refused
+        self._notes.append(f"TPDO{pdo.number} keeps transmission type {pdo.transmission_type}")
+        return True
+
     def _valid(self, pdo: PdoMap) -> PdoMap:
         """Make a TPDO valid, and sent at each SYNC, where it is not; return it as it then is, read once more."""
         objects, communication = self._objects, 0x1800 + pdo.number - 1
         cob_id = objects.number((communication, 1), 4)
-        event = pdo.transmission_type in EVENT_DRIVEN and (pdo.objects[0].index, 0) == TEMPERATURE
+        event = _is_temperature(pdo) or pdo.transmission_type in self._asked_for(pdo)
         if pdo.transmission_type != EVERY_SYNC and not event:
             with suppress(BootError):
                 if not cob_id & INVALID:
                     objects.write((communication, 1), cob_id | INVALID, 4)
-            objects.write((communication, 2), EVERY_SYNC, 1)
+            try:
+                objects.write((communication, 2), EVERY_SYNC, 1)
+            except BootError as refused:
+                event = self._by_itself(pdo, refused)
         if objects.number((communication, 1), 4) & INVALID:
             objects.put((communication, 1), cob_id & NO_RTR | pdo.cob_id, 4, "COB-ID")
         mapping = communication + _MAPPING
@@ -237,6 +261,11 @@ class TpdoSetup:
         kind = pdo.transmission_type if event else EVERY_SYNC
         objects.require((communication, 2), kind, 1, "transmission type")
         return PdoMap(pdo.cob_id, pdo.objects, kind, pdo.number)
+
+
+def _is_temperature(pdo: PdoMap) -> bool:
+    """Return whether this is the event-driven TPDO with the temperature, whose timers jtqd sets."""
+    return pdo.transmission_type in EVENT_DRIVEN and (pdo.objects[0].index, 0) == TEMPERATURE
 
 
 def _is_refused_write(error: BootError) -> bool:

@@ -20,6 +20,7 @@ from jtqd.drivers.devices import (
     sensor_tpdo2,
 )
 from jtqd.drivers.frame import unstuffed_bits, worst_case_bits
+from jtqd.drivers.layout import BY_ITSELF
 from jtqd.drivers.nmt import HEARTBEAT_BASE
 from jtqd.drivers.pdo import LAST_SYNC_TYPE, PdoMap
 
@@ -143,7 +144,13 @@ def configured_load(
         rows.append(pdo_row(who, pdo))
     rows.append(heartbeat_row("jtqd", master, heartbeat_ms, period_s))
     for node, tpdos in layouts.items():
-        rows += [pdo_row(f"drive {node} TPDO{pdo.number}", pdo) for pdo in tpdos]
+        rows += [
+            # one that the drive sends by itself is counted once per SYNC: an inhibit time must keep it so
+            Row(pdo.cob_id, f"drive {node} TPDO{pdo.number}", pdo.length)
+            if pdo.transmission_type in BY_ITSELF
+            else pdo_row(f"drive {node} TPDO{pdo.number}", pdo)
+            for pdo in tpdos
+        ]
         rows.append(heartbeat_row(f"drive {node}", node, heartbeat_ms, period_s))
     rows += [temperature_row(node, period_s) for node in temperatures]
     for node, channels in sensors.items():

@@ -136,6 +136,7 @@ class DriveProfile:
         given: scaling objects by the configuration, which are then not read.
         temperature: it has 3001h, and shall send it by TPDO3.
         torque_constant_nm_per_a: of the motor, for a drive that tells torque instead of current; 0: not known.
+        by_itself: its TPDOs may have transmission types 0, 254, 255.
         layout: TPDOs that shall carry its quantities; empty: TPDO1 and TPDO2 as jtqd maps them.
     """
 
@@ -146,6 +147,7 @@ class DriveProfile:
     objects: DriveObjects = CIA_402
     layout: tuple[PdoMap, ...] = ()
     torque_constant_nm_per_a: float = 0.0
+    by_itself: bool = False
     profile_number = 402
 
     @property

@@ -13,7 +13,7 @@ from jtqd.daemon.config import Config
 from jtqd.daemon.core.intake import JointTemperature
 from jtqd.daemon.shared.cycle_record import TEMPERATURE_LIFE_S
 from jtqd.drivers.devices import CIA_402, DriveObjects, drive_layout, drive_tpdo3, sensor_tpdo1, sensor_tpdo2
-from jtqd.drivers.layout import Place, places
+from jtqd.drivers.layout import BY_ITSELF, Place, places
 from jtqd.drivers.pdo import PdoMap
 
 POSITIONS = ("motor_position", "link_position")
@@ -22,7 +22,7 @@ POSITIONS = ("motor_position", "link_position")
 
 @dataclass(frozen=True)
 class InputPdo:
-    """One synchronous TPDO that the loop waits for.
+    """One TPDO that is an input: the loop waits for it, unless it has an age.
 
     Attributes:
         cob_id: 11-bit identifier.
@@ -30,6 +30,7 @@ class InputPdo:
         layout: precompiled unpacking of the mapped objects.
         node_id: its producer.
         name: as it appears in counters and events, e.g. "181h drive 1 TPDO1".
+        age_ns: 0 for one that is sent at each SYNC; of another one, for how long its last frame counts.
     """
 
     cob_id: int
@@ -37,6 +38,7 @@ class InputPdo:
     layout: struct.Struct
     node_id: int
     name: str
+    age_ns: int = 0
 
 
 @dataclass(frozen=True)
@@ -98,11 +100,17 @@ def names_of_inputs(config: Config, number: int) -> tuple[str, str]:
 def input_pdos(config: Config) -> list[InputPdo]:
     """Return the expected PDOs: the TPDOs of each drive, then one per sensor channel in use."""
 
-    def pdo(pdo_map: PdoMap, node: int, what: str) -> InputPdo:
-        return InputPdo(pdo_map.cob_id, pdo_map.length, pdo_map.layout, node, f"{pdo_map.cob_id:03X}h {what}")
+    def pdo(pdo_map: PdoMap, node: int, what: str, age_ns: int = 0) -> InputPdo:
+        name = f"{pdo_map.cob_id:03X}h {what}"
+        return InputPdo(pdo_map.cob_id, pdo_map.length, pdo_map.layout, node, name, age_ns)
 
     pdos = [
-        pdo(each, joint.node_id, f"drive {joint.node_id} TPDO{each.number}")
+        pdo(
+            each,
+            joint.node_id,
+            f"drive {joint.node_id} TPDO{each.number}",
+            round(joint.max_age_ms * 1e6) if each.transmission_type in BY_ITSELF else 0,
+        )
         for joint in config.joints
         for each in joint.tpdos
     ]

@@ -84,6 +84,8 @@ def decode(origin: Origin, records: RecordArray, joints: Sequence[RecordArray]) 
     for index, pdo in enumerate(input_pdos(origin.config)):
         fresh = _fresh(index, origin.inputs, joints)
         there, data = table.last(pdo.cob_id, pdo.length)
+        if pdo.age_ns:
+            there, data = _held(there, left_out, data)
         values = [*_unpack(pdo, data)]
         absent = fresh & (~there | left_out)
         if absent.any():
@@ -104,6 +106,15 @@ def decode(origin: Origin, records: RecordArray, joints: Sequence[RecordArray]) 
         recorded,
         from_si,
     )
+
+
+def _held(
+    there: BoolArray, left_out: BoolArray, data: npt.NDArray[np.uint8]
+) -> tuple[BoolArray, npt.NDArray[np.uint8]]:
+    """Return whether the last frame up to each cycle is known [n], and its data: it counts until the next one."""
+    last = np.maximum.accumulate(np.where(there | left_out, np.arange(len(there)), -1))
+    known: BoolArray = (last >= 0) & ~left_out[last]
+    return known, data[last]
 
 
 def _fresh(index: int, inputs: Sequence[JointInputs], joints: Sequence[RecordArray]) -> BoolArray:

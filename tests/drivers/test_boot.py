@@ -709,6 +709,15 @@ def test_a_transmission_type_that_cannot_be_written_is_named(bench):
     assert "1800h:2: write of 0x01 refused" in found
 
 
+@pytest.mark.parametrize("kind", [0, 254, 255])
+def test_a_type_that_cannot_be_written_is_accepted_where_an_age_is_configured(bench, kind):
+    fixed(bench.drive1, *ELSEWHERE, kind=kind)
+    assert f"TPDO1 has transmission type {kind}: joint_N.max_age_ms allows it" in str(bench.fails())
+    node = bench.boot(nodes=[{**NODES[0], "by_itself": True}, *NODES[1:]]).nodes[1]
+    assert [pdo.transmission_type for pdo in node.tpdos] == [kind] * 3
+    assert f"TPDO1 keeps transmission type {kind}" in node.notes
+
+
 def test_a_layout_that_is_asked_for_is_written(bench):
     """TPDOs of the request: one PDO has two quantities, another one the rest."""
     words = [0x6041_0010, 0x6064_0020], [0x606C_0020, 0x6078_0010], [0x60E4_0120]
