@@ -23,6 +23,8 @@ cdef struct Scale:  # SI per count or unit
 cdef struct Derived:  # velocity of a drive that tells none
     int64_t last_ns
     double last_rad, rad_s
+    bint is_replayed  # by the log, whose steps tell no time of cycles without inputs
+    double replayed_rad_s
 
 cdef struct JointState:
     int64_t last_ns

@@ -343,6 +343,9 @@ cdef class JointCycle:
         if known:
             self.derived.rad_s = (position - self.derived.last_rad) / (dt_ns * 1e-9)
         self.derived.last_ns, self.derived.last_rad = sync_ns, position
+        if self.derived.is_replayed:
+            self.derived.rad_s = self.derived.replayed_rad_s
+            return not isnan(self.derived.replayed_rad_s)
         return known
 
 

@@ -128,6 +128,7 @@ class ExactReplay:
             self._joints,
             fresh=[each.fresh for each in frames.pdos],
             values=[each.values for each in frames.pdos],
+            velocity=[each["motor_velocity_rad_s"] for each in joints],
             celsius=celsius,
             cycle=joints[0]["cycle"],
             counter=joints[0]["sync_counter"],

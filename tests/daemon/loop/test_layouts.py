@@ -9,11 +9,18 @@ import numpy as np
 import pytest
 
 from jtqd.daemon.config import Config, as_booted
-from jtqd.daemon.loop.input_pdos import input_pdos, names_of_inputs, sensor_index
+from jtqd.daemon.loop.input_pdos import (
+    JointInputs,
+    drive_places,
+    input_pdos,
+    names_of_inputs,
+    sensor_index,
+)
 from jtqd.daemon.replay.rows import CycleRows
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.drivers.layout import tpdos_as_json
 from jtqd.estimator.checked import ConfigError
+from tests.daemon.loop.cycle_helpers import SCALE
 from tests.daemon.loop.one_drive import MS, NUMBER_OF, OneDrive, config_with
 
 SCATTERED = [
@@ -133,28 +140,42 @@ def test_a_layout_that_cannot_be_is_refused_in_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_a_replay_of_rows_reads_the_same_places(tmp_path: Path) -> None:
-    """What a replay puts into the intake's fields is what the loop has read from the frames."""
-    config = config_with(tmp_path, SCATTERED)
+@pytest.mark.parametrize("less", [{}, {"link_position": False, "motor_velocity": False}])
+def test_a_replay_of_rows_reads_the_same_places(tmp_path: Path, less: Any) -> None:
+    """What a replay puts into the intake's fields is what the loop has read from the frames.
+
+    A log's steps tell no time of cycles that a joint has missed: a derived velocity is taken as it was logged.
+    """
+    config = config_with(tmp_path, [] if less else SCATTERED, objects=less)
     live, again = OneDrive(config), OneDrive(config)
-    count = 50
-    logged = b"".join(cr.JOINT.pack(*live.step(k)) for k in range(count))
+    count = 120
+    records = [live.step(k, missing={40: 0, 80: 1}.get(k)) for k in range(count)]
+    both = cr.FLAG_POSITION | cr.FLAG_MOTION
+    flags = np.array([each.input_flags for each in records])
+    groups = JointInputs(drive_places(0, config.joints[0].tpdos, config.joints[0].objects), None, **SCALE)
+    fresh = [
+        (flags & sum(f for f, pdos in ((1, groups.positions), (2, groups.motion)) if n in pdos)) != 0
+        for n in range(len(config.joints[0].tpdos))
+    ]
     values = [
         np.array([[NUMBER_OF[name](k) if name else 0x55 for k in range(count)] for name in pdo.names])
         for pdo in config.joints[0].tpdos
     ]
     rest = len(input_pdos(config)) - len(values)
+    dt_s = np.array([each.dt_s if each.input_flags & both == both else 0.0 for each in records])
     rows = CycleRows(
         again.intake,
         [again.cycle],
-        fresh=np.array([[1] * count] * len(values) + [[0] * count] * rest, np.uint8),
+        fresh=np.array([*fresh, *[np.zeros(count, np.bool_)] * rest]).astype(np.uint8),
         values=[*values, *[np.zeros((2, count), np.int64)] * rest],
         celsius=np.zeros((0, count)),
         cycle=np.arange(1000, 1000 + count),
         counter=np.arange(count) % 240 + 1,
-        sync_ns=(np.arange(count)[None] + 1) * MS,
+        sync_ns=(MS + np.cumsum(np.rint(dt_s * 1e9)).astype(np.int64))[None],
         wanted=np.ones((1, count), np.uint8),
         withdrawn=np.zeros(count, np.uint8),
+        velocity=[np.array([each.motor_velocity_rad_s for each in records])],
     )
     rows.go_on(0, count)
-    assert rows.samples[0].tobytes() == logged
+    assert rows.samples[0].tobytes() == b"".join(cr.JOINT.pack(*each) for each in records)
+    assert 3 <= np.isnan([each.dt_s for each in records]).sum() < 40
