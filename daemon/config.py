@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
+from jtqd.daemon.profiles import path_of, with_profiles
 from jtqd.daemon.shared import faults
 from jtqd.drivers.devices import (
     CIA_402,
@@ -182,6 +183,11 @@ class JointConfig:
     """For how long a frame of a TPDO with transmission type 0, 254 or 255 counts; 0: such a TPDO is not used."""
     joint_data: bytes = field(default=b"", repr=False)
     """The joint file as it was read, for the log."""
+    profile: str | None = None
+    """Of the drive's family."""
+    profile_path: Path | None = None
+    profile_data: bytes = field(default=b"", repr=False)
+    """The profile as it was read, for the log."""
 
     @property
     def joint_sha256(self) -> str:
@@ -453,6 +459,8 @@ class _JointSection:
     max_age_ms: Annotated[float, limits("ms", ge=0.1, le=1000.0)] | None = None
     """For how long a frame of a TPDO that the drive sends by itself counts."""
     network: _Network | None = None
+    profile: Text | None = None
+    """Of the drive's family: its values have been put below those of the section (`with_profiles`)."""
 
     def __post_init__(self) -> None:
         _check_given("joint", self.given, EVERY_SCALING_OBJECT)
@@ -596,8 +604,9 @@ class Config:
 
     @property
     def files_sha256(self) -> str:
-        """Hash of the configuration and its joint files together; networks are named in it by theirs."""
+        """Hash of the configuration, its joint files and profiles together; networks are named in it by theirs."""
         parts = [self.sha256, *(joint.joint_sha256 for joint in self.joints)]
+        parts += [sha256_hex(joint.profile_data) for joint in self.joints if joint.profile]
         return sha256_hex("".join(parts).encode())
 
     @property
@@ -637,7 +646,7 @@ def load_config(path: Path | None) -> Config:
     if path is None:
         path = shipped(DEFAULT_CONFIG)
     mapping, data = read_yaml(path)
-    file = decode(_File, Section(mapping, str(path)))
+    file = decode(_File, Section(with_profiles(mapping, path), str(path)))
     joints = tuple(
         _joint(path, number, section, file.estimator.method, file.nodes.sdo_timeout_ms)
         for number, section in enumerate(file.joints, start=1)
@@ -685,6 +694,7 @@ def _joint(path: Path, number: int, section: _JointSection, method: str, sdo_tim
     objects = section.objects.of_drive(f"joint_{number}", path)
     network = None if section.network is None else _network(section.network, path)
     joint_path = path.parent / section.file
+    profile_path = None if section.profile is None else path_of(section.profile, path.parent)
     mapping, data = read_yaml(joint_path)
     joint = Joint.from_mapping(mapping, str(joint_path))
     if method == "network" and network is None:
@@ -713,6 +723,9 @@ def _joint(path: Path, number: int, section: _JointSection, method: str, sdo_tim
         tpdos=_tpdos(f"joint_{number}", path, section, objects),
         max_age_ms=section.max_age_ms or 0.0,
         joint_data=data,
+        profile=section.profile,
+        profile_path=profile_path,
+        profile_data=b"" if profile_path is None else read_yaml(profile_path)[1],
     )
     _check_encoders(path, number, made, method)
     return made

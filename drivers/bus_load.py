@@ -125,7 +125,7 @@ def configured_load(
     drives: Iterable[int] | Mapping[int, Sequence[PdoMap]],
     sensors: Mapping[int, tuple[int, ...]],
     *,
-    sync_counter: bool = True,
+    sync_counter: bool = False,
     temperatures: Iterable[int] = (),
     heartbeat_ms: int = 100,
     master: int = JTQD_NODE,
@@ -135,8 +135,8 @@ def configured_load(
 ) -> BusLoad:
     """Add up drives (node numbers), sensors (node -> channels), SYNC, estimates, heartbeats and `extra`.
 
-    `drives` may hold their TPDOs by node; without, they are as jtqd maps them.
-    `temperatures`: nodes among the drives that send their joint's temperature.
+    `drives` may hold their TPDOs by node; without, they are as jtqd maps them. `sync_counter`: SYNC has a counter byte
+    (1019h). `temperatures`: nodes among the drives that send their joint's temperature.
     """
     layouts = drives if isinstance(drives, Mapping) else {node: drive_layout(node) for node in drives}
     rows = [sync_row(sync_counter)]

@@ -203,6 +203,10 @@ def _place(  # noqa: PLR0917
     (directory / file).write_bytes(data)
     section["file"] = file
     hashes = [hashlib.sha256(data).hexdigest()]
+    profile = provenance["joints"][str(number)].get("profile")
+    if isinstance(profile, str):  # as it was then, also where one of that name ships
+        section["profile"] = f"{key}.profile.yaml"
+        (directory / section["profile"]).write_bytes(_attachment(log, attachments, profile))
     network = section.get("network")
     if not isinstance(network, dict):
         return hashes
@@ -217,7 +221,7 @@ def _place(  # noqa: PLR0917
 
 
 def _check_scaling(inputs: JointInputs) -> None:
-    """ValueError unless all factors are numbers that are not 0 (the sensor's may be 0: there is none)."""
+    """ValueError unless all factors are numbers that are not 0 (the sensor's may be); a drive may count backwards."""
     for quantity, name in (
         ("motor_position", "motor_rad_per_count"),
         ("motor_velocity", "motor_rad_s_per_unit"),
