@@ -17,13 +17,17 @@ from jtqd.daemon.profiles import path_of, with_profiles
 from jtqd.daemon.shared import faults
 from jtqd.drivers.devices import (
     CIA_402,
-    DRIVE_SCALING_OBJECTS,
+    EVERY_SCALING_OBJECT,
     SENSOR_SCALING_OBJECTS,
     DriveObject,
     DriveObjects,
+    drive_layout,
     parse_key,
 )
+from jtqd.drivers.layout import BY_ITSELF, LayoutError, chosen, maps_of_json, pdo_of_words
+from jtqd.drivers.pdo import PdoError, PdoMap
 from jtqd.drivers.sdo import Key, label
+from jtqd.drivers.units import AT_JOINT, BY_TORQUE, SCALES, SHAFTS
 from jtqd.estimator.checked import ConfigError, Section, Verbatim, range_text
 from jtqd.estimator.decoder import FieldError, Text, check, choice, decode, limits
 from jtqd.estimator.joint import Joint
@@ -206,6 +210,10 @@ class JointConfig:
     """Silence of the drive after which an SDO request is repeated."""
     objects: DriveObjects
     """Which objects of the drive are mapped, with sign and factor."""
+    tpdos: tuple[PdoMap, ...]
+    """TPDOs that carry them: wanted ones, and after the boot those in force (`as_booted`)."""
+    max_age_ms: float
+    """For how long a frame of a TPDO with transmission type 0, 254 or 255 counts; 0: such a TPDO is not used."""
     joint_data: bytes = field(default=b"", repr=False)
     """The joint file as it was read, for the log."""
     profile: str | None = None
@@ -319,6 +327,8 @@ def _check_unit_words(words: Mapping[str, float]) -> None:
 
 
 _TYPES: Final = {"I16": (16, True), "I32": (32, True), "U16": (16, False), "U32": (32, False)}
+_TORQUE: Final = 0x6077
+"""In 1/1000 of 6076h."""
 _Index = Annotated[int, limits(ge=0x1000, le=0xFFFF)]
 _SubIndex = Annotated[int, limits(ge=0, le=254)]
 
@@ -333,6 +343,10 @@ class _Object:
     sign: Annotated[int, limits(ge=-1, le=1)] = 1
     factor: Annotated[float, limits(gt=0.0)] | None = None
     """SI units (rad, rad/s, A) per unit; without it the drive's scaling objects count."""
+    by: Text | None = None
+    """Which scaling object; `drivers/units.py` has those of each quantity."""
+    shaft: Annotated[str, choice(SHAFTS)] | None = None
+    """Where the drive counts by 6092h, 60A8h, 60A9h."""
 
     def __post_init__(self) -> None:
         if self.sign == 0:
@@ -348,7 +362,37 @@ class _Object:
             signed,
             self.sign,
             self.factor,
+            BY_TORQUE if self.by is None and self.factor is None and self.index == _TORQUE else self.by or "",
+            self.shaft or AT_JOINT,
         )
+
+    def check(self, name: str, standard: DriveObject, where: str) -> None:
+        """Raise ConfigError for what cannot be mapped or scaled."""
+        chosen = self.of_drive(standard)
+        if name == "statusword":
+            if chosen.bits != standard.bits or self.sign != 1 or self.factor or self.by or self.shaft:
+                raise ConfigError(f"{where}': expected an object of type U16, no sign, no factor")
+            return
+        scales = SCALES[name]
+        another = (chosen.index, chosen.subindex) != (standard.index, standard.subindex)
+        if self.by is not None and self.by not in scales:
+            raise ConfigError(f"{where}.by': found '{self.by}', expected one of {', '.join(scales)}")
+        if self.by is not None and self.factor is not None:
+            raise ConfigError(f"{where}.by': found both by and factor, expected one of them")
+        if another and chosen.factor is None and not chosen.by:
+            unit = "A" if name == "current" else "rad/s" if "velocity" in name else "rad"
+            raise ConfigError(
+                f"{where}.factor': missing, expected {unit} per unit, or 'by': "
+                f"CiA 402 scales {label(standard.index, standard.subindex)} alone"
+            )
+        if self.shaft is not None and not (self.by and scales[self.by].at_shaft and name.startswith("motor")):
+            raise ConfigError(f"{where}.shaft': expected only for the motor by 6092h, 60A8h or 60A9h")
+        if "position" in name and (chosen.bits, chosen.signed) != (32, True):
+            raise ConfigError(f"{where}.type': expected I32: a position rolls over at 32 bits")
+
+
+_OPTIONAL: Final = ("link_position", "motor_velocity")
+"""Quantities that a drive need not have."""
 
 
 @dataclass(frozen=True)
@@ -356,41 +400,79 @@ class _Objects:
     """Section `joint_N.objects`."""
 
     motor_position: _Object = _Object()
-    link_position: _Object = _Object()
-    motor_velocity: _Object = _Object()
+    link_position: _Object | None = _Object()
+    motor_velocity: _Object | None = _Object()
     current: _Object = _Object()
     statusword: _Object = _Object()
+
+    @classmethod
+    def from_section(cls, section: Section) -> _Objects:
+        """Read the section; `false` for a quantity that the drive does not have. Raises ConfigError."""
+        absent = {name: None for name in _OPTIONAL if section.raw(name, None) is False}
+        return decode(cls, section, **absent)
 
     def of_drive(self, joint: str, path: Path) -> DriveObjects:
         """Return the objects of the drive. Raises ConfigError for what cannot be mapped or scaled."""
         where = f"{path}: key '{joint}.objects"
-        found = {}
+        found: dict[str, DriveObject | None] = {}
         for each in fields(self):
-            standard: DriveObject = getattr(CIA_402, each.name)
-            chosen = found[each.name] = getattr(self, each.name).of_drive(standard)
-            another = (chosen.index, chosen.subindex) != (standard.index, standard.subindex)
-            if each.name == "statusword":
-                if chosen.bits != standard.bits or chosen.sign != 1 or chosen.factor is not None:
-                    raise ConfigError(
-                        f"{where}.statusword': expected an object of type U16, no sign, no factor"
-                    )
-            elif another and chosen.factor is None:
-                unit = "A" if each.name == "current" else "rad/s" if "velocity" in each.name else "rad"
-                raise ConfigError(
-                    f"{where}.{each.name}.factor': missing, expected {unit} per unit: "
-                    f"CiA 402 scales {label(standard.index, standard.subindex)} alone"
-                )
-            if "position" in each.name and (chosen.bits, chosen.signed) != (32, True):
-                raise ConfigError(
-                    f"{where}.{each.name}.type': expected I32: a position rolls over at 32 bits"
-                )
-        objects = DriveObjects(**found)
-        bits = objects.motor_velocity.bits + objects.current.bits + objects.statusword.bits
+            written: _Object | None = getattr(self, each.name)
+            found[each.name] = None
+            if written is not None:
+                standard: DriveObject = getattr(CIA_402, each.name)
+                found[each.name] = written.of_drive(standard)
+                written.check(each.name, standard, f"{where}.{each.name}")
+        made: dict[str, Any] = found
+        return DriveObjects(**made)
+
+
+@dataclass(frozen=True)
+class _Tpdo:
+    """One TPDO in section `joint_N.tpdos`: parameters 1800h and 1A00h, 1801h and 1A01h, ..."""
+
+    number: Annotated[int, limits(ge=1, le=4)]
+    cob_id: Annotated[int, limits(ge=0x181, le=0x4FF)]
+    objects: tuple[Annotated[int, limits(ge=0, le=0xFFFF_FFFF)], ...]
+    """Mapping entries 0xIIIISSLL."""
+    type: Annotated[int, limits(ge=0, le=255)] = 1
+    """Transmission type: 1, or 0, 254, 255 with `max_age_ms`."""
+
+
+def _tpdos(joint: str, path: Path, section: _JointSection, objects: DriveObjects) -> tuple[PdoMap, ...]:
+    """Return the TPDOs that shall carry the objects. Raises ConfigError for what they lack, or cannot be."""
+    if not section.tpdos:
+        second = (objects.motor_velocity, objects.current, objects.statusword)
+        bits = sum(each.bits for each in second if each is not None)
         if bits > _PDO_BITS:
             raise ConfigError(
-                f"{where}': found {bits} bits of velocity, current and statusword, expected at most {_PDO_BITS}: one PDO"
+                f"{path}: key '{joint}.objects': found {bits} bits of velocity, current and statusword, "
+                f"expected at most {_PDO_BITS}: one PDO"
             )
-        return objects
+        return drive_layout(section.node, objects)
+    where = f"{path}: key '{joint}.tpdos'"
+    for each in section.tpdos:
+        if each.type != 1 and each.type not in BY_ITSELF:
+            raise ConfigError(f"{where}: found type {each.type}, expected 1, 0, 254 or 255")
+        if each.type in BY_ITSELF and section.max_age_ms is None:
+            raise ConfigError(
+                f"{path}: key '{joint}.max_age_ms': missing, expected ms because TPDO{each.number} has type {each.type}"
+            )
+    try:
+        maps = tuple(
+            pdo_of_words(section.node, each.number, each.cob_id, each.objects, each.type, objects)
+            for each in section.tpdos
+        )
+        used = chosen(objects, maps)
+    except (PdoError, LayoutError) as error:
+        raise ConfigError(f"{where}: {error}") from None
+    for name, taken in (("number", {3}), ("cob_id", {0x380 + section.node})):
+        values = [getattr(pdo, name) for pdo in maps]
+        reserved = taken if section.temperature else set()
+        if len({*values, *reserved}) != len(values) + len(reserved):
+            shown = ", ".join(str(value) if name == "number" else f"{value:03X}h" for value in values)
+            rule = ", TPDO3 is that of the temperature" if reserved else ""
+            raise ConfigError(f"{where}: found {name} {shown}, expected each once{rule}")
+    return used
 
 
 @dataclass(frozen=True)
@@ -406,12 +488,15 @@ class _JointSection:
     mandatory: bool = True
     sdo_timeout_ms: _SdoTimeout | None = None
     objects: _Objects = _Objects()
+    tpdos: tuple[_Tpdo, ...] = ()
+    max_age_ms: Annotated[float, limits("ms", ge=0.1, le=1000.0)] | None = None
+    """For how long a frame of a TPDO that the drive sends by itself counts."""
     network: _Network | None = None
     profile: Text | None = None
     """Of the drive's family: its values have been put below those of the section (`with_profiles`)."""
 
     def __post_init__(self) -> None:
-        _check_given("joint", self.given, DRIVE_SCALING_OBJECTS)
+        _check_given("joint", self.given, EVERY_SCALING_OBJECT)
 
 
 @dataclass(frozen=True)
@@ -586,6 +671,23 @@ class Config:
         return self.recording.ring_cycles
 
 
+def as_booted(config: Config, nodes: Mapping[str, Mapping[str, Any]]) -> Config:
+    """Return the configuration with the TPDOs that the drives have.
+
+    nodes: of the boot report, or of a log's provenance, by node-ID; a drive that is not in it (it was absent) keeps those
+    that are wanted. Raises PdoError, LayoutError, KeyError or TypeError for what is no such report.
+    """
+
+    def of(joint: JointConfig) -> JointConfig:
+        booted = nodes.get(str(joint.node_id))
+        if booted is None or "tpdos" not in booted:
+            return joint
+        maps = maps_of_json(joint.node_id, booted["tpdos"], joint.objects)
+        return replace(joint, tpdos=chosen(joint.objects, maps))
+
+    return replace(config, joints=tuple(of(joint) for joint in config.joints))
+
+
 def load_config(path: Path | None) -> Config:
     """Read and check a configuration; None is the shipped bench configuration.
 
@@ -655,6 +757,7 @@ def _sensor(section: _SensorSection, sdo_timeout_ms: int) -> SensorConfig:
 
 def _joint(path: Path, number: int, section: _JointSection, method: str, sdo_timeout_ms: int) -> JointConfig:
     """Read what a section `joint_N` names: the joint file and, where the method uses one, the network."""
+    objects = section.objects.of_drive(f"joint_{number}", path)
     network = None if section.network is None else _network(section.network, path)
     joint_path = path.parent / section.file
     profile_path = None if section.profile is None else path_of(section.profile, path.parent)
@@ -670,7 +773,7 @@ def _joint(path: Path, number: int, section: _JointSection, method: str, sdo_tim
             raise ConfigError(
                 f"{joint_path}: key '{needed}': missing, expected because estimator.method is {method}"
             )
-    return JointConfig(
+    made = JointConfig(
         number=number,
         node_id=section.node,
         identity=section.identity,
@@ -682,16 +785,35 @@ def _joint(path: Path, number: int, section: _JointSection, method: str, sdo_tim
         temperature=section.temperature,
         mandatory=section.mandatory,
         sdo_timeout_ms=section.sdo_timeout_ms or sdo_timeout_ms,
-        objects=section.objects.of_drive(f"joint_{number}", path),
+        objects=objects,
+        tpdos=_tpdos(f"joint_{number}", path, section, objects),
+        max_age_ms=section.max_age_ms or 0.0,
         joint_data=data,
         profile=section.profile,
         profile_path=profile_path,
         profile_data=b"" if profile_path is None else read_yaml(profile_path)[1],
     )
+    _check_encoders(path, number, made, method)
+    return made
 
 
 def _whole(values: Mapping[str, float]) -> dict[str, int]:
     return {name: int(value) for name, value in values.items()}
+
+
+def _check_encoders(path: Path, number: int, joint: JointConfig, method: str) -> None:
+    """Refuse what needs the link position of a drive that has none. Raises ConfigError."""
+    if joint.objects.link_position is not None:
+        return
+    torsion = method == "fused" and joint.joint.fused is not None and joint.joint.fused.torsion is not None
+    if torsion or joint.network is not None:
+        what = (
+            "estimates from the torsion of the gear" if torsion else "uses a network with the link position"
+        )
+        raise ConfigError(
+            f"{path}: key 'joint_{number}.objects.link_position': found false, expected a link position because "
+            f"estimator.method {method} {what}; tob and efficiency do without"
+        )
 
 
 def _network(section: _Network, path: Path) -> NetworkFile:

@@ -10,9 +10,8 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from jtqd.drivers.boot_error import BootError, mismatch
+from jtqd.drivers.boot_tpdos import TpdoSetup
 from jtqd.drivers.devices import (
-    EVENT_DRIVEN,
-    EVENT_MS,
     OPERATING_MODE_OBJECT,
     TEMPERATURE,
     DriveProfile,
@@ -22,7 +21,7 @@ from jtqd.drivers.devices import (
     drive_scaling,
     sensor_scaling,
 )
-from jtqd.drivers.pdo import CAN_ID, INVALID, NO_RTR, PdoMap
+from jtqd.drivers.pdo import CAN_ID, INVALID, PdoMap
 from jtqd.drivers.sdo import Key, label
 from jtqd.drivers.sdo_client import NodeObjects, SdoAccess
 
@@ -32,14 +31,12 @@ _IDENTITY = (
     ("revision", "revision number", "N"),
     ("serial", "serial number", "O"),
 )
-_TPDO_COUNT = 4  # TPDOs of the predefined connection set: those not used are switched off
 _PDO_PARAMETERS = range(0x1800, 0x1C00)  # communication and mapping parameters of TPDOs
 _SOFTWARE: Key = (0x100A, 0)
 VERIFY_CONFIGURATION = 0x1020
 _ERROR_BEHAVIOUR: Key = (0x1029, 1)
 _ABORT_OPTION: Key = (0x6007, 0)
 _SYNC_PRODUCER = 1 << 30  # of 1005h
-_INHIBIT_TIME, _EVENT_TIMER = 3, 5  # sub-indices of a PDO's communication parameter
 
 
 @dataclass(frozen=True)
@@ -104,7 +101,7 @@ class NodeBoot:
         """Do all steps between `check_device_type`, whose result it takes, and error control and NMT start."""
         serial = self.check_identity()
         self.check_temperature()
-        self.configure_pdos()
+        tpdos = self.configure_pdos()
         self.configure_sync()
         self.configure_heartbeat()
         self.configure_error_behaviour()
@@ -120,7 +117,7 @@ class NodeBoot:
             serial=serial,
             scaling=scaling,
             gear_ratio=gear_ratio,
-            tpdos=self._profile.tpdos,
+            tpdos=tpdos,
             configuration_sha256=sha256,
             signed=signed,
             watched=watched,
@@ -180,78 +177,9 @@ class NodeBoot:
                 self._node, TEMPERATURE, what, expected=expected, found="no such object", letter="J"
             )
 
-    def configure_pdos(self) -> None:
-        """Write the profile's TPDOs, each in the order of CiA 301; switch off the others of 1..4."""
-        wanted = {(pdo.cob_id - 0x80) // 0x100: pdo for pdo in self._profile.tpdos}
-        for number in range(1, _TPDO_COUNT + 1):
-            pdo = wanted.get(number)
-            if pdo is None:
-                self._switch_off(0x1800 + number - 1)
-            else:
-                self._configure_or_accept(0x1800 + number - 1, pdo)
-
-    def _configure_or_accept(self, communication: int, pdo: PdoMap) -> None:
-        """Configure a PDO; of a drive whose mapping is fixed, accept one that is as it should be."""
-        try:
-            self._configure_pdo(communication, pdo)
-        except BootError as refused:
-            written = refused.letter == "J" and refused.expected.endswith(" accepted")
-            if not (written and refused.object.startswith("1A")):
-                raise
-            found = self._mapped(communication)
-            self._restore(communication, pdo)
-            if found != (pdo.transmission_type, *pdo.words):
-                words = ", ".join(f"0x{word:08X}" for word in found[1:]) or "nothing"
-                text = f"{label(communication + 0x200)} maps {words} with transmission type {found[0]}"
-                raise refused.explained(text) from refused
-            self._notes.append(f"TPDO {pdo.cob_id:03X}h is fixed, and as it should be ({refused.detail})")
-
-    def _mapped(self, communication: int) -> tuple[int, ...]:
-        """Return transmission type and mapping words of a PDO."""
-        objects, mapping = self._objects, communication + 0x200
-        count = objects.number((mapping, 0), 1)
-        words = (objects.number((mapping, entry), 4) for entry in range(1, min(count, 8) + 1))
-        return (objects.number((communication, 2), 1), *words)
-
-    def _restore(self, communication: int, pdo: PdoMap) -> None:
-        """Switch a PDO on again that was switched off to be mapped."""
-        key = (communication, 1)
-        found = self._objects.number(key, 4)
-        enabled = found & NO_RTR | pdo.cob_id & CAN_ID
-        if found != enabled:
-            self._objects.put(key, enabled, 4, "COB-ID")
-
-    def _switch_off(self, communication: int) -> None:
-        cob_id = self._objects.optional_number((communication, 1), 4)
-        if cob_id is not None and not cob_id & INVALID:
-            self._objects.put((communication, 1), cob_id | INVALID, 4, "COB-ID")
-
-    def _configure_pdo(self, communication: int, pdo: PdoMap) -> None:
-        mapping = communication + 0x200
-        cob_id = self._objects.number((communication, 1), 4)
-        self._objects.write((communication, 1), cob_id | INVALID, 4)
-        self._objects.write((mapping, 0), 0, 1)
-        for entry, word in enumerate(pdo.words, 1):
-            self._objects.write((mapping, entry), word, 4)
-        self._objects.write((mapping, 0), len(pdo.words), 1)
-        self._objects.write((communication, 2), pdo.transmission_type, 1)
-        if pdo.transmission_type in EVENT_DRIVEN:
-            self._configure_timer(communication)
-        # the device's own RTR bit is kept: some accept one value only
-        enabled = cob_id & NO_RTR | pdo.cob_id & CAN_ID
-        self._objects.write((communication, 1), enabled, 4)
-        # read back at the end and not after each write: a later write may undo an earlier one
-        self._objects.require((mapping, 0), len(pdo.words), 1, "number of mapped objects")
-        for entry, word in enumerate(pdo.words, 1):
-            self._objects.require((mapping, entry), word, 4, "mapping entry")
-        self._objects.require((communication, 2), pdo.transmission_type, 1, "transmission type")
-        self._objects.require((communication, 1), enabled, 4, "COB-ID")
-
-    def _configure_timer(self, communication: int) -> None:
-        """Set event timer, and inhibit time where the node has one: a value that flickers must not fill the bus."""
-        if self._objects.read((communication, _INHIBIT_TIME)) is not None:
-            self._objects.put((communication, _INHIBIT_TIME), 10 * EVENT_MS, 2, "inhibit time in 100 us")
-        self._objects.put((communication, _EVENT_TIMER), EVENT_MS, 2, "event timer in ms")
+    def configure_pdos(self) -> tuple[PdoMap, ...]:
+        """Set up the TPDOs and return those that are used (`TpdoSetup`)."""
+        return TpdoSetup(self._objects, self._profile, self._notes).run()
 
     def configure_sync(self) -> None:
         """Check that 1005h is jtqd's SYNC; make 1019h tell whether it has a counter byte."""

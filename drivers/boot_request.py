@@ -11,7 +11,9 @@ Only "bus" and "nodes" with "node" and "kind" are needed. `given` replaces objec
 a drive asks for TPDO3 with 3001h; a node that is not `mandatory` may be absent. "error_behaviour" is 1029h:1; without it
 the nodes keep theirs. "reset": NMT reset communication comes first. `sdo_timeout_ms`: silence of the node after which a
 request is repeated.
-`objects` of a drive: fields of `devices.DriveObjects`, each with those of `DriveObject`.
+`objects` of a drive: fields of `devices.DriveObjects`, each with those of `DriveObject`, or null; `tpdos`: TPDOs that
+shall carry them (`layout.tpdos_as_json`), without it TPDO1 and TPDO2 as jtqd maps them. `torque_constant_nm_per_a`: for a
+current by its torque (6077h). `by_itself`: TPDOs of transmission types 0, 254 and 255 are accepted.
 """
 
 from __future__ import annotations
@@ -32,7 +34,10 @@ from jtqd.drivers.devices import (
     SensorProfile,
     parse_key,
 )
+from jtqd.drivers.layout import maps_of_json, tpdos_as_json
+from jtqd.drivers.pdo import PdoError, PdoMap
 from jtqd.drivers.sdo import ANSWER_S, Key
+from jtqd.drivers.units import BY_TORQUE
 
 _TOP = {
     "bus",
@@ -48,7 +53,7 @@ _TOP = {
 }
 _SYNC = {"cob_id", "counter_overflow", "check_foreign"}
 _NODE = {"node", "kind", "identity", "channels", "given", "unit_words", "temperature", "mandatory"}
-_NODE |= {"sdo_timeout_ms", "objects"}
+_NODE |= {"sdo_timeout_ms", "objects", "tpdos", "torque_constant_nm_per_a", "by_itself"}
 _OPTIONAL_TIMEOUT_S = 0.5
 """An optional node is not waited for any longer: it is booted again when it appears."""
 
@@ -147,7 +152,15 @@ def _profile(raw: object, where: str) -> Profile:
     if kind == "drive":
         temperature = _boolean(node, "temperature", default=False, where=where)
         objects = _objects(node.get("objects"), f"{where}.objects")
-        return DriveProfile(number, identity, given, temperature, objects)
+        layout = _layout(node.get("tpdos", []), number, objects, f"{where}.tpdos")
+        constant = node.get("torque_constant_nm_per_a", 0.0)
+        itself = _boolean(node, "by_itself", default=False, where=where)
+        by_torque = objects.current.by == BY_TORQUE and not objects.current.factor
+        if isinstance(constant, bool) or not isinstance(constant, int | float) or constant <= 0.0 < by_torque:
+            raise RequestError(
+                f"{where}.torque_constant_nm_per_a: found {constant!r}, expected a number above 0"
+            )
+        return DriveProfile(number, identity, given, temperature, objects, layout, float(constant), itself)
     if kind != "sensor":
         raise RequestError(f"{where}.kind: found {kind!r}, expected 'drive' or 'sensor'")
     channels = node.get("channels", [1])
@@ -173,10 +186,22 @@ def _objects(raw: object, where: str) -> DriveObjects:
     known = {each.name for each in fields(DriveObject)}
     found = _mapping(raw, where, names)
     try:
-        return DriveObjects(
-            **{name: DriveObject(**_mapping(each, f"{where}.{name}", known)) for name, each in found.items()}
-        )
+        chosen: dict[str, Any] = {
+            name: None if each is None else DriveObject(**_mapping(each, f"{where}.{name}", known))
+            for name, each in found.items()
+        }
+        return DriveObjects(**chosen)
     except TypeError as error:
+        raise RequestError(f"{where}: {error}") from error
+
+
+def _layout(raw: object, node: int, objects: DriveObjects, where: str) -> tuple[PdoMap, ...]:
+    """Return the TPDOs of a request. Raises RequestError."""
+    if not isinstance(raw, list):
+        raise RequestError(f"{where}: found {raw!r}, expected a list")
+    try:
+        return maps_of_json(node, raw, objects)
+    except (PdoError, KeyError, TypeError, AttributeError) as error:
         raise RequestError(f"{where}: {error}") from error
 
 
@@ -244,14 +269,7 @@ def node_report(node: BootedNode) -> dict[str, object]:
         "serial": node.serial,
         "scaling": asdict(node.scaling),
         "gear_ratio": node.gear_ratio,
-        "tpdos": [
-            {
-                "cob_id": pdo.cob_id,
-                "transmission_type": pdo.transmission_type,
-                "words": list(pdo.words),
-            }
-            for pdo in node.tpdos
-        ],
+        "tpdos": tpdos_as_json(node.tpdos),
         "configuration_sha256": node.configuration_sha256,
         "signed": node.signed,
         "watched": [list(each) for each in node.watched],

@@ -6,21 +6,21 @@ configuration above 95 % of it is refused: what is left must carry SDO, EMCY and
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from jtqd.drivers.devices import (
     EVENT_MS,
     JTQD_NODE,
     SYNC_COB_ID,
-    drive_tpdo1,
-    drive_tpdo2,
+    drive_layout,
     drive_tpdo3,
     estimate_tpdos,
     sensor_tpdo1,
     sensor_tpdo2,
 )
 from jtqd.drivers.frame import unstuffed_bits, worst_case_bits
+from jtqd.drivers.layout import BY_ITSELF
 from jtqd.drivers.nmt import HEARTBEAT_BASE
 from jtqd.drivers.pdo import LAST_SYNC_TYPE, PdoMap
 
@@ -122,7 +122,7 @@ def heartbeat_row(who: str, node: int, heartbeat_ms: int, period_s: float = PERI
 
 
 def configured_load(
-    drives: Iterable[int],
+    drives: Iterable[int] | Mapping[int, Sequence[PdoMap]],
     sensors: Mapping[int, tuple[int, ...]],
     *,
     sync_counter: bool = False,
@@ -135,17 +135,22 @@ def configured_load(
 ) -> BusLoad:
     """Add up drives (node numbers), sensors (node -> channels), SYNC, estimates, heartbeats and `extra`.
 
-    `sync_counter`: SYNC has a counter byte (1019h). `temperatures`: nodes among the drives that send their joint's
-    temperature.
+    `drives` may hold their TPDOs by node; without, they are as jtqd maps them. `sync_counter`: SYNC has a counter byte
+    (1019h). `temperatures`: nodes among the drives that send their joint's temperature.
     """
-    drives = tuple(drives)
+    layouts = drives if isinstance(drives, Mapping) else {node: drive_layout(node) for node in drives}
     rows = [sync_row(sync_counter)]
-    for pdo, who in zip(estimate_tpdos(len(drives), master), _ESTIMATES, strict=False):
+    for pdo, who in zip(estimate_tpdos(len(layouts), master), _ESTIMATES, strict=False):
         rows.append(pdo_row(who, pdo))
     rows.append(heartbeat_row("jtqd", master, heartbeat_ms, period_s))
-    for node in drives:
-        rows.append(pdo_row(f"drive {node} TPDO1", drive_tpdo1(node)))
-        rows.append(pdo_row(f"drive {node} TPDO2", drive_tpdo2(node)))
+    for node, tpdos in layouts.items():
+        rows += [
+            # one that the drive sends by itself is counted once per SYNC: an inhibit time must keep it so
+            Row(pdo.cob_id, f"drive {node} TPDO{pdo.number}", pdo.length)
+            if pdo.transmission_type in BY_ITSELF
+            else pdo_row(f"drive {node} TPDO{pdo.number}", pdo)
+            for pdo in tpdos
+        ]
         rows.append(heartbeat_row(f"drive {node}", node, heartbeat_ms, period_s))
     rows += [temperature_row(node, period_s) for node in temperatures]
     for node, channels in sensors.items():

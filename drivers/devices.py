@@ -6,13 +6,21 @@ by the configuration instead ("608Fh:1" -> number); no factor is a constant of t
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from jtqd.drivers.boot_error import mismatch
 from jtqd.drivers.pdo import MappedObject, PdoMap
 from jtqd.drivers.sdo import Key, label
+from jtqd.drivers.units import (
+    AT_JOINT,
+    GEAR,
+    OTHER_SCALING_OBJECTS,
+    SCALES,
+    UnitError,
+    scale_of,
+    si_per_unit,
+)
 
 JTQD_NODE = 0x20
 COMMANDER_NODE = 0x21
@@ -33,6 +41,7 @@ DRIVE_SCALING_OBJECTS: dict[Key, tuple[str, int]] = {
     (0x6091, 2): ("gear ratio driving shaft revolutions", 2**31),
     (0x6075, 0): ("motor rated current in mA", 1_000_000),
 }
+EVERY_SCALING_OBJECT = DRIVE_SCALING_OBJECTS | OTHER_SCALING_OBJECTS
 UNIT_OBJECT, DECIMALS_OBJECT, OPERATING_MODE_OBJECT = 0x6131, 0x6132, 0x6112
 JOULE = 0x23  # CiA 303-2 code of J = Nm; the table has none of the newton metre that could be verified
 MAX_DECIMALS = 9
@@ -76,7 +85,9 @@ class DriveObject:
     Attributes:
         index, subindex, bits, signed: the object; it is mapped as a whole.
         sign: -1 where the drive counts the other way.
-        factor: SI units per unit; None: by the scaling objects of CiA 402.
+        factor: SI units per unit; None: by the scaling objects of the drive.
+        by: which of them (`units.SCALES`); "": those of CIA_402.
+        shaft: where it counts, for those that count at a shaft (`units.SHAFTS`).
     """
 
     index: int
@@ -85,33 +96,34 @@ class DriveObject:
     signed: bool = True
     sign: int = 1
     factor: float | None = None
+    by: str = ""
+    shaft: str = AT_JOINT
 
 
 @dataclass(frozen=True)
 class DriveObjects:
-    """Objects of a drive's two synchronous TPDOs; those of CiA 402 unless the configuration names others.
+    """Objects of a drive's synchronous TPDOs; those of CiA 402 unless the configuration names others.
 
-    The first PDO holds both positions, of 32 bits each; the second one velocity, current and statusword, together 8 bytes.
+    None: the drive has no such object, for example only one encoder. Where jtqd maps them (`drive_layout`) the first PDO
+    holds the positions, of 32 bits each; the second one velocity, current and statusword, together 8 bytes at most.
     """
 
     motor_position: DriveObject = DriveObject(0x6064)
-    link_position: DriveObject = DriveObject(0x60E4, 1)
-    motor_velocity: DriveObject = DriveObject(0x606C)
+    link_position: DriveObject | None = DriveObject(0x60E4, 1)
+    motor_velocity: DriveObject | None = DriveObject(0x606C)
     current: DriveObject = DriveObject(0x6078, bits=16)
     statusword: DriveObject = DriveObject(0x6041, bits=16, signed=False)
 
     def scaled_by(self) -> dict[str, tuple[Key, ...]]:
-        """Return the scaling objects of each quantity; none for one with a factor of its own."""
-        return {name: () if getattr(self, name).factor else keys for name, keys in _SCALED_BY.items()}
+        """Return the scaling objects of each quantity that the drive has; none for one with a factor of its own."""
+        found = {name: getattr(self, name) for name in SCALES}
+        return {
+            name: () if each.factor else scale_of(name, each.by).keys
+            for name, each in found.items()
+            if each is not None
+        }
 
 
-_SCALED_BY: dict[str, tuple[Key, ...]] = {
-    "motor_position": ((0x608F, 1), (0x608F, 2)),
-    "motor_velocity": ((0x6090, 1), (0x6090, 2)),
-    "link_position": ((0x60E6, 1), (0x60EB, 1)),
-    "current": ((0x6075, 0),),
-}
-_GEAR: tuple[Key, ...] = ((0x6091, 1), (0x6091, 2))
 CIA_402 = DriveObjects()
 
 
@@ -123,6 +135,9 @@ class DriveProfile:
         objects: which of its objects are mapped.
         given: scaling objects by the configuration, which are then not read.
         temperature: it has 3001h, and shall send it by TPDO3.
+        torque_constant_nm_per_a: of the motor, for a drive that tells torque instead of current; 0: not known.
+        by_itself: its TPDOs may have transmission types 0, 254, 255.
+        layout: TPDOs that shall carry its quantities; empty: TPDO1 and TPDO2 as jtqd maps them.
     """
 
     node_id: int
@@ -130,25 +145,28 @@ class DriveProfile:
     given: Mapping[Key, int] = field(default_factory=dict)
     temperature: bool = False
     objects: DriveObjects = CIA_402
+    layout: tuple[PdoMap, ...] = ()
+    torque_constant_nm_per_a: float = 0.0
+    by_itself: bool = False
     profile_number = 402
 
     @property
     def tpdos(self) -> tuple[PdoMap, ...]:
-        """TPDO1 and TPDO2, and TPDO3 with the temperature."""
+        """TPDOs of the quantities, and TPDO3 with the temperature."""
         node, objects = self.node_id, self.objects
-        every = drive_tpdo1(node, objects), drive_tpdo2(node, objects), drive_tpdo3(node)
-        return every if self.temperature else every[:2]
+        layout = self.layout or drive_layout(node, objects)
+        return (*layout, drive_tpdo3(node)) if self.temperature else layout
 
     @property
     def scaling_objects(self) -> tuple[Key, ...]:
         """Objects that the boot must read."""
         used = self.used_scaling
-        return tuple(key for key in DRIVE_SCALING_OBJECTS if key in used and key not in self.given)
+        return tuple(key for key in EVERY_SCALING_OBJECT if key in used and key not in self.given)
 
     @property
     def used_scaling(self) -> set[Key]:
         """Scaling objects that mean something for this drive, read or given."""
-        return {*_GEAR, *(key for keys in self.objects.scaled_by().values() for key in keys)}
+        return {*GEAR, *(key for keys in self.objects.scaled_by().values() for key in keys)}
 
 
 @dataclass(frozen=True)
@@ -190,7 +208,7 @@ Profile = DriveProfile | SensorProfile
 
 @dataclass(frozen=True)
 class DriveScaling:
-    """Factors from a drive's numbers to SI: 6064h, 606Ch (motor side), 60E4h:1 (joint side), 6078h."""
+    """Factors from a drive's numbers to SI: 6064h, 606Ch (motor side), 60E4h:1 (joint side), 6078h; 0 for none."""
 
     motor_rad_per_count: float
     motor_rad_s_per_unit: float
@@ -203,6 +221,11 @@ class SensorScaling:
     """Nm per unit of 9130h/7130h, by channel."""
 
     nm_per_unit: Mapping[int, float]
+
+
+def drive_layout(node: int, objects: DriveObjects = CIA_402) -> tuple[PdoMap, ...]:
+    """Return the TPDOs into which jtqd maps a drive's quantities."""
+    return drive_tpdo1(node, objects), drive_tpdo2(node, objects)
 
 
 def drive_tpdo1(node: int, objects: DriveObjects = CIA_402) -> PdoMap:
@@ -218,7 +241,9 @@ def drive_tpdo2(node: int, objects: DriveObjects = CIA_402) -> PdoMap:
 def _mapped(objects: DriveObjects, *names: str) -> tuple[MappedObject, ...]:
     found = ((getattr(objects, name), name) for name in names)
     return tuple(
-        MappedObject(each.index, each.subindex, each.bits, each.signed, name) for each, name in found
+        MappedObject(each.index, each.subindex, each.bits, each.signed, name)
+        for each, name in found
+        if each is not None
     )
 
 
@@ -274,20 +299,26 @@ def drive_scaling(profile: DriveProfile, read: Mapping[Key, int]) -> tuple[Drive
     values = {**read, **profile.given}
     objects = profile.objects
     used = profile.used_scaling
-    for key, (name, highest) in DRIVE_SCALING_OBJECTS.items():
+    for key, (name, highest) in EVERY_SCALING_OBJECT.items():
         if key in used and not 1 <= values[key] <= highest:
             raise mismatch(profile.node_id, key, name, expected=f"1..{highest}", found=str(values[key]))
-    turn = 2.0 * math.pi
 
-    def factor(each: DriveObject, of_cia_402: Callable[[], float]) -> float:
-        return each.sign * (of_cia_402() if each.factor is None else each.factor)
+    def factor(name: str) -> float:
+        each: DriveObject | None = getattr(objects, name)
+        if each is None:
+            return 0.0
+        if each.factor is not None:
+            return each.sign * each.factor
+        try:
+            constant = profile.torque_constant_nm_per_a
+            return each.sign * si_per_unit(name, each.by, each.shaft, values, constant)
+        except UnitError as error:
+            what = EVERY_SCALING_OBJECT[error.key][0]
+            found = error.found
+            raise mismatch(profile.node_id, error.key, what, expected=error.expected, found=found) from None
 
     scaling = DriveScaling(
-        factor(objects.motor_position, lambda: turn * values[0x608F, 2] / values[0x608F, 1]),
-        factor(objects.motor_velocity, lambda: turn * values[0x6090, 2] / values[0x6090, 1]),
-        factor(objects.link_position, lambda: turn * values[0x60EB, 1] / values[0x60E6, 1]),
-        # 6078h is 1/1000 of 6075h, which is in mA
-        factor(objects.current, lambda: values[0x6075, 0] * 1e-3 * 1e-3),
+        factor("motor_position"), factor("motor_velocity"), factor("link_position"), factor("current")
     )
     return scaling, values[0x6091, 1] / values[0x6091, 2]
 

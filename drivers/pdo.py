@@ -69,11 +69,15 @@ class MappedObject:
 
 @dataclass(frozen=True)
 class PdoMap:
-    """What one PDO carries. Raises PdoError when empty, longer than a frame, or on no identifier of a PDO."""
+    """What one PDO carries. Raises PdoError when empty, longer than a frame, or on no identifier of a PDO.
+
+    given_number: of the TPDO (1: 1800h) where it is not that of its COB-ID in the predefined connection set.
+    """
 
     cob_id: int
     objects: tuple[MappedObject, ...]
     transmission_type: int = 1
+    given_number: int | None = field(default=None, compare=False)
     layout: struct.Struct = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -89,6 +93,11 @@ class PdoMap:
         if layout.size > MAX_PDO_BYTES:
             raise PdoError(f"PDO {self.cob_id:X}h: {layout.size} bytes mapped, a frame holds {MAX_PDO_BYTES}")
         object.__setattr__(self, "layout", layout)
+
+    @property
+    def number(self) -> int:
+        """Return the number of the TPDO: 1 for 1800h and 1A00h."""
+        return (self.cob_id - 0x80) // 0x100 if self.given_number is None else self.given_number
 
     @property
     def length(self) -> int:

@@ -167,13 +167,14 @@ class NodeObjects:
 
     Attributes:
         node: node number.
+        access: to its SDO server.
         values: newest value of each number that was read; the boot makes the configuration hash of them.
     """
 
     def __init__(self, access: SdoAccess, node: int) -> None:
         self.node = node
         self.values: dict[Key, int] = {}
-        self._access = access
+        self.access = access
 
     def read(self, key: Key, letter: str = "") -> bytes | None:
         """Upload an object as bytes, which are not kept in `values`; None when the device does not have it."""
@@ -187,7 +188,7 @@ class NodeObjects:
     def best_effort(self, key: Key) -> bytes | None:
         """Upload an object that nothing depends on; None where the device gives none, for whatever reason."""
         try:
-            return self._access.read(*key)
+            return self.access.read(*key)
         except (SdoAbort, SdoTimeout):
             return None
 
@@ -208,7 +209,7 @@ class NodeObjects:
         """Download a number; a negative one as its two's complement."""
         value &= (1 << 8 * size) - 1
         try:
-            self._access.write(*key, value.to_bytes(size, "little"))
+            self.access.write(*key, value.to_bytes(size, "little"))
         except SdoTimeout as timeout:
             raise self._no_answer(key, timeout, "J") from timeout
         except SdoAbort as abort:
@@ -229,7 +230,7 @@ class NodeObjects:
 
     def _read(self, key: Key, letter: str) -> bytes:
         try:
-            return self._access.read(*key)
+            return self.access.read(*key)
         except SdoTimeout as timeout:
             raise self._no_answer(key, timeout, letter) from timeout
 

@@ -11,12 +11,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from jtqd.daemon.config import Config
+from jtqd.daemon.config import Config, as_booted
 from jtqd.daemon.shared.child_process import Child
 from jtqd.daemon.shared.log_lines import RateLimit
 from jtqd.daemon.shared.snapshot import NOT_OPERATIONAL, SnapshotReader, View
 from jtqd.drivers.bus_load import BusLoad, configured_load
 from jtqd.drivers.eds.own_objects import own_sheet
+from jtqd.drivers.layout import tpdos_as_json
 
 _EDS = Path(__file__).resolve().parents[2] / "drivers" / "eds"
 
@@ -37,6 +38,9 @@ def boot_request(
             "temperature": joint.temperature,
             "sdo_timeout_ms": joint.sdo_timeout_ms,
             "objects": asdict(joint.objects),
+            "tpdos": tpdos_as_json(joint.tpdos),
+            "by_itself": joint.max_age_ms > 0.0,
+            "torque_constant_nm_per_a": joint.joint.torque_constant_nm_per_a,
             "mandatory": joint.mandatory or only is not None,
         }
         for joint in config.joints
@@ -74,7 +78,7 @@ def boot_request(
 def bus_load_of(config: Config) -> BusLoad:
     """Compute the load of everything that the configuration puts on the bus; nothing is checked here."""
     return configured_load(
-        [joint.node_id for joint in config.joints],
+        {joint.node_id: joint.tpdos for joint in config.joints},
         {config.sensor.node_id: config.sensor.channels} if config.sensor else {},
         sync_counter=config.counter_overflow > 0,
         temperatures=[joint.node_id for joint in config.joints if joint.temperature],
@@ -231,6 +235,11 @@ class ReturningNodes:
                 text = f"node {node} has another {key} than at the start: expected {then[key]}, found {now[key]}: not used"
                 self._refuse(node, text, now_s)
                 return None
+        if now.get("tpdos") != then.get("tpdos"):
+            self._refuse(
+                node, f"node {node} has other TPDOs than at the start: not used; restart jtqd", now_s
+            )
+            return None
         if now["serial"] != then["serial"]:
             text = f"another device: serial number {now['serial']:08X}h, before {then['serial']:08X}h"
             self._log("boot", node, f"node {node}: {text}")
@@ -239,6 +248,8 @@ class ReturningNodes:
     def _accepted_first(self, node: int, now: dict[str, Any], now_s: float) -> dict[str, Any] | None:
         """Check a node that was absent at the start as the first boot would have done."""
         wrong = gear_ratio_error(self._config, node, now.get("gear_ratio"))
+        if wrong is None and as_booted(self._config, {str(node): now}) != self._config:
+            wrong = f"node {node} has other TPDOs than expected at the start, when it was absent: not used; restart jtqd"
         if wrong is None:
             return now
         self._refuse(node, wrong, now_s)

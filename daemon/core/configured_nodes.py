@@ -37,7 +37,7 @@ class ConfiguredNodes:
             intake.configured(node)
             snapshot.unconfigured[node] = 0
             for joint in self._joints:
-                if intake.pdos[joint.inputs.position].node_id == node:
+                if joint.node_id == node:
                     joint.begin_again()
                 joint.rescale(node, snapshot.factors(node))
 

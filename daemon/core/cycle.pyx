@@ -22,7 +22,7 @@ from jtqd.daemon.core.configured_nodes import ConfiguredNodes
 from jtqd.daemon.core.counters cimport LoopCounters
 from jtqd.daemon.core.estimate_pdo cimport NOBODY, Published, encode_into
 from jtqd.drivers.frame_socket cimport Frame
-from jtqd.daemon.core.intake cimport Intake, temperature_at
+from jtqd.daemon.core.intake cimport Input, Intake, temperature_at
 from jtqd.daemon.core.joint cimport JointCycle
 from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.core.record cimport CycleFrames, Header, RecordRing
@@ -393,8 +393,9 @@ cdef class Cycle:
             (<JointCycle> self.at[n]).take_back(status)
 
     cdef void hold(self, const Frame *frame, int64_t stamp_ns) noexcept nogil:
-        """Of a slot without a record, temperatures go into the next one that there is."""
-        if self.intake.temperature_with(frame.id) != NULL:
+        """Of a slot without a record, what belongs to no cycle goes into the next one that there is."""
+        cdef Input *state = self.intake.input_with(frame.id)
+        if self.intake.temperature_with(frame.id) != NULL or (state != NULL and state.age_ns):
             self.frames.hold(frame, stamp_ns)
 
     cdef int write_snapshot(self) except -1:

@@ -5,7 +5,7 @@ from libc.stdint cimport int8_t, int64_t, uint8_t, uint32_t
 from jtqd.drivers.frame_socket cimport Frame
 
 cdef enum:
-    MOST_INPUTS = 16  # PDOs that the loop waits for, and as many temperatures
+    MOST_INPUTS = 20  # PDOs that the loop waits for, and as many temperatures
     MOST_FIELDS = 8
     NODES = 128
     IDENTIFIERS = 2048  # of 11 bits
@@ -17,6 +17,7 @@ cdef struct Field:  # one object of a PDO
 cdef struct Input:  # what the intake knows of one synchronous PDO
     uint32_t cob_id
     int length, node_id
+    int64_t age_ns  # 0: sent at each SYNC; else its last frame counts for so long, and nobody waits for it
     int field_count
     Field fields[MOST_FIELDS]
     int wanted  # 0 while its node is absent or not configured: nobody waits for it then
@@ -98,6 +99,7 @@ cdef class Intake:
     cdef Input *input_with(self, uint32_t can_id) noexcept nogil
     cdef Temperature *temperature_with(self, uint32_t can_id) noexcept nogil
     cdef void wrong_length(self, Input *state, int length) noexcept nogil
+    cdef bint young(self, const Input *state) noexcept nogil
     cdef void doubt(self, Input *state, int64_t delay_ns) noexcept nogil
     cdef void late(self, Input *state) noexcept nogil
     cdef void own_sync(self, int counter, int64_t stamp_ns) noexcept nogil

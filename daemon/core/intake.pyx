@@ -22,6 +22,10 @@ the same PDO can still be under way:
 * a SYNC that is not our own echo makes every input of the cycle doubtful: none is used;
 * the PDOs of a node that is not believed (`NodeTrust`) are not used.
 
+A PDO that its producer sends by itself (transmission types 0, 254, 255) belongs to no cycle either. Its last frame is an input of
+every cycle whose SYNC is at most `age_ns` away from it, by the kernel's stamps; nobody waits for it, and it has no debt. With a
+step of CLOCK_REALTIME it is too old, until the next one comes.
+
 A joint's temperature (TPDO3) is not bound to SYNC: it belongs to no cycle, nobody waits for it, and none of the above but
 the last two rules concerns it.
 
@@ -73,7 +77,7 @@ cdef int TEMPERATURE_BYTES = 2
 cdef int NOT_MEASURED = devices.NOT_MEASURED
 cdef double C_PER_UNIT = devices.TEMPERATURE_C_PER_UNIT
 
-_SIZES: Final = {"b": 1, "h": 2, "i": 4, "q": 8, "B": 1, "H": 2, "I": 4}
+_SIZES: Final = {"b": 1, "h": 2, "i": 4, "q": 8, "B": 1, "H": 2, "I": 4, "Q": 8}
 """Bytes of the objects that a PDO may carry, by their letters in `struct`; a small letter is a signed one."""
 
 
@@ -83,7 +87,7 @@ _SIZES: Final = {"b": 1, "h": 2, "i": 4, "q": 8, "B": 1, "H": 2, "I": 4}
 cdef class InputState:
     """State of one synchronous PDO in the intake: frame of this cycle, missing frames, usual arrival.
 
-    pdo: an `InputPdo` (`jtqd.daemon.loop.input_pdos`): `cob_id`, `length`, `layout`, `node_id`, `name`.
+    pdo: an `InputPdo` (`jtqd.daemon.loop.input_pdos`): `cob_id`, `length`, `layout`, `node_id`, `name`, `age_ns`.
     """
 
     def __init__(self, pdo):
@@ -93,6 +97,7 @@ cdef class InputState:
             raise ValueError(f"{pdo.name}: cannot decode the layout {pdo.layout.format!r}")
         self.pdo = pdo
         self.input.cob_id, self.input.length, self.input.node_id = pdo.cob_id, pdo.length, pdo.node_id
+        self.input.age_ns = pdo.age_ns
         for letter in letters:
             self.input.fields[self.input.field_count] = Field(offset, _SIZES[letter], letter.islower())
             self.input.field_count += 1
@@ -439,7 +444,7 @@ cdef class NodeTrust:
             self.producer[_node(node_id)] = True
             self.inputs[self.count] = &state.input
             self.count += 1
-        self.now.wanted = self.count
+            self.now.wanted += not state.input.age_ns
 
     @property
     def wanted(self):
@@ -512,7 +517,10 @@ cdef class NodeTrust:
                 each.wanted = configured
                 each.debt = 0
                 each.probation = False
-            self.now.wanted += each.wanted
+                if each.age_ns:
+                    each.has_data = False  # of a mapping that is no more
+            if not each.age_ns:
+                self.now.wanted += each.wanted
 
 
 cdef int _node(int node_id) except -1:
@@ -713,6 +721,8 @@ cdef class Intake:
             self.other(frame, stamp_ns, own)
         elif frame.length != state.length:
             self.wrong_length(state, frame.length)
+        elif state.age_ns:
+            _keep(state, frame, stamp_ns)
         elif state.fresh:
             self.second(state, frame, stamp_ns)
         else:
@@ -728,7 +738,9 @@ cdef class Intake:
         cdef int n
         for n in range(self.count):
             state = self.inputs[n]
-            if state.fresh:
+            if state.age_ns:
+                state.fresh = self.young(state)
+            elif state.fresh:
                 delay = state.stamp_ns - sync_ns if sync_ns else -1
                 if state.debt or state.quarantine or not state.wanted:
                     self.doubt(state, delay)
@@ -753,6 +765,13 @@ cdef class Intake:
             self.now.last_delay_ns = last_ns
         return complete
 
+    cdef bint young(self, const Input *state) noexcept nogil:
+        """Return whether the last frame of a PDO that is sent by itself is an input of the cycle to be closed."""
+        cdef int64_t sync_ns = self.now.sync_stamp_ns
+        if not state.wanted or not state.has_data or not sync_ns or self.now.foreign_sync_now:
+            return False
+        return -state.age_ns <= sync_ns - state.stamp_ns <= state.age_ns
+
     cdef void doubt(self, Input *state, int64_t delay_ns) noexcept nogil:
         """A frame came, but it may be an earlier cycle's, or of a node that nobody has configured: it is not used."""
         state.fresh = False
@@ -772,6 +791,8 @@ cdef class Intake:
             self.other(frame, stamp_ns, own)
         elif frame.length != state.length:
             self.wrong_length(state, frame.length)
+        elif state.age_ns:
+            _keep(state, frame, stamp_ns)
         elif not state.wanted:
             return  # of a node with a mapping that nobody has checked
         elif state.debt:

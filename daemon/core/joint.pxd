@@ -8,6 +8,9 @@ from jtqd.daemon.core.record cimport JointBlock
 from jtqd.daemon.core.status cimport JointRules
 from jtqd.estimator.sample cimport Estimator
 
+cdef enum:
+    MOST_TPDOS = 4  # of a drive
+
 cdef struct UnwrapState:
     int64_t last, offset
 
@@ -16,6 +19,12 @@ cdef class Unwrap:
 
 cdef struct Scale:  # SI per count or unit
     double motor_rad, motor_rad_s, link_rad, ampere, sensor_nm
+
+cdef struct Derived:  # velocity of a drive that tells none
+    int64_t last_ns
+    double last_rad, rad_s
+    bint is_replayed  # by the log, whose steps tell no time of cycles without inputs
+    double replayed_rad_s
 
 cdef struct JointState:
     int64_t last_ns
@@ -30,16 +39,28 @@ cdef class JointCycle:
     cdef Estimator core
     cdef readonly JointRules rules
     cdef readonly Unwrap motor, link
-    cdef Input *position
-    cdef Input *motion
+    cdef int input_count
+    cdef Input *input[MOST_TPDOS]  # of its drive, and which flags of the record stand for them
+    cdef int flags[MOST_TPDOS]
+    cdef Input *motor_position  # the one that carries the motor position
+    cdef const int64_t *motor_count
+    cdef const int64_t *link_count  # NULL without a link encoder
+    cdef const int64_t *motor_speed  # NULL where it is derived
+    cdef const int64_t *current_count
+    cdef const int64_t *statusword
     cdef Input *sensor  # NULL without reference
     cdef Temperature *temperature
     cdef int64_t period_ns
     cdef Scale scale
+    cdef double gear_ratio
+    cdef Derived derived
     cdef JointState now
+    cdef int find_inputs(self, inputs) except -1
     cdef void observe_at(self, int64_t sync_ns, bint starting, bint network_wanted) noexcept nogil
     cdef void estimate(self, int64_t sync_ns, bint starting, bint network_wanted, int flags) noexcept nogil
     cdef void miss(self, int flags) noexcept nogil
     cdef int reference(self) noexcept nogil
     cdef double since_last(self, int64_t sync_ns) noexcept nogil
+    cdef int64_t on_grid(self, int64_t dt_ns) noexcept nogil
+    cdef bint derive(self, int64_t sync_ns) noexcept nogil
     cdef void take_back(self, int status) noexcept nogil

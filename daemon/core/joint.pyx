@@ -1,4 +1,12 @@
-"""One joint in the loop: counts of this cycle into SI units, the estimate, its status, and what goes out and is recorded."""
+"""One joint in the loop: counts of this cycle into SI units, the estimate, its status, and what goes out and is recorded.
+
+What a drive does not tell:
+
+    link position     one encoder. The estimator is given theta_m/G, a gear without torsion; the record has NaN. Methods that live on
+                      the torsion are refused by the configuration.
+    motor velocity    (theta_m(k) - theta_m(j))/(t_k - t_j), j the last cycle that had the motor position: the mean over that time,
+                      half a period older than the position. The first cycle of all has none, and is one without inputs.
+"""
 
 from libc.math cimport INFINITY, NAN, isnan
 from libc.stdint cimport int64_t
@@ -82,8 +90,7 @@ cdef class JointCycle:
         self.estimator = estimator
         self.intake, self.pdos, self.period_ns = intake, intake.pdos, period_ns
         self.inputs = inputs
-        self.position = _input(intake, inputs.position, 2)
-        self.motion = _input(intake, inputs.motion, 3)
+        self.find_inputs(inputs)
         self.sensor = NULL if inputs.sensor is None else _input(intake, inputs.sensor, 2)
         temperature = UNKNOWN if inputs.temperature is None else intake.temperatures[inputs.temperature]
         self.temperature = &temperature.known  # the intake, or the module, keeps it
@@ -91,6 +98,34 @@ cdef class JointCycle:
         self.now.status = STARTING
         self.now.sample = nothing
         self.now.published = field_of(NAN, INFINITY, STARTING)
+
+    cdef int find_inputs(self, inputs) except -1:
+        """Find the drive's PDOs and the numbers in them; the flags of a record count all PDOs of a kind as one."""
+        cdef int position, motion
+        positions, motions = inputs.positions, inputs.motion
+        both = sorted(positions | motions)
+        if not 0 < len(both) <= MOST_TPDOS:
+            raise ValueError(f"found {len(both)} PDOs of a drive, expected 1 to {MOST_TPDOS}")
+        for index in both:
+            position, motion = POSITION if index in positions else 0, MOTION if index in motions else 0
+            self.flags[self.input_count] = position | motion
+            self.input[self.input_count] = _input(self.intake, index, 1)
+            self.input_count += 1
+        self.motor_count = _number_at(self.intake, inputs.places["motor_position"])
+        self.motor_position = _input(self.intake, inputs.places["motor_position"].pdo, 1)
+        self.link_count = self.motor_speed = NULL
+        if "link_position" in inputs.places:
+            self.link_count = _number_at(self.intake, inputs.places["link_position"])
+        if "motor_velocity" in inputs.places:
+            self.motor_speed = _number_at(self.intake, inputs.places["motor_velocity"])
+        self.current_count = _number_at(self.intake, inputs.places["current"])
+        self.statusword = _number_at(self.intake, inputs.places["statusword"])
+        return 0
+
+    @property
+    def node_id(self):
+        """Node-ID of its drive."""
+        return self.input[0].node_id
 
     @property
     def inputs(self):
@@ -113,6 +148,8 @@ cdef class JointCycle:
 
     @estimator.setter
     def estimator(self, estimator):
+        joint = getattr(estimator, "joint", None)
+        self.gear_ratio = 1.0 if joint is None else joint.gear_ratio
         self.core = estimator if isinstance(estimator, Estimator) else PythonEstimator(estimator)
         self.given = estimator
 
@@ -151,7 +188,7 @@ cdef class JointCycle:
     def begin_again(self):
         """Restart after a restart of the drive: earlier positions and the observer's state are invalid."""
         self.motor, self.link = Unwrap(), Unwrap()
-        self.now.last_ns = 0
+        self.now.last_ns = self.derived.last_ns = 0
         self.given.reset()
         self.rules.begin_again()
 
@@ -176,7 +213,7 @@ cdef class JointCycle:
         inputs, pdos = self.inputs, self.pdos
         if not any(factors):
             return
-        if pdos[inputs.position].node_id == node_id:
+        if self.node_id == node_id:
             motor, speed, link, ampere = factors
             self.inputs = replace(
                 inputs,
@@ -215,11 +252,14 @@ cdef class JointCycle:
         self.now.sample.temperature_c = self.temperature.celsius
         if not isnan(self.temperature.celsius):
             flags |= TEMPERATURE
-        if self.position.fresh:
-            flags |= POSITION
-        if self.motion.fresh:
-            flags |= MOTION
-        if self.position.fresh and self.motion.fresh:
+        cdef int n, missing = 0
+        for n in range(self.input_count):
+            if not self.input[n].fresh:
+                missing |= self.flags[n]
+        if self.motor_speed == NULL and self.motor_position.fresh and not self.derive(sync_ns):
+            missing |= MOTION
+        flags |= (POSITION | MOTION) & ~missing
+        if not missing:
             self.estimate(sync_ns, starting, network_wanted, flags)
         else:
             self.miss(flags)
@@ -230,12 +270,18 @@ cdef class JointCycle:
         cdef JointBlock *record = &self.now.sample
         cdef Sample sample
         cdef Values e = Values(NAN, NAN, NAN, NAN, NAN, INVALID)
-        cdef int status, statusword = <int> self.motion.values[2]
+        cdef int status, statusword = <int> self.statusword[0]
         sample.dt_s = self.since_last(sync_ns)
-        sample.current_a = self.motion.values[1] * scale.ampere
-        sample.motor_position_rad = _counts(&self.motor.now, self.position.values[0]) * scale.motor_rad
-        sample.motor_velocity_rad_s = self.motion.values[0] * scale.motor_rad_s
-        sample.link_position_rad = _counts(&self.link.now, self.position.values[1]) * scale.link_rad
+        sample.current_a = self.current_count[0] * scale.ampere
+        if self.motor_speed != NULL:
+            sample.motor_position_rad = _counts(&self.motor.now, self.motor_count[0]) * scale.motor_rad
+            sample.motor_velocity_rad_s = self.motor_speed[0] * scale.motor_rad_s
+        else:
+            sample.motor_position_rad, sample.motor_velocity_rad_s = self.derived.last_rad, self.derived.rad_s
+        if self.link_count != NULL:
+            sample.link_position_rad = _counts(&self.link.now, self.link_count[0]) * scale.link_rad
+        else:
+            sample.link_position_rad = sample.motor_position_rad / self.gear_ratio
         sample.temperature_c = record.temperature_c
         self.core.advance(&sample, network_wanted, &e)
         status = self.rules.judge(
@@ -246,8 +292,8 @@ cdef class JointCycle:
             e.torque_nm = e.sigma_nm = NAN
         elif status != STANDSTILL and not isnan(record.sensor_torque_nm):
             self.rules.tally.error(e.torque_nm - record.sensor_torque_nm)
-        record.current_a = sample.current_a
-        record.motor_position_rad, record.link_position_rad = sample.motor_position_rad, sample.link_position_rad
+        record.current_a, record.motor_position_rad = sample.current_a, sample.motor_position_rad
+        record.link_position_rad = sample.link_position_rad if self.link_count != NULL else NAN
         record.motor_velocity_rad_s = sample.motor_velocity_rad_s
         record.torque_nm, record.sigma_nm, record.tob_nm = e.torque_nm, e.sigma_nm, e.tob_nm
         record.physics_nm, record.network_nm = e.physics_nm, e.network_nm
@@ -281,17 +327,37 @@ cdef class JointCycle:
 
     cdef double since_last(self, int64_t sync_ns) noexcept nogil:
         """Return the time step [s] from the last cycle with inputs, 0 at the first; the SYNC of this one becomes the last."""
-        cdef int64_t dt_ns = sync_ns - self.now.last_ns if self.now.last_ns else 0
-        # SYNC keeps an absolute grid: a deviation below the stamps' own accuracy is theirs, not time's.
-        if -ACCURACY_NS < dt_ns - self.period_ns < ACCURACY_NS:
-            dt_ns = self.period_ns
+        cdef int64_t dt_ns = self.on_grid(sync_ns - self.now.last_ns) if self.now.last_ns else 0
         self.now.last_ns = sync_ns
         return dt_ns * 1e-9
 
+    cdef int64_t on_grid(self, int64_t dt_ns) noexcept nogil:
+        """Return a time step; SYNC keeps an absolute grid: a deviation below the stamps' own accuracy is theirs, not time's."""
+        return self.period_ns if -ACCURACY_NS < dt_ns - self.period_ns < ACCURACY_NS else dt_ns
+
+    cdef bint derive(self, int64_t sync_ns) noexcept nogil:
+        """Derive the motor's velocity from its position, which has come; return whether there is one."""
+        cdef double position = _counts(&self.motor.now, self.motor_count[0]) * self.scale.motor_rad
+        cdef int64_t dt_ns = self.on_grid(sync_ns - self.derived.last_ns)
+        cdef bint known = self.derived.last_ns != 0 and dt_ns > 0
+        if known:
+            self.derived.rad_s = (position - self.derived.last_rad) / (dt_ns * 1e-9)
+        self.derived.last_ns, self.derived.last_rad = sync_ns, position
+        if self.derived.is_replayed:
+            self.derived.rad_s = self.derived.replayed_rad_s
+            return not isnan(self.derived.replayed_rad_s)
+        return known
+
 
 cdef Input *_input(Intake intake, int index, int count) except NULL:
-    """Return the PDO of this index; raises ValueError when it does not hold `count` objects."""
+    """Return the PDO of this index; raises ValueError when it does not hold at least `count` objects."""
     cdef InputState state = intake.states[index]
-    if state.input.field_count != count:
+    if state.input.field_count < count:
         raise ValueError(f"{state.pdo.name}: found {state.input.field_count} objects, expected {count}")
     return &state.input
+
+
+cdef const int64_t *_number_at(Intake intake, place) except NULL:
+    """Return where a number lies when its PDO has come (`jtqd.drivers.layout.Place`); raises ValueError when it has no such entry."""
+    cdef Input *state = _input(intake, place.pdo, place.entry + 1)
+    return &state.values[<int> place.entry]

@@ -6,18 +6,23 @@ What a cycle keeps of them is in `daemon/core/intake.pyx`.
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from jtqd.daemon.config import Config
 from jtqd.daemon.core.intake import JointTemperature
 from jtqd.daemon.shared.cycle_record import TEMPERATURE_LIFE_S
-from jtqd.drivers.devices import drive_tpdo1, drive_tpdo2, drive_tpdo3, sensor_tpdo1, sensor_tpdo2
+from jtqd.drivers.devices import CIA_402, DriveObjects, drive_layout, drive_tpdo3, sensor_tpdo1, sensor_tpdo2
+from jtqd.drivers.layout import BY_ITSELF, Place, places
 from jtqd.drivers.pdo import PdoMap
+
+POSITIONS = ("motor_position", "link_position")
+"""Quantities whose PDOs are FLAG_POSITION of a record; the others are FLAG_MOTION."""
 
 
 @dataclass(frozen=True)
 class InputPdo:
-    """One synchronous TPDO that the loop waits for.
+    """One TPDO that is an input: the loop waits for it, unless it has an age.
 
     Attributes:
         cob_id: 11-bit identifier.
@@ -25,6 +30,7 @@ class InputPdo:
         layout: precompiled unpacking of the mapped objects.
         node_id: its producer.
         name: as it appears in counters and events, e.g. "181h drive 1 TPDO1".
+        age_ns: 0 for one that is sent at each SYNC; of another one, for how long its last frame counts.
     """
 
     cob_id: int
@@ -32,22 +38,21 @@ class InputPdo:
     layout: struct.Struct
     node_id: int
     name: str
+    age_ns: int = 0
 
 
 @dataclass(frozen=True)
 class JointInputs:
-    """Indices of one joint's inputs among the intake's PDOs, and their scaling.
+    """Where one joint's inputs lie among the intake's PDOs, and their scaling.
 
     Attributes:
-        position: index of TPDO1 (motor position, link position).
-        motion: index of TPDO2 (motor velocity, current, statusword).
+        places: of each quantity of the drive (`devices.DriveObjects`), its PDO and its entry there.
         sensor: index of the sensor's PDO, None without reference.
         temperature: index among the intake's temperatures, None where the drive sends none.
         motor_rad_per_count, motor_rad_s_per_unit, link_rad_per_count, ampere_per_unit, sensor_nm_per_unit: scaling, SI.
     """
 
-    position: int
-    motion: int
+    places: Mapping[str, Place]
     sensor: int | None
     motor_rad_per_count: float
     motor_rad_s_per_unit: float
@@ -56,21 +61,59 @@ class JointInputs:
     sensor_nm_per_unit: float
     temperature: int | None = None
 
+    @property
+    def positions(self) -> frozenset[int]:
+        """Return the PDOs that carry a position (FLAG_POSITION)."""
+        return frozenset(place.pdo for name, place in self.places.items() if name in POSITIONS)
+
+    @property
+    def motion(self) -> frozenset[int]:
+        """Return the PDOs that carry velocity, current or statusword (FLAG_MOTION)."""
+        return frozenset(place.pdo for name, place in self.places.items() if name not in POSITIONS)
+
+
+def drive_places(
+    first: int, tpdos: tuple[PdoMap, ...] = (), objects: DriveObjects = CIA_402
+) -> dict[str, Place]:
+    """Return where the quantities of a drive lie whose first PDO has index `first`; without `tpdos` as jtqd maps them."""
+    found = places(objects, tpdos or drive_layout(1, objects))
+    return {name: Place(first + place.pdo, place.entry) for name, place in found.items()}
+
+
+def first_inputs(config: Config) -> list[int]:
+    """Return the index of each joint's first PDO among `input_pdos`, and then that of the sensor's."""
+    firsts = [0]
+    for joint in config.joints:
+        firsts.append(firsts[-1] + len(joint.tpdos))
+    return firsts
+
+
+def names_of_inputs(config: Config, number: int) -> tuple[str, str]:
+    """Return the names of the PDOs with the positions of joint `number` (from 0), and of those with its other quantities."""
+    joint, pdos = config.joints[number], input_pdos(config)
+    found = drive_places(first_inputs(config)[number], joint.tpdos, joint.objects)
+    positions = sorted({place.pdo for name, place in found.items() if name in POSITIONS})
+    others = sorted({place.pdo for name, place in found.items() if name not in POSITIONS})
+    return tuple(" and ".join(pdos[n].name for n in each) for each in (positions, others))  # type: ignore[return-value]
+
 
 def input_pdos(config: Config) -> list[InputPdo]:
-    """Return the expected PDOs: both TPDOs of each drive, then one per sensor channel in use."""
+    """Return the expected PDOs: the TPDOs of each drive, then one per sensor channel in use."""
 
-    def pdo(pdo_map: PdoMap, node: int, what: str) -> InputPdo:
-        return InputPdo(pdo_map.cob_id, pdo_map.length, pdo_map.layout, node, f"{pdo_map.cob_id:03X}h {what}")
+    def pdo(pdo_map: PdoMap, node: int, what: str, age_ns: int = 0) -> InputPdo:
+        name = f"{pdo_map.cob_id:03X}h {what}"
+        return InputPdo(pdo_map.cob_id, pdo_map.length, pdo_map.layout, node, name, age_ns)
 
-    pdos = []
-    for joint in config.joints:
-        pdos.append(
-            pdo(drive_tpdo1(joint.node_id, joint.objects), joint.node_id, f"drive {joint.node_id} TPDO1")
+    pdos = [
+        pdo(
+            each,
+            joint.node_id,
+            f"drive {joint.node_id} TPDO{each.number}",
+            round(joint.max_age_ms * 1e6) if each.transmission_type in BY_ITSELF else 0,
         )
-        pdos.append(
-            pdo(drive_tpdo2(joint.node_id, joint.objects), joint.node_id, f"drive {joint.node_id} TPDO2")
-        )
+        for joint in config.joints
+        for each in joint.tpdos
+    ]
     if config.sensor is not None:
         node = config.sensor.node_id
         for channel in config.sensor.channels:
@@ -83,7 +126,7 @@ def sensor_index(config: Config, channel: int | None) -> int | None:
     """Return the index of a sensor channel's PDO; None without channel or sensor."""
     if channel is None or config.sensor is None:
         return None
-    return 2 * len(config.joints) + config.sensor.channels.index(channel)
+    return first_inputs(config)[-1] + config.sensor.channels.index(channel)
 
 
 def joint_temperatures(config: Config) -> list[JointTemperature]:

@@ -20,14 +20,21 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, TextIO
 
-from jtqd.daemon.config import Config, JointConfig, load_config
+from jtqd.daemon.config import Config, JointConfig, as_booted, load_config
 from jtqd.daemon.core.counters import frame_counts
 from jtqd.daemon.core.cycle import RUN_ENDED, SLOT_PASSED, Cycle
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint_safety import safety_of
 from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.loop import realtime
-from jtqd.daemon.loop.input_pdos import JointInputs, input_pdos, joint_temperatures, sensor_index
+from jtqd.daemon.loop.input_pdos import (
+    JointInputs,
+    drive_places,
+    first_inputs,
+    input_pdos,
+    joint_temperatures,
+    sensor_index,
+)
 from jtqd.daemon.loop.referee import judged
 from jtqd.daemon.reload.order import Order
 from jtqd.daemon.reload.swap import Swap
@@ -162,8 +169,8 @@ def _scaling(report: dict[str, Any], node: int, names: tuple[str, ...]) -> dict[
 
 
 def joint_inputs(config: Config, report: dict[str, Any]) -> list[JointInputs]:
-    """Return indices into `input_pdos` and the scaling that the boot read from the devices."""
-    result = []
+    """Return places in `input_pdos` and the scaling that the boot read from the devices."""
+    result, firsts = [], first_inputs(config)
     measured = [joint.number for joint in config.joints if joint.temperature]
     for number, joint in enumerate(config.joints):
         drive = _scaling(report, joint.node_id, _DRIVE_FACTORS)
@@ -173,8 +180,7 @@ def joint_inputs(config: Config, report: dict[str, Any]) -> list[JointInputs]:
             sensor_nm = scaling["nm_per_unit"][str(joint.sensor_channel)] if scaling["nm_per_unit"] else 0.0
         result.append(
             JointInputs(
-                position=2 * number,
-                motion=2 * number + 1,
+                places=drive_places(firsts[number], joint.tpdos, joint.objects),
                 sensor=sensor_index(config, joint.sensor_channel),
                 **drive,
                 sensor_nm_per_unit=sensor_nm,
@@ -252,7 +258,10 @@ def build_cycle(
     """Build cycle and grid from configuration and boot report."""
     grid = Grid(0, config.period_ns)
     snapshot = Snapshot(
-        Path(request["snapshot"]), config.period_ns * 1e-9, float(request["worst_load"]), len(config.joints)
+        Path(request["snapshot"]),
+        config.period_ns * 1e-9,
+        float(report.get("worst_load", request["worst_load"])),
+        len(config.joints),
     )
     intake = Intake(input_pdos(config), joint_temperatures(config))
     for node in {pdo.node_id for pdo in intake.pdos} - {int(node) for node in report["nodes"]}:
@@ -295,8 +304,10 @@ def serve(request: dict[str, Any]) -> int:
     line = read_line(stop)
     if line is None:
         return 0
+    report = json.loads(line)
+    config = as_booted(config, report["nodes"])
     socket = open_frame_socket(request["bus"], loop_filters(config), receive_own=True)
-    cycle, grid = build_cycle(config, request, json.loads(line), socket, estimators)
+    cycle, grid = build_cycle(config, request, report, socket, estimators)
     refused = realtime.prepare(config.realtime.priority, config.realtime.cpu, config.realtime.lock_memory)
     swap = Swap(cycle, Path(request["ring"]), config.safety, answer)
     swap.rehearse(estimators)  # which stay as they are until the end: to free a runtime's session takes long

@@ -15,13 +15,12 @@ from jtqd.drivers.devices import (
     NOT_MEASURED,
     TEMPERATURE,
     TEMPERATURE_C_PER_UNIT,
-    drive_tpdo1,
-    drive_tpdo2,
     drive_tpdo3,
     estimate_tpdos,
     sensor_tpdo1,
     sensor_tpdo2,
 )
+from jtqd.drivers.layout import places
 from jtqd.drivers.nmt import HEARTBEAT_BASE, STATES
 from jtqd.drivers.pdo import PdoMap
 
@@ -30,6 +29,12 @@ if TYPE_CHECKING:
 
 SYNC_ID, EMCY_BASE = 0x080, 0x080
 _RECEIVER = "Vector__XXX"  # the format's word for "nobody in particular"
+_DRIVE_QUANTITIES = {
+    "motor_position": ("motor_rad_per_count", "rad"),
+    "link_position": ("link_rad_per_count", "rad"),
+    "motor_velocity": ("motor_rad_s_per_unit", "rad/s"),
+    "current": ("ampere_per_unit", "A"),
+}
 _PDO_NUMBER = {0x180: 1, 0x280: 2, 0x380: 3, 0x480: 4}
 
 
@@ -157,7 +162,7 @@ def dbc_text(config: Config, report: Mapping[str, Any] | None) -> str:
     """DBC of a configured bus with the scaling that the boot read from its devices.
 
     Args:
-        config: names the nodes.
+        config: names the nodes; with a report that after the boot (`as_booted`).
         report: boot report; `nodes[n].scaling` of each drive and of the sensor. None: the devices are not known, what
             they send is plain integers.
     """
@@ -168,23 +173,15 @@ def dbc_text(config: Config, report: Mapping[str, Any] | None) -> str:
     for joint in config.joints:
         node = joint.node_id
         names[node] = f"drive_{joint.number}"
-        objects = joint.objects
-        position, motion = drive_tpdo1(node, objects), drive_tpdo2(node, objects)
-        maps += [position, motion]
+        maps += joint.tpdos
         scaling = _scaling(report, node)
-        quantities |= (
-            {}
-            if scaling is None
-            else {
-                (pdo.cob_id, each.index, each.subindex): Quantity(scaling[factor], unit)
-                for pdo, each, factor, unit in (
-                    (position, objects.motor_position, "motor_rad_per_count", "rad"),
-                    (position, objects.link_position, "link_rad_per_count", "rad"),
-                    (motion, objects.motor_velocity, "motor_rad_s_per_unit", "rad/s"),
-                    (motion, objects.current, "ampere_per_unit", "A"),
-                )
-            }
-        )
+        if scaling is not None:
+            found = places(joint.objects, joint.tpdos)
+            for name, (factor, unit) in _DRIVE_QUANTITIES.items():
+                if name in found:
+                    pdo = joint.tpdos[found[name].pdo]
+                    mapped = pdo.objects[found[name].entry]
+                    quantities[pdo.cob_id, mapped.index, mapped.subindex] = Quantity(scaling[factor], unit)
         if joint.temperature:
             pdo3 = drive_tpdo3(node)
             maps.append(pdo3)

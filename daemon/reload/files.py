@@ -49,7 +49,10 @@ def needs_restart(old: Config, new: Config) -> list[str]:
                 if field.name not in _FREE_OF_JOINT
                 and getattr(before, field.name) != getattr(after, field.name)
             ]
-            keys += [f"joint_{before.number}.{name}" for name in names]
+            made = {"node_id", "objects"} & {
+                *names
+            }  # of which the TPDOs are made, unless the file names them
+            keys += [f"joint_{before.number}.{name}" for name in names if not (made and name == "tpdos")]
     return keys
 
 

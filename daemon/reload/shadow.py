@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isfinite
+from math import isfinite, isnan
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,12 +24,15 @@ def follow(estimator: Estimator, record: cr.JointRecord) -> Estimate | None:
     """Step an estimator as the loop has stepped its own in this cycle; None: it has not."""
     if record.input_flags & _INPUTS != _INPUTS:
         return None
+    link = record.link_position_rad
+    if isnan(link):  # one encoder: as `JointCycle`
+        link = record.motor_position_rad / estimator.joint.gear_ratio
     return estimator.step(
         record.dt_s,
         record.current_a,
         record.motor_position_rad,
         record.motor_velocity_rad_s,
-        record.link_position_rad,
+        link,
         record.temperature_c,
         not record.input_flags & FLAG_NETWORK_SKIPPED,
     )

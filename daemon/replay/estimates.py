@@ -128,6 +128,7 @@ class ExactReplay:
             self._joints,
             fresh=[each.fresh for each in frames.pdos],
             values=[each.values for each in frames.pdos],
+            velocity=[each["motor_velocity_rad_s"] for each in joints],
             celsius=celsius,
             cycle=joints[0]["cycle"],
             counter=joints[0]["sync_counter"],
@@ -177,7 +178,7 @@ class ExactReplay:
         for row in steps.begins.tolist():
             marks.setdefault(row, []).append(joint.begin_again)
         for row, _ in steps.breaks:
-            found = offsets(frames.pdos[each.position], records, each, row)
+            found = offsets(frames.pdos, records, each, row)
             marks.setdefault(row, []).append(partial(joint.resume, *found))
         return marks
 
@@ -211,11 +212,14 @@ def replay_whole(model: Model, safety: JointSafety, records: RecordArray, steps:
     """
     rows: npt.NDArray[np.intp] | slice = slice(None) if steps.used.all() else np.flatnonzero(steps.used)
     flags, word, cycle = (records[name][rows] for name in ("input_flags", "statusword", "cycle"))
+    motor, link = records["motor_position_rad"][rows].copy(), records["link_position_rad"][rows].copy()
+    if np.isnan(link).all():  # one encoder: as `JointCycle`
+        link = motor / model.joint.gear_ratio
     columns = JointColumns(
         current_a=records["current_a"][rows].copy(),
-        motor_position_rad=records["motor_position_rad"][rows].copy(),
+        motor_position_rad=motor,
         motor_velocity_rad_s=records["motor_velocity_rad_s"][rows].copy(),
-        link_position_rad=records["link_position_rad"][rows].copy(),
+        link_position_rad=link,
         temperature_c=np.where(flags & FLAG_TEMPERATURE, records["temperature_c"][rows], np.nan),
     )
     values = {name: np.full(len(records), np.nan) for name in _STAGES}

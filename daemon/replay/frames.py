@@ -84,12 +84,14 @@ def decode(origin: Origin, records: RecordArray, joints: Sequence[RecordArray]) 
     for index, pdo in enumerate(input_pdos(origin.config)):
         fresh = _fresh(index, origin.inputs, joints)
         there, data = table.last(pdo.cob_id, pdo.length)
+        if pdo.age_ns:
+            there, data = _held(there, left_out, data)
         values = [*_unpack(pdo, data)]
         absent = fresh & (~there | left_out)
         if absent.any():
             from_si += int(absent.sum())
-            for column, known in zip(values, _counts(index, origin.inputs, joints), strict=True):
-                column[absent] = known[absent]
+            for entry, known in _counts(index, origin.inputs, joints).items():
+                values[entry][absent] = known[absent]
         pdos.append(Pdo(tuple(values), fresh))
     pairs = [
         table.last(pdo.cob_id, pdo.length)
@@ -106,16 +108,25 @@ def decode(origin: Origin, records: RecordArray, joints: Sequence[RecordArray]) 
     )
 
 
+def _held(
+    there: BoolArray, left_out: BoolArray, data: npt.NDArray[np.uint8]
+) -> tuple[BoolArray, npt.NDArray[np.uint8]]:
+    """Return whether the last frame up to each cycle is known [n], and its data: it counts until the next one."""
+    last = np.maximum.accumulate(np.where(there | left_out, np.arange(len(there)), -1))
+    known: BoolArray = (last >= 0) & ~left_out[last]
+    return known, data[last]
+
+
 def _fresh(index: int, inputs: Sequence[JointInputs], joints: Sequence[RecordArray]) -> BoolArray:
     """Return whether PDO `index` counted, by the flags of the joints that use it [n]."""
     fresh: BoolArray = np.zeros(len(joints[0]), np.bool_)
     for each, records in zip(inputs, joints, strict=True):
-        for place, flag in (
-            (each.position, FLAG_POSITION),
+        for used, flag in (
+            (each.positions, FLAG_POSITION),
             (each.motion, FLAG_MOTION),
-            (each.sensor, FLAG_SENSOR),
+            ({each.sensor}, FLAG_SENSOR),
         ):
-            if place == index:
+            if index in used:
                 fresh |= (records["input_flags"] & flag) != 0
     return fresh
 
@@ -128,21 +139,32 @@ def _unpack(pdo: InputPdo, data: npt.NDArray[np.uint8]) -> list[IntegerArray]:
     return [rows[name].astype(np.int64) for name in layout.names or ()]
 
 
-def _counts(index: int, inputs: Sequence[JointInputs], joints: Sequence[RecordArray]) -> list[IntegerArray]:
-    """IntegerArray of PDO `index` by the SI values that the log has beside the frames."""
+def _counts(
+    index: int, inputs: Sequence[JointInputs], joints: Sequence[RecordArray]
+) -> dict[int, IntegerArray]:
+    """Entries of PDO `index` by the SI values that the log has beside the frames; nobody reads the others."""
+    found: dict[int, IntegerArray] = {}
     for each, records in zip(inputs, joints, strict=True):
-        if index == each.position:
-            motor = _whole(records["motor_position_rad"], each.motor_rad_per_count)
-            link = _whole(records["link_position_rad"], each.link_rad_per_count)
-            return [_rolled(motor), _rolled(link)]
-        if index == each.motion:
-            velocity = _whole(records["motor_velocity_rad_s"], each.motor_rad_s_per_unit)
-            current = _whole(records["current_a"], each.ampere_per_unit)
-            return [velocity, current, records["statusword"].astype(np.int64)]
+        for name, place in each.places.items():
+            if place.pdo == index:
+                found[place.entry] = _counted(name, each, records)
         if index == each.sensor:
-            torque = _whole(records["sensor_torque_nm"], each.sensor_nm_per_unit)
-            return [torque, records["sensor_status"].astype(np.int64)]
-    raise AssertionError("every PDO has a joint")
+            found[0] = _whole(records["sensor_torque_nm"], each.sensor_nm_per_unit)
+            found[1] = records["sensor_status"].astype(np.int64)
+    return found
+
+
+def _counted(name: str, each: JointInputs, records: RecordArray) -> IntegerArray:
+    """Integers of a quantity of the drive."""
+    if name == "motor_position":
+        return _rolled(_whole(records["motor_position_rad"], each.motor_rad_per_count))
+    if name == "link_position":
+        return _rolled(_whole(records["link_position_rad"], each.link_rad_per_count))
+    if name == "motor_velocity":
+        return _whole(records["motor_velocity_rad_s"], each.motor_rad_s_per_unit)
+    if name == "current":
+        return _whole(records["current_a"], each.ampere_per_unit)
+    return records["statusword"].astype(np.int64)
 
 
 def _whole(values: FloatArray, unit: float) -> IntegerArray:
@@ -157,13 +179,18 @@ def _rolled(counts: IntegerArray) -> IntegerArray:
     return (counts + _HALF) % _FULL - _HALF
 
 
-def offsets(pdo: Pdo, records: RecordArray, each: JointInputs, row: int) -> tuple[int, int]:
+def offsets(pdos: Sequence[Pdo], records: RecordArray, each: JointInputs, row: int) -> tuple[int, int]:
     """Whole ranges [counts] that motor and link position had rolled over by `row`: the log says where they were."""
     found = []
-    for column, name, unit in (
-        (pdo.values[0], "motor_position_rad", each.motor_rad_per_count),
-        (pdo.values[1], "link_position_rad", each.link_rad_per_count),
+    for quantity, name, unit in (
+        ("motor_position", "motor_position_rad", each.motor_rad_per_count),
+        ("link_position", "link_position_rad", each.link_rad_per_count),
     ):
+        place = each.places.get(quantity)
+        if place is None:
+            found.append(0)
+            continue
+        column = pdos[place.pdo].values[place.entry]
         counts = int(_whole(records[name][row : row + 1], unit)[0])
         found.append(round((counts - int(column[row])) / _FULL) * _FULL)
     return found[0], found[1]

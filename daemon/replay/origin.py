@@ -10,6 +10,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
-from jtqd.daemon.config import Config, load_config
+from jtqd.daemon.config import Config, as_booted, load_config
 from jtqd.daemon.logs import LogError
 from jtqd.daemon.loop.input_pdos import JointInputs
 from jtqd.daemon.loop.process import joint_inputs
@@ -119,6 +120,7 @@ def open_origin(log: Path, attachments: Mapping[str, bytes], directory: Path) ->
     except ConfigError as error:
         raise LogError(f"{log}: its configuration: {_without(str(error), directory)}") from None
     try:
+        config = as_booted(config, provenance["nodes"])
         inputs = tuple(joint_inputs(config, provenance))
         for each in inputs:
             _check_scaling(each)
@@ -219,9 +221,15 @@ def _place(  # noqa: PLR0917
 
 
 def _check_scaling(inputs: JointInputs) -> None:
-    """ValueError unless all factors are numbers, and not 0 (the sensor's may be); a drive may count backwards."""
-    for name in ("motor_rad_per_count", "motor_rad_s_per_unit", "link_rad_per_count", "ampere_per_unit"):
-        if not abs(getattr(inputs, name)) > 0.0:
-            raise ValueError(f"{name} is 0: the drive was absent at the start of the log")
+    """ValueError unless all factors are numbers that are not 0 (the sensor's may be); a drive may count backwards."""
+    for quantity, name in (
+        ("motor_position", "motor_rad_per_count"),
+        ("motor_velocity", "motor_rad_s_per_unit"),
+        ("link_position", "link_rad_per_count"),
+        ("current", "ampere_per_unit"),
+    ):
+        factor = getattr(inputs, name)
+        if quantity in inputs.places and (not isfinite(factor) or factor == 0.0):
+            raise ValueError(f"{name} is {factor}: the drive was absent at the start of the log")
     if not inputs.sensor_nm_per_unit >= 0.0:
         raise ValueError("sensor_nm_per_unit is below 0")

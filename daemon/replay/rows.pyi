@@ -24,5 +24,6 @@ class CycleRows:
         sync_ns: IntegerArray | Sequence[IntegerArray],
         wanted: BoolArray | Sequence[BoolArray],
         withdrawn: BoolArray,
+        velocity: FloatArray | Sequence[FloatArray] | None = None,
     ) -> None: ...
     def go_on(self, first: int, end: int) -> None: ...

@@ -30,6 +30,7 @@ cdef class CycleRows:
         sync_ns: of each joint, when its SYNC went out [joints, n].
         wanted: of each joint, whether there was time for the network [joints, n].
         withdrawn: whether the estimate was too late [n].
+        velocity: of each joint, the motor velocity as logged [joints, n], for drives that tell none; None: derived again.
 
     Attributes:
         samples: of each joint, blocks of the cycle record [joints, n, bytes].
@@ -50,13 +51,15 @@ cdef class CycleRows:
     cdef const int64_t[::1] cycle, counter
     cdef const int64_t[:, ::1] sync_ns
     cdef const uint8_t[::1] withdrawn
+    cdef const double[:, ::1] velocity
+    cdef bint with_velocity
     cdef uint8_t[:, :, ::1] to_samples
     cdef uint8_t[:, ::1] to_estimates
     cdef readonly object samples, estimates
     cdef readonly int64_t temperatures_from_log
 
     def __init__(
-        self, Intake intake, joints, *, fresh, values, celsius, cycle, counter, sync_ns, wanted, withdrawn
+        self, Intake intake, joints, *, fresh, values, celsius, cycle, counter, sync_ns, wanted, withdrawn, velocity=None
     ):
         cdef JointCycle joint
         n = len(cycle)
@@ -74,6 +77,8 @@ cdef class CycleRows:
         self.cycle, self.counter = _checked(cycle, np.int64, (n,)), _checked(counter, np.int64, (n,))
         self.sync_ns = _checked(sync_ns, np.int64, (self.count, n))
         self.wanted, self.withdrawn = _checked(wanted, np.uint8, (self.count, n)), _checked(withdrawn, np.uint8, (n,))
+        self.with_velocity = velocity is not None
+        self.velocity = _checked(np.zeros((self.count, n)) if velocity is None else velocity, np.float64, (self.count, n))
         self.samples = np.zeros((self.count, n, sizeof(JointBlock)), np.uint8)
         self.estimates = np.zeros((n, 8 * self.pdos), np.uint8)
         self.to_samples, self.to_estimates = self.samples, self.estimates
@@ -118,6 +123,8 @@ cdef class CycleRows:
 
     cdef void observe(self, JointCycle joint, int number, Py_ssize_t row) noexcept nogil:
         """Estimate one joint in a row and keep its block."""
+        joint.derived.is_replayed = self.with_velocity
+        joint.derived.replayed_rad_s = self.velocity[number, row]
         joint.observe_at(self.sync_ns[number, row], self.cycle[row] < FIRST_CYCLES, self.wanted[number, row])
         if self.withdrawn[row]:
             joint.take_back(STALE)

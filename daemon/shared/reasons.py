@@ -130,7 +130,7 @@ def stale_reason(
 
     Args:
         node: the joint's drive.
-        names: of its TPDO1 and TPDO2.
+        names: of its PDOs with positions, and of those with its other quantities; several are joined by "and".
         seen: the joint's estimate.
         view: the reading it is from.
         earlier: counters of an earlier reading; what has risen since then may be the cause.
@@ -151,7 +151,8 @@ def stale_reason(
     missing = [name for name, flag in zip(names, flags, strict=True) if not seen.input_flags & flag]
     if not missing:
         return "the estimate is not ready before the next SYNC"
-    what = f"{' and '.join(missing)} not received in time"
+    each = dict.fromkeys(name for names in missing for name in names.split(" and "))
+    what = f"{' and '.join(each)} not received in time"
     hints = [meaning for counter, meaning in _ON_THE_PDO if rose(counter)]
     return f"{what} ({', '.join(hints)})" if hints else what
 

@@ -184,10 +184,10 @@ def quantiles(bins: tuple[int, ...], bin_ns: int, largest_ns: int, shares: tuple
 
 WORK_BINS, WORK_BIN_NS = 500, 4_000
 LATE_BINS, LATE_BIN_NS = 250, 4_000
-MAX_INPUTS = 16
-"""Two TPDOs of each of four drives and two sensor channels are ten."""
+MAX_INPUTS = 20
+"""Four TPDOs of each of four drives and two sensor channels are eighteen."""
 
-_MAGIC = 0x4A54_5144_5354_4107  # "JTQDSTA", layout 7
+_MAGIC = 0x4A54_5144_5354_4108  # "JTQDSTA", layout 8
 _HEAD = struct.Struct("<QQddQ")
 """Magic number, process, period [s], worst load, number of joints."""
 JOINT = struct.Struct("<6dHBBHH")

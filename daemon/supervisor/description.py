@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 from jtqd.daemon.config import Config, JointConfig
-from jtqd.daemon.loop.input_pdos import input_pdos, sensor_index
+from jtqd.daemon.loop.input_pdos import input_pdos, names_of_inputs, sensor_index
 from jtqd.daemon.shared.runtime_dir import About, AboutJoint, start_ticks, versions
 
 
@@ -49,7 +49,7 @@ def _joint(config: Config, number: int, joint: JointConfig, names: tuple[str, ..
         torque_limit_nm=config.estimator.torque_limit * rated,
         network=joint.network.path.name if joint.network else None,
         network_limit_nm=config.estimator.network_limit * rated,
-        inputs=names[2 * number : 2 * number + 2],
+        inputs=names_of_inputs(config, number),
         sensor=None if sensor is None else names[sensor],
         temperature=joint.temperature,
     )

@@ -13,7 +13,7 @@ from math import hypot, inf, isfinite
 from typing import NamedTuple
 
 from jtqd.daemon.config import Config
-from jtqd.daemon.loop.input_pdos import input_pdos, joint_temperatures, sensor_index
+from jtqd.daemon.loop.input_pdos import input_pdos, joint_temperatures, names_of_inputs, sensor_index
 from jtqd.daemon.shared.conditions import (
     DEVIATION_S,
     DEVIATION_SIGMAS,
@@ -222,7 +222,7 @@ class Health:
                 _Joint(
                     subject,
                     joint.node_id,
-                    (names[2 * n], names[2 * n + 1]),
+                    names_of_inputs(config, n),
                     None if sensor is None else names[sensor],
                     None if sensor is None or config.sensor is None else config.sensor.node_id,
                     temperatures.get(joint.node_id),

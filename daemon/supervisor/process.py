@@ -22,7 +22,7 @@ from typing import Any
 from jtqd.daemon.bus.boot import ReturningNodes, boot_request, bus_load_of, gear_ratio_error
 from jtqd.daemon.bus.own_node import OwnNode
 from jtqd.daemon.bus.service import BusService, nodes_of, service_filters
-from jtqd.daemon.config import Config, Ros2Settings
+from jtqd.daemon.config import Config, Ros2Settings, as_booted
 from jtqd.daemon.live.address import Address
 from jtqd.daemon.live.keeper import LiveKeeper
 from jtqd.daemon.loop.realtime import stolen_s
@@ -312,9 +312,10 @@ class Supervisor:
         wrong = check_gears(self._config, report)
         if wrong is not None:
             raise SupervisorError(wrong)
+        self._take_layout(report)
         if wait_for(loop, self._stopped) is None:
             return None
-        loop.tell(report)
+        loop.tell({**report, "worst_load": self._load.worst})
         running = wait_for(loop, self._stopped)
         if running is None:
             return None
@@ -365,6 +366,15 @@ class Supervisor:
             began_s=began_s,
             stolen_s=stolen,
         )
+
+    def _take_layout(self, report: dict[str, Any]) -> None:
+        """Go on with the TPDOs that the drives have, where their mapping is fixed. Raises SupervisorError."""
+        config = as_booted(self._config, report["nodes"])
+        if config != self._config:
+            self._config, self._load = config, checked_load(config)
+            self._health = Health(config, self._conditions)
+            self._about = replace(self._own_description(), started=self._about.started)
+            write_about(self._directory, self._about)
 
     def _own_description(self) -> About:
         return about(self._config, bus=self._bus, instance=self._instance, log_directory=self._log_directory)
@@ -492,7 +502,7 @@ class Supervisor:
 
     def _renew(self, config: Config) -> None:
         """Show another configuration, which has come into force, wherever it shows."""
-        self._config = config
+        self._config = config = as_booted(config, self._report["nodes"])
         self._health.use(config)
         self._node.set_parameters(config)
         write_about(self._directory, replace(self._own_description(), started=self._about.started))

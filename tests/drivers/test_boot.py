@@ -227,9 +227,13 @@ def test_refused_mapping(bench):
 
     bench.drive1.answer = refuse
     error = bench.fails()
-    assert str(error) == (
+    said = str(error)
+    assert said.startswith(
         "node 1: 1A00h:1: write of 0x60640020 refused: object cannot be mapped (06040041h); "
-        "1A00h:0 maps nothing with transmission type 255 (status J)"
+    )
+    assert (
+        "no TPDO carries 60E4h:1 (link position), 6078h:0 (current), 6041h:0 (statusword); TPDO1 carries"
+        in said
     )
     assert error.letter == "J"
 
@@ -584,27 +588,143 @@ def test_a_name_that_steers_a_terminal_is_replaced(bench):
     assert bench.boot().nodes[1].name == "?[2Jdrive"
 
 
-def fixed(node, *words):
-    """Make the mapping of its TPDO1 read-only, with these words."""
-    node.store.set_number(0x1A00, 0, len(words))
-    for entry, word in enumerate(words, 1):
-        node.store.set_number(0x1A00, entry, word)
-    node.store.set_number(0x1800, 2, 1)
-    for key, entry in node.store.entries.items():
-        if key[0] == 0x1A00:
-            node.store.entries[key] = dataclasses.replace(entry, access="ro")
+def fixed(node, *tpdos, valid=True, kind=1, writable=()):
+    """Make the mapping of its TPDOs 1, 2, ... read-only, with these words; entries `writable` stay so."""
+    store = node.store
+    for number in range(4):
+        if not store.has(0x1A00 + number, 1):
+            continue
+        words = tpdos[number] if number < len(tpdos) else ()
+        store.set_number(0x1A00 + number, 0, len(words))
+        for entry, word in enumerate(words, 1):
+            store.set_number(0x1A00 + number, entry, word)
+        cob_id = 0x4000_0180 + 0x100 * number + 1
+        store.set_number(0x1800 + number, 1, cob_id if valid and words else cob_id | 0x8000_0000)
+        store.set_number(0x1800 + number, 2, kind)
+    for key, entry in store.entries.items():
+        if 0x1800 <= key[0] < 0x1C00 and key not in writable:
+            store.entries[key] = dataclasses.replace(entry, access="ro")
 
 
-def test_a_mapping_that_is_fixed_in_the_drive_is_used_where_it_is_the_right_one(bench):
-    fixed(bench.drive1, *drive_tpdo1(1).words)
+COB_IDS = tuple((index, 1) for index in range(0x1800, 0x1804))
+RIGHT = tuple(pdo.words for pdo in (drive_tpdo1(1), drive_tpdo2(1)))
+ELSEWHERE = (0x6041_0010, 0x6064_0020), (0x606C_0020, 0x6078_0010, 0x6061_0008), (0x60E4_0120,)
+"""Layout of a drive whose maker has thought of other readers."""
+
+
+def test_what_is_as_wanted_is_not_written(bench):
+    """The second boot finds what the first has written: it maps nothing."""
+    bench.boot()
+    written = []
+    answered = bench.drive1.answer
+
+    def watch(request, reply):
+        if request[0] & 0xE0 == 0x20 and 0x18 <= request[2] < 0x1C:
+            written.append(request.hex(" "))
+        return answered(request, reply)
+
+    bench.drive1.answer = watch
+    node = bench.boot(reset=False).nodes[1]
+    assert written == []
+    assert node.tpdos == (drive_tpdo1(1), drive_tpdo2(1))
+
+
+@pytest.mark.parametrize("writable", [(), COB_IDS])
+def test_a_mapping_that_is_fixed_in_the_drive_is_used_where_it_is_the_right_one(bench, writable):
+    fixed(bench.drive1, *RIGHT, valid=not writable, writable=writable)
     node = bench.boot().nodes[1]
     assert bench.drive1.state == 5
     assert bench.drive1.store.number(0x1800, 1) == 0x4000_0181, "it is on"
-    assert node.notes[0].startswith("TPDO 181h is fixed, and as it should be (1A00h:0: write of 0x00 refused")
+    assert node.tpdos == (drive_tpdo1(1), drive_tpdo2(1))
 
 
-def test_a_mapping_that_is_fixed_otherwise_is_named(bench):
-    fixed(bench.drive1, 0x6064_0020, 0x606C_0020)
-    said = str(bench.fails())
-    assert "node 1: 1A00h:0: write of 0x00 refused: object is read only (06010002h)" in said
-    assert "1A00h:0 maps 0x60640020, 0x606C0020 with transmission type 1" in said
+@pytest.mark.parametrize("writable", [(), COB_IDS])
+def test_a_mapping_that_is_fixed_otherwise_is_used_as_it_is(bench, writable):
+    fixed(bench.drive1, *ELSEWHERE, writable=writable)
+    node = bench.boot().nodes[1]
+    assert bench.drive1.state == 5
+    assert [(pdo.number, pdo.cob_id, pdo.words) for pdo in node.tpdos] == [
+        (1, 0x181, ELSEWHERE[0]),
+        (2, 0x281, ELSEWHERE[1]),
+        (3, 0x381, ELSEWHERE[2]),
+    ]
+    assert node.notes[0].startswith(
+        "its mapping is used as it is: TPDO1 (181h), TPDO2 (281h), TPDO3 (381h) (1"
+    )
+    assert [bench.drive1.store.number(0x1800 + n, 1) for n in range(3)] == [
+        0x4000_0181,
+        0x4000_0281,
+        0x4000_0381,
+    ]
+    watched = {(index, sub): value for index, sub, value in node.watched}
+    assert watched[0x1A01, 2] == 0x6078_0010, "and watched in service"
+
+
+def test_a_fixed_mapping_with_the_same_numbers_has_one_hash(bench):
+    """What the attempt has read of what is not in force is not in it."""
+    fixed(bench.drive1, *ELSEWHERE)
+    first = bench.boot().nodes[1].configuration_sha256
+    assert bench.boot().nodes[1].configuration_sha256 == first
+
+
+def test_a_tpdo_that_is_not_needed_and_cannot_be_switched_off_is_told(bench):
+    fixed(bench.drive1, *RIGHT, (0x6061_0008,))
+    node = bench.boot().nodes[1]
+    assert node.tpdos == (drive_tpdo1(1), drive_tpdo2(1))
+    assert any("TPDO3 is not needed and stays on" in note for note in node.notes)
+
+
+def test_another_cob_id_of_the_predefined_set(bench):
+    fixed(bench.drive1, *ELSEWHERE)
+    bench.drive1.store.set_number(0x1802, 1, 0x4000_0481)
+    assert [pdo.cob_id for pdo in bench.boot().nodes[1].tpdos] == [0x181, 0x281, 0x481]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ((0x1802, 1, 0x4000_0391), "TPDO3: TPDO3 has COB-ID 391h, expected one of 181h, 281h, 381h, 481h"),
+        ((0x1802, 1, 0x6000_0381), "TPDO3: TPDO3 has a 29-bit COB-ID"),
+        ((0x1A02, 1, 0x60E4_0110), "TPDO3: 60E4h:1 is mapped with 16 bits, expected 32"),
+        (
+            (0x1A02, 1, 0x6064_0020),
+            "no TPDO carries 60E4h:1 (link position); TPDO1 carries 0x60410010, 0x60640020",
+        ),
+    ],
+)
+def test_a_mapping_that_is_fixed_and_not_enough_is_named(bench, change, said):
+    fixed(bench.drive1, *ELSEWHERE)
+    bench.drive1.store.set_number(*change)
+    found = str(bench.fails())
+    assert (
+        "node 1: 1800h:1: write of 0xC0000181 refused: object is read only (06010002h); no TPDO carries"
+        in found
+    )
+    assert said in found
+
+
+def test_a_transmission_type_that_cannot_be_written_is_named(bench):
+    fixed(bench.drive1, *ELSEWHERE, kind=10)
+    found = str(bench.fails())
+    assert "1800h:2: write of 0x01 refused" in found
+
+
+@pytest.mark.parametrize("kind", [0, 254, 255])
+def test_a_type_that_cannot_be_written_is_accepted_where_an_age_is_configured(bench, kind):
+    fixed(bench.drive1, *ELSEWHERE, kind=kind)
+    assert f"TPDO1 has transmission type {kind}: joint_N.max_age_ms allows it" in str(bench.fails())
+    node = bench.boot(nodes=[{**NODES[0], "by_itself": True}, *NODES[1:]]).nodes[1]
+    assert [pdo.transmission_type for pdo in node.tpdos] == [kind] * 3
+    assert f"TPDO1 keeps transmission type {kind}" in node.notes
+
+
+def test_a_layout_that_is_asked_for_is_written(bench):
+    """TPDOs of the request: one PDO has two quantities, another one the rest."""
+    words = [0x6041_0010, 0x6064_0020], [0x606C_0020, 0x6078_0010], [0x60E4_0120]
+    tpdos = [
+        {"number": number, "cob_id": cob_id, "transmission_type": 1, "words": entries}
+        for number, cob_id, entries in zip((1, 2, 3), (0x381, 0x281, 0x181), words, strict=True)
+    ]
+    node = bench.boot(nodes=[{**NODES[0], "tpdos": tpdos}, *NODES[1:]]).nodes[1]
+    assert [(pdo.number, pdo.cob_id) for pdo in node.tpdos] == [(1, 0x381), (2, 0x281), (3, 0x181)]
+    assert bench.drive1.parameters.tpdos() == list(node.tpdos)

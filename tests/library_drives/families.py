@@ -153,4 +153,6 @@ FAMILIES: dict[str, type[StrictDrive]] = {
 def manners_of(family: str, manners: Manners) -> Manners:
     """The manners, and what the family lacks."""
     lacks = getattr(FAMILIES[family], "lacks", ())
-    return Manners(manners.boot_ups, manners.sdo_s, (*manners.without, *lacks), manners.reset_s)
+    return Manners(
+        manners.boot_ups, manners.sdo_s, (*manners.without, *lacks), manners.reset_s, manners.fixed
+    )

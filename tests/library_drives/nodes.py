@@ -38,6 +38,8 @@ MASTER = 0x20
 PRE_OPERATIONAL, OPERATIONAL = 127, 5
 SAVE = b"save"
 MOTOR_COUNTS, LINK_COUNTS, GEAR = 65536, 524288, 100
+RATED_MNM, TORQUE_CONSTANT = 100, 0.062
+"""Of the drive that tells torque as well as current: 1 A at the top of its swing."""
 _WRONG_STATE, _UNSUPPORTED, _NOT_MAPPABLE, _TOO_LONG = 0x08000022, 0x06010000, 0x06040041, 0x06040042
 _RANGE, _NOT_STORED = 0x06090030, 0x08000020
 _SIZES = {UNSIGNED8: "B", UNSIGNED16: "H", UNSIGNED32: "I", INTEGER16: "h", INTEGER32: "i"}
@@ -52,12 +54,15 @@ class Manners:
         sdo_s: time for an SDO answer.
         without: objects that it does not have.
         reset_s: from a reset to its boot-up message.
+        fixed: its TPDOs have a layout of the maker's (`FIXED`), and what can be written of them is nothing ("mapping") or
+            bit 31 of the COB-ID and the transmission type ("valid"); "": all can be written.
     """
 
     boot_ups: int = 1
     sdo_s: float = 0.0
     without: tuple[int, ...] = ()
     reset_s: float = 0.03
+    fixed: str = ""
 
 
 class Cable(canopen.Network):  # type: ignore[misc]
@@ -159,6 +164,15 @@ def _common(device_type: int, serial: int) -> dict[tuple[int, int], tuple[int, A
     return numbers
 
 
+FIXED = (
+    (0x180, (0x60410010, 0x60640020)),
+    (0x380, (0x60610008, 0x606C0020, 0x60780010)),
+    (0x280, (0x10010008,)),
+    (0x480, (0x60E40120,)),
+)
+"""TPDOs of a drive whose maker has thought of other readers: COB-IDs without the node-ID, and mapping."""
+
+
 class StrictNode:
     """One device on a bus of its own: `power_on`, `power_off`, `cable.cut`."""
 
@@ -183,6 +197,20 @@ class StrictNode:
         self.cable.bus = self._open_bus()
         self.cable.NOTIFIER_CYCLE = 0.01
         numbers = {**_common(self.device_type, self.number), **self.process}
+        if self.fixed:
+            for number, (base, words) in enumerate(FIXED):
+                cob_id = 0x40000000 + base + self.number
+                valid = self.manners.fixed == "mapping"
+                numbers[0x1800 + number, 1] = (
+                    UNSIGNED32,
+                    cob_id if valid else cob_id | 0x80000000,
+                    "ro" if valid else "rw",
+                )
+                numbers[0x1800 + number, 2] = (UNSIGNED8, 1 if valid else 255, "ro" if valid else "rw")
+                numbers[0x1A00 + number, 0] = (UNSIGNED8, len(words), "ro")
+                for entry in range(1, 5):
+                    word = words[entry - 1] if entry <= len(words) else 0
+                    numbers[0x1A00 + number, entry] = (UNSIGNED32, word, "ro")
         self.node = _Local(self, dictionary(numbers, self.manners.without))
         self.cable.add_node(self.node)
         for cob_id, callback in (
@@ -195,6 +223,11 @@ class StrictNode:
         self._start()
         self.cable.connect()
         threading.Thread(target=self._watch, args=(self.cable,), daemon=True).start()
+
+    @property
+    def fixed(self) -> bool:
+        """Its mapping is fixed: of drives alone."""
+        return bool(self.manners.fixed) and self.device_type & 0xFFFF == 402
 
     def power_off(self) -> None:
         self.on = False
@@ -410,10 +443,11 @@ class _Local(canopen.LocalNode):  # type: ignore[misc]
 
 
 class StrictDrive(StrictNode):
-    """A CiA 402 drive whose motor swings to and fro; its maker's own objects count mA, backwards, and rpm."""
+    """A CiA 402 drive whose motor swings to and fro; it counts its torque backwards, mA and rpm, too."""
 
     device_type = 0x00020192
     process: ClassVar = {
+        (0x1001, 0): (UNSIGNED8, 0, "ro"),
         (0x2030, 0): (INTEGER16, 0, "ro"),
         (0x2031, 0): (INTEGER16, 0, "ro"),
         (0x6041, 0): (UNSIGNED16, 0x1237, "ro"),
@@ -421,6 +455,8 @@ class StrictDrive(StrictNode):
         (0x6064, 0): (INTEGER32, 0, "ro"),
         (0x606C, 0): (INTEGER32, 0, "ro"),
         (0x6075, 0): (UNSIGNED32, 5000, "rw"),
+        (0x6076, 0): (UNSIGNED32, RATED_MNM, "rw"),
+        (0x6077, 0): (INTEGER16, 0, "ro"),
         (0x6078, 0): (INTEGER16, 0, "ro"),
         (0x608F, 0): (UNSIGNED8, 2, "const"),
         (0x608F, 1): (UNSIGNED32, MOTOR_COUNTS, "ro"),
@@ -443,12 +479,14 @@ class StrictDrive(StrictNode):
         phase = 2.0 * math.pi * 0.2 * now
         turns, per_s = math.sin(phase), 2.0 * math.pi * 0.2 * math.cos(phase)
         return {
+            0x1001: 0,
             0x2030: round(-1000 * math.sin(phase)),
             0x2031: round(60 * per_s),
             0x6041: 0x1237,
             0x6061: 9,
             0x6064: round(MOTOR_COUNTS * turns),
             0x606C: round(MOTOR_COUNTS * per_s),
+            0x6077: round(-TORQUE_CONSTANT * math.sin(phase) * 1e6 / RATED_MNM),
             0x6078: round(200 * math.sin(phase)),
             0x60E4: round(LINK_COUNTS * turns / GEAR),
         }[index]

@@ -140,6 +140,24 @@ def test_devices_differ(manners: tuple[str, ...]) -> None:
         assert bench.stop(jtqd) == 0
 
 
+@pytest.mark.parametrize("fixed", ["mapping", "valid"])
+def test_a_fixed_mapping_is_used_as_it_is(fixed: str) -> None:
+    """Quantities in three of four TPDOs, one of them on another COB-ID: read from the drive, also after its power cycle."""
+    with a_bench("--fixed", fixed) as bench:
+        jtqd = bench.start()
+        assert bench.until(bench.both_used), bench.said()
+        assert "its mapping is used as it is: TPDO1 (181h), TPDO2 (381h), TPDO4 (481h)" in bench.said()
+        assert bench.until(
+            lambda: any(torque and abs(torque) > 2.0 for pair in bench.torques_nm for torque in pair)
+        )
+        bench.order("off 1")
+        assert bench.until(lambda: bench.joint_stale(0))
+        bench.listen_anew()
+        bench.order("on 1")
+        assert bench.until(bench.both_used), bench.said()
+        assert bench.stop(jtqd) == 0
+
+
 @pytest.mark.native
 def test_objects_of_the_makers_own(bench: LibraryBench) -> None:
     """Joint 1 by its drive's mA, counted backwards, and rpm; joint 2, with the same motion, by CiA 402."""
@@ -156,6 +174,28 @@ def test_objects_of_the_makers_own(bench: LibraryBench) -> None:
     apart = sorted(abs(one - two) for one, two in pairs)  # at a reversal one rpm is another quadrant
     assert apart[round(0.8 * len(apart))] < 0.3
     assert bench.stop(jtqd) == 0
+
+
+@pytest.mark.native
+def test_one_encoder_no_velocity_and_torque_instead_of_current() -> None:
+    """Drives that have none of 60E4h, 606Ch and their scaling; joint 1 by 6077h, counted backwards, joint 2 by 6078h."""
+    less = {"link_position": False, "motor_velocity": False}
+    torque = {**less, "current": {"index": 0x6077, "sign": -1}}
+
+    def pairs() -> list[tuple[float, float]]:
+        found = bench.torques_nm[100:]
+        return [(one, two) for one, two in found if one is not None and two is not None]
+
+    with a_bench("--without", "60E4,60E6,60EB,606C,6090") as bench:
+        jtqd = bench.start(
+            joint_1={"objects": torque}, joint_2={"objects": less, "file": str(shipped("joint1.yaml"))}
+        )
+        assert bench.until(bench.both_used), bench.said()
+        assert bench.until(lambda: len(pairs()) > 300), bench.said()
+        assert bench.stop(jtqd) == 0
+    assert max(abs(one) for one, _ in pairs()) > 2.0
+    apart = sorted(abs(one - two) for one, two in pairs())
+    assert apart[round(0.8 * len(apart))] < 0.3
 
 
 @pytest.mark.campaign

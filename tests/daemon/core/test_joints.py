@@ -9,7 +9,7 @@ from jtqd.daemon.core.cycle import Cycle
 from jtqd.daemon.core.estimate_pdo import decode
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.schedule import Grid
-from jtqd.daemon.loop.input_pdos import InputPdo, JointInputs
+from jtqd.daemon.loop.input_pdos import InputPdo, JointInputs, drive_places
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import Ring, RingReader
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
@@ -53,7 +53,7 @@ class Bus:
             Intake(pdos),
             [
                 (
-                    JointInputs(2 * n, 2 * n + 1, 2 * joints if sensor else None, **SCALE),
+                    JointInputs(drive_places(2 * n), 2 * joints if sensor else None, **SCALE),
                     JointEstimator(load_joint(shipped("joint1.yaml")), settings),
                 )
                 for n in range(joints)

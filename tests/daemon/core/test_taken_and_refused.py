@@ -52,16 +52,16 @@ def test_integers_of_every_width_and_sign(layout: str, values: tuple[int, ...]) 
     assert intake.values(0) == values == intake.views()[0].unpack(data)
 
 
-@pytest.mark.parametrize("layout", ["<Q", "<f", "<d", "<4s", "<bbbbbbbbb"])
+@pytest.mark.parametrize("layout", ["<f", "<d", "<4s", "<bbbbbbbbb"])
 def test_a_layout_that_cannot_be_decoded_is_refused(layout: str) -> None:
     with pytest.raises(ValueError, match="cannot decode the layout"):
         Intake([one(0x181, layout)])
 
 
 def test_more_inputs_than_there_is_room_for_are_refused() -> None:
-    Intake([one(0x181 + n, "<i") for n in range(16)])
-    with pytest.raises(ValueError, match="found 17 inputs, expected at most 16"):
-        Intake([one(0x181 + n, "<i") for n in range(17)])
+    Intake([one(0x181 + n, "<i") for n in range(20)])
+    with pytest.raises(ValueError, match="found 21 inputs, expected at most 20"):
+        Intake([one(0x181 + n, "<i") for n in range(21)])
     with pytest.raises(ValueError, match="has more than 11 bits"):
         Intake([one(0x18000, "<i")])
     with pytest.raises(ValueError, match="200 is no node-ID"):

@@ -17,7 +17,7 @@ from jtqd.daemon.core.cycle import Cycle
 from jtqd.daemon.core.intake import Intake, JointTemperature
 from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.core.schedule import Grid
-from jtqd.daemon.loop.input_pdos import InputPdo, JointInputs
+from jtqd.daemon.loop.input_pdos import InputPdo, JointInputs, drive_places
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import Ring, RingReader
 from jtqd.daemon.shared.snapshot import Snapshot
@@ -166,7 +166,7 @@ def make(
         estimators = [JointEstimator(load_joint(shipped(f"joint{n}.yaml")), settings) for n in (1, 2)]
     joints = [
         (
-            JointInputs(2 * n, 2 * n + 1, 4, temperature=n if n < len(temperatures) else None, **SCALE),
+            JointInputs(drive_places(2 * n), 4, temperature=n if n < len(temperatures) else None, **SCALE),
             estimators[n],
         )
         for n in range(2)

@@ -17,7 +17,7 @@ from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import JointCycle
 from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.core.schedule import RESERVED_NS, NetworkBudget
-from jtqd.daemon.loop.input_pdos import JointInputs
+from jtqd.daemon.loop.input_pdos import JointInputs, drive_places
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.cycle_record import FLAG_NETWORK_SKIPPED
 from jtqd.daemon.shared.snapshot import COUNTERS, SnapshotReader
@@ -275,7 +275,7 @@ def replay(records: list[bytes], clock: ExactTime) -> Iterator[tuple[float, ...]
 
     joint = JointCycle(
         0,
-        JointInputs(0, 1, 4, **SCALE),
+        JointInputs(drive_places(0), 4, **SCALE),
         FusedEstimator(joint_of(1), SETTINGS, SlowNetwork(1, clock)),
         intake=intake,
         snapshot=Tally(),

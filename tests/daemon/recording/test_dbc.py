@@ -8,7 +8,7 @@ import pytest
 
 from jtqd.daemon.core.estimate_pdo import encode
 from jtqd.daemon.recording.dbc import Quantity, dbc_of, dbc_text
-from jtqd.drivers.devices import CIA_402
+from jtqd.drivers.devices import CIA_402, drive_layout
 from jtqd.drivers.pdo import MappedObject, PdoMap
 
 TURN = 2 * math.pi
@@ -20,9 +20,19 @@ SCALING = {
 }
 
 
+def drive(number, *, temperature=False):
+    return SimpleNamespace(
+        number=number,
+        node_id=number,
+        temperature=temperature,
+        objects=CIA_402,
+        tpdos=drive_layout(number),
+    )
+
+
 @pytest.fixture(scope="module")
 def database():
-    joints = tuple(SimpleNamespace(number=n, node_id=n, temperature=n == 2, objects=CIA_402) for n in (1, 2))
+    joints = tuple(drive(n, temperature=n == 2) for n in (1, 2))
     config = SimpleNamespace(
         counter_overflow=240,
         node_id=0x20,
@@ -97,7 +107,7 @@ def test_services(database):
 
 
 def test_without_a_sensor():
-    joints = tuple(SimpleNamespace(number=n, node_id=n, temperature=False, objects=CIA_402) for n in (1, 2))
+    joints = tuple(drive(n) for n in (1, 2))
     config = SimpleNamespace(counter_overflow=0, node_id=0x20, joints=joints, sensor=None)
     text = dbc_text(config, {"nodes": {"1": {"scaling": SCALING}, "2": {"scaling": SCALING}}})
     assert "torque_sensor" not in text

@@ -9,7 +9,7 @@ from jtqd.daemon.config import SafetySettings, load_config
 from jtqd.daemon.core import estimate_pdo
 from jtqd.daemon.core.joint import Unwrap
 from jtqd.daemon.core.status import JointStatus
-from jtqd.daemon.loop.input_pdos import JointInputs
+from jtqd.daemon.loop.input_pdos import JointInputs, drive_places
 from jtqd.daemon.replay.compare import SETTLED_CYCLES, bits_equal, identity
 from jtqd.daemon.replay.estimates import fields, status_many
 from jtqd.daemon.replay.frames import Pdo, offsets
@@ -86,11 +86,11 @@ def test_a_position_goes_on_with_the_turns_that_it_had() -> None:
 
 def test_turns_that_a_log_in_the_middle_of_a_run_had() -> None:
     """Raw counts beside the continuous positions of the log."""
-    inputs = JointInputs(0, 1, None, 1e-4, 1e-3, 1e-5, 0.01, 0.0)
+    inputs = JointInputs(drive_places(0), None, 1e-4, 1e-3, 1e-5, 0.01, 0.0)
     log = records([500])
     log["motor_position_rad"], log["link_position_rad"] = (5 * 2**32 + 77) * 1e-4, (-(2**32) - 12) * 1e-5
     pdo = Pdo((np.array([77]), np.array([-12])), np.array([True]))
-    assert offsets(pdo, log, inputs, 0) == (5 * 2**32, -(2**32))
+    assert offsets([pdo], log, inputs, 0) == (5 * 2**32, -(2**32))
 
 
 def test_where_the_state_is_known() -> None:

@@ -12,7 +12,7 @@ from jtqd.daemon.core import estimate_pdo
 from jtqd.daemon.core.intake import Intake, JointTemperature
 from jtqd.daemon.core.joint import JointCycle
 from jtqd.daemon.core.joint_safety import JointSafety
-from jtqd.daemon.loop.input_pdos import JointInputs
+from jtqd.daemon.loop.input_pdos import JointInputs, drive_places
 from jtqd.daemon.replay.origin import SAMPLE
 from jtqd.daemon.replay.rows import CycleRows
 from jtqd.daemon.shared.snapshot import COUNTERS
@@ -37,7 +37,7 @@ def made() -> tuple[Intake, list[JointCycle]]:
     joints = [
         JointCycle(
             n,
-            JointInputs(2 * n, 2 * n + 1, 4, temperature=n, **SCALE),
+            JointInputs(drive_places(2 * n), 4, temperature=n, **SCALE),
             make_estimator(joint_of(n + 1), SETTINGS, load_network("fused", network_of(n + 1))),
             intake=intake,
             snapshot=counts,

@@ -13,7 +13,7 @@ from jtqd.daemon.core import estimate_pdo
 from jtqd.daemon.core.cycle import Cycle
 from jtqd.daemon.core.intake import Intake, JointTemperature
 from jtqd.daemon.core.schedule import Grid
-from jtqd.daemon.loop.input_pdos import InputPdo, JointInputs
+from jtqd.daemon.loop.input_pdos import InputPdo, JointInputs, drive_places
 from jtqd.daemon.loop.process import run
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import Ring
@@ -137,7 +137,7 @@ def make_cycle(directory: Path, script: Script) -> tuple[Cycle, BusInTime]:
     temperatures = [JointTemperature(0x380 + n, n, f"{380 + n}h", 2000) for n in (1, 2)]
     joints = [
         (
-            JointInputs(2 * n, 2 * n + 1, 4, *_SCALE, temperature=n),
+            JointInputs(drive_places(2 * n), 4, *_SCALE, temperature=n),
             JointEstimator(load_joint(shipped(f"joint{n + 1}.yaml")), settings),
         )
         for n in range(2)
