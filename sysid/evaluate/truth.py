@@ -4,7 +4,7 @@ Runs of `python -m jtqd.sysid.campaign.emulated` have the torque of each gear be
 has noise, a zero of the day and the links' inertia in it; an interval that holds the sensor may be too wide for the torque.
 
 `now`: the estimate against the torque at the same instant, with the estimate's own age as an error, as a controller sees it.
-`aligned`: against the torque passed through the estimator's filter, as the tables against the sensor do.
+`aligned`: against the torque passed through the filter of the method's age, as the tables against the sensor do.
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jtqd.estimator.observer import low_pass
-from jtqd.estimator.settings import EstimatorSettings
-from jtqd.sysid.evaluate.methods import Samples
+from jtqd.sysid.evaluate.methods import PAPERS_BANDWIDTH, Samples
 from jtqd.sysid.evaluate.scores import IntervalTables, Row, Standstill, interval_tables, row, standstill
 
 
@@ -37,9 +36,12 @@ def truth_tables(samples: Sequence[Samples]) -> TruthTables | None:
         if each.true_nm is None:
             continue
         dt = np.diff(each.time_s, prepend=each.time_s[0])
-        passed = low_pass(each.true_nm, dt, EstimatorSettings().bandwidth_rad_s)
-        now.append(replace(each, sensor_nm=each.true_nm))
-        aligned.append(replace(each, sensor_nm=passed))
+        young = {
+            method: low_pass(each.true_nm, dt, each.bandwidth_rad_s[method]) for method in each.sensors_nm
+        }
+        now.append(replace(each, sensor_nm=each.true_nm, sensors_nm={}))
+        passed = low_pass(each.true_nm, dt, PAPERS_BANDWIDTH)
+        aligned.append(replace(each, sensor_nm=passed, sensors_nm=young))
     if not now:
         return None
     numbers = sorted({each.number for each in now})
