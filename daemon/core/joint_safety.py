@@ -7,6 +7,7 @@ from typing import Final
 
 from jtqd.daemon.config import Config, SafetySettings
 from jtqd.daemon.shared import faults
+from jtqd.estimator.age import bandwidth_of
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.plausibility import Plausibility
 from jtqd.estimator.settings import EstimatorSettings
@@ -26,9 +27,19 @@ class JointSafety:
         torque_limit_nm: a torque beyond it is never published.
         network_limit_nm: a network further from physics than this has been dropped by the estimator.
         deviation_cycles: length of the fault `deviation`, 0 where it is not latched.
+        bandwidth_rad_s: that makes the estimate's age (`age`); 0 without a joint: its sensor is taken as it is.
+        max_gap_s: that a sensor of the same age bridges.
     """
 
-    __slots__ = ("deviation_cycles", "network_limit_nm", "plausibility", "settings", "torque_limit_nm")
+    __slots__ = (
+        "bandwidth_rad_s",
+        "deviation_cycles",
+        "max_gap_s",
+        "network_limit_nm",
+        "plausibility",
+        "settings",
+        "torque_limit_nm",
+    )
 
     def __init__(
         self,
@@ -41,10 +52,12 @@ class JointSafety:
         self.plausibility: Plausibility | None = None
         self.torque_limit_nm, self.network_limit_nm = TORQUE_RANGE_NM, inf
         self.deviation_cycles = 0
+        self.bandwidth_rad_s, self.max_gap_s = 0.0, 0.05
         if self.settings.latch & faults.DEVIATION:
             self.deviation_cycles = max(1, round(self.settings.deviation_s * 1e9 / period_ns))
         if joint is None or estimator is None:
             return
+        self.bandwidth_rad_s, self.max_gap_s = bandwidth_of(joint, estimator), estimator.max_gap_s
         self.torque_limit_nm = min(TORQUE_RANGE_NM, estimator.torque_limit * joint.rated_torque_nm)
         self.network_limit_nm = estimator.network_limit * joint.rated_torque_nm
         if self.settings.plausibility is not None:
