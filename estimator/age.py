@@ -9,10 +9,13 @@ missing). Against the sensor as it is, the age counts as error: that is what a c
 
 from __future__ import annotations
 
-from jtqd.estimator.arrays import FloatArray
+from typing import TYPE_CHECKING
+
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.observer import low_pass
 from jtqd.estimator.settings import EstimatorSettings
+
+if TYPE_CHECKING:
+    from jtqd.estimator.arrays import FloatArray
 
 
 def bandwidth_of(joint: Joint, settings: EstimatorSettings) -> float:
@@ -29,4 +32,6 @@ def age_ms(joint: Joint, settings: EstimatorSettings) -> float:
 
 def aligned(values: FloatArray, dt_s: FloatArray, joint: Joint, settings: EstimatorSettings) -> FloatArray:
     """Return values [n] as old as the joint's estimate; dt_s [n] as of `low_pass`, which this is."""
+    from jtqd.estimator.observer import low_pass  # numpy: the supervisor, which tells the age, needs none
+
     return low_pass(values, dt_s, bandwidth_of(joint, settings))
