@@ -7,7 +7,7 @@
 | `ExtendedEstimator` | either of them for a joint with effects: inputs corrected first (`corrections`) |
 
 `methods.make_estimator` chooses. Parameters and state of an estimator are one flat block each. Everything that enters the
-loss went through the same filter, so the physics estimate as a whole is 1/g old.
+loss went through the same filter; how old the result is says `age`.
 """
 
 from libc.math cimport NAN, fabs, fmin, sqrt
@@ -263,7 +263,12 @@ cdef class FusedEstimator(Estimator):
         self.width = len(FUSED_FEATURES)
         fill_guard(&self.law.guard, joint, settings)
         fill_fused_observer(
-            &self.law.observer, joint, fused.torsion, settings.bandwidth_rad_s, settings.link_bandwidth_rad_s
+            &self.law.observer,
+            joint,
+            fused.torsion,
+            settings.bandwidth_rad_s,
+            settings.link_bandwidth_rad_s,
+            settings.own_torsion_bandwidth_rad_s,
         )
         self.law.loss = (<AdditiveLossModel>AdditiveLossModel(fused.loss)).law
         fill_fusion(&self.law.fusion, fused.sigma, fused.torsion is not None)
@@ -388,7 +393,7 @@ cdef class FusedEstimator(Estimator):
         lowered = self.foreign(&physics, x.dt_s)
         if law.zeros.used:
             self.learn_zeros(seen, x, &physics, loss.nm, out.status)
-        out.torque_nm = out.physics_nm = physics.value
+        out.torque_nm = out.physics_nm = physics.value + seen.ahead_nm  # both paths fused at one age, then made younger
         scale = law.physics_scale[quadrant]
         self.features[0], self.features[1], self.features[2] = v, raw, seen.torsion_nm - (raw - loss.nm)
         self.features[3], self.features[4] = seen.cos2, seen.sin2
@@ -398,7 +403,7 @@ cdef class FusedEstimator(Estimator):
                 correction = (
                     evaluate(&law.network.perceptron, self.features) if law.network.native else self.ask()
                 )
-                out.network_nm = physics.value + correction
+                out.network_nm = out.physics_nm + correction
                 size = fabs(correction)
                 if size <= law.network_limit:  # not so for NaN
                     weight = fused_trust(&law.trust, v, raw, self.features[2], x.temperature_c)
@@ -428,7 +433,7 @@ cdef class FusedEstimator(Estimator):
         n = len(seen.raw_nm)
         values, features, status = np.full((5, n), NAN), np.full((n, self.width), NAN), seen.status.copy()
         rows = np.column_stack(
-            (seen.raw_nm, seen.velocity_rad_s, seen.torsion_nm, seen.waves, seen.direction, seen.open_nm)
+            (seen.raw_nm, seen.velocity_rad_s, seen.torsion_nm, seen.waves, seen.direction, seen.open_nm, seen.ahead_nm)
         )
         cdef const double[:, ::1] row = np.ascontiguousarray(rows)
         cdef const double[::1] dt = np.ascontiguousarray(seen.dt_s)
@@ -450,7 +455,7 @@ cdef class FusedEstimator(Estimator):
                     continue
                 one.raw_nm, one.joint_velocity_rad_s, one.torsion_nm = row[k, 0], row[k, 1], row[k, 2]
                 one.cos2, one.sin2, one.cos4, one.sin4 = row[k, 3], row[k, 4], row[k, 5], row[k, 6]
-                one.direction, one.open_nm = row[k, 7], row[k, 8]
+                one.direction, one.open_nm, one.ahead_nm = row[k, 7], row[k, 8], row[k, 9]
                 sample.dt_s, sample.temperature_c = dt[k], temperature[k]
                 no_values(&out, asked[k])
                 self.estimate(&one, &sample, True, &out)
@@ -486,10 +491,17 @@ def observe_run(
     cdef Sample sample
     cdef Py_ssize_t k
     fill_guard(&law.guard, joint, settings)
-    fill_fused_observer(&law.observer, joint, torsion, settings.bandwidth_rad_s, settings.link_bandwidth_rad_s)
+    fill_fused_observer(
+        &law.observer,
+        joint,
+        torsion,
+        settings.bandwidth_rad_s,
+        settings.link_bandwidth_rad_s,
+        settings.own_torsion_bandwidth_rad_s,
+    )
     restart_guard(&guard)
     n = inputs.shape[1]
-    rows, waves, status = np.full((5, n), NAN), np.full((n, 4), NAN), np.empty(n, np.uint8)
+    rows, waves, status = np.full((6, n), NAN), np.full((n, 4), NAN), np.empty(n, np.uint8)
     cdef const double[:, ::1] x = inputs
     cdef double[:, ::1] to = rows
     cdef double[:, ::1] w = waves
@@ -499,11 +511,11 @@ def observe_run(
             sample = Sample(x[0, k], x[1, k], x[2, k], x[3, k], x[4, k], x[5, k])
             if observe_fused(&law.guard, &guard, &law.observer, &state, &sample, &out):
                 to[0, k], to[1, k], to[2, k] = out.raw_nm, out.joint_velocity_rad_s, out.torsion_nm
-                to[3, k], to[4, k] = out.direction, out.open_nm
+                to[3, k], to[4, k], to[5, k] = out.direction, out.open_nm, out.ahead_nm
                 w[k, 0], w[k, 1], w[k, 2], w[k, 3] = out.cos2, out.sin2, out.cos4, out.sin4
             s[k] = guard.status
-    raw, v, torsion_nm, direction, open_nm = rows
-    return ObservedRun(status, raw, v, torsion_nm, waves, inputs[5], direction, inputs[0], open_nm)
+    raw, v, torsion_nm, direction, open_nm, ahead_nm = rows
+    return ObservedRun(status, raw, v, torsion_nm, waves, inputs[5], direction, inputs[0], open_nm, ahead_nm)
 
 
 # Joints with effects --------------------------------------------------------------------------------------------------

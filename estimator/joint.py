@@ -91,12 +91,15 @@ def _check_length(where: str, key: str, values: tuple[float, ...], count: int, o
 
 @dataclass(frozen=True, slots=True)
 class LossSide:
-    """Loss while turning one way, per load node: constant + viscous |v| + quadratic v^2 [Nm], and a Stribeck peak."""
+    """Loss while turning one way, per load node: constant + viscous |v| + quadratic v^2 [Nm], and a Stribeck peak.
+
+    Friction takes energy: viscous and Stribeck parts are at least 0, and so is the loss at breakaway, constant + Stribeck.
+    """
 
     constant_nm: Annotated[tuple[float, ...], limits("Nm")]
     viscous_nms_per_rad: Annotated[tuple[float, ...], limits("Nms/rad")]
     quadratic_nms2_per_rad2: Annotated[tuple[float, ...], limits("Nms2/rad2")]
-    stribeck_nm: Annotated[float, limits("Nm")]
+    stribeck_nm: Annotated[float, limits("Nm", ge=0.0)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +128,15 @@ class AdditiveLoss:
             side = getattr(self, name)
             for key in ("constant_nm", "viscous_nms_per_rad", "quadratic_nms2_per_rad2"):
                 _check_length("fused.loss", f"{name}.{key}", getattr(side, key), len(nodes), "load_nodes_nm")
+            slowest = min(side.viscous_nms_per_rad)
+            if slowest < 0.0:
+                raise FieldError(
+                    "fused.loss", f"{name}.viscous_nms_per_rad", slowest, "at least 0 Nms/rad at every load"
+                )
+            least = min(side.constant_nm)
+            if least + side.stribeck_nm < 0.0:
+                expected = f"at least -stribeck_nm ({-side.stribeck_nm:g} Nm): friction takes energy"
+                raise FieldError("fused.loss", f"{name}.constant_nm", least, expected)
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,10 @@ cdef struct Inputs:  # of the filter: u = i Kt + J g w, v, deflection d, waves, 
 
 cdef struct FusedObserved:  # as Observed, and the filtered waves; open: what the torsion's slip leaves open
     double raw_nm, joint_velocity_rad_s, link_velocity_rad_s, torsion_nm
-    double cos2, sin2, cos4, sin4, direction, open_nm
+    double cos2, sin2, cos4, sin4, direction, open_nm, ahead_nm  # ahead: what the torsion's own filter knows earlier
+
+cdef struct Reference:  # a sensor as old as the estimate
+    double last, z, since, settled
 
 cdef struct Wave:
     double order, cos, sin
@@ -40,6 +43,8 @@ cdef struct Bounds:  # of a slip's z
 
 cdef struct FusedObserverLaw:
     double gear, inverse_gear, kt, inertia_rate, rate, link_rate
+    bint apart  # the torsion has a filter of its own
+    double torsion_rate, torsion_share  # share: rate/torsion_rate
     double stiffness, cubic, zero, damping, torsion_limit
     Wave two, four  # kinematic error at the ripple orders, which costs no further cos and sin
     int others, link_waves, hardenings, slips
@@ -51,6 +56,7 @@ cdef struct FusedObserverLaw:
 cdef struct FusedObserverState:
     Inputs last, z
     double d
+    double torsion, torsion_z  # of the torsion's own filter, and through the rest of the motor path's
     Bounds bounds[MOST_SLIPS]
     double link, link_velocity
 
@@ -63,8 +69,10 @@ cdef struct GuardState:
 
 cdef int fill_observer(ObserverLaw *law, joint, double bandwidth, double link_bandwidth) except -1
 cdef int fill_fused_observer(
-    FusedObserverLaw *law, joint, torsion, double bandwidth, double link_bandwidth
+    FusedObserverLaw *law, joint, torsion, double bandwidth, double link_bandwidth, double torsion_bandwidth
 ) except -1
+cdef void restart_reference(Reference *r) noexcept nogil
+cdef double follow_reference(Reference *r, double rate, double max_gap, double dt, double now) noexcept nogil
 cdef int fill_guard(GuardLaw *law, joint, settings) except -1
 cdef void restart_guard(GuardState *g) noexcept nogil
 cdef bint observe(

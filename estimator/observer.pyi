@@ -10,6 +10,9 @@ RIPPLE_ORDERS: Final = (2, 4)
 def first_order_hold(rate_rad_s: float, dt_s: float) -> tuple[float, float, float]: ...
 def slipped(d_rad: FloatArray, travel_rad: float) -> tuple[FloatArray, FloatArray]: ...
 def low_pass(values: FloatArray, dt_s: FloatArray, bandwidth_rad_s: float) -> FloatArray: ...
+def reference_of(
+    sensor_nm: FloatArray, dt_s: FloatArray, bandwidth_rad_s: float, max_gap_s: float = 0.05
+) -> FloatArray: ...
 
 class ObservedSample(NamedTuple):
     raw_nm: float
@@ -46,10 +49,16 @@ class FusedObservedSample(NamedTuple):
     sin4: float
     direction: float
     open_nm: float = 0.0
+    ahead_nm: float = 0.0
 
 class FusedObserver:
     def __init__(
-        self, joint: Joint, torsion: Torsion | None, bandwidth_rad_s: float, link_bandwidth_rad_s: float
+        self,
+        joint: Joint,
+        torsion: Torsion | None,
+        bandwidth_rad_s: float,
+        link_bandwidth_rad_s: float,
+        torsion_bandwidth_rad_s: float | None = None,
     ) -> None: ...
     def start(
         self,

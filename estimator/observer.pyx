@@ -28,7 +28,7 @@ The guard decides about starts, gaps, garbage and standstill, sample by sample:
 | else | VALID |
 """
 
-from libc.math cimport NAN, copysign, cos, expm1, fabs, fmax, fmin, isfinite, isinf, sin
+from libc.math cimport INFINITY, NAN, copysign, cos, expm1, fabs, fmax, fmin, isfinite, isinf, sin
 
 from jtqd.estimator.losses cimport FrictionModel, direction_of, friction_torque
 from jtqd.estimator.sample cimport Sample
@@ -95,6 +95,59 @@ def low_pass(values, dt_s, double bandwidth_rad_s):
         if dt[k] > 0.0:
             h = _hold(bandwidth_rad_s, dt[k])
             z[k] = _filtered(&h, z[k - 1], x[k], x[k - 1])
+    return out
+
+
+# What an estimate is compared with ----------------------------------------------------------------------------------
+
+
+cdef double SETTLED = 5.0  # of 1/g: exp(-5) of the start is left
+
+
+cdef void restart_reference(Reference *r) noexcept nogil:
+    """Forget everything: the next value starts."""
+    r.since = INFINITY
+    r.last = r.z = r.settled = 0.0
+
+
+cdef double follow_reference(Reference *r, double rate, double max_gap, double dt, double now) noexcept nogil:
+    """Return a sensor's value, dt after the sample before, as old as an estimate of this bandwidth; NaN where unknown.
+
+    NaN of a sensor that was not heard is bridged by a straight line, up to max_gap; then, at the first value, and after a
+    step that is no step it starts again, and is unknown until 5/g later.
+    """
+    cdef Hold h
+    r.since = r.since + dt if dt > 0.0 else INFINITY
+    if now != now:
+        return NAN
+    if r.since <= max_gap:
+        h = _hold(rate, r.since)
+        r.z = _filtered(&h, r.z, now, r.last)
+        r.settled += r.since
+    else:
+        r.z, r.settled = now, 0.0
+    r.last, r.since = now, 0.0
+    return r.z if r.settled * rate >= SETTLED else NAN
+
+
+def reference_of(sensor_nm, dt_s, double bandwidth_rad_s, double max_gap_s=0.05):
+    """Return a sensor's torque [n] as old as estimates of this bandwidth, as the loop forms it; NaN where it is unknown.
+
+    dt_s [n]: as the estimator was given it, since the last sample with inputs; NaN at samples without inputs, which count
+    for nothing. Raises ValueError for arrays of different length.
+    """
+    cdef const double[::1] x = np.ascontiguousarray(sensor_nm, np.float64)
+    cdef const double[::1] dt = np.ascontiguousarray(dt_s, np.float64)
+    out = np.full(len(sensor_nm), NAN)
+    cdef double[::1] to = out
+    cdef Reference r
+    cdef Py_ssize_t k
+    if x.shape[0] != dt.shape[0]:
+        raise ValueError(f"found {x.shape[0]} values and {dt.shape[0]} steps, expected as many")
+    restart_reference(&r)
+    for k in range(x.shape[0]):
+        if dt[k] == dt[k]:
+            to[k] = follow_reference(&r, bandwidth_rad_s, max_gap_s, dt[k], x[k])
     return out
 
 
@@ -197,6 +250,7 @@ class FusedObservedSample(NamedTuple):
 
     raw_nm is NaN where the torsion is impossible: the guard then starts again, as for an impossible motor torque.
     open_nm: half width of what the torsion's slip leaves open, 0 once the slip is known and where there is none.
+    torsion_nm: as old as raw_nm, 1/g; ahead_nm: the torsion that is only 1/g_t old, less this one.
     """
 
     raw_nm: float
@@ -209,6 +263,7 @@ class FusedObservedSample(NamedTuple):
     sin4: float
     direction: float
     open_nm: float = 0.0
+    ahead_nm: float = 0.0
 
 
 cdef double _sum_of_waves(const Wave *wave, int count, double angle) noexcept nogil:
@@ -264,6 +319,18 @@ cdef void _torsion(const FusedObserverLaw *law, FusedObserverState *s, double d,
     out.open_nm = 0.0
     for k in range(law.slips):
         _slip(&law.slip[k], &s.bounds[k], step, out)
+
+
+cdef void _age(const FusedObserverLaw *law, FusedObserverState *s, const Hold *h, FusedObserved *out) noexcept nogil:
+    """Make the torsion as old as the motor path, and set by how much the young one is ahead of it.
+
+    g/(s+g) over g_t/(s+g_t) is r + (1 - r) g/(s+g) with r = g/g_t: linear in the torque, whatever the spring.
+    """
+    cdef double young = out.torsion_nm
+    s.torsion_z = _filtered(h, s.torsion_z, young, s.torsion)
+    s.torsion = young
+    out.torsion_nm = s.torsion_z + law.torsion_share * (young - s.torsion_z)
+    out.ahead_nm = young - out.torsion_nm
 
 
 cdef void _slip(const Slip *law, Bounds *z, double step, FusedObserved *out) noexcept nogil:
@@ -323,6 +390,8 @@ cdef void _start_fused(const FusedObserverLaw *law, FusedObserverState *s, const
     s.link_velocity = s.z.v
     s.d = s.z.d
     _torsion(law, s, s.z.d, 1.0, out)
+    s.torsion = s.torsion_z = out.torsion_nm
+    out.ahead_nm = 0.0
     _set_outputs(law, s, out)
     out.raw_nm = (s.z.u - law.inertia_rate * x.motor_velocity_rad_s) * law.gear
 
@@ -333,7 +402,8 @@ cdef void _step_fused(const FusedObserverLaw *law, FusedObserverState *s, const 
     cdef Inputs now = _inputs(law, x)
     s.z.u = _filtered(&h, s.z.u, now.u, s.last.u)
     s.z.v = _filtered(&h, s.z.v, now.v, s.last.v)
-    s.z.d = _filtered(&h, s.z.d, now.d, s.last.d)
+    cdef Hold own = _hold(law.torsion_rate, x.dt_s) if law.apart else h
+    s.z.d = _filtered(&own, s.z.d, now.d, s.last.d)
     s.z.cos2 = _filtered(&h, s.z.cos2, now.cos2, s.last.cos2)
     s.z.sin2 = _filtered(&h, s.z.sin2, now.sin2, s.last.sin2)
     s.z.cos4 = _filtered(&h, s.z.cos4, now.cos4, s.last.cos4)
@@ -344,14 +414,21 @@ cdef void _step_fused(const FusedObserverLaw *law, FusedObserverState *s, const 
     s.link_velocity += gone * ((x.link_position_rad - s.link) / x.dt_s - s.link_velocity)
     s.link = x.link_position_rad
     _torsion(law, s, s.z.d, x.dt_s, out)
+    out.ahead_nm = 0.0
+    if law.apart:
+        _age(law, s, &h, out)
     _set_outputs(law, s, out)
     out.raw_nm = (s.z.u - law.inertia_rate * x.motor_velocity_rad_s) * law.gear
     if not -law.torsion_limit <= out.torsion_nm <= law.torsion_limit:  # NaN included
         out.raw_nm = NAN
 
 
-cdef int fill_fused_observer(FusedObserverLaw *law, joint, torsion, double bandwidth, double link_bandwidth) except -1:
+cdef int fill_fused_observer(
+    FusedObserverLaw *law, joint, torsion, double bandwidth, double link_bandwidth, double torsion_bandwidth
+) except -1:
     """Set the parameters from a joint file; torsion None: its torque is always 0."""
+    law.apart = torsion is not None and torsion_bandwidth != bandwidth
+    law.torsion_rate, law.torsion_share = torsion_bandwidth, bandwidth / torsion_bandwidth
     law.gear = joint.gear_ratio
     law.inverse_gear = 1.0 / joint.gear_ratio
     law.kt = joint.torque_constant_nm_per_a
@@ -414,6 +491,7 @@ cdef _python(const FusedObserved *out):
         out.sin4,
         out.direction,
         out.open_nm,
+        out.ahead_nm,
     )
 
 
@@ -433,11 +511,18 @@ cdef class FusedObserver:
     encoder's noise. Where it was when the observer started is not known: its bounds meet after twice its travel in one
     direction, and until then `open` is what it may hold to either side of the middle.
 
-    torsion None: its torque is always 0.
+    With a bandwidth g_t of its own the torsion, spring and slip included, is formed from the deflection through
+    g_t/(s+g_t). `torsion_nm` is then that torque through [g/(s+g)]/[g_t/(s+g_t)], as old as all the rest, and `ahead_nm`
+    the young torque less it.
+
+    torsion None: its torque is always 0. torsion_bandwidth_rad_s: g_t, None for g.
     """
 
-    def __init__(self, joint, torsion, double bandwidth_rad_s, double link_bandwidth_rad_s):
-        fill_fused_observer(&self.law, joint, torsion, bandwidth_rad_s, link_bandwidth_rad_s)
+    def __init__(
+        self, joint, torsion, double bandwidth_rad_s, double link_bandwidth_rad_s, torsion_bandwidth_rad_s=None
+    ):
+        own = bandwidth_rad_s if torsion_bandwidth_rad_s is None else torsion_bandwidth_rad_s
+        fill_fused_observer(&self.law, joint, torsion, bandwidth_rad_s, link_bandwidth_rad_s, own)
 
     def start(
         self, double current_a, double motor_position_rad, double motor_velocity_rad_s, double link_position_rad

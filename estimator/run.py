@@ -156,7 +156,8 @@ class ObservedRun:
 
     Torques [Nm, joint side], velocity [rad/s, joint side]; waves [n, 4]: filtered cos and sin of 2 and 4 times
     the motor angle; temperature [n], NaN where unknown; direction [n], -1 to 1; dt_s [n], time since the sample before;
-    open_nm [n]: what the torsion's slip leaves open to either side.
+    open_nm [n]: what the torsion's slip leaves open to either side; ahead_nm [n]: the torsion that went through its own
+    filter only, less torsion_nm, which is as old as raw_nm.
     """
 
     status: StatusArray
@@ -168,6 +169,7 @@ class ObservedRun:
     direction: FloatArray
     dt_s: FloatArray
     open_nm: FloatArray
+    ahead_nm: FloatArray
 
 
 @dataclass(frozen=True, slots=True)

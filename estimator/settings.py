@@ -5,7 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Final
 
-from jtqd.estimator.decoder import check, choice, limits
+from jtqd.estimator.decoder import FieldError, check, choice, limits
+
+TORSION_BANDWIDTH_RAD_S: Final = 800.0
+"""Of new configurations, and of what is fitted and scored here: chosen from a table, docs/estimator.md."""
 
 METHODS: Final = ("tob", "efficiency", "network", "fused")
 """tob: Eq. (4) with additive friction; efficiency: Eq. (7); network: the paper's section III on top; fused: ours."""
@@ -15,7 +18,8 @@ METHODS: Final = ("tob", "efficiency", "network", "fused")
 class EstimatorSettings:
     """How one joint is estimated. Values out of range raise ConfigError.
 
-    bandwidth_rad_s: g of the observer, group delay 1/g; link_bandwidth_rad_s: of the link velocity;
+    bandwidth_rad_s: g of the observer, group delay 1/g; torsion_bandwidth_rad_s: g_t of the torsion of method
+    `fused`, at least g, None for g; link_bandwidth_rad_s: of the link velocity;
     standstill_velocity_rad_s: joint side, entered below it, left above twice it; max_gap_s: longer steps
     restart; envelope_margin: part of each feature's span over which the network fades out; network_limit,
     sigma_floor, torque_limit: parts of the rated torque (largest trusted difference between network and
@@ -26,6 +30,7 @@ class EstimatorSettings:
 
     method: Annotated[str, choice(METHODS)] = "network"
     bandwidth_rad_s: Annotated[float, limits("rad/s", ge=1.0, le=5000.0)] = 200.0
+    torsion_bandwidth_rad_s: Annotated[float, limits("rad/s", ge=1.0, le=5000.0)] | None = None
     link_bandwidth_rad_s: Annotated[float, limits("rad/s", ge=1.0, le=5000.0)] = 200.0
     standstill_velocity_rad_s: Annotated[float, limits("rad/s", ge=0.0, le=1.0)] = 0.01
     max_gap_s: Annotated[float, limits("s", ge=1e-4, le=1.0)] = 0.05
@@ -39,6 +44,16 @@ class EstimatorSettings:
 
     def __post_init__(self) -> None:
         check(self, "estimator")
+        own = self.torsion_bandwidth_rad_s
+        if own is not None and own < self.bandwidth_rad_s:
+            expected = f"at least bandwidth_rad_s ({self.bandwidth_rad_s:g} rad/s)"
+            raise FieldError("estimator", "torsion_bandwidth_rad_s", own, expected)
+
+    @property
+    def own_torsion_bandwidth_rad_s(self) -> float:
+        """g_t of the torsion, which is g where none is set."""
+        own = self.torsion_bandwidth_rad_s
+        return self.bandwidth_rad_s if own is None else own
 
     def sensor_zero_nm(self, rated_torque_nm: float) -> float:
         """Return what a comparison with a torque sensor holds beside sigma, as a standard deviation: the sensor's zero.
@@ -46,6 +61,12 @@ class EstimatorSettings:
         Of method fused; sigma of the others never falls below `sigma_floor` anyway.
         """
         return self.sigma_floor * rated_torque_nm if self.method == "fused" else 0.0
+
+
+def recommended(method: str) -> EstimatorSettings:
+    """Return the settings of a new configuration with this method. Raises ConfigError for an unknown one."""
+    own = TORSION_BANDWIDTH_RAD_S if method == "fused" else None
+    return EstimatorSettings(method=method, torsion_bandwidth_rad_s=own)
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from jtqd.daemon.logs import LogError, Records, read_topic
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.observer import reference_of
+from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import (
     DEGRADED,
     DRIVE_FAULT,
@@ -41,7 +44,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq plot`."""
     parser = argparse.ArgumentParser(
         prog="jtq plot",
-        description="Draw the estimate of one joint and the torque sensor from a log of jtqd.",
+        description="Draw the estimate of one joint and the torque sensor, as old as it, from a log of jtqd.",
         epilog="example: jtq plot logs/jtqd-sim-20261121T080000Z.mcap --joint 1 --out joint1.png",
     )
     parser.add_argument("log", type=Path, help="MCAP file of jtqd")
@@ -79,11 +82,24 @@ def main(argv: list[str]) -> int:
     return 0
 
 
+def reference(log: Records) -> tuple[FloatArray, float]:
+    """Return the sensor as old as the estimate [n], and that age [ms].
+
+    A log of before its field `reference_nm` does not tell the age: then the one of every shipped configuration until then.
+    """
+    if "reference_nm" in (log.dtype.names or ()):
+        known = log["age_ms"][np.isfinite(log["age_ms"])]
+        return log["reference_nm"], float(known[-1]) if len(known) else math.nan
+    rate = EstimatorSettings().bandwidth_rad_s
+    return reference_of(log["sensor_torque_nm"], log["dt_s"], rate), 1e3 / rate
+
+
 def draw(log: Records, joint: int, path: Path) -> float:
     """Draw two panels over time: torque and sensor, then their difference; shaded where the status is not valid.
 
     Returns:
-        The RMSE in the title [Nm], over what was published while the joint moved and the sensor was valid; NaN without any.
+        The RMSE in the title [Nm], over what was published while the joint moved and the sensor was valid, both of one age;
+        NaN without any.
     """
     import matplotlib as mpl
 
@@ -94,7 +110,7 @@ def draw(log: Records, joint: int, path: Path) -> float:
     status = log["status"]
     published = np.isin(status, (VALID, DEGRADED, STANDSTILL))
     torque = np.where(published, log["torque_nm"], np.nan)
-    sigma, sensor = log["sigma_nm"], log["sensor_torque_nm"]
+    sigma, sensor, age = log["sigma_nm"], *reference(log)
     figure, (above, below) = plt.subplots(2, 1, figsize=(11, 5.2), sharex=True, height_ratios=(3, 1.3))
     above.fill_between(
         time_s, torque - sigma, torque + sigma, color="#9ec5e8", linewidth=0, label="estimate ± sigma"
@@ -109,7 +125,7 @@ def draw(log: Records, joint: int, path: Path) -> float:
     below.axhline(0.0, color="#222222", linewidth=0.6)
     rmse = float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else float("nan")
     title = (
-        f"estimate and sensor, RMSE {rmse:.2f} Nm in motion"
+        f"estimate and sensor, both {age:.3g} ms old, RMSE {rmse:.2f} Nm in motion"
         if with_sensor
         else "estimate; the log has no reference"
     )

@@ -18,6 +18,7 @@ from jtqd.drivers.boot_procedure import signature
 from jtqd.drivers.eds.own_objects import BUS_FIELDS, COUNTERS, JOINT_PARAMETERS, PARAMETERS, VERSION, room_for
 from jtqd.drivers.object_dictionary import ObjectStore
 from jtqd.drivers.sdo_server import SdoServer
+from jtqd.estimator.age import age_ms
 from jtqd.estimator.status import OFF, STALE
 
 _STANDSTILL_S = 0.2
@@ -145,4 +146,6 @@ class OwnNode:
         store.set_text(0x2204, 0, config.sha256)
         for index, joint in zip(PARAMETERS, config.joints, strict=False):
             for sub, name in enumerate(JOINT_PARAMETERS, start=1):
-                store.set_number(index, sub, getattr(joint.joint, name))
+                of_estimate = name == "age_ms"
+                value = age_ms(joint.joint, config.estimator) if of_estimate else getattr(joint.joint, name)
+                store.set_number(index, sub, value)

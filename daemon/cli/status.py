@@ -137,6 +137,10 @@ def _joint(reading: Reading, number: int) -> dict[str, Any]:
         "physics_nm": finite(seen.physics_nm),
         "network_nm": finite(seen.network_nm),
         "sensor_nm": finite(seen.sensor_nm),
+        "reference_nm": finite(seen.reference_nm),
+        "error_nm": finite(seen.torque_nm - seen.reference_nm if known else nan),
+        "rmse_nm": finite(view.rmse_nm[n]),
+        "age_ms": finite(seen.age_ms),
         "current_a": finite(measured.current_a),
         "motor_velocity_rad_s": finite(measured.motor_velocity_rad_s),
         "temperature_c": finite(measured.temperature_c),
@@ -314,9 +318,9 @@ def _quantity(value: float, unit: str, digits: int = 2) -> str:
 
 def _joints(about: About, view: View, *, still: bool) -> Columns:
     headings = {"joint": "left", "status": "left"} | dict.fromkeys(
-        ("torque", "sigma", "sensor", "current", "motor", "temp.", "with a torque"), "right"
+        ("torque", "sigma", "sensor", "age", "current", "motor", "temp.", "with a torque"), "right"
     )
-    table = Columns(headings, ("with a torque", "motor", "temp.", "current", "sensor", "sigma"))
+    table = Columns(headings, ("age", "with a torque", "motor", "temp.", "current", "sensor", "sigma"))
     for n, (joint, seen) in enumerate(zip(about.joints, view.joints, strict=True)):
         known = seen.status in PUBLISHED and not still
         measured, spent = view.measured[n], view.status_cycles[n]
@@ -326,7 +330,8 @@ def _joints(about: About, view: View, *, still: bool) -> Columns:
             Text(name, style="dim" if still else COLOURS.get(name, "bold red")),
             _quantity(seen.torque_nm if known else nan, "Nm"),
             _quantity(seen.sigma_nm if known else nan, "Nm"),
-            _quantity(seen.sensor_nm, "Nm"),
+            _quantity(seen.reference_nm, "Nm"),
+            _quantity(seen.age_ms if known else nan, "ms"),
             _quantity(measured.current_a, "A"),
             _quantity(measured.motor_velocity_rad_s, "rad/s", 1),
             _quantity(measured.temperature_c, "°C", 1),

@@ -22,6 +22,7 @@ cdef struct ViewBlock:  # a `JointView`
     uint16_t statusword
     uint8_t status, sensor_status
     uint16_t input_flags, latched
+    double reference_nm, age_ms
 
 cdef struct MeasuredBlock:  # a `Measured`
     double current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, sensor_nm, temperature_c

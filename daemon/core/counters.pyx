@@ -137,6 +137,8 @@ cdef ViewBlock _view(const JointState *joint) noexcept nogil:
         s.sensor_status,
         s.input_flags,
         joint.latched,
+        s.reference_nm,
+        s.age_ms,
     )
 
 

@@ -83,7 +83,7 @@ cdef class JointCycle:
     def __init__(self, int number, inputs, estimator, *, Intake intake, snapshot, int64_t period_ns, safety=None):
         cdef JointTemperature temperature
         cdef JointBlock nothing = JointBlock(
-            NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, 0, 0, 0, 0
+            NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, 0, 0, 0, 0
         )
         self.limits = safety or JointSafety()
         self.rules = JointRules(number, snapshot, self.limits, estimator.with_network)
@@ -173,7 +173,7 @@ cdef class JointCycle:
     def view(self):
         cdef JointBlock *s = &self.now.sample
         values = s.torque_nm, s.sigma_nm, s.tob_nm, s.physics_nm, s.network_nm, s.sensor_torque_nm
-        return *values, s.statusword, s.status, s.sensor_status, s.input_flags, self.now.latched
+        return *values, s.statusword, s.status, s.sensor_status, s.input_flags, self.now.latched, s.reference_nm, s.age_ms
 
     @property
     def last_ns(self):
@@ -284,14 +284,15 @@ cdef class JointCycle:
             sample.link_position_rad = sample.motor_position_rad / self.gear_ratio
         sample.temperature_c = record.temperature_c
         self.core.advance(&sample, network_wanted, &e)
+        record.reference_nm = self.rules.reference(sample.dt_s, record.sensor_torque_nm)
         status = self.rules.judge(
-            &e, &sample, record.sensor_torque_nm, statusword, starting, network_wanted, &flags
+            &e, &sample, record.reference_nm, statusword, starting, network_wanted, &flags
         )
         self.now.published = field_of(e.torque_nm, e.sigma_nm, status)
         if not has_torque(status):
             e.torque_nm = e.sigma_nm = NAN
-        elif status != STANDSTILL and not isnan(record.sensor_torque_nm):
-            self.rules.tally.error(e.torque_nm - record.sensor_torque_nm)
+        elif status != STANDSTILL and not isnan(record.reference_nm):
+            self.rules.tally.error(e.torque_nm - record.reference_nm, e.torque_nm - record.sensor_torque_nm)
         record.current_a, record.motor_position_rad = sample.current_a, sample.motor_position_rad
         record.link_position_rad = sample.link_position_rad if self.link_count != NULL else NAN
         record.motor_velocity_rad_s = sample.motor_velocity_rad_s
@@ -309,7 +310,7 @@ cdef class JointCycle:
         self.now.published = field_of(NAN, INFINITY, status)
         record.current_a = record.motor_position_rad = record.motor_velocity_rad_s = record.link_position_rad = NAN
         record.torque_nm = record.sigma_nm = record.tob_nm = record.physics_nm = record.network_nm = NAN
-        record.dt_s = NAN
+        record.dt_s = record.reference_nm = NAN
         record.statusword, record.input_flags = 0, flags
         self.now.status = record.status = status
         self.now.latched = self.rules.status.now.latched
@@ -317,7 +318,7 @@ cdef class JointCycle:
     cdef int reference(self) noexcept nogil:
         """Record the sensor's torque and its 6150h in this cycle, NaN and 0 where there is none; return its flag."""
         cdef JointBlock *record = &self.now.sample
-        record.sensor_torque_nm, record.sensor_status = NAN, 0
+        record.sensor_torque_nm, record.sensor_status, record.age_ms = NAN, 0, self.rules.age_ms
         if self.sensor == NULL or not self.sensor.fresh:
             return 0
         record.sensor_status = self.sensor.values[1]

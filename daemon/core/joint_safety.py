@@ -7,6 +7,7 @@ from typing import Final
 
 from jtqd.daemon.config import Config, SafetySettings
 from jtqd.daemon.shared import faults
+from jtqd.estimator.age import bandwidth_of
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.plausibility import Plausibility
 from jtqd.estimator.settings import EstimatorSettings
@@ -27,10 +28,14 @@ class JointSafety:
         network_limit_nm: a network further from physics than this has been dropped by the estimator.
         deviation_cycles: length of the fault `deviation`, 0 where it is not latched.
         sensor_zero_nm: of the torque sensor, beside sigma: standard deviation.
+        bandwidth_rad_s: that makes the estimate's age (`age`); 0 without a joint: its sensor is taken as it is.
+        max_gap_s: that a sensor of the same age bridges.
     """
 
     __slots__ = (
+        "bandwidth_rad_s",
         "deviation_cycles",
+        "max_gap_s",
         "network_limit_nm",
         "plausibility",
         "sensor_zero_nm",
@@ -50,10 +55,12 @@ class JointSafety:
         self.torque_limit_nm, self.network_limit_nm = TORQUE_RANGE_NM, inf
         self.deviation_cycles = 0
         self.sensor_zero_nm = 0.0
+        self.bandwidth_rad_s, self.max_gap_s = 0.0, 0.05
         if self.settings.latch & faults.DEVIATION:
             self.deviation_cycles = max(1, round(self.settings.deviation_s * 1e9 / period_ns))
         if joint is None or estimator is None:
             return
+        self.bandwidth_rad_s, self.max_gap_s = bandwidth_of(joint, estimator), estimator.max_gap_s
         self.torque_limit_nm = min(TORQUE_RANGE_NM, estimator.torque_limit * joint.rated_torque_nm)
         self.network_limit_nm = estimator.network_limit * joint.rated_torque_nm
         self.sensor_zero_nm = estimator.sensor_zero_nm(joint.rated_torque_nm)

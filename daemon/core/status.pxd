@@ -2,6 +2,7 @@
 
 from libc.stdint cimport int64_t, uint64_t
 
+from jtqd.estimator.observer cimport Reference
 from jtqd.estimator.plausibility cimport Plausibility
 from jtqd.estimator.sample cimport Sample, Values
 
@@ -30,7 +31,7 @@ cdef class JointTally:
     cdef int number
     cdef int faults(self, StatusState *state) noexcept nogil
     cdef void network(self, const Values *estimate, bint wanted, double limit_nm) noexcept nogil
-    cdef void error(self, double difference_nm) noexcept nogil
+    cdef void error(self, double aligned_nm, double now_nm) noexcept nogil
 
 cdef class JointRules:
     cdef JointTally tally
@@ -39,11 +40,14 @@ cdef class JointRules:
     cdef bint is_checked, with_network
     cdef double torque_limit_nm, network_limit_nm, deviation_sigmas, sensor_variance
     cdef int64_t deviation_cycles, deviates
+    cdef double bandwidth, max_gap, age_ms
+    cdef Reference seen
+    cdef double reference(self, double dt, double sensor_nm) noexcept nogil
     cdef int judge(
         self,
         const Values *estimate,
         const Sample *sample,
-        double sensor_nm,
+        double reference_nm,
         int statusword,
         bint starting,
         bint network_wanted,
@@ -51,4 +55,4 @@ cdef class JointRules:
     ) noexcept nogil
     cdef int stale(self, int *flags) noexcept nogil
     cdef int told(self) noexcept nogil
-    cdef int faults_of(self, const Values *estimate, double sensor_nm, bint network_wanted) noexcept nogil
+    cdef int faults_of(self, const Values *estimate, double reference_nm, bint network_wanted) noexcept nogil

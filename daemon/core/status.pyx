@@ -23,7 +23,7 @@ The statuses have an order, from good to bad:
 No clock and no randomness: the same statuses and faults give the same answer again, in the loop and from a log.
 """
 
-from libc.math cimport INFINITY, fabs, isnan, sqrt
+from libc.math cimport INFINITY, NAN, fabs, isnan, sqrt
 from libc.stdint cimport int64_t, uint64_t
 
 from typing import Final
@@ -33,6 +33,7 @@ from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared import faults
 from jtqd.daemon.shared.snapshot import COUNTERS
 from jtqd.estimator import status as st
+from jtqd.estimator.observer cimport follow_reference, restart_reference
 from jtqd.estimator.plausibility cimport Plausibility
 from jtqd.estimator.sample cimport Sample, Values
 
@@ -253,7 +254,7 @@ cdef class JointTally:
     def __init__(self, int number, tally):
         self.counters, self.errors = tally.counters, tally.errors
         self.number = number
-        if self.counters.shape[0] != len(COUNTERS) or self.errors.shape[0] < 2 * number + 2:
+        if self.counters.shape[0] != len(COUNTERS) or self.errors.shape[0] < 3 * number + 3:
             raise ValueError("not the counters and errors of a snapshot")
 
     cdef int faults(self, StatusState *state) noexcept nogil:
@@ -285,10 +286,11 @@ cdef class JointTally:
         else:
             self.counters[NETWORK_OUTSIDE] += 1
 
-    cdef void error(self, double difference_nm) noexcept nogil:
-        """Add the error of a published estimate against the sensor."""
-        self.errors[2 * self.number] += difference_nm * difference_nm
-        self.errors[2 * self.number + 1] += 1.0
+    cdef void error(self, double aligned_nm, double now_nm) noexcept nogil:
+        """Add the error of a published estimate against the sensor of its age, and against the sensor now."""
+        self.errors[3 * self.number] += aligned_nm * aligned_nm
+        self.errors[3 * self.number + 1] += now_nm * now_nm
+        self.errors[3 * self.number + 2] += 1.0
 
 
 # The rules of docs/safety.md ------------------------------------------------------------------------------------------
@@ -320,6 +322,7 @@ cdef class JointRules:
 
     def __init__(self, int number, tally, safety, bint with_network):
         self.tally = JointTally(number, tally)
+        restart_reference(&self.seen)
         self.status = JointStatus(safety.settings)
         self.use(safety, with_network)
 
@@ -331,6 +334,10 @@ cdef class JointRules:
         self.deviation_cycles, self.deviation_sigmas = safety.deviation_cycles, safety.settings.deviation_sigmas
         self.sensor_variance = safety.sensor_zero_nm**2
         self.deviates = 0
+        if safety.bandwidth_rad_s != self.bandwidth:
+            restart_reference(&self.seen)
+        self.bandwidth, self.max_gap = safety.bandwidth_rad_s, safety.max_gap_s
+        self.age_ms = 1e3 / self.bandwidth if self.bandwidth else NAN
         self.status.use(safety.settings)
 
     def begin_again(self):
@@ -339,11 +346,17 @@ cdef class JointRules:
         if self.is_checked:
             self.plausibility.reset()
 
+    cdef double reference(self, double dt, double sensor_nm) noexcept nogil:
+        """Return the sensor [Nm] as old as the estimate of this sample, dt after the one before; NaN where unknown."""
+        if not self.bandwidth:
+            return sensor_nm
+        return follow_reference(&self.seen, self.bandwidth, self.max_gap, dt, sensor_nm)
+
     cdef int judge(
         self,
         const Values *estimate,
         const Sample *sample,
-        double sensor_nm,
+        double reference_nm,
         int statusword,
         bint starting,
         bint network_wanted,
@@ -351,7 +364,7 @@ cdef class JointRules:
     ) noexcept nogil:
         """Return the status to publish and set its bits of `input_flags`.
 
-        sample: what the estimate was made of; sensor_nm: NaN where unknown; while `starting`, an estimate with a number has
+        sample: what the estimate was made of; reference_nm: of the same age, NaN where unknown; while `starting`, an estimate with a number has
         status 1 instead.
         """
         cdef int found = 0, status = estimate.status
@@ -368,7 +381,7 @@ cdef class JointRules:
         if not _powered(statusword):
             status = _unpowered(statusword)
         elif has_torque(status):
-            found |= self.faults_of(estimate, sensor_nm, network_wanted)
+            found |= self.faults_of(estimate, reference_nm, network_wanted)
             if starting:
                 status = STARTING
         elif status == INVALID:
@@ -389,7 +402,7 @@ cdef class JointRules:
             return self.tally.faults(&self.status.now)
         return 0
 
-    cdef int faults_of(self, const Values *estimate, double sensor_nm, bint network_wanted) noexcept nogil:
+    cdef int faults_of(self, const Values *estimate, double reference_nm, bint network_wanted) noexcept nogil:
         """Return the faults of numbers that the estimator marked as good."""
         cdef double torque = estimate.torque_nm, sigma = estimate.sigma_nm, network = estimate.network_nm
         cdef double limit = self.torque_limit_nm
@@ -400,9 +413,9 @@ cdef class JointRules:
         if self.with_network and (estimate.status == DEGRADED or network - network != 0.0):
             self.tally.network(estimate, network_wanted, self.network_limit_nm)
         if self.deviation_cycles:
-            if fabs(torque - sensor_nm) <= self.deviation_sigmas * sqrt(sigma * sigma + self.sensor_variance):
+            if fabs(torque - reference_nm) <= self.deviation_sigmas * sqrt(sigma * sigma + self.sensor_variance):
                 self.deviates = 0
-            elif not isnan(sensor_nm):
+            elif not isnan(reference_nm):
                 self.deviates += 1
             if self.deviates >= self.deviation_cycles:
                 found |= FAULT_DEVIATION

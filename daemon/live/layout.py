@@ -30,7 +30,7 @@ CYCLE_TOPIC = f"{_PREFIX}cycle"
 """Topic with period_us, work_us, late_us [us]."""
 
 _JOINT_SCRIPT = """\
-// Sigma band of the estimate, and its residual to the torque sensor. NaN where either is not known.
+// Sigma band of the estimate, and its residual to the torque sensor of the same age. NaN where either is not known.
 import { Input } from "./types";
 
 type Output = { upper_nm: number; lower_nm: number; minus_sigma_nm: number; residual_nm: number };
@@ -44,7 +44,7 @@ export default function script(event: Input<"%(state)s">): Output {
     upper_nm: message.torque_nm + message.sigma_nm,
     lower_nm: message.torque_nm - message.sigma_nm,
     minus_sigma_nm: -message.sigma_nm,
-    residual_nm: message.torque_nm - message.sensor_torque_nm,
+    residual_nm: message.torque_nm - message.reference_nm,
   };
 }
 """
@@ -157,12 +157,12 @@ def _torque_panels(joint: int) -> dict[str, dict[str, Any]]:
             f"Joint {joint}: torque, Nm",
             # Drawn from the last to the first: the estimate lies on top.
             _series(f"{state}.torque_nm", "estimate", _BLUE, 1.5),
-            _series(f"{state}.sensor_torque_nm", "sensor", _ORANGE),
+            _series(f"{state}.reference_nm", "sensor, as old as the estimate", _ORANGE),
             _series(f"{made}.upper_nm", "estimate + sigma", _PALE_BLUE),
             _series(f"{made}.lower_nm", "estimate - sigma", _PALE_BLUE),
         ),
         f"Plot!residual{joint}": _plot(
-            f"Joint {joint}: estimate - sensor, Nm",
+            f"Joint {joint}: estimate - sensor of the same age, Nm",
             _series(f"{made}.residual_nm", "residual", _RED),
             _series(f"{state}.sigma_nm", "sigma", _PALE_BLUE),
             _series(f"{made}.minus_sigma_nm", "- sigma", _PALE_BLUE),

@@ -155,6 +155,8 @@ class Diagnostics:
             "torque_nm": joint.torque_nm,
             "sigma_nm": joint.sigma_nm,
             "sensor_nm": joint.sensor_nm,
+            "reference_nm": joint.reference_nm,
+            "age_ms": joint.age_ms,
             "rmse_nm": view.rmse_nm[number - 1],
             "statusword": f"{joint.statusword:04X}h",
             "sensor_status": joint.sensor_status,

@@ -105,6 +105,8 @@ float64 tob_nm                  # [Nm] stage: classical observer
 float64 physics_nm              # [Nm] stage: physics: observer with losses, before any network
 float64 network_nm              # [Nm] stage: network
 float64 dt_s                    # [s] time step that the observer used
+float64 reference_nm            # [Nm] the torque sensor through the estimator's filter: as old as torque_nm
+float64 age_ms                  # [ms] age of torque_nm: group delay of the estimator's filter at low frequency
 uint16 statusword               # 6041h of the drive
 # Values of `status`: viewers give a field the names of the constants that stand right before it
 {_STATUS_CONSTANTS}uint16 status

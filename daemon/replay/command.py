@@ -264,6 +264,7 @@ def _messages(result: Result, number: int) -> RecordArray:
     for field, value in constants.items():
         out[field] = value
     out["channel"] = [[2 * number + 1, 2 * number + 2]]
+    nothing = np.full(len(logged), np.nan)  # of a log of before: a field that it does not have
     columns = {
         "sequence": logged["cycle"] & 0xFFFF_FFFF,
         "log_time": time_ns,
@@ -271,7 +272,10 @@ def _messages(result: Result, number: int) -> RecordArray:
         "sec": seconds.view(np.int32),
         "nanosec": nanoseconds,
         **{name: logged[name] for name in ("cycle", "sync_monotonic_ns", "sync_counter", "cycle_flags")},
-        **{name: logged[name] for name in SAMPLE.names or ()},
+        **{
+            name: logged[name] if name in (logged.dtype.names or ()) else nothing
+            for name in SAMPLE.names or ()
+        },
     }
     for field, values in columns.items():
         out[field] = values[:, np.newaxis]

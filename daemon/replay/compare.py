@@ -10,8 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from jtqd.daemon.replay.estimates import fields
+from jtqd.daemon.replay.origin import ADDED
 from jtqd.daemon.replay.runs import CUT, Steps
 from jtqd.estimator.arrays import BoolArray, FloatArray, RecordArray
+from jtqd.estimator.observer import reference_of
 from jtqd.estimator.status import NAMES, STANDSTILL
 
 
@@ -35,7 +37,7 @@ class Comparison:
         both: cycles with a torque in log and replay.
         rms_nm, max_nm, max_cycle: of the difference of the two, and where it is largest.
         sensor_cycles: cycles of these with a torque sensor beside them.
-        sensor_logged_nm, sensor_replayed_nm: RMSE against the sensor, over the same cycles.
+        sensor_logged_nm, sensor_replayed_nm: RMSE against the sensor as old as each estimate, over the same cycles.
         sigma_logged_nm, sigma_replayed_nm: mean of sigma over `both`.
         status_changed: cycles whose status is another.
         changes: largest first.
@@ -64,13 +66,25 @@ class Comparison:
         }
 
 
-def compare(number: int, logged: RecordArray, replayed: RecordArray, taken: BoolArray) -> Comparison:
-    """Compare joint `number` over the cycles `taken` [n]."""
+def compare(
+    number: int,
+    logged: RecordArray,
+    replayed: RecordArray,
+    taken: BoolArray,
+    bandwidths_rad_s: tuple[float, float],
+) -> Comparison:
+    """Compare joint `number` over the cycles `taken` [n]; each estimate with the sensor of its own age.
+
+    bandwidths_rad_s: of the estimate in the log, and of the replay (`jtqd.estimator.age`).
+    """
+    sensors = [
+        reference_of(logged["sensor_torque_nm"], logged["dt_s"], each)[taken] for each in bandwidths_rad_s
+    ]
     logged, replayed = logged[taken], replayed[taken]
     both = np.isfinite(logged["torque_nm"]) & np.isfinite(replayed["torque_nm"])
     apart = np.abs(replayed["torque_nm"][both] - logged["torque_nm"][both])
-    beside = both & np.isfinite(logged["sensor_torque_nm"])
-    sensor = logged["sensor_torque_nm"][beside]
+    beside = np.logical_and.reduce([both, *map(np.isfinite, sensors)])
+    sensor, of_replay = (each[beside] for each in sensors)
     at = int(np.argmax(apart)) if len(apart) else None
     changed = logged["status"] != replayed["status"]
     return Comparison(
@@ -83,7 +97,7 @@ def compare(number: int, logged: RecordArray, replayed: RecordArray, taken: Bool
         int(logged["cycle"][both][at]) if at is not None else None,
         len(sensor),
         _rms(logged["torque_nm"][beside] - sensor),
-        _rms(replayed["torque_nm"][beside] - sensor),
+        _rms(replayed["torque_nm"][beside] - of_replay),
         float(logged["sigma_nm"][both].mean()) if both.any() else np.nan,
         float(replayed["sigma_nm"][both].mean()) if both.any() else np.nan,
         int(changed.sum()),
@@ -266,9 +280,14 @@ def identity(
     )
 
 
+def _compared(replayed: RecordArray) -> list[str]:
+    """Return the fields whose identity counts: those of before; what was ADDED follows from them."""
+    return [name for name in replayed.dtype.names or () if name not in ADDED]
+
+
 def _same(logged: RecordArray, replayed: RecordArray, tolerance: float) -> BoolArray:
     same = np.ones(len(logged), np.bool_)
-    for name in replayed.dtype.names or ():
+    for name in _compared(replayed):
         same &= _equal(logged, replayed, name, tolerance)
     return same
 
@@ -276,7 +295,7 @@ def _same(logged: RecordArray, replayed: RecordArray, tolerance: float) -> BoolA
 def _same_network(logged: RecordArray, replayed: RecordArray, limit: float) -> BoolArray:
     """Equal bit for bit but for the network's share, which differs by no more than `limit` [n]."""
     same = ~bits_equal(logged["network_nm"], replayed["network_nm"])
-    for name in replayed.dtype.names or ():
+    for name in _compared(replayed):
         if name in ("network_nm", "torque_nm", "sigma_nm"):
             same &= _equal(logged, replayed, name, limit)
         else:
@@ -325,8 +344,8 @@ def _difference(
     number: int, logged: RecordArray, replayed: RecordArray, wrong: npt.NDArray[np.intp], tolerance: float
 ) -> Difference:
     row = int(wrong[0])
-    names = [name for name in _FIELDS if name in (replayed.dtype.names or ())]
-    names += [name for name in replayed.dtype.names or () if name not in names]
+    names = [name for name in _FIELDS if name in _compared(replayed)]
+    names += [name for name in _compared(replayed) if name not in names]
     field = next(
         name
         for name in names

@@ -56,7 +56,7 @@ class _Counters:
     """Counters of the loop in shared memory; not read here."""
 
     counters: array[int] = field(default_factory=lambda: array("Q", [0] * len(COUNTERS)))
-    errors: array[float] = field(default_factory=lambda: array("d", [0.0] * 2 * cr.MOST_JOINTS))
+    errors: array[float] = field(default_factory=lambda: array("d", [0.0] * 3 * cr.MOST_JOINTS))
 
 
 @dataclass(frozen=True)

@@ -32,10 +32,13 @@ from jtqd.models.files import load_yaml
 SAMPLE = np.dtype(
     [
         (name, "<f8" if code == "d" else "<u2")
-        for name, code in zip(cr.JointRecord._fields, 12 * "d" + 4 * "H", strict=True)
+        for name, code in zip(cr.JointRecord._fields, 14 * "d" + 4 * "H", strict=True)
     ]
 )
 """What the loop records of a joint: the fields of `cycle_record.JointRecord`."""
+
+ADDED = ("reference_nm", "age_ms")
+"""Fields that logs of before do not have; a replay makes them anew."""
 
 STAMP = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])
 JOINT: dict[str, np.dtype[Any]] = {
@@ -44,7 +47,7 @@ JOINT: dict[str, np.dtype[Any]] = {
     "sync_monotonic_ns": np.dtype("<i8"),
     "sync_counter": np.dtype("u1"),
     "cycle_flags": np.dtype("u1"),
-    **{name: SAMPLE[name] for name in SAMPLE.names or ()},
+    **{name: SAMPLE[name] for name in SAMPLE.names or () if name not in ADDED},
 }
 """Of /joint/N/state: path -> type."""
 FRAMES: dict[str, np.dtype[Any]] = {

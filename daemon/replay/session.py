@@ -33,6 +33,7 @@ from jtqd.daemon.replay.runs import (
     read_pieces,
     stretches,
 )
+from jtqd.estimator.age import bandwidth_of
 from jtqd.estimator.arrays import RecordArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Joint
@@ -113,6 +114,12 @@ def other_models(origin: Origin, directory: Path | None, method: str | None) -> 
             f"{directory}: found no file for these joints, expected one of {names} or a network"
         )
     return Models(tuple(made), tuple(files))
+
+
+def _bandwidths(run: Run, models: Models, number: int) -> tuple[float, float]:
+    """Return what makes the age of joint `number`'s estimate, in the log and in the replay [rad/s]."""
+    logged, replayed = run.origin.config.joints[number - 1].joint, models.joints[number - 1]
+    return bandwidth_of(logged, run.origin.config.estimator), bandwidth_of(replayed.joint, replayed.settings)
 
 
 def _named(path: Path) -> str:
@@ -335,7 +342,7 @@ def _replay_run(
             limit = NATIVE_LIMIT * min(each.joint.rated_torque_nm for each in models.joints)
             same = identity(logged, found.joints, steps, estimate, network_nm=limit)
     comparisons = tuple(
-        compare(number, *both, _known(run, same, number))
+        compare(number, *both, _known(run, same, number), _bandwidths(run, models, number))
         for number, both in enumerate(zip(logged, found.joints, strict=True), start=1)
     )
     return Result(

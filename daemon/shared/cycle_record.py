@@ -22,7 +22,7 @@ from typing import Final, NamedTuple
 MOST_JOINTS: Final = 4
 """Joints of one bus: two estimate PDOs of two each."""
 
-JOINT_FORMAT = "12d4H"
+JOINT_FORMAT = "14d4H"
 HEADER_FORMAT = "QqqIIiI8B"
 
 HEADER = struct.Struct("<" + HEADER_FORMAT)
@@ -127,6 +127,10 @@ class JointRecord(NamedTuple):
     physics_nm: float
     network_nm: float
     dt_s: float
+    reference_nm: float
+    """`sensor_torque_nm` through the estimator's filter: as old as `torque_nm`; NaN until it has settled."""
+    age_ms: float
+    """Group delay of the estimate at low frequency; NaN where no joint file is known."""
     statusword: int
     status: int
     sensor_status: int

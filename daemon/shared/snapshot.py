@@ -83,7 +83,7 @@ BUS_COUNTERS = (
 
 
 class JointView(NamedTuple):
-    """Last estimate of one joint; NaN where unknown. `sensor_nm` is the reference in the same cycle."""
+    """Last estimate of one joint; NaN where unknown. `sensor_nm` is the sensor in the same cycle."""
 
     torque_nm: float
     sigma_nm: float
@@ -98,6 +98,10 @@ class JointView(NamedTuple):
     """Inputs and faults of that cycle, as in the cycle record (`daemon/shared/cycle_record.py`)."""
     latched: int = 0
     """Bits of the faults that are latched (`daemon/shared/cycle_record.py`)."""
+    reference_nm: float = float("nan")
+    """The sensor as old as the estimate (`daemon/shared/cycle_record.py`): what the estimate is compared with."""
+    age_ms: float = float("nan")
+    """Group delay of the estimate."""
 
 
 class Measured(NamedTuple):
@@ -149,6 +153,7 @@ class View(NamedTuple):
     joints: tuple[JointView, ...]
     counters: dict[str, int]
     rmse_nm: tuple[float, ...]
+    """Of each joint in motion, against the sensor as old as the estimate."""
     node_states: bytes
     unconfigured: tuple[int, ...]
     """Node-IDs that restarted and wait for their configuration."""
@@ -164,6 +169,8 @@ class View(NamedTuple):
     """Kernel stamp of the last heartbeat of each node-ID, CLOCK_REALTIME; 0 never."""
     restarts: tuple[int, ...] = (0,) * MAX_NODE
     """Boot-up messages of each node-ID."""
+    rmse_now_nm: tuple[float, ...] = ()
+    """As `rmse_nm`, against the sensor now: with the estimate's age as an error."""
 
 
 def quantiles(bins: tuple[int, ...], bin_ns: int, largest_ns: int, shares: tuple[float, ...]) -> list[float]:
@@ -190,7 +197,7 @@ MAX_INPUTS = 20
 _MAGIC = 0x4A54_5144_5354_4108  # "JTQDSTA", layout 8
 _HEAD = struct.Struct("<QQddQ")
 """Magic number, process, period [s], worst load, number of joints."""
-JOINT = struct.Struct("<6dHBBHH")
+JOINT = struct.Struct("<6dHBBHH2d")
 _ESTIMATE = struct.Struct(f"<qQqq{MOST_JOINTS}q")
 _MEASURED = struct.Struct("<6d")
 INPUT = struct.Struct("<12q")
@@ -202,7 +209,7 @@ _ESTIMATE_OFFSET = _SEQUENCE_OFFSET + 8
 ESTIMATE_SIZE = _ESTIMATE.size + MOST_JOINTS * (JOINT.size + _MEASURED.size)
 _MEASURED_OFFSET = _ESTIMATE_OFFSET + _ESTIMATE.size + MOST_JOINTS * JOINT.size
 _ERRORS_OFFSET = _MEASURED_OFFSET + MOST_JOINTS * _MEASURED.size
-_WORK_OFFSET = _ERRORS_OFFSET + MOST_JOINTS * 2 * 8
+_WORK_OFFSET = _ERRORS_OFFSET + MOST_JOINTS * 3 * 8
 _LATE_OFFSET = _WORK_OFFSET + 8 * WORK_BINS
 _STATUS_OFFSET = _LATE_OFFSET + 8 * LATE_BINS
 _INPUTS_OFFSET = _STATUS_OFFSET + 8 * MOST_JOINTS * STATUS_CODES
@@ -237,7 +244,8 @@ class Snapshot:
         counters: memory of the counters, one unsigned 64-bit word each, in the order of `COUNTERS`.
         work: histogram of the work per cycle, `WORK_BIN_NS` per bin, the last bin takes the rest.
         late: histogram of the SYNC's lateness, `LATE_BIN_NS` per bin.
-        errors: sum of squared errors and number of samples of each joint: [sum 1, n 1, sum 2, n 2, ...].
+        errors: of each joint the sums of squared errors against the sensor of the estimate's age and against the sensor
+            now, and the number of samples.
         status_cycles: cycles that joint 1 has spent in each of the 16 status codes, then joint 2, ...
         inputs: one `INPUT` for each input PDO.
         node_states: last heartbeat state of each node-ID.
@@ -336,9 +344,13 @@ class SnapshotReader:
             InputView._make(INPUT.unpack_from(memory, _INPUTS_OFFSET + n * INPUT.size))
             for n in range(MAX_INPUTS)
         )
-        sums = struct.unpack_from(f"<{2 * count}d", memory, _ERRORS_OFFSET)
-        rmse = tuple(
-            (sums[2 * n] / sums[2 * n + 1]) ** 0.5 if sums[2 * n + 1] else float("nan") for n in numbers
+        sums = struct.unpack_from(f"<{3 * count}d", memory, _ERRORS_OFFSET)
+        aligned, now = (
+            tuple(
+                (sums[3 * n + k] / sums[3 * n + 2]) ** 0.5 if sums[3 * n + 2] else float("nan")
+                for n in numbers
+            )
+            for k in (0, 1)
         )
         return View(
             pid,
@@ -349,7 +361,7 @@ class SnapshotReader:
             worst_load,
             joints,
             dict(zip(COUNTERS, words, strict=True)),
-            rmse,
+            aligned,
             bytes(memory[_NODES_OFFSET:_CONFIGURED_OFFSET]),
             tuple(node for node, flag in enumerate(memory[_UNCONFIGURED_OFFSET:_FACTORS_OFFSET]) if flag),
             monotonic_ns,
@@ -359,6 +371,7 @@ class SnapshotReader:
             tuple(each for each in inputs if any(each)),
             struct.unpack_from(f"<{MAX_NODE}q", memory, _HEARD_OFFSET),
             struct.unpack_from(f"<{MAX_NODE}Q", memory, _RESTARTS_OFFSET),
+            now,
         )
 
     def work_us(self, *shares: float) -> list[float]:

@@ -78,8 +78,8 @@ def node_subjects(config: Config) -> dict[int, Subject]:
 class Deviation:
     """Detects an estimate that stays further from the torque sensor than its sigma allows.
 
-    It begins after DEVIATION_S beyond DEVIATION_SIGMAS and ends after as long within NEAR_SIGMAS: delays and friction at
-    a reversal are over sooner.
+    It begins after DEVIATION_S beyond DEVIATION_SIGMAS and ends after as long within NEAR_SIGMAS: friction at a reversal is
+    over sooner. Both are of one age (`JointView.reference_nm`).
     """
 
     def __init__(self) -> None:
@@ -92,7 +92,7 @@ class Deviation:
 
         sensor_zero_nm: of the torque sensor, beside sigma: standard deviation.
         """
-        difference = abs(seen.torque_nm - seen.sensor_nm)
+        difference = abs(seen.torque_nm - seen.reference_nm)
         if seen.status not in st.PUBLISHED or not isfinite(difference) or not seen.sigma_nm > 0.0:
             return self.present
         sigmas = difference / hypot(seen.sigma_nm, sensor_zero_nm)
@@ -277,9 +277,7 @@ class Health:
             self._observe_status(joint, seen, limit_nm, now_s)
             if advanced:
                 far = joint.deviation.update(seen, now_s, zero_nm)
-                text = (
-                    f"{seen.torque_nm:.2f} Nm against {seen.sensor_nm:.2f} Nm, sigma {seen.sigma_nm:.2f} Nm"
-                )
+                text = f"{seen.torque_nm:.2f} Nm against {seen.reference_nm:.2f} Nm, sigma {seen.sigma_nm:.2f} Nm"
                 if far != self._conditions.is_present("deviation", joint.subject.name):
                     self._conditions.update("deviation", joint.subject, far, now_s, text)
         for node, subject in self._nodes.items():

@@ -12,10 +12,6 @@ from jtqd.daemon.shared.notices import INFO
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.estimator.checked import finite
 
-_AGES = (
-    "              (estimate and sensor reading of the same cycle;\n"
-    "              the RMSE includes the delay of the estimate, about 5 ms)"
-)
 _REFUSED = ("overruns", "latches", "latch_resets")
 """Counters beside those of the faults (docs/safety.md)."""
 
@@ -30,6 +26,7 @@ class Summary:
     work_us: tuple[float, float, float]
     late_us: tuple[float, float, float]
     rmse_nm: tuple[float, ...]
+    """Of each joint in motion, against the sensor as old as the estimate."""
     counters: dict[str, int]
     refused: tuple[str, ...]
     recording: dict[str, Any] | None
@@ -40,6 +37,9 @@ class Summary:
     """What happened (`jtqd.daemon.shared.conditions`); `first_s` counts from the begin of the run."""
     stolen_s: float = 0.0
     """What a hypervisor took from the processors meanwhile (`daemon/loop/realtime.py`)."""
+    rmse_now_nm: tuple[float, ...] = ()
+    """Against the sensor now: with the estimate's age as an error, as a controller meets it."""
+    age_ms: tuple[float, ...] = ()
 
     @property
     def exit_status(self) -> int:
@@ -57,6 +57,8 @@ class Summary:
             "work_us": dict(zip(("p50", "p99", "max"), map(finite, self.work_us), strict=True)),
             "late_us": dict(zip(("p50", "p99", "max"), map(finite, self.late_us), strict=True)),
             "rmse_nm": {f"joint_{n}": finite(rmse) for n, rmse in enumerate(self.rmse_nm, start=1)},
+            "rmse_now_nm": {f"joint_{n}": finite(rmse) for n, rmse in enumerate(self.rmse_now_nm, start=1)},
+            "age_ms": {f"joint_{n}": finite(age) for n, age in enumerate(self.age_ms, start=1)},
             "deviations": {f"joint_{n}": self._deviations(n) for n in range(1, len(self.rmse_nm) + 1)},
             "conditions": [
                 each._asdict() | {"total_s": round(each.total_s, 3), "first_s": round(each.first_s, 3)}
@@ -89,11 +91,13 @@ class Summary:
         ]
         if self.stolen_s > 0.0:
             lines.append(f"processors    {self.stolen_s:.2f} s stolen by the hypervisor")
-        for joint, rmse in enumerate(self.rmse_nm, start=1):
-            shown = f"{rmse:.3f} Nm against the sensor in motion" if isfinite(rmse) else "no reference"
+        for joint, (rmse, now, age) in enumerate(
+            zip(self.rmse_nm, self.rmse_now_nm, self.age_ms, strict=False), start=1
+        ):
+            shown = "no reference"
+            if isfinite(rmse):
+                shown = f"{rmse:.3f} Nm against the sensor in motion, both {age:.2f} ms old ({now:.3f} Nm against it now)"
             lines.append(f"RMSE joint {joint}  {shown}")
-        if any(map(isfinite, self.rmse_nm)):
-            lines.append(_AGES)
         happened = [each for each in self.conditions if CATALOGUE[each.name].severity > INFO]
         for n, each in enumerate(happened):
             times = "once" if each.times == 1 else f"{each.times} times"
@@ -180,6 +184,8 @@ def summary_of(
         work_us=(p50, p99, worst),
         late_us=(late50, late99, late_worst),
         rmse_nm=view.rmse_nm,
+        rmse_now_nm=view.rmse_now_nm,
+        age_ms=tuple(each.age_ms for each in view.joints),
         counters=view.counters,
         refused=tuple(refused),
         recording=recording,

@@ -99,8 +99,8 @@ def _cells(number: int, joint: JointView) -> dict[str, str | Text]:
         "joint": str(number),
         "torque [Nm]": _number(joint.torque_nm) if known else "-",
         "sigma [Nm]": _number(joint.sigma_nm) if known else "-",
-        "sensor [Nm]": _number(joint.sensor_nm),
-        "error [Nm]": _number(joint.torque_nm - joint.sensor_nm) if known else "-",
+        "sensor [Nm]": _number(joint.reference_nm),
+        "error [Nm]": _number(joint.torque_nm - joint.reference_nm) if known else "-",
         "status": Text(name, style=COLOURS.get(name, "bold red")),
     }
 

@@ -85,5 +85,6 @@ JOINT_PARAMETERS = (
     "stiffness_nm_per_rad",
     "damping_nms_per_rad",
     "rated_torque_nm",
+    "age_ms",
 )
-"""Sub-indices 1.. of `PARAMETERS`: fields of the joint file."""
+"""Sub-indices 1.. of `PARAMETERS`: fields of the joint file, and the age of its estimate."""

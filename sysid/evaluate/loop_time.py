@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.methods import make_estimator
-from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.settings import recommended
 from jtqd.sysid.evaluate.inputs import JudgedRun
 from jtqd.sysid.evaluate.methods import OURS, PAPERS, JointModels
 
@@ -77,9 +77,7 @@ def _costs_us(
 ) -> dict[str, float]:
     """Return the median cost of a step [us] by method."""
     steps = {
-        method: make_estimator(
-            models.joint, EstimatorSettings(method=method), models.networks.get(method)
-        ).step
+        method: make_estimator(models.joint, recommended(method), models.networks.get(method)).step
         for method in METHODS
     }
     took: dict[str, list[int]] = {method: [] for method in METHODS}

@@ -17,7 +17,7 @@ import json
 import re
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
@@ -25,6 +25,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from jtqd.estimator.age import bandwidth_of
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.estimator import FusedEstimator, observe_run, quadrants
@@ -32,7 +33,7 @@ from jtqd.estimator.joint import Joint
 from jtqd.estimator.methods import AnyNetwork, estimate_columns, load_network
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import EstimateRun, JointColumns, ObservedRun
-from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.settings import EstimatorSettings, recommended
 from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
 from jtqd.models.files import load_joint
 
@@ -123,6 +124,7 @@ TITLES: Final = MappingProxyType(
 """Methods in the order of every table. `physics` is `fused` without its network; the others are jtqd's own names."""
 
 OURS: Final = "fused"
+PAPERS_BANDWIDTH: Final = EstimatorSettings().bandwidth_rad_s
 PAPERS: Final = "network"
 
 
@@ -149,11 +151,11 @@ class JointModels:
         runs = {}
         for method in self.methods:
             if method not in ("physics", OURS):
-                settings = EstimatorSettings(method=method)
+                settings = recommended(method)
                 runs[method] = estimate_columns(
                     self.joint, settings, self.networks.get(method), time_s, columns
                 )
-        settings = EstimatorSettings(method=OURS, track_zeros=False)  # one observer serves both
+        settings = replace(recommended(OURS), track_zeros=False)  # one observer serves both
         torsion = None if self.joint.fused is None else self.joint.fused.torsion
         dt = np.diff(time_s, prepend=time_s[0])
         current, motor, velocity, link = (getattr(columns, name) for name in _INPUTS)
@@ -242,7 +244,8 @@ Flags = NDArray[np.bool_]
 class Samples:
     """Arrays [n] of one joint (`number`) in one run (`run`).
 
-    sensor_nm: torque sensor, filtered like the estimates; raw_nm: G Kt i less the rotor's share, whose sign with the
+    sensor_nm: torque sensor, as old as the paper's estimates; sensors_nm: by method, for those that are younger;
+    bandwidth_rad_s: by method, of the filter that makes its age; raw_nm: G Kt i less the rotor's share, whose sign with the
     velocity's [rad/s, joint side] makes the quadrant (index into QUADRANTS); estimate_nm, sigma_nm, status: by method;
     scored: all methods move and have a value; standing: all have a value and stand still; missing: settled, but some
     method has no value; temperature_c: NaN where the run has none; bare_nm: the paper's network by itself, without the
@@ -267,11 +270,17 @@ class Samples:
     missing: Flags
     bare_nm: FloatArray
     true_nm: FloatArray | None = None
+    sensors_nm: Mapping[str, FloatArray] = field(default_factory=dict)
+    bandwidth_rad_s: Mapping[str, float] = field(default_factory=dict)
     reference_nm: float = 0.0
 
+    def sensor_of(self, method: str) -> FloatArray:
+        """Return the sensor [n] as old as a method's estimate [Nm]."""
+        return self.sensors_nm.get(method, self.sensor_nm)
+
     def error_nm(self, method: str) -> FloatArray:
-        """Estimate less sensor [n] [Nm]."""
-        return self.estimate_nm[method] - self.sensor_nm
+        """Estimate less sensor of the same age [n] [Nm]."""
+        return self.estimate_nm[method] - self.sensor_of(method)
 
 
 def take_samples(
@@ -289,7 +298,12 @@ def take_samples(
     if columns.torque_nm is None:
         raise ValueError(f"{run}: j{models.number}.torque_nm: missing")
     dt = np.diff(time_s, prepend=time_s[0])
-    sensor = low_pass(columns.torque_nm, dt, EstimatorSettings().bandwidth_rad_s)
+    rates = {
+        method: bandwidth_of(models.joint, recommended(OURS if method == "physics" else method))
+        for method in runs
+    }
+    sensors = {rate: low_pass(columns.torque_nm, dt, rate) for rate in {PAPERS_BANDWIDTH, *rates.values()}}
+    sensor = sensors[PAPERS_BANDWIDTH]
     settled = time_s - time_s[0] >= SETTLE_S
     published = settled & np.logical_and.reduce([np.isfinite(each.torque_nm) for each in runs.values()])
     moving = np.logical_and.reduce([np.isin(each.status, (VALID, DEGRADED)) for each in runs.values()])
@@ -314,4 +328,6 @@ def take_samples(
         bare_nm=np.full_like(sensor, np.nan) if paper is None else paper.network_nm,
         true_nm=true_nm,
         reference_nm=0.0 if models.joint.fused is None else models.joint.fused.sigma.reference_nm,
+        sensors_nm={method: sensors[rate] for method, rate in rates.items() if rate != PAPERS_BANDWIDTH},
+        bandwidth_rad_s=rates,
     )

@@ -389,8 +389,8 @@ def largest_jump(samples: Iterable[Samples], method: str, *, passage: bool = Fal
             continue
         reach = round(0.5 * WINDOW_S / float(np.median(np.diff(each.time_s))))
         estimate = each.estimate_nm[method]
-        jump = jumps_around(estimate, each.sensor_nm, 2 * reach + 1, reach)
-        strict = jumps_around(estimate, each.sensor_nm, 2 * reach + 1)
+        jump = jumps_around(estimate, each.sensor_of(method), 2 * reach + 1, reach)
+        strict = jumps_around(estimate, each.sensor_of(method), 2 * reach + 1)
         elsewhere.append(jump[each.scored & np.isfinite(jump)])
         for of, one in _all_crossings(each):
             inside = slice(one.at, one.at + 1)

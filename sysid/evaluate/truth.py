@@ -6,7 +6,7 @@ has noise, a zero of the day and the links' inertia in it; an interval that hold
 `now`: the estimate against the torque at the same instant, with the estimate's own age as an error, as a controller sees it.
 Intervals are scored against the torque where a run has it: sigma is that of the torque (`for_intervals`).
 
-`aligned`: against the torque passed through the estimator's filter, as the tables against the sensor do.
+`aligned`: against the torque passed through the filter of the method's age, as the tables against the sensor do.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ import numpy as np
 
 from jtqd.estimator.estimator import STANDSTILL_SIGMAS
 from jtqd.estimator.observer import low_pass
-from jtqd.estimator.settings import EstimatorSettings
-from jtqd.sysid.evaluate.methods import Samples
+from jtqd.sysid.evaluate.methods import PAPERS_BANDWIDTH, Samples
 from jtqd.sysid.evaluate.scores import IntervalTables, Row, Standstill, interval_tables, row, standstill
 
 _OURS: Final = ("physics", "fused")
@@ -28,14 +27,18 @@ _OURS: Final = ("physics", "fused")
 
 
 def for_intervals(samples: Samples) -> Samples:
-    """Return samples whose `sensor_nm` an interval is to hold: the true torque, aligned, where the run has it.
+    """Return samples whose `sensor_of` an interval is to hold: the true torque, aligned, where the run has it.
 
     Else the sensor, and sigma of ours grows by the sensor's zero, which the comparison contains: at standstill, where sigma
     is a half width of STANDSTILL_SIGMAS, by as many.
     """
     if samples.true_nm is not None:
         dt = np.diff(samples.time_s, prepend=samples.time_s[0])
-        return replace(samples, sensor_nm=low_pass(samples.true_nm, dt, EstimatorSettings().bandwidth_rad_s))
+        young = {
+            method: low_pass(samples.true_nm, dt, samples.bandwidth_rad_s[method])
+            for method in samples.sensors_nm
+        }
+        return replace(samples, sensor_nm=low_pass(samples.true_nm, dt, PAPERS_BANDWIDTH), sensors_nm=young)
     wider = samples.reference_nm * np.where(samples.standing, STANDSTILL_SIGMAS, 1.0)
     sigma = {
         method: np.hypot(values, wider) if method in _OURS else values
@@ -60,7 +63,7 @@ def truth_tables(samples: Sequence[Samples]) -> TruthTables | None:
     for each in samples:
         if each.true_nm is None:
             continue
-        now.append(replace(each, sensor_nm=each.true_nm))
+        now.append(replace(each, sensor_nm=each.true_nm, sensors_nm={}))
         aligned.append(for_intervals(each))
     if not now:
         return None

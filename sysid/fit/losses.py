@@ -5,7 +5,8 @@
 s is the observer's direction; L_+ and L_- are linear in their node values (jtqd.estimator.losses). zero_r (the
 sensor's zero) and u_r (viscous friction of that run against the mean) are random effects with a prior width, the
 ripple waves have a wide one: none of them enters the result, all of them would bias it. Curvature over the nodes is
-penalised, and where there are no data the nodes fall back on the joint file's friction. g(T) is
+penalised, and where there are no data the nodes fall back on the joint file's friction. Constant and viscous part of every
+load and the Stribeck peak are at least 0: friction takes energy, and a fit of a few runs may not say otherwise. g(T) is
 (exp(-b (T - T0)) - 1)/b with b = kappa/Fv, the viscous_per_k, found by repetition; it has a prior.
 """
 
@@ -16,6 +17,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.optimize import lsq_linear
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import AdditiveLoss, Friction, LossSide
@@ -36,6 +39,9 @@ _RIPPLE: Final = slice(2 * _ROWS, 2 * _ROWS + 4)
 _THERMAL: Final = 2 * _ROWS + 4
 _COMMON: Final = 2 * _ROWS + 5  # what all runs share; zero_r and u_r of each run follow
 
+_SIGNED: Final = np.concatenate(
+    [side * _ROWS + np.r_[: 2 * _NODES, 3 * _NODES] for side in range(2)]
+)  # constant and viscous part of every load, Stribeck peak: friction takes energy; a quadratic part may be below 0
 PER_K_PRIOR = (0.02, 0.012)  # 1/K: oil and grease lose 2 to 3.5 % of viscosity per kelvin
 _PER_K_LIMIT: Final = 0.1  # what a joint file may hold
 _REPETITIONS: Final = 3
@@ -199,7 +205,21 @@ def _solve(
         left[np.ix_(at, at)] += weight * (block.x.T @ block.x)
         right[at] += weight * (block.x.T @ block.y)
     covariance = np.asarray(np.linalg.inv(left), np.float64)
-    return covariance @ right, covariance
+    values = covariance @ right
+    if (values[_SIGNED] < 0.0).any():
+        values = _bounded(left, right)
+    return values, covariance
+
+
+def _bounded(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Return the most probable values of which none in _SIGNED is below 0: bounded least squares (Stark and Parker 1995)."""
+    root = np.linalg.cholesky(left)
+    lowest = np.full(len(left), -np.inf)
+    lowest[_SIGNED] = 0.0
+    found = lsq_linear(root.T, solve_triangular(root, right, lower=True), (lowest, np.inf), method="bvls")
+    result: FloatArray = found.x
+    result[_SIGNED] = np.maximum(result[_SIGNED], 0.0)
+    return result
 
 
 def _residual(blocks: Sequence[_Block], w: FloatArray) -> float:

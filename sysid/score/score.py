@@ -17,12 +17,12 @@ from typing import Any, Final
 
 import numpy as np
 
+from jtqd.estimator.age import aligned
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.methods import estimate_columns
-from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import RunTable
-from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.settings import recommended
 from jtqd.sysid.diagnosis.dataset import without_known_effects
 from jtqd.sysid.diagnosis.diagnose import with_effects_applied
 from jtqd.sysid.diagnosis.gain import free_run
@@ -96,9 +96,9 @@ def errors_on(name: str, table: RunTable, number: int, joint: Joint) -> RunError
             method == "fused" and joint.fused is None
         ):
             continue
-        settings = EstimatorSettings(method=method)
+        settings = recommended(method)
         estimate = estimate_columns(joint, settings, None, table.time_s, columns).torque_nm
-        sensor = low_pass(columns.torque_nm, dt, settings.bandwidth_rad_s)
+        sensor = aligned(columns.torque_nm, dt, joint, settings)
         errors[title] = _rms((estimate - sensor)[settled])
     return RunErrors(name, errors, int(np.count_nonzero(moving)))
 

@@ -17,7 +17,7 @@ from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.losses import LossModel
 from jtqd.estimator.methods import load_network, make_estimator
 from jtqd.estimator.network import FusedNetwork, TorqueNetwork
-from jtqd.estimator.settings import METHODS, EstimatorSettings
+from jtqd.estimator.settings import METHODS, EstimatorSettings, recommended
 from tests.benchmarks.measure import quantile
 from tests.benchmarks.table import mark
 from tests.estimator.estimator_helpers import joint1, motion, small_network
@@ -52,7 +52,7 @@ def step_costs_us() -> dict[str, float]:
         data = networks.get(method)
         joint = joint_of(1) if method == "fused" else joint1()
         network = None if data is None else load_network(method, data)
-        steps[method] = make_estimator(joint, EstimatorSettings(method=method), network).step
+        steps[method] = make_estimator(joint, recommended(method), network).step
         steps[method](*_STEP)
     rounds = [
         {method: best_us(lambda step=step: step(*_STEP), rounds=1) for method, step in steps.items()}
@@ -89,7 +89,7 @@ def costs_us() -> dict[str, float]:
         ("step, fused, one effect", with_effects(1), FusedNetwork(graph)),
         ("step, fused, four effects", with_effects(4), FusedNetwork(graph)),
     ):
-        step = make_estimator(joint, EstimatorSettings(method="fused"), used).step
+        step = make_estimator(joint, recommended("fused"), used).step
         costs[name] = best_us(lambda step=step: step(*_STEP))
     run = motion(1, SAMPLES).arrays()
     began = time.process_time()
@@ -113,7 +113,7 @@ def cold_us() -> dict[str, tuple[float, float]]:
             network = load_network(method, network_of(n) if method == "fused" else small_network().data)
             if foreign[n - 1]:
                 network.perceptron = None  # type: ignore[misc]
-            steps.append(make_estimator(joint, EstimatorSettings(method=method), network).step)
+            steps.append(make_estimator(joint, recommended(method), network).step)
         return tuple(steps)
 
     cases = {

@@ -22,7 +22,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jtqd.estimator import EstimatorSettings, load_network, make_estimator, onnx_graph
+from jtqd.estimator import load_network, make_estimator, onnx_graph
+from jtqd.estimator.settings import recommended
 from jtqd.models.files import load_joint, shipped
 
 STORED = Path(__file__).with_name("instructions.json")
@@ -36,9 +37,7 @@ def work(method: str) -> None:
     fused = method == "fused"
     name = "trained/joint1.fused.onnx" if fused else "trained/joint1.onnx"
     network = load_network(method, str(shipped(name))) if method in ("network", "fused") else None
-    estimator = make_estimator(
-        load_joint(shipped("trained/joint1.yaml")), EstimatorSettings(method=method), network
-    )
+    estimator = make_estimator(load_joint(shipped("trained/joint1.yaml")), recommended(method), network)
     time = np.arange(SAMPLES) * 1e-3
     angle = np.sin(3.0 * time)
     run = estimator.run(

@@ -49,6 +49,28 @@ def put(path: str, value: object) -> Callable[[Mapping], None]:
     return change
 
 
+def first_below_zero(path: str) -> Callable[[Mapping], None]:
+    def change(fused: Mapping) -> None:
+        side, key = path.split(".")
+        fused["loss"][side][key][2] = -0.25
+
+    return change
+
+
+@pytest.mark.parametrize("way", ["positive", "negative"])
+def test_a_sign_that_friction_cannot_have_is_refused(way: str) -> None:
+    """With file, key, found and expected."""
+    message = refused(put(f"loss.{way}.stribeck_nm", -4.1))
+    assert f"fused.loss.{way}.stribeck_nm" in message
+    assert "-4.1" in message
+    assert "at least 0" in message or ">= 0" in message
+    message = refused(first_below_zero(f"{way}.viscous_nms_per_rad"))
+    assert f"fused.loss.{way}.viscous_nms_per_rad" in message
+    message = refused(put(f"loss.{way}.constant_nm", [-2.0] * len(NODES)))
+    assert f"fused.loss.{way}.constant_nm" in message
+    assert "friction takes energy" in message
+
+
 @pytest.mark.parametrize("torsion", [TORSION, None, replace(TORSION, orders_per_motor_rev=(2.0, 4.25))])
 def test_round_trip(torsion: Any) -> None:
     joint = fused_joint(3, torsion)

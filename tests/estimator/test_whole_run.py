@@ -79,7 +79,8 @@ def test_random_runs_equal_their_twin(torsion: Any, with_network: bool) -> None:
                 seed, size_nm=(0.5, 6.0)[seed % 2], envelope=patches(seed, (20.0, 40.0)).to_mapping()
             )
             network = FusedNetwork(small.data)
-        settings = replace(FUSED, bandwidth_rad_s=(200.0, 90.0)[seed % 2], link_bandwidth_rad_s=200.0)
+        own = (None, 800.0)[seed // 2 % 2]
+        settings = replace(FUSED, bandwidth_rad_s=(200.0, 90.0)[seed % 2], torsion_bandwidth_rad_s=own)
         m = with_faults(twisted(seed), seed) if seed % 4 else twisted(seed)
         temperature = temperatures(("none", "gaps", "constant", "rising")[seed // 2 % 4], seed, len(m.dt_s))
         run = compare(fused_joint(seed, torsion), settings, network, m, temperature, f"seed {seed}")

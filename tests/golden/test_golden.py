@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jtqd.estimator.observer import reference_of
 from jtqd.estimator.settings import METHODS
 from tests.benchmarks import replay_speed
 from tests.golden.reference import CASES, HERE, Case, Output, difference, replayed, store, stored
@@ -34,6 +35,16 @@ def test_golden(name: str) -> None:
         assert result.identity.explained
         assert result.identity.pdos == result.identity.pdos_equal > 1000
         assert result.identity.whole or name == "network"  # recorded when ONNX Runtime evaluated the networks
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_loop_gives_the_sensor_the_age_of_the_estimate(name: str) -> None:
+    """These configurations are older than the torsion's own bandwidth: 200 rad/s, 5 ms."""
+    for records in replayed(CASES[name])[1].joints:
+        expected = reference_of(records["sensor_torque_nm"], records["dt_s"], 200.0)
+        assert np.isfinite(expected).sum() > 500
+        np.testing.assert_array_equal(records["reference_nm"], expected)
+        assert set(records["age_ms"]) == {5.0}
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)

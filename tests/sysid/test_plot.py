@@ -23,9 +23,12 @@ ROWS = [  # status, estimate, sensor
 
 @pytest.fixture
 def log(monkeypatch):
-    names = ("sync_monotonic_ns", "status", "torque_nm", "sigma_nm", "sensor_torque_nm")
+    names = ("sync_monotonic_ns", "status", "torque_nm", "sigma_nm", "reference_nm", "age_ms")
     table = np.array(
-        [(n * 1_000_000, status, torque, 0.5, sensor) for n, (status, torque, sensor) in enumerate(ROWS)],
+        [
+            (n * 1_000_000, status, torque, 0.5, sensor, 1.25)
+            for n, (status, torque, sensor) in enumerate(ROWS)
+        ],
         dtype=[(name, "i8" if name == "sync_monotonic_ns" else "f8") for name in names],
     )
     asked = []

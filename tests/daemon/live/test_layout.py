@@ -114,9 +114,7 @@ def test_the_scripts_make_band_and_residual(made, log):
         for number in range(len(log.messages[topic]) // 2, len(log.messages[topic]))
     )
     message = next(
-        each
-        for each in messages
-        if math.isfinite(each["torque_nm"]) and math.isfinite(each["sensor_torque_nm"])
+        each for each in messages if math.isfinite(each["torque_nm"]) and math.isfinite(each["reference_nm"])
     )
     value = {
         name: eval(text, {"NaN": math.nan}, {"message": types.SimpleNamespace(**message)})
@@ -126,7 +124,7 @@ def test_the_scripts_make_band_and_residual(made, log):
     assert math.isfinite(torque)
     assert (value["upper_nm"], value["lower_nm"]) == (torque + sigma, torque - sigma)
     assert value["minus_sigma_nm"] == -sigma
-    assert value["residual_nm"] == torque - message["sensor_torque_nm"]
+    assert value["residual_nm"] == torque - message["reference_nm"]
 
 
 def test_viewers_name_status_and_kind_of_event(log):

@@ -28,7 +28,7 @@ SETTINGS = EstimatorSettings(method="fused")
 
 class Counts:
     def __init__(self) -> None:
-        self.counters, self.errors = array("Q", [0] * len(COUNTERS)), array("d", [0.0] * 4)
+        self.counters, self.errors = array("Q", [0] * len(COUNTERS)), array("d", [0.0] * 6)
 
 
 def made() -> tuple[Intake, list[JointCycle]]:

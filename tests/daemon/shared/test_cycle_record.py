@@ -8,8 +8,8 @@ import pytest
 from jtqd.daemon.shared import cycle_record as cr
 
 HEADER = (7, 1_000, 1_700_000_000_123_456_789, 0xF, 50_000, -3, 2, 240, 2, 255, 1, 2, 3, 4, 0)
-JOINT_1 = (*(0.5 + n for n in range(12)), 0x1237, 2, 0x80, 7)
-JOINT_2 = (*(-0.25 * n for n in range(11)), math.nan, 0x0250, 15, 0, 1)
+JOINT_1 = (*(0.5 + n for n in range(14)), 0x1237, 2, 0x80, 7)
+JOINT_2 = (*(-0.25 * n for n in range(13)), math.nan, 0x0250, 15, 0, 1)
 SYNC = bytes.fromhex("80000000 01 000000 f000000000000000")
 TPDO = bytes.fromhex("81010000 08 000000 0102030405060708")
 
@@ -24,13 +24,13 @@ def sample():
 
 
 def test_offsets():
-    """48 bytes of header, two joints of 104, 16 frames of 16, 16 stamps of 8, the index."""
+    """48 bytes of header, two joints of 120, 16 frames of 16, 16 stamps of 8, the index."""
     assert cr.HEADER.size == 48
-    assert cr.JOINT.size == 104
-    assert cr.HEAD.size == 256 == cr.FRAMES_OFFSET
-    assert cr.STAMPS_OFFSET == 512
-    assert cr.TAIL_OFFSET == 640
-    assert cr.RECORD_SIZE == 648
+    assert cr.JOINT.size == 120
+    assert cr.HEAD.size == 288 == cr.FRAMES_OFFSET
+    assert cr.STAMPS_OFFSET == 544
+    assert cr.TAIL_OFFSET == 672
+    assert cr.RECORD_SIZE == 680
 
 
 def test_bytes_of_the_header():
@@ -44,12 +44,12 @@ def test_bytes_of_the_header():
     assert sample()[:48] == expected
 
 
-def test_joint_blocks_lie_at_48_and_152():
+def test_joint_blocks_lie_at_48_and_168():
     record = sample()
-    assert record[48:144] == struct.pack("<12d", *JOINT_1[:12])
-    assert record[144:152] == bytes.fromhex("3712 0200 8000 0700")
-    assert record[152:248] == struct.pack("<12d", *JOINT_2[:12])
-    assert record[248:256] == bytes.fromhex("5002 0f00 0000 0100")
+    assert record[48:160] == struct.pack("<14d", *JOINT_1[:14])
+    assert record[160:168] == bytes.fromhex("3712 0200 8000 0700")
+    assert record[168:280] == struct.pack("<14d", *JOINT_2[:14])
+    assert record[280:288] == bytes.fromhex("5002 0f00 0000 0100")
 
 
 def test_fields_by_name():
@@ -64,15 +64,16 @@ def test_fields_by_name():
     assert (one.torque_nm, one.network_nm, one.dt_s) == (6.5, 10.5, 11.5)
     assert (one.statusword, one.status, one.sensor_status, one.input_flags) == (0x1237, 2, 0x80, 7)
     assert (two.motor_position_rad, two.status) == (-0.25, 15)
-    assert math.isnan(two.dt_s)
+    assert (one.reference_nm, one.age_ms) == (12.5, 13.5)
+    assert math.isnan(two.age_ms)
 
 
 def test_a_selection_of_fields_is_what_the_whole_record_says():
     record = sample()
     wanted = ("frame_count", "cycle", "late_ns")  # in any order: the record's own is kept
-    picked = cr.selection(wanted, ("status", "dt_s")).unpack_from(record)
+    picked = cr.selection(wanted, ("status", "age_ms")).unpack_from(record)
     header, one, two = cr.header_of(record), cr.joint_of(record, 1), cr.joint_of(record, 2)
-    assert picked[:5] == (header.cycle, header.late_ns, header.frame_count, one.dt_s, one.status)
+    assert picked[:5] == (header.cycle, header.late_ns, header.frame_count, one.age_ms, one.status)
     assert math.isnan(picked[5])
     assert picked[6:] == (two.status,)
     everything = cr.selection(cr.Header._fields, cr.JointRecord._fields)

@@ -27,8 +27,8 @@ from tests.daemon.loop.cycle_helpers import frame, inputs, make, turn
 
 pytestmark = pytest.mark.native
 
-ONE = (1.0, 0.1, 1.1, 1.2, math.nan, 0.9, 0x27, 2, 0, 7, 0)
-TWO = (-2.0, 0.2, -2.1, -2.2, -2.3, math.nan, 0x0F, 5, 1, 0x2403, 0x104)
+ONE = (1.0, 0.1, 1.1, 1.2, math.nan, 0.9, 0x27, 2, 0, 7, 0, 0.8, 1.25)
+TWO = (-2.0, 0.2, -2.1, -2.2, -2.3, math.nan, 0x0F, 5, 1, 0x2403, 0x104, math.nan, 5.0)
 
 
 def test_states_of_nodes_are_those_of_the_drivers() -> None:
@@ -43,14 +43,16 @@ def test_round_trip(tmp_path: Path) -> None:
     told.write(41, 17, 1_700_000_000_123_456_789, (ONE, TWO))
     for n in range(len(COUNTERS)):
         snapshot.counters[n] = n + 100
-    snapshot.errors[0], snapshot.errors[1] = 8.0, 2.0
+    snapshot.errors[0], snapshot.errors[1], snapshot.errors[2] = 8.0, 18.0, 2.0
     view = SnapshotReader(tmp_path / "s").read()
     assert (view.cycle, view.sync_counter, view.sync_realtime_ns) == (41, 17, 1_700_000_000_123_456_789)
     assert view.joints[0][:4] == ONE[:4]
     assert math.isnan(view.joints[0].network_nm)
-    assert tuple(view.joints[1])[6:] == (0x0F, 5, 1, 0x2403, 0x104)
+    assert tuple(view.joints[1])[6:11] == (0x0F, 5, 1, 0x2403, 0x104)
+    assert view.joints[0][11:] == (0.8, 1.25)
+    assert view.joints[1].age_ms == 5.0
     assert view.counters == {name: n + 100 for n, name in enumerate(COUNTERS)}
-    assert view.rmse_nm[0] == 2.0
+    assert (view.rmse_nm[0], view.rmse_now_nm[0]) == (2.0, 3.0)
     assert math.isnan(view.rmse_nm[1])
     assert (view.period_s, view.worst_load) == (1e-3, 0.848)
 

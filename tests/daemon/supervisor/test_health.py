@@ -194,7 +194,7 @@ def test_what_is_not_known_is_neither_far_nor_near():
     assert at == 20, "a moment without a number is passed over"
     assert len(watched([4.0] * 25 + [None] * 100 + [4.0] * 25)) == 1, "the episode has not ended"
     watch = Observer()
-    blind = WELL._replace(torque_nm=90.0, sensor_nm=NAN)
+    blind = WELL._replace(torque_nm=90.0, sensor_nm=NAN, reference_nm=NAN)
     for n in range(100):
         watch.lines(view(8 * n, blind), 0.05 * n)
     assert far(watch) == []

@@ -9,7 +9,7 @@ from jtqd.daemon.supervisor.health import Health
 from jtqd.estimator.status import VALID
 
 NAN = float("nan")
-WELL = JointView(10.0, 0.5, NAN, NAN, NAN, 10.0, 0x27, VALID, 0, 15)
+WELL = JointView(10.0, 0.5, NAN, NAN, NAN, 10.0, 0x27, VALID, 0, 15, 0, 10.0, 1.25)
 
 
 def view(

@@ -53,18 +53,20 @@ def by_hand(bench: Path, name: str, number: int) -> dict[str, tuple[float, int]]
     joint = load_joint(bench / "models" / f"joint{number}.yaml")
     columns = table.joint(number, joint.gear_ratio)
     assert columns.torque_nm is not None
-    sensor = low_pass(columns.torque_nm, table.dt_s, 200.0)
-    runs = {}
+    runs, sensors = {}, {}
     for method in ("tob", "efficiency", "network", "physics", "fused"):
         own = "fused" if method == "physics" else method
         file = {"network": f"joint{number}.onnx", "fused": f"joint{number}.fused.onnx"}.get(method)
         network = None if file is None else load_network(own, str(bench / "models" / file))
-        runs[method] = estimate_columns(joint, EstimatorSettings(method=own), network, table.time_s, columns)
+        young = 800.0 if own == "fused" else None
+        settings = EstimatorSettings(method=own, torsion_bandwidth_rad_s=young)
+        runs[method] = estimate_columns(joint, settings, network, table.time_s, columns)
+        sensors[method] = low_pass(columns.torque_nm, table.dt_s, 200.0 if young is None else young)
     keep = table.time_s >= 0.1
     for run in runs.values():
         keep &= np.isfinite(run.torque_nm) & ((run.status == VALID) | (run.status == DEGRADED))
     return {
-        method: (float(np.mean((run.torque_nm - sensor)[keep] ** 2)), int(keep.sum()))
+        method: (float(np.mean((run.torque_nm - sensors[method])[keep] ** 2)), int(keep.sum()))
         for method, run in runs.items()
     }
 

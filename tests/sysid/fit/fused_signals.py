@@ -90,6 +90,7 @@ def made_run(
         direction=direction,
         dt_s=np.full(count, 1e-3),
         open_nm=np.zeros(count),
+        ahead_nm=np.zeros(count),
     )
     sensor = torque - own.zero_nm + rng.normal(0.0, noise_nm, count)
     return RunSignals(f"run {seed}", seen, sensor, np.ones(count, bool), np.zeros(count, bool))

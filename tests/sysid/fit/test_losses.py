@@ -125,3 +125,19 @@ def test_what_gives_no_loss_is_refused() -> None:
     ]
     with pytest.raises(LossFitError, match=r"found viscous_per_k -0\..*, expected at most 0\.1 either way"):
         fit_loss(strange * 4, FRICTION)
+
+
+def test_no_fit_has_a_friction_that_gives_energy() -> None:
+    """A plant whose loss falls towards standstill: the best Stribeck peak would be negative; what comes out is a file."""
+    truth = smooth_loss()
+    inverted = replace(
+        truth,
+        positive=replace(truth.positive, stribeck_nm=-2.5),
+        negative=replace(truth.negative, stribeck_nm=-2.5),
+        stribeck_velocity_rad_s=0.3,
+    )
+    fitted = fit_loss(made_runs(7, inverted, 8), replace(FRICTION, stribeck_velocity_rad_s=0.3)).loss
+    for side in (fitted.positive, fitted.negative):
+        assert side.stribeck_nm == 0.0
+        assert min(side.constant_nm) >= 0.0
+        assert min(side.viscous_nms_per_rad) >= 0.0
