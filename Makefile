@@ -30,19 +30,20 @@ test: lint ## everything but the tests marked campaign
 # Two at a time, each with one thread: the bench kernel keeps a time of its own, so neither feels the other.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 HERE := not (campaign or socketcan or boots or native)
+SLOWEST := --durations=20 --durations-min=2
 
 test-here:
-	$(ONE_THREAD) $(BIN)/python -m pytest -m "$(HERE)" --ignore=tests/hidden
+	$(ONE_THREAD) $(BIN)/python -m pytest $(SLOWEST) -m "$(HERE)" --ignore=tests/hidden
 
 test-hidden:
-	$(ONE_THREAD) $(BIN)/python -m pytest -m "$(HERE)" tests/hidden
+	$(ONE_THREAD) $(BIN)/python -m pytest $(SLOWEST) -m "$(HERE)" tests/hidden
 
 test-guest:
-	$(BIN)/python -m pytest -m "(socketcan or boots) and not campaign"
+	$(BIN)/python -m pytest $(SLOWEST) -m "(socketcan or boots) and not campaign"
 
 # Loops of 1 kHz at the pace of this machine's clock: nothing beside them.
 test-native:
-	$(BIN)/python -m pytest -m "native and not (campaign or socketcan or boots)"
+	$(BIN)/python -m pytest $(SLOWEST) -m "native and not (campaign or socketcan or boots)"
 
 test-all: lint ## everything
 	$(BIN)/python -m jtqd.sim_can.bench_kernel build --unless-vcan

@@ -78,6 +78,7 @@ if __name__ == "__main__":
     setup(
         ext_modules=cythonize(
             extensions(),
+            nthreads=os.cpu_count() or 0,
             include_path=["src"],
             build_dir=str(Path("build") / "cython" / BUILD),
             compiler_directives={
