@@ -173,7 +173,7 @@ class Family(NamedTuple):
     phase_rad: float = 0.0
 
 
-_ZERO: Final = 0.004
+_ZERO: Final = 0.0025
 """Prior standard deviation of a run's own sensor zero, part of the rated torque."""
 _SHARE: Final = {"smooth": 0.3, "viscous": 0.08, "coulomb": 0.02}
 """Prior standard deviations of a run's own friction, as parts of the joint's usual one (`usual_friction`)."""

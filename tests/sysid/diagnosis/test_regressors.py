@@ -202,7 +202,7 @@ def test_what_may_differ_from_run_to_run() -> None:
     sigma = {(g.name, g.joint): g.sigma for g in groups}
     assert sigma["viscous", 1] == pytest.approx(0.08 * 3.0), "shares of the file's friction"
     assert sigma["coulomb", 1] == pytest.approx(0.02 * 4.0)
-    assert sigma["zero", 0] == pytest.approx(0.004 * PLAIN.rated_torque_nm)
+    assert sigma["zero", 0] == pytest.approx(0.0025 * PLAIN.rated_torque_nm)
     order, hertz = names.index(("line", 1)), names.index(("line", 1)) + 2
     assert column(MOTOR1, order) == pytest.approx(np.cos(3.5 * s.state.motor_position_rad))
     assert column(MOTOR1, order + 1) == pytest.approx(np.sin(3.5 * s.state.motor_position_rad))
