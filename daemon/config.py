@@ -1,17 +1,19 @@
 """Configuration of jtqd: read once into frozen, validated objects.
 
 The keys of the file with their types, units, ranges and defaults are `SafetySettings`, `RecordingSettings`, `Realtime`,
-`EstimatorSettings` and the sections from `_Sync` to `_File`. Unknown keys and wrong values are errors of one line that
-name the file, the key, what was found and what was expected.
+`Ros2Settings`, `EstimatorSettings` and the sections from `_Sync` to `_File`. Unknown keys and wrong values are errors of one
+line that name the file, the key, what was found and what was expected.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
+from jtqd.daemon.profiles import path_of, with_profiles
 from jtqd.daemon.shared import faults
 from jtqd.drivers.devices import (
     CIA_402,
@@ -42,6 +44,11 @@ _LARGEST_NETWORK: Final = 64_000_000
 _PDO_BITS: Final = 64
 _NEEDED: Final = {"tob": (), "efficiency": ("efficiency",), "network": ("efficiency",), "fused": ("fused",)}
 """Sections of a joint file that a method cannot do without."""
+LOOPBACK: Final = "lo"
+"""Network interface that no other machine reaches."""
+HIGHEST_DOMAIN: Final = 232
+"""Of DDS: ports of a higher one are beyond 65535 (DDSI-RTPS, 9.6.1)."""
+_INTERFACE: Final = re.compile(r"[\w.@-]{1,15}", re.ASCII)
 _WITH_NETWORK: Final = ("network", "fused")
 """Methods that use one; `fused` is its physics alone without."""
 
@@ -130,6 +137,33 @@ class Realtime:
 
 
 @dataclass(frozen=True)
+class Ros2Settings:
+    """Section `ros2`: what is published for ROS 2 (docs/ros2.md).
+
+    Attributes:
+        domain_id: DDS domain; None: as ROS_DOMAIN_ID says, else 0.
+        interface: network interface.
+        rate_hz: of joint states and torque states.
+        names: of the joints in ROS 2, by section (`joint_1`); left out: the section's name.
+    """
+
+    domain_id: Annotated[int, limits(ge=0, le=HIGHEST_DOMAIN)] | None = None
+    interface: Text = LOOPBACK
+    rate_hz: Annotated[float, limits("Hz", ge=1.0, le=500.0)] = 100.0
+    names: Mapping[str, Text] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check(self, "ros2")
+        if not _INTERFACE.fullmatch(self.interface):
+            raise FieldError("ros2", "interface", self.interface, "a network interface such as lo or eth0")
+
+    def names_of(self, joints: int) -> tuple[str, ...]:
+        """Return the names of so many joints, joint 1 first."""
+        sections = (f"joint_{number}" for number in range(1, joints + 1))
+        return tuple(self.names.get(section, section) for section in sections)
+
+
+@dataclass(frozen=True)
 class Identity:
     """Expected 1018h entries and software; None where the bench accepts any value."""
 
@@ -174,6 +208,11 @@ class JointConfig:
     """Which objects of the drive are mapped, with sign and factor."""
     joint_data: bytes = field(default=b"", repr=False)
     """The joint file as it was read, for the log."""
+    profile: str | None = None
+    """Of the drive's family."""
+    profile_path: Path | None = None
+    profile_data: bytes = field(default=b"", repr=False)
+    """The profile as it was read, for the log."""
 
     @property
     def joint_sha256(self) -> str:
@@ -368,6 +407,8 @@ class _JointSection:
     sdo_timeout_ms: _SdoTimeout | None = None
     objects: _Objects = _Objects()
     network: _Network | None = None
+    profile: Text | None = None
+    """Of the drive's family: its values have been put below those of the section (`with_profiles`)."""
 
     def __post_init__(self) -> None:
         _check_given("joint", self.given, DRIVE_SCALING_OBJECTS)
@@ -416,12 +457,14 @@ class _File:
     realtime: Realtime = Realtime()
     recording: RecordingSettings = field(default_factory=RecordingSettings)
     metrics: _Metrics | None = None
+    ros2: Ros2Settings | None = None
 
     def __post_init__(self) -> None:
         self._check_numbers()
         self._check_inputs()
         self._check_channels()
         self._check_node_ids()
+        self._check_names()
 
     @property
     def joints(self) -> tuple[_JointSection, ...]:
@@ -467,6 +510,20 @@ class _File:
                 )
                 raise FieldError("configuration", f"joint_{number}.sensor_channel", channel, expected)
 
+    def _check_names(self) -> None:
+        """Names of ROS 2: of joints that there are, and each once, as ROS 2 tells joints apart by nothing else."""
+        if self.ros2 is None:
+            return
+        sections = [f"joint_{number}" for number in range(1, len(self.joints) + 1)]
+        for section in self.ros2.names:
+            if section not in sections:
+                expected = "one of " + ", ".join(sections)
+                raise FieldError("configuration", f"ros2.names.{section}", Verbatim("that joint"), expected)
+        names = self.ros2.names_of(len(sections))
+        for n, name in enumerate(names):
+            if name in names[:n]:
+                raise FieldError("configuration", f"ros2.names.{sections[n]}", name, "a name of its own")
+
     def _check_node_ids(self) -> None:
         users = {self.node_id: "node_id"}
         nodes = {f"joint_{number}.node": joint.node for number, joint in enumerate(self.joints, start=1)}
@@ -508,11 +565,14 @@ class Config:
     recording: RecordingSettings
     metrics_file: Path | None = None
     """Prometheus text file, written every 5 s; None for none."""
+    ros2: Ros2Settings | None = None
+    """What is published for ROS 2; None: nothing, unless the command line asks for it."""
 
     @property
     def files_sha256(self) -> str:
-        """Hash of the configuration and its joint files together; networks are named in it by theirs."""
+        """Hash of the configuration, its joint files and profiles together; networks are named in it by theirs."""
         parts = [self.sha256, *(joint.joint_sha256 for joint in self.joints)]
+        parts += [sha256_hex(joint.profile_data) for joint in self.joints if joint.profile]
         return sha256_hex("".join(parts).encode())
 
     @property
@@ -535,7 +595,7 @@ def load_config(path: Path | None) -> Config:
     if path is None:
         path = shipped(DEFAULT_CONFIG)
     mapping, data = read_yaml(path)
-    file = decode(_File, Section(mapping, str(path)))
+    file = decode(_File, Section(with_profiles(mapping, path), str(path)))
     joints = tuple(
         _joint(path, number, section, file.estimator.method, file.nodes.sdo_timeout_ms)
         for number, section in enumerate(file.joints, start=1)
@@ -563,6 +623,7 @@ def load_config(path: Path | None) -> Config:
         realtime=file.realtime,
         recording=file.recording,
         metrics_file=None if file.metrics is None else Path(file.metrics.file),
+        ros2=file.ros2,
     )
 
 
@@ -582,6 +643,7 @@ def _joint(path: Path, number: int, section: _JointSection, method: str, sdo_tim
     """Read what a section `joint_N` names: the joint file and, where the method uses one, the network."""
     network = None if section.network is None else _network(section.network, path)
     joint_path = path.parent / section.file
+    profile_path = None if section.profile is None else path_of(section.profile, path.parent)
     mapping, data = read_yaml(joint_path)
     joint = Joint.from_mapping(mapping, str(joint_path))
     if method == "network" and network is None:
@@ -608,6 +670,9 @@ def _joint(path: Path, number: int, section: _JointSection, method: str, sdo_tim
         sdo_timeout_ms=section.sdo_timeout_ms or sdo_timeout_ms,
         objects=section.objects.of_drive(f"joint_{number}", path),
         joint_data=data,
+        profile=section.profile,
+        profile_path=profile_path,
+        profile_data=b"" if profile_path is None else read_yaml(profile_path)[1],
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import platform
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -22,6 +23,7 @@ _EXAMPLES = """examples:
   jtqd --bus vcan0                      SocketCAN interface, until Ctrl-C or SIGTERM
   jtqd --bus unix:/run/bench.sock       frame socket of `jtq sim --bus unix:/run/bench.sock`
   jtqd --bus can0 --config /etc/jtqd/arm.yaml --record /var/log/jtqd
+  jtqd --bus can0 --ros2                joint states, torque states and diagnostics for ROS 2 nodes of this machine
   jtqd --bus can0 --live                open ws://127.0.0.1:8765 in Foxglove, with the layout of `jtq layout`
 
 exit status: 0 done, 1 failure, 2 usage or a wrong configuration, 3 done, but cycles are missing in the log"""
@@ -59,6 +61,11 @@ def parser() -> argparse.ArgumentParser:
         const=Address(),
         metavar="HOST:PORT",
         help="serve Foxglove or Lichtblick, read-only, 50 Hz (default: 127.0.0.1:8765; extra: live)",
+    )
+    result.add_argument(
+        "--ros2",
+        action="store_true",
+        help="publish for ROS 2, 100 Hz, on loopback unless the configuration (ros2) says otherwise (extra: ros2)",
     )
     result.add_argument("--json", action="store_true", help="print the final summary as JSON")
     result.add_argument(
@@ -109,14 +116,26 @@ def _run(arguments: argparse.Namespace, stop_requests: list[int]) -> int:
         print(f"jtqd: {NEEDED}", file=sys.stderr)
         return 1
     from jtqd.daemon.config import load_config
+    from jtqd.daemon.ros2 import network as ros2
     from jtqd.daemon.supervisor.process import ConfigurationRefused, Supervisor, SupervisorError
     from jtqd.drivers.frame_socket import BusError
     from jtqd.estimator.checked import ConfigError
 
     try:
         config = load_config(arguments.config)
+        wants_ros2 = arguments.ros2 or config.ros2 is not None
+        if wants_ros2 and not ros2.installed():
+            who = "--ros2" if arguments.ros2 else f"{config.path}: key 'ros2':"
+            print(f"jtqd: {who} needs {ros2.needed(platform.machine())}", file=sys.stderr)
+            return 1
         supervisor = Supervisor(
-            config, arguments.bus, arguments.config, arguments.record, arguments.duration, arguments.live
+            config,
+            arguments.bus,
+            arguments.config,
+            arguments.record,
+            arguments.duration,
+            arguments.live,
+            ros2=wants_ros2,
         )
         if stop_requests:
             supervisor.stop()

@@ -255,8 +255,11 @@ class NodeBoot:
 
     def configure_sync(self) -> None:
         """Check that 1005h is jtqd's SYNC; make 1019h tell whether it has a counter byte."""
-        found = self._objects.number((0x1005, 0), 4)
         wanted = self._settings.sync_cob_id
+        found = self._objects.optional_number((0x1005, 0), 4)
+        if found is None:  # as some have it that list no 1005h
+            self._notes.append(f"no 1005h: its SYNC is taken to be the default {wanted:03X}h")
+            found = wanted
         if found & CAN_ID != wanted:
             raise mismatch(
                 self._node, (0x1005, 0), "COB-ID SYNC", expected=f"{wanted:03X}h", found=f"0x{found:08X}"

@@ -125,7 +125,7 @@ def configured_load(
     drives: Iterable[int],
     sensors: Mapping[int, tuple[int, ...]],
     *,
-    sync_counter: bool = True,
+    sync_counter: bool = False,
     temperatures: Iterable[int] = (),
     heartbeat_ms: int = 100,
     master: int = JTQD_NODE,
@@ -135,7 +135,8 @@ def configured_load(
 ) -> BusLoad:
     """Add up drives (node numbers), sensors (node -> channels), SYNC, estimates, heartbeats and `extra`.
 
-    `temperatures`: nodes among the drives that send their joint's temperature.
+    `sync_counter`: SYNC has a counter byte (1019h). `temperatures`: nodes among the drives that send their joint's
+    temperature.
     """
     drives = tuple(drives)
     rows = [sync_row(sync_counter)]

@@ -145,8 +145,8 @@ def survey(access: SdoAccess, node: int) -> Survey:
     return Survey(node, "the bus", device_type & 0xFFFF, texts, numbers, frozenset(missing))
 
 
-def survey_of_eds(path: Path, node: int) -> Survey:
-    """Read a device from its EDS. Raises EdsError."""
+def survey_of_eds(path: Path, node: int, more: Iterable[Key] = ()) -> Survey:
+    """Read a device from its EDS; `more`: further objects that shall be among its numbers. Raises EdsError."""
     entries = {(each.index, each.subindex): each for each in read_eds(path, node)}
 
     def number(key: Key) -> int:
@@ -154,7 +154,7 @@ def survey_of_eds(path: Path, node: int) -> Survey:
         return int.from_bytes(entry.default, "little") if entry.is_integer else 0
 
     profile = number((0x1000, 0)) & 0xFFFF if (0x1000, 0) in entries else 0
-    wanted = (*IDENTITY.values(), *_READ.get(profile, ()))
+    wanted = (*IDENTITY.values(), *_READ.get(profile, ()), *more)
     return Survey(
         node=node,
         source=f"defaults of {path.name}",
@@ -170,7 +170,7 @@ def survey_of_eds(path: Path, node: int) -> Survey:
         numbers={key: number(key) for key in wanted if key in entries},
         missing=frozenset(key for key in wanted if key not in entries),
         unmappable=frozenset(
-            key for key in MAPPED.get(profile, ()) if key in entries and not entries[key].mappable
+            key for key in (*MAPPED.get(profile, ()), *more) if key in entries and not entries[key].mappable
         ),
     )
 
@@ -216,6 +216,16 @@ class BusSurvey:
             return survey(SdoClient(FrameChannel(self._socket, node), _ANSWER_S), node)
         except SdoTimeout:
             return None
+
+    def access(self, node: int, answer_s: float = _ANSWER_S) -> SdoClient:
+        """Return the SDO client of one node; it waits `answer_s` for an answer, and repeats nothing within it."""
+        return SdoClient(FrameChannel(self._socket, node), answer_s, answer_s)
+
+    def numbers(self, node: int, keys: Iterable[Key]) -> dict[Key, int]:
+        """Read further numbers of one node; those that it does not have are left out."""
+        access = self.access(node)
+        found = {key: _number(access, key) for key in keys}
+        return {key: number for key, number in found.items() if number is not None}
 
     def tpdos(self, node: int) -> list[Tpdo]:
         """Read the TPDOs of one node."""

@@ -82,3 +82,22 @@ def test_the_examples_of_docstrings_run(name: str) -> None:
     result = doctest.testmod(importlib.import_module(name))
     assert result.attempted
     assert not result.failed
+
+
+COMMAND = re.compile(r"`pytest (tests/[\w/]+\.py)(?: -m \w+)?(?: -k (\w+))?`")
+
+
+def test_every_command_of_the_drives_page_names_tests_that_are_there() -> None:
+    """A word behind -k is part of the name of a test of that file, or of the name of its cases."""
+    rows = [line for line in (ROOT / "docs" / "drives.md").read_text().splitlines() if line.startswith("| ")][
+        1:
+    ]
+    assert len(rows) > 20
+    for row in rows:
+        found = COMMAND.findall(row)
+        assert found, row
+        for path, word in found:
+            text = (ROOT / path).read_text()
+            assert not word or any(
+                word in name for name in re.findall(r"^def (test_\w+)", text, re.MULTILINE)
+            ), row

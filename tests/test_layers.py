@@ -20,7 +20,7 @@ from tests.paths import ROOT
 
 PACKAGES = ("daemon", "drivers", "estimator", "models", "sim_can", "sysid")
 PAGE = ROOT / "docs" / "architecture.md"
-ROW = re.compile(r"^\| `([a-z_./]+)` \|[^|]*\|([^|]*)\|([^|]*)\|$", re.MULTILINE)
+ROW = re.compile(r"^\| `([a-z0-9_./]+)` \|[^|]*\|([^|]*)\|([^|]*)\|$", re.MULTILINE)
 
 
 @cache
@@ -145,9 +145,12 @@ def test_no_circles() -> None:
     [
         (
             "daemon.supervisor.process",
-            {"numpy", "onnxruntime", "canopen", "can", "mcap.writer", "zstandard", "_hashlib"},
+            {"numpy", "onnxruntime", "canopen", "can", "mcap.writer", "zstandard", "_hashlib", "cyclonedds"},
         ),
-        ("daemon.loop.process", {"onnxruntime", "canopen", "can", "mcap", "rich", "argparse", "_hashlib"}),
+        (
+            "daemon.loop.process",
+            {"onnxruntime", "canopen", "can", "mcap", "rich", "argparse", "_hashlib", "cyclonedds"},
+        ),
         ("sim_can.bench_loop", {"onnxruntime", "canopen", "can", "_hashlib"}),
         ("sim_can.plant_source", {"numpy", "onnxruntime"}),
     ],

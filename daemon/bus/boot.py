@@ -76,6 +76,7 @@ def bus_load_of(config: Config) -> BusLoad:
     return configured_load(
         [joint.node_id for joint in config.joints],
         {config.sensor.node_id: config.sensor.channels} if config.sensor else {},
+        sync_counter=config.counter_overflow > 0,
         temperatures=[joint.node_id for joint in config.joints if joint.temperature],
         heartbeat_ms=config.heartbeat_ms,
         master=config.node_id,

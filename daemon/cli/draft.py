@@ -11,9 +11,10 @@ A guess is scaled from the shipped bench by the rated torque: orders of magnitud
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 
-from jtqd.drivers.devices import COMMANDER_NODE, JTQD_NODE
+from jtqd.daemon.profiles import INIT, Family
+from jtqd.drivers.devices import CIA_402, COMMANDER_NODE, JTQD_NODE, parse_key
 from jtqd.drivers.sdo import Key, label
 from jtqd.drivers.survey import (
     DRIVE,
@@ -81,6 +82,10 @@ class JointDraft:
     given: Mapping[Key, Value]
     problems: tuple[str, ...]
     """Why this version of jtqd does not work with this drive."""
+    family: Family | None = None
+    """Profile that the configuration names."""
+    own: Mapping[str, Value] = field(default_factory=dict)
+    """What the profile leaves to the drive and the operator: keys of the section, such as "objects.current.factor"."""
 
     @property
     def guesses(self) -> list[str]:
@@ -108,9 +113,24 @@ def plain(number: float) -> str:
     return repr(float(f"{number:.6g}"))
 
 
-def draft_joint(number: int, node: int, survey: Survey | None, wanted: Wanted) -> JointDraft:
-    """Return what is known and guessed of a joint. Raises DraftError."""
+def mapped_by(family: Family | None) -> tuple[Key, ...]:
+    """Return the objects that jtqd maps, with a profile or without."""
+    if family is None:
+        return MAPPED[DRIVE]
+    standard = {each.name: getattr(CIA_402, each.name) for each in fields(CIA_402)}
+    return tuple(family.mapped(name, (each.index, each.subindex)) for name, each in standard.items())
+
+
+def draft_joint(
+    number: int, node: int, survey: Survey | None, wanted: Wanted, family: Family | None = None
+) -> JointDraft:
+    """Return what is known and guessed of a joint; `family`: profile of the drive. Raises DraftError."""
     given: dict[Key, Value] = {}
+    problems = _problems(node, survey, family)
+    filled: dict[str, Value] = {}
+    if family is not None:
+        filled = _filled(number, node, survey, wanted, family)
+        survey = _translated(survey, filled)
     gear = _gear(number, node, survey, wanted, given)
     current_a = _rated_current(survey, wanted, given)
     motor_mnm = None if survey is None else survey.number(RATED_TORQUE)
@@ -118,7 +138,12 @@ def draft_joint(number: int, node: int, survey: Survey | None, wanted: Wanted) -
     constant = _torque_constant(
         number, wanted=wanted, gear=gear, rated=rated, current_a=current_a, motor_mnm=motor_mnm, survey=survey
     )
-    _encoders(node, survey, wanted, given)
+    _encoders(node, survey, wanted, given, family)
+    for key, value in filled.items():
+        if key.startswith("given."):
+            given.setdefault(parse_key(key.removeprefix("given.")), value)
+    if family is not None and family.scales("current"):
+        given.pop(RATED_CURRENT, None)
     torque, origin = rated.number, "shipped bench scaled by the rated torque"
     stiffness = STIFFNESS_PER_RAD * torque
     values = {
@@ -134,7 +159,42 @@ def draft_joint(number: int, node: int, survey: Survey | None, wanted: Wanted) -
         "coulomb_nm": _guess(COULOMB * torque, origin, "jtq fit friction"),
         "viscous_nms_per_rad": _guess(VISCOUS * torque, origin, "jtq fit friction"),
     }
-    return JointDraft(number, node, survey, values, given, _problems(node, survey))
+    own = {key: value for key, value in filled.items() if key.startswith("objects.")}
+    return JointDraft(number, node, survey, values, given, problems, family, own)
+
+
+def _filled(
+    number: int, node: int, survey: Survey | None, wanted: Wanted, family: Family
+) -> dict[str, Value]:
+    """Return what a profile leaves to the drive and to the operator. Raises DraftError."""
+    options: dict[str, float] = {}
+    if wanted.gear_ratio is not None:
+        numerator, denominator = ratio(wanted.gear_ratio)
+        options = {"gear_ratio_numerator": numerator, "gear_ratio_denominator": denominator}
+    for name in ("encoder_counts", "link_encoder_counts"):
+        if (counts := getattr(wanted, name)) is not None:
+            options[name] = counts
+    found = family.filled({} if survey is None else survey.numbers, options)
+    for line in family.lines:
+        if line.open and line.key not in found:
+            where = f"joint {number} (node {node}): profile {family.name}"
+            if line.option is None:
+                raise DraftError(f"{where}: {line.read} has no value ({line.why})")
+            option = "gear-ratio" if line.option.startswith("gear_ratio") else line.option.replace("_", "-")
+            raise DraftError(f"{where} needs what no object of the drive tells: give --{option}")
+    return {key: Value(value, origin) for key, (value, origin) in found.items()}
+
+
+def _translated(survey: Survey | None, filled: Mapping[str, Value]) -> Survey | None:
+    """Return the survey of a drive as if it had the objects of CiA 402 for what its profile has elsewhere."""
+    if survey is None:
+        return None
+    numbers = dict(survey.numbers)
+    for name, value in filled.items():
+        prefix, _, key = name.partition(".")
+        if prefix in ("given", INIT.removesuffix(".")):
+            numbers[parse_key(key)] = round(value.number)
+    return replace(survey, numbers=numbers, missing=survey.missing - set(numbers))
 
 
 def _told(survey: Survey | None, key: Key) -> str:
@@ -221,8 +281,10 @@ def _torque_constant(
     return _guess(constant, f"rated torque / ({EFFICIENCY:g} x gear ratio x rated current)", better)
 
 
-def _encoders(node: int, survey: Survey | None, wanted: Wanted, given: dict[Key, Value]) -> None:
-    """Give what the drive does not tell, or tells otherwise. Raises DraftError."""
+def _encoders(
+    node: int, survey: Survey | None, wanted: Wanted, given: dict[Key, Value], family: Family | None
+) -> None:
+    """Give what the drive does not tell, or tells otherwise; not what a profile scales. Raises DraftError."""
 
     def give(keys: tuple[Key, Key], counts: int | None, option: str) -> None:
         told = [None if survey is None else survey.number(key) for key in keys]
@@ -233,29 +295,40 @@ def _encoders(node: int, survey: Survey | None, wanted: Wanted, given: dict[Key,
             given[keys[0]] = Value(counts, option)
             given[keys[1]] = Value(1, option)
 
-    give(POSITION, wanted.encoder_counts, "--encoder-counts")
-    if survey is not None and not all(survey.tells(key) for key in VELOCITY):
+    def by_cia_402(quantity: str) -> bool:
+        return family is None or not family.scales(quantity)
+
+    if by_cia_402("motor_position"):
+        give(POSITION, wanted.encoder_counts, "--encoder-counts")
+    untold = survey is not None and not all(survey.tells(key) for key in VELOCITY)
+    if by_cia_402("motor_velocity") and untold and survey is not None:
         for ours, of_position in zip(VELOCITY, POSITION, strict=True):
             number = given[of_position].number if of_position in given else survey.number(of_position)
             better = "turn the motor at a known speed and compare jtq status; 606Ch may be in rpm"
             given[ours] = Value(number or 1, "606Ch taken for encoder counts per second: no 6090h", better)
-    if survey is None or (0x60E4, 1) not in survey.missing:
+    if by_cia_402("link_position") and (survey is None or (0x60E4, 1) not in survey.missing):
         give(LINK, wanted.link_encoder_counts, "--link-encoder-counts")
 
 
-def _problems(node: int, survey: Survey | None) -> tuple[str, ...]:
+def _problems(node: int, survey: Survey | None, family: Family | None) -> tuple[str, ...]:
     if survey is None:
         return ()
+    mapped = mapped_by(family)
     found = [
         f"node {node} ({survey.title}): has no {label(*key)}, which jtqd maps"
-        for key in MAPPED[DRIVE]
+        for key in mapped
         if key in survey.missing
     ]
     found += [
         f"node {node} ({survey.title}): {label(*key)} cannot be mapped, by {survey.source}"
-        for key in MAPPED[DRIVE]
+        for key in mapped
         if key in survey.unmappable
     ]
+    if family is not None:
+        found += [
+            f"node {node} ({survey.title}): profile {family.name}: {text}"
+            for text in family.findings(survey.numbers)
+        ]
     return tuple(found)
 
 
@@ -356,6 +429,17 @@ def drive_lines(joint: JointDraft) -> list[str]:
         for key, value in joint.given.items():
             entry = f'    "{label(*key)}": {round(value.number)}'
             lines.append(f"{entry:<26}# {'GUESS, ' * value.guess}{value.origin}")
+    if joint.family is not None:
+        lines += [f"  profile: {joint.family.name:<15}# docs/profiles.md", *_own_lines(joint.own)]
+    return lines
+
+
+def _own_lines(own: Mapping[str, Value]) -> list[str]:
+    """Return what a profile leaves to the drive as `objects` of the section."""
+    lines = ["  objects:                # of this drive; all else is in the profile"] if own else []
+    for key, value in own.items():
+        _, quantity, name = key.split(".")
+        lines.append(f"    {quantity}: {{{name}: {value.number:.10e}}}  # {value.origin}")
     return lines
 
 

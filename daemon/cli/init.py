@@ -12,7 +12,7 @@ import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +25,15 @@ from jtqd.daemon.cli.draft import (
     config_text,
     draft_joint,
     joint_text,
+    mapped_by,
     sensor_problems,
 )
 from jtqd.daemon.config import MAX_NODE_ID, load_config
+from jtqd.daemon.profiles import Family, named, of_vendor
 from jtqd.drivers.bus_load import LIMIT, BusLoadError
 from jtqd.drivers.frame_socket import BusError
 from jtqd.drivers.object_dictionary import EdsError
-from jtqd.drivers.survey import DRIVE, SENSOR, BusSurvey, Survey, survey_of_eds
+from jtqd.drivers.survey import DRIVE, IDENTITY, SENSOR, BusSurvey, Survey, survey_of_eds
 from jtqd.estimator.checked import ConfigError
 
 MAX_JOINTS = 2
@@ -100,6 +102,11 @@ def parser() -> argparse.ArgumentParser:
         default="jtqd",
         help="of the configuration: NAME.yaml (default jtqd; can0 for jtqd@can0)",
     )
+    made.add_argument(
+        "--profile",
+        metavar="NAME|none",
+        help="profile of the drives' family (default: by their vendor-ID; docs/profiles.md)",
+    )
     made.add_argument("--out", type=Path, required=True, metavar="DIR", help="directory for the files")
     made.add_argument("--force", action="store_true", help="replace files that are there")
     made.add_argument("--no-questions", action="store_true", help="ask nothing, also on a terminal")
@@ -151,6 +158,8 @@ class Found:
     surveys: dict[int, Survey]
     sensor: int | None
     notes: list[str]
+    families: dict[int, Family | None] = field(default_factory=dict)
+    """Profile of each drive."""
 
 
 def main(argv: list[str]) -> int:
@@ -215,7 +224,7 @@ def _found(options: argparse.Namespace) -> Found:
     notes: list[str] = []
     sensor = options.sensor
     if options.bus is not None:
-        surveys = _on_the_bus(options.bus, nodes, sensor)
+        surveys = _on_the_bus(options.bus, nodes, sensor, options.profile)
         drives = [node for node, each in surveys.items() if each.profile == DRIVE]
         sensors = [node for node, each in surveys.items() if each.profile == SENSOR]
         notes += [f"node {node}: {description(each)}" for node, each in surveys.items()]
@@ -234,19 +243,47 @@ def _found(options: argparse.Namespace) -> Found:
         raise UsageError(f"--node: {len(nodes)} drives, this version of jtqd has at most {MAX_JOINTS} joints")
     for node, path in zip(nodes, _each("from_eds", options.from_eds, len(nodes)), strict=True):
         if path is not None:
-            surveys[node] = merged(survey_of_eds(path, node), surveys.get(node))
+            surveys[node] = merged(eds_survey(path, node, options.profile), surveys.get(node))
             notes.append(f"node {node}: {description(surveys[node])}")
     for node in nodes:
         if node in surveys and surveys[node].profile != DRIVE:
             raise UsageError(f"node {node} is no CiA 402 drive: {description(surveys[node])}")
-    return Found(nodes, surveys, sensor or None, notes)
+    families = {node: family_of(surveys.get(node), options.profile) for node in nodes}
+    notes += [f"node {node}: profile {each.name} ({each.title})" for node, each in families.items() if each]
+    return Found(nodes, surveys, sensor or None, notes, families)
 
 
-def _on_the_bus(bus: str, nodes: Sequence[int], sensor: int | None) -> dict[int, Survey]:
+def family_of(survey: Survey | None, name: str | None) -> Family | None:
+    """Return the profile by name ("none": no profile), else by the drive's vendor-ID. Raises ConfigError."""
+    if name is not None:
+        return None if name == "none" else named(name)
+    if survey is None or survey.profile != DRIVE:
+        return None
+    return of_vendor(survey.numbers.get(IDENTITY["vendor"]))
+
+
+def surveyed(reader: BusSurvey, node: int, profile: str | None) -> Survey | None:
+    """Survey one node, with the objects that its profile needs; None when it does not answer. Raises ConfigError."""
+    found = reader.read(node)
+    if found is None or (family := family_of(found, profile)) is None:
+        return found
+    wanted = {*family.objects, *mapped_by(family)}
+    numbers = {**found.numbers, **reader.numbers(node, wanted - set(found.numbers))}
+    return replace(found, numbers=numbers, missing=found.missing | (wanted - set(numbers)))
+
+
+def eds_survey(path: Path, node: int, profile: str | None) -> Survey:
+    """Return the survey by an EDS, with the objects that its profile needs. Raises EdsError, ConfigError."""
+    found = survey_of_eds(path, node)
+    family = family_of(found, profile)
+    return found if family is None else survey_of_eds(path, node, (*family.objects, *mapped_by(family)))
+
+
+def _on_the_bus(bus: str, nodes: Sequence[int], sensor: int | None, profile: str | None) -> dict[int, Survey]:
     with _survey(bus) as reader:
         wanted = {*nodes, *([sensor] if sensor else [])}
         there = reader.nodes() if not nodes or sensor is None else sorted(wanted)
-        read = {node: reader.read(node) for node in there}
+        read = {node: surveyed(reader, node, profile) for node in there}
     return {node: each for node, each in read.items() if each is not None}
 
 
@@ -313,15 +350,19 @@ def _drafts(options: argparse.Namespace, found: Found) -> list[JointDraft]:
     drafts = []
     for position, node in enumerate(found.nodes):
         wanted = Wanted(**{each.name: columns[each.name][position] for each in fields(Wanted)})
-        drafts.append(_draft(position + 1, node, found.surveys.get(node), wanted, ask))
+        drafts.append(
+            _draft((position + 1, node), found.surveys.get(node), wanted, ask, found.families.get(node))
+        )
     return drafts
 
 
-def _draft(number: int, node: int, survey: Survey | None, wanted: Wanted, ask: bool) -> JointDraft:
+def _draft(
+    joint: tuple[int, int], survey: Survey | None, wanted: Wanted, ask: bool, family: Family | None
+) -> JointDraft:
     """Return a joint's draft; on a terminal, ask for what is missing."""
     while True:
         try:
-            return draft_joint(number, node, survey, wanted)
+            return draft_joint(*joint, survey, wanted, family)
         except DraftError as error:
             option = str(error).rpartition("give --")[2].partition(",")[0]
             field = next((name for name, each in _OPTIONS.items() if each == option.replace("-", "_")), None)

@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from jtqd.daemon.cli.draft import DraftError, Wanted, draft_joint, drive_lines, sensor_lines, sensor_problems
-from jtqd.daemon.cli.init import description, merged, node_id
+from jtqd.daemon.cli.init import description, eds_survey, family_of, merged, node_id, surveyed
+from jtqd.daemon.profiles import Family
 from jtqd.drivers.frame_socket import BusError
 from jtqd.drivers.object_dictionary import EdsError
 from jtqd.drivers.sdo import label
-from jtqd.drivers.survey import DRIVE, IDENTITY, SENSOR, BusSurvey, Survey, Tpdo, survey_of_eds
+from jtqd.drivers.survey import DRIVE, IDENTITY, SENSOR, BusSurvey, Survey, Tpdo
 
 _EXAMPLES = """examples:
   jtq probe --bus can0                      which nodes are there
@@ -38,6 +39,11 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--bus", required=True, help="can0, or unix:PATH")
     made.add_argument("--node", type=node_id, metavar="N", help="node-ID (default: list the nodes)")
     made.add_argument("--eds", type=Path, metavar="FILE", help="its EDS, which tells what can be mapped")
+    made.add_argument(
+        "--profile",
+        metavar="NAME|none",
+        help="profile of its family (default: by its vendor-ID; docs/profiles.md)",
+    )
     made.add_argument("--json", action="store_true", help="print as JSON")
     return made
 
@@ -54,7 +60,7 @@ def main(argv: list[str]) -> int:
             return _list(options, bus) if options.node is None else _one(options, bus)
         finally:
             bus.close()
-    except (BusError, EdsError, ValueError) as error:
+    except (BusError, EdsError, ValueError) as error:  # ConfigError is one
         print(f"jtq probe: {error}", file=sys.stderr)
         return 1
 
@@ -69,24 +75,28 @@ def _list(options: argparse.Namespace, bus: BusSurvey) -> int:
 
 
 def _one(options: argparse.Namespace, bus: BusSurvey) -> int:
-    found = bus.read(options.node)
+    found = surveyed(bus, options.node, options.profile)
     if found is None:
         raise ValueError(f"node {options.node} does not answer on {options.bus}")
     tpdos = bus.tpdos(options.node)
     if options.eds is not None:
-        found = merged(survey_of_eds(options.eds, options.node), found)
-    problems = problems_of(found)
+        found = merged(eds_survey(options.eds, options.node, options.profile), found)
+    family = family_of(found, options.profile)
+    problems = problems_of(found, family)
     if options.json:
-        print(json.dumps(content(found, tpdos, problems)))
+        print(json.dumps(content(found, tpdos, problems, family)))
     else:
-        print(text(found, tpdos, problems))
+        print(text(found, tpdos, problems, family))
     return 3 if problems else 0
 
 
-def problems_of(survey: Survey) -> list[str]:
+def problems_of(survey: Survey, family: Family | None = None) -> list[str]:
     """Why this version of jtqd does not work with a device."""
     if survey.profile == DRIVE:
-        return list(draft_joint(1, survey.node, survey, _ANY).problems)
+        try:
+            return list(draft_joint(1, survey.node, survey, _ANY, family).problems)
+        except DraftError as error:
+            return [str(error)]
     if survey.profile == SENSOR:
         return sensor_problems(survey.node, survey)
     return [f"node {survey.node}: {description(survey)}: neither a drive (402) nor a sensor (404)"]
@@ -96,18 +106,21 @@ _ANY = Wanted(1.0, 1.0, 1.0, 1.0, 1, 1)
 """Of a joint whose values do not matter: only what the drive lacks is asked."""
 
 
-def section(survey: Survey) -> list[str]:
+def section(survey: Survey, family: Family | None = None) -> list[str]:
     """Return its section of the configuration; objects that it has no value of are left to be given."""
     if survey.profile == SENSOR:
         return sensor_lines(survey.node, survey)
     try:
-        draft = draft_joint(1, survey.node, survey, Wanted(rated_torque_nm=1.0, torque_constant_nm_per_a=1.0))
+        known = Wanted(rated_torque_nm=1.0, torque_constant_nm_per_a=1.0)
+        draft = draft_joint(1, survey.node, survey, known, family)
     except DraftError as error:
         return [f"# jtq init: {error}"]
     return drive_lines(draft)
 
 
-def content(survey: Survey, tpdos: list[Tpdo], problems: list[str]) -> dict[str, Any]:
+def content(
+    survey: Survey, tpdos: list[Tpdo], problems: list[str], family: Family | None = None
+) -> dict[str, Any]:
     """Return everything for a program."""
     return {
         "schema": "jtq.probe/1",
@@ -131,12 +144,15 @@ def content(survey: Survey, tpdos: list[Tpdo], problems: list[str]) -> dict[str,
             for each in tpdos
         ],
         "problems": problems,
+        "family": None if family is None else family.name,
     }
 
 
-def text(survey: Survey, tpdos: list[Tpdo], problems: list[str]) -> str:
+def text(survey: Survey, tpdos: list[Tpdo], problems: list[str], family: Family | None = None) -> str:
     """Return everything for people."""
     lines = [f"node {survey.node}: {description(survey)}"]
+    if family is not None:
+        lines.append(f"profile {family.name}: {family.title} (docs/profiles.md)")
     lines += [f"  {label(*key):<8} {value}" for key, value in sorted(survey.numbers.items())]
     lines += [f"  {label(*key):<8} not there" for key in sorted(survey.missing)]
     lines.append("TPDOs as they are now (jtqd writes its own mapping at its start)")
@@ -144,7 +160,7 @@ def text(survey: Survey, tpdos: list[Tpdo], problems: list[str]) -> str:
         kind = f"type {each.transmission_type}" if each.on else "off"
         lines.append(f"  {each.number}  {each.cob_id:X}h  {kind:<8}  {', '.join(each.objects) or 'nothing'}")
     if survey.profile in (DRIVE, SENSOR):
-        lines += ["section of the configuration", *(f"  {line}" for line in section(survey))]
+        lines += ["section of the configuration", *(f"  {line}" for line in section(survey, family))]
     if problems:
         lines += ["jtqd does not work with it yet:", *(f"  {line}" for line in problems)]
     return "\n".join(lines)

@@ -6,13 +6,14 @@ and no lock is held that anybody waits for.
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from collections import deque
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jtqd.daemon.recording.progress import Account, read_account
 from jtqd.daemon.shared.conditions import Condition, read_conditions
@@ -163,6 +164,8 @@ class Reading:
     """The daemon's last notices about the bus."""
     conditions: tuple[Condition, ...] = ()
     """What is wrong now, the worst first."""
+    bus: Mapping[str, Any] = field(default_factory=dict)
+    """`bus.json`: what the supervisor sees of the bus; empty where it cannot be read."""
 
 
 class Watch:
@@ -196,6 +199,7 @@ class Watch:
             _log(self.daemon),
             self._read_notices(),
             tuple(read_conditions(self.daemon.directory)),
+            _bus(self.daemon.directory),
         )
 
     def _read_notices(self) -> tuple[Notice, ...]:
@@ -215,6 +219,14 @@ class Watch:
                 return None
         view = self._reader.read()
         return view if view.sync_monotonic_ns else None
+
+
+def _bus(directory: Path) -> dict[str, Any]:
+    try:
+        content = json.loads((directory / "bus.json").read_text())
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
 
 
 def _three(values: list[float]) -> tuple[float, float, float]:

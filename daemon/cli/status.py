@@ -110,6 +110,7 @@ def content(reading: Reading) -> dict[str, Any]:
             "now": finite(bus_load(reading.earlier, view, about.bitrate)),
             "worst_case": view.worst_load,
         },
+        "bus_state": dict(reading.bus),
         "counters": view.counters,
         "nodes": [_node(node, what, view) for node, what in sorted(about.nodes.items())],
         "notices": [_notice(each) for each in reading.notices],
@@ -233,6 +234,7 @@ class StatusView:
         yield ""
         yield _loop(reading, view, width)
         yield _bus(about, view, reading.earlier)
+        yield from _frames(reading)
         faults = [
             f"{name.replace('_', ' ')} {view.counters[name]}" for name in _FAULTS if view.counters[name]
         ]
@@ -401,6 +403,21 @@ def _bus(about: About, view: View, earlier: View) -> RenderableType:
         "bus load",
         f"{share(now)} now, with worst-case stuff bits; {share(view.worst_load)} by configuration",
     )
+
+
+def _frames(reading: Reading) -> Iterator[RenderableType]:
+    """What is on the bus beside jtqd's frames: errors of the controller, and frames that no socket of jtqd receives."""
+    state = reading.bus.get("state")
+    if state is None:
+        return
+    counts = reading.bus.get("counts", {})
+    errors = sum(
+        counts.get(name, 0) for name in ("protocol_errors", "no_acknowledge", "overruns", "bus_offs")
+    )
+    text = f"{state}, {counted(errors, 'error frame')}"
+    if long_frames := reading.bus.get("long_frames", 0):
+        text += f", {counted(long_frames, 'CAN FD or XL frame')} not read"
+    yield _line("bus state", text)
 
 
 def _nodes(about: About, view: View) -> Columns:

@@ -17,14 +17,12 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import socket
 import sys
 import time
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import FrameType
 from typing import Any, NamedTuple
 
 import foxglove
@@ -45,6 +43,7 @@ from jtqd.daemon.shared import cycle_record as cycle
 from jtqd.daemon.shared.conditions import Condition, read_conditions
 from jtqd.daemon.shared.notices import Notice, NoticesError, NoticesReader
 from jtqd.daemon.shared.ring import RingError, RingReader
+from jtqd.daemon.shared.side_process import Stop, answer
 from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader, View
 
 # ---- messages ----
@@ -263,18 +262,6 @@ _QUANTILES = (0.5, 0.99, 1.0)
 _NICE = 10
 
 
-class Stop:
-    """Set by SIGTERM and SIGINT."""
-
-    def __init__(self) -> None:
-        self.requested = False
-        signal.signal(signal.SIGTERM, self._on_signal)
-        signal.signal(signal.SIGINT, self._on_signal)
-
-    def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        self.requested = True
-
-
 def _free(address: Address) -> str | None:
     """None, or why nobody can listen there: the server's own message does not always say."""
     try:
@@ -343,11 +330,6 @@ def serve(source: Source, server: LiveServer, stop: Stop) -> None:
         time.sleep(_POLL_S)
 
 
-def _answer(**content: Any) -> None:
-    with suppress(OSError):
-        print(json.dumps(content), flush=True)
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Command line of the process; returns the exit status."""
     request = json.loads((sys.argv[1:] if arguments is None else arguments)[0])
@@ -357,15 +339,15 @@ def main(arguments: list[str] | None = None) -> int:
     address = Address(request["host"], request["port"])
     problem = _free(address)
     if problem is not None:
-        _answer(failed=f"{address.host}:{address.port}: {problem}")
+        answer(failed=f"{address.host}:{address.port}: {problem}")
         return 1
     try:
         source = Source(request)
         server = LiveServer(f"jtqd on {request['bus']}", address, len(request["gear_ratios"]))
     except (ImportError, RingError, SnapshotError, RuntimeError, OSError, ValueError) as error:
-        _answer(failed=f"{address.host}:{address.port}: {error}")
+        answer(failed=f"{address.host}:{address.port}: {error}")
         return 1
-    _answer(listening=server.address.url)
+    answer(listening=server.address.url)
     try:
         serve(source, server, stop)
     finally:

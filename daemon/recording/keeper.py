@@ -242,24 +242,27 @@ def nodes_of(config: Config) -> list[tuple[int, str]]:
 
 
 def _attachment_names(config: Config) -> dict[Path, str]:
-    """Return names of joint files and networks in the log: their own, unless two of them are called the same."""
+    """Return names of joint files, networks and profiles in the log: their own, unless two of them are called the same."""
     names: dict[Path, str] = {}
     for joint in config.joints:
-        for path in (joint.joint_path, *([joint.network.path] if joint.network else [])):
-            if path not in names:
+        network = joint.network.path if joint.network else None
+        for path in (joint.joint_path, network, joint.profile_path):
+            if path is not None and path not in names:
                 taken = path.name in names.values()
                 names[path] = f"joint_{joint.number}.{path.name}" if taken else path.name
     return names
 
 
 def _attached_files(config: Config) -> list[tuple[str, str, bytes]]:
-    """(name, media type, content) of joint files and networks."""
+    """(name, media type, content) of joint files, networks and profiles."""
     names = _attachment_names(config)
     found: dict[str, tuple[str, bytes]] = {}
     for joint in config.joints:
         found.setdefault(names[joint.joint_path], ("application/yaml", joint.joint_data))
         if joint.network:
             found.setdefault(names[joint.network.path], ("application/octet-stream", joint.network.data))
+        if joint.profile_path:
+            found.setdefault(names[joint.profile_path], ("application/yaml", joint.profile_data))
     return [(name, kind, data) for name, (kind, data) in found.items()]
 
 
@@ -274,6 +277,7 @@ def _provenance(config: Config, report: dict[str, Any]) -> dict[str, Any]:
                 "file_sha256": joint.joint_sha256,
                 "network": names[joint.network.path] if joint.network else None,
                 "network_sha256": joint.network.sha256 if joint.network else None,
+                **({"profile": names[joint.profile_path]} if joint.profile_path else {}),
             }
             for joint in config.joints
         },

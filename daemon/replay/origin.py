@@ -201,6 +201,10 @@ def _place(  # noqa: PLR0917
     (directory / file).write_bytes(data)
     section["file"] = file
     hashes = [hashlib.sha256(data).hexdigest()]
+    profile = provenance["joints"][str(number)].get("profile")
+    if isinstance(profile, str):  # as it was then, also where one of that name ships
+        section["profile"] = f"{key}.profile.yaml"
+        (directory / section["profile"]).write_bytes(_attachment(log, attachments, profile))
     network = section.get("network")
     if not isinstance(network, dict):
         return hashes
@@ -215,9 +219,9 @@ def _place(  # noqa: PLR0917
 
 
 def _check_scaling(inputs: JointInputs) -> None:
-    """ValueError unless all factors are numbers above 0 (the sensor's may be 0: there is none)."""
+    """ValueError unless all factors are numbers, and not 0 (the sensor's may be); a drive may count backwards."""
     for name in ("motor_rad_per_count", "motor_rad_s_per_unit", "link_rad_per_count", "ampere_per_unit"):
-        if not getattr(inputs, name) > 0.0:
+        if not abs(getattr(inputs, name)) > 0.0:
             raise ValueError(f"{name} is 0: the drive was absent at the start of the log")
     if not inputs.sensor_nm_per_unit >= 0.0:
         raise ValueError("sensor_nm_per_unit is below 0")

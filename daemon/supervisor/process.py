@@ -22,12 +22,13 @@ from typing import Any
 from jtqd.daemon.bus.boot import ReturningNodes, boot_request, bus_load_of, gear_ratio_error
 from jtqd.daemon.bus.own_node import OwnNode
 from jtqd.daemon.bus.service import BusService, nodes_of, service_filters
-from jtqd.daemon.config import Config
+from jtqd.daemon.config import Config, Ros2Settings
 from jtqd.daemon.live.address import Address
 from jtqd.daemon.live.keeper import LiveKeeper
 from jtqd.daemon.loop.realtime import stolen_s
 from jtqd.daemon.recording.keeper import Keeper, recording_request
 from jtqd.daemon.reload.files import Reload, ReloadError
+from jtqd.daemon.ros2.keeper import Ros2Keeper
 from jtqd.daemon.shared.child_process import Child, ChildError, ChildSilence
 from jtqd.daemon.shared.conditions import JOINT, PDO, THE_MACHINE, Conditions, ConditionsFile
 from jtqd.daemon.shared.log_lines import ERROR, WARNING, EventLog, OperatorLog
@@ -43,6 +44,7 @@ from jtqd.daemon.supervisor.table import Display
 from jtqd.drivers import nmt
 from jtqd.drivers.bus_load import BusLoad, BusLoadError, check_bus_load
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
+from jtqd.drivers.long_frames import LongFrames
 from jtqd.drivers.object_dictionary import ObjectStore, entries_from_json
 
 _WARM_UP_TIMEOUT_S = 60.0
@@ -209,6 +211,10 @@ class Supervisor:
         record: directory for logs, "none", or None for the default.
         duration_s: end by itself after this time, None to run until stopped.
         live: where to serve viewers, None for no live view.
+        ros2: publish for ROS 2.
+
+    Raises:
+        SupervisorError, ConfigError: it cannot start.
     """
 
     def __init__(  # noqa: PLR0917 - the command line's options
@@ -219,6 +225,8 @@ class Supervisor:
         record: str | None,
         duration_s: float | None,
         live: Address | None = None,
+        *,
+        ros2: bool = False,
     ) -> None:
         self._config = config
         self._config_path = config_path
@@ -231,6 +239,7 @@ class Supervisor:
         """Set as long as nodes that we have started are on the bus."""
         self._load = checked_load(config)
         self._log_directory = log_directory(record)
+        self._ros2 = Ros2Keeper(self._child, config.ros2 or Ros2Settings()) if ros2 else None
         try:
             self._directory, self._lock = claim(bus)
         except BlockingIOError as error:
@@ -320,6 +329,8 @@ class Supervisor:
         self._record(report)
         if self._live is not None:
             self._live.start(self._config, self._directory, self._instance)
+        if self._ros2 is not None:
+            self._ros2.start(self._config, self._directory, self._instance)
         store = ObjectStore(entries_from_json(report["own_entries"]), self._config.node_id)
         self._bus_service = BusService(
             socket,
@@ -331,6 +342,7 @@ class Supervisor:
             conditions=self._conditions,
             log=self._log_event,
             directory=self._directory,
+            long_frames=LongFrames(self._bus),
         )
         self._node = node = self._bus_service.own
         self._bus_service.begin(time.monotonic())
@@ -426,6 +438,8 @@ class Supervisor:
                 self._recorder.watch()
                 if self._live is not None:
                     self._live.watch()
+                if self._ros2 is not None:
+                    self._ros2.watch()
                 node.recorder_lost = self._recorder.lost
                 reader.note_alive()
                 view, now = reader.read(), time.monotonic()
@@ -483,6 +497,8 @@ class Supervisor:
         self._node.set_parameters(config)
         write_about(self._directory, replace(self._own_description(), started=self._about.started))
         self._record(self._report, again=True)
+        if self._ros2 is not None:
+            self._ros2.renew(config)
 
     # End -----------------------------------------------------------------------------------------------------------------
 

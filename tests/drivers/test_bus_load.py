@@ -1,5 +1,7 @@
 import pytest
 
+from jtqd.daemon.bus.boot import bus_load_of
+from jtqd.daemon.config import load_config
 from jtqd.drivers.bus_load import (
     BusLoad,
     BusLoadError,
@@ -13,17 +15,20 @@ from jtqd.drivers.bus_load import (
 )
 from jtqd.drivers.devices import drive_tpdo1, estimate_tpdos
 from jtqd.drivers.pdo import PdoMap
+from jtqd.models.files import shipped
 
 
 def test_the_bench_by_hand():
-    """SYNC 65, four drive PDOs of 135, sensor 105, estimate 135, four heartbeats of 65 in 100 cycles."""
+    """SYNC 55 (65 with a counter byte), four drive PDOs of 135, sensor 105, estimate 135, four heartbeats of 65 in 100."""
     load = configured_load((1, 2), {3: (1,)})
-    bits = 65 + 4 * 135 + 105 + 135 + 4 * 65 / 100
+    bits = 55 + 4 * 135 + 105 + 135 + 4 * 65 / 100
     assert load.worst == pytest.approx(bits / 1000)
-    assert f"{load.worst:.1%}" == "84.8%"
-    unstuffed = 55 + 4 * 111 + 87 + 111 + 4 * 55 / 100
+    assert f"{load.worst:.1%}" == "83.8%"
+    counted = configured_load((1, 2), {3: (1,)}, sync_counter=True)
+    assert counted.worst - load.worst == pytest.approx(0.010)
+    unstuffed = 47 + 4 * 111 + 87 + 111 + 4 * 55 / 100
     assert load.unstuffed == pytest.approx(unstuffed / 1000)
-    assert f"{load.unstuffed:.1%}" == "69.9%"
+    assert f"{load.unstuffed:.1%}" == "69.1%"
     assert check_bus_load(load) is load
 
 
@@ -37,12 +42,12 @@ def test_a_temperature_is_a_frame_of_75_bits_in_500_ms():
 
 def test_second_channel_fits_and_two_rpdos_do_not():
     load = configured_load((1, 2), {3: (1, 2)})
-    assert load.worst == pytest.approx(0.8476 + 0.085)
+    assert load.worst == pytest.approx(0.8376 + 0.085)
     check_bus_load(load)
     commands = [Row(0x201, "command 1", 6), Row(0x202, "command 2", 6)]
     full = configured_load((1, 2), {3: (1,)}, extra=commands)
-    assert full.worst == pytest.approx(1.0776)
-    with pytest.raises(BusLoadError, match=r"bus load 107\.8% in the worst case, expected at most 95%"):
+    assert full.worst == pytest.approx(1.0676)
+    with pytest.raises(BusLoadError, match=r"bus load 106\.8% in the worst case, expected at most 95%"):
         check_bus_load(full)
 
 
@@ -86,3 +91,14 @@ def test_table_is_in_the_order_of_priority_and_adds_up():
     table = load.table()
     assert [row["cob_id"] for row in table][:7] == ["080h", "181h", "182h", "183h", "1A0h", "281h", "282h"]
     assert sum(row["share"] for row in table) == pytest.approx(load.worst)
+
+
+@pytest.mark.parametrize(("overflow", "length"), [(0, 0), (240, 1)])
+def test_a_configuration_without_sync_counter_has_no_counter_byte(tmp_path, overflow, length):
+    path = tmp_path / "c.yaml"
+    joint = f"{{node: 1, file: '{shipped('joint1.yaml')}'}}"
+    path.write_text(
+        f"node_id: 32\nsync: {{counter_overflow: {overflow}}}\nestimator: {{method: tob}}\njoint_1: {joint}\n"
+    )
+    (row,) = (row for row in bus_load_of(load_config(path)).rows if row.cob_id == 0x080)
+    assert row.length == length

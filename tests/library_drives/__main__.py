@@ -1,4 +1,6 @@
-"""Program of the nodes: `python -m tests.library_drives BUS [--boot-ups N] [--sdo S] [--without 1016,1029]`.
+"""Program of the nodes.
+
+    python -m tests.library_drives BUS [--boot-ups N] [--sdo S] [--without 1016,1029] [--family epos4]
 
 BUS is unix:PATH or a SocketCAN interface. Orders come as lines, each is answered by one: "off 1", "on 1", "cut 1", "join 1",
 "emcy 1 2310", "well 1 2310", "mute 1" (no heartbeat), "state".
@@ -13,6 +15,7 @@ import sys
 
 import can
 
+from tests.library_drives.families import FAMILIES, manners_of
 from tests.library_drives.nodes import Manners, StrictDrive, StrictNode, StrictSensor
 
 
@@ -22,6 +25,7 @@ def main() -> None:
     parser.add_argument("--boot-ups", type=int, default=1)
     parser.add_argument("--sdo", type=float, default=0.0)
     parser.add_argument("--without", default="")
+    parser.add_argument("--family", choices=FAMILIES, default="standard", help="of drive 1")
     arguments = parser.parse_args()
     logging.getLogger("canopen").setLevel(logging.CRITICAL)
     without = tuple(int(each, 16) for each in arguments.without.split(",") if each)
@@ -33,7 +37,7 @@ def main() -> None:
         return can.Bus(interface="socketcan", channel=arguments.bus)
 
     nodes: dict[int, StrictNode] = {
-        1: StrictDrive(1, open_bus, manners),
+        1: FAMILIES[arguments.family](1, open_bus, manners_of(arguments.family, manners)),
         2: StrictDrive(2, open_bus, manners),
         3: StrictSensor(3, open_bus, manners),
     }

@@ -164,6 +164,7 @@ class StrictNode:
 
     device_type = 0
     process: ClassVar[dict[tuple[int, int], tuple[int, Any, str]]] = {}
+    unmappable: ClassVar[frozenset[tuple[int, int]]] = frozenset()
 
     def __init__(self, number: int, open_bus: Callable[[], can.BusABC], manners: Manners) -> None:
         self.number, self.manners = number, manners
@@ -334,7 +335,7 @@ class StrictNode:
                 raise canopen.SdoAbortedError(_UNSUPPORTED)
             if not subindex:
                 self._check_mapping(index, value)
-        elif index == 0x1019 and self.number_of(0x1006):
+        elif index == 0x1019 and 0x1006 not in self.manners.without and self.number_of(0x1006):
             raise canopen.SdoAbortedError(_WRONG_STATE)
         elif index == 0x1010 and bytes(data) != SAVE:
             raise canopen.SdoAbortedError(_NOT_STORED)
@@ -345,7 +346,8 @@ class StrictNode:
         bits = 0
         for entry in range(1, count + 1):
             word = self.number_of(index, entry)
-            kind = self.process.get((word >> 16, word >> 8 & 0xFF), (None,))[0]
+            key = word >> 16, word >> 8 & 0xFF
+            kind = None if key in self.unmappable else self.process.get(key, (None,))[0]
             if kind is None or 8 * struct.calcsize(_SIZES[kind]) != word & 0xFF:
                 raise canopen.SdoAbortedError(_NOT_MAPPABLE)
             bits += word & 0xFF

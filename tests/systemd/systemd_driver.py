@@ -236,6 +236,42 @@ def stopped_loop():
     return {"noticed": noticed, "ready again": ready, "estimate again": time.monotonic() - began}, {}
 
 
+def stopped_supervisor():
+    """SIGSTOP: the loop goes on, and feeds no watchdog for a supervisor that does not turn."""
+    before, pid, began = restarts(), main_pid(), time.monotonic()
+    os.kill(pid, signal.SIGSTOP)
+    noticed = until(lambda: not active(), 20, "the watchdog notices a supervisor that stands still")
+    until(lambda: restarts() == before + 1 and active(), 60, "a restart by the watchdog")
+    ready = time.monotonic() - began
+    estimates(30)
+    assert main_pid() != pid
+    assert len(loops()) == 1, loops()
+    return {"noticed": noticed, "ready again": ready}, {}
+
+
+def wrong_configuration():
+    """Of a unit that is stopped: exit status 2 and one line, and no restart, until somebody has put it right."""
+    good, before = CONFIG.read_text(), restarts()
+    CONFIG.write_text(good.replace("node_id: 32", "node_id: 300"))
+    try:
+        done = run("systemctl", "start", UNIT, check=False)
+        assert done.returncode != 0
+        time.sleep(3.0)  # six times RestartSec
+        seen = {name: show(name) for name in ("ActiveState", "ExecMainStatus", "Result")}
+        assert seen == {"ActiveState": "failed", "ExecMainStatus": "2", "Result": "exit-code"}, seen
+        assert restarts() in (0, before), "a restart would fail again, twice a second"
+        assert not loops()
+        line = re.findall(r"jtqd: (.*node_id.*)", journal(40))[-1]
+        assert "300" in line, line
+        assert "Traceback" not in journal(40)
+    finally:
+        CONFIG.write_text(good)
+    run("systemctl", "start", UNIT)
+    estimates(30)
+    run("systemctl", "stop", UNIT)
+    return {}, {**seen, "said": line}
+
+
 def killed(which):
     before = restarts()
     pids = loops()
@@ -420,6 +456,8 @@ def uninstall(root):
 STEPS = {
     "start": start,
     "stopped loop": stopped_loop,
+    "stopped supervisor": stopped_supervisor,
+    "wrong configuration": wrong_configuration,
     "killed supervisor": lambda: killed("supervisor"),
     "killed loop": lambda: killed("loop"),
     "link down and up": link_down,

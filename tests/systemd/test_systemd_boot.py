@@ -18,10 +18,26 @@ from tests.systemd.systemd_wheels import ROOT, make_environment, make_wheels
 DRIVER = Path(__file__).with_name("systemd_driver.py")
 PYTHON = Path("/usr/bin/python3")
 pytestmark = pytest.mark.boots
-SHORT = ("start", "bad reload", "good reload", "stopped loop", "stop")
+SHORT = (
+    "start",
+    "bad reload",
+    "good reload",
+    "stopped loop",
+    "stopped supervisor",
+    "stop",
+    "wrong configuration",
+)
 LONG = (
-    *("start", "bad reload", "good reload", "stopped loop", "killed supervisor", "killed loop"),
-    *("link down and up", "link removed and made again", "full disk", "stop", "uninstall"),
+    *("start", "bad reload", "good reload", "stopped loop", "stopped supervisor"),
+    *("killed supervisor", "killed loop"),
+    *(
+        "link down and up",
+        "link removed and made again",
+        "full disk",
+        "stop",
+        "wrong configuration",
+        "uninstall",
+    ),
 )
 
 
@@ -65,6 +81,8 @@ def check(found: dict[str, dict[str, Any]], steps: tuple[str, ...]) -> None:
     assert list(found) == ["install", *steps]
     assert found["install"]["seen"]["exposure"] <= 2.0
     assert 1.5 < found["stopped loop"]["seconds"]["noticed"] < 4.0  # WatchdogSec=2s
+    assert 1.5 < found["stopped supervisor"]["seconds"]["noticed"] < 8.0
+    assert found["wrong configuration"]["seen"]["ExecMainStatus"] == "2"
     assert len(found["bad reload"]["seen"]) == 4
     assert "needs a restart" in found["bad reload"]["seen"]["another period"]
     assert "sha256" in found["bad reload"]["seen"]["a network with another hash"]

@@ -10,11 +10,14 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from jtqd.models.files import shipped
 from tests.library_drives.bench import LibraryBench
+from tests.library_drives.families import PULSES, RATED_MA
+from tests.library_drives.nodes import GEAR, LINK_COUNTS
 
 
 @contextmanager
@@ -153,6 +156,52 @@ def test_objects_of_the_makers_own(bench: LibraryBench) -> None:
     apart = sorted(abs(one - two) for one, two in pairs)  # at a reversal one rpm is another quadrant
     assert apart[round(0.8 * len(apart))] < 0.3
     assert bench.stop(jtqd) == 0
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize(
+    ("family", "section"),
+    [
+        (
+            "epos4",
+            {
+                "objects": {
+                    "motor_position": {"factor": math.pi / (2 * PULSES)},
+                    "link_position": {"factor": 2.0 * math.pi / LINK_COUNTS},
+                    "current": {"factor": 1e-6 * RATED_MA},
+                },
+                "given": {"6091h:1": GEAR, "6091h:2": 1},
+            },
+        ),
+        (
+            "elmo_gold",
+            {
+                "objects": {"link_position": {"factor": 2.0 * math.pi / LINK_COUNTS}},
+                "given": {"608Fh:1": 4 * PULSES, "6090h:1": 4 * PULSES, "6091h:1": GEAR, "6091h:2": 1},
+            },
+        ),
+        (
+            "nanotec",
+            {
+                "objects": {"current": {"factor": 1e-6 * RATED_MA}},
+                "given": {"6091h:1": GEAR, "6091h:2": 1},
+            },
+        ),
+    ],
+)
+def test_a_drive_of_a_family_beside_one_of_cia_402(family: str, section: dict[str, Any]) -> None:
+    """Joint 1 by its profile, joint 2, with the same motion and joint file, by CiA 402: the torques agree."""
+    with a_bench("--family", family) as bench:
+        joint_2 = {"file": str(shipped("joint1.yaml"))}
+        jtqd = bench.start(joint_1={"profile": family, **section}, joint_2=joint_2)
+        assert bench.until(bench.both_used), bench.said()
+        assert bench.until(lambda: len(bench.torques_nm) > 500)
+        pairs = [(one, two) for one, two in bench.torques_nm[100:] if one is not None and two is not None]
+        assert len(pairs) > 250
+        assert max(abs(one) for one, _ in pairs) > 2.0
+        apart = sorted(abs(one - two) for one, two in pairs)  # at a reversal one rpm is another quadrant
+        assert apart[round(0.8 * len(apart))] < 0.5
+        assert bench.stop(jtqd) == 0
 
 
 @pytest.mark.campaign

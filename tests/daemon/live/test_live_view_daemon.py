@@ -14,9 +14,9 @@ import pytest
 
 from jtqd.daemon import jtqd
 from jtqd.daemon.config import load_config
-from jtqd.daemon.live import keeper as keeper_module
 from jtqd.daemon.live.address import Address
 from jtqd.daemon.live.keeper import LiveKeeper
+from jtqd.daemon.shared import side_process
 from jtqd.daemon.shared.child_process import Child
 from tests.daemon.live.live_view_helpers import ROOT, Memory, Viewer
 
@@ -73,7 +73,7 @@ def test_one_that_is_killed_is_started_again(kept):
 
 
 def test_one_that_dies_again_and_again_is_left(kept, monkeypatch):
-    monkeypatch.setattr(keeper_module, "_PAUSE_S", 0.0)
+    monkeypatch.setattr(side_process, "_PAUSE_S", 0.0)
     for _ in range(5):
         kept.until(_LISTENING)
         os.kill(kept.keeper.pid, signal.SIGKILL)

@@ -1,0 +1,156 @@
+"""Cycle records and diagnostics as messages of ROS 2. Pure.
+
+A quantity without a value is NaN; with a status that permits no torque neither torque nor sigma is a number.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from jtqd.daemon.recording.messages import Status
+from jtqd.daemon.ros2.idl import (
+    DiagnosticArray,
+    DiagnosticStatus,
+    Header,
+    JointState,
+    JointTorqueState,
+    KeyValue,
+    Time,
+)
+from jtqd.daemon.shared import cycle_record as cycle
+from jtqd.daemon.shared import faults
+from jtqd.daemon.shared.snapshot import JointView, View
+from jtqd.estimator import status as st
+
+INTERVAL_SIGMAS = 1.96
+"""95 % of a normal distribution."""
+_NS = 1_000_000_000
+_NS_TO_S = 1e-9
+
+
+def header(time_ns: int) -> Header:
+    """Return a header without a frame; `time_ns`: CLOCK_REALTIME."""
+    seconds, nanoseconds = divmod(time_ns, _NS)
+    return Header(stamp=Time(sec=seconds, nanosec=nanoseconds), frame_id="")
+
+
+class JointMessages:
+    """Messages of the newest cycle.
+
+    Args:
+        names: of the joints, joint 1 first.
+        gear_ratios: motor revolutions per joint revolution.
+    """
+
+    def __init__(self, names: Sequence[str], gear_ratios: Sequence[float]) -> None:
+        self._names, self._ratios = [*names], [*gear_ratios]
+        self._statuses = cycle.selection((), ("status",), len(names)).unpack_from
+        self._withheld = [0] * len(names)
+        self._last: bytes | None = None
+
+    def take(self, records: Sequence[bytes]) -> None:
+        """Take the cycle records since the last call, oldest first; the messages are of the newest."""
+        for record in records:
+            for n, status in enumerate(self._statuses(record)):
+                self._withheld[n] += status not in st.PUBLISHED
+        if records:
+            self._last = records[-1]
+
+    def joint_state(self) -> JointState | None:
+        """Return the measured motion and the estimate of the newest cycle; None before the first."""
+        if self._last is None:
+            return None
+        joints = self._joints(self._last)
+        return JointState(
+            header=header(cycle.header_of(self._last).sync_realtime_ns),
+            name=self._names,
+            position=[joint.link_position_rad for joint in joints],
+            velocity=[
+                joint.motor_velocity_rad_s / ratio for joint, ratio in zip(joints, self._ratios, strict=True)
+            ],
+            effort=[_number(joint.torque_nm, joint.status) for joint in joints],
+        )
+
+    def torque_state(self, now_ns: int, *, stalled: bool = False) -> JointTorqueState | None:
+        """Return the torque state of the newest cycle; None before the first.
+
+        Args:
+            now_ns: CLOCK_MONOTONIC.
+            stalled: the loop stands still: nothing of that cycle is true any more.
+        """
+        if self._last is None:
+            return None
+        of, joints = cycle.header_of(self._last), self._joints(self._last)
+        statuses = [st.STALE if stalled else joint.status for joint in joints]
+        torque = [_number(joint.torque_nm, s) for joint, s in zip(joints, statuses, strict=True)]
+        sigma = [_number(joint.sigma_nm, s) for joint, s in zip(joints, statuses, strict=True)]
+        reach = [
+            s if status == st.STANDSTILL else INTERVAL_SIGMAS * s
+            for s, status in zip(sigma, statuses, strict=True)
+        ]
+        withheld, self._withheld = self._withheld, [0] * len(joints)
+        return JointTorqueState(
+            header=header(of.sync_realtime_ns),
+            cycle=of.cycle,
+            missed=of.missed,
+            sync_counter=of.sync_counter,
+            age=(now_ns - of.sync_monotonic_ns) * _NS_TO_S,
+            name=self._names,
+            status=statuses,
+            torque=torque,
+            sigma=sigma,
+            lower=[value - half for value, half in zip(torque, reach, strict=True)],
+            upper=[value + half for value, half in zip(torque, reach, strict=True)],
+            faults=[joint.input_flags >> 8 for joint in joints],
+            latched=[bool(joint.input_flags & cycle.FLAG_LATCHED) for joint in joints],
+            withheld=withheld,
+        )
+
+    def _joints(self, record: bytes) -> list[cycle.JointRecord]:
+        return [cycle.joint_of(record, number) for number in range(1, len(self._names) + 1)]
+
+
+def _number(value: float, status: int) -> float:
+    return value if status in st.PUBLISHED else math.nan
+
+
+def diagnostic_array(
+    time_ns: int, bus: str, statuses: Sequence[Status], view: View, age_s: float
+) -> DiagnosticArray:
+    """Return the statuses of /diagnostics, the bus in their names, and with the faults and the age of each joint.
+
+    Args:
+        time_ns: CLOCK_REALTIME.
+        bus: aggregators tell statuses apart by their names alone.
+        statuses: of the log's /diagnostics.
+        view: that they were made of.
+        age_s: of its newest cycle [s].
+    """
+    joints = {f"jtqd: joint {number}": joint for number, joint in enumerate(view.joints, start=1)}
+    return DiagnosticArray(
+        header=header(time_ns),
+        status=[
+            DiagnosticStatus(
+                level=status.level,
+                name=status.name.replace("jtqd:", f"jtqd {bus}:", 1),
+                message=status.text,
+                hardware_id=status.hardware_id,
+                values=[
+                    KeyValue(key=key, value=f"{value:.6g}" if isinstance(value, float) else str(value))
+                    for key, value in (dict(status.values) | _faults(joints.get(status.name), age_s)).items()
+                ],
+            )
+            for status in statuses
+        ],
+    )
+
+
+def _faults(joint: JointView | None, age_s: float) -> dict[str, float | str]:
+    if joint is None:
+        return {}
+    return {
+        "faults": ", ".join(faults.names_of(joint.input_flags >> 8)) or "none",
+        "latched": ", ".join(faults.names_of(joint.latched)) or "none",
+        "age_s": age_s,
+    }

@@ -1,0 +1,218 @@
+"""The ROS 2 publisher's process: `python -m jtqd.daemon.ros2.process REQUEST` reads the loop's shared memory and publishes.
+
+Topics, all reliable, volatile, keep last 10, in XCDR1:
+
+    rt/joint_states          sensor_msgs/JointState        `rate_hz`
+    rt/joint_torque_states   jtqd_msgs/JointTorqueState    `rate_hz`
+    rt/diagnostics           diagnostic_msgs/DiagnosticArray   1 Hz
+
+A joint state is sent once per new cycle at most: while the loop stands still there is none. The torque state goes on and
+says so: STALE, no torque, a growing age. Nothing that the network sends reaches the loop: ring and snapshot are mapped
+read-only.
+
+REQUEST is JSON: {"ring", "snapshot": paths, "domain_id", "interface", "rate_hz", "names": of the joints, "bus": name,
+"nodes": [[node-ID, name]], "gear_ratios"}. One line of JSON on stdout says how it began: {"publishing": what} or
+{"failed": why}. It ends on SIGTERM. Exit status 0 ended in order, 1 could not begin.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import math
+import os
+import socket
+import struct
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+from cyclonedds.core import DDSException
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+from jtqd.daemon.recording.diagnostics import Diagnostics, Node
+from jtqd.daemon.ros2.idl import TYPE_HASHES, DiagnosticArray, JointState, JointTorqueState, Message
+from jtqd.daemon.ros2.messages import JointMessages, diagnostic_array
+from jtqd.daemon.ros2.network import domain_xml
+from jtqd.daemon.shared import cycle_record as cycle
+from jtqd.daemon.shared.conditions import read_conditions
+from jtqd.daemon.shared.ring import RingError, RingReader
+from jtqd.daemon.shared.side_process import Stop, answer
+from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader
+
+TOPICS: Final[dict[type[Message], str]] = {
+    JointState: "joint_states",
+    JointTorqueState: "joint_torque_states",
+    DiagnosticArray: "diagnostics",
+}
+"""Names in ROS 2; on the wire they begin with rt/."""
+DEPTH = 10
+STALLED_S = 0.1
+"""A loop without a new cycle for so long stands still."""
+_DIAGNOSIS_S = 1.0
+_QUANTILES = (0.5, 0.99, 1.0)
+_NICE = 10
+
+
+_SIOCGIFADDR = 0x8915
+
+
+def own_addresses() -> list[str]:
+    """Return the IPv4 addresses of this machine, one per interface that has any."""
+    found = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
+        for _, name in socket.if_nameindex():
+            with suppress(OSError):  # it has none
+                request = struct.pack("256s", name.encode()[:15])
+                found.append(socket.inet_ntoa(fcntl.ioctl(asked, _SIOCGIFADDR, request)[20:24]))
+    return found
+
+
+class Writers:
+    """One DDS writer per topic.
+
+    Args:
+        domain_id: DDS domain.
+        interface: network interface.
+
+    Raises:
+        DDSException: it cannot take part in that domain.
+    """
+
+    def __init__(self, domain_id: int, interface: str) -> None:
+        self._domain = Domain(domain_id, domain_xml(interface, own_addresses()))
+        # rmw takes a participant without an enclave for none of ROS
+        participant = DomainParticipant(domain_id, Qos(Policy.Userdata(b"enclave=/;")))
+        self._writers: dict[type[Message], DataWriter[Any]] = {
+            kind: DataWriter(participant, Topic(participant, f"rt/{name}", kind), qos_of(kind))
+            for kind, name in TOPICS.items()
+        }
+
+    def write(self, message: Message) -> None:
+        """Write a message; one that a reader holds up for too long is left out. Raises DDSException."""
+        try:
+            self._writers[type(message)].write(message)
+        except DDSException as error:
+            if error.code != DDSException.DDS_RETCODE_TIMEOUT:
+                raise
+
+
+def qos_of(kind: type[Message]) -> Qos:
+    """Return the quality of service of a topic: the default of ROS 2."""
+    return Qos(
+        Policy.Reliability.Reliable(duration(milliseconds=100)),
+        Policy.Durability.Volatile,
+        Policy.History.KeepLast(DEPTH),
+        Policy.DataRepresentation(use_cdrv0_representation=True),
+        Policy.Userdata(f"typehash={TYPE_HASHES[kind]};".encode()),
+    )
+
+
+class Source:
+    """What the daemon leaves in shared memory, as messages.
+
+    Args:
+        request: of the process.
+
+    Raises:
+        RingError, SnapshotError: it is not there.
+    """
+
+    def __init__(self, request: dict[str, Any]) -> None:
+        names, self._bus = request["names"], request["bus"]
+        self._ring = RingReader(Path(request["ring"]), cycle.layout_of(len(names)).size)
+        self._snapshot = SnapshotReader(Path(request["snapshot"]))
+        self._directory = Path(request["snapshot"]).parent
+        nodes = [Node(int(number), str(name)) for number, name in request["nodes"]]
+        self._diagnostics = Diagnostics(self._bus, names, nodes)
+        self._joints = JointMessages(names, request["gear_ratios"])
+        self._ring.position += self._ring.backlog  # what was before us is old
+        self._newest_ns: int | None = None
+        self._diagnosed_ns = 0
+
+    def read(self, now_ns: int, realtime_ns: int) -> Iterator[Message]:
+        """Return the messages that are due.
+
+        Args:
+            now_ns: CLOCK_MONOTONIC.
+            realtime_ns: CLOCK_REALTIME.
+        """
+        records = self._ring.read(self._ring.backlog).records
+        self._joints.take(records)
+        if records:
+            self._newest_ns = now_ns
+        stalled = self._newest_ns is not None and now_ns - self._newest_ns > STALLED_S * 1e9
+        made = self._joints.joint_state() if records else None
+        state = self._joints.torque_state(now_ns, stalled=stalled) if records or stalled else None
+        yield from (message for message in (made, state) if message is not None)
+        if now_ns - self._diagnosed_ns >= _DIAGNOSIS_S * 1e9:
+            self._diagnosed_ns = now_ns
+            yield self._diagnosis(now_ns, realtime_ns)
+
+    def _diagnosis(self, now_ns: int, realtime_ns: int) -> DiagnosticArray:
+        view = self._snapshot.read()
+        statuses = self._diagnostics.of_the_loop(
+            view,
+            work_us=self._snapshot.work_us(*_QUANTILES),
+            late_us=self._snapshot.late_us(*_QUANTILES),
+            now_ns=realtime_ns,
+            conditions=read_conditions(self._directory),
+        )
+        age_s = (now_ns - view.sync_monotonic_ns) * 1e-9 if view.sync_monotonic_ns else math.nan
+        return diagnostic_array(realtime_ns, self._bus, statuses, view, age_s)
+
+
+def publish(source: Source, writers: Writers, rate_hz: float, stop: Stop) -> None:
+    """Publish until stopped. Turns follow a grid; one that is missed is not made up."""
+    period_s = 1.0 / rate_hz
+    due = time.monotonic()
+    while not stop.requested:
+        for message in source.read(time.monotonic_ns(), time.time_ns()):
+            writers.write(message)
+        left = (due := due + period_s) - time.monotonic()
+        if left < 0.0:
+            due += math.ceil(-left / period_s) * period_s
+        time.sleep(max(0.0, due - time.monotonic()))
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line of the process; returns the exit status."""
+    request = json.loads((sys.argv[1:] if arguments is None else arguments)[0])
+    stop = Stop()
+    with suppress(OSError):
+        os.nice(_NICE)
+    domain_id, interface, rate_hz = request["domain_id"], request["interface"], request["rate_hz"]
+    where = f"domain {domain_id}, interface {interface}"
+    try:
+        source = Source(request)
+        if interface not in (name for _, name in socket.if_nameindex()):
+            answer(failed=f"{where}: there is no such network interface")
+            return 1
+        writers = Writers(domain_id, interface)
+    except (RingError, SnapshotError) as error:
+        answer(failed=str(error))
+        return 1
+    except OSError as error:  # a service whose unit forbids them
+        answer(failed=f"{where}: no network sockets: {error.strerror or error}")
+        return 1
+    except DDSException as error:
+        answer(failed=f"{where}: Cyclone DDS: {error.msg or error}")
+        return 1
+    answer(publishing=f"/{', /'.join(TOPICS.values())} at {rate_hz:g} Hz, {where}")
+    try:
+        publish(source, writers, rate_hz, stop)
+    except DDSException as error:
+        print(f"jtqd: ROS 2 publisher: {error.msg or error}", file=sys.stderr, flush=True)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

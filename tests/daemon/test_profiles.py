@@ -1,0 +1,320 @@
+"""Profiles of drive families: read, put below a configuration, found by vendor-ID, and tried on nodes with their layouts.
+
+The nodes are the canopen library's (tests/library_drives/families.py). What `jtq init` writes for such a node is booted, and
+its PDOs are scaled: they must say how its motor moves, as those of the drive of CiA 402 beside it do.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from jtqd.daemon import profiles
+from jtqd.daemon.bus.boot import boot_request
+from jtqd.daemon.cli import init, probe
+from jtqd.daemon.config import load_config
+from jtqd.daemon.recording import keeper
+from jtqd.daemon.replay.origin import CONFIGURATION, PROVENANCE, open_origin
+from jtqd.drivers.boot import BootReport, boot
+from jtqd.drivers.boot_request import parse_request
+from jtqd.drivers.devices import DriveScaling
+from jtqd.drivers.filters import CanFilter
+from jtqd.drivers.frame import CAN_EFF_FLAG, FRAME, pack
+from jtqd.drivers.frame_socket import open_frame_socket
+from jtqd.estimator.checked import ConfigError
+from jtqd.models.files import shipped
+from tests.library_drives.families import PULSES, RATED_MA
+from tests.library_drives.nodes import GEAR, LINK_COUNTS
+from tests.paths import ROOT
+
+FAMILIES = ["elmo_gold", "epos4", "nanotec"]
+PAGE = ROOT / "docs" / "profiles.md"
+OPTIONS = ["--rated-torque", "30", "--torque-constant", "0.1", "--gear-ratio", str(GEAR)]
+COUNTS = {
+    "epos4": ["--link-encoder-counts", str(LINK_COUNTS)],
+    "elmo_gold": ["--encoder-counts", str(4 * PULSES), "--link-encoder-counts", str(LINK_COUNTS)],
+    "nanotec": [],
+}
+"""What no object of such a drive tells."""
+
+
+def configuration(tmp_path: Path, **joint: Any) -> Path:
+    path = tmp_path / "c.yaml"
+    section = {"node": 1, "file": str(shipped("joint1.yaml")), **joint}
+    path.write_text(yaml.safe_dump({"node_id": 32, "estimator": {"method": "tob"}, "joint_1": section}))
+    return path
+
+
+def test_every_family_is_read_and_every_line_has_its_source() -> None:
+    assert profiles.names() == FAMILIES
+    for family in profiles.shipped():
+        assert family.lines
+        assert profiles.of_vendor(family.vendor) == family
+        assert all(line.source and line.state in profiles.STATES for line in family.lines)
+    assert profiles.of_vendor(0x7A1) is None
+    assert profiles.of_vendor(None) is None
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_the_page_shows_the_profile_as_it_is(name: str) -> None:
+    family = profiles.named(name)
+    page = PAGE.read_text()
+    assert "\n".join(profiles.table(family)) in page, "python -m jtqd.daemon.profiles prints it"
+    assert all(text in page for text in family.waits)
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_a_configuration_has_the_values_of_its_profile_and_its_own_go_before(
+    name: str, tmp_path: Path
+) -> None:
+    family = profiles.named(name)
+    own: dict[str, Any] = {"profile": name}
+    for line in family.lines:
+        if line.open and line.key is not None:
+            section, *middle, last = line.key.split(".")
+            place = own.setdefault(section, {})
+            for each in middle:
+                place = place.setdefault(each, {})
+            place[last] = 7
+    own.setdefault("objects", {})["statusword"] = {"index": 0x2041}
+    (joint,) = load_config(configuration(tmp_path, **own)).joints
+    assert joint.profile == name
+    assert joint.objects.statusword.index == 0x2041
+    section = family.section()
+    for quantity, values in section["objects"].items():
+        for key, value in values.items():
+            found = getattr(joint.objects, quantity)
+            assert {"index": found.index, "sub": found.subindex, "factor": found.factor}.get(
+                key, value
+            ) == value
+    assert {key: joint.given[key] for key in section.get("given", {})} == section.get("given", {})
+
+
+def test_what_the_profile_leaves_open_must_be_there(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config(configuration(tmp_path, profile="epos4"))
+    text = str(caught.value)
+    assert text.startswith(f"{tmp_path / 'c.yaml'}: key 'joint_1.objects.motor_position.factor': missing")
+    assert "3010h:1" in text
+    assert "\n" not in text
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("epos5", "key 'joint_1.profile': profile: found 'epos5', expected one of 'elmo_gold', 'epos4'"),
+        ("mine.yaml", "mine.yaml: cannot be read"),
+    ],
+)
+def test_a_profile_that_there_is_not_is_one_line(name: str, text: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"joint_1\.profile") as caught:
+        load_config(configuration(tmp_path, profile=name))
+    assert text in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("line", "text"),
+    [
+        ({"key": "a.b"}, "a key with one of value, read and option"),
+        ({"key": "a.b", "value": 1, "read": "6075h"}, "a key with one of value, read and option"),
+        ({"value": 1}, "a key with one of value, read and option"),
+        ({"check": "6075h"}, "an object with its expected value"),
+        ({"check": "75", "expected": 1}, "an object like 608Fh:1"),
+        ({"state": "surely"}, "one of 'by the manual'"),
+        ({"source": ""}, "a text of printable characters"),
+        ({"unknown": 1}, "unknown"),
+    ],
+)
+def test_a_wrong_line_is_one_line_that_names_it(line: dict[str, Any], text: str, tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    whole = {"why": "w", "source": "s", "state": "not confirmed", **line}
+    path.write_text(yaml.safe_dump({"title": "t", "vendor": 1, "lines": [whole]}))
+    with pytest.raises(ConfigError) as caught:
+        profiles.load(path)
+    assert text in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+def test_a_profile_of_ones_own_lies_beside_the_configuration(tmp_path: Path) -> None:
+    line = {
+        "key": "objects.current.factor",
+        "value": 0.25,
+        "why": "w",
+        "source": "s",
+        "state": "tried on the bus",
+    }
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump({"title": "t", "vendor": 1, "lines": [line]}))
+    (joint,) = load_config(configuration(tmp_path, profile="mine.yaml")).joints
+    assert joint.objects.current.factor == 0.25
+
+
+def test_the_log_keeps_the_profile_and_a_replay_reads_it_as_it_was(tmp_path: Path) -> None:
+    line = {
+        "key": "objects.current.factor",
+        "value": 0.25,
+        "why": "w",
+        "source": "s",
+        "state": "tried on the bus",
+    }
+    profile = tmp_path / "mine.yaml"
+    profile.write_text(yaml.safe_dump({"title": "t", "vendor": 1, "lines": [line]}))
+    config = load_config(configuration(tmp_path, profile="mine.yaml"))
+    attached = {name: data for name, _, data in keeper._attached_files(config)}
+    assert attached["mine.yaml"] == profile.read_bytes()
+    factors = dict.fromkeys(
+        ("motor_rad_per_count", "motor_rad_s_per_unit", "link_rad_per_count", "ampere_per_unit"), 1.0
+    )
+    factors["ampere_per_unit"] = -0.25  # a drive that counts backwards
+    provenance = keeper._provenance(config, {"nodes": {"1": {"scaling": factors, "gear_ratio": 100.0}}})
+    attached |= {CONFIGURATION: config.text.encode(), PROVENANCE: json.dumps(provenance).encode()}
+    profile.unlink()
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    origin = open_origin(tmp_path / "a.mcap", attached, empty)
+    assert origin.config.joints[0].objects.current.factor == 0.25
+    changed = load_config(configuration(write_again(tmp_path, line), profile="mine.yaml"))
+    assert changed.sha256 == config.sha256
+    assert changed.files_sha256 != config.files_sha256
+
+
+def write_again(directory: Path, line: dict[str, Any]) -> Path:
+    text = yaml.safe_dump({"title": "t", "vendor": 1, "lines": [line | {"value": 0.5}]})
+    (directory / "mine.yaml").write_text(text)
+    return directory
+
+
+# On a bus -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module", params=FAMILIES)
+def bus(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple[str, str]]:
+    """A hub with a drive of the family as node 1, one of CiA 402 as node 2, a sensor as node 3."""
+    hub = tmp_path_factory.mktemp("hub") / "h"
+    name = f"unix:{hub}"
+    command = [sys.executable, "-m"]
+    with subprocess.Popen([*command, "jtqd.drivers.hub", name]) as server:
+        deadline = time.monotonic() + 20.0
+        while not hub.exists() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        nodes = subprocess.Popen(
+            [*command, "tests.library_drives", name, "--family", request.param],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert nodes.stdout is not None
+        assert nodes.stdout.readline() == "ready\n"
+        yield name, request.param
+        nodes.terminate()
+        nodes.communicate(timeout=20)
+        server.terminate()
+
+
+def files_of_init(name: str, family: str, tmp_path: Path, *more: str) -> tuple[int, Path]:
+    nodes = ["--node", "1", "--node", "2", "--sensor", "none"]
+    arguments = ["--bus", name, "--out", str(tmp_path), *nodes, *OPTIONS, *COUNTS[family], *more]
+    return init.main([*arguments, "--json", "--force"]), tmp_path / "jtqd.yaml"
+
+
+def test_init_finds_the_family_and_its_drive_is_scaled_as_the_one_beside_it(
+    bus: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name, family = bus
+    status, path = files_of_init(name, family, tmp_path)
+    printed = capsys.readouterr()
+    assert status == 0, printed
+    assert any(f"profile {family}" in note for note in json.loads(printed.out)["notes"])
+    config = load_config(path)
+    assert [joint.profile for joint in config.joints] == [family, None]
+    found: list[dict[str, float]] = []
+    boot(
+        parse_request(boot_request(config, name)), hold=lambda report: found.extend(quantities(name, report))
+    )
+    for each in found:
+        moves_as_it_should(each)
+    first, second = found
+    assert first["motor_velocity"] == pytest.approx(second["motor_velocity"], abs=2.0), "the same direction"
+
+
+def moves_as_it_should(values: dict[str, float]) -> None:
+    """All values of one SYNC are of one moment: a swing of one turn at 0.2 Hz, 1 A in phase with the position."""
+    assert values["gear_ratio"] == GEAR
+    assert 0.1 < abs(values["current"]) < 1.0, "it moves"
+    assert values["motor_position"] == pytest.approx(2.0 * math.pi * values["current"], abs=2e-2)
+    assert values["link_position"] == pytest.approx(values["motor_position"] / GEAR, abs=1e-3)
+    velocity = values["motor_velocity"] / (0.8 * math.pi**2)
+    assert velocity**2 + values["current"] ** 2 == pytest.approx(1.0, abs=3e-2)
+
+
+def quantities(name: str, report: BootReport) -> list[dict[str, float]]:
+    """What the PDOs of nodes 1 and 2 say in SI units after one SYNC, when the motor is neither at rest nor at its turn."""
+    socket = open_frame_socket(name, [CanFilter(0, CAN_EFF_FLAG)])
+    wanted = {pdo.cob_id: (node, pdo) for node in (1, 2) for pdo in report.nodes[node].tpdos}
+    while not 0.3 < abs(math.sin(0.4 * math.pi * time.monotonic())) < 0.9:
+        time.sleep(0.01)
+    socket.send(pack(0x080))
+    raw: dict[int, dict[str, float]] = {1: {}, 2: {}}
+    seen = set()
+    deadline = time.monotonic() + 5.0
+    while seen != set(wanted) and time.monotonic() < deadline:
+        socket.wait(0.1)
+        for n in range(socket.receive()):
+            can_id, length, data = FRAME.unpack_from(socket.frames, 16 * n)
+            if can_id in wanted:
+                node, pdo = wanted[can_id]
+                raw[node] |= dict(zip(pdo.names, pdo.layout.unpack(data[:length]), strict=True))
+                seen.add(can_id)
+    socket.close()
+    assert seen == set(wanted)
+    found = []
+    for node in (1, 2):
+        scaling = report.nodes[node].scaling
+        assert isinstance(scaling, DriveScaling)
+        found.append(
+            {
+                "motor_position": raw[node]["motor_position"] * scaling.motor_rad_per_count,
+                "link_position": raw[node]["link_position"] * scaling.link_rad_per_count,
+                "motor_velocity": raw[node]["motor_velocity"] * scaling.motor_rad_s_per_unit,
+                "current": raw[node]["current"] * scaling.ampere_per_unit,
+                "gear_ratio": report.nodes[node].gear_ratio or 0.0,
+            }
+        )
+    return found
+
+
+def test_probe_names_the_family_and_prints_its_section(
+    bus: tuple[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    name, family = bus
+    probe.main(["--bus", name, "--node", "1"])
+    text = capsys.readouterr().out
+    assert f"profile {family}: {profiles.named(family).title}" in text
+    probe.main(["--bus", name, "--node", "1", "--profile", "none"])
+    assert "profile" not in capsys.readouterr().out.splitlines()[1]
+    probe.main(["--bus", name, "--node", "2"])
+    assert "profile epos4" not in capsys.readouterr().out
+
+
+def test_a_drive_in_other_units_than_the_profile_takes_it_for_is_told() -> None:
+    numbers = {(0x60A8, 0): 0x00B50000, (0x60A9, 0): 0xFDB44700}
+    (finding,) = profiles.named("epos4").findings(numbers)
+    assert finding.startswith("60A9h:0: expected 0xB44700, found 0xFDB44700")
+
+
+def test_the_rated_current_makes_the_factor() -> None:
+    family = profiles.named("epos4")
+    filled = family.filled({(0x3001, 1): RATED_MA, (0x3010, 1): 800}, {})
+    assert filled["objects.current.factor"] == (pytest.approx(RATED_MA * 1e-6), "3001h:1 of the drive")
+    assert filled["objects.motor_position.factor"][0] == pytest.approx(2.0 * math.pi / 3200)
+    assert "objects.link_position.factor" not in filled
