@@ -22,13 +22,18 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib import pyplot as plt
 
+from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable, RunTableError
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.command import diagnosed
+from jtqd.sysid.diagnosis.dataset import usable_signals
 from jtqd.sysid.diagnosis.findings import Cause, Findings, Gap, Value, to_mapping
+from jtqd.sysid.diagnosis.regressors import bin_samples, binned, run_data
+from jtqd.sysid.diagnosis.signals import Channel, JointSignals
 from jtqd.sysid.report import figures as parts
+from jtqd.sysid.runs.checks import check_runs
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import RunError, RunFile, read_run
 
@@ -65,7 +70,8 @@ def measured_runs() -> list[RunFile]:
 def one_encoder(table: RunTable) -> RunTable:
     """Return the run without motor positions, which the column map makes from the joint's: there is one encoder.
 
-    As a second encoder they would mean that no joint ever twists under its load.
+    As a second encoder they would mean that no joint ever twists under its load. Velocity and acceleration are those of the
+    velocity channel: of the position, with its repeated rows, they would be known below 18 Hz only.
     """
     joints = {number: replace(columns, motor_position_rad=None) for number, columns in table.joints.items()}
     return RunTable(table.time_s, joints)
@@ -110,6 +116,42 @@ def run_lines(results: Sequence[Diagnosed]) -> list[str]:
             for run in (one.findings.gain.runs if one.findings.gain is not None else ())
         ]
     return lines
+
+
+def ladder_lines(results: Sequence[Diagnosed]) -> list[str]:
+    """Return the error on each run of a regression fitted on the other: offset, Coulomb, viscous, inertia, load."""
+    runs = measured_runs()
+    lines = ["| joint | left out | ladder [Nm rms] | with the causes |", "|---|---|---|---|"]
+    for one in results:
+        checked = check_runs([(r.name, only(r, one.number).table) for r in runs], {one.number: one.joint})
+        signals, _ = usable_signals(checked.runs, {one.number: one.joint}, (one.number,))
+        if len(signals) < len(RUNS):
+            continue
+        samples = bin_samples(s for run in signals for s in run)
+        parts = [_ladder(run, samples) for run in signals]
+        after = {} if one.findings.gain is None else {g.run: g.rmse_after_nm for g in one.findings.gain.runs}
+        for (x, y, name), (fitted_x, fitted_y, _) in zip(parts, parts[::-1], strict=True):
+            size = np.sqrt(np.mean(fitted_x**2, axis=0))
+            found = np.linalg.lstsq(fitted_x / size, fitted_y, rcond=1e-3)[0] / size
+            error = float(np.sqrt(np.mean((y - x @ found) ** 2)))
+            own = f"{after[name]:.2f}" if name in after else f"{float(np.sqrt(np.mean(y**2))):.2f} (file)"
+            lines.append(f"| {one.number} | {name} | {error:.2f} | {own} |")
+    return lines
+
+
+def _ladder(run: Sequence[JointSignals], samples: int) -> tuple[FloatArray, FloatArray, str]:
+    """Return columns [n, 5] and residual [n] of the motor balance, binned as the diagnosis has them, and the run's name."""
+    (s,) = run
+    state, data = s.state, run_data(run, [], samples).channels[Channel(s.number, "motor")]
+    terms = (
+        np.ones(len(s.time_s)),
+        state.direction,
+        state.velocity_rad_s,
+        state.motor_acceleration_rad_s2,
+        np.abs(state.torque_nm) * state.direction,
+    )
+    columns = np.column_stack([binned(s.seen("motor", term), samples) for term in terms])
+    return columns[data.valid], data.residual[data.valid], s.run
 
 
 def largest_gap(findings: Findings) -> Gap | None:
@@ -201,7 +243,7 @@ def main(arguments: list[str] | None = None) -> int:
     if options.json:
         print(json.dumps(as_mapping(results, sha256), indent=1, allow_nan=False))
     else:
-        print("\n".join((*table_lines(results), "", *run_lines(results))))
+        print("\n".join((*table_lines(results), "", *run_lines(results), "", *ladder_lines(results))))
     return 0
 
 

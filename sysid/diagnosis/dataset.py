@@ -210,7 +210,7 @@ def build_dataset(
     candidates = library_candidates(signals, joints, scope)
     candidates += _cogging_orders(signals, joints, candidates, scope)
     lines = unknown_lines(signals, candidates, samples, step)
-    groups = families([s.number for s in signals[0]], lines)
+    groups = families(signals, lines)
     if scope.known_references & set(joints):  # a known load has no zero that differs from run to run
         groups = [group for group in groups if group.name != "zero"]
     runs = [run_data(run, candidates, samples, groups) for run in signals]

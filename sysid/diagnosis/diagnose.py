@@ -1,6 +1,7 @@
 """The diagnosis from run tables and joint files to findings: the order of its steps.
 
-tables -> signals -> binned dataset -> noise -> search -> refinement -> (events out, again) -> verdict
+tables -> signals -> binned dataset -> (odd runs out, again) -> noise -> search -> refinement -> (events out, again)
+-> verdict
 """
 
 from __future__ import annotations
@@ -26,17 +27,19 @@ from jtqd.sysid.diagnosis.findings import (
     NO_GAP,
     UNEXPLAINED,
     Findings,
+    OddRun,
 )
 from jtqd.sysid.diagnosis.leftover import events_left
 from jtqd.sysid.diagnosis.mixed_model import Mixed
 from jtqd.sysid.diagnosis.next_experiment import each_joint, next_experiment
 from jtqd.sysid.diagnosis.noise import Noise, noise_model, run_sums
-from jtqd.sysid.diagnosis.recordings import piece_notes
+from jtqd.sysid.diagnosis.odd_runs import odd_run
+from jtqd.sysid.diagnosis.recordings import piece_notes, recordings
 from jtqd.sysid.diagnosis.refine import present_effects, refine
 from jtqd.sysid.diagnosis.regressors import RunData, column_moments
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope
 from jtqd.sysid.diagnosis.search import Hypothesis, Search
-from jtqd.sysid.diagnosis.signals import Channel
+from jtqd.sysid.diagnosis.signals import Channel, JointSignals
 from jtqd.sysid.diagnosis.verdict import RELEVANCE, conclude
 
 _WORST_FIRST: Final = (UNEXPLAINED, AMBIGUOUS, CAUSE, INSUFFICIENT, NO_GAP)
@@ -87,7 +90,7 @@ def _diagnosed(
         there = {n: joints[n] for n in numbers}
         plan = next_experiment([], there, "; ".join(reasons)) if there else None
         return Findings(INSUFFICIENT, tuple(reasons), names, numbers, next_experiment=plan)
-    dataset = build_dataset(usable, joints, scope)
+    usable, dataset, odd = without_odd_runs(usable, joints, scope)
     least = RELEVANT * max(joints[n].rated_torque_nm for n in numbers)
     noise, search, best = _searched(dataset, least)
     refined = refine(dataset, present_effects(best), noise)
@@ -97,7 +100,28 @@ def _diagnosed(
         noise, search, best = _searched(dataset, least)
         refined = refine(dataset, present_effects(best), noise)
     findings = conclude(dataset, search, best, refined, noise, joints, names, numbers, relevance)
-    return replace(findings, channel_notes=(*reasons, *resolution_notes(usable), *piece_notes(usable)))
+    notes = (*reasons, *(o.text for o in odd), *resolution_notes(usable), *piece_notes(usable))
+    return replace(findings, channel_notes=notes, odd_runs=tuple(odd))
+
+
+def without_odd_runs(
+    signals: list[list[JointSignals]], joints: Mapping[int, Joint], scope: Scope = EVERYTHING
+) -> tuple[list[list[JointSignals]], Dataset, list[OddRun]]:
+    """Return signals and dataset without the runs that differ from all others, and how those differ: one at a time, fewer
+    than half of the recordings.
+    """
+    odd: list[OddRun] = []
+    dataset = build_dataset(signals, joints, scope)
+    count = len(set(recordings(signals)))
+    while 2 * (len(odd) + 1) < count:
+        found = odd_run(dataset)
+        if found is None:
+            break
+        places, one = found
+        odd.append(one)
+        signals = [run for r, run in enumerate(signals) if r not in places]
+        dataset = build_dataset(signals, joints, scope)
+    return signals, dataset, odd
 
 
 def one_sensor(runs: Sequence[tuple[str, RunTable]], numbers: Sequence[int]) -> bool:
@@ -138,6 +162,7 @@ def combined(parts: Sequence[Findings]) -> Findings:
             key=lambda left: (left.matters, left.of_rated),
             default=None,
         ),
+        odd_runs=tuple(odd for f in parts for odd in f.odd_runs),
     )
 
 

@@ -148,6 +148,43 @@ class LeftOver:
 
 
 @dataclass(frozen=True)
+class OddRun:
+    """A run that differs from all others and is not used: what ("gain", "zero", "delay") of which column differs by `value`
+    from the mean of the others, whose standard deviation is `usual`. others: deviations that fit nearly as well.
+
+    unit: "" for a gain (0.07: it reads 7 % more), "of rated" (torque; of a current, its torque), "s" (late).
+    """
+
+    run: str
+    what: str
+    channel: str
+    joint: JointName
+    value: float
+    usual: float
+    unit: str
+    others: tuple[str, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """One line for people."""
+        channel = "torque_nm" if self.joint == "sensor" else f"j{self.joint}.{self.channel}"
+        what, scale, unit = {
+            "gain": ("reads", 100.0, "%"),
+            "zero": ("has its zero", 100.0, "% of rated torque"),
+            "delay": ("is", 1000.0, "ms"),
+        }[self.what]
+        sides = {"gain": ("more", "less"), "zero": ("higher", "lower"), "delay": ("later", "earlier")}[
+            self.what
+        ]
+        side = sides[0] if self.value > 0.0 else sides[1]
+        either = f", or it differs in the {' or '.join(self.others)}" if self.others else ""
+        return (
+            f"{self.run}: {channel} {what} {abs(scale * self.value):.3g} {unit} {side} than in the other runs, which differ "
+            f"by {scale * self.usual:.2g} {unit} among themselves{either}: a matter of this run, which is not used"
+        )
+
+
+@dataclass(frozen=True)
 class Findings:
     """All of it. gaps: largest excess first; causes: largest first; reasons: lines for people."""
 
@@ -167,6 +204,7 @@ class Findings:
     )  # to compare the found values with
     explained_share: float = float("nan")
     left_over: LeftOver | None = None
+    odd_runs: tuple[OddRun, ...] = ()
 
 
 _NO_GAP_MEASURED: Final[dict[str, Any]] = {
@@ -199,6 +237,7 @@ def to_mapping(
         "left_over": None if findings.left_over is None else _left_over(findings.left_over),
         "next_experiment": _without_table(findings.next_experiment),
         "reasons": findings.reasons,
+        "odd_runs": [_odd_run(each) for each in findings.odd_runs],
         "joints": findings.joints,
         "runs": [{"name": name, "sha256": (sha256 or {}).get(name)} for name in findings.runs],
         "gaps": [_gap(each) for each in findings.gaps],
@@ -282,6 +321,20 @@ def _left_over(left: LeftOver) -> dict[str, Any]:
     }
 
 
+def _odd_run(odd: OddRun) -> dict[str, Any]:
+    return {
+        "run": odd.run,
+        "what": odd.what,
+        "channel": odd.channel,
+        "joint": odd.joint,
+        "value": odd.value,
+        "usual": odd.usual,
+        "unit": odd.unit,
+        "or": odd.others,
+        "text": odd.text,
+    }
+
+
 def _values(cause: Cause, joints: Mapping[int, Joint]) -> dict[str, Any]:
     """Value, interval and unit; and with joint files the file's value and the relative change."""
     known = file_values(cause.name, cause.joint, cause.parameters, joints)
@@ -331,6 +384,7 @@ def summary_lines(findings: Findings) -> list[str]:
     """Return verdict, gap, causes with intervals, gain, next experiment for a terminal: one line each."""
     lines = [f"{findings.verdict}: {_VERDICTS_IN_WORDS.get(findings.verdict, '')}"]
     lines += [f"  {reason}" for reason in findings.reasons]
+    lines += [f"odd run: {odd.text}" for odd in findings.odd_runs]
     for gap in findings.gaps[:1]:
         lines.append(
             f"gap: joint {gap.joint}, {gap.balance} balance: {gap.rmse_nm:.3g} Nm rms, "

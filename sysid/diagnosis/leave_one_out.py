@@ -64,14 +64,15 @@ class LeaveOneOut:
 
     def _ladders(self) -> list[Hypothesis]:
         """Return the sets that are worth it of what is fitted to a joint first: friction, inertia, load-dependent friction.
-        One of them may show only with the others, as each is wrong in a file that nobody measured.
+        One of them may show only with the others, as each is wrong in a file that nobody measured; and one alone, that
+        all runs share, need not be worth it in BIC, which may give it to the changes from run to run.
         """
         terms: dict[tuple[str, object], EffectCandidate] = {}
         for c in self.search.candidates:
             if c.effect.name in _LADDER:
                 terms.setdefault(c.key, c)
         out = []
-        for size in range(2, len(_LADDER) + 1):
+        for size in range(1, len(_LADDER) + 1):
             for chosen in itertools.combinations(terms.values(), size):
                 if len({c.joint for c in chosen}) == 1:
                     h = self.search.hypothesis(chosen)

@@ -18,7 +18,13 @@ from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.effects.effect import MOTOR, TORSION, Effect, Term, Values
 from jtqd.estimator.effects.whole import Whole
 from jtqd.sysid.diagnosis.findings import JointName
-from jtqd.sysid.diagnosis.signals import Channel, JointSignals, Line, second_difference
+from jtqd.sysid.diagnosis.signals import (
+    SLOWEST_RAD_S,
+    Channel,
+    JointSignals,
+    Line,
+    second_difference,
+)
 
 BIN_S: Final = 0.005
 LONG_S: Final = 600.0
@@ -167,22 +173,49 @@ class Family(NamedTuple):
     phase_rad: float = 0.0
 
 
-_SIGMA: Final = {"zero": 0.15, "smooth": 0.3, "viscous": 0.08, "coulomb": 0.02, "torsion_zero": 1e3}
-"""Prior standard deviations: Nm; shares of the file's Coulomb, viscous, Coulomb friction; Nm. All but `zero` per joint."""
+_ZERO: Final = 0.0025
+"""Prior standard deviation of a run's own sensor zero, part of the rated torque."""
+_SHARE: Final = {"smooth": 0.3, "viscous": 0.08, "coulomb": 0.02}
+"""Prior standard deviations of a run's own friction, as parts of the joint's usual one (`usual_friction`)."""
+_TORSION_ZERO: Final = 25.0
+"""The same of the torsion's zero, part of the rated torque: any, as encoders are mounted."""
+_LEAST_COULOMB: Final = 0.0125
+_LEAST_SMOOTH: Final = 0.0025
+_LEAST_VISCOUS: Final = 0.01
+"""Parts of the rated torque that a usual friction is at least (viscous: at the usual speed), whatever the file says."""
 
 LINE: Final = "line"
 
 
-def families(joints: Sequence[int], lines: Sequence[Line] = ()) -> list[Family]:
-    """Return the families of nuisances of these joints and lines."""
-    out = [Family("zero", 0, _SIGMA["zero"])]
-    out += [Family(name, j, sigma) for name, sigma in _SIGMA.items() if name != "zero" for j in joints]
+def families(runs: Sequence[Sequence[JointSignals]], lines: Sequence[Line] = ()) -> list[Family]:
+    """Return the families of nuisances of the joints of these runs [run][joint], and of lines.
+
+    All scales are in proportion to the joint: its rated torque, its friction, the speeds of the runs.
+    """
+    joints = [s.number for s in runs[0]]
+    rated = {s.number: s.joint.rated_torque_nm for s in runs[0]}
+    usual = {n: usual_friction([s for run in runs for s in run if s.number == n]) for n in joints}
+    out = [Family("zero", 0, _ZERO * min(rated.values()))]
+    out += [Family(name, n, part * usual[n][name]) for name, part in _SHARE.items() for n in joints]
+    out += [Family("torsion_zero", n, _TORSION_ZERO * rated[n]) for n in joints]
     for line in lines:
         wave = {"hz": line.order} if line.unit == "Hz" else {"order": line.order}
         for phase in (0.0, 0.5 * np.pi):
             c = line.channel
             out.append(Family(LINE, c.joint, line.amplitude_nm, c.balance, phase_rad=phase, **wave))
     return out
+
+
+def usual_friction(signals: Sequence[JointSignals]) -> dict[str, float]:
+    """Return what friction of one joint is usual in its runs, per family: Nm, viscous Nms/rad."""
+    joint = signals[0].joint
+    rated, friction = joint.rated_torque_nm, joint.friction
+    speed = math.sqrt(float(np.mean([np.mean(s.state.velocity_rad_s**2) for s in signals])))
+    return {
+        "smooth": max(friction.coulomb_nm, _LEAST_SMOOTH * rated),
+        "viscous": max(friction.viscous_nms_per_rad, _LEAST_VISCOUS * rated / max(speed, SLOWEST_RAD_S)),
+        "coulomb": max(friction.coulomb_nm, _LEAST_COULOMB * rated),
+    }
 
 
 def _nuisance(s: JointSignals, balance: str, family: Family) -> FloatArray | None:
@@ -196,14 +229,13 @@ def _nuisance(s: JointSignals, balance: str, family: Family) -> FloatArray | Non
             return None
         turn = family.order * s.state.motor_position_rad + 2.0 * np.pi * family.hz * s.state.time_s
         return np.asarray(np.cos(turn - family.phase_rad))
-    friction = s.joint.friction
     v, d = s.state.velocity_rad_s, s.state.direction
     if balance == TORSION:
         return np.ones(len(s.time_s)) if family.name == "torsion_zero" else None
     made: dict[str, FloatArray] = {
-        "smooth": max(friction.coulomb_nm, 0.1) * d * (1.0 - np.tanh(np.abs(v) / 0.02)),
-        "viscous": max(friction.viscous_nms_per_rad, 0.5) * v,
-        "coulomb": max(friction.coulomb_nm, 0.5) * d,
+        "smooth": d * (1.0 - np.tanh(np.abs(v) / 0.02)),
+        "viscous": v,
+        "coulomb": d,
     }
     return made.get(family.name)
 
@@ -215,7 +247,7 @@ def run_data(
     groups: Sequence[Family] = (),
 ) -> RunData:
     """Return one run's binned residuals and regressors; `run`: its joints; groups: nuisances, the usual ones if empty."""
-    groups = groups or families([s.number for s in run])
+    groups = groups or families([run])
     channels: dict[Channel, ChannelData] = {}
     for s in run:
         for balance in (MOTOR, TORSION):

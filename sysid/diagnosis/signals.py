@@ -51,7 +51,8 @@ class Line:
     unit: str = "1/rev"
 
 
-_SLOPE_NM: Final = 0.3
+_SLOPE: Final = 0.0075
+"""Part of the rated torque over which the losses' slope is taken: as wide as zeros of torque sensors are."""
 
 
 class BaseLoss:
@@ -64,6 +65,7 @@ class BaseLoss:
 
     def __init__(self, joint: Joint) -> None:
         self._friction: Final = joint.friction
+        self._slope_nm: Final = _SLOPE * joint.rated_torque_nm
         self._rows: tuple[FloatArray, FloatArray] | None = None
         if joint.efficiency is not None:
             highest = max(DRIVING_CURRENT_MAX_A, 9.0)
@@ -109,14 +111,15 @@ class BaseLoss:
     def slope(self, torque_nm: FloatArray, velocity_rad_s: FloatArray) -> FloatArray:
         """Return d loss / d torque [n]: torque that is wrong by e leaves a loss wrong by slope times e.
 
-        Zero without efficiency: such losses know no load. Taken over +-_SLOPE_NM, as wide as zeros of torque sensors are,
-        so that the grid of the table does not show.
+        Zero without efficiency: such losses know no load. Taken over +-_SLOPE of the rated torque, so that the grid of the
+        table does not show.
         """
         if self._rows is None:
             return np.zeros_like(velocity_rad_s)
-        ahead = self.loss(torque_nm + _SLOPE_NM, velocity_rad_s)
-        behind = self.loss(torque_nm - _SLOPE_NM, velocity_rad_s)
-        return (ahead - behind) / (2.0 * _SLOPE_NM)
+        wide = self._slope_nm
+        ahead = self.loss(torque_nm + wide, velocity_rad_s)
+        behind = self.loss(torque_nm - wide, velocity_rad_s)
+        return (ahead - behind) / (2.0 * wide)
 
 
 SLOWEST_RAD_S: Final = 0.03
@@ -403,7 +406,8 @@ def smooth(x: FloatArray, samples: int) -> FloatArray:
     return result
 
 
-_LARGEST_NM: Final = 2.0
+_LARGEST_ZERO: Final = 0.05
+"""Part of the rated torque that a first guess of the sensor's zero may be."""
 _TURNS: Final = 2
 
 
@@ -416,7 +420,7 @@ def about_zero(run: Sequence[JointSignals], bases: Mapping[int, BaseLoss]) -> li
 
         motor = .. - loss0(tau) - tau = .. - z - (loss0(tau) - loss0(tau - z))  ~  .. - z (1 + loss0')
 
-    A zero of 0.3 Nm is not small where the efficiency turns from driving to driven back, within 2 Nm. So loss0 is expanded
+    A zero of 1 % of the rated torque is not small where the efficiency turns over, within 5 %. So loss0 is expanded
     about a first guess z0 of each run's zero and not about 0; the residual still holds the whole of z, now linearly. A bad
     guess does no harm but that of none.
     """
@@ -462,4 +466,5 @@ def _first_guess(run: Sequence[JointSignals]) -> float:
     if not rows:
         return 0.0
     found = np.linalg.lstsq(np.concatenate(rows), np.concatenate(rest), rcond=None)[0]
-    return float(np.clip(found[0], -_LARGEST_NM, _LARGEST_NM))
+    largest = _LARGEST_ZERO * min(s.joint.rated_torque_nm for s in run)
+    return float(np.clip(found[0], -largest, largest))

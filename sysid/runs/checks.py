@@ -2,9 +2,9 @@
 
 Every check of a joint's channels against each other holds for every use (`channels`). A diagnosis takes every column at
 its word, so a thorough check asks more: time base (`time_base`), units (`units`), energy, held and clipped stretches,
-spikes, skew. A joint of a run whose columns contradict each other (unit, sign, dead, another joint's file) is left out
-with one line; a channel that is only not needed (temperature, link encoder) is left out alone; what is usable but odd
-(short stuck stretches, clipping, spikes, uneven time) is a note.
+spikes, skew, columns exchanged between two joints (`swapped`). A joint of a run whose columns contradict each other (unit,
+sign, dead, another joint's file or columns) is left out with one line; a channel that is only not needed (temperature, link
+encoder) is left out alone; what is usable but odd (short stuck stretches, clipping, spikes, uneven time) is a note.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.runs.channels import RunIssue, check_channels, check_energy, check_held, check_spikes
 from jtqd.sysid.runs.files import RunFile
+from jtqd.sysid.runs.swapped import swapped_columns
 from jtqd.sysid.runs.time_base import (
     SKEW_NOTED_S,
     SKEW_REFUSED_S,
@@ -95,7 +96,9 @@ def check_run(
         notes += rolled + uneven
     refused: list[RunIssue] = []
     usable: dict[int, JointColumns] = {}
-    for number in sorted(set(joints) & set(table.joints)):
+    exchanged = swapped_columns(table, joints, name) if thorough else []
+    refused += [issue for _, _, issue in exchanged]
+    for number in sorted(set(joints) & set(table.joints) - {n for a, b, _ in exchanged for n in (a, b)}):
         where = f"{name}: j{number}" if name else f"j{number}"
         if thorough:
             columns, why, odd = _checked_joint(table, number, joints[number], where)

@@ -47,6 +47,7 @@ def render(findings: Findings, made: str = "", effects: Mapping[str, Effect] | N
         "reasons_first": findings.verdict in {UNEXPLAINED, INSUFFICIENT},
         "causes": views.cause_views(findings, library() if effects is None else effects),
         "gaps": gap_views(findings.gaps),
+        "left": views.left_view(findings),
         "evidence": evidence,
         "shown": max(views.SHOWN, sum(1 for row in evidence if row.state)),
         "gains": views.gain_views(findings.gain),

@@ -201,6 +201,18 @@ class CauseView:
     balance: str
     equation: str
     tell_tale: str
+    share: str = ""
+    steadiness: str = ""
+
+
+@dataclass(frozen=True)
+class LeftView:
+    """What the causes leave: rms, part of the rated torque, whether that matters, what they explain ("" without causes)."""
+
+    rms: str
+    of_rated: str
+    judged: str
+    explained: str
 
 
 @dataclass(frozen=True)
@@ -262,6 +274,27 @@ def _cause(cause: Cause, effects: Mapping[str, Effect], joints: Mapping[int, Joi
         balance_title(cause.balance),
         effect.equation if effect else "",
         effect.tell_tale if effect else "",
+        _known_percent(cause.explained_share),
+        number(cause.steadiness, 2) if math.isfinite(cause.steadiness) else "",
+    )
+
+
+def _known_percent(share: float) -> str:
+    return percent(share) if math.isfinite(share) else ""
+
+
+def left_view(findings: Findings) -> LeftView | None:
+    """Return what the causes leave that is structure, None where it was not measured."""
+    left = findings.left_over
+    if left is None:
+        return None
+    limit = f"from {number(left.relevant_nm)}{SPACE}Nm on it matters"
+    place_ = f"joint {left.joint}, {left.balance} balance"
+    return LeftView(
+        f"{number(left.rms_nm)}{SPACE}Nm",
+        percent(left.of_rated, 2),
+        f"{place_}; {'it matters' if left.matters else 'it does not matter'} ({limit})",
+        _known_percent(findings.explained_share) if findings.causes else "",
     )
 
 

@@ -171,3 +171,48 @@ def rigid_run(
         current_a=current, motor_position_rad=G * motor, link_position_rad=link, torque_nm=torque
     )
     return RunTable(t, {1: columns})
+
+
+def rich_run(
+    joint: Joint,
+    seed: int,
+    *,
+    seconds: float = 6.0,
+    step_s: float = 1e-3,
+    noise: float = 0.0,
+    zero: float = 0.0,
+) -> RunTable:
+    """Joint 1 by the equations, both encoders, motion and load of many periods each: what differs in one run shows.
+
+    noise: of current and link encoder, as torque at the joint; zero: of the sensor; both as parts of the rated torque.
+    """
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, seconds, step_s)
+
+    def waves(slowest_s: float, fastest_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        w = 2.0 * np.pi / np.geomspace(slowest_s, fastest_s, 5) * rng.uniform(0.8, 1.25, 5)
+        size, phase = w**-0.6 * rng.uniform(0.5, 1.0, 5), rng.uniform(0.0, 2.0 * np.pi, 5)
+        angle = w[:, None] * t + phase[:, None]
+        scale = 1.0 / float(np.abs(size @ np.sin(angle)).max())
+        return (
+            scale * (size @ np.sin(angle)),
+            scale * ((size * w) @ np.cos(angle)),
+            -scale * ((size * w**2) @ np.sin(angle)),
+        )
+
+    link, speed, acceleration = (0.5 * x for x in waves(5.0, 0.5))
+    torque, rate, bend = (0.45 * joint.rated_torque_nm * x for x in waves(3.0, 0.25))
+    G, K, friction = joint.gear_ratio, joint.stiffness_nm_per_rad, joint.friction
+    gear = torque + joint.link_inertia_kgm2 * acceleration
+    velocity = speed + rate / K
+    bent = (gear - joint.damping_nms_per_rad * rate / K) / K
+    loss = friction.coulomb_nm * np.sign(velocity) + friction.viscous_nms_per_rad * velocity
+    inertial = joint.rotor_inertia_kgm2 * G**2 * (acceleration + bend / K)
+    noise_nm = noise * joint.rated_torque_nm * rng.normal(size=len(t))
+    columns = JointColumns(
+        current_a=(gear + loss + inertial + noise_nm) / (G * joint.torque_constant_nm_per_a),
+        motor_position_rad=G * (link + bent),
+        link_position_rad=link + noise * joint.rated_torque_nm / K * rng.normal(size=len(t)),
+        torque_nm=torque + zero * joint.rated_torque_nm,
+    )
+    return RunTable(t, {1: columns})

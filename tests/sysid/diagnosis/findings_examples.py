@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from jtqd.sysid.diagnosis.findings import Cause, Findings, Gain
+from jtqd.sysid.diagnosis.findings import Cause, Findings, Gain, LeftOver, OddRun
 from tests.sysid.diagnosis.findings_parts import (
     GAIN,
     INFINITY,
@@ -55,7 +55,23 @@ def one_cause() -> Findings:
             ),
             gap(1, "torsion", 0.152, 0.149, {}),
         ),
-        causes=(Cause("torque_ripple", 1, ("torque_ripple",), ripple, 4312.0, 0.81, 0.296, "motor"),),
+        causes=(
+            Cause("torque_ripple", 1, ("torque_ripple",), ripple, 4312.0, 0.81, 0.296, "motor", 0.94, 57.0),
+        ),
+        explained_share=0.94,
+        left_over=LeftOver(1, "motor", 0.072, 0.0018, 0.06, 0.2, matters=False),
+        odd_runs=(
+            OddRun(
+                "excitation_07.csv.gz",
+                "gain",
+                "current_a",
+                1,
+                0.071,
+                0.002,
+                "",
+                ("gain of torque_nm of the sensor",),
+            ),
+        ),
         candidates=candidates(
             (1,),
             {

@@ -53,7 +53,7 @@ def peaked(runs: int, seed: float, noise: float = NOISE_NM) -> Dataset:
         for k in range(runs)
     ]
     made = [[signals(t, name=f"run{k}")] for k, t in enumerate(tables)]
-    groups = families([1])
+    groups = families(made)
     binned = [columns_module.run_data(s, [], SAMPLES, groups) for s in made]
     unexplained = {c: [np.zeros(len(r.time_s)) for r in binned] for c in binned[0].channels}
     return Dataset(made, binned, [], SAMPLES, SAMPLES * 1e-3, unexplained, groups, [])

@@ -180,7 +180,7 @@ def test_a_run_holds_every_column_where_its_effect_shows() -> None:
 def test_what_may_differ_from_run_to_run() -> None:
     s = joint_signals("run", rigid_run(PLAIN), 1, PLAIN, BaseLoss(PLAIN))
     lines = [Line(MOTOR1, 3.5, 0.4, 50.0), Line(TORSION1, 7.0, 0.2, 50.0, "Hz")]
-    groups = families([1, 2], lines)
+    groups = families([[s, replace(s, number=2)]], lines)
     names = [(g.name, g.joint) for g in groups]
     assert names[0] == ("zero", 0)
     assert names.count(("viscous", 2)) == 1
@@ -197,10 +197,12 @@ def test_what_may_differ_from_run_to_run() -> None:
     assert column(MOTOR1, 0) == pytest.approx(-1.0), "a sensor that reads too high"
     assert column(TORSION1, 0) == pytest.approx(-1.0)
     v, d = s.state.velocity_rad_s, s.state.direction
-    assert column(MOTOR1, names.index(("viscous", 1))) == pytest.approx(3.0 * v), (
-        "shares of the file's friction"
-    )
-    assert column(MOTOR1, names.index(("coulomb", 1))) == pytest.approx(4.0 * d)
+    assert column(MOTOR1, names.index(("viscous", 1))) == pytest.approx(v)
+    assert column(MOTOR1, names.index(("coulomb", 1))) == pytest.approx(d)
+    sigma = {(g.name, g.joint): g.sigma for g in groups}
+    assert sigma["viscous", 1] == pytest.approx(0.08 * 3.0), "shares of the file's friction"
+    assert sigma["coulomb", 1] == pytest.approx(0.02 * 4.0)
+    assert sigma["zero", 0] == pytest.approx(0.0025 * PLAIN.rated_torque_nm)
     order, hertz = names.index(("line", 1)), names.index(("line", 1)) + 2
     assert column(MOTOR1, order) == pytest.approx(np.cos(3.5 * s.state.motor_position_rad))
     assert column(MOTOR1, order + 1) == pytest.approx(np.sin(3.5 * s.state.motor_position_rad))

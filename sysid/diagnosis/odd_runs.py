@@ -1,0 +1,264 @@
+"""Runs whose channels differ from those of the other runs: another gain, zero or delay than all the rest.
+
+A loose plug, a sensor zeroed anew or another filter of the drive belongs to one run and to no joint. An effect of the joint
+is in all runs, a change from day to day is small; what is in one run alone and beyond any day is that run's:
+
+    y_r = X_r beta + Z_r u_r + w_r d_r + e          w: a unit of gain, zero or delay of one channel of run r alone
+
+1. Effects of the library and deviations of single runs are added one by one, whichever lowers the squared error most, beside
+   the usual changes u_r from run to run (`regressors.families`), until none lowers BIC by `search.ENTER`.
+2. A run is odd where a deviation was chosen and, beside the effects chosen, differs from the mean of the other runs by more
+   than FAR standard deviations: its own error, and the spread of the others with what is usual (USUAL, worth four runs).
+
+All effects at once would not do: with a coefficient for everything a library with temperatures and gains follows any single
+run. Two runs cannot tell which of them is odd. One run at a time is taken away, fewer than half of all (`diagnose`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.effects.effect import MOTOR
+from jtqd.sysid.diagnosis.dataset import Dataset
+from jtqd.sysid.diagnosis.findings import JointName, OddRun
+from jtqd.sysid.diagnosis.mixed_model import explained, solve
+from jtqd.sysid.diagnosis.noise import noise_model, run_sums, saturated_residuals
+from jtqd.sysid.diagnosis.regressors import EffectCandidate, RunData, binned, gain_columns
+from jtqd.sysid.diagnosis.search import ENTER, within
+from jtqd.sysid.diagnosis.signals import Channel, JointSignals
+
+FEWEST: Final = 3
+"""Recordings among which one can be odd."""
+FAR: Final = 5.0
+USUAL: Final[Mapping[str, float]] = {"gain": 0.01, "zero": 0.004, "delay": 5e-4}
+"""What runs usually differ by: a part, a part of the rated torque (of a current, its torque), seconds."""
+UNITS: Final[Mapping[str, str]] = {"gain": "", "zero": "of rated", "delay": "s"}
+_USUAL_RUNS: Final = 4.0
+_FREE: Final = 100.0
+"""Deviations that are asked for are free up to so many times the usual."""
+_PASSES: Final = 2
+_AS_GOOD: Final = 0.8
+"""Part of the drop of the squared error that another deviation of the same run must reach to be named beside."""
+_NOT_BESIDE: Final = frozenset({"sensor_gain"})
+"""With the sensor's gain free beside all else, everything can be scaled away (`noise.saturated_residuals`)."""
+_MOST_COLUMNS: Final = 24
+
+
+class Deviation(NamedTuple):
+    """What one run may have of its own: a gain, zero or delay of the current of a joint, or of the sensor."""
+
+    what: str
+    channel: str
+    joint: JointName
+    usual: float
+    unit: str
+
+
+def odd_run(dataset: Dataset) -> tuple[list[int], OddRun] | None:
+    """Return places in dataset.runs of the run (or its pieces) that differs most from all others, and how; None: none."""
+    pieces = np.arange(len(dataset.runs)) if dataset.pieces is None else np.array(dataset.pieces, np.intp)
+    count = int(pieces.max()) + 1
+    if count < FEWEST:
+        return None
+    kinds = deviations(dataset.joints)
+    runs = [
+        _with_columns(run, signals, kinds, dataset)
+        for run, signals in zip(dataset.runs, dataset.signals, strict=True)
+    ]
+    columns = dataset.candidates[-1].columns.stop if dataset.candidates else 0
+    sigma = np.array([family.sigma for family in dataset.families])
+    leave = gain_columns(dataset.candidates)
+    for _ in range(_PASSES):
+        # the noise is first what nothing explains, then what the chosen effects leave
+        residuals = {c: saturated_residuals(runs, c, leave) for c in runs[0].channels}
+        noise = noise_model(runs, residuals, dataset.step_s)
+        sums = [run_sums(run, noise, columns, len(sigma) + len(kinds)) for run in runs]
+        grams = np.zeros((count, *sums[0].gram.shape))
+        np.add.at(grams, pieces, np.array([s.gram for s in sums]))
+        rows = sum(s.rows for s in sums) / noise.inflation
+        comparison = Comparison(without_days(grams, columns, sigma), columns)
+        chosen, odd = comparison.chosen(dataset.candidates, math.log(max(rows, 10.0)))
+        found = [(comparison.drop(chosen, odd, *at), at, comparison.far(chosen, at, kinds)) for at in odd]
+        far = [(drop, at, size) for drop, at, size in found if size is not None]
+        if not far:
+            return None
+        leave = set(range(columns)) - set(chosen)
+    most, (r, k), (apart, spread) = max(far)
+    others = tuple(
+        f"{o.what} of {o.channel} of {'the sensor' if o.joint == 'sensor' else f'joint {o.joint}'}"
+        for j, o in enumerate(kinds)
+        if j != k and comparison.drop(chosen, odd, r, j) >= _AS_GOOD * most
+    )
+    places = [int(p) for p in np.flatnonzero(pieces == r)]
+    kind, name = kinds[k], dataset.runs[places[0]].name
+    return places, OddRun(name, kind.what, kind.channel, kind.joint, apart, spread, kind.unit, others)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Normal equations of every run over effects, deviations and residual [r, P + K + 1, same]; columns: P."""
+
+    runs: FloatArray
+    columns: int
+
+    @property
+    def kinds(self) -> int:
+        """Number of deviations K."""
+        return int(self.runs.shape[1]) - 1 - self.columns
+
+    @cached_property
+    def total(self) -> FloatArray:
+        """The sum over the runs [P + R K + 1, same], every deviation of every run a column of its own."""
+        count, p, k = len(self.runs), self.columns, self.kinds
+        out = np.zeros((p + count * k + 1,) * 2)
+        for r, run in enumerate(self.runs):
+            places = np.array([*range(p), *range(p + r * k, p + (r + 1) * k), out.shape[0] - 1], np.intp)
+            out[places[:, None], places] += run
+        return out
+
+    def place(self, r: int, k: int) -> int:
+        """Return the column of deviation k of run r in `total`."""
+        return self.columns + r * self.kinds + k
+
+    def chosen(
+        self, candidates: Sequence[EffectCandidate], log_n: float
+    ) -> tuple[list[int], list[tuple[int, int]]]:
+        """Return the columns of the effects, and the deviations (run, kind), that are there: added one by one."""
+        own = [(r, k) for r in range(len(self.runs)) for k in range(self.kinds)]
+        price = log_n + 2.0 * math.log(len(own))
+        blocks: list[tuple[list[int], EffectCandidate | tuple[int, int], float]] = [
+            (list(c.columns), c, c.size * log_n) for c in candidates if c.effect.name not in _NOT_BESIDE
+        ]
+        blocks += [([self.place(*at)], at, price) for at in own]
+        here: list[int] = []
+        odd: list[tuple[int, int]] = []
+        while blocks and len(here) < _MOST_COLUMNS:
+            worth = [explained(self.total, here, block) - cost for block, _, cost in blocks]
+            if max(worth) < ENTER:
+                break
+            block, new, _ = blocks.pop(int(np.argmax(worth)))
+            if isinstance(new, EffectCandidate):
+                ends = np.array([*here, *block, -1], np.intp)
+                beta, _ = solve(self.total[ends[:, None], ends], len(ends) - 1)
+                if not within(new, [float(x) for x in beta[len(here) :]]):
+                    continue
+                blocks = [b for b in blocks if not isinstance(b[1], EffectCandidate) or b[1].key != new.key]
+            else:
+                odd.append(new)
+            here += block
+        return [p for p in here if p < self.columns], odd
+
+    def drop(self, chosen: Sequence[int], odd: Sequence[tuple[int, int]], r: int, k: int) -> float:
+        """Return by how much deviation k of run r lowers the squared error beside the effects and other runs' deviations."""
+        beside = [*chosen, *(self.place(*at) for at in odd if at[0] != r)]
+        return explained(self.total, beside, [self.place(r, k)])
+
+    def far(
+        self, chosen: Sequence[int], at: tuple[int, int], kinds: Sequence[Deviation]
+    ) -> tuple[float, float] | None:
+        """Return by how much a run is apart from the others, and their spread, where it is far from them."""
+        r, k = at
+        values, errors = own_deviations(self.runs, chosen, self.columns + k, _FREE * kinds[k].usual)
+        apart, spread = apart_from_others(values, r, kinds[k].usual)
+        return (apart, spread) if abs(apart) > FAR * float(np.hypot(spread, errors[r])) else None
+
+
+def deviations(joints: Mapping[int, object]) -> list[Deviation]:
+    """Return what is asked of every run with these joints; zeros are in parts of the rated torque."""
+    where: list[tuple[str, JointName]] = [*(("current_a", n) for n in joints), ("torque_nm", "sensor")]
+    return [
+        Deviation(what, channel, joint, USUAL[what], UNITS[what])
+        for what in USUAL
+        for channel, joint in where
+    ]
+
+
+def column(kind: Deviation, s: JointSignals, balance: str) -> FloatArray | None:
+    """Return what one unit of a deviation leaves in a balance of one joint [n], Nm; None: nothing."""
+    state, joint = s.state, s.joint
+    if kind.channel == "current_a":
+        if kind.joint != s.number or balance != MOTOR:
+            return None
+        scale = joint.gear_ratio * joint.torque_constant_nm_per_a
+        made = {
+            "gain": scale * state.current_a,
+            "zero": np.full(len(s.time_s), joint.rated_torque_nm),
+            "delay": -scale * state.current_rate_a_s,
+        }
+        return np.asarray(made[kind.what])
+    made = {
+        "gain": -state.torque_nm,
+        "zero": np.full(len(s.time_s), -joint.rated_torque_nm),
+        "delay": state.torque_rate_nm_s,
+    }
+    return np.asarray(made[kind.what] * (s.per_torque if balance == MOTOR else 1.0))
+
+
+def _with_columns(
+    run: RunData, signals: Sequence[JointSignals], kinds: Sequence[Deviation], dataset: Dataset
+) -> RunData:
+    """Return the run with the deviations as further nuisances, behind the families."""
+    channels = dict(run.channels)
+    for s in signals:
+        for balance in ("motor", "torsion"):
+            channel = Channel(s.number, balance)
+            if channel not in channels:
+                continue
+            d = channels[channel]
+            made = [(len(dataset.families) + k, column(kind, s, balance)) for k, kind in enumerate(kinds)]
+            there = [(k, binned(s.seen(balance, c), dataset.samples)) for k, c in made if c is not None]
+            channels[channel] = replace(
+                d,
+                nuisances=np.column_stack((d.nuisances, *(c for _, c in there))),
+                families=np.concatenate((d.families, [k for k, _ in there])).astype(np.intp),
+            )
+    return replace(run, channels=channels)
+
+
+def without_days(grams: FloatArray, columns: int, sigma: FloatArray) -> FloatArray:
+    """Return per run the normal equations of effects, deviations and residual [r, P + K + 1, same], with the usual changes
+    from run to run (of standard deviation sigma [q]) integrated out.
+    """
+    days = np.arange(columns, columns + len(sigma))
+    rest = np.concatenate((np.arange(columns), np.arange(columns + len(sigma), grams.shape[1])))
+    inner = np.linalg.inv(grams[:, days[:, None], days] + np.diag(1.0 / sigma**2))
+    cross = grams[:, rest[:, None], days]
+    return np.asarray(grams[:, rest[:, None], rest] - cross @ inner @ cross.transpose(0, 2, 1))
+
+
+def own_deviations(
+    runs: FloatArray, chosen: Sequence[int], at: int, free: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the deviation in column `at` of every run [r], estimated beside the chosen columns in common, and its standard
+    error as a difference from the mean of the others [r]; free: prior standard deviation.
+    """
+    count, shared = len(runs), len(chosen)
+    common = np.array(chosen, np.intp)
+    size = shared + count
+    gram = np.zeros((size + 1, size + 1))
+    gram[:shared, :shared] = runs[:, common[:, None], common].sum(axis=0)
+    gram[:shared, size] = runs[:, common, -1].sum(axis=0)
+    for place, run in enumerate(runs, shared):
+        gram[:shared, place] = gram[place, :shared] = run[common, at]
+        gram[place, place] = run[at, at] + 1.0 / free**2
+        gram[place, size] = run[at, -1]
+    solution, covariance = solve(gram, size)
+    contrast = (count * np.eye(count) - np.ones((count, count))) / (count - 1.0)
+    spread = contrast @ covariance[shared:, shared:] @ contrast.T
+    return solution[shared:], np.sqrt(np.maximum(np.diag(spread), 0.0))
+
+
+def apart_from_others(own: FloatArray, r: int, usual: float) -> tuple[float, float]:
+    """Return by how much run r differs from the mean of the others, and their standard deviation; `usual` counts as
+    _USUAL_RUNS runs.
+    """
+    others = np.delete(own, r)
+    squares = float(np.sum((others - others.mean()) ** 2)) + _USUAL_RUNS * usual**2
+    return float(own[r] - others.mean()), float(np.sqrt(squares / (len(others) + _USUAL_RUNS)))

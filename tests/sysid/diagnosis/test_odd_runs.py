@@ -1,0 +1,114 @@
+"""One run with another gain, zero or delay than the others is named as a run; what all runs share is not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.run import JointColumns, RunTable
+from jtqd.models.files import load_joint, shipped
+from jtqd.sysid.diagnosis.diagnose import diagnose
+from jtqd.sysid.diagnosis.findings import Findings, OddRun, summary_lines, to_mapping
+from jtqd.sysid.diagnosis.odd_runs import apart_from_others, own_deviations
+from tests.sysid.diagnosis.diagnose_core_helpers import rich_run
+
+NOMINAL = load_joint(shipped("joint1.yaml"))
+PLAIN = replace(NOMINAL, efficiency=None, friction=replace(NOMINAL.friction, stribeck_nm=0.0))
+COUNT = 5
+
+
+def runs(joint: Joint = PLAIN, count: int = COUNT) -> list[tuple[str, RunTable]]:
+    """Runs of 6 s by the equations, each with a zero of its own, as days have."""
+    zeros = np.linspace(-2e-3, 2e-3, count)
+    return [(f"run{k}", rich_run(joint, 20 + k, noise=2e-3, zero=float(zeros[k]))) for k in range(count)]
+
+
+def changed(
+    all_runs: list[tuple[str, RunTable]],
+    where: list[int],
+    change: Callable[[RunTable, JointColumns], JointColumns],
+) -> list[tuple[str, RunTable]]:
+    return [
+        (name, RunTable(t.time_s, {1: change(t, t.joints[1])}) if k in where else t)
+        for k, (name, t) in enumerate(all_runs)
+    ]
+
+
+def current_gain(table: RunTable, c: JointColumns) -> JointColumns:
+    assert c.current_a is not None
+    return replace(c, current_a=1.08 * c.current_a)
+
+
+def sensor_zero(table: RunTable, c: JointColumns) -> JointColumns:
+    assert c.torque_nm is not None
+    return replace(c, torque_nm=c.torque_nm + 0.05 * PLAIN.rated_torque_nm)
+
+
+def late_current(table: RunTable, c: JointColumns) -> JointColumns:
+    assert c.current_a is not None
+    return replace(c, current_a=np.interp(table.time_s - 0.006, table.time_s, c.current_a))
+
+
+TAMPERED: list[tuple[Callable[[RunTable, JointColumns], JointColumns], str, str, float]] = [
+    (current_gain, "gain", "current_a", 0.08),
+    (sensor_zero, "zero", "torque_nm", 0.05),
+    (late_current, "delay", "current_a", 0.006),
+]
+
+
+@pytest.mark.parametrize(("change", "what", "channel", "size"), TAMPERED, ids=["gain", "zero", "delay"])
+def test_one_run_is_named_and_the_joint_is_not(
+    change: Callable[[RunTable, JointColumns], JointColumns], what: str, channel: str, size: float
+) -> None:
+    findings = diagnose(changed(runs(), [2], change), {1: PLAIN})
+    (odd,) = findings.odd_runs
+    of = "joint 1" if channel == "current_a" else "the sensor"
+    assert (odd.run, odd.what) == ("run2", what)
+    assert odd.channel == channel or f"{what} of {channel} of {of}" in odd.others, (
+        "one joint: two zeros are one"
+    )
+    assert abs(odd.value) == pytest.approx(size, rel=0.15)
+    assert findings.causes == (), "nothing is wrong with the joint"
+    assert findings.verdict == "no_gap"
+    assert any(line.startswith("odd run: run2: ") for line in summary_lines(findings))
+    (found,) = to_mapping(findings)["odd_runs"]
+    assert (found["run"], found["what"], found["joint"]) == ("run2", what, odd.joint)
+    assert odd.text in findings.channel_notes
+
+
+def test_what_all_runs_share_is_an_effect_and_days_are_none() -> None:
+    assert diagnose(runs(), {1: PLAIN}).odd_runs == ()
+    shared = diagnose(changed(runs(), list(range(COUNT)), current_gain), {1: PLAIN})
+    assert shared.odd_runs == ()
+    assert "torque_constant" in {name for cause in shared.causes for name in cause.names}
+
+
+def test_two_runs_cannot_tell_which_is_odd() -> None:
+    assert diagnose(changed(runs(count=2), [1], current_gain), {1: PLAIN}).odd_runs == ()
+
+
+def test_size_of_a_deviation_beside_the_others() -> None:
+    own = np.array([0.01, -0.01, 0.5, 0.0])
+    apart, spread = apart_from_others(own, 2, 0.02)
+    assert apart == pytest.approx(0.5)
+    assert spread == pytest.approx(np.sqrt((2e-4 + 4.0 * 4e-4) / 7.0)), "what is usual counts as four runs"
+    rng = np.random.default_rng(1)
+    blocks = [np.column_stack([rng.normal(size=(300, 2)), np.zeros(300)]) for _ in range(4)]
+    for k, block in enumerate(blocks):  # column 0 is common to all, column 1 the run's own
+        block[:, 2] = 0.7 * block[:, 0] + (0.5 if k == 2 else 0.0) * block[:, 1] + rng.normal(size=300)
+    values, errors = own_deviations(np.array([b.T @ b for b in blocks]), [0], 1, 100.0)
+    assert values == pytest.approx([0.0, 0.0, 0.5, 0.0], abs=0.2)
+    assert errors == pytest.approx(np.full(4, np.sqrt(1.0 + 1.0 / 3.0) / np.sqrt(300.0)), rel=0.1)
+
+
+def test_text_says_what_run_and_channel() -> None:
+    odd = OddRun("b.csv", "delay", "current_a", 3, -0.004, 0.0002, "s", ("delay of torque_nm of the sensor",))
+    assert odd.text == (
+        "b.csv: j3.current_a is 4 ms earlier than in the other runs, which differ by 0.2 ms among themselves, or it differs "
+        "in the delay of torque_nm of the sensor: a matter of this run, which is not used"
+    )
+    assert Findings("no_gap", (), ("b.csv",), (3,)).odd_runs == ()
