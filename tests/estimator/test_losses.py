@@ -317,7 +317,11 @@ def test_the_additive_loss_dissipates(seed: int) -> None:
         if abs(v) >= W0 and abs(raw) <= 20.0:
             assert model.loss(raw, v, 0.0)[0] * v >= 0.0, (seed, raw, v)
     rng = np.random.default_rng(seed)
-    wild = [LossSide(*(tuple(rng.normal(0.0, 5.0, 8).tolist()) for _ in range(3)), -2.0) for _ in range(2)]
+    drawn = [rng.normal(0.0, 5.0, (3, 8)) for _ in range(2)]
+    wild = [  # only the quadratic part and the temperature may take away: a file with other signs is refused
+        LossSide(*(tuple(each.tolist()) for each in (abs(c), abs(v), q)), stribeck_nm=0.5)
+        for c, v, q in drawn
+    ]
     model = AdditiveLossModel(replace(loss_of(seed), positive=wild[0], negative=wild[1]))
     zero = 0
     for raw, v in scattered_points(seed):
