@@ -1,0 +1,193 @@
+"""What a section `joint_N` says of its drive: objects (`objects`), TPDOs (`tpdos`), values of absent objects (`given`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+from jtqd.drivers.devices import CIA_402, DriveObject, DriveObjects, drive_layout, parse_key
+from jtqd.drivers.layout import BY_ITSELF, LayoutError, chosen, pdo_of_words
+from jtqd.drivers.pdo import PdoError, PdoMap
+from jtqd.drivers.sdo import Key, label
+from jtqd.drivers.units import AT_JOINT, BY_TORQUE, SCALES, SHAFTS
+from jtqd.estimator.checked import ConfigError, Section, Verbatim, range_text
+from jtqd.estimator.decoder import FieldError, Text, choice, decode, limits
+
+_PDO_BITS: Final = 64
+_TYPES: Final = {"I16": (16, True), "I32": (32, True), "U16": (16, False), "U32": (32, False)}
+_TORQUE: Final = 0x6077
+"""In 1/1000 of 6076h."""
+_Index = Annotated[int, limits(ge=0x1000, le=0xFFFF)]
+_SubIndex = Annotated[int, limits(ge=0, le=254)]
+
+
+@dataclass(frozen=True)
+class _Object:
+    """One object in section `joint_N.objects`; what is left out is as in CiA 402."""
+
+    index: _Index | None = None
+    sub: _SubIndex | None = None
+    type: Annotated[str, choice(_TYPES)] | None = None
+    sign: Annotated[int, limits(ge=-1, le=1)] = 1
+    factor: Annotated[float, limits(gt=0.0)] | None = None
+    """SI units (rad, rad/s, A) per unit; without it the drive's scaling objects count."""
+    by: Text | None = None
+    """Which scaling object; `drivers/units.py` has those of each quantity."""
+    shaft: Annotated[str, choice(SHAFTS)] | None = None
+    """Where the drive counts by 6092h, 60A8h, 60A9h."""
+
+    def __post_init__(self) -> None:
+        if self.sign == 0:
+            raise FieldError("object", "sign", 0, "1 or -1")
+
+    def of_drive(self, standard: DriveObject) -> DriveObject:
+        """Return the object of the drive; `standard` is that of CiA 402."""
+        bits, signed = _TYPES[self.type] if self.type else (standard.bits, standard.signed)
+        return DriveObject(
+            standard.index if self.index is None else self.index,
+            (standard.subindex if self.index is None else 0) if self.sub is None else self.sub,
+            bits,
+            signed,
+            self.sign,
+            self.factor,
+            BY_TORQUE if self.by is None and self.factor is None and self.index == _TORQUE else self.by or "",
+            self.shaft or AT_JOINT,
+        )
+
+    def check(self, name: str, standard: DriveObject, where: str) -> None:
+        """Raise ConfigError for what cannot be mapped or scaled."""
+        chosen = self.of_drive(standard)
+        if name == "statusword":
+            if chosen.bits != standard.bits or self.sign != 1 or self.factor or self.by or self.shaft:
+                raise ConfigError(f"{where}': expected an object of type U16, no sign, no factor")
+            return
+        scales = SCALES[name]
+        another = (chosen.index, chosen.subindex) != (standard.index, standard.subindex)
+        if self.by is not None and self.by not in scales:
+            raise ConfigError(f"{where}.by': found '{self.by}', expected one of {', '.join(scales)}")
+        if self.by is not None and self.factor is not None:
+            raise ConfigError(f"{where}.by': found both by and factor, expected one of them")
+        if another and chosen.factor is None and not chosen.by:
+            unit = "A" if name == "current" else "rad/s" if "velocity" in name else "rad"
+            raise ConfigError(
+                f"{where}.factor': missing, expected {unit} per unit, or 'by': "
+                f"CiA 402 scales {label(standard.index, standard.subindex)} alone"
+            )
+        if self.shaft is not None and not (self.by and scales[self.by].at_shaft and name.startswith("motor")):
+            raise ConfigError(f"{where}.shaft': expected only for the motor by 6092h, 60A8h or 60A9h")
+        if "position" in name and (chosen.bits, chosen.signed) != (32, True):
+            raise ConfigError(f"{where}.type': expected I32: a position rolls over at 32 bits")
+
+
+_OPTIONAL: Final = ("link_position", "motor_velocity")
+"""Quantities that a drive need not have."""
+
+
+@dataclass(frozen=True)
+class ObjectsSection:
+    """Section `joint_N.objects`."""
+
+    motor_position: _Object = _Object()
+    link_position: _Object | None = _Object()
+    motor_velocity: _Object | None = _Object()
+    current: _Object = _Object()
+    statusword: _Object = _Object()
+
+    @classmethod
+    def from_section(cls, section: Section) -> ObjectsSection:
+        """Read the section; `false` for a quantity that the drive does not have. Raises ConfigError."""
+        absent = {name: None for name in _OPTIONAL if section.raw(name, None) is False}
+        return decode(cls, section, **absent)
+
+    def of_drive(self, joint: str, path: Path) -> DriveObjects:
+        """Return the objects of the drive. Raises ConfigError for what cannot be mapped or scaled."""
+        where = f"{path}: key '{joint}.objects"
+        found: dict[str, DriveObject | None] = {}
+        for each in fields(self):
+            written: _Object | None = getattr(self, each.name)
+            found[each.name] = None
+            if written is not None:
+                standard: DriveObject = getattr(CIA_402, each.name)
+                found[each.name] = written.of_drive(standard)
+                written.check(each.name, standard, f"{where}.{each.name}")
+        made: dict[str, Any] = found
+        return DriveObjects(**made)
+
+
+@dataclass(frozen=True)
+class TpdoSection:
+    """One TPDO in section `joint_N.tpdos`: parameters 1800h and 1A00h, 1801h and 1A01h, ..."""
+
+    number: Annotated[int, limits(ge=1, le=4)]
+    cob_id: Annotated[int, limits(ge=0x181, le=0x4FF)]
+    objects: tuple[Annotated[int, limits(ge=0, le=0xFFFF_FFFF)], ...]
+    """Mapping entries 0xIIIISSLL."""
+    type: Annotated[int, limits(ge=0, le=255)] = 1
+    """Transmission type: 1, or 0, 254, 255 with `max_age_ms`."""
+
+
+def check_given(where: str, given: Mapping[str, float], known: Mapping[Key, tuple[str, int]]) -> None:
+    """Refuse objects that scale nothing, and values that they cannot have. Raises FieldError."""
+    for name, value in given.items():
+        try:
+            key = parse_key(name)
+        except ValueError:
+            key = (0, 0)
+        if key not in known:
+            expected = "one of " + ", ".join(label(*each) for each in known)
+            raise FieldError(where, f"given.{name}", Verbatim("that object"), expected)
+        what, highest = known[key]
+        if value != int(value) or not value <= highest:
+            expected = f"{what}, {range_text('a whole number', 0, highest, None)}"
+            raise FieldError(where, f"given.{name}", value, expected)
+
+
+def tpdos_of(
+    joint: str,
+    path: Path,
+    node: int,
+    objects: DriveObjects,
+    tpdos: Sequence[TpdoSection],
+    *,
+    by_itself: bool,
+    temperature: bool,
+) -> tuple[PdoMap, ...]:
+    """Return the TPDOs that shall carry the objects.
+
+    by_itself: `max_age_ms` is there, so those that the drive sends by itself may be among them.
+    Raises ConfigError for what they lack, or cannot be.
+    """
+    if not tpdos:
+        second = (objects.motor_velocity, objects.current, objects.statusword)
+        bits = sum(each.bits for each in second if each is not None)
+        if bits > _PDO_BITS:
+            raise ConfigError(
+                f"{path}: key '{joint}.objects': found {bits} bits of velocity, current and statusword, "
+                f"expected at most {_PDO_BITS}: one PDO"
+            )
+        return drive_layout(node, objects)
+    where = f"{path}: key '{joint}.tpdos'"
+    for each in tpdos:
+        if each.type != 1 and each.type not in BY_ITSELF:
+            raise ConfigError(f"{where}: found type {each.type}, expected 1, 0, 254 or 255")
+        if each.type in BY_ITSELF and not by_itself:
+            raise ConfigError(
+                f"{path}: key '{joint}.max_age_ms': missing, expected ms because TPDO{each.number} has type {each.type}"
+            )
+    try:
+        maps = tuple(
+            pdo_of_words(node, each.number, each.cob_id, each.objects, each.type, objects) for each in tpdos
+        )
+        used = chosen(objects, maps)
+    except (PdoError, LayoutError) as error:
+        raise ConfigError(f"{where}: {error}") from None
+    for name, taken in (("number", {3}), ("cob_id", {0x380 + node})):
+        values = [getattr(pdo, name) for pdo in maps]
+        reserved = taken if temperature else set()
+        if len({*values, *reserved}) != len(values) + len(reserved):
+            shown = ", ".join(str(value) if name == "number" else f"{value:03X}h" for value in values)
+            rule = ", TPDO3 is that of the temperature" if reserved else ""
+            raise ConfigError(f"{where}: found {name} {shown}, expected each once{rule}")
+    return used

@@ -1,0 +1,330 @@
+"""Configuration of jtqd: read once into frozen, validated objects.
+
+    YAML -> profiles put below -> `sections` (types, units, ranges) -> joint files, networks -> `Config`
+
+Unknown keys and wrong values are errors of one line that name the file, the key, what was found and what was expected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+from jtqd.daemon.config.drive import tpdos_of
+from jtqd.daemon.config.sections import (
+    ERROR_BEHAVIOURS,
+    ConfigFile,
+    Identity,
+    JointSection,
+    NetworkSection,
+    SensorSection,
+)
+from jtqd.daemon.config.settings import Realtime, RecordingSettings, Ros2Settings, SafetySettings
+from jtqd.daemon.profiles import path_of, with_profiles
+from jtqd.drivers.devices import DriveObjects
+from jtqd.drivers.layout import chosen, maps_of_json
+from jtqd.drivers.pdo import PdoMap
+from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.decoder import decode
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.sha256 import sha256_hex
+from jtqd.models.files import read_regular, read_yaml, shipped
+
+DEFAULT_CONFIG: Final = "bench.yaml"
+MAX_COUNTER: Final = 240
+"""Of SYNC (CiA 301, 7.2.5.3)."""
+_LARGEST_NETWORK: Final = 64_000_000
+"""Bytes; ours have 50 000."""
+_NEEDED: Final = {"tob": (), "efficiency": ("efficiency",), "network": ("efficiency",), "fused": ("fused",)}
+"""Sections of a joint file that a method cannot do without."""
+_WITH_NETWORK: Final = ("network", "fused")
+"""Methods that use one; `fused` is its physics alone without."""
+
+
+@dataclass(frozen=True)
+class NetworkFile:
+    """An ONNX file and the hash under which the configuration trusts it."""
+
+    path: Path
+    sha256: str
+    data: bytes = field(default=b"", repr=False)
+    """The file as it was read, for the log."""
+
+
+@dataclass(frozen=True)
+class JointConfig:
+    """One joint: its drive, its parameters, its network and the sensor channel that serves as reference."""
+
+    number: int
+    node_id: int
+    identity: Identity
+    given: dict[str, int]
+    """Objects that the drive lacks and the boot shall take as read, e.g. {"6091h:1": 100}."""
+    joint_path: Path
+    joint: Joint
+    network: NetworkFile | None
+    sensor_channel: int | None
+    temperature: bool
+    """The drive sends the joint's temperature (3001h by TPDO3)."""
+    mandatory: bool
+    """jtqd does not start without it."""
+    sdo_timeout_ms: int
+    """Silence of the drive after which an SDO request is repeated."""
+    objects: DriveObjects
+    """Which objects of the drive are mapped, with sign and factor."""
+    tpdos: tuple[PdoMap, ...]
+    """TPDOs that carry them: wanted ones, and after the boot those in force (`as_booted`)."""
+    max_age_ms: float
+    """For how long a frame of a TPDO with transmission type 0, 254 or 255 counts; 0: such a TPDO is not used."""
+    joint_data: bytes = field(default=b"", repr=False)
+    """The joint file as it was read, for the log."""
+    profile: str | None = None
+    """Of the drive's family."""
+    profile_path: Path | None = None
+    profile_data: bytes = field(default=b"", repr=False)
+    """The profile as it was read, for the log."""
+
+    @property
+    def joint_sha256(self) -> str:
+        """Hash of the joint file."""
+        return sha256_hex(self.joint_data)
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """The optional torque sensor (CiA 404)."""
+
+    node_id: int
+    identity: Identity
+    channels: tuple[int, ...]
+    given: dict[str, int]
+    unit_words: dict[str, float]
+    """Values of 6131h that mean a torque, in Nm per unit, e.g. {"0x00560000": 1.0}: CiA 303-2 names none for Nm."""
+    mandatory: bool
+    """jtqd does not start without it. By default it does, and configures the sensor when it appears."""
+    sdo_timeout_ms: int
+    """As of a joint."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Configuration of jtqd with its joint files and networks. `text`: the YAML as read, for the log; `sha256`: its hash."""
+
+    path: Path
+    text: str
+    sha256: str
+    node_id: int
+    bitrate: int
+    period_ns: int
+    counter_overflow: int
+    input_wait_ns: int
+    input_deadline_ns: int
+    heartbeat_ms: int
+    heartbeat_timeout_ms: int
+    """A node that was not heard for so long is lost (1016h of jtqd)."""
+    error_behaviour: int
+    """1029h:1 of every node that has it: 0 pre-operational, 1 no change, 2 stopped."""
+    emcy_inhibit_ms: int
+    """Time between two EMCY of jtqd (1015h)."""
+    boot_timeout_s: float
+    reset_communication: bool
+    estimator: EstimatorSettings
+    safety: SafetySettings
+    joints: tuple[JointConfig, ...]
+    sensor: SensorConfig | None
+    realtime: Realtime
+    recording: RecordingSettings
+    metrics_file: Path | None = None
+    """Prometheus text file, written every 5 s; None for none."""
+    ros2: Ros2Settings | None = None
+    """What is published for ROS 2; None: nothing, unless the command line asks for it."""
+
+    @property
+    def files_sha256(self) -> str:
+        """Hash of the configuration, its joint files and profiles together; networks are named in it by theirs."""
+        parts = [self.sha256, *(joint.joint_sha256 for joint in self.joints)]
+        parts += [sha256_hex(joint.profile_data) for joint in self.joints if joint.profile]
+        return sha256_hex("".join(parts).encode())
+
+    @property
+    def sequence_overflow(self) -> int:
+        """Last number of a cycle in estimate PDO and log; SYNC itself carries it only with a `counter_overflow`."""
+        return self.counter_overflow or MAX_COUNTER
+
+    @property
+    def ring_cycles(self) -> int:
+        """Cycles that the ring in shared memory holds."""
+        return self.recording.ring_cycles
+
+
+def as_booted(config: Config, nodes: Mapping[str, Mapping[str, Any]]) -> Config:
+    """Return the configuration with the TPDOs that the drives have.
+
+    nodes: of the boot report, or of a log's provenance, by node-ID; a drive that is not in it (it was absent) keeps those
+    that are wanted. Raises PdoError, LayoutError, KeyError or TypeError for what is no such report.
+    """
+
+    def of(joint: JointConfig) -> JointConfig:
+        booted = nodes.get(str(joint.node_id))
+        if booted is None or "tpdos" not in booted:
+            return joint
+        maps = maps_of_json(joint.node_id, booted["tpdos"], joint.objects)
+        return replace(joint, tpdos=chosen(joint.objects, maps))
+
+    return replace(config, joints=tuple(of(joint) for joint in config.joints))
+
+
+def load_config(path: Path | None) -> Config:
+    """Read and check a configuration; None is the shipped bench configuration.
+
+    Raises:
+        ConfigError: one line naming file, key, what was found and what was expected.
+    """
+    if path is None:
+        path = shipped(DEFAULT_CONFIG)
+    mapping, data = read_yaml(path)
+    _check_one_sensor(path, mapping)
+    file = decode(ConfigFile, Section(with_profiles(mapping, path), str(path)))
+    joints = tuple(
+        _joint(path, number, section, file.estimator.method, file.nodes.sdo_timeout_ms)
+        for number, section in enumerate(file.joints, start=1)
+    )
+    return Config(
+        path=path,
+        text=_text(path, data),
+        sha256=sha256_hex(data),
+        node_id=file.node_id,
+        bitrate=file.bitrate,
+        period_ns=file.sync.period_us * 1000,
+        counter_overflow=file.sync.counter_overflow,
+        input_wait_ns=round(file.wait_us * 1000),
+        input_deadline_ns=round(file.deadline_us * 1000),
+        heartbeat_ms=file.nodes.heartbeat_ms,
+        heartbeat_timeout_ms=file.nodes.timeout_ms,
+        error_behaviour=ERROR_BEHAVIOURS.index(file.nodes.error_behaviour),
+        emcy_inhibit_ms=file.nodes.emcy_inhibit_ms,
+        boot_timeout_s=file.nodes.boot_timeout_s,
+        reset_communication=file.nodes.reset_communication,
+        estimator=file.estimator,
+        safety=file.safety,
+        joints=joints,
+        sensor=None if file.sensor is None else _sensor(file.sensor, file.nodes.sdo_timeout_ms),
+        realtime=file.realtime,
+        recording=file.recording,
+        metrics_file=None if file.metrics is None else Path(file.metrics.file),
+        ros2=file.ros2,
+    )
+
+
+_ONE_SENSOR: Final = "one section 'sensor': a bus has one sensor node with 1 or 2 channels (docs/arm.md)"
+
+
+def _check_one_sensor(path: Path, mapping: Mapping[str, object]) -> None:
+    """Refuse a second sensor node by what it is, not as an unknown key. Raises ConfigError."""
+    for key, value in mapping.items():
+        more = (
+            isinstance(key, str) and key.startswith(("sensor_", "sensors")) and isinstance(value, dict | list)
+        )
+        if more or (key == "sensor" and isinstance(value, list)):
+            raise ConfigError(f"{path}: key '{key}': found a second sensor or a list, expected {_ONE_SENSOR}")
+
+
+def _sensor(section: SensorSection, sdo_timeout_ms: int) -> SensorConfig:
+    return SensorConfig(
+        node_id=section.node,
+        identity=section.identity,
+        channels=tuple(range(1, section.channels + 1)),
+        given=_whole(section.given),
+        unit_words=dict(section.unit_words),
+        mandatory=section.mandatory,
+        sdo_timeout_ms=section.sdo_timeout_ms or sdo_timeout_ms,
+    )
+
+
+def _joint(path: Path, number: int, section: JointSection, method: str, sdo_timeout_ms: int) -> JointConfig:
+    """Read what a section `joint_N` names: the joint file and, where the method uses one, the network."""
+    objects = section.objects.of_drive(f"joint_{number}", path)
+    network = None if section.network is None else _network(section.network, path)
+    joint_path = path.parent / section.file
+    profile_path = None if section.profile is None else path_of(section.profile, path.parent)
+    mapping, data = read_yaml(joint_path)
+    joint = Joint.from_mapping(mapping, str(joint_path))
+    if method == "network" and network is None:
+        key = f"joint_{number}.network"
+        raise ConfigError(
+            f"{path}: key '{key}': missing, expected file and sha256 because estimator.method is network"
+        )
+    for needed in _NEEDED[method]:
+        if getattr(joint, needed) is None:
+            raise ConfigError(
+                f"{joint_path}: key '{needed}': missing, expected because estimator.method is {method}"
+            )
+    made = JointConfig(
+        number=number,
+        node_id=section.node,
+        identity=section.identity,
+        given=_whole(section.given),
+        joint_path=joint_path,
+        joint=joint,
+        network=network if method in _WITH_NETWORK else None,
+        sensor_channel=section.sensor_channel,
+        temperature=section.temperature,
+        mandatory=section.mandatory,
+        sdo_timeout_ms=section.sdo_timeout_ms or sdo_timeout_ms,
+        objects=objects,
+        tpdos=tpdos_of(
+            f"joint_{number}",
+            path,
+            section.node,
+            objects,
+            section.tpdos,
+            by_itself=section.max_age_ms is not None,
+            temperature=section.temperature,
+        ),
+        max_age_ms=section.max_age_ms or 0.0,
+        joint_data=data,
+        profile=section.profile,
+        profile_path=profile_path,
+        profile_data=b"" if profile_path is None else read_yaml(profile_path)[1],
+    )
+    _check_encoders(path, number, made, method)
+    return made
+
+
+def _whole(values: Mapping[str, float]) -> dict[str, int]:
+    return {name: int(value) for name, value in values.items()}
+
+
+def _check_encoders(path: Path, number: int, joint: JointConfig, method: str) -> None:
+    """Refuse what needs the link position of a drive that has none. Raises ConfigError."""
+    if joint.objects.link_position is not None:
+        return
+    torsion = method == "fused" and joint.joint.fused is not None and joint.joint.fused.torsion is not None
+    if torsion or joint.network is not None:
+        what = (
+            "estimates from the torsion of the gear" if torsion else "uses a network with the link position"
+        )
+        raise ConfigError(
+            f"{path}: key 'joint_{number}.objects.link_position': found false, expected a link position because "
+            f"estimator.method {method} {what}; tob and efficiency do without"
+        )
+
+
+def _network(section: NetworkSection, path: Path) -> NetworkFile:
+    file, expected = path.parent / section.file, section.sha256.lower()
+    data = read_regular(file, _LARGEST_NETWORK, "a network")
+    found = sha256_hex(data)
+    if found != expected:
+        raise ConfigError(f"{file}: sha256 of the network: found {found}, expected {expected} (from {path})")
+    return NetworkFile(file, expected, data)
+
+
+def _text(path: Path, data: bytes) -> str:
+    """As it is, so that its hash is that of the text in the log."""
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not UTF-8: byte {error.start + 1}") from None

@@ -1,0 +1,124 @@
+"""Sections that other modules take as they are: safety, recording, real time, ROS 2. Their keys are their fields."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, Final
+
+from jtqd.daemon.shared import faults
+from jtqd.estimator.checked import Section
+from jtqd.estimator.decoder import FieldError, Text, check, decode, limits
+from jtqd.estimator.settings import PlausibilityLimits
+
+LATCHED_BY_DEFAULT: Final = faults.NOT_FINITE | faults.BITS["motor_jump"] | faults.BITS["link_jump"]
+"""What leaves numbers behind that look right and are not: a broken estimator, an encoder that has lost its zero."""
+LOOPBACK: Final = "lo"
+"""Network interface that no other machine reaches."""
+HIGHEST_DOMAIN: Final = 232
+"""Of DDS: ports of a higher one are beyond 65535 (DDSI-RTPS, 9.6.1)."""
+_INTERFACE: Final = re.compile(r"[\w.@-]{1,15}", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class SafetySettings:
+    """Section `safety`: how faults are found and which of them wait for a reset.
+
+    latch: bits of `shared/cycle_record.py`, in the file a list of their names; stale_latch_cycles: so many cycles in a
+    row without inputs, or without time, are the fault `stale` (None: never); deviation_sigmas, deviation_s: the fault
+    `deviation`; plausibility: None (in the file: false) for no checks.
+    """
+
+    latch: int = LATCHED_BY_DEFAULT
+    stale_latch_cycles: Annotated[int, limits(ge=1, le=1_000_000)] | None = None
+    deviation_sigmas: Annotated[float, limits(ge=1.0, le=100.0)] = 3.0
+    deviation_s: Annotated[float, limits("s", ge=0.01, le=60.0)] = 1.0
+    plausibility: PlausibilityLimits | None = field(default_factory=PlausibilityLimits)
+
+    def __post_init__(self) -> None:
+        check(self, "safety")
+
+    @classmethod
+    def from_section(cls, section: Section) -> SafetySettings:
+        """Read the section of a configuration file; every key is optional. Raises ConfigError."""
+        given: dict[str, Any] = {"latch": _latch(section)}
+        if section.raw("plausibility", None) is False:
+            given["plausibility"] = None
+        settings = decode(cls, section, **given)
+        if settings.stale_latch_cycles is None:
+            return settings
+        return replace(settings, latch=settings.latch | faults.STALE)
+
+
+def _latch(section: Section) -> int:
+    names = [name for name in faults.BITS if name != "stale"]
+    value: Any = section.raw("latch", None)
+    if value is None:
+        return LATCHED_BY_DEFAULT
+    if not isinstance(value, list) or not all(isinstance(name, str) and name in names for name in value):
+        raise section.error("latch", value, f"a list of {', '.join(names)}; [] for none")
+    return sum({faults.BITS[name] for name in value})
+
+
+@dataclass(frozen=True)
+class RecordingSettings:
+    """Section `recording`; megabytes are of 1 000 000 bytes.
+
+    Attributes:
+        ring_cycles: cycles that shared memory holds for the recorder: for so long it may be stopped.
+        chunk_s: length of a chunk [s]; a crash costs at most this and 0.1 s.
+        rotate_s, rotate_mb: a file is ended and the next one begun after this time, or at this size.
+        budget_mb: all files of this bus in the directory; older ones are removed. None: nothing is removed.
+        keep_run: the budget never removes a part of the run that is being written.
+        reserve_mb: recording ends when less than this is free, and goes on when there is room again.
+        flight_recorder_s: keep this time in memory and write it on a fault or on request. None: record all.
+    """
+
+    ring_cycles: Annotated[int, limits(ge=256, le=1 << 20)] = 4096
+    chunk_s: Annotated[float, limits("s", ge=0.05, le=10.0)] = 0.5
+    rotate_s: Annotated[float, limits("s", ge=1.0, le=86_400.0)] = 600.0
+    rotate_mb: Annotated[float, limits("MB", ge=1.0, le=1e6)] = 1000.0
+    budget_mb: Annotated[float, limits("MB", ge=10.0, le=1e9)] | None = None
+    keep_run: bool = True
+    reserve_mb: Annotated[float, limits("MB", ge=0.0, le=1e9)] = 256.0
+    flight_recorder_s: Annotated[float, limits("s", ge=1.0, le=600.0)] | None = None
+
+    def __post_init__(self) -> None:
+        check(self, "recording")
+
+
+@dataclass(frozen=True)
+class Realtime:
+    """Section `realtime`: what the loop asks of the kernel; what it does not get is logged."""
+
+    priority: Annotated[int, limits(ge=0, le=98)] = 80
+    cpu: Annotated[int, limits(ge=0, le=4095)] | None = None
+    lock_memory: bool = True
+
+
+@dataclass(frozen=True)
+class Ros2Settings:
+    """Section `ros2`: what is published for ROS 2 (docs/ros2.md).
+
+    Attributes:
+        domain_id: DDS domain; None: as ROS_DOMAIN_ID says, else 0.
+        interface: network interface.
+        rate_hz: of joint states and torque states.
+        names: of the joints in ROS 2, by section (`joint_1`); left out: the section's name.
+    """
+
+    domain_id: Annotated[int, limits(ge=0, le=HIGHEST_DOMAIN)] | None = None
+    interface: Text = LOOPBACK
+    rate_hz: Annotated[float, limits("Hz", ge=1.0, le=500.0)] = 100.0
+    names: Mapping[str, Text] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check(self, "ros2")
+        if not _INTERFACE.fullmatch(self.interface):
+            raise FieldError("ros2", "interface", self.interface, "a network interface such as lo or eth0")
+
+    def names_of(self, joints: int) -> tuple[str, ...]:
+        """Return the names of so many joints, joint 1 first."""
+        sections = (f"joint_{number}" for number in range(1, joints + 1))
+        return tuple(self.names.get(section, section) for section in sections)
