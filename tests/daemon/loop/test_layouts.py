@@ -43,7 +43,7 @@ def run(config: Config, count: int = 400) -> bytes:
 def test_estimates_are_the_same_bit_for_bit_wherever_the_numbers_lie(tmp_path: Path, tpdos: Any) -> None:
     usual = run(config_with(tmp_path, []))
     assert run(config_with(tmp_path, tpdos)) == usual
-    torque = np.frombuffer(usual, np.dtype([("d", "<f8", 12), ("h", "<u2", 4)]))["d"][:, 0]
+    torque = [cr.JointRecord(*each).torque_nm for each in cr.JOINT.iter_unpack(usual)]
     assert np.isfinite(torque).sum() > 300
 
 
