@@ -11,7 +11,7 @@ from tests.systemd.test_systemd_boot import PYTHON, needs
 
 DRIVER = Path(__file__).with_name("arm_driver.py")
 JOINTS = {"vcan0": 2, "vcan1": 2, "vcan2": 2, "vcan3": 1}
-pytestmark = pytest.mark.boots
+pytestmark = [pytest.mark.boots, pytest.mark.campaign]
 
 
 def test_four_instances_have_one_status_each_and_share_no_fate(tmp_path: Path) -> None:

@@ -63,7 +63,8 @@ def test_every_section_comes_back_with_effects_and_any_provenance(tmp_path: Path
 
 def test_the_fused_section_comes_back_with_a_row_per_list(tmp_path: Path) -> None:
     nodes = tuple(np.linspace(-36.0, 50.0, 25).tolist())
-    side = LossSide(nodes, nodes, nodes, 0.7)
+    losses = tuple(np.linspace(0.1, 3.0, 25).tolist())
+    side = LossSide(losses, losses, nodes, 0.7)
     loss = AdditiveLoss(nodes, side, side, 0.05, 3.0, 25.0, 2.0, 0.02)
     torsion = Torsion(12000.0, 1e9, -1.2e-5, (1.0, 2.0), (1e-5, 2e-5), (-1e-5, 0.1 + 0.2))
     fused = Fused(loss, torsion, FusedSigma(0.1, 0.2, 0.03, 0.4, 0.05, 0.3, (1.0, 1.1, 1.2, 1.3)))
