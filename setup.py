@@ -1,6 +1,7 @@
 """Compile the extension modules: every .pyx of the packages. All else about the project stands in pyproject.toml.
 
-JTQD_BUILD=checked compiles with bounds checks and assertions, JTQD_BUILD=sanitized with AddressSanitizer and UBSan.
+JTQD_BUILD=quick compiles without optimisation, JTQD_BUILD=checked with bounds checks and assertions,
+JTQD_BUILD=sanitized with AddressSanitizer and UBSan.
 """
 
 import os
@@ -19,6 +20,7 @@ BUILD = os.environ.get("JTQD_BUILD", "release")
 # -ffp-contract=off: no fused multiply-add, so that every machine computes the same bits
 FLAGS = {
     "release": ["-O3", "-g0", "-ffp-contract=off"],
+    "quick": ["-O0", "-g0", "-ffp-contract=off"],
     "checked": ["-O1", "-g", "-ffp-contract=off"],
     "sanitized": [
         "-O1",
@@ -28,7 +30,7 @@ FLAGS = {
         "-fno-omit-frame-pointer",
     ],
 }
-CHECKS = BUILD != "release"
+CHECKS = BUILD in ("checked", "sanitized")
 
 
 class BuildExtensions(build_ext):
