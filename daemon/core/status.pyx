@@ -111,6 +111,7 @@ cdef class JointStatus:
     Attributes:
         latched: bits of the faults that are latched (`daemon/shared/cycle_record.py`).
         reasons: faults since a number was last published; 0 while one is.
+        held: the status that stays until a better one has been asked for long enough; a standstill is told meanwhile.
         news, latches: faults that began, and how often one was latched, since whoever counts them set these to 0.
     """
 
@@ -128,6 +129,10 @@ cdef class JointStatus:
     @property
     def reasons(self):
         return self.now.reasons
+
+    @property
+    def held(self):
+        return self.now.held
 
     @property
     def news(self):

@@ -305,7 +305,8 @@ def status_many(
                 said = state.late()
             out[row] = said
             row += 1
-            if said == status and not faulty and not flags & cr.FLAG_WITHDRAWN and status in _STEADY:
+            settled = said == status == state.held and status in _STEADY
+            if settled and not faulty and not flags & cr.FLAG_WITHDRAWN:
                 state.pass_over(end - row)
                 out[row:end] = said
                 break

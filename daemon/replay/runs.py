@@ -118,7 +118,7 @@ def _holes(records: RecordArray, config: Config) -> npt.NDArray[np.int64]:
     found = np.zeros(len(records), np.int64)
     slots = cycle[1:] - cycle[:-1]
     lost = np.remainder(counter[1:] - counter[:-1] - 1, overflow)
-    step = np.rint(records["dt_s"][1:] * (1e9 / config.period_ns)).astype(np.int64)
+    step = np.rint(np.nan_to_num(records["dt_s"][1:]) * (1e9 / config.period_ns)).astype(np.int64)
     most = slots - np.maximum(step, 1)
     exact = most - np.remainder(most - lost, overflow)
     least = np.where(slots > overflow, np.maximum(lost, 1), np.minimum(lost, slots - 1))

@@ -49,6 +49,7 @@ def _header(config: Config) -> str:
         "RING_SLOTS": config.ring_cycles,
         "STAMP_ACCURACY_NS": joint_cycle.STAMP_ACCURACY_NS,
         "DEGRADED_CYCLES": NEEDED[DEGRADED],
+        "MAX_GAP_S": config.estimator.max_gap_s,
         "WAIT_NS": config.input_wait_ns,
         "DEADLINE_NS": config.input_deadline_ns,
         "FOLLOW_STEP_NS": schedule._STEP_NS,

@@ -34,7 +34,7 @@ typedef struct {
 } frame;
 
 typedef struct __attribute__((packed)) {
-    double current, motor_position, motor_velocity, link_position, sensor, temperature, torque, sigma, tob, efficiency, network, dt;
+    double current, motor_position, motor_velocity, link_position, sensor, temperature, torque, sigma, tob, efficiency, network, dt, reference, age;
     uint16_t statusword, status, sensor_status, flags;
 } joint_record;
 
@@ -64,6 +64,10 @@ typedef struct {
 } input;
 
 typedef struct {
+    double since, last, z, settled;
+} sensor_filter;
+
+typedef struct {
     int fd;
     uint8_t *ring;
     uint64_t ring_count, index, published, missed;
@@ -72,6 +76,7 @@ typedef struct {
     int64_t sync_stamp, last_sync;
     uint32_t late, duplicates, rejected, stale;
     joint_state joints[2];
+    sensor_filter references[2];
     int held[2], calm[2], asked[2];
     struct mmsghdr messages[CAPACITY];
     struct iovec parts[CAPACITY];
@@ -219,6 +224,22 @@ static int hold(loop_state *s, int n, int status)
     return s->held[n] = s->asked[n];
 }
 
+/* observer.pyx, follow_reference: the sensor as old as the estimate; NAN until it has settled. */
+static double follow_sensor(sensor_filter *f, double rate, double dt, double sensor)
+{
+    f->since = dt > 0.0 ? f->since + dt : INFINITY;
+    if (isnan(sensor))
+        return NAN;
+    if (f->since <= MAX_GAP_S) {
+        double x = rate * f->since, gone = -expm1(-x), share = gone / x, a = 1.0 - gone;
+        f->z = a * f->z + (1.0 - share) * sensor + (share - a) * f->last;
+        f->settled += f->since;
+    } else
+        f->z = sensor, f->settled = 0.0;
+    f->last = sensor, f->since = 0.0;
+    return f->settled * rate >= 5.0 ? f->z : NAN;
+}
+
 /* Both joints from the inputs of this cycle; fills the record and the eight bytes of the estimate PDO. */
 static void observe(loop_state *s, int64_t sync, cycle_record *r, uint8_t pdo[8])
 {
@@ -231,6 +252,7 @@ static void observe(loop_state *s, int64_t sync, cycle_record *r, uint8_t pdo[8]
         joint_record *j = &r->joints[n];
         estimate e = nothing(STALE);
         j->sensor = sensor->fresh && !(sensor->data[4] & 7) ? i32(sensor->data) * NM_PER_UNIT : NAN;
+        j->reference = NAN, j->age = 1e3 / parameters[n].rate;
         j->temperature = NAN; /* the traffic has none */
         j->sensor_status = sensor->fresh ? sensor->data[4] : 0;
         j->flags = position->fresh | motion->fresh << 1 | sensor->fresh << 2;
@@ -245,6 +267,7 @@ static void observe(loop_state *s, int64_t sync, cycle_record *r, uint8_t pdo[8]
                 dt = PERIOD;
             j->dt = dt * 1e-9;
             e = step(&parameters[n], &s->joints[n], j->dt, j->current, j->motor_position, j->motor_velocity, j->link_position);
+            j->reference = follow_sensor(&s->references[n], parameters[n].rate, j->dt, j->sensor);
             bool known = e.status == VALID || e.status == DEGRADED || e.status == STANDSTILL;
             if (s->index < STARTING_CYCLES && known)
                 e.status = STARTING;
