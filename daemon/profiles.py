@@ -91,13 +91,13 @@ def _parsed(text: str) -> Key | None:
 
 @dataclass(frozen=True)
 class Family:
-    """A drive family: name, title, vendor-ID (1018h:1), its lines, and what it waits for in this version."""
+    """A drive family: name, title, vendor-ID (1018h:1), its lines, and what its drives can also do."""
 
     name: str
     title: Text
     vendor: _Unsigned32
     lines: tuple[Line, ...]
-    waits: tuple[str, ...] = ()
+    variants: tuple[str, ...] = ()
 
     def section(self) -> dict[str, Any]:
         """Return the values as part of a section `joint_N`."""
@@ -274,7 +274,7 @@ def main() -> int:
         print(f"## {family.title}\n")
         print(f"`profile: {family.name}`, vendor-ID {family.vendor:08X}h.\n")
         print("\n".join(table(family)), end="\n\n")
-        print("".join(f"Waits: {text}.\n" for text in family.waits))
+        print("".join(f"Also: {text}.\n" for text in family.variants))
     return 0
 
 

@@ -69,7 +69,7 @@ def test_the_page_shows_the_profile_as_it_is(name: str) -> None:
     family = profiles.named(name)
     page = PAGE.read_text()
     assert "\n".join(profiles.table(family)) in page, "python -m jtqd.daemon.profiles prints it"
-    assert all(text in page for text in family.waits)
+    assert all(text in page for text in family.variants)
 
 
 @pytest.mark.parametrize("name", FAMILIES)
