@@ -1,7 +1,6 @@
 """Compile the extension modules: every .pyx of the packages. All else about the project stands in pyproject.toml.
 
-JTQD_BUILD=quick compiles without optimisation, JTQD_BUILD=checked with bounds checks and assertions,
-JTQD_BUILD=sanitized with AddressSanitizer and UBSan.
+JTQD_BUILD=checked compiles with bounds checks and assertions, JTQD_BUILD=sanitized with AddressSanitizer and UBSan.
 """
 
 import os
@@ -20,7 +19,6 @@ BUILD = os.environ.get("JTQD_BUILD", "release")
 # -ffp-contract=off: no fused multiply-add, so that every machine computes the same bits
 FLAGS = {
     "release": ["-O3", "-g0", "-ffp-contract=off"],
-    "quick": ["-O0", "-g0", "-ffp-contract=off"],
     "checked": ["-O1", "-g", "-ffp-contract=off"],
     "sanitized": [
         "-O1",
@@ -30,7 +28,7 @@ FLAGS = {
         "-fno-omit-frame-pointer",
     ],
 }
-CHECKS = BUILD in ("checked", "sanitized")
+CHECKS = BUILD != "release"
 
 
 class BuildExtensions(build_ext):

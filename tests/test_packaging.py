@@ -11,7 +11,6 @@ import sysconfig
 import tarfile
 import tomllib
 import zipfile
-from collections.abc import Iterator
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -26,14 +25,6 @@ PACKAGES = ("daemon", "drivers", "estimator", "models", "sim_can", "sysid")
 EXT_SUFFIX = sysconfig.get_config_var("EXT_SUFFIX")
 DIST_INFO = f"jtqd-{jtqd.__version__}.dist-info"
 _HOOK = "import sys, setuptools.build_meta as backend; getattr(backend, sys.argv[1])(sys.argv[2])"
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quick_build() -> Iterator[None]:
-    """Compile in a third of the time: what is looked at here are files."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("JTQD_BUILD", "quick")
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -83,9 +83,11 @@ def copy_sources(copy: Path) -> Path:
     packages = [link.name for link in (ROOT / "src" / "jtqd").iterdir() if link.is_symlink()]
     for folder in (*packages, "systemd"):
         shutil.copytree(ROOT / folder, copy / folder, ignore=unwanted)
-    shutil.copytree(ROOT / "build" / "cython", copy / "build" / "cython")
+    # What was translated and compiled here need not be again: setuptools and Cython go by the times of the files, and
+    # Cython's own, which came with the development tools, may be younger than what was made before them.
+    shutil.copytree(ROOT / "build" / "cython", copy / "build" / "cython", copy_function=shutil.copy)
     library = f"lib.{sysconfig.get_platform()}-{sys.implementation.cache_tag}"
-    for folder in packages:  # what is compiled here need not be compiled again: setuptools looks for it there
+    for folder in packages:
         for module in (copy / folder).rglob("*.so"):
             target = copy / "build" / library / "jtqd" / module.relative_to(copy)
             target.parent.mkdir(parents=True, exist_ok=True)
