@@ -34,6 +34,8 @@ _PROBES: Final = (0.25, -0.5)  # two different inputs: the binding must see the 
 _WARM_UP: Final = 50
 _LONGEST_S: Final = 5.0
 """Of this process's own processor time for each step before the first use: a busy machine is no endless loop."""
+_TIMES_BY_THE_CLOCK: Final = 6.0
+"""So many times as long by the clock: a step that waits for ever takes no processor time."""
 _POLL_S: Final = 0.1
 _NATIVE_PROBES: Final = 256
 """Inputs at which native evaluation is compared: in the range of the training data, and a quarter of it beyond."""
@@ -199,7 +201,7 @@ class OnnxGraph(GraphFile):
         self._probes = low + share * (high - low)
 
     def _answered(self, step: Callable[[], Any]) -> Any:
-        """Return what `step` returns; NetworkError when it has not after _LONGEST_S: a graph may hold an endless loop.
+        """Return what `step` returns; NetworkError when it has not after _LONGEST_S: it may loop for ever, or block.
 
         ONNX Runtime cannot be interrupted: the thread stays behind until the process, which refuses the network, ends.
         """
@@ -215,7 +217,8 @@ class OnnxGraph(GraphFile):
         thread = threading.Thread(target=run, daemon=True)
         thread.start()
         end_s = time.process_time() + _LONGEST_S
-        while thread.is_alive() and time.process_time() < end_s:
+        latest_s = time.monotonic() + _TIMES_BY_THE_CLOCK * _LONGEST_S
+        while thread.is_alive() and time.process_time() < end_s and time.monotonic() < latest_s:
             thread.join(_POLL_S)
         if errors:
             raise errors[0]

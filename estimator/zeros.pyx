@@ -11,16 +11,17 @@
 | g | gain of the current against the stiffness | with the torque |
 
 f, u and g are there so that they are not taken for a zero; nothing is corrected by them. A load, whatever its size, is in
-both views alike: it is not in y. Friction cannot be told from a zero before the joint has moved in both directions: until then the
-covariance of e stays as wide as f, and nothing is corrected (below). e and i0 are told apart by little: what is common to both goes by their
-prior widths, and the standard deviation of e never falls below what i0 leaves open.
+both views alike: it is not in y. Friction cannot be told from a zero before the joint has moved in both directions: until
+then the covariance of e stays as wide as f, and nothing is corrected (below). e and i0 are told apart by little: what is
+common to both goes by their prior widths, and the standard deviation of e never falls below what i0 leaves open.
 
-Samples count in motion only, with the friction on one side: |v| > MOVING_RAD_S, |s| > ONE_WAY. They are averaged over blocks of BLOCK
-samples, and a block counts as BLOCK_S/CORRELATION_S of an independent sample of variance s_c^2 + s_t^2: ripple and errors
-of the encoders are not white.
+Samples count in motion only, with the friction on one side: |v| > MOVING_RAD_S, |s| > ONE_WAY. They are averaged over
+blocks of BLOCK samples, and a block counts as its length/CORRELATION_S of an independent sample of variance s_c^2 + s_t^2:
+ripple and errors of the encoders are not white.
 
-What is taken off the readings is x w(|x|/sigma_x): nothing below DOUBT standard deviations, all of it above SURE, linear between (firm
-shrinkage, Gao and Bruce 1997): on a day without a zero worth it nothing is changed. It follows with SLEW_S: the estimate must not jump.
+What is taken off the readings is x w(|x|/sigma_x): nothing below DOUBT standard deviations, all of it above SURE, linear
+between (firm shrinkage, Gao and Bruce 1997): on a day without a zero worth it nothing is changed. It follows with SLEW_S:
+the estimate must not jump.
 """
 
 from libc.math cimport fabs, fmax, sqrt
@@ -58,8 +59,8 @@ cdef double LOW = DOUBT, HIGH = SURE, INVERSE_RANGE = 1.0 / (SURE - DOUBT)
 class Zeros(NamedTuple):
     """What is known of the zeros of a joint, and its standard deviations; 0 and the prior width where nothing is.
 
-    link_rad, current_a: what the readings are off by; link_used_rad, current_used_a: what is taken off them; plausible: whether
-    the link's zero is within the joint file's limit.
+    link_rad, current_a: what the readings are off by; link_used_rad, current_used_a: what is taken off them; plausible:
+    whether the link's zero is within the joint file's limit.
     """
 
     link_rad: float

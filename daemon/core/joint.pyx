@@ -2,10 +2,10 @@
 
 What a drive does not tell:
 
-    link position     one encoder. The estimator is given theta_m/G, a gear without torsion; the record has NaN. Methods that live on
-                      the torsion are refused by the configuration.
-    motor velocity    (theta_m(k) - theta_m(j))/(t_k - t_j), j the last cycle that had the motor position: the mean over that time,
-                      half a period older than the position. The first cycle of all has none, and is one without inputs.
+    link position     one encoder. The estimator is given theta_m/G, a gear without torsion; the record has NaN. Methods that
+                      live on the torsion are refused by the configuration.
+    motor velocity    (theta_m(k) - theta_m(j))/(t_k - t_j), j the last cycle that had the motor position: the mean over that
+                      time, half a period older than the position. The first cycle of all has none, and is without inputs.
 """
 
 from libc.math cimport INFINITY, NAN, isnan
@@ -327,13 +327,13 @@ cdef class JointCycle:
         return SENSOR
 
     cdef double since_last(self, int64_t sync_ns) noexcept nogil:
-        """Return the time step [s] from the last cycle with inputs, 0 at the first; the SYNC of this one becomes the last."""
+        """Return the time step [s] from the last cycle with inputs, 0 at the first; this one's SYNC becomes the last."""
         cdef int64_t dt_ns = self.on_grid(sync_ns - self.now.last_ns) if self.now.last_ns else 0
         self.now.last_ns = sync_ns
         return dt_ns * 1e-9
 
     cdef int64_t on_grid(self, int64_t dt_ns) noexcept nogil:
-        """Return a time step; SYNC keeps an absolute grid: a deviation below the stamps' own accuracy is theirs, not time's."""
+        """Return a time step; SYNC keeps an absolute grid: a deviation below the stamps' accuracy is theirs, not time's."""
         return self.period_ns if -ACCURACY_NS < dt_ns - self.period_ns < ACCURACY_NS else dt_ns
 
     cdef bint derive(self, int64_t sync_ns) noexcept nogil:
@@ -359,6 +359,6 @@ cdef Input *_input(Intake intake, int index, int count) except NULL:
 
 
 cdef const int64_t *_number_at(Intake intake, place) except NULL:
-    """Return where a number lies when its PDO has come (`jtqd.drivers.layout.Place`); raises ValueError when it has no such entry."""
+    """Return where a number lies when its PDO has come (`drivers.layout.Place`); raises ValueError without such an entry."""
     cdef Input *state = _input(intake, place.pdo, place.entry + 1)
     return &state.values[<int> place.entry]

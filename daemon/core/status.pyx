@@ -369,8 +369,8 @@ cdef class JointRules:
     ) noexcept nogil:
         """Return the status to publish and set its bits of `input_flags`.
 
-        sample: what the estimate was made of; reference_nm: of the same age, NaN where unknown; while `starting`, an estimate with a number has
-        status 1 instead.
+        sample: what the estimate was made of; reference_nm: of the same age, NaN where unknown; while `starting`, an
+        estimate with a number has status 1 instead.
         """
         cdef int found = 0, status = estimate.status
         if self.is_checked:

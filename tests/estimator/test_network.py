@@ -7,6 +7,7 @@ import math
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ import onnx
 import onnxruntime
 import pytest
 
+from jtqd.estimator import onnx_graph
 from jtqd.estimator.network import FEATURES, FUSED_FEATURES, FusedNetwork, TorqueNetwork
 from jtqd.estimator.onnx_graph import NetworkError
 from jtqd.sysid.train.network import export_network
@@ -218,6 +220,18 @@ except onnx_graph.NetworkError as error:
         [sys.executable, "-c", program], check=False, capture_output=True, text=True, timeout=30
     )
     assert "endless.onnx: found no answer within 0.3 s, expected one: it is not used" in result.stdout
+
+
+def test_a_step_that_blocks_is_refused_although_it_takes_no_processor_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    graph, released = TorqueNetwork(small_network().data)._graph, threading.Event()
+    monkeypatch.setattr(onnx_graph, "_LONGEST_S", 0.05)
+    try:
+        with pytest.raises(NetworkError, match=r"found no answer within 0\.05 s"):
+            graph._answered(lambda: released.wait(20.0))
+    finally:
+        released.set()
 
 
 def test_wrong_shapes_types_and_names() -> None:
