@@ -271,10 +271,9 @@ def draw_residuals(results: Sequence[Diagnosed], path: Path) -> None:
             axis.set_title(f"joint {one.number}, {run}: {one.findings.verdict}", fontsize=9)
         line[0].set_ylabel("residual [Nm]")
     if rows:
-        parts.legend(axes[0][0])
         for axis in axes[-1]:
             axis.set_xlabel("time [s]")
-    _save(figure, path)
+    _save(figure, path, axes[0][0])
 
 
 def draw_loads(results: Sequence[Diagnosed], path: Path) -> None:
@@ -307,18 +306,21 @@ def draw_loads(results: Sequence[Diagnosed], path: Path) -> None:
         axis.set_xlabel("load along the motion [Nm]")
     for line in axes:
         line[0].set_ylabel("loss missed [Nm]")
-    if shown:
-        parts.legend(axes[0][0])
-    _save(figure, path)
+    _save(figure, path, axes[0][0])
 
 
 def _traces(one: Diagnosed) -> list[Any]:
     return [trace for trace in one.findings.traces if trace.balance == "motor" and trace.joint == one.number]
 
 
-def _save(figure: Any, path: Path) -> None:
+def _save(figure: Any, path: Path, named: Any) -> None:
+    """Write a figure with the legend of the panel `named` above all panels: none of them has room for it."""
     figure.tight_layout()
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    handles, labels = named.get_legend_handles_labels()
+    if handles:
+        place = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": len(labels)}
+        figure.legend(handles, labels, **place, fontsize=8, frameon=False, markerscale=3.0)
+    figure.savefig(path, dpi=110, bbox_inches="tight", metadata={"Software": None})
     plt.close(figure)
 
 
