@@ -19,7 +19,7 @@ from jtqd.sysid.motion.setpoints import PERIOD_S
 from jtqd.sysid.runs.logs import LoggedRun
 
 LONGEST_FILLED_S: Final = 0.0505
-"""Longest time between two rows that is interpolated: 50 periods. The trajectories' harmonics lie below 1 Hz."""
+"""Longest time between two rows that is interpolated: 50 periods of 1 ms. The trajectories' harmonics lie below 1 Hz."""
 FILLED_SHARE: Final = 0.005
 """Largest part of a table that may be interpolated."""
 
@@ -42,7 +42,7 @@ def pieces_of(run: Run) -> tuple[Run, ...]:
         pieces.append((*ahead, run.segments[place], *before))
         ahead = list(after)
     return tuple(
-        Run(f"{run.name}~{number}", run.velocity_joint, each) for number, each in enumerate(pieces, 1)
+        replace(run, name=f"{run.name}~{number}", segments=each) for number, each in enumerate(pieces, 1)
     )
 
 
@@ -52,8 +52,8 @@ def _halves(rests: list[Rest]) -> tuple[list[Rest], list[Rest]]:
     return [half], [half]
 
 
-def fill(logged: LoggedRun, longest_gap_s: float) -> tuple[LoggedRun, int]:
-    """Interpolate the gaps that are longer than readers bear; returns the run and the number of rows made.
+def fill(logged: LoggedRun, longest_gap_s: float, period_s: float = PERIOD_S) -> tuple[LoggedRun, int]:
+    """Interpolate the gaps that are longer than readers bear; returns the run and the number of rows made, period_s apart.
 
     The run as it was, and 0, where a gap is longer than LONGEST_FILLED_S, or more than FILLED_SHARE would be made.
     Values between two rows are linear in time.
@@ -64,7 +64,7 @@ def fill(logged: LoggedRun, longest_gap_s: float) -> tuple[LoggedRun, int]:
     if not len(places) or float(steps.max()) > LONGEST_FILLED_S:
         return logged, 0
     made = [
-        time_s[place] + PERIOD_S * np.arange(1, round(float(steps[place]) / PERIOD_S)) for place in places
+        time_s[place] + period_s * np.arange(1, round(float(steps[place]) / period_s)) for place in places
     ]
     added = np.concatenate(made)
     if len(added) > FILLED_SHARE * (len(added) + len(time_s)):

@@ -11,7 +11,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -37,8 +37,9 @@ _BUS_WAS_LATE: Final = re.compile(
     r"SYNC missing|missing for \d+ cycles|no heartbeat for|no temperature for|late by|transmit queue"
 )
 _SIGNALLED: Final = re.compile(r"SIGINT|SIGTERM")
-LONGEST_GAP_S: Final = 0.0095
-"""A longer step, of 10 cycles or more: the table would be refused by whoever reads it (jtqd.sysid.runs.files)."""
+LONGEST_GAP: Final = 9.5
+"""In periods of SYNC. A longer step, of 10 cycles or more: the table would be refused by whoever reads it
+(jtqd.sysid.runs.files)."""
 LOST_SHARE: Final = 0.01
 FOLLOW_VELOCITY: Final = (0.05, 0.05)
 FOLLOW_CURRENT: Final = (0.1, 0.05)
@@ -126,11 +127,19 @@ def _kept(
     state = replace(state, status=FAILED)
     lost = int((recorded.summary.get("recording") or {}).get("lost", 0))
     try:
-        logged = log_to_run(log, all_needed=True, nodes=config.nodes, sensor=config.sensor is not None)
+        logged = log_to_run(
+            log,
+            joints=run.joints,
+            all_needed=True,
+            nodes=config.nodes,
+            sensor=config.sensor is not None,
+            enabled=range(1, len(config.joints) + 1),
+        )
     except LogError as error:
         _keep(log, out, run.name, ".failed.mcap")
         return Attempt(replace(state, reason=str(error)), again=True)
-    logged, interpolated = fill(logged, LONGEST_GAP_S)
+    longest_gap_s = LONGEST_GAP * config.period_s
+    logged, interpolated = fill(logged, longest_gap_s, config.period_s)
     state = replace(
         state,
         interpolated=interpolated,
@@ -138,13 +147,15 @@ def _kept(
         missed=logged.missed,
         incomplete=logged.incomplete,
         incomplete_by=dict(logged.incomplete_by),
-        findings=findings(logged, setpoints, config.joints, sensor=config.sensor is not None),
+        findings=findings(
+            logged, setpoints, config.joints, measured=[n for n in run.joints if config.measured(n)]
+        ),
     )
     if lost:
         state = replace(
             state, findings=(f"log: found {counted(lost, 'cycle')} lost by the recorder", *state.findings)
         )
-    why = gap_too_long(logged)
+    why = gap_too_long(logged, longest_gap_s)
     if why is not None:
         _keep(log, out, run.name, ".failed.mcap")
         return Attempt(replace(state, reason=why), again=True)
@@ -164,20 +175,20 @@ def _keep(paths: Sequence[Path], out: Path, run: str, ending: str) -> None:
             os.replace(path, out / (run + ("" if number == 1 else f"@{number}") + ending))
 
 
-def gap_too_long(logged: LoggedRun) -> str | None:
+def gap_too_long(logged: LoggedRun, longest_gap_s: float) -> str | None:
     """Return why a table cannot be kept at all, or None."""
-    if logged.longest_gap_s > LONGEST_GAP_S:
+    if logged.longest_gap_s > longest_gap_s:
         time_s = logged.table.time_s
         at = time_s[int(np.argmax(np.diff(time_s)))]
         return (
             f"found a gap of {logged.longest_gap_s * 1e3:.1f} ms in the log at {at:.3f} s, "
-            f"expected at most {LONGEST_GAP_S * 1e3:.1f} ms"
+            f"expected at most {longest_gap_s * 1e3:.1f} ms"
         )
     return None
 
 
 def findings(
-    logged: LoggedRun, setpoints: Setpoints, joints: tuple[Joint, Joint], *, sensor: bool
+    logged: LoggedRun, setpoints: Setpoints, joints: Sequence[Joint], *, measured: Collection[int]
 ) -> tuple[str, ...]:
     """Return what is wrong with a run beside its set-points, a line each; empty when nothing is.
 
@@ -186,16 +197,16 @@ def findings(
 
     Args:
         logged: whose first row belongs to the first set-point.
-        joints: as in jtqd's configuration. sensor: the bench has a torque sensor.
+        joints: as in jtqd's configuration, 1, 2, ... measured: those of the run that have a channel of the torque sensor.
     """
-    by_number = dict(zip((1, 2), joints, strict=True))
+    by_number = {number: joints[number - 1] for number in setpoints.joints}
     channels = [issue.text for issue in check_run(logged.table, by_number).refused]
     return (
         *_lost(logged),
-        *(_no_sensor(logged) if sensor else ()),
+        *_no_sensor(logged, measured),
         *channels,
         *_followed(logged, setpoints, joints),
-        *_opposite(logged),
+        *(() if setpoints.current_joint is None else _opposite(logged, setpoints.joints)),
     )
 
 
@@ -209,28 +220,30 @@ def _lost(logged: LoggedRun) -> Iterator[str]:
     )
 
 
-def _no_sensor(logged: LoggedRun) -> Iterator[str]:
+def _no_sensor(logged: LoggedRun, measured: Collection[int]) -> Iterator[str]:
     for number, columns in logged.table.joints.items():
-        if columns.torque_nm is None:
+        if columns.torque_nm is None and number in measured:
             yield f"j{number}.torque_nm: found no value in the whole run, expected the sensor's: dead channel"
 
 
-def _followed(logged: LoggedRun, setpoints: Setpoints, joints: tuple[Joint, Joint]) -> Iterator[str]:
+def _followed(logged: LoggedRun, setpoints: Setpoints, joints: Sequence[Joint]) -> Iterator[str]:
     """Yield the velocity joint against its velocity, the other one against its current."""
     table = logged.table
     place = np.minimum(np.round(table.time_s / PERIOD_S).astype(np.intp), len(setpoints) - 1)
     mover, driver = setpoints.velocity_joint, setpoints.current_joint
-    velocity, current = table.joints[mover].motor_velocity_rad_s, table.joints[driver].current_a
+    velocity = table.joints[mover].motor_velocity_rad_s
     assert velocity is not None  # log_to_run sees to it that these are there
-    assert current is not None
-    joint_side = velocity / joints[mover - 1].gear_ratio
     yield from _follows(
-        joint_side,
+        velocity / joints[mover - 1].gear_ratio,
         setpoints.velocity_rad_s[place],
         FOLLOW_VELOCITY,
         f"j{mover}.motor_velocity_rad_s: through the gear",
         "rad/s",
     )
+    if driver is None:
+        return
+    current = table.joints[driver].current_a
+    assert current is not None
     yield from _follows(current, setpoints.current_a[place], FOLLOW_CURRENT, f"j{driver}.current_a:", "A")
 
 
@@ -248,9 +261,9 @@ def _follows(
     )
 
 
-def _opposite(logged: LoggedRun) -> Iterator[str]:
+def _opposite(logged: LoggedRun, pair: tuple[int, ...]) -> Iterator[str]:
     """The links are one body: in their own frames they turn oppositely."""
-    one, two = (logged.table.joints[number].link_position_rad for number in (1, 2))
+    one, two = (logged.table.joints[number].link_position_rad for number in pair)
     assert one is not None
     assert two is not None
     if max(float(np.ptp(one)), float(np.ptp(two))) < MOVED_RAD:
@@ -259,7 +272,9 @@ def _opposite(logged: LoggedRun) -> Iterator[str]:
     variance = float(dx @ dx)
     slope = float(dx @ (two - two.mean())) / variance if variance else np.inf
     if abs(slope + 1.0) > OPPOSITE_TOLERANCE:
-        yield f"j2.link_position_rad: found it turning {slope:.4g} times as far as j1's, expected -1"
+        yield (
+            f"j{pair[1]}.link_position_rad: found it turning {slope:.4g} times as far as j{pair[0]}'s, expected -1"
+        )
 
 
 ATTEMPTS: Final = 3

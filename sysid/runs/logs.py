@@ -81,6 +81,7 @@ def log_to_run(
     all_needed: bool = False,
     nodes: Sequence[int] | None = None,
     sensor: bool = True,
+    enabled: Sequence[int] = (),
 ) -> LoggedRun:
     """Read joints of a log from the first to the last cycle in which all their drives are in "operation enabled".
 
@@ -96,6 +97,7 @@ def log_to_run(
             configuration that is attached to the log, without one 1, 2, ...
         sensor: a row needs the sensor's value, where a joint has a channel of it; False: the bench has none,
             torque_nm is None.
+        enabled: further joints whose drives must be in "operation enabled" at both ends, although they are not wanted.
 
     Raises:
         LogError: no such joint or cycle, an input that never came, or topics that do not belong together.
@@ -114,14 +116,16 @@ def log_to_run(
         raise LogError(f"{name}: {'; '.join(left_out.values())}")
     nodes = nodes or _nodes(log, there)
     node_of = dict(zip(there, nodes, strict=False))
+    looked_at = [*wanted, *(number for number in enabled if number not in wanted)]
     states, readings = _read(
-        log, name, {number: node_of.get(number, number) for number in wanted if number in there}
+        log, name, {number: node_of.get(number, number) for number in looked_at if number in there}
     )
+    beside = {number: states.pop(number) for number in list(states) if number not in wanted}
     left_out |= {number: why for number, state in states.items() if (why := _unusable(number, state))}
     if left_out and (all_needed or len(left_out) == len(wanted)):
         raise LogError(f"{name}: {'; '.join(left_out.values())}")
     states = {number: state for number, state in states.items() if number not in left_out}
-    span = _span(states, name)
+    span = _span(states | beside, name)
     temperatures = {number: _temperature(readings[number], span) for number in states}
     states = {number: state[span] for number, state in states.items()}
     present = {f"joint {number}": _complete(number, state, name) for number, state in states.items()}
