@@ -20,9 +20,11 @@ from jtqd.sysid.motion.setpoints import (
     MOST_JOINTS,
     Limits,
     MotionResult,
+    OutOfPlaceError,
     Setpoints,
     Surroundings,
     Timing,
+    approach,
 )
 from jtqd.sysid.motion.shell import Progress, play
 
@@ -209,7 +211,7 @@ class Bench:
         """Return the commander on this bench; limits_of: what holds in a run."""
         timing = self.config.timing(self.timing or Timing())
 
-        def motion(setpoints: Setpoints) -> MotionResult:
+        def played(setpoints: Setpoints) -> MotionResult:
             with on_time():
                 return play(
                     self.bus,
@@ -221,5 +223,20 @@ class Bench:
                     timing=timing,
                     around=self.config.around(setpoints),
                 )
+
+        def motion(setpoints: Setpoints) -> MotionResult:
+            """Play; a joint that is moved alone and stands elsewhere is brought to the middle of its travel first."""
+            try:
+                return played(setpoints)
+            except OutOfPlaceError as away:
+                low, high = limits_of(setpoints).position_rad
+                middle = 0.5 * (low + high)
+                there = approach(setpoints.velocity_joint, away.position_rad, middle, limits_of(setpoints))
+                result = played(there)
+                if result.status == "stopped":
+                    return result._replace(
+                        reason=f"on the way to {middle:g} rad: {result.reason}", played_s=0.0
+                    )
+                return played(setpoints)
 
         return motion

@@ -134,6 +134,7 @@ def _kept(
             nodes=config.nodes,
             sensor=config.sensor is not None,
             enabled=range(1, len(config.joints) + 1),
+            last_motion=run.current_joint is None,  # what brought it to its place is none of it
         )
     except LogError as error:
         _keep(log, out, run.name, ".failed.mcap")

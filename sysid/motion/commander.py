@@ -134,6 +134,7 @@ class Commander:
     Attributes:
         phase: see the module's diagram.
         refusal: why nothing was begun; None otherwise, and `result` holds once `over`.
+        out_of_place: the refusal is that the joint stands at the wrong place, at this position [rad]; else None.
     """
 
     def __init__(
@@ -151,6 +152,7 @@ class Commander:
         self.inputs = Inputs(drives, sensor, COMMANDER_NODE)
         self.phase = Phase.WAITING
         self.refusal: str | None = None
+        self.out_of_place: float | None = None
         self._reason = ""
         self._handlers = self.inputs.handlers
         self._pace = Pace(timing, now_ns)
@@ -365,6 +367,8 @@ class Commander:
         elif self._now_ns - self._still_since_ns >= self.timing.still_s * 1e9:
             leader = self.inputs.drives[self._setpoints.velocity_joint - 1]
             self.refusal = out_of_room(self._setpoints, self._limits, leader.position_rad)
+            if self.refusal is not None:
+                self.out_of_place = leader.position_rad
             self._enter(Phase.ENABLING if self.refusal is None else Phase.OVER)
 
     def _enabling(self, turn: int) -> bytes | None:

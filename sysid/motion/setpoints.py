@@ -21,6 +21,17 @@ class MotionError(Exception):
     """The motion was refused before anything moved; one line for the operator."""
 
 
+class OutOfPlaceError(MotionError):
+    """The motion was refused because a joint that is moved alone stands where it would leave its travel.
+
+    position_rad: where it stands, by its own encoder.
+    """
+
+    def __init__(self, reason: str, position_rad: float) -> None:
+        super().__init__(reason)
+        self.position_rad = position_rad
+
+
 class MotionResult(NamedTuple):
     """How a motion ended. Both joints are disabled in either case, or `reason` says what could not be confirmed.
 
@@ -430,3 +441,30 @@ def _smooth(series: FloatArray, limit: float, what: str, unit: str) -> None:
         raise MotionError(
             f"plan: {what} {where} of {steps[jumps[0]]:.3f} {unit}, limit {limit:g} {unit} per ms"
         )
+
+
+APPROACH_SHARE: Final = 0.3
+"""Largest velocity of an approach, as a part of its limit."""
+APPROACH_S: Final = 1.0
+"""Shortest ramp of an approach."""
+
+
+def approach(joint: int, start_rad: float, target_rad: float, limits: Limits) -> Setpoints:
+    """Return the motion of one joint, alone, from where it stands to another place, slowly; positions by its own encoder.
+
+    Raises:
+        MotionError: it stands, or shall stand, outside of its travel.
+    """
+    low, high = limits.position_rad
+    for what, position in (("stands at", start_rad), ("shall go to", target_rad)):
+        if not low <= position <= high:
+            raise MotionError(
+                f"joint {joint}: {what} {position:.3f} rad, travel_rad is {low:g} to {high:g}: move it by hand"
+            )
+    distance = target_rad - start_rad
+    speed = min(APPROACH_SHARE * limits.velocity_rad_s, max(abs(distance) / APPROACH_S, 1e-6))
+    ramp, hold = round(APPROACH_S / PERIOD_S), round((abs(distance) / speed - APPROACH_S) / PERIOD_S)
+    rising = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, ramp + 1) / ramp)
+    shape = np.concatenate((rising, np.ones(max(hold, 0)), rising[::-1], np.zeros(1)))
+    velocity = shape * (distance / (float(shape.sum()) * PERIOD_S))
+    return Setpoints(joint, velocity, np.zeros(len(velocity)), current_joint=None)

@@ -25,6 +25,7 @@ from jtqd.sysid.motion.setpoints import (
     Limits,
     MotionError,
     MotionResult,
+    OutOfPlaceError,
     Setpoints,
     Surroundings,
     Timing,
@@ -58,7 +59,7 @@ def play(
     SIGINT and SIGTERM stop the joints, a second one makes them brake at once; the handlers that were there before are
     back when this returns. `drives` are joints 1, 2, ..; those that the set-points do not name are held. Without `sensor`
     the torque is not supervised.
-    Raises MotionError, one line, when the motion was refused and nothing has moved.
+    Raises MotionError (OutOfPlaceError), one line, when the motion was refused and nothing has moved.
     """
     timing = timing or Timing()
     check_setpoints(setpoints, limits)
@@ -81,7 +82,10 @@ def play(
             finally:
                 left = setup.release(beating=beating)
     if commander.refusal is not None:
-        raise MotionError("; ".join(reason for reason in (commander.refusal, left) if reason))
+        refusal = "; ".join(reason for reason in (commander.refusal, left) if reason)
+        if commander.out_of_place is not None and not left:
+            raise OutOfPlaceError(refusal, commander.out_of_place)
+        raise MotionError(refusal)
     result = commander.result
     reasons = [reason for reason in (result.reason, error, left) if reason]
     return result._replace(status="stopped" if reasons else "done", reason="; ".join(reasons))

@@ -82,6 +82,7 @@ def log_to_run(
     nodes: Sequence[int] | None = None,
     sensor: bool = True,
     enabled: Sequence[int] = (),
+    last_motion: bool = False,
 ) -> LoggedRun:
     """Read joints of a log from the first to the last cycle in which all their drives are in "operation enabled".
 
@@ -98,6 +99,7 @@ def log_to_run(
         sensor: a row needs the sensor's value, where a joint has a channel of it; False: the bench has none,
             torque_nm is None.
         enabled: further joints whose drives must be in "operation enabled" at both ends, although they are not wanted.
+        last_motion: begin behind the last time without power, not at the first cycle with it.
 
     Raises:
         LogError: no such joint or cycle, an input that never came, or topics that do not belong together.
@@ -125,7 +127,7 @@ def log_to_run(
     if left_out and (all_needed or len(left_out) == len(wanted)):
         raise LogError(f"{name}: {'; '.join(left_out.values())}")
     states = {number: state for number, state in states.items() if number not in left_out}
-    span = _span(states | beside, name)
+    span = _span(states | beside, name, last_motion=last_motion)
     temperatures = {number: _temperature(readings[number], span) for number in states}
     states = {number: state[span] for number, state in states.items()}
     present = {f"joint {number}": _complete(number, state, name) for number, state in states.items()}
@@ -257,9 +259,15 @@ def _unusable(number: int, state: Records) -> str:
     return ""
 
 
-def _span(states: Mapping[int, Records], log: Path) -> slice:
+def _span(states: Mapping[int, Records], log: Path, *, last_motion: bool) -> slice:
     """From the first to the last cycle that counts; what is stale in between is looked at later."""
     rows = np.flatnonzero(np.logical_and.reduce([_enabled(state) for state in states.values()]))
+    if last_motion and len(rows):
+        off: Flags = np.logical_or.reduce(
+            [_unpowered(state["statusword"]) & _fresh(state) for state in states.values()]
+        )
+        before = np.flatnonzero(off[: rows[-1]])
+        rows = rows[rows > before[-1]] if len(before) else rows
     if len(rows) < 2:
         raise LogError(
             f"{log}: found {counted(len(rows), 'cycle')} of the motion with all drives (joints "
@@ -304,9 +312,14 @@ def _columns(state: Records, sensor: bool, temperature: FloatArray | None) -> Jo
     )
 
 
+def _unpowered(statusword: NDArray[Any]) -> Flags:
+    found: Flags = np.logical_or.reduce([(statusword & mask) == value for mask, value in _NO_POWER])
+    return found
+
+
 def _powered(statusword: NDArray[Any]) -> FloatArray | None:
     """Column `enabled` [n]; None for a run in which the power was never off, which is most of them."""
-    off = np.logical_or.reduce([(statusword & mask) == value for mask, value in _NO_POWER])
+    off = _unpowered(statusword)
     return np.where(off, 0.0, 1.0) if off.any() else None
 
 
