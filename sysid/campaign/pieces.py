@@ -94,6 +94,12 @@ def _of_one_direction(run: Run, moving: list[int]) -> list[list[Segment]]:
     return [[ends[0], replace(each, ramp_s=max(ramp_s, each.ramp_s)), ends[1]] for each in plateaus]
 
 
+def gaps_of(time_s: FloatArray, longest_gap_s: float) -> list[list[float]]:
+    """Return the last row before and the first behind [s] of each step that is longer than longest_gap_s."""
+    places = np.flatnonzero(np.diff(time_s) > longest_gap_s)
+    return [[round(float(time_s[place]), 6), round(float(time_s[place + 1]), 6)] for place in places]
+
+
 def fill(logged: LoggedRun, longest_gap_s: float, period_s: float = PERIOD_S) -> tuple[LoggedRun, int]:
     """Interpolate the gaps that are longer than readers bear; returns the run and the number of rows made, period_s apart.
 

@@ -23,7 +23,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.campaign.bench import Bench, BenchConfig, Play
-from jtqd.sysid.campaign.pieces import fill, pieces_of
+from jtqd.sysid.campaign.pieces import fill, gaps_of, pieces_of
 from jtqd.sysid.campaign.plan import Plan, Run, expand, marks_of
 from jtqd.sysid.campaign.processes import Interrupted, Jtqd, ProcessError, StopAsked
 from jtqd.sysid.campaign.reporter import Reporter
@@ -140,6 +140,7 @@ def _kept(
         _keep(log, out, run.name, ".failed.mcap")
         return Attempt(replace(state, reason=str(error)), again=True)
     longest_gap_s = LONGEST_GAP * config.period_s
+    gaps = gaps_of(logged.table.time_s, longest_gap_s)
     logged, interpolated = fill(logged, longest_gap_s, config.period_s)
     state = replace(
         state,
@@ -161,7 +162,10 @@ def _kept(
         _keep(log, out, run.name, ".failed.mcap")
         return Attempt(replace(state, reason=why), again=True)
     sha256 = write_run(out / f"{run.name}.csv.gz", logged.table)
-    (out / f"{run.name}.json").write_text(json.dumps(marks_of(run, setpoints), indent=1) + "\n")
+    marks = marks_of(run, setpoints)
+    if interpolated:
+        marks["interpolated_s"] = gaps
+    (out / f"{run.name}.json").write_text(json.dumps(marks, indent=1) + "\n")
     _keep(log, out, run.name, ".mcap")
     return Attempt(replace(state, status=DONE, sha256=sha256))
 

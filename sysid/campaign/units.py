@@ -53,8 +53,11 @@ class Unit:
                 "beside them (jN.load of a column map)"
             )
         if len(self.joints) == 1:
-            return "moved alone: friction, and what the loads of gravity and inertia show; no efficiency under other loads"
-        return "on a towing bench: friction, efficiency, losses, torsion"
+            return (
+                "moved alone: losses and torsion under the loads of gravity and inertia (jtq fit losses, jtq diagnose); no "
+                "efficiency under other loads"
+            )
+        return "on a towing bench: efficiency, losses, torsion"
 
 
 def said_of(units: Iterable[Unit], say: Callable[[Unit], str]) -> list[str]:
