@@ -187,17 +187,17 @@ def test_the_torque_of_another_joint_is_no_reason_to_stop() -> None:
     lock.commander(alone(3, 1.0), ALONE, around=around)
     lock.play_until(200)
 
-    def loaded(channel: int) -> Callable[[Frames], Frames]:
-        large = (2_000_000_000).to_bytes(4, "little")
-        can_id = 0x080 + 0x100 * channel + 5
+    def loaded(channel: int, torque: bytes) -> Callable[[Frames], Frames]:
+        cob_id = 0x080 + 0x100 * channel + 5
         return lambda frames: [
-            (each[0], large + each[1][4:], each[2]) if each[0] == can_id else each for each in frames
+            (can_id, torque + data[-1:], stamp) if can_id == cob_id else (can_id, data, stamp)
+            for can_id, data, stamp in frames
         ]
 
-    lock.filter = loaded(1)
+    lock.filter = loaded(1, b"\xff\xff\xff\x7f")
     lock.run_for(50)
     assert lock.motion.phase is Phase.PLAYING
-    lock.filter = loaded(2)
+    lock.filter = loaded(2, b"\xff\x7f")
     lock.run()
     assert lock.motion.result.reason.startswith("joint 3: torque at the sensor")
 
