@@ -140,10 +140,9 @@ class BenchConfig:
             channel = self.channels[number - 1]
             if channel is not None:
                 own[channel] = (*own.get(channel, ()), number)
-        towing = (
-            run.joints == (1, 2) and len(self.joints) == 2
-        )  # a sensor between them is theirs, named or not
-        return Surroundings(held, None if towing else own)
+        # where there are no others, every channel of the sensor is theirs, named in the configuration or not
+        everything = len(run.joints) == 2 == len(self.joints)
+        return Surroundings(held, None if everything else own)
 
     @property
     def estimate_cob_id(self) -> int:

@@ -276,7 +276,7 @@ def unit_lines(options: argparse.Namespace, units: Sequence[Unit], plan: Plan) -
         low, high = limits.position_rad
         lines.append(
             f"joint {number} alone: {low:g} to {high:g} rad, {limits.velocity_rad_s:g} rad/s, {limits.current_a:g} A, "
-            f"{limits.torque_nm:g} Nm; each run begins near {0.5 * (low + high):g} rad, and the other joints are held"
+            f"{limits.torque_nm:g} Nm; each run begins near {0.5 * (low + high):g} rad; the others are held; all are off after it: no brakes, no load"
         )
     return lines
 
