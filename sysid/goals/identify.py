@@ -138,17 +138,31 @@ def identify(plant: PlantFile, sizes: Sizes, seed: int = FIT_SEED) -> tuple[Iden
     Raises:
         ConfigError, LossFitError, TorsionError, ValueError: as the fits, where the runs are too few.
     """
+    physics, excitation = identify_physics(plant, sizes, seed)
+    plan = make_plan("efficiency", scale_of(sizes, nominal_joints(plant), seed, "efficiency"))
+    efficiency = drive(plant.bench(), plan.runs, seed)
+    return tuple(_with_others(one, excitation, efficiency, sizes.iterations, seed) for one in physics)
+
+
+def identify_physics(
+    plant: PlantFile, sizes: Sizes, seed: int = FIT_SEED
+) -> tuple[tuple[Identified, ...], list[Driven]]:
+    """Return both joints with section `fused` alone, and the runs that they were fitted to. Raises as `identify`."""
     joints = nominal_joints(plant)
-    bench = plant.bench()
-    plans = {
-        kind: make_plan(kind, scale_of(sizes, joints, seed, kind)).runs
-        for kind in ("excitation", "efficiency")
-    }
-    excitation, efficiency = (drive(bench, plans[kind], seed) for kind in ("excitation", "efficiency"))
-    return tuple(
-        _identified(number, with_efficiency(joint, number, efficiency), excitation, sizes.iterations, seed)
-        for number, joint in zip(NUMBERS, joints, strict=True)
-    )
+    plan = make_plan("excitation", scale_of(sizes, joints, seed, "excitation"))
+    excitation = drive(plant.bench(), plan.runs, seed)
+    settings = EstimatorSettings(method="fused")  # as `jtq fit losses`
+    found = []
+    for number, joint in zip(NUMBERS, joints, strict=True):
+        signals = [
+            run_signals(run.name, joint, settings, run.table.time_s, run.columns(number, joint))
+            for run in excitation
+        ]
+        fused = fit_fused(signals, joint.friction, joint.rated_torque_nm).fused
+        found.append(
+            Identified(number, replace(joint, fused=fused), b"", {}, Range.of(excitation, number, joint))
+        )
+    return tuple(found), excitation
 
 
 def with_efficiency(joint: Joint, number: int, runs: Sequence[Driven]) -> Joint:
@@ -164,15 +178,11 @@ def with_efficiency(joint: Joint, number: int, runs: Sequence[Driven]) -> Joint:
     return replace(joint, efficiency=fit.efficiency(joint.efficiency))
 
 
-def _identified(
-    number: int, joint: Joint, excitation: Sequence[Driven], iterations: int, seed: int
+def _with_others(
+    one: Identified, excitation: Sequence[Driven], efficiency: Sequence[Driven], iterations: int, seed: int
 ) -> Identified:
-    settings = EstimatorSettings(method="fused")
-    signals = [
-        run_signals(run.name, joint, settings, run.table.time_s, run.columns(number, joint))
-        for run in excitation
-    ]
-    joint = replace(joint, fused=fit_fused(signals, joint.friction, joint.rated_torque_nm).fused)
+    """Return the joint with the paper's chain and the baselines."""
+    number, joint = one.number, with_efficiency(one.joint, one.number, efficiency)
     blocks = [
         paper_block(run.name, joint, run.table.time_s, run.columns(number, joint)) for run in excitation
     ]
@@ -181,13 +191,8 @@ def _identified(
         blocks, joint, names, iterations=iterations, seed=seed, progress=lambda n, loss: None
     )
     examples = [example(run, number, joint) for run in excitation]
-    return Identified(
-        number,
-        joint,
-        network.data,
-        {name: fit_baseline(baseline, examples) for name, baseline in BASELINES.items()},
-        Range.of(excitation, number, joint),
-    )
+    baselines = {name: fit_baseline(baseline, examples) for name, baseline in BASELINES.items()}
+    return replace(one, joint=joint, network=network.data, baselines=baselines)
 
 
 def observed(run: Driven, columns: JointColumns, joint: Joint) -> ObservedRun:

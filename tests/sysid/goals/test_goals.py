@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.run import ObservedRun
 from jtqd.estimator.status import DEGRADED, VALID
 from jtqd.sim_can.plant_file import PlantParameters
@@ -33,6 +34,7 @@ from jtqd.sysid.goals.figures import (
 )
 from jtqd.sysid.goals.identify import FIT_SEED, JUDGE_SEED, Driven, Identified, Range, drive, nominal_joints
 from jtqd.sysid.goals.judge import OWN, TITLES, ZEROS, Judged, Result, judge
+from jtqd.sysid.goals.network_study import Part, made_of, outcome, shares_of_error
 from jtqd.sysid.goals.plants import CHANGES, the_three
 from jtqd.sysid.goals.table import goal_lines, goal_rows, markdown
 from tests.estimator.fused_helpers import fused
@@ -53,11 +55,14 @@ def judged(run: str = "a", number: int = 1, error_nm: float = 0.0, **changes: ob
 def test_errors_of_figures_are_from_run_to_run() -> None:
     """Two joints of one run are one run; sqrt(p (1-p)/n) of 4000 samples would be 0.008."""
     found = share([("a", YES, YES), ("a", YES, YES), ("b", NO, YES), ("b", NO, YES)])
-    assert found == (50.0, pytest.approx(50.0))
+    assert found.value == 50.0
+    assert found.se == pytest.approx(50.0)
     assert math.isnan(share([("a", YES, YES)]).se)
     assert math.isnan(share([("a", YES, NO)]).value)
     assert ratio([("a", 8.0, 2.0)]).value == 4.0
-    assert root(Figure(4.0, 0.4)) == (2.0, pytest.approx(0.1))
+    rooted = root(Figure(4.0, 0.4))
+    assert rooted.value == 2.0
+    assert rooted.se == pytest.approx(0.1)
 
 
 def test_interval_takes_the_worst_cell_and_standstill_leaves_out_what_is_degraded() -> None:
@@ -103,7 +108,7 @@ def test_a_baseline_finds_the_coefficients_it_is_made_of(name: str) -> None:
         np.full(N, VALID, np.uint8), raw, v, 0.7 * d, np.zeros((N, 4)), v, np.tanh(v / 0.1), v, v, 0.3 * d
     )
     baseline = BASELINES[name]
-    truth = rng.uniform(0.5, 1.5, baseline.regressors(seen).shape[1])
+    truth: FloatArray = np.linspace(0.5, 1.5, baseline.regressors(seen).shape[1])
     wanted = baseline.estimate(seen, truth)
     old = np.full(N, np.nan)
     young, slow = (wanted, old) if baseline.young else (old, wanted)
@@ -153,7 +158,6 @@ def test_a_change_of_the_link_reaches_the_estimate_and_not_the_truth() -> None:
 
 
 def test_days_that_judge_are_of_no_fit() -> None:
-    assert FIT_SEED != JUDGE_SEED
     plant = the_three()[2]
     days = [plant.bench().run_to_run.day(seed, 0) for seed in (FIT_SEED, JUDGE_SEED)]
     assert days[0] != days[1]
@@ -214,3 +218,26 @@ def test_driven_runs_have_the_truth_of_both_joints() -> None:
     run: Driven = drive(the_three()[0].bench(), [short_run()], 5)[0]
     assert run.true_nm.shape == (len(run.table.time_s), 2)
     assert run.columns(2, nominal_joints(the_three()[0])[1]).torque_nm is not None
+
+
+def test_a_network_finds_a_ripple_that_physics_leaves_and_no_zero_of_a_run() -> None:
+    """A wave of the motor's turn in proportion to the load is in every run; each run's zero is its own."""
+    rng = np.random.default_rng(8)
+
+    def part(zero_nm: float) -> Part:
+        n = 4000
+        angle = np.cumsum(rng.uniform(0.0, 0.4, n))
+        core = np.column_stack((rng.normal(size=n), 10.0 * rng.normal(size=n), rng.normal(size=n)))
+        waves = np.column_stack([wave(k * angle) for k in (1, 2, 3, 4) for wave in (np.cos, np.sin)])
+        ripple = 0.05 * core[:, 1] * waves[:, 2]
+        return Part(core, rng.normal(size=(n, 3)), waves, ripple - ripple.mean(), zero_nm - ripple)
+
+    known, other = ([part(rng.uniform(-0.2, 0.2)) for _ in range(6)] for _ in range(2))
+    made = made_of("waves", known, 40)
+    found = outcome(made, 1.0, other)
+    every, mean, slow, quick = shares_of_error(other)
+    assert every == pytest.approx(mean + slow + quick, rel=0.05)
+    assert found.physics_nm2 == pytest.approx(every)
+    assert mean < found.mse_nm2 < mean + 0.1 * (every - mean)
+    assert found.worse == 0
+    assert outcome(made, 0.0, other).off_percent == 0.0
