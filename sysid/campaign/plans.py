@@ -231,21 +231,30 @@ def variable_runs(
 
 
 def outside_runs(
-    limits: Limits, count: int, run_s: float, *, seed: int, joints: Joints = None
+    limits: Limits,
+    count: int,
+    run_s: float,
+    *,
+    seed: int,
+    joints: Joints = None,
+    load: float = 1.5,
+    velocity_rad_s: float = FULL_RAD_S,
 ) -> tuple[Run, ...]:
-    """Return runs with half as much load again as any other campaign has: what no model has been trained on.
+    """Return runs with `load` times the currents of any other campaign, or a higher peak velocity: what no model has been
+    trained on.
 
     Raises:
         ConfigError: runs too short for a trajectory.
     """
     wanted = ExcitationLimits(
-        velocity_rad_s=FULL_RAD_S,
+        velocity_rad_s=velocity_rad_s,
+        acceleration_rad_s2=velocity_rad_s / FULL_RAD_S * ExcitationLimits().acceleration_rad_s2,
         travel_rad=_LIMIT_SHARE * limits.travel_rad,
-        current_a=1.5 * CURRENT_A,
-        joint_current_a=1.5 * JOINT_CURRENT_A,
+        current_a=load * CURRENT_A,
+        joint_current_a=load * JOINT_CURRENT_A,
         torque_nm=_LIMIT_SHARE * limits.torque_nm,
     )
-    chosen = seed_of("outside", FULL_RAD_S, seed)
+    chosen = seed_of("outside", velocity_rad_s, seed)
     made = draw(
         wanted,
         count=count,

@@ -363,7 +363,7 @@ def losses_main(argv: list[str]) -> int:
             for finding in findings:
                 print(f"{LOSSES_BY}: {finding.text}", file=sys.stderr)
             return 3
-        fit = fit_fused(signals_of(runs, number, joint), joint.friction)
+        fit = fit_fused(signals_of(runs, number, joint), joint.friction, joint.rated_torque_nm)
         written = _with_fused(joint, fit, runs)
         print(json.dumps(_losses_mapping(fit), indent=1) if options.json else "\n".join(_lines(joint, fit)))
         if options.out is not None:
