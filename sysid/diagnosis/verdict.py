@@ -28,7 +28,7 @@ from jtqd.sysid.diagnosis.findings import (
 )
 from jtqd.sysid.diagnosis.gain import held_out_gain, left_out_steps
 from jtqd.sysid.diagnosis.gaps import channel_gaps, traces
-from jtqd.sysid.diagnosis.guards import STEADY, nothing_of, objections, steadiness
+from jtqd.sysid.diagnosis.guards import nothing_of, objections
 from jtqd.sysid.diagnosis.leave_one_out import ENOUGH_RUNS, LeaveOneOut
 from jtqd.sysid.diagnosis.leftover import Leftover, leftover
 from jtqd.sysid.diagnosis.next_experiment import MOST_KINDS, next_experiment
@@ -44,6 +44,7 @@ from jtqd.sysid.diagnosis.refine import (
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.search import Hypothesis, Search
 from jtqd.sysid.diagnosis.signals import Channel
+from jtqd.sysid.diagnosis.steadiness import steadiness
 from jtqd.sysid.fit.friction import student_975
 
 RELEVANCE: Final = 0.005
@@ -60,6 +61,8 @@ INACCURATE: Final = 0.06
 """Half width of the 95 % interval, as part of an effect's size, for what the equations here simplify (smoothing, first
 order in a delay): no interval is narrower. Judged by its coverage of known truths (docs/diagnosis.md).
 """
+_FAR_FROM_CERTAIN: Final = 0.25
+"""Part of the steadiness that is needed below which effects are taken away at once, not one by one."""
 BESIDE: Final = 0.02
 """Part of the largest cause's contribution below which another one is within the model's own inaccuracy."""
 
@@ -110,10 +113,10 @@ def conclude(  # noqa: PLR0917
     ]
     energies = [sum(r * r for r in e.values()) for e in explained]
     total = max(sum(energies) + left.energy_nm2(), 1e-30)
-    steady = steadiness(refined, nothing_of(best))
+    steady = steadiness(refined, noise, nothing_of(best))
     causes = [
-        replace(c, explained_share=e / total, steadiness=t)
-        for c, e, t in zip(causes, energies, steady, strict=True)
+        replace(c, explained_share=e / total, steadiness=s.ratio)
+        for c, e, s in zip(causes, energies, steady, strict=True)
     ]
     rated = {n: joint.rated_torque_nm for n, joint in joints.items()}
     rest = _left_over(left, limits, rated, left.energy_nm2() / total, matters=matters)
@@ -218,15 +221,14 @@ def _proven(  # noqa: PLR0917
     noise: Noise,
     joints: Mapping[int, Joint],
 ) -> tuple[Hypothesis, Refined, list[dict[Channel, float]]]:
-    """Return the same with those causes only that are certain whatever is left over (`guards.STEADY`)."""
+    """Return the same with those causes only that are certain whatever is left over (`steadiness`)."""
     while best.chosen:
-        steady = steadiness(refined, nothing_of(best))
-        weakest = min(range(len(steady)), key=lambda k: steady[k])
-        if steady[weakest] >= STEADY:
+        margins = [s.margin for s in steadiness(refined, noise, nothing_of(best))]
+        if min(margins) >= 1.0:
             break
-        least = max(steady[weakest], 0.25 * STEADY)
+        least = max(min(margins), _FAR_FROM_CERTAIN)
         best = search.hypothesis(
-            [c for c, t in zip(best.chosen, steady, strict=True) if t > least], best.model
+            [c for c, m in zip(best.chosen, margins, strict=True) if m > least], best.model
         )
         refined = refine(dataset, present_effects(best), noise)
     return _without_negligible(dataset, search, best, refined, noise, joints)
