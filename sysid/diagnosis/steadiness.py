@@ -31,7 +31,7 @@ RUNS: Final = "run"
 CONDITIONS: Final = ("velocity", "load", "current", "link_angle", "motor_angle", "time")
 _SLICES: Final = 6
 _FEWEST_SLICES: Final = 4
-_CELLS: Final = 48
+_CELLS: Final = 240
 """Of as many samples each, of which the slices are made."""
 _NO_SIZE: Final = ("phase_rad", "reference_c")
 
@@ -123,9 +123,12 @@ def _cells(
     width = rows[0][0].shape[1]
     out = np.zeros((len(rows), len(edges) + 1, width, width))
     for grams, x, (block, _) in zip(out, values, rows, strict=True):
-        place = np.where(np.isfinite(x), np.searchsorted(edges, x, side="right"), -1)
-        for k in np.unique(place[place >= 0]):
-            here = block[place == k]
+        place = np.where(np.isfinite(x), np.searchsorted(edges, x, side="right"), len(edges) + 1)
+        order = np.argsort(place, kind="stable")
+        ends = np.searchsorted(place[order], np.arange(len(edges) + 2))
+        ordered = block[order]
+        for k in range(len(edges) + 1):
+            here = ordered[ends[k] : ends[k + 1]]
             grams[k] = here.T @ here
     return out
 
