@@ -224,9 +224,9 @@ class SignalsError(ValueError):
 class _Motion:
     """Motion of one motor as it is known, at the motor's shaft.
 
-    speed: as recorded or derived; whole: acceleration at the full rate; acceleration, shared: where it is known to `_VISIBLE`
-    and `_SHARED`; visible: the smoother of the first; of_position: all is of the position, else of the velocity; coarse:
-    what its noise costs, in words.
+    speed: as recorded or derived; whole: acceleration at the full rate; acceleration, shared: where it is known to
+    `_VISIBLE` and `_SHARED`; visible: the smoother of the first; of_position: all is of the position, else of the velocity;
+    coarse: what its noise costs, in words.
     """
 
     position: FloatArray
