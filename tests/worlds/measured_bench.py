@@ -73,7 +73,8 @@ class MeasuredBench:
     def unseen(self) -> MeasuredBench:
         """Return the bench with what a ladder leaves in seconds that it was not fitted to, steps between them and all. A fit
         leaves nothing that looks like its own terms in the runs it was made of: by that, an offset or a friction would
-        be visible at any size, to somebody who knows that the file is fitted to these very runs.
+        be visible at any size, to somebody who knows that the file is fitted to these very runs. RunTrajectory1 moves for
+        a second and a half, too short for that: it stays as it is fitted, so sizes that come from it are still small ones.
         """
         return MeasuredBench(unseen=True)
 
