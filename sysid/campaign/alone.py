@@ -2,7 +2,7 @@
 
 Nothing commands its load: that is what gravity and inertia make of it. Where and how fast it may go is said by
 `motion_limits` of its joint file, or by --limits; the torque by its rating. A run begins and ends where the joint stands
-and goes as far to either side; a joint that does not stand in the middle of its travel is brought there before.
+and goes as far to either side; where that does not fit into its travel, it is brought to the middle before.
 
     plateaus       constant velocities in both directions over the same positions: friction over velocity
     trajectories   Eq. (10), chosen for the information about friction, inertia and gravity:

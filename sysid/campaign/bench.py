@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -42,7 +43,7 @@ class BenchConfig:
 
     Attributes:
         path: the file. drives: of joints 1, 2, ... joints: their joint files. channels: of the sensor, for each joint; None:
-            it has none. sensor: None without one. master: jtqd's own node-ID.
+            it has none. temperatures: jtqd takes that of the joint. sensor: None without one. master: jtqd's own node-ID.
         period_us: of SYNC, whole milliseconds.
     """
 
@@ -50,6 +51,7 @@ class BenchConfig:
     drives: tuple[DriveProfile, ...]
     joints: tuple[Joint, ...]
     channels: tuple[int | None, ...]
+    temperatures: tuple[bool, ...]
     sensor: SensorProfile | None
     master: int
     heartbeat_ms: int
@@ -99,6 +101,9 @@ class BenchConfig:
                 joint.integer("sensor_channel", low=1, high=2) if joint.has("sensor_channel") else None
                 for joint in sections
             ),
+            temperatures=tuple(
+                joint.has("temperature") and joint.raw("temperature") is True for joint in sections
+            ),
             sensor=next((each for each in request.profiles if isinstance(each, SensorProfile)), None),
             master=master,
             heartbeat_ms=100 if timing is None else timing.integer("heartbeat_ms", low=10, default=100),
@@ -119,6 +124,22 @@ class BenchConfig:
     def measured(self, number: int) -> bool:
         """Return whether a channel of the torque sensor belongs to the joint."""
         return self.sensor is not None and self.channels[number - 1] is not None
+
+    def check_temperature(self, limit_c: float) -> None:
+        """Refuse a limit of the temperature where jtqd leaves that of a joint off.
+
+        A drive on which the commander switched TPDO3 on would count as changed, and lose its inputs.
+
+        Raises:
+            ConfigError: naming file, joint and what to do.
+        """
+        if not math.isfinite(limit_c) or all(self.temperatures):
+            return
+        number = 1 + self.temperatures.index(False)
+        raise ConfigError(
+            f"{self.path}: joint_{number}: found no 'temperature: true', expected it for the limit of {limit_c:g} degC "
+            "(--limit temperature_c=none: not supervised)"
+        )
 
     def timing(self, timing: Timing) -> Timing:
         """Return times of the supervision at this period of SYNC: a set-point leaves at the same part of the cycle."""

@@ -274,9 +274,14 @@ def unit_lines(options: argparse.Namespace, units: Sequence[Unit], plan: Plan) -
     )
     for number, limits in sorted(plan.alone.items()):
         low, high = limits.position_rad
+        most = f"{limits.velocity_rad_s:g} rad/s, {limits.current_a:g} A, {limits.torque_nm:g} Nm"
         lines.append(
-            f"joint {number} alone: {low:g} to {high:g} rad, {limits.velocity_rad_s:g} rad/s, {limits.current_a:g} A, "
-            f"{limits.torque_nm:g} Nm; each run begins near {0.5 * (low + high):g} rad; the others are held; all are off after it: no brakes, no load"
+            f"joint {number} alone: {low:g} to {high:g} rad, {most}; a run that does not fit where it stands begins at "
+            f"{0.5 * (low + high):g} rad; the other joints are held"
+        )
+    if plan.alone:
+        lines.append(
+            "after each run and every stop all drives are off: a joint that carries a load needs a brake"
         )
     return lines
 
@@ -386,6 +391,7 @@ def _dry_run(options: argparse.Namespace) -> int:
     load = config.load_with_commander()
     plan = _make_plan(options, config, units)
     setpoints = _check_plan(plan, options)
+    config.check_temperature(plan.limits.temperature_c)
     notes = unit_lines(options, units, plan)
     if options.json:
         print(json.dumps(dry_run_mapping(plan, setpoints, load, notes)))
@@ -402,6 +408,7 @@ def _campaign(options: argparse.Namespace) -> int:
     try:
         plan = directory.same_recipe(made_from) or _make_plan(options, config, units)
         setpoints = _check_plan(plan, options)
+        config.check_temperature(plan.limits.temperature_c)
         directory.begin(plan, made_from)
         for line in unit_lines(options, units, plan):
             print(f"jtq campaign: {line}", file=sys.stderr)

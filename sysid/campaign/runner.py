@@ -41,6 +41,7 @@ LONGEST_GAP: Final = 9.5
 """In periods of SYNC. A longer step, of 10 cycles or more: the table would be refused by whoever reads it
 (jtqd.sysid.runs.files)."""
 LOST_SHARE: Final = 0.01
+LOST_END_S: Final = 0.1
 FOLLOW_VELOCITY: Final = (0.05, 0.05)
 FOLLOW_CURRENT: Final = (0.1, 0.05)
 """RMS that is allowed between set-point and measurement: rad/s or A, and a part of the peak."""
@@ -157,7 +158,7 @@ def _kept(
         state = replace(
             state, findings=(f"log: found {counted(lost, 'cycle')} lost by the recorder", *state.findings)
         )
-    why = gap_too_long(logged, longest_gap_s)
+    why = gap_too_long(logged, longest_gap_s) or ends_early(logged, setpoints)
     if why is not None:
         _keep(log, out, run.name, ".failed.mcap")
         return Attempt(replace(state, reason=why), again=True)
@@ -178,6 +179,14 @@ def _keep(paths: Sequence[Path], out: Path, run: str, ending: str) -> None:
     for number, path in enumerate(paths, start=1):
         if path.exists():
             os.replace(path, out / (run + ("" if number == 1 else f"@{number}") + ending))
+
+
+def ends_early(logged: LoggedRun, setpoints: Setpoints) -> str | None:
+    """Return that the log has lost the end of the motion, or None; lost cycles only make a motion longer."""
+    last_s = float(logged.table.time_s[-1])
+    if last_s >= setpoints.duration_s - LOST_END_S:
+        return None
+    return f"found the last row of the log at {last_s:.3f} s, expected it after {setpoints.duration_s:.3f} s"
 
 
 def gap_too_long(logged: LoggedRun, longest_gap_s: float) -> str | None:

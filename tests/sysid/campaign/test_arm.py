@@ -65,7 +65,7 @@ def config_file(
     (folder / "joint.yaml").write_text(yaml.safe_dump(content))
     made: dict[str, Any] = {"node_id": 32, "estimator": {"method": "tob"}, **more}
     for number, channel in enumerate(channels, 1):
-        made[f"joint_{number}"] = {"node": number, "file": "joint.yaml"}
+        made[f"joint_{number}"] = {"node": number, "file": "joint.yaml", "temperature": True}
         if channel is not None:
             made[f"joint_{number}"]["sensor_channel"] = channel
     if sensor:
@@ -120,7 +120,7 @@ TWO_MS = {"sync": {"period_us": 2000}}
 @pytest.mark.parametrize(
     ("channels", "sensor", "more", "kind", "status", "words"),
     [
-        ([1], True, {}, "excitation", 0, ["1 alone", "-1 to 2 rad", "near 0.5 rad"]),
+        ([1], True, {}, "excitation", 0, ["1 alone", "-1 to 2 rad", "begins at 0.5 rad"]),
         ([1], True, {}, "validate", 0, ["joint_1_variable_01", "1 alone"]),
         ([1], True, {}, "efficiency", 1, ["joint 1: no efficiency", "jtq campaign excitation"]),
         ([None], False, {}, "excitation", 0, ["1 alone", "no torque sensor"]),
@@ -339,6 +339,21 @@ def test_a_run_of_a_joint_alone_holds_its_own_columns_and_is_checked(tmp_path: P
     runs = read_runs([tmp_path])
     assert [run.name for run in with_joint(runs, 3)] == [f"{plan.runs[-1].name}.csv.gz"]
     assert len(with_joint(runs, 4)) == 2, "no run has it: the reader says so"
+
+
+def test_a_limit_of_the_temperature_needs_that_of_every_joint(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """jtqd leaves TPDO3 of the others off, and takes a drive on which it is switched on for one that was changed."""
+    file = config_file(tmp_path, [None, None], sensor=False)
+    content = yaml.safe_load(file.read_text())
+    del content["joint_2"]["temperature"]
+    file.write_text(yaml.safe_dump(content))
+    arguments = ["excitation", "--quick", "--evaluations", "1", "--dry-run", "--config", str(file)]
+    assert main(arguments) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "joint_2: found no 'temperature: true', expected it for the limit of 70 degC" in line
+    assert main([*arguments, "--limit", "temperature_c=none"]) == 0
 
 
 def test_a_joint_that_stands_elsewhere_is_brought_to_the_middle_first(

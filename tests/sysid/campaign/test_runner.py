@@ -37,6 +37,7 @@ from jtqd.sysid.campaign.runner import (
     Attempt,
     Outcome,
     _stopped,
+    ends_early,
     findings,
     gap_too_long,
     go_through,
@@ -480,6 +481,16 @@ def test_what_is_too_long_or_too_much_is_not_interpolated(gaps: tuple[tuple[int,
     run = with_gaps(*gaps)
     assert fill(run, GAP_S) == (run, 0)
     assert (gap_too_long(run, GAP_S) is None) == (not gaps)
+
+
+def test_a_log_that_lost_the_end_of_the_motion_is_not_kept() -> None:
+    table, points, _ = good_run()
+    assert ends_early(logged(table), points) is None
+    keep = table.time_s < points.duration_s - 0.2
+    joints = {n: JointColumns(current_a=columns.current_a[keep]) for n, columns in table.joints.items()}  # type: ignore[index]
+    why = ends_early(logged(RunTable(table.time_s[keep], joints)), points)
+    assert why is not None
+    assert "found the last row of the log at" in why
 
 
 def test_a_gap_that_readers_refuse_makes_a_run_gap_too_long() -> None:
