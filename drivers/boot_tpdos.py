@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from jtqd.drivers.boot_error import BootError
 from jtqd.drivers.devices import EVENT_DRIVEN, EVENT_MS, TEMPERATURE, DriveProfile, Profile
-from jtqd.drivers.layout import BY_ITSELF, LayoutError, chosen, pdo_of_words
+from jtqd.drivers.layout import BY_ITSELF, EVERY_SYNC, LayoutError, chosen, pdo_of_words
 from jtqd.drivers.pdo import CAN_ID, EXTENDED, INVALID, NO_RTR, PdoError, PdoMap
 from jtqd.drivers.sdo import label
 from jtqd.drivers.sdo_client import NodeObjects
@@ -31,7 +31,6 @@ _INHIBIT_TIME, _EVENT_TIMER = 3, 5
 """Sub-indices of a PDO's communication parameter."""
 _MOST_ENTRIES = 8
 """Whole objects in a frame."""
-EVERY_SYNC = 1
 
 
 class _Before(NamedTuple):

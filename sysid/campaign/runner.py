@@ -195,7 +195,7 @@ def findings(
         *(_no_sensor(logged) if sensor else ()),
         *channels,
         *_followed(logged, setpoints, joints),
-        *_opposite(logged),
+        *_opposite(logged, joints),
     )
 
 
@@ -248,9 +248,12 @@ def _follows(
     )
 
 
-def _opposite(logged: LoggedRun) -> Iterator[str]:
-    """The links are one body: in their own frames they turn oppositely."""
-    one, two = (logged.table.joints[number].link_position_rad for number in (1, 2))
+def _opposite(logged: LoggedRun, joints: tuple[Joint, Joint]) -> Iterator[str]:
+    """The links are one body: in their own frames they turn oppositely. With one encoder the motor's, through the gear."""
+    one, two = (
+        logged.table.joint(number, joint.gear_ratio).link_position_rad
+        for number, joint in enumerate(joints, 1)
+    )
     assert one is not None
     assert two is not None
     if max(float(np.ptp(one)), float(np.ptp(two))) < MOVED_RAD:
@@ -259,7 +262,9 @@ def _opposite(logged: LoggedRun) -> Iterator[str]:
     variance = float(dx @ dx)
     slope = float(dx @ (two - two.mean())) / variance if variance else np.inf
     if abs(slope + 1.0) > OPPOSITE_TOLERANCE:
-        yield f"j2.link_position_rad: found it turning {slope:.4g} times as far as j1's, expected -1"
+        link = logged.table.joints[2].link_position_rad is not None
+        name = "link_position_rad:" if link else "motor_position_rad: through the gear"
+        yield f"j2.{name} found it turning {slope:.4g} times as far as j1's, expected -1"
 
 
 ATTEMPTS: Final = 3

@@ -43,6 +43,7 @@ def plateau(
     return Setpoints(joint, velocity * shape, current * shape)
 
 
+CIA_402_DRIVES = (DriveProfile(1), DriveProfile(2))
 Frames = list[tuple[int, bytes, int]]
 """COB-ID, data and time of each."""
 
@@ -72,7 +73,12 @@ class LockStep:
     `filter` sees each batch of frames on its way to the commander and may change it: that is how faults are injected.
     """
 
-    def __init__(self, plant: Any = PLANT, profile: str = "rest") -> None:
+    def __init__(
+        self,
+        plant: Any = PLANT,
+        profile: str = "rest",
+        drives: tuple[DriveProfile, DriveProfile] = CIA_402_DRIVES,
+    ) -> None:
         self.source = PlantSource(plant, 1)
         self.bench = Bench(self.source, profile)
         self.now = 1_000 * MS
@@ -84,9 +90,9 @@ class LockStep:
         self.waiting: Frames = []
         self.bench.tick(self.now)
         settings = BusSettings(0x20, counter_overflow=240)
-        for node in (1, 2, 3):
-            profile_of = DriveProfile(node) if node < 3 else SensorProfile(3)
-            boot = NodeBoot(BenchAccess(self, node), profile_of, settings)
+        self.drives = drives
+        for profile_of in (*drives, SensorProfile(3)):
+            boot = NodeBoot(BenchAccess(self, profile_of.node_id), profile_of, settings)
             boot.run(boot.check_device_type())
         self.to_bench(0, b"\x01\x00")
 
@@ -118,7 +124,7 @@ class LockStep:
         units = [
             set_up(
                 self.access(node),
-                DriveProfile(node),
+                self.drives[node - 1],
                 CSV if node == setpoints.velocity_joint else CST,
                 round(timing.drive_timeout_s * 1e3),
                 self.sleep,
