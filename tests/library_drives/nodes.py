@@ -179,6 +179,7 @@ class StrictNode:
     device_type = 0
     process: ClassVar[dict[tuple[int, int], tuple[int, Any, str]]] = {}
     unmappable: ClassVar[frozenset[tuple[int, int]]] = frozenset()
+    cable_class: type[Cable] = Cable
 
     def __init__(self, number: int, open_bus: Callable[[], can.BusABC], manners: Manners) -> None:
         self.number, self.manners = number, manners
@@ -193,7 +194,7 @@ class StrictNode:
     # Power --------------------------------------------------------------------------------------------------
 
     def power_on(self) -> None:
-        self.cable = Cable()
+        self.cable = self.cable_class()
         self.cable.bus = self._open_bus()
         self.cable.NOTIFIER_CYCLE = 0.01
         numbers = {**_common(self.device_type, self.number), **self.process}
@@ -253,6 +254,14 @@ class StrictNode:
         node.nmt._state = PRE_OPERATIONAL
         node.nmt.start_heartbeat(self.number_of(0x1017))
 
+    def restart(self) -> None:
+        """Restart, as after a dip of the supply; returns before it has."""
+        threading.Thread(target=self._start, daemon=True).start()
+
+    def keep(self, index: int, subindex: int) -> None:
+        """Store one object, as 1010h does all."""
+        self._stored.setdefault(index, {})[subindex] = self.node.get_data(index, subindex)
+
     def number_of(self, index: int, subindex: int = 0) -> int:
         return int.from_bytes(self.node.get_data(index, subindex), "little")
 
@@ -262,7 +271,7 @@ class StrictNode:
     def state(self) -> int:
         return int(self.node.nmt._state)
 
-    def _set_state(self, state: int) -> None:
+    def set_state(self, state: int) -> None:
         self.node.nmt._state = state
         self.node.nmt.update_heartbeat()
 
@@ -271,10 +280,10 @@ class StrictNode:
         if len(data) != 2 or data[1] not in (0, self.number):
             return
         if data[0] in (0x81, 0x82):
-            threading.Thread(target=self._start, daemon=True).start()
+            self.restart()
         elif self.state == OPERATIONAL:
             if self.errors:
-                self._set_state(PRE_OPERATIONAL)
+                self.set_state(PRE_OPERATIONAL)
             else:
                 self._tpdos = list(self._compiled())
 
@@ -330,7 +339,7 @@ class StrictNode:
         self._show()
         self.node.emcy.send(code, self._register())
         if register & 0x10 and self.state == OPERATIONAL:
-            self._set_state(PRE_OPERATIONAL)
+            self.set_state(PRE_OPERATIONAL)
 
     def clear_error(self, code: int) -> None:
         if self.errors.pop(code, None) is None:
@@ -446,6 +455,8 @@ class StrictDrive(StrictNode):
     """A CiA 402 drive whose motor swings to and fro; it counts its torque backwards, mA and rpm, too."""
 
     device_type = 0x00020192
+    swing_turns: ClassVar[float] = 1.0
+    statusword = 0x1237
     process: ClassVar = {
         (0x1001, 0): (UNSIGNED8, 0, "ro"),
         (0x2030, 0): (INTEGER16, 0, "ro"),
@@ -477,12 +488,13 @@ class StrictDrive(StrictNode):
 
     def value(self, index: int, subindex: int, now: float) -> int:
         phase = 2.0 * math.pi * 0.2 * now
-        turns, per_s = math.sin(phase), 2.0 * math.pi * 0.2 * math.cos(phase)
+        turns = self.swing_turns * math.sin(phase)
+        per_s = self.swing_turns * 2.0 * math.pi * 0.2 * math.cos(phase)
         return {
             0x1001: 0,
             0x2030: round(-1000 * math.sin(phase)),
             0x2031: round(60 * per_s),
-            0x6041: 0x1237,
+            0x6041: self.statusword,
             0x6061: 9,
             0x6064: round(MOTOR_COUNTS * turns),
             0x606C: round(MOTOR_COUNTS * per_s),
