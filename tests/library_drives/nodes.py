@@ -7,6 +7,8 @@ What the library leaves to the device is added here, as strictly as drives have 
     1016h        counts from the first heartbeat; without it, or at a boot-up message, 8130h, and no start before it is over
     1019h        SYNC of another length than it tells is 8240h until a reset; not to be written while 1006h is set
     SYNC         a TPDO of type 1 is sent at each, with the values of that moment
+    events       one of type 254 or 255 when a value has changed, not sooner than its inhibit time (1800h:3, in 100 us) after
+                 the last one, and when its event timer (1800h:5, in ms) has run out
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import can
 import canopen
@@ -54,8 +56,8 @@ class Manners:
         sdo_s: time for an SDO answer.
         without: objects that it does not have.
         reset_s: from a reset to its boot-up message.
-        fixed: its TPDOs have a layout of the maker's (`FIXED`), and what can be written of them is nothing ("mapping") or
-            bit 31 of the COB-ID and the transmission type ("valid"); "": all can be written.
+        fixed: its TPDOs have a layout of the maker's (`FIXED`), and what can be written of them is nothing ("mapping";
+            "event": of type 255, too) or bit 31 of the COB-ID and the transmission type ("valid"); "": all can be written.
     """
 
     boot_ups: int = 1
@@ -171,6 +173,19 @@ FIXED = (
     (0x480, (0x60E40120,)),
 )
 """TPDOs of a drive whose maker has thought of other readers: COB-IDs without the node-ID, and mapping."""
+INHIBIT_MS, EVENT_TIMER_MS = 10, 30
+"""Of a drive that sends by itself ("event")."""
+
+
+class Tpdo(NamedTuple):
+    """One that is valid, as it was when the node was started."""
+
+    cob_id: int
+    objects: list[tuple[int, int]]
+    layout: str
+    kind: int
+    inhibit_s: float
+    timer_s: float
 
 
 class StrictNode:
@@ -201,13 +216,18 @@ class StrictNode:
         if self.fixed:
             for number, (base, words) in enumerate(FIXED):
                 cob_id = 0x40000000 + base + self.number
-                valid = self.manners.fixed == "mapping"
+                valid = self.manners.fixed in ("mapping", "event")
+                event = self.manners.fixed == "event"
                 numbers[0x1800 + number, 1] = (
                     UNSIGNED32,
                     cob_id if valid else cob_id | 0x80000000,
                     "ro" if valid else "rw",
                 )
-                numbers[0x1800 + number, 2] = (UNSIGNED8, 1 if valid else 255, "ro" if valid else "rw")
+                kind = 1 if valid and not event else 255
+                numbers[0x1800 + number, 2] = (UNSIGNED8, kind, "ro" if valid else "rw")
+                if event:
+                    numbers[0x1800 + number, 3] = (UNSIGNED16, 10 * INHIBIT_MS, "ro")
+                    numbers[0x1800 + number, 5] = (UNSIGNED16, EVENT_TIMER_MS, "ro")
                 numbers[0x1A00 + number, 0] = (UNSIGNED8, len(words), "ro")
                 for entry in range(1, 5):
                     word = words[entry - 1] if entry <= len(words) else 0
@@ -224,6 +244,8 @@ class StrictNode:
         self._start()
         self.cable.connect()
         threading.Thread(target=self._watch, args=(self.cable,), daemon=True).start()
+        if self.manners.fixed == "event":
+            threading.Thread(target=self._send_events, args=(self.cable,), daemon=True).start()
 
     @property
     def fixed(self) -> bool:
@@ -244,7 +266,7 @@ class StrictNode:
             for index, members in self._stored.items():
                 node.data_store[index] = dict(members)
             self.errors.clear()
-            self._tpdos: list[tuple[int, list[tuple[int, int]], str]] = []
+            self._tpdos: list[Tpdo] = []
             self._master_due = math.inf
             node.nmt.stop_heartbeat()
             node.nmt._state = 0
@@ -325,9 +347,26 @@ class StrictNode:
         if self.state != OPERATIONAL:
             return
         now = time.monotonic()
-        for cob_id, objects, layout in self._tpdos:
-            values = [self.value(index, subindex, now) for index, subindex in objects]
-            self.cable.send_message(cob_id, struct.pack(layout, *values))
+        for pdo in self._tpdos:
+            if pdo.kind == 1:
+                self.cable.send_message(pdo.cob_id, self._data(pdo, now))
+
+    def _data(self, pdo: Tpdo, now: float) -> bytes:
+        return struct.pack(pdo.layout, *(self.value(index, subindex, now) for index, subindex in pdo.objects))
+
+    def _send_events(self, cable: Cable) -> None:
+        last: dict[int, tuple[float, bytes]] = {}
+        while self.on and self.cable is cable:
+            time.sleep(0.001)
+            now = time.monotonic()
+            for pdo in self._tpdos if self.state == OPERATIONAL else ():
+                at, before = last.get(pdo.cob_id, (-math.inf, b""))
+                if pdo.kind not in (254, 255) or now - at < pdo.inhibit_s:
+                    continue
+                data = self._data(pdo, now)
+                if data != before or (pdo.timer_s and now - at >= pdo.timer_s):
+                    last[pdo.cob_id] = now, data
+                    cable.send_message(pdo.cob_id, data)
 
     # Errors -------------------------------------------------------------------------------------------------
 
@@ -408,14 +447,18 @@ class StrictNode:
     def _compiled(self) -> Any:
         for number in range(4):
             cob_id = self.number_of(0x1800 + number, 1)
-            if cob_id >> 31 or self.number_of(0x1800 + number, 2) != 1:
+            kind = self.number_of(0x1800 + number, 2)
+            if cob_id >> 31 or kind not in (1, 254, 255):
                 continue
             words = [
                 self.number_of(0x1A00 + number, entry + 1)
                 for entry in range(self.number_of(0x1A00 + number, 0))
             ]
             objects = [(word >> 16, word >> 8 & 0xFF) for word in words]
-            yield cob_id & 0x7FF, objects, "<" + "".join(_SIZES[self.process[key][0]] for key in objects)
+            layout = "<" + "".join(_SIZES[self.process[key][0]] for key in objects)
+            inhibit_s = self.number_of(0x1800 + number, 3) * 1e-4
+            timer_s = self.number_of(0x1800 + number, 5) * 1e-3
+            yield Tpdo(cob_id & 0x7FF, objects, layout, kind, inhibit_s, timer_s)
 
     def value(self, index: int, subindex: int, now: float) -> int:
         raise NotImplementedError

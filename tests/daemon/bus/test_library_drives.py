@@ -19,6 +19,8 @@ import pytest
 import yaml
 
 from jtqd.daemon.cli import init, probe
+from jtqd.drivers.filters import exact
+from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.models.files import shipped
 from tests.library_drives.bench import LibraryBench
 from tests.library_drives.families import PULSES, RATED_MA
@@ -214,6 +216,34 @@ def test_check_knows_the_mapping_of_the_drives() -> None:
             assert "481h drive 1 TPDO4" in found
             assert all("wrong length" not in text for text in found.values())
             assert "281h drive 1 TPDO2" not in found
+        assert bench.stop(jtqd) == 0
+
+
+def test_a_drive_that_sends_by_itself_needs_an_age_and_is_used_by_its_stamps() -> None:
+    """Type 255 for good, inhibit time 10 ms, event timer 30 ms; one TPDO changes always, one (1001h) never."""
+    with a_bench("--fixed", "event") as bench:
+        refused = bench.start()
+        assert refused.wait(20) == 1
+        assert "TPDO1 has transmission type 255: joint_N.max_age_ms allows it" in bench.said()
+        ages = {f"joint_{n}": {"max_age_ms": 100} for n in (1, 2)}
+        jtqd = bench.start(**ages)
+        assert bench.until(bench.both_used), bench.said()
+        assert "TPDO1 keeps transmission type 255" in bench.said()
+        assert bench.until(
+            lambda: any(torque and abs(torque) > 2.0 for pair in bench.torques_nm for torque in pair)
+        )
+        socket = open_frame_socket(bench.bus, [exact(0x181), exact(0x281)])
+        stamps: dict[int, list[int]] = {0x181: [], 0x281: []}
+        until = time.monotonic() + 1.0
+        while time.monotonic() < until:
+            socket.wait(0.05)
+            for n in range(socket.receive()):
+                can_id = int.from_bytes(socket.frames[16 * n : 16 * n + 4], "little")
+                stamps[can_id].append(socket.stamps_ns[n])
+        socket.close()
+        changing, constant = (len(stamps[can_id]) for can_id in (0x181, 0x281))
+        assert 40 < changing < 110, "at most one in 10 ms"
+        assert 10 < constant < 40, "by its timer alone"
         assert bench.stop(jtqd) == 0
 
 
