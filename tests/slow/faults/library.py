@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 from tests.slow.faults import acts
-from tests.slow.faults.case import Case
+from tests.slow.faults.case import STALE, STARTING, Case, codes
 from tests.slow.faults.injections import Added
 
 LEFT_OUT: Mapping[str, str] = {
@@ -20,7 +20,16 @@ LEFT_OUT: Mapping[str, str] = {
 }
 """Case -> why it is not played with them."""
 
+_AFTER_A_RESET_MS = 5000.0
+"""They answer a SYNC with data by 8240h and stay pre-operational: the second boot, which resets them, helps."""
 _OTHERWISE: Mapping[str, Mapping[str, Any]] = {
+    "12": {"recover_ms": _AFTER_A_RESET_MS},
+    "13a": {
+        "one": STALE | STARTING,
+        "two": STALE | STARTING,
+        "may": codes("8250"),
+        "recover_ms": _AFTER_A_RESET_MS,
+    },
     "28": {"fault": lambda: Added(first=acts.reconfigure_by_the_rules)},
 }
 """Case -> fields that are otherwise with them."""
