@@ -10,8 +10,8 @@
 | current | 6075h | 6075h / 10^6 (1/1000 of the rated current in mA) |
 | current | 6076h | 6076h / 10^6 / torque constant (1/1000 of the rated torque in mNm: 6077h) |
 
-Unit codes: CiA DR-303-2, tables 4.1, 4.2 and 4.4, which were not at hand themselves: as github.com/heig-vd-iai/canopen-stack
-(generator/validation/helpers.py) has them, radian 10h, degree 41h, second 03h, minute 47h. B4h, the revolution, is the makers':
+Unit codes: CiA DR-303-2, tables 4.1, 4.2 and 4.4 (not at hand themselves; github.com/heig-vd-iai/canopen-stack,
+generator/validation/helpers.py, has them): radian 10h, degree 41h, second 03h, minute 47h. The revolution B4h is that of
 60A9h in the manuals of Synapticon and Nanotec (B4h 47h is rpm).
 
 6092h, 60A8h and 60A9h count at the driving shaft, behind the gear of 6091h (CiA 402-2): the motor's quantities are

@@ -148,11 +148,13 @@ def reconfigure_signed(rig: Rig) -> None:
 def changes(number: int, index: int, subindex: int, factor: float) -> Fault:
     """An object of a node that runs is another for a while, and nothing else shows it."""
 
-    def scale(rig: Rig, by: float) -> None:
-        objects = store(rig, number)
-        objects.set_number(index, subindex, round(objects.number(index, subindex) * by))
+    was: list[int] = []
 
-    return Added(first=lambda rig: scale(rig, factor), last=lambda rig: scale(rig, 1.0 / factor))
+    def first(rig: Rig) -> None:
+        was.append(store(rig, number).number(index, subindex))
+        store(rig, number).set_number(index, subindex, round(was[0] * factor))
+
+    return Added(first=first, last=lambda rig: store(rig, number).set_number(index, subindex, was[0]))
 
 
 def sdo_reads(rig: Rig) -> None:
