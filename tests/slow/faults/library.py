@@ -20,8 +20,8 @@ LEFT_OUT: Mapping[str, str] = {
 }
 """Case -> why it is not played with them."""
 
-_AFTER_A_RESET_MS = 5000.0
-"""They answer a SYNC with data by 8240h and stay pre-operational: the second boot, which resets them, helps."""
+_AFTER_A_RESET_MS = 1800.0
+"""They answer a SYNC with data by 8240h and stay pre-operational until they are reset."""
 _OTHERWISE: Mapping[str, Mapping[str, Any]] = {
     "12": {"recover_ms": _AFTER_A_RESET_MS},
     "13a": {
