@@ -365,11 +365,20 @@ def _inputs(about: About, view: View) -> Columns:
         table.add(
             name,
             Text("never" if not each.used_ns else duration(age_s), style="bold red" if old else ""),
-            f"{each.delay_ns / 1000:.0f} us" if each.used_ns else NOTHING,
+            after_sync(each.delay_ns) if each.used_ns else NOTHING,
             band if each.low_ns <= each.high_ns else NOTHING,
             *map(str, (each.missed, each.late, each.lost, each.duplicates, each.rejected)),
         )
     return table
+
+
+def after_sync(delay_ns: int) -> str:
+    """Return when an input came after its SYNC; what came before it is of a drive that sends by itself, and so old.
+
+    >>> after_sync(426_000), after_sync(-4_803_000)
+    ('426 us', '4803 us old')
+    """
+    return f"{delay_ns / 1000:.0f} us" if delay_ns >= 0 else f"{-delay_ns / 1000:.0f} us old"
 
 
 def _line(heading: str, text: str | Text) -> RenderableType:
