@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jtqd.daemon.recording.journal import Journal
-from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData, SealedChunk
+from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData, Span
 from jtqd.daemon.recording.messages import CycleMessages, JointStateMessage
 from jtqd.daemon.recording.progress import Account
 from jtqd.daemon.recording.recording import Recording
@@ -45,7 +45,7 @@ class _OneFile:
     def __init__(self, file: McapFile) -> None:
         self._file = file
 
-    def write(self, chunk: SealedChunk, at_ns: int) -> None:
+    def write(self, chunk: Span, at_ns: int) -> None:
         """Append it."""
         self._file.append(chunk)
 

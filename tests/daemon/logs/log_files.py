@@ -32,8 +32,8 @@ def cycles(count, seed=1):
         yield Cycle(100 + n, 7_000_000_000 + n * 1_000_000, joints, frames)
 
 
-def ours(path, count=120, chunk_ns=20_000_000, seed=1):
-    """A log by the recorder's own code, with attachments."""
+def ours(path, count=120, chunk_ns=20_000_000, seed=1, *, together=False):
+    """A log by the recorder's own code, with attachments; `together`: all topics in one chunk, as before 0.2."""
     from tests.daemon.logs import campaign_log
 
     schemas, channels = definitions(None)
@@ -44,13 +44,23 @@ def ours(path, count=120, chunk_ns=20_000_000, seed=1):
         def write(self, chunk, at_ns):
             file.append(chunk)
 
-    journal = Journal(ChunkBuilder(schemas, channels, BLOCK_PARTS, 60), print)
+    builder = ChunkBuilder(schemas, channels, [] if together else BLOCK_PARTS, 60)
+    if together:
+        builder.add_block = lambda block, time_ns: _add_each(builder, block, time_ns)
+    journal = Journal(builder, print)
     recording = Recording(journal, OneFile(), JointStateMessage(("a", "b"), (1.0, 1.0)), chunk_ns, Account())
     for cycle in cycles(count, seed):
         recording.add(campaign_log._record(cycle))
     recording.flush()
     file.finish(path.name)
     return path.read_bytes()
+
+
+def _add_each(builder, block, time_ns):
+    starts = [start for _, start in BLOCK_PARTS]
+    for (channel, start), end in zip(BLOCK_PARTS, [*starts[1:], len(block)], strict=True):
+        (sequence,) = struct.unpack_from("<I", block, start + 11)
+        builder.add(channel, time_ns, block[start + 31 : end], sequence)
 
 
 def foreign(compression="zstd", *, chunked=True, count=400, finish=True):
