@@ -304,10 +304,13 @@ def index_entries(records: Walk) -> dict[int, NDArray[np.uint64]]:
 
 
 def _marks(records: Walk) -> dict[int, int]:
-    channels, cycles = records.heads["channel"], records.heads[["sequence", "log_time"]]
-    return {
-        channel: zlib.crc32(cycles[channels == channel].tobytes()) for channel in np.unique(channels).tolist()
-    }
+    heads = records.heads
+    channels, numbers, times = heads["channel"], heads["sequence"], heads["log_time"]
+    found = {}
+    for channel in np.unique(channels).tolist():
+        mine = channels == channel
+        found[channel] = zlib.crc32(times[mine].tobytes(), zlib.crc32(numbers[mine].tobytes()))
+    return found
 
 
 def _definitions(data: bytes, records: Walk) -> Iterator[Schema | Channel]:

@@ -10,12 +10,12 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 from jtqd.daemon.recording.journal import Journal
-from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData
-from jtqd.daemon.recording.messages import BLOCK_PARTS, JointStateMessage
+from jtqd.daemon.recording.mcap_file import Head, McapFile, NamedData
+from jtqd.daemon.recording.messages import JointStateMessage
 from jtqd.daemon.recording.progress import Account
 from jtqd.daemon.recording.recording import Recording
 from jtqd.daemon.recording.schemas import definitions
-from tests.daemon.logs.campaign_log import Cycle, Joint, write_log
+from tests.daemon.logs.campaign_log import Cycle, Joint, builder_of, write_log
 
 ATTACHMENTS = [
     NamedData("configuration.yaml", "application/yaml", b"a: 1\n" * 50),
@@ -44,23 +44,13 @@ def ours(path, count=120, chunk_ns=20_000_000, seed=1, *, together=False):
         def write(self, chunk, at_ns):
             file.append(chunk)
 
-    builder = ChunkBuilder(schemas, channels, [] if together else BLOCK_PARTS, 60)
-    if together:
-        builder.add_block = lambda block, time_ns: _add_each(builder, block, time_ns)
-    journal = Journal(builder, print)
+    journal = Journal(builder_of(schemas, channels, together=together), print)
     recording = Recording(journal, OneFile(), JointStateMessage(("a", "b"), (1.0, 1.0)), chunk_ns, Account())
     for cycle in cycles(count, seed):
         recording.add(campaign_log._record(cycle))
     recording.flush()
     file.finish(path.name)
     return path.read_bytes()
-
-
-def _add_each(builder, block, time_ns):
-    starts = [start for _, start in BLOCK_PARTS]
-    for (channel, start), end in zip(BLOCK_PARTS, [*starts[1:], len(block)], strict=True):
-        (sequence,) = struct.unpack_from("<I", block, start + 11)
-        builder.add(channel, time_ns, block[start + 31 : end], sequence)
 
 
 def foreign(compression="zstd", *, chunked=True, count=400, finish=True):

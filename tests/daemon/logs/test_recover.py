@@ -92,6 +92,14 @@ def test_killed_between_two_chunks_loses_nothing(log, tmp_path):
     assert [(a.name, a.data) for a in attached] == [(a.name, a.data) for a in ATTACHMENTS]
 
 
+def test_spans_of_half_a_second_are_whole_without_a_summary(tmp_path):
+    data = ours(tmp_path / "whole.mcap", count=1200, chunk_ns=500_000_000)
+    data_end = starts_of((data, record_starts(data)), DATA_END)[0][0]
+    result, now = repaired(tmp_path / "a.mcap.active", data[:data_end])
+    assert (result.lossy, result.chunks) == (False, 3 * 4)
+    assert cycles_of(now) == [list(range(100, 1300))] * 3
+
+
 @pytest.mark.parametrize("chunk", [-3, -2, -1], ids=["joint 1", "joint 2", "frames"])
 def test_torn_last_span_costs_that_span_and_says_its_time(log, tmp_path, chunk):
     """Spans of 21 cycles; the last one, of 15 cycles, torn within one of its chunks: no joint ends later than another."""
