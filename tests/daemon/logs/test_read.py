@@ -13,7 +13,7 @@ import pytest
 import zstandard
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import ChunkIndex
+from mcap.records import Channel, ChunkIndex, Schema
 from mcap.writer import CompressionType, Writer
 from mcap_ros2.decoder import DecoderFactory
 from numpy.lib.recfunctions import repack_fields
@@ -34,7 +34,7 @@ from jtqd.daemon.logs.can_frames import iter_frames
 from jtqd.daemon.logs.container import ChunkError, Source, chunk_index, message_index, parse, unpack_data
 from jtqd.daemon.logs.export import main as export
 from jtqd.daemon.logs.log_file import LogFile, _indexed
-from jtqd.daemon.recording.mcap_file import bytes_of
+from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, bytes_of
 from jtqd.daemon.recording.schemas import SCHEMAS
 from jtqd.daemon.replay.command import main as replay
 from jtqd.daemon.replay.session import ReplayOptions
@@ -193,16 +193,19 @@ def test_text_of_another_length_in_the_middle_of_a_topic(tmp_path):
 
 
 def write_texts(path, messages):
-    """(channel, text) in one chunk."""
-    with open(path, "wb") as file:
-        writer = Writer(file, compression=CompressionType.ZSTD)
-        writer.start("ros2", "x")
-        schema = writer.register_schema("x/Text", "ros2msg", b"string a\n")
-        channels = [writer.register_channel(f"/{n}", "cdr", schema) for n in range(2)]
-        for n, (channel, text) in enumerate(messages):
-            data = b"\0\1\0\0" + struct.pack("<I", len(text) + 1) + text + b"\0"
-            writer.add_message(channels[channel], n, data, n)
-        writer.finish()
+    """(channel, text) in one chunk, which holds no definitions; they stand in the chunk before."""
+    schemas = [Schema(id=1, name="x/Text", encoding="ros2msg", data=b"string a\n")]
+    channels = [
+        Channel(id=n + 1, topic=f"/{n}", message_encoding="cdr", metadata={}, schema_id=1) for n in (0, 1, 2)
+    ]
+    file = McapFile(path, Head(schemas, channels, []), {}, 0)
+    builder = ChunkBuilder(schemas, channels, [], 60)
+    builder.add(3, 0, b"\0\1\0\0\1\0\0\0\0")
+    file.append(builder.seal())
+    for n, (channel, text) in enumerate(messages):
+        builder.add(channel + 1, n, b"\0\1\0\0" + struct.pack("<I", len(text) + 1) + text + b"\0")
+    file.append(builder.seal())
+    file.finish(path.name)
 
 
 @pytest.mark.parametrize(
@@ -214,7 +217,7 @@ def write_texts(path, messages):
     ],
 )
 def test_a_chunk_that_only_looks_like_rows_of_one_length(tmp_path, messages):
-    """Schemas and channels are at the head of the file: the chunk begins with a message."""
+    """It begins with a message, and is as long as a whole number of such messages."""
     path = tmp_path / "a.mcap"
     write_texts(path, messages)
     for channel in {channel for channel, _ in messages}:
