@@ -13,6 +13,12 @@ LEAST_GAIN: Final = 0.01
 DRIFT_S: Final = 600.0
 JUMP: Final = 4.0
 JUMP_S: Final = 0.3
+KNOWN_SHARE: Final = 0.5
+TRACKED: int
+LEARNED: int
+BEYOND: int
+LEFT: int
+APART: int
 
 class Zeros(NamedTuple):
     link_rad: float
@@ -21,4 +27,12 @@ class Zeros(NamedTuple):
     current_a: float
     current_sigma_a: float
     current_used_a: float
-    plausible: bool
+    limit_rad: float
+    flags: int
+    jumps: int
+    @property
+    def tracked(self) -> bool: ...
+    @property
+    def learned(self) -> bool: ...
+    @property
+    def plausible(self) -> bool: ...

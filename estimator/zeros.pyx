@@ -49,18 +49,26 @@ DRIFT_S: Final = 600.0
 JUMP: Final = 4.0
 JUMP_S: Final = 0.3
 """Views that are apart by more than JUMP standard deviations for so long: the encoder has slipped, its zero is unknown again."""
+KNOWN_SHARE: Final = 0.5
+"""Part of the variance of the day's friction below which the variance of the link zero counts as learned: what one
+direction of motion alone never reaches."""
+TRACKED, LEARNED, BEYOND, LEFT, APART = (1 << n for n in range(5))
+"""Bits of `Zeros.flags`: the zeros are tracked; the link zero is learned; it is beyond the joint file's limit; what is known of
+it is not yet taken off; the two views disagree now (also where nothing is tracked)."""
 
 cdef int SAMPLES = BLOCK
 cdef double CORRELATION = CORRELATION_S, INVERSE_SLEW = 1.0 / SLEW_S
 cdef double JUMP_SIGMAS = JUMP, LONGEST_S = JUMP_S
+cdef int IS_TRACKED = TRACKED, IS_LEARNED = LEARNED, IS_BEYOND = BEYOND
 cdef double LOW = DOUBT, HIGH = SURE, INVERSE_RANGE = 1.0 / (SURE - DOUBT)
 
 
 class Zeros(NamedTuple):
     """What is known of the zeros of a joint, and its standard deviations; 0 and the prior width where nothing is.
 
-    link_rad, current_a: what the readings are off by; link_used_rad, current_used_a: what is taken off them; plausible:
-    whether the link's zero is within the joint file's limit.
+    link_rad, current_a: what the readings are off by; link_used_rad, current_used_a: what is taken off them; limit_rad: of
+    the joint file, for a link zero that is plausible; flags: bits TRACKED to APART; jumps: how often a zero that was
+    learned became unknown, because the views were apart for JUMP_S.
     """
 
     link_rad: float
@@ -69,7 +77,24 @@ class Zeros(NamedTuple):
     current_a: float
     current_sigma_a: float
     current_used_a: float
-    plausible: bool
+    limit_rad: float
+    flags: int
+    jumps: int
+
+    @property
+    def tracked(self) -> bool:
+        """Return whether there is anything to tell."""
+        return bool(self.flags & TRACKED)
+
+    @property
+    def learned(self) -> bool:
+        """Return whether the link zero is known better than friction of the day alone would let it be."""
+        return bool(self.flags & LEARNED)
+
+    @property
+    def plausible(self) -> bool:
+        """Return whether the link zero is within the joint file's limit."""
+        return not self.flags & BEYOND
 
 
 cdef int fill_zeros(ZerosLaw *law, joint, sigma, torsion, bint used) except -1:
@@ -81,6 +106,7 @@ cdef int fill_zeros(ZerosLaw *law, joint, sigma, torsion, bint used) except -1:
     law.stiffness = torsion.stiffness_nm_per_rad
     law.torque_per_ampere = joint.gear_ratio * joint.torque_constant_nm_per_a
     law.limit = torsion.zero_limit_rad
+    law.known = KNOWN_SHARE * (sigma.current_nm / law.stiffness) ** 2
     law.prior[0] = (LARGEST_LINK * joint.rated_torque_nm / law.stiffness) ** 2
     law.prior[1] = (CURRENT_SHARE * sigma.current_nm / law.torque_per_ampere) ** 2
     law.prior[2] = sigma.current_nm**2
@@ -148,7 +174,7 @@ cdef void update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, dou
     cdef Gathered b = s.block
     cdef double h[ZERO_STATES]
     cdef double ph[ZERO_STATES]
-    cdef double share = 1.0 / SAMPLES, innovation, variance, gain, way, left
+    cdef double share = 1.0 / SAMPLES, innovation, variance, gain, way, left, before = s.apart_s
     cdef int m, n
     memset(&s.block, 0, sizeof(Gathered))
     h[0], h[1] = -stiffness, -law.torque_per_ampere * (1.0 - slope)
@@ -161,6 +187,8 @@ cdef void update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, dou
         innovation -= h[n] * s.x[n]
     s.apart_s = s.apart_s + b.dt if fabs(innovation) > JUMP_SIGMAS * sqrt(b.variance * share) else 0.0
     if s.apart_s > LONGEST_S:
+        if before <= LONGEST_S and s.p[0][0] < law.known:
+            s.jumps += 1
         for n in range(ZERO_STATES):
             s.p[0][n] = s.p[n][0] = 0.0
         s.p[0][0] = law.prior[0]
@@ -190,13 +218,31 @@ cdef bint beyond(const ZerosLaw *law, const ZerosState *s) noexcept nogil:
     return fabs(s.x[0]) > law.limit and fabs(s.x[0]) > HIGH * sqrt(s.p[0][0])
 
 
+cdef void tell_zeros(const ZerosLaw *law, const ZerosState *s, Learned *out) noexcept nogil:
+    """Set `out` to what is known of the zeros; no flag where they are not tracked."""
+    memset(out, 0, sizeof(Learned))
+    if not law.used:
+        return
+    out.link_rad, out.link_sigma_rad, out.link_used_rad = s.x[0], sqrt(s.p[0][0]), s.link_rad
+    out.current_a, out.current_sigma_a, out.current_used_a = s.x[1], sqrt(s.p[1][1]), s.current_a
+    out.limit_rad, out.jumps, out.flags = law.limit, s.jumps, IS_TRACKED
+    if s.p[0][0] < law.known:
+        out.flags |= IS_LEARNED
+    if beyond(law, s):
+        out.flags |= IS_BEYOND
+
+
 cdef zeros_of(const ZerosLaw *law, const ZerosState *s):
+    cdef Learned told
+    tell_zeros(law, s, &told)
     return Zeros(
-        s.x[0],
-        sqrt(s.p[0][0]),
-        s.link_rad,
-        s.x[1],
-        sqrt(s.p[1][1]),
-        s.current_a,
-        not beyond(law, s),
+        told.link_rad,
+        told.link_sigma_rad,
+        told.link_used_rad,
+        told.current_a,
+        told.current_sigma_a,
+        told.current_used_a,
+        told.limit_rad,
+        told.flags,
+        told.jumps,
     )

@@ -63,7 +63,7 @@ class Estimated(NamedTuple):
     link_sigma_rad: float
 
 
-def estimated(
+def estimated(  # noqa: PLR0917 - a run and how it is estimated
     joint: Joint, table: RunTable, number: int, truth_nm: FloatArray, link_zero_rad: float, track: bool
 ) -> Estimated:
     """Estimate one joint of a run."""
@@ -116,7 +116,7 @@ def table_of(models: Path, runs: Path, link_zero_rad: float) -> None:
     print(f"worse with zeros: {np.count_nonzero(worse)} of {len(pairs)}; RMSE at most {most:+.3f} Nm")
 
 
-def pushed(
+def pushed(  # noqa: PLR0917 - of a process pool
     models: Path, plant: Path, seed: int, link_zero_rad: float, push_nm: float, day: int
 ) -> list[tuple[float, float]]:
     """Return, of each joint on one day, what the push moved the zero by, as torque [Nm], and its standard deviation."""
