@@ -3,14 +3,13 @@ from typing import Final, Self
 from jtqd.estimator.arrays import FloatArray, QuadrantArray
 from jtqd.estimator.corrections import ExtendedInputs
 from jtqd.estimator.joint import Joint, Torsion
+from jtqd.estimator.learned import Zeros
 from jtqd.estimator.network import FusedNetworkModel, NetworkModel
 from jtqd.estimator.run import EstimateRun, ObservedRun
 from jtqd.estimator.sample import Estimator
 from jtqd.estimator.settings import EstimatorSettings
-from jtqd.estimator.zeros import Zeros
 
 STANDSTILL_SIGMAS: Final = 3.0
-PAST_LAYOUT: Final = 1
 LOWERED_S: Final = 0.1
 
 def quadrants(raw_nm: FloatArray, velocity_rad_s: FloatArray) -> QuadrantArray: ...

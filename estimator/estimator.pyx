@@ -71,15 +71,11 @@ from jtqd.estimator.network import FEATURES, FUSED_FEATURES, checked_fused, chec
 from jtqd.estimator.run import EstimateRun, ObservedRun
 from jtqd.estimator.sample import columns
 from jtqd.estimator.validity import FADE_START
-from jtqd.estimator.zeros import APART, LEFT, MOVING_RAD_S, ONE_WAY
+from jtqd.estimator.learned import APART, LEFT
+from jtqd.estimator.zeros import MOVING_RAD_S, ONE_WAY
 
 STANDSTILL_SIGMAS: Final = 3.0
 """Half width of the standstill interval in standard deviations, where torsion narrows what friction leaves open."""
-
-PAST_LAYOUT: Final = 1
-"""Number of the layout of `FusedEstimator.past`: another one where its fields, their order or their meaning have changed.
-
-Logs hold it: `tests/estimator/test_past.py` has the size that belongs to it."""
 
 LOWERED_S: Final = 0.1
 """So long the status stays lowered after the two paths have disagreed: it must not flicker."""
@@ -327,7 +323,7 @@ cdef class FusedEstimator(Estimator):
 
     @property
     def past(self):
-        """All that it knows of the samples so far, bytes of one layout (`PAST_LAYOUT`); `past = other.past` goes on there.
+        """All that it knows of the samples so far, bytes of layout `learned.PAST_LAYOUT`; `past = other.past` goes on there.
 
         Raises ValueError for bytes of another length.
         """

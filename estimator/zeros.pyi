@@ -1,4 +1,4 @@
-from typing import Final, NamedTuple
+from typing import Final
 
 MOVING_RAD_S: Final = 0.05
 ONE_WAY: Final = 0.9
@@ -14,25 +14,3 @@ DRIFT_S: Final = 600.0
 JUMP: Final = 4.0
 JUMP_S: Final = 0.3
 KNOWN_SHARE: Final = 0.5
-TRACKED: int
-LEARNED: int
-BEYOND: int
-LEFT: int
-APART: int
-
-class Zeros(NamedTuple):
-    link_rad: float
-    link_sigma_rad: float
-    link_used_rad: float
-    current_a: float
-    current_sigma_a: float
-    current_used_a: float
-    limit_rad: float
-    flags: int
-    jumps: int
-    @property
-    def tracked(self) -> bool: ...
-    @property
-    def learned(self) -> bool: ...
-    @property
-    def plausible(self) -> bool: ...

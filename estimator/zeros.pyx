@@ -27,7 +27,9 @@ the estimate must not jump.
 from libc.math cimport fabs, fmax, sqrt
 from libc.string cimport memset
 
-from typing import Final, NamedTuple
+from typing import Final
+
+from jtqd.estimator.learned import BEYOND, LEARNED, TRACKED, Zeros
 
 MOVING_RAD_S: Final = 0.05
 ONE_WAY: Final = 0.9
@@ -52,49 +54,12 @@ JUMP_S: Final = 0.3
 KNOWN_SHARE: Final = 0.5
 """Part of the variance of the day's friction below which the variance of the link zero counts as learned: what one
 direction of motion alone never reaches."""
-TRACKED, LEARNED, BEYOND, LEFT, APART = (1 << n for n in range(5))
-"""Bits of `Zeros.flags`: the zeros are tracked; the link zero is learned; it is beyond the joint file's limit; what is known of
-it is not yet taken off; the two views disagree now (also where nothing is tracked)."""
 
 cdef int SAMPLES = BLOCK
 cdef double CORRELATION = CORRELATION_S, INVERSE_SLEW = 1.0 / SLEW_S
 cdef double JUMP_SIGMAS = JUMP, LONGEST_S = JUMP_S
 cdef int IS_TRACKED = TRACKED, IS_LEARNED = LEARNED, IS_BEYOND = BEYOND
 cdef double LOW = DOUBT, HIGH = SURE, INVERSE_RANGE = 1.0 / (SURE - DOUBT)
-
-
-class Zeros(NamedTuple):
-    """What is known of the zeros of a joint, and its standard deviations; 0 and the prior width where nothing is.
-
-    link_rad, current_a: what the readings are off by; link_used_rad, current_used_a: what is taken off them; limit_rad: of
-    the joint file, for a link zero that is plausible; flags: bits TRACKED to APART; jumps: how often a zero that was
-    learned became unknown, because the views were apart for JUMP_S.
-    """
-
-    link_rad: float
-    link_sigma_rad: float
-    link_used_rad: float
-    current_a: float
-    current_sigma_a: float
-    current_used_a: float
-    limit_rad: float
-    flags: int
-    jumps: int
-
-    @property
-    def tracked(self) -> bool:
-        """Return whether there is anything to tell."""
-        return bool(self.flags & TRACKED)
-
-    @property
-    def learned(self) -> bool:
-        """Return whether the link zero is known better than friction of the day alone would let it be."""
-        return bool(self.flags & LEARNED)
-
-    @property
-    def plausible(self) -> bool:
-        """Return whether the link zero is within the joint file's limit."""
-        return not self.flags & BEYOND
 
 
 cdef int fill_zeros(ZerosLaw *law, joint, sigma, torsion, bint used) except -1:

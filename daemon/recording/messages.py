@@ -18,6 +18,8 @@ from typing import NamedTuple
 
 from jtqd.daemon.recording import schemas
 from jtqd.daemon.shared import cycle_record as cycle
+from jtqd.daemon.shared.snapshot import PAST_WORDS
+from jtqd.estimator.learned import PAST_LAYOUT, Zeros
 
 CDR_HEADER = b"\x00\x01\x00\x00"
 _NS = 1_000_000_000
@@ -237,6 +239,22 @@ def log(time_ns: int, level: int, text: str) -> bytes:
     """rcl_interfaces/msg/Log; `level` 20 information, 30 warning, 40 error."""
     builder = CdrBuilder().stamp(time_ns).put("B", level).text("jtqd").text(fit(text, LOG_TEXT_LENGTH))
     return builder.text("").text("").put("I", 0).payload()
+
+
+def zeros(time_ns: int, joint: int, index: int, seen: Zeros, past: bytes) -> bytes:
+    """jtqd_msgs/msg/Zeros of joint `joint`, from 1 on; index: of the cycle after which `past` is its estimator's state."""
+    return (
+        CdrBuilder()
+        .stamp(time_ns)
+        .text(f"joint_{joint}")
+        .put("Q", index)
+        .put("d", *seen[:7])
+        .put("Q", seen.jumps)
+        .put("I", seen.flags)
+        .put("H", PAST_LAYOUT, len(past))
+        .put("Q", *struct.unpack(f"<{PAST_WORDS}Q", past.ljust(8 * PAST_WORDS, b"\0")))
+        .payload()
+    )
 
 
 class Status(NamedTuple):
