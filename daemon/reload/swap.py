@@ -180,10 +180,13 @@ class Swap:
         yield from self._follow(position, [estimator for estimator, _ in new])
         zeros: dict[str, str] = {}
         for joint, (estimator, limits) in zip(joints, new, strict=True):
-            zeros[f"joint_{len(zeros) + 1}"] = hand_over(joint.estimator, estimator)
+            became = hand_over(joint.estimator, estimator)
+            if became:
+                zeros[f"joint_{joints.index(joint) + 1}"] = became
             joint.use(estimator, limits)
+        told = {"zeros": zeros} if zeros else {}
         missed = self._cycle.grid.missed - self._missed
-        self._report(swapped=True, cycle=self._cycle.index, missed=missed, zeros=zeros)
+        self._report(swapped=True, cycle=self._cycle.index, missed=missed, **told)
 
     def _read(self, source: io.RawIOBase | io.BytesIO, order: Order, content: memoryview) -> Iterator[str]:
         digest, at = sha256(), 0

@@ -137,7 +137,13 @@ _ROWS = (
         "the link encoder's zero is {}",
         "the link encoder's zero is plausible again",
     ),
-    Definition("zero_jumped", JOINT, WARNING, "the link encoder's zero has jumped and is learned anew: {}"),
+    Definition(
+        "zero_jumped",
+        JOINT,
+        WARNING,
+        "the link encoder's zero has jumped, {}, and is not known again yet",
+        "the link encoder's zero is learned anew",
+    ),
     Definition(
         "deviation",
         JOINT,

@@ -45,8 +45,6 @@ COUNTER_QUIET_S = 1.0
 """A condition that shows by a counter has ended when the counter has stood still for so long."""
 _STOPPED_S = 0.25
 """The snapshot is written every 8th cycle."""
-JUMPED_S = 10.0
-"""So long a jump of a zero is told: until it is learned anew."""
 TIMEOUT_CYCLES = 20
 """Cycles in a row without a valid frame of a PDO: timeout (EMCY 8250h)."""
 LENGTH_S = 1.0
@@ -205,7 +203,6 @@ class _Joint:
     faults: int = 0
     latched: int = 0
     jumps: int = 0
-    jumped_s: float = -inf
     deviation: Deviation = field(default_factory=Deviation)
 
 
@@ -314,12 +311,11 @@ class Health:
         subject = joint.subject
         why = zeros.implausible
         self._conditions.update("zero_implausible", subject, not zeros.plausible, now_s, why)
-        if zeros.jumps > joint.jumps:
-            joint.jumped_s = now_s
+        before = self._conditions.is_present("zero_jumped", subject.name)
+        jumped = zeros.jumps > joint.jumps or (before and zeros.tracked and not zeros.learned)
         joint.jumps = zeros.jumps
-        jumped = now_s - joint.jumped_s < JUMPED_S
-        text = f"it was {1e6 * zeros.link_used_rad:+.0f} µrad"
-        if jumped != self._conditions.is_present("zero_jumped", subject.name):
+        if jumped != before:
+            text = f"from {1e6 * zeros.link_used_rad:+.0f} µrad"
             self._conditions.update("zero_jumped", subject, jumped, now_s, text)
 
     def _observe_status(

@@ -300,7 +300,7 @@ class Service:
                 "missed": missed,
                 "shadowed_cycles": cycles,
                 "changes": about["changes"],
-                "zeros": about["zeros"],
+                "zeros": about.get("zeros", {}),
             }
         )
         changes = ", ".join(
@@ -308,12 +308,12 @@ class Service:
             for name, change in about["changes"].items()
             if change["rms_change_nm"] is not None
         )
-        zeros = about["zeros"]
+        zeros = about.get("zeros", {})
         self._log(
             f"reloaded {self._config.path}: in force from cycle {cycle} on, "
             f"{missed} cycle{'s' if missed != 1 else ''} missed; "
             f"on the last {cycles} cycles the estimates change: {changes or 'nothing to compare'}"
-            + "".join(_of_zeros(name, became) for name, became in zeros.items() if became),
+            + "".join(_of_zeros(name, became) for name, became in zeros.items()),
             NOTICE,
         )
         self._notifier.send("READY=1")
