@@ -4,21 +4,27 @@ r"""What tracking the zeros changes: error and interval against the true torque,
         --hold 1.0 --seed 9301 --out days
     python -m tests.benchmarks.zeros MODELS days [--link-zero 1e-4]
     python -m tests.benchmarks.zeros MODELS --push 10 --plant models/plants/typical.yaml --seed 9302 [--link-zero 1e-4]
+    python -m tests.benchmarks.zeros --world 9303 9304 9305 [--link-zero 1e-4]
 
 MODELS has joint1.yaml and joint2.yaml with section `fused`, fitted on the same plant; a run has its true torques beside it.
 Settings are those of new configurations; estimate and truth are of one age. `--link-zero` adds a zero [rad] to the link
 encoder from the first sample on. `--push` has runs of its own: the other joint pushes with so many Nm more from PUSH_S on,
-and the zero that is found is compared with that of the same day and noise without the push.
+and the zero that is found is compared with that of the same day and noise without the push. `--world` draws joints and runs
+of a bench that shares no code with ours (tests/worlds, MuJoCo): fitted on some runs of each seed, scored on the others
+against its torque sensor, whose own zero of the day counts as part of the error and of the interval.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import subprocess
+import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
@@ -37,10 +43,18 @@ from jtqd.sim_can.plants import load_any_plant
 from jtqd.sysid.fit.fused import GAUSS
 from jtqd.sysid.runs.files import read_run
 from jtqd.sysid.runs.truth import read_truth
+from tests.worlds.judge import write
+from tests.worlds.mujoco_bench import MujocoBench
+from tests.worlds.recorder import Recorder
 
 SETTLED_S, LATE_S = 0.1, 2.5
 NO_WORSE = 1.001
 PUSH_S, PUSHED_S, PUSHED_DAYS = 4.0, 12.0, 8
+
+
+WORLD_RUNS, WORLD_FITTED, WORLD_SECONDS = 16, 10, 10.0
+WORLD_SENSOR = 0.003 / math.sqrt(3.0)
+"""Standard deviation of that sensor's zero, part of the rated torque."""
 
 
 class Figures(NamedTuple):
@@ -83,11 +97,23 @@ def figures(models: Path, link_zero_rad: float, run: tuple[Path, int]) -> tuple[
     """Return the figures without and with zeros, None for a joint that hardly moves."""
     path, number = run
     joint, table = load_joint(models / f"joint{number}.yaml"), read_run(path).table
+    return compared(joint, table, number, read_truth(path)[number], link_zero_rad)
+
+
+def compared(  # noqa: PLR0917 - as `estimated`
+    joint: Joint,
+    table: RunTable,
+    number: int,
+    truth_nm: FloatArray,
+    link_zero_rad: float,
+    sensor_nm: float = 0.0,
+) -> tuple[Figures, Figures] | None:
+    """Return the same of one joint of a run; sensor_nm: standard deviation of the zero of what is the truth here."""
     time_s = table.time_s - table.time_s[0]
     found = []
     for on in (False, True):
-        got = estimated(joint, table, number, read_truth(path)[number], link_zero_rad, on)
-        inside = np.abs(got.error_nm) <= GAUSS * got.sigma_nm
+        got = estimated(joint, table, number, truth_nm, link_zero_rad, on)
+        inside = np.abs(got.error_nm) <= GAUSS * np.hypot(got.sigma_nm, sensor_nm)
         moving = np.isin(got.status, (VALID, DEGRADED)) & (time_s > SETTLED_S)
         late = moving & (time_s > LATE_S)
         if np.count_nonzero(late) < len(time_s) // 20:
@@ -102,8 +128,12 @@ def table_of(models: Path, runs: Path, link_zero_rad: float) -> None:
     """Print two rows: without and with zeros, and in how many runs it is worse."""
     every = [(path, number) for path in sorted(runs.glob("*.csv.gz")) for number in (1, 2)]
     with ProcessPoolExecutor(2) as pool:
-        all_pairs = list(pool.map(partial(figures, models, link_zero_rad), every))
-    pairs = np.array([pair for pair in all_pairs if pair is not None])
+        report(list(pool.map(partial(figures, models, link_zero_rad), every)))
+
+
+def report(found: list[tuple[Figures, Figures] | None]) -> None:
+    """Print the table of these."""
+    pairs = np.array([pair for pair in found if pair is not None])
     print(f"{len(pairs)} joints in runs     RMSE  covered  degraded | after {LATE_S:g} s: RMSE  covered")
     for name, part in (("without", pairs[:, 0]), ("with zeros", pairs[:, 1])):
         rmse, later = (np.sqrt(np.mean(part[:, k] ** 2)) for k in (0, 3))
@@ -114,6 +144,36 @@ def table_of(models: Path, runs: Path, link_zero_rad: float) -> None:
     worse = pairs[:, 1, 0] > NO_WORSE * pairs[:, 0, 0]
     most = (pairs[:, 1, 0] - pairs[:, 0, 0]).max()
     print(f"worse with zeros: {np.count_nonzero(worse)} of {len(pairs)}; RMSE at most {most:+.3f} Nm")
+
+
+def of_the_world(link_zero_rad: float, seed: int) -> list[tuple[Figures, Figures] | None]:
+    """Return the figures of the runs of one seed that its joints were not fitted on."""
+    drawn = MujocoBench(WORLD_RUNS, WORLD_SECONDS).draw(seed)
+    found = []
+    with TemporaryDirectory() as directory:
+        paths, files = write(Path(directory), drawn.runs, drawn.joints, Recorder(), seed)
+        for number, file in files.items():
+            fitted = file.with_name(f"fitted{number}.yaml")
+            command = [
+                "fit",
+                "losses",
+                *map(str, paths[:WORLD_FITTED]),
+                "--joint",
+                str(file),
+                "--out",
+                str(fitted),
+            ]
+            subprocess.run(
+                [sys.executable, "-m", "jtqd.daemon.jtq", *command], check=True, capture_output=True
+            )
+            joint = load_joint(fitted)
+            sensor_nm = WORLD_SENSOR * joint.rated_torque_nm
+            for path in paths[WORLD_FITTED:]:
+                table = read_run(path).table
+                sensor = table.joints[number].torque_nm
+                assert sensor is not None
+                found.append(compared(joint, table, number, sensor, link_zero_rad, sensor_nm))
+    return found
 
 
 def pushed(  # noqa: PLR0917 - of a process pool
@@ -154,13 +214,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("models", type=Path)
+    parser.add_argument("models", type=Path, nargs="?")
     parser.add_argument("runs", type=Path, nargs="?")
     parser.add_argument("--link-zero", type=float, default=0.0, metavar="RAD")
     parser.add_argument("--push", type=float, metavar="NM")
     parser.add_argument("--plant", type=Path)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--world", type=int, nargs="+", metavar="SEED")
     options = parser.parse_args()
+    if options.world is not None:
+        with ProcessPoolExecutor(2) as pool:
+            drawn = pool.map(partial(of_the_world, options.link_zero), options.world)
+            report([each for seed in drawn for each in seed])
+        return
+    if options.models is None:
+        parser.error("found no directory of joint files")
     if options.push is None:
         if options.runs is None:
             parser.error("found no runs, expected a directory of runs or --push")
