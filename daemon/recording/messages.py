@@ -13,12 +13,12 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from jtqd.daemon.recording import schemas
 from jtqd.daemon.shared import cycle_record as cycle
-from jtqd.daemon.shared.snapshot import PAST_WORDS
+from jtqd.daemon.shared.snapshot import PAST_WORDS, View
 from jtqd.estimator.learned import PAST_LAYOUT, Zeros
 
 CDR_HEADER = b"\x00\x01\x00\x00"
@@ -255,6 +255,13 @@ def zeros(time_ns: int, joint: int, index: int, seen: Zeros, past: bytes) -> byt
         .put("Q", *struct.unpack(f"<{PAST_WORDS}Q", past.ljust(8 * PAST_WORDS, b"\0")))
         .payload()
     )
+
+
+def zeros_of(view: View) -> Iterator[tuple[schemas.Topic, bytes]]:
+    """Yield topic and message of each joint that tracks its zeros, from one reading of the snapshot."""
+    for number, (seen, past) in enumerate(zip(view.zeros, view.pasts, strict=True), start=1):
+        if seen.tracked:
+            yield schemas.ZEROS[number - 1], zeros(view.sync_realtime_ns, number, view.cycle, seen, past)
 
 
 class Status(NamedTuple):

@@ -25,7 +25,7 @@ from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.diagnostics import Diagnostics, RecorderState
 from jtqd.daemon.recording.journal import INFO, WARN, Journal
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head
-from jtqd.daemon.recording.messages import CycleMessages, JointStateMessage, diagnostics, zeros
+from jtqd.daemon.recording.messages import CycleMessages, JointStateMessage, diagnostics, zeros_of
 from jtqd.daemon.recording.own_files import MEGABYTE, free_run, own_files, sized
 from jtqd.daemon.recording.parts import Parts, Rules
 from jtqd.daemon.recording.progress import Account, ProgressFile
@@ -37,7 +37,7 @@ from jtqd.daemon.shared.conditions import read_conditions
 from jtqd.daemon.shared.cycle_record import layout_of
 from jtqd.daemon.shared.notices import NoticesError, NoticesReader
 from jtqd.daemon.shared.ring import RingError, RingReader
-from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader, View
+from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader
 
 _REPEAT_EVERY, _REPEAT_EVERY_IN_MEMORY = 60, 10
 """Chunks after which schemas and channels are repeated; a flight recording begins with any chunk."""
@@ -150,16 +150,10 @@ class Session:
             view, self.account, state, work_us=work, late_us=late, now_ns=now_ns, conditions=conditions
         )
         self.journal.builder.add(schemas.DIAGNOSTICS.number, now_ns, diagnostics(now_ns, statuses))
-        if view is not None:
-            self._write_zeros(view, now_ns)
-
-    def _write_zeros(self, view: View, now_ns: int) -> None:
-        """Write /joint/N/zeros where they are tracked: with the state that a replay goes on from."""
-        for number, (seen, past) in enumerate(zip(view.zeros, view.pasts, strict=True), start=1):
-            if seen.tracked and view.cycle != self._zeros_cycle:
-                message = zeros(view.sync_realtime_ns, number, view.cycle, seen, past)
-                self.journal.builder.add(schemas.ZEROS[number - 1].number, now_ns, message)
-        self._zeros_cycle = view.cycle
+        if view is not None and view.cycle != self._zeros_cycle:
+            self._zeros_cycle = view.cycle
+            for topic, message in zeros_of(view):
+                self.journal.builder.add(topic.number, now_ns, message)
 
     def finish(self) -> dict[str, Any]:
         """End everything; returns the summary of the run."""

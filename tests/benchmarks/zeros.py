@@ -11,7 +11,7 @@ Settings are those of new configurations; estimate and truth are of one age. `--
 encoder from the first sample on. `--push` has runs of its own: the other joint pushes with so many Nm more from PUSH_S on,
 and the zero that is found is compared with that of the same day and noise without the push. `--world` draws joints and runs
 of a bench that shares no code with ours (tests/worlds, MuJoCo): fitted on some runs of each seed, scored on the others
-against its torque sensor, whose own zero of the day counts as part of the error and of the interval.
+against its torque sensor without that sensor's zero of the day.
 """
 
 from __future__ import annotations
@@ -53,8 +53,6 @@ PUSH_S, PUSHED_S, PUSHED_DAYS = 4.0, 12.0, 8
 
 
 WORLD_RUNS, WORLD_FITTED, WORLD_SECONDS = 16, 10, 10.0
-WORLD_SENSOR = 0.003 / math.sqrt(3.0)
-"""Standard deviation of that sensor's zero, part of the rated torque."""
 
 
 class Figures(NamedTuple):
@@ -100,20 +98,19 @@ def figures(models: Path, link_zero_rad: float, run: tuple[Path, int]) -> tuple[
     return compared(joint, table, number, read_truth(path)[number], link_zero_rad)
 
 
-def compared(  # noqa: PLR0917 - as `estimated`
+def compared(
     joint: Joint,
     table: RunTable,
     number: int,
     truth_nm: FloatArray,
     link_zero_rad: float,
-    sensor_nm: float = 0.0,
 ) -> tuple[Figures, Figures] | None:
-    """Return the same of one joint of a run; sensor_nm: standard deviation of the zero of what is the truth here."""
+    """Return the same of one joint of a run."""
     time_s = table.time_s - table.time_s[0]
     found = []
     for on in (False, True):
         got = estimated(joint, table, number, truth_nm, link_zero_rad, on)
-        inside = np.abs(got.error_nm) <= GAUSS * np.hypot(got.sigma_nm, sensor_nm)
+        inside = np.abs(got.error_nm) <= GAUSS * got.sigma_nm
         moving = np.isin(got.status, (VALID, DEGRADED)) & (time_s > SETTLED_S)
         late = moving & (time_s > LATE_S)
         if np.count_nonzero(late) < len(time_s) // 20:
@@ -148,7 +145,8 @@ def report(found: list[tuple[Figures, Figures] | None]) -> None:
 
 def of_the_world(link_zero_rad: float, seed: int) -> list[tuple[Figures, Figures] | None]:
     """Return the figures of the runs of one seed that its joints were not fitted on."""
-    drawn = MujocoBench(WORLD_RUNS, WORLD_SECONDS).draw(seed)
+    bench = MujocoBench(WORLD_RUNS, WORLD_SECONDS)
+    drawn, days = bench.draw(seed), bench.days(seed)
     found = []
     with TemporaryDirectory() as directory:
         paths, files = write(Path(directory), drawn.runs, drawn.joints, Recorder(), seed)
@@ -167,12 +165,11 @@ def of_the_world(link_zero_rad: float, seed: int) -> list[tuple[Figures, Figures
                 [sys.executable, "-m", "jtqd.daemon.jtq", *command], check=True, capture_output=True
             )
             joint = load_joint(fitted)
-            sensor_nm = WORLD_SENSOR * joint.rated_torque_nm
-            for path in paths[WORLD_FITTED:]:
+            for path, day in zip(paths[WORLD_FITTED:], days[WORLD_FITTED:], strict=True):
                 table = read_run(path).table
                 sensor = table.joints[number].torque_nm
                 assert sensor is not None
-                found.append(compared(joint, table, number, sensor, link_zero_rad, sensor_nm))
+                found.append(compared(joint, table, number, sensor - day.sensor_nm, link_zero_rad))
     return found
 
 

@@ -25,8 +25,8 @@ from jtqd.daemon.core.status import NEEDED
 from jtqd.daemon.logs import read_attachments, read_topic
 from jtqd.daemon.loop.input_pdos import input_pdos, joint_temperatures
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData
-from jtqd.daemon.recording.messages import CycleMessages, zeros
-from jtqd.daemon.recording.schemas import ZEROS, definitions
+from jtqd.daemon.recording.messages import CycleMessages, zeros_of
+from jtqd.daemon.recording.schemas import definitions
 from jtqd.daemon.replay.origin import Origin, open_origin
 from jtqd.daemon.replay.session import ReplayOptions, Result, logged_models, replay_each
 from jtqd.daemon.shared import cycle_record as cr
@@ -161,9 +161,8 @@ def written(path: Path, run: Recorded, first: int = 0, end: int = CYCLES, *, tol
         builder.add_block(block, header.sync_realtime_ns)
         view = views.get(header.cycle)
         if view is not None:
-            for number, (seen, past) in enumerate(zip(view.zeros, view.pasts, strict=True), start=1):
-                message = zeros(header.sync_realtime_ns, number, view.cycle, seen, past)
-                builder.add(ZEROS[number - 1].number, header.sync_realtime_ns, message)
+            for topic, message in zeros_of(view):
+                builder.add(topic.number, header.sync_realtime_ns, message)
     sealed = builder.seal()
     assert sealed is not None
     file.append(sealed)
