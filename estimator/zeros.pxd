@@ -13,6 +13,7 @@ cdef struct ZerosLaw:
     double prior[ZERO_STATES]  # variances
     double drift[ZERO_STATES]  # variance per second
     double stiffness, torque_per_ampere, limit
+    double floor  # variance of the link zero [rad^2] that the joint file's own sigma covers
     double known  # variance of the link zero [rad^2] below which it counts as learned
 
 cdef struct Gathered:  # sums over the samples of a block

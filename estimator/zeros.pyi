@@ -6,6 +6,7 @@ BLOCK: Final = 16
 CORRELATION_S: Final = 0.3
 DOUBT: Final = 2.0
 SURE: Final = 4.0
+COVERED: Final = 0.5
 SLEW_S: Final = 0.25
 LARGEST_LINK: Final = 0.3
 CURRENT_SHARE: Final = 0.2

@@ -19,8 +19,8 @@ Samples count in motion only, with the friction on one side: |v| > MOVING_RAD_S,
 blocks of BLOCK samples, and a block counts as its length/CORRELATION_S of an independent sample of variance s_c^2 + s_t^2:
 ripple and errors of the encoders are not white.
 
-What is taken off the readings is x w(|x|/sigma_x): nothing below DOUBT standard deviations, all of it above SURE, linear
-between (firm shrinkage, Gao and Bruce 1997): on a day without a zero worth it nothing is changed. It follows with SLEW_S:
+What is taken off the readings is x w(|x|/sigma_x): nothing below DOUBT standard deviations (of the link zero: and of COVERED
+of the torsion's sigma), all of it above SURE, linear between (firm shrinkage, Gao and Bruce 1997): on a day without a zero worth it nothing is changed. It follows with SLEW_S:
 the estimate must not jump.
 """
 
@@ -39,6 +39,9 @@ CORRELATION_S: Final = 0.3
 """So long the difference of the views keeps its error; chosen, with the rest, on runs that no figure is reported on."""
 DOUBT: Final = 2.0
 SURE: Final = 4.0
+COVERED: Final = 0.5
+"""Part of the torsion's sigma in the joint file that counts as doubt of a link zero, however long it is seen: the paths have
+errors of model, not of noise, and what the file's sigma covers need not be taken off."""
 SLEW_S: Final = 0.25
 LARGEST_LINK: Final = 0.3
 """Prior standard deviation of the link zero as a torque, part of the rated one."""
@@ -71,6 +74,7 @@ cdef int fill_zeros(ZerosLaw *law, joint, sigma, torsion, bint used) except -1:
     law.stiffness = torsion.stiffness_nm_per_rad
     law.torque_per_ampere = joint.gear_ratio * joint.torque_constant_nm_per_a
     law.limit = torsion.zero_limit_rad
+    law.floor = (COVERED * sigma.torsion_nm / law.stiffness) ** 2
     law.known = KNOWN_SHARE * (sigma.current_nm / law.stiffness) ** 2
     law.prior[0] = (LARGEST_LINK * joint.rated_torque_nm / law.stiffness) ** 2
     law.prior[1] = (CURRENT_SHARE * sigma.current_nm / law.torque_per_ampere) ** 2
@@ -171,11 +175,11 @@ cdef void update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, dou
     way = b.dt * INVERSE_SLEW
     if way > 1.0:
         way = 1.0
-    s.link_rad += way * (_used(s.x[0], s.p[0][0]) - s.link_rad)
+    s.link_rad += way * (_used(s.x[0], s.p[0][0] + law.floor) - s.link_rad)
     s.current_a += way * (_used(s.x[1], s.p[1][1]) - s.current_a)
     # beyond what is doubt about the zero: of a joint without one nothing is left, on average
     left = s.x[0] - s.link_rad
-    s.left_nm = law.stiffness * sqrt(fmax(0.0, left * left - s.p[0][0]))
+    s.left_nm = law.stiffness * sqrt(fmax(0.0, left * left - s.p[0][0] - law.floor))
 
 
 cdef bint beyond(const ZerosLaw *law, const ZerosState *s) noexcept nogil:

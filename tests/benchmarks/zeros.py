@@ -1,10 +1,10 @@
 r"""What tracking the zeros changes: error and interval against the true torque, run by run, with and without it.
 
     python -m jtqd.sysid.campaign.emulated --plant models/plants/typical.yaml --runs 36 --seconds 8 \
-        --hold 1.0 --seed 9301 --out days
+        --hold 1.0 --seed 9311 --out days
     python -m tests.benchmarks.zeros MODELS days [--link-zero 1e-4]
-    python -m tests.benchmarks.zeros MODELS --push 10 --plant models/plants/typical.yaml --seed 9302 [--link-zero 1e-4]
-    python -m tests.benchmarks.zeros --world 9303 9304 9305 [--link-zero 1e-4]
+    python -m tests.benchmarks.zeros MODELS --push 10 --plant models/plants/typical.yaml --seed 9312 [--link-zero 1e-4]
+    python -m tests.benchmarks.zeros --world 9403 9404 9405 [--link-zero 1e-4]
 
 MODELS has joint1.yaml and joint2.yaml with section `fused`, fitted on the same plant; a run has its true torques beside it.
 Settings are those of new configurations; estimate and truth are of one age. `--link-zero` adds a zero [rad] to the link
