@@ -141,6 +141,7 @@ def _joint(reading: Reading, number: int) -> dict[str, Any]:
         "error_nm": finite(seen.torque_nm - seen.reference_nm if known else nan),
         "rmse_nm": finite(view.rmse_nm[n]),
         "age_ms": finite(seen.age_ms),
+        "zeros": view.zeros[n].content(),
         "current_a": finite(measured.current_a),
         "motor_velocity_rad_s": finite(measured.motor_velocity_rad_s),
         "temperature_c": finite(measured.temperature_c),
@@ -231,6 +232,11 @@ class StatusView:
         yield _joints(about, view, still=still)
         if not still:
             yield from _reasons(about, view, reading.earlier)
+            for joint, zeros in zip(about.joints, view.zeros, strict=False):
+                if zeros.tracked:
+                    yield _line(
+                        f"zeros {joint.number}", Text(zeros.text, style="" if zeros.plausible else "yellow")
+                    )
             if self._recent is not None:
                 yield from _last_seconds(self._recent, len(about.joints), width)
         yield ""
