@@ -10,6 +10,7 @@ cdef struct Sample:
 
 cdef struct Values:  # `jtqd.estimator.status.Estimate` as a block; NaN where not computed or not to be published
     double torque_nm, sigma_nm, tob_nm, physics_nm, network_nm
+    double torque_rate_nm_s, load_nm  # `contact`: load of the sample before
     int status
 
 cdef void no_values(Values *out, int status) noexcept nogil

@@ -83,7 +83,7 @@ cdef class JointCycle:
     def __init__(self, int number, inputs, estimator, *, Intake intake, snapshot, int64_t period_ns, safety=None):
         cdef JointTemperature temperature
         cdef JointBlock nothing = JointBlock(
-            NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, 0, 0, 0, 0
+            NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, 0, 0, 0, 0
         )
         self.limits = safety or JointSafety()
         self.rules = JointRules(number, snapshot, self.limits, estimator.with_network)
@@ -269,7 +269,7 @@ cdef class JointCycle:
         cdef Scale *scale = &self.scale
         cdef JointBlock *record = &self.now.sample
         cdef Sample sample
-        cdef Values e = Values(NAN, NAN, NAN, NAN, NAN, INVALID)
+        cdef Values e = Values(NAN, NAN, NAN, NAN, NAN, NAN, NAN, INVALID)
         cdef int status, statusword = <int> self.statusword[0]
         sample.dt_s = self.since_last(sync_ns)
         sample.current_a = self.current_count[0] * scale.ampere
