@@ -97,6 +97,7 @@ cdef class JointCycle:
         self.motor, self.link = Unwrap(), Unwrap()
         self.now.status = STARTING
         self.now.sample = nothing
+        self.now.load_nm = NAN
         self.now.published = field_of(NAN, INFINITY, STARTING)
 
     cdef int find_inputs(self, inputs) except -1:
@@ -299,6 +300,7 @@ cdef class JointCycle:
         record.torque_nm, record.sigma_nm, record.tob_nm = e.torque_nm, e.sigma_nm, e.tob_nm
         record.physics_nm, record.network_nm = e.physics_nm, e.network_nm
         record.dt_s = sample.dt_s
+        record.torque_rate_nm_s, self.now.load_nm = e.torque_rate_nm_s, e.load_nm
         record.statusword, record.input_flags = statusword, flags
         self.now.status = record.status = status
         self.now.latched = self.rules.status.now.latched
@@ -310,7 +312,7 @@ cdef class JointCycle:
         self.now.published = field_of(NAN, INFINITY, status)
         record.current_a = record.motor_position_rad = record.motor_velocity_rad_s = record.link_position_rad = NAN
         record.torque_nm = record.sigma_nm = record.tob_nm = record.physics_nm = record.network_nm = NAN
-        record.dt_s = record.reference_nm = NAN
+        record.dt_s = record.reference_nm = record.torque_rate_nm_s = self.now.load_nm = NAN
         record.statusword, record.input_flags = 0, flags
         self.now.status = record.status = status
         self.now.latched = self.rules.status.now.latched

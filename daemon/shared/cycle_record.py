@@ -81,7 +81,8 @@ FLAG_POSITION, FLAG_MOTION, FLAG_SENSOR, FLAG_TEMPERATURE = 1, 2, 4, 8
 """`input_flags` of record and snapshot: TPDO1, TPDO2 and the sensor's PDO are of this cycle; the temperature is known."""
 FLAG_NETWORK_SKIPPED, FLAG_LATCHED = 0x10, 0x20
 FLAG_CONTACT_KNOWN, FLAG_CONTACT = 0x40, 0x80
-"""... no time for the network; a fault is latched; contact is watched and known; there is one. Bits 8 to 15: low byte of the faults below."""
+"""... no time for the network; a fault is latched; contacts are watched and known; there is one. Bits 8 to 15: low byte of
+the faults below."""
 TEMPERATURE_LIFE_S = 2.0
 """Four frames in a row are missing then; a joint needs minutes to become noticeably warmer."""
 
@@ -142,8 +143,9 @@ class JointRecord(NamedTuple):
     sensor_status: int
     input_flags: int
     """Bit n set: input n of this joint (0 TPDO1, 1 TPDO2, 2 sensor) is of this cycle; bit 3: temperature_c is known; bit 4:
-    no time for the network; bit 5: a fault is latched; bit 6: whether there is a contact is known; bit 7: there is; bits 8 to 15: the faults (`faults.py`) for which there
-    is no torque: of this cycle, of one not long ago, or latched."""
+    no time for the network; bit 5: a fault is latched; bit 6: whether there is a contact is known; bit 7: there
+    is; bits 8 to 15: the faults (`faults.py`) for which there is no torque: of this cycle, of one not long ago, or
+    latched."""
 
 
 def selection(header: Collection[str], joint: Collection[str], joints: int = 2) -> struct.Struct:

@@ -100,7 +100,7 @@ def test_sizes_are_constant_and_as_stated():
     sizes = {tuple(len(part[4]) for part in split(block_of(*random_record(seed)[:2]))) for seed in range(20)}
     assert sizes == {(182, 182, 444)}
     assert (messages.JOINT_ESTIMATE_SIZE, messages.CAN_FRAMES_SIZE, messages.BLOCK_SIZE) == (182, 444, 901)
-    assert messages.BLOCK_PARTS == ((1, 0), (2, 197), (3, 394))
+    assert messages.BLOCK_PARTS == ((1, 0), (2, 213), (3, 426))
 
 
 def test_joint_message_literally():
