@@ -77,6 +77,10 @@ class MujocoBench:
             else (1, 2)
         )
 
+    def unseen(self) -> MujocoBench:
+        """Return the bench itself: nothing is fitted to its runs."""
+        return self
+
     def draw(self, seed: int, hidden: Sequence[Hidden] = (), *, quiet: bool = False) -> Set:
         """Return one set; about half a second per run."""
         runs = self.runs
