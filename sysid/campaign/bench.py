@@ -26,7 +26,6 @@ from jtqd.sysid.campaign.alone import allowed_torque
 from jtqd.sysid.campaign.processes import on_time
 from jtqd.sysid.excitation.model import current_at
 from jtqd.sysid.motion.setpoints import (
-    MOST_JOINTS,
     Limits,
     MotionResult,
     OutOfPlaceError,
@@ -72,16 +71,10 @@ class BenchConfig:
 
         Raises:
             ConfigError: naming file, key, found and expected; also for a period of SYNC that is no whole milliseconds up to
-                10, for joints whose numbers have a gap, and for drives that tell what they are commanded by otherwise than
-                CiA 402.
+                10, and for drives that tell what they are commanded by otherwise than CiA 402.
         """
         config = load_config(path)
         joints = config.joints
-        if [joint.number for joint in joints] != list(range(1, len(joints) + 1)):
-            raise ConfigError(
-                f"{config.path}: found {', '.join(f'joint_{joint.number}' for joint in joints)}, expected joint_1 to "
-                f"joint_{MOST_JOINTS} without a gap"
-            )
         period_us, rest_ns = divmod(config.period_ns, 1000)
         if rest_ns or period_us % PERIOD_US or period_us > LONGEST_PERIOD_US:
             raise ConfigError(
