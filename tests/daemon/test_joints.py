@@ -66,9 +66,11 @@ class Run:
             stderr=subprocess.PIPE,
             text=True,
         ) as process:
-            self.said = self.ask(directory, environment) if ask else {}
-            if ask:
-                process.terminate()
+            try:
+                self.said = self.ask(directory, environment) if ask else {}
+            finally:  # else a failure would wait for its end for ever
+                if ask:
+                    process.terminate()
             out, error = process.communicate(timeout=60)
         assert process.returncode == 0, error
         assert "Traceback" not in error
