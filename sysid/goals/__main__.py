@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from jtqd.estimator.checked import ConfigError, count, natural
+from jtqd.estimator.checked import ConfigError, check_output, count, natural
 from jtqd.sysid.fit.losses import LossFitError
 from jtqd.sysid.fit.torsion import TorsionError
 from jtqd.sysid.goals.figures import Column, column
@@ -64,7 +64,7 @@ def main(argv: list[str] | None = None) -> int:
     name = options.size or "full"
     try:
         if options.json is not None:
-            options.json.touch()
+            check_output(options.json)
         with ProcessPoolExecutor(options.jobs) as pool:
             work = partial(_timed, SIZES[name], options.fit_seed, options.seed)
             done = list(pool.map(work, the_three()))

@@ -1,6 +1,6 @@
 """`python -m jtqd.sysid.goals.network_study`: what a network could still learn of what physics leaves on a plant.
 
-    residual = sensor - physics      both as old as the estimate at 800 rad/s, less the run's own mean (its zeros)
+    residual = sensor - physics      both as old as the estimate at 800 rad/s; trained on less each run's mean (its zeros)
 
 Two networks, trained on the campaign's runs by whole runs. `waves`: gains of the waves of the motor angle over speed, motor
 torque, torsion less current; it has no mean over a turn. `free`: a function of the same, the direction, the torsion's rate
@@ -53,8 +53,8 @@ _SLOW_RAD_S: Final = 0.05
 
 @dataclass(frozen=True)
 class Part:
-    """Moving samples of a joint in a run: core [n, 3], extra [n, 3], waves [n, 8]; residual against the sensor, less its
-    mean, error of physics against the true torque as old, both [n].
+    """Moving samples of a joint in a run: core [n, 3], extra [n, 3], waves [n, 8]; residual against the sensor, error of
+    physics against the true torque as old, both [n].
     """
 
     core: FloatArray
@@ -94,7 +94,7 @@ def part_of(run: Driven, one: Identified) -> Part:
         found.features[keep][:, :3],
         np.column_stack((seen.direction, torsion, twist_rate))[keep],
         waves[keep],
-        residual - residual.mean(),
+        residual,
         (found.torque_nm - true)[keep],
     )
 
@@ -119,7 +119,10 @@ def made_of(name: str, parts: Sequence[Part], iterations: int) -> Made:
     """Train one of the two networks."""
     waves = name == "waves"
     features = np.concatenate([(part.core if waves else part.free)[::EVERY] for part in parts])
-    targets = [quick_part(part.residual_nm) if waves else part.residual_nm for part in parts]
+    targets = [
+        quick_part(part.residual_nm) if waves else part.residual_nm - part.residual_nm.mean()
+        for part in parts
+    ]
     return Made(
         name,
         train(
@@ -136,7 +139,7 @@ def made_of(name: str, parts: Sequence[Part], iterations: int) -> Made:
 
 
 def share_of(name: str, parts: Sequence[Part], iterations: int) -> float:
-    """Return the share that improves the runs left out and worsens none, 0 where there is none."""
+    """Return the share that improves the runs left out, their zeros included, and worsens none; 0 where there is none."""
     unseen = []
     for fold in range(FOLDS):
         made = made_of(name, [part for n, part in enumerate(parts) if n % FOLDS != fold], iterations)

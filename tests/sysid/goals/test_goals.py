@@ -230,7 +230,7 @@ def test_a_network_finds_a_ripple_that_physics_leaves_and_no_zero_of_a_run() -> 
         core = np.column_stack((rng.normal(size=n), 10.0 * rng.normal(size=n), rng.normal(size=n)))
         waves = np.column_stack([wave(k * angle) for k in (1, 2, 3, 4) for wave in (np.cos, np.sin)])
         ripple = 0.05 * core[:, 1] * waves[:, 2]
-        return Part(core, rng.normal(size=(n, 3)), waves, ripple - ripple.mean(), zero_nm - ripple)
+        return Part(core, rng.normal(size=(n, 3)), waves, ripple - zero_nm, zero_nm - ripple)
 
     known, other = ([part(rng.uniform(-0.2, 0.2)) for _ in range(6)] for _ in range(2))
     made = made_of("waves", known, 40)
