@@ -13,7 +13,7 @@ from jtqd.estimator.observer cimport (
     ObserverState,
 )
 from jtqd.estimator.perceptron cimport PerceptronLaw
-from jtqd.estimator.sample cimport Estimator, Sample, Values
+from jtqd.estimator.sample cimport Estimator, Learned, Sample, Values
 from jtqd.estimator.validity cimport FusedTrustLaw, TrustLaw, UncertaintyLaw
 from jtqd.estimator.zeros cimport ZerosLaw, ZerosState
 
@@ -46,6 +46,7 @@ cdef struct FusedLaw:
     AdditiveLaw loss
     FusionLaw fusion
     FusedTrustLaw trust
+    bint with_envelope  # trust is set, of the network or of the joint file
     NetworkLaw network
     ZerosLaw zeros
     double physics_scale[4]
@@ -66,6 +67,7 @@ cdef class FusedEstimator(Estimator):
     cdef void learn_zeros(
         self, const FusedObserved *seen, const Sample *x, const Fused *physics, double loss, int status
     ) noexcept nogil
+    cdef bint left_behind(self) noexcept nogil
     cdef bint foreign(self, const Fused *physics, double dt) noexcept nogil
     cdef void estimate(self, const FusedObserved *seen, const Sample *x, bint network_wanted, Values *out) noexcept nogil
 

@@ -1,4 +1,4 @@
-"""Make both drives and the sensor ready for a motion, and put them back after it, by SDO.
+"""Make all drives and the sensor ready for a motion, and put them back after it, by SDO.
 
 jtqd has booted the nodes: TPDOs, heartbeat and the watch over jtqd (1016h:1) are there. Here come mode of operation,
 interpolation time, temperature (TPDO3) and the watch over the commander (1016h:2). What is written is read back. Every
@@ -14,7 +14,8 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
@@ -25,6 +26,7 @@ from jtqd.drivers.devices import (
     COMMANDER_NODE,
     JTQD_NODE,
     SYNC_COB_ID,
+    DriveObjects,
     DriveProfile,
     DriveScaling,
     SensorProfile,
@@ -36,7 +38,8 @@ from jtqd.drivers.devices import (
 from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import FRAME, FRAME_SIZE
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
-from jtqd.drivers.pdo import CAN_ID, INVALID, PdoMap, split_word
+from jtqd.drivers.layout import EVERY_SYNC, LayoutError, chosen, pdo_of_words
+from jtqd.drivers.pdo import CAN_ID, INVALID, PdoError, PdoMap, split_word
 from jtqd.drivers.sdo import Key
 from jtqd.drivers.sdo_client import RESPONSE_ID, FrameChannel, NodeObjects, SdoAccess, SdoClient
 from jtqd.sysid.motion.cia402 import (
@@ -51,9 +54,10 @@ from jtqd.sysid.motion.cia402 import (
     state_of,
 )
 from jtqd.sysid.motion.setpoints import Limits, MotionError, Setpoints, Timing
+from jtqd.sysid.motion.turns import turns
 
 INTERPOLATION_MS: Final = 2
-"""60C2h: each drive gets every second set-point."""
+"""60C2h where two drives at 1 kHz take turns: each gets every second set-point."""
 _POLL_S, _POLLS = 0.005, 200
 _CONTROLWORD, _STATUSWORD, _MODE_DISPLAY = (0x6040, 0), (0x6041, 0), (0x6061, 0)
 _TARGET_VELOCITY, _TARGET_TORQUE = (0x60FF, 0), (0x6071, 0)
@@ -67,12 +71,13 @@ class DriveUnits:
     """What the commander must know of a drive: identifiers and factors to SI, as read from it.
 
     Attributes:
-        node: node number; also the number of the joint.
+        node: node number.
         mode: 9 (csv) or 10 (cst).
         gear_ratio: 6091h.
         scaling: factors of 6064h, 606Ch, 60E4h:1 and 6078h.
         heartbeat_ms: 1017h.
         temperature: True when TPDO3 (380h+n) brings the temperature in 0.1 °C.
+        objects: which of its objects hold the quantities. tpdos: those that carry them, as they are mapped in it.
     """
 
     node: int
@@ -81,6 +86,8 @@ class DriveUnits:
     scaling: DriveScaling
     heartbeat_ms: int
     temperature: bool
+    objects: DriveObjects
+    tpdos: tuple[PdoMap, ...]
 
     def velocity_units(self, velocity_rad_s: float) -> int:
         """Return 60FFh of a joint side velocity: it counts as 606Ch does, on the motor side."""
@@ -146,9 +153,16 @@ def reset_fault(access: SdoAccess, node: int, sleep: Sleep) -> str | None:
 
 
 def set_up(
-    access: SdoAccess, profile: DriveProfile, mode: int, timeout_ms: int, sleep: Sleep, *, temperature: bool
+    access: SdoAccess,
+    profile: DriveProfile,
+    mode: int,
+    timeout_ms: int,
+    sleep: Sleep,
+    *,
+    temperature: bool,
+    interpolation_ms: int = INTERPOLATION_MS,
 ) -> DriveUnits:
-    """Set mode, targets of zero, 60C2h, TPDO3 if `temperature` is wanted, and last the watch over the commander.
+    """Set mode, targets of zero, 60C2h [ms], TPDO3 if `temperature` is wanted, and last the watch over the commander.
 
     The drive must be off (`switch_off`, `reset_fault`). Raises BootError.
     """
@@ -165,17 +179,18 @@ def set_up(
     heartbeat_ms = _heartbeat(drive)
     for communication, pdo in ((0x1400, drive_rpdo1(node)), (0x1401, drive_rpdo2(node))):
         _require_rpdo(drive, communication, pdo)
+    tpdos = _tpdos(drive, profile)
     _zero_targets(drive)
     drive.write((0x6060, 0), mode, 1)
     found = _wait(drive, _MODE_DISPLAY, 1, lambda display: display == mode, sleep)
     if found != mode:
         raise mismatch(node, _MODE_DISPLAY, "mode of operation display", expected=str(mode), found=str(found))
-    drive.put((0x60C2, 1), INTERPOLATION_MS, 1, "interpolation time period value")
+    drive.put((0x60C2, 1), interpolation_ms, 1, "interpolation time period value")
     drive.put((0x60C2, 2), -3, 1, "interpolation time index")  # ms
     if temperature:
         _switch_on_temperature(drive)
     drive.put(_COMMANDER_WATCH, COMMANDER_NODE << 16 | timeout_ms, 4, "consumer heartbeat time")
-    return DriveUnits(node, mode, gear_ratio, scaling, heartbeat_ms, temperature)
+    return DriveUnits(node, mode, gear_ratio, scaling, heartbeat_ms, temperature, profile.objects, tpdos)
 
 
 def sensor_units(access: SdoAccess, profile: SensorProfile) -> SensorUnits:
@@ -245,6 +260,31 @@ def _require_rpdo(drive: NodeObjects, communication: int, pdo: PdoMap) -> None:
         raise mismatch(drive.node, (mapping, 1), "mapping of RPDO", expected=wanted, found=found or "nothing")
 
 
+def _tpdos(drive: NodeObjects, profile: DriveProfile) -> tuple[PdoMap, ...]:
+    """Return the TPDOs that carry the drive's quantities, as they are mapped now, by jtqd or for good. Raises BootError."""
+    maps = []
+    for number in range(1, 5):
+        communication = 0x1800 + number - 1
+        cob_id = drive.optional_number((communication, 1), 4)
+        if cob_id is None or cob_id & INVALID:
+            continue
+        count = drive.number((communication + 0x200, 0), 1)
+        words = [drive.number((communication + 0x200, entry), 4) for entry in range(1, min(count, 8) + 1)]
+        kind = drive.number((communication, 2), 1)
+        with suppress(PdoError):  # whatever else it sends
+            maps.append(pdo_of_words(drive.node, number, cob_id & CAN_ID, words, kind, profile.objects))
+    try:
+        used = chosen(profile.objects, maps)
+    except LayoutError as error:
+        raise BootError(drive.node, "1A00h", detail=f"{error}; start jtqd, which configures it") from None
+    for pdo in used:
+        if pdo.transmission_type != EVERY_SYNC:
+            key, found = (0x1800 + pdo.number - 1, 2), str(pdo.transmission_type)
+            what = "transmission type (a motion needs every value at each SYNC)"
+            raise mismatch(drive.node, key, what, expected=str(EVERY_SYNC), found=found)
+    return used
+
+
 def _switch_on_temperature(drive: NodeObjects) -> None:
     """Switch on TPDO3, which must carry a 16-bit number first; jtqd's boot may have switched it off."""
     cob_id, count = drive.optional_number((0x1802, 1), 4), drive.optional_number((0x1A02, 0), 1)
@@ -272,7 +312,7 @@ class BenchSetup:
     def __init__(
         self,
         bus: str,
-        drives: tuple[DriveProfile, DriveProfile],
+        drives: Sequence[DriveProfile],
         sensor: SensorProfile | None,
         timing: Timing,
     ) -> None:
@@ -280,14 +320,14 @@ class BenchSetup:
         self._socket = open_frame_socket(
             bus, [exact(SYNC_COB_ID), exact(nmt.HEARTBEAT_BASE + COMMANDER_NODE)]
         )
-        self._drives, self._sensor, self._timing = drives, sensor, timing
+        self._drives, self._sensor, self._timing = tuple(drives), sensor, timing
         self._beating = False
         self._access = {node: SdoClient(FrameChannel(self._socket, node)) for node in nodes}
 
     def prepare(
         self, setpoints: Setpoints, limits: Limits
-    ) -> tuple[tuple[DriveUnits, DriveUnits], SensorUnits | None]:
-        """Bring both drives to: off, free of faults, modes set, targets zero, watching our heartbeat; return all units.
+    ) -> tuple[tuple[DriveUnits, ...], SensorUnits | None]:
+        """Bring all drives to: off, free of faults, modes set, targets zero, watching our heartbeat; return all units.
 
         Raises MotionError; what was set is put back then. A second commander is noticed before anything is touched.
         """
@@ -318,7 +358,7 @@ class BenchSetup:
 
     def _prepare(
         self, setpoints: Setpoints, limits: Limits
-    ) -> tuple[tuple[DriveUnits, DriveUnits], SensorUnits | None]:
+    ) -> tuple[tuple[DriveUnits, ...], SensorUnits | None]:
         access = self._access
         for profile in self._drives:
             quick_stop(access[profile.node_id], profile.node_id)
@@ -327,23 +367,25 @@ class BenchSetup:
             fault = reset_fault(access[profile.node_id], profile.node_id, time.sleep)
             if fault is not None:
                 logging.getLogger(__name__).warning("node %d: %s was reset", profile.node_id, fault)
-        units = [
+        round_cycles = turns(setpoints.joints, len(self._drives))[1]
+        units = tuple(
             set_up(
                 access[profile.node_id],
                 profile,
-                CSV if joint == setpoints.velocity_joint else CST,
+                CST if joint == setpoints.current_joint else CSV,
                 round(self._timing.drive_timeout_s * 1e3),
                 time.sleep,
                 temperature=math.isfinite(limits.temperature_c),
+                interpolation_ms=round(round_cycles * self._timing.period_s * 1e3),
             )
             for joint, profile in enumerate(self._drives, 1)
-        ]
+        )
         sensor = self._sensor
         found = None if sensor is None else sensor_units(access[sensor.node_id], sensor)
-        return (units[0], units[1]), found
+        return units, found
 
     def release(self, *, beating: bool) -> str:
-        """Release both drives for certain; return "", or what could not be done, in one line.
+        """Release all drives for certain; return "", or what could not be done, in one line.
 
         `beating`: our heartbeat has been heard, so it goes on until nobody watches it any more.
         """

@@ -28,7 +28,9 @@ DRIVE_INPUTS: Final = 3
 _ENABLED_MASK, _ENABLED = 0x6F, 0x27  # 6041h: "operation enabled" of CiA 402
 _NO_POWER: Final = ((0x4F, 0x40), (0x6F, 0x21), (0x6F, 0x23))
 """Mask and value of 6041h: switch on disabled, ready to switch on, switched on."""
-_INPUTS: Final = ("current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad")
+_LINK: Final = "link_position_rad"
+"""Not there in the log of a joint with one encoder."""
+_INPUTS: Final = ("current_a", "motor_position_rad", "motor_velocity_rad_s", _LINK)
 _STATE: Final = np.dtype(
     [
         ("cycle", "<u8"),
@@ -52,7 +54,8 @@ class LoggedRun:
     """The run table of a log and the account of its cycles: rows + incomplete + missed are all slots of SYNC.
 
     Attributes:
-        table: torque_nm is None where the log has no value of the sensor at all, temperature_c where the drive sent none.
+        table: torque_nm is None where the log has no value of the sensor at all, temperature_c where the drive sent none,
+            link_position_rad of a joint with one encoder.
         missed: slots without a cycle (missed by the loop, or left silent on purpose).
         incomplete: cycles left out because an input was not fresh.
         incomplete_by: the same by input, e.g. {"joint 2": 3, "sensor": 1}; a cycle may miss several.
@@ -81,6 +84,8 @@ def log_to_run(
     all_needed: bool = False,
     nodes: Sequence[int] | None = None,
     sensor: bool = True,
+    enabled: Sequence[int] = (),
+    last_motion: bool = False,
 ) -> LoggedRun:
     """Read joints of a log from the first to the last cycle in which all their drives are in "operation enabled".
 
@@ -96,6 +101,8 @@ def log_to_run(
             configuration that is attached to the log, without one 1, 2, ...
         sensor: a row needs the sensor's value, where a joint has a channel of it; False: the bench has none,
             torque_nm is None.
+        enabled: further joints whose drives must be in "operation enabled" at both ends, although they are not wanted.
+        last_motion: begin behind the last time without power, not at the first cycle with it.
 
     Raises:
         LogError: no such joint or cycle, an input that never came, or topics that do not belong together.
@@ -114,14 +121,16 @@ def log_to_run(
         raise LogError(f"{name}: {'; '.join(left_out.values())}")
     nodes = nodes or _nodes(log, there)
     node_of = dict(zip(there, nodes, strict=False))
+    looked_at = [*wanted, *(number for number in enabled if number not in wanted)]
     states, readings = _read(
-        log, name, {number: node_of.get(number, number) for number in wanted if number in there}
+        log, name, {number: node_of.get(number, number) for number in looked_at if number in there}
     )
+    beside = {number: states.pop(number) for number in list(states) if number not in wanted}
     left_out |= {number: why for number, state in states.items() if (why := _unusable(number, state))}
     if left_out and (all_needed or len(left_out) == len(wanted)):
         raise LogError(f"{name}: {'; '.join(left_out.values())}")
     states = {number: state for number, state in states.items() if number not in left_out}
-    span = _span(states, name)
+    span = _span(states | beside, name, last_motion=last_motion)
     temperatures = {number: _temperature(readings[number], span) for number in states}
     states = {number: state[span] for number, state in states.items()}
     present = {f"joint {number}": _complete(number, state, name) for number, state in states.items()}
@@ -247,15 +256,26 @@ def _unusable(number: int, state: Records) -> str:
         cycles = counted(len(enabled), "cycle")
         return f"found {cycles} of joint {number} in 'operation enabled', expected at least 2"
     there = state[enabled[0] : enabled[-1] + 1]
-    for name in _INPUTS:
+    for name in _inputs_of(there):
         if not np.isfinite(there[name]).any():
             return f"j{number}.{name}: found no value in {counted(len(there), 'cycle')}, expected one in each"
     return ""
 
 
-def _span(states: Mapping[int, Records], log: Path) -> slice:
+def _inputs_of(state: Records) -> tuple[str, ...]:
+    """Return the names of the inputs that the joint's drive sends: with one encoder no link position."""
+    return _INPUTS if np.isfinite(state[_LINK]).any() else tuple(name for name in _INPUTS if name != _LINK)
+
+
+def _span(states: Mapping[int, Records], log: Path, *, last_motion: bool) -> slice:
     """From the first to the last cycle that counts; what is stale in between is looked at later."""
     rows = np.flatnonzero(np.logical_and.reduce([_enabled(state) for state in states.values()]))
+    if last_motion and len(rows):
+        off: Flags = np.logical_or.reduce(
+            [_unpowered(state["statusword"]) & _fresh(state) for state in states.values()]
+        )
+        before = np.flatnonzero(off[: rows[-1]])
+        rows = rows[rows > before[-1]] if len(before) else rows
     if len(rows) < 2:
         raise LogError(
             f"{log}: found {counted(len(rows), 'cycle')} of the motion with all drives (joints "
@@ -265,9 +285,9 @@ def _span(states: Mapping[int, Records], log: Path) -> slice:
 
 
 def _complete(number: int, state: Records, log: Path) -> Flags:
-    """Return cycles [n] with all four inputs of a joint; LogError for one that never came."""
+    """Return cycles [n] with all inputs of a joint; LogError for one that never came."""
     there = _fresh(state)
-    for name in _INPUTS:
+    for name in _inputs_of(state):
         finite = np.isfinite(state[name])
         if not finite.any():
             raise LogError(
@@ -293,16 +313,21 @@ def _columns(state: Records, sensor: bool, temperature: FloatArray | None) -> Jo
 
     torque = column("sensor_torque_nm") if sensor else None
     return JointColumns(
-        **{name: column(name) for name in _INPUTS},
+        **{name: column(name) for name in _inputs_of(state)},
         torque_nm=torque if torque is not None and np.isfinite(torque).all() else None,
         temperature_c=temperature,
         enabled=_powered(state["statusword"]),
     )
 
 
+def _unpowered(statusword: NDArray[Any]) -> Flags:
+    found: Flags = np.logical_or.reduce([(statusword & mask) == value for mask, value in _NO_POWER])
+    return found
+
+
 def _powered(statusword: NDArray[Any]) -> FloatArray | None:
     """Column `enabled` [n]; None for a run in which the power was never off, which is most of them."""
-    off = np.logical_or.reduce([(statusword & mask) == value for mask, value in _NO_POWER])
+    off = _unpowered(statusword)
     return np.where(off, 0.0, 1.0) if off.any() else None
 
 
