@@ -234,9 +234,7 @@ def fit_fused(
     fit = fit_loss(runs, friction)
     rmse = tuple(float(np.sqrt(np.mean(e * e))) for e in errors)
     torsion = fit_torsion(runs) if with_torsion else None
-    envelope = (
-        None if rated_nm is None or torsion is None else _envelope(runs, fit.loss, torsion, rated_nm)
-    )
+    envelope = None if rated_nm is None or torsion is None else _envelope(runs, fit.loss, torsion, rated_nm)
     return FusedFit(Fused(fit.loss, torsion, sigma, envelope), fit, rmse)
 
 

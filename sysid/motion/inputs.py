@@ -108,7 +108,7 @@ class DriveInput(NodeInput):
 
     @property
     def position_rad(self) -> float:
-        """Position by the link's encoder, else by the motor's, from its zero; a roll-over within the motion does not show."""
+        """Position by the link's encoder, else the motor's, from its zero; a roll-over within the motion does not show."""
         if "link" in self._last:
             return (self._began.get("link", 0) + self._link_counts) * self._link
         return (self._began.get("motor", 0) + self._motor_counts) * self._motor

@@ -118,7 +118,20 @@ def _record(cycle: Cycle) -> bytes:
     nan = math.nan
     blocks: list[float] = []
     for joint in cycle.joints:
-        numbers = [*joint[:5], nan, nan, nan, nan, nan, nan, 1e-3, nan, nan]  # no temperature, no estimate
+        numbers = [
+            *joint[:5],
+            nan,
+            nan,
+            nan,
+            nan,
+            nan,
+            nan,
+            1e-3,
+            nan,
+            nan,
+            nan,
+            nan,
+        ]  # no temperature, no estimate
         blocks += [*numbers, joint.statusword, 0, 0, joint.input_flags]
     counts = (cycle.index % 240 + 1, len(cycle.frames), 0, 0, 0, 0, 0, 0)
     layout.head.pack_into(
