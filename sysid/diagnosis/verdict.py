@@ -62,6 +62,7 @@ INACCURATE: Final = 0.06
 """Half width of the 95 % interval, as part of an effect's size, for what the equations here simplify (smoothing, first
 order in a delay): no interval is narrower. Judged by its coverage of known truths (docs/diagnosis.md).
 """
+_UNSTEADY: Final = "its size is not the same in all runs and under all conditions"
 _FAR_FROM_CERTAIN: Final = 0.25
 """Part of the steadiness that is needed below which effects are taken away at once, not one by one."""
 BESIDE: Final = 0.02
@@ -132,6 +133,13 @@ def _found(  # noqa: PLR0917
     found = _Found(whole, refined, best, refined, few, left, left.share(squares), limits, refused)
     if found.beside:
         best, proven = _proven(dataset, search, best, refined, noise, joints)
+        weak = [c for c in whole.chosen if c not in best.chosen]
+        if weak and not found.matters:  # what is not certain is left over, too
+            left = leftover(dataset, proven, noise, joints)
+            share = left.share(_squares([_rms_at(dataset, p) for p in proven.present]))
+            said = [f"{c.effect.name} of {_owner(c.joint)} fits but is not named: {_UNSTEADY}" for c in weak]
+            refused = [*refused, *said]
+            found = replace(found, whole=best, refined=proven, left=left, share=share, refused=refused)
         found = replace(found, best=best, proven=proven)
     return found
 

@@ -37,12 +37,14 @@ def rows_of(found: Findings, joints: Mapping[int, Mapping[str, object]]) -> dict
         joint = joints[c.joint if isinstance(c.joint, int) else min(joints)]
         if c.name in UNITS:
             new = (_size(c) / UNITS[c.name].of(joint), 100.0 * c.minimum_rms_nm / rated_nm(joint))
-            out[c.name] = min(out.get(c.name, (math.inf, math.inf)), new)
+            out[c.name] = min(out.get(c.name, (math.inf, math.inf)), new, key=lambda row: row[1])
     return out
 
 
 def _size(c: CandidateEvidence) -> float:
-    return next(iter(c.minimum.values())).value
+    """Return the size of the parameter that carries the effect, infinite where another one shows it first."""
+    found = c.minimum.get(UNITS[c.name].parameter)
+    return math.inf if found is None else found.value
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -76,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name, rows in sorted(found.items(), key=lambda item: float(np.median([r[1] for r in item[1]]))):
         size, torque = (float(np.median([r[k] for r in rows])) for k in (0, 1))
         seen = f"{visible[name]:.2g}" if name in visible else "-"
-        text = (f"{size:.2g}", f"{torque:.2g}") if math.isfinite(size) else ("none", "-")
+        text = [f"{x:.2g}" if math.isfinite(x) else "-" for x in (size, torque)]
         print(f"| {name} | {text[0]} | {text[1]} | {seen} | {UNITS[name].largest:g} |")
     return 0
 
