@@ -1,5 +1,6 @@
 """The estimators of a joint; the equations stand in estimator.pyx."""
 
+from jtqd.estimator.contact cimport LinkLaw, LinkState
 from jtqd.estimator.fusion cimport Fused, FusionLaw
 from jtqd.estimator.losses cimport AdditiveLaw, EfficiencyLaw
 from jtqd.estimator.observer cimport (
@@ -13,7 +14,7 @@ from jtqd.estimator.observer cimport (
     ObserverState,
 )
 from jtqd.estimator.perceptron cimport PerceptronLaw
-from jtqd.estimator.sample cimport Estimator, Sample, Values
+from jtqd.estimator.sample cimport Estimator, Learned, Sample, Values
 from jtqd.estimator.validity cimport FusedTrustLaw, TrustLaw, UncertaintyLaw
 from jtqd.estimator.zeros cimport ZerosLaw, ZerosState
 
@@ -46,8 +47,10 @@ cdef struct FusedLaw:
     AdditiveLaw loss
     FusionLaw fusion
     FusedTrustLaw trust
+    bint with_envelope  # trust is set, of the network or of the joint file
     NetworkLaw network
     ZerosLaw zeros
+    LinkLaw link
     double physics_scale[4]
     double network_scale[4]
     double stand_share, stand_floor, limit, network_limit, fade, inverse_fade
@@ -59,6 +62,7 @@ cdef struct FusedState:
     double half
     double lowered_s  # for how long the status still is, after the paths disagreed
     ZerosState zeros
+    LinkState link
 
 cdef class FusedEstimator(Estimator):
     cdef FusedLaw law
@@ -66,6 +70,7 @@ cdef class FusedEstimator(Estimator):
     cdef void learn_zeros(
         self, const FusedObserved *seen, const Sample *x, const Fused *physics, double loss, int status
     ) noexcept nogil
+    cdef bint left_behind(self) noexcept nogil
     cdef bint foreign(self, const Fused *physics, double dt) noexcept nogil
     cdef void estimate(self, const FusedObserved *seen, const Sample *x, bint network_wanted, Values *out) noexcept nogil
 

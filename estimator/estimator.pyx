@@ -11,10 +11,13 @@ loss went through the same filter; how old the result is says `age`.
 """
 
 from libc.math cimport NAN, fabs, fmin, sqrt
+from libc.string cimport memcmp
 
 from jtqd.estimator.block cimport copied, put_back
+from jtqd.estimator.contact cimport LinkSeen, fill_link, follow_link, restart_link
 from jtqd.estimator.fusion cimport Fused, fill_fusion, fuse_paths, keep, share_by_speed, widening
 from jtqd.estimator.losses cimport (
+    AdditiveLaw,
     AdditiveLossModel,
     Loss,
     LossModel,
@@ -24,6 +27,7 @@ from jtqd.estimator.losses cimport (
 )
 from jtqd.estimator.observer cimport (
     FusedObserved,
+    FusedObserverLaw,
     Observed,
     fill_fused_observer,
     fill_guard,
@@ -33,7 +37,7 @@ from jtqd.estimator.observer cimport (
     restart_guard,
 )
 from jtqd.estimator.perceptron cimport Perceptron, evaluate
-from jtqd.estimator.sample cimport Estimator, Sample, Values, no_values
+from jtqd.estimator.sample cimport Estimator, Learned, Sample, Values, no_values
 from jtqd.estimator.validity cimport (
     Spread,
     fill_fused_trust,
@@ -51,6 +55,7 @@ from jtqd.estimator.zeros cimport (
     gather,
     local_stiffness,
     restart_zeros,
+    tell_zeros,
     update_zeros,
     zeros_of,
 )
@@ -67,6 +72,7 @@ from jtqd.estimator.network import FEATURES, FUSED_FEATURES, checked_fused, chec
 from jtqd.estimator.run import EstimateRun, ObservedRun
 from jtqd.estimator.sample import columns
 from jtqd.estimator.validity import FADE_START
+from jtqd.estimator.learned import APART, LEFT
 from jtqd.estimator.zeros import MOVING_RAD_S, ONE_WAY
 
 STANDSTILL_SIGMAS: Final = 3.0
@@ -82,6 +88,7 @@ cdef double STANDSTILL_WIDTH = STANDSTILL_SIGMAS, FOREIGN = FOREIGN_SIGMAS, LOWE
 cdef double MOVING = MOVING_RAD_S, ONE_SIDED = ONE_WAY
 cdef int STARTING = st.STARTING, VALID = st.VALID, DEGRADED = st.DEGRADED, STANDSTILL = st.STANDSTILL
 cdef int INVALID = st.INVALID
+cdef int IS_LEFT = LEFT, IS_APART = APART
 
 
 cdef fill_network(NetworkLaw *law, network, joint):
@@ -243,7 +250,7 @@ def quadrants(raw_nm, velocity_rad_s):
 
 
 cdef class FusedEstimator(Estimator):
-    """Our estimator of one joint, method `fused`; without a network its physics alone, status valid.
+    """Our estimator of one joint, method `fused`; without a network its physics alone, degraded outside of the file's envelope.
 
         tau_raw, v, tau_t, waves, s, open  <-  FusedObserver    s: direction, -1 to 1; open: of the torsion's slip
         physics = fusion of tau_raw - loss(tau_raw, v, s, T) and tau_t
@@ -274,6 +281,7 @@ cdef class FusedEstimator(Estimator):
         fill_fusion(&self.law.fusion, fused.sigma, fused.torsion is not None)
         self.law.fusion.reference = 0.0  # sigma is that of the torque, not of a comparison with a sensor
         fill_zeros(&self.law.zeros, joint, fused.sigma, fused.torsion, settings.track_zeros)
+        fill_link(&self.law.link, joint, fused.torsion)
         network_scale = fused.sigma.scale if network is None else network.sigma_scale
         for k in range(4):
             self.law.physics_scale[k], self.law.network_scale[k] = fused.sigma.scale[k], network_scale[k]
@@ -284,8 +292,10 @@ cdef class FusedEstimator(Estimator):
         self.law.fade = FADE_START * self.law.network_limit
         self.law.inverse_fade = 1.0 / max(self.law.network_limit - self.law.fade, 1e-12)
         self.run_one = fill_network(&self.law.network, network, joint)
-        if network is not None:
-            fill_fused_trust(&self.law.trust, network.envelope)
+        envelope = fused.envelope if network is None else network.envelope
+        self.law.with_envelope = envelope is not None
+        if envelope is not None:
+            fill_fused_trust(&self.law.trust, envelope)
         self.state.temperature, self.state.thermal = NAN, 0.0
         self.reset()
 
@@ -299,11 +309,46 @@ cdef class FusedEstimator(Estimator):
         restart_guard(&self.state.guard)
         self.state.half = self.state.lowered_s = 0.0
         restart_zeros(&self.law.zeros, &self.state.zeros)
+        restart_link(&self.state.link)
 
     @property
     def zeros(self):
         """What is known of the joint's zeros (`Zeros`); None where they are not tracked."""
         return zeros_of(&self.law.zeros, &self.state.zeros) if self.law.zeros.used else None
+
+    cdef const void *learned(self, Learned *out, size_t *size) noexcept nogil:
+        """As `Estimator.learned`; whether the two views disagree is told in any case."""
+        tell_zeros(&self.law.zeros, &self.state.zeros, out)
+        if self.state.lowered_s > 0.0:
+            out.flags |= IS_APART
+        if self.left_behind():
+            out.flags |= IS_LEFT
+        size[0] = sizeof(FusedState)
+        return &self.state
+
+    @property
+    def past(self):
+        """All that it knows of the samples so far, bytes of layout `learned.PAST_LAYOUT`; `past = other.past` goes on there.
+
+        Raises ValueError for bytes of another length.
+        """
+        return copied(&self.state, sizeof(FusedState))
+
+    @past.setter
+    def past(self, content):
+        put_back(&self.state, sizeof(FusedState), content)
+
+    def shares_past(self, FusedEstimator other):
+        """Return whether the past of `other` means the same here: nothing differs that the zeros were learned with.
+
+        That is the observer with its torsion, the losses, and the torque per ampere. Limits, sigmas and networks may differ.
+        """
+        return (
+            self.law.zeros.used == other.law.zeros.used
+            and self.law.zeros.torque_per_ampere == other.law.zeros.torque_per_ampere
+            and memcmp(&self.law.observer, &other.law.observer, sizeof(FusedObserverLaw)) == 0
+            and memcmp(&self.law.loss, &other.law.loss, sizeof(AdditiveLaw)) == 0
+        )
 
     def blocks(self):
         """Return (parameters, state): one block each, of which `of_blocks` makes an estimator that goes on as this one would.
@@ -329,6 +374,7 @@ cdef class FusedEstimator(Estimator):
     cdef void advance(self, const Sample *x, bint network_wanted, Values *out) noexcept nogil:
         """Set `out` to the estimate at this sample."""
         cdef FusedObserved seen
+        cdef LinkSeen link
         cdef Sample corrected
         if self.law.zeros.used:
             corrected = x[0]
@@ -340,10 +386,21 @@ cdef class FusedEstimator(Estimator):
         )
         no_values(out, self.state.guard.status)
         if self.observed:
+            follow_link(
+                &self.law.link,
+                &self.state.link,
+                &self.law.observer,
+                &self.state.observer,
+                seen.torsion_nm + seen.ahead_nm,
+                x.dt_s,
+                &link,
+            )
+            out.torque_rate_nm_s, out.load_nm = link.rate_nm_s, link.load_nm
             self.estimate(&seen, x, network_wanted, out)
         else:
             self.state.half = 0.0
             drop_block(&self.state.zeros)
+            restart_link(&self.state.link)
 
     cdef void learn_zeros(
         self, const FusedObserved *seen, const Sample *x, const Fused *physics, double loss, int status
@@ -370,17 +427,19 @@ cdef class FusedEstimator(Estimator):
             s.lowered_s -= dt
         if s.lowered_s > 0.0:
             return True
-        return self.law.zeros.used and (
-            s.zeros.left_nm * s.zeros.left_nm > FOREIGN * FOREIGN * self.law.fusion.torsion
-            or beyond(&self.law.zeros, &s.zeros)
-        )
+        return self.left_behind() or (self.law.zeros.used and beyond(&self.law.zeros, &s.zeros))
+
+    cdef bint left_behind(self) noexcept nogil:
+        """Return whether more of a known zero is not yet taken off than the torsion's own sigma can hide."""
+        cdef double left = self.state.zeros.left_nm
+        return self.law.zeros.used and left * left > FOREIGN * FOREIGN * self.law.fusion.torsion
 
     cdef void estimate(self, const FusedObserved *seen, const Sample *x, bint network_wanted, Values *out) noexcept nogil:
         """Set `out`, whose status is the guard's, to the estimate of an observed sample."""
         cdef const FusedLaw *law = &self.law
         cdef FusedState *s = &self.state
         cdef double raw = seen.raw_nm, v = seen.joint_velocity_rad_s
-        cdef double scale, weight = 0.0, correction, size
+        cdef double scale, weight = 0.0, correction, size, apart
         cdef int quadrant = quadrant_of(raw, v)
         cdef Loss loss
         cdef Fused physics
@@ -412,6 +471,11 @@ cdef class FusedEstimator(Estimator):
                     out.torque_nm += weight * share_by_speed(v) * correction
                     scale += weight * (law.network_scale[quadrant] - scale)
             if weight < 1.0:
+                lowered = True
+        elif law.with_envelope:
+            # at half the weight ends the cell that the fit has visited; at rest the current path says little of the torque
+            apart = 0.0 if out.status == STANDSTILL else self.features[2]
+            if fused_trust(&law.trust, v, raw, apart, x.temperature_c) < 0.5:
                 lowered = True
         out.sigma_nm = scale * physics.sigma
         wider = widening(&physics, s.zeros.left_nm)
@@ -539,6 +603,15 @@ cdef class ExtendedEstimator(Estimator):
     def with_network(self):
         """Whether a network is used."""
         return self.inner.with_network
+
+    @property
+    def zeros(self):
+        """As `FusedEstimator.zeros`; None with the paper's methods."""
+        return getattr(self.inner, "zeros", None)
+
+    cdef const void *learned(self, Learned *out, size_t *size) noexcept nogil:
+        """As that of the inner estimator: the corrections forget within a second, and are not told."""
+        return self.inner.learned(out, size)
 
     def reset(self):
         """Forget the past: the next step starts."""

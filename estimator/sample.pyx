@@ -1,6 +1,7 @@
 """One sample of a joint, what an estimator makes of it, and the class that all estimators share."""
 
 from libc.math cimport NAN
+from libc.string cimport memset
 
 import numpy as np
 
@@ -14,6 +15,7 @@ cdef int INVALID = st.INVALID
 cdef void no_values(Values *out, int status) noexcept nogil:
     """Set `out` to a status without any number."""
     out.torque_nm = out.sigma_nm = out.tob_nm = out.physics_nm = out.network_nm = NAN
+    out.torque_rate_nm_s = out.load_nm = NAN
     out.status = status
 
 
@@ -34,6 +36,15 @@ cdef class Estimator:
             return self.run_one(*[self.features[n] for n in range(self.width)])
         except Exception:
             return NAN
+
+    cdef const void *learned(self, Learned *out, size_t *size) noexcept nogil:
+        """Set `out` to what is known of the zeros; return the estimator's whole state and its `size`.
+
+        An estimator that learns nothing: no flag is set, and NULL is returned.
+        """
+        memset(out, 0, sizeof(Learned))
+        size[0] = 0
+        return NULL
 
     @property
     def with_network(self):

@@ -83,6 +83,7 @@ def bus_load_of(config: Config) -> BusLoad:
         {config.sensor.node_id: config.sensor.channels} if config.sensor else {},
         sync_counter=config.counter_overflow > 0,
         temperatures=[joint.node_id for joint in config.joints if joint.temperature],
+        contacts=config.contact is not None and config.contact.pdo,
         heartbeat_ms=config.heartbeat_ms,
         master=config.node_id,
         bitrate=config.bitrate,

@@ -38,6 +38,7 @@ from jtqd.daemon.cli.reading import (
 )
 from jtqd.daemon.cli.recent import Moment, Recent, page, sparkline
 from jtqd.daemon.shared.conditions import SEVERITIES, Condition
+from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
 from jtqd.daemon.shared.notices import ERROR, WARNING, Notice
 from jtqd.daemon.shared.reasons import drive_state, joint_reason, silent_s
 from jtqd.daemon.shared.runtime_dir import About
@@ -141,6 +142,10 @@ def _joint(reading: Reading, number: int) -> dict[str, Any]:
         "error_nm": finite(seen.torque_nm - seen.reference_nm if known else nan),
         "rmse_nm": finite(view.rmse_nm[n]),
         "age_ms": finite(seen.age_ms),
+        "zeros": view.zeros[n].content(),
+        "contact": bool(seen.input_flags & FLAG_CONTACT) if seen.input_flags & FLAG_CONTACT_KNOWN else None,
+        "contact_nm": finite(seen.contact_nm),
+        "torque_rate_nm_s": finite(seen.torque_rate_nm_s),
         "current_a": finite(measured.current_a),
         "motor_velocity_rad_s": finite(measured.motor_velocity_rad_s),
         "temperature_c": finite(measured.temperature_c),
@@ -231,6 +236,11 @@ class StatusView:
         yield _joints(about, view, still=still)
         if not still:
             yield from _reasons(about, view, reading.earlier)
+            for joint, zeros in zip(about.joints, view.zeros, strict=False):
+                if zeros.tracked:
+                    yield _line(
+                        f"zeros {joint.number}", Text(zeros.text, style="" if zeros.plausible else "yellow")
+                    )
             if self._recent is not None:
                 yield from _last_seconds(self._recent, len(about.joints), width)
         yield ""

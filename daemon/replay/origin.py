@@ -24,6 +24,7 @@ from jtqd.daemon.loop.input_pdos import JointInputs
 from jtqd.daemon.loop.process import joint_inputs
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.cycle_record import MOST_JOINTS
+from jtqd.daemon.shared.snapshot import PAST_WORDS
 from jtqd.estimator.checked import ConfigError
 from jtqd.models.files import load_yaml
 
@@ -32,12 +33,12 @@ from jtqd.models.files import load_yaml
 SAMPLE = np.dtype(
     [
         (name, "<f8" if code == "d" else "<u2")
-        for name, code in zip(cr.JointRecord._fields, 14 * "d" + 4 * "H", strict=True)
+        for name, code in zip(cr.JointRecord._fields, 16 * "d" + 4 * "H", strict=True)
     ]
 )
 """What the loop records of a joint: the fields of `cycle_record.JointRecord`."""
 
-ADDED = ("reference_nm", "age_ms")
+ADDED = ("reference_nm", "age_ms", "torque_rate_nm_s", "contact_nm")
 """Fields that logs of before do not have; a replay makes them anew."""
 
 STAMP = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])
@@ -59,6 +60,13 @@ FRAMES: dict[str, np.dtype[Any]] = {
     "frames.data": np.dtype(("u1", 8)),
 }
 """Of /can/frames: path -> type of each element."""
+PAST: dict[str, np.dtype[Any]] = {
+    "cycle": np.dtype("<u8"),
+    "past_layout": np.dtype("<u2"),
+    "past_bytes": np.dtype("<u2"),
+    "past": np.dtype(("<u8", PAST_WORDS)),
+}
+"""Of /joint/N/zeros: path -> type of each element."""
 
 
 def check_fields(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -21,11 +22,23 @@ from jtqd.drivers.pdo import PdoMap
 from jtqd.drivers.sdo import Key, label
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Joint
+from jtqd.sysid.campaign.alone import allowed_torque
 from jtqd.sysid.campaign.processes import on_time
-from jtqd.sysid.motion.setpoints import Limits, MotionResult, Setpoints, Timing
+from jtqd.sysid.excitation.model import current_at
+from jtqd.sysid.motion.setpoints import (
+    MOST_JOINTS,
+    Limits,
+    MotionResult,
+    OutOfPlaceError,
+    Setpoints,
+    Surroundings,
+    Timing,
+    approach,
+)
 from jtqd.sysid.motion.shell import Progress, play
 
 PERIOD_US: Final = 1000
+LONGEST_PERIOD_US: Final = 10_000
 _SETPOINT_RPDO: Final = 0x200  # or 300h+n: either way four bytes
 _RPDO_BYTES: Final = 4
 """RPDO1: 6040h and 6071h; RPDO2: 60FFh."""
@@ -36,17 +49,21 @@ class BenchConfig:
     """The part of jtqd's configuration that concerns the bench.
 
     Attributes:
-        path: the file. drives: of joint 1 and 2. joints: their joint files. tpdos: by node-ID, as they are wanted.
-        sensor: None without one. master: jtqd's own node-ID.
+        path: the file. drives: of joints 1, 2, ... joints: their joint files. channels: of the sensor, for each joint; None:
+            it has none. temperatures: jtqd takes that of the joint. sensor: None without one. master: jtqd's own node-ID.
+        period_us: of SYNC, whole milliseconds. tpdos: by node-ID, as they are wanted.
     """
 
     path: Path
-    drives: tuple[DriveProfile, DriveProfile]
-    joints: tuple[Joint, Joint]
+    drives: tuple[DriveProfile, ...]
+    joints: tuple[Joint, ...]
+    channels: tuple[int | None, ...]
+    temperatures: tuple[bool, ...]
     sensor: SensorProfile | None
     master: int
     heartbeat_ms: int
     bitrate: int
+    period_us: int
     tpdos: Mapping[int, tuple[PdoMap, ...]]
 
     @classmethod
@@ -54,27 +71,30 @@ class BenchConfig:
         """Read a configuration of jtqd (None: the one that ships).
 
         Raises:
-            ConfigError: naming file, key, found and expected; also for a period of SYNC other than 1 ms, and for drives
-                that tell what they are commanded by otherwise than CiA 402.
+            ConfigError: naming file, key, found and expected; also for a period of SYNC that is no whole milliseconds up to
+                10, for joints whose numbers have a gap, and for drives that tell what they are commanded by otherwise than
+                CiA 402.
         """
         config = load_config(path)
-        numbers = [joint.number for joint in config.joints]
-        if numbers != [1, 2]:
+        joints = config.joints
+        if [joint.number for joint in joints] != list(range(1, len(joints) + 1)):
             raise ConfigError(
-                f"{config.path}: found {', '.join(f'joint_{n}' for n in numbers)}, expected joint_1 and joint_2: a campaign "
-                "moves two joints that are coupled, and no others may be on the bus; logs of other motions are read by jtq "
-                "diagnose"
+                f"{config.path}: found {', '.join(f'joint_{joint.number}' for joint in joints)}, expected joint_1 to "
+                f"joint_{MOST_JOINTS} without a gap"
             )
-        if config.period_ns != PERIOD_US * 1000:
+        period_us, rest_ns = divmod(config.period_ns, 1000)
+        if rest_ns or period_us % PERIOD_US or period_us > LONGEST_PERIOD_US:
             raise ConfigError(
-                f"{config.path}: key 'sync.period_us': found {config.period_ns // 1000}, expected {PERIOD_US} for a campaign"
+                f"{config.path}: key 'sync.period_us': found {period_us}, expected whole milliseconds up to "
+                f"{LONGEST_PERIOD_US // PERIOD_US} for a campaign: set-points are that far apart"
             )
-        one, two = config.joints
         sensor = config.sensor
         return cls(
             path=config.path,
-            drives=(_drive(config.path, one), _drive(config.path, two)),
-            joints=(one.joint, two.joint),
+            drives=tuple(_drive(config.path, joint) for joint in joints),
+            joints=tuple(joint.joint for joint in joints),
+            channels=tuple(joint.sensor_channel for joint in joints),
+            temperatures=tuple(joint.temperature for joint in joints),
             sensor=None
             if sensor is None
             else SensorProfile(
@@ -87,13 +107,63 @@ class BenchConfig:
             master=config.node_id,
             heartbeat_ms=config.heartbeat_ms,
             bitrate=config.bitrate,
-            tpdos={joint.node_id: joint.tpdos for joint in config.joints},
+            period_us=period_us,
+            tpdos={joint.node_id: joint.tpdos for joint in joints},
         )
 
     @property
-    def nodes(self) -> tuple[int, int]:
-        """Node-IDs of drive 1 and 2."""
-        return self.drives[0].node_id, self.drives[1].node_id
+    def nodes(self) -> tuple[int, ...]:
+        """Node-IDs of the drives."""
+        return tuple(drive.node_id for drive in self.drives)
+
+    @property
+    def period_s(self) -> float:
+        """Period of SYNC."""
+        return 1e-6 * self.period_us
+
+    def measured(self, number: int) -> bool:
+        """Return whether a channel of the torque sensor belongs to the joint."""
+        return self.sensor is not None and self.channels[number - 1] is not None
+
+    def check_temperature(self, limit_c: float) -> None:
+        """Refuse a limit of the temperature where jtqd leaves that of a joint off.
+
+        A drive on which the commander switched TPDO3 on would count as changed, and lose its inputs.
+
+        Raises:
+            ConfigError: naming file, joint and what to do.
+        """
+        if not math.isfinite(limit_c) or all(self.temperatures):
+            return
+        number = 1 + self.temperatures.index(False)
+        raise ConfigError(
+            f"{self.path}: joint_{number}: found no 'temperature: true', expected it for the limit of {limit_c:g} degC "
+            "(--limit temperature_c=none: not supervised)"
+        )
+
+    def timing(self, timing: Timing) -> Timing:
+        """Return times of the supervision at this period of SYNC: a set-point leaves at the same part of the cycle."""
+        return replace(
+            timing,
+            period_s=self.period_s,
+            setpoint_delay_s=timing.setpoint_delay_s / timing.period_s * self.period_s,
+        )
+
+    def around(self, run: Setpoints) -> Surroundings:
+        """Return what is beside the joints of a run: those that are held may need what they need to carry their rating."""
+        held = {
+            number: current_at(joint, allowed_torque(joint), 0.0)
+            for number, joint in enumerate(self.joints, 1)
+            if number not in run.joints
+        }
+        own: dict[int, tuple[int, ...]] = {}
+        for number in run.joints:
+            channel = self.channels[number - 1]
+            if channel is not None:
+                own[channel] = (*own.get(channel, ()), number)
+        # where there are no others, every channel of the sensor is theirs, named in the configuration or not
+        everything = len(run.joints) == 2 == len(self.joints)
+        return Surroundings(held, None if everything else own)
 
     @property
     def estimate_cob_id(self) -> int:
@@ -103,15 +173,17 @@ class BenchConfig:
     def load_with_commander(self) -> BusLoad:
         """Load of the bus during a campaign: jtqd's configuration, and what the commander and its drives add.
 
-        Set-points go to the two drives in turn, so that a cycle holds one RPDO.
+        Set-points go to the drives in turn, so that a cycle holds one RPDO.
 
         Raises:
             ConfigError: above 95 % in the worst case, or two users of one COB-ID.
         """
         extra = [heartbeat_row("commander", COMMANDER_NODE, round(Timing().own_heartbeat_s * 1e3))]
-        # either drive may be the velocity joint: both RPDOs have four bytes, so one row stands for both
+        # any drive may be the velocity joint: both RPDOs have four bytes, so one row stands for both
+        share = 1.0 / len(self.nodes)
         extra += [
-            Row(_SETPOINT_RPDO + node, f"set-points of drive {node}", _RPDO_BYTES, 0.5) for node in self.nodes
+            Row(_SETPOINT_RPDO + node, f"set-points of drive {node}", _RPDO_BYTES, share)
+            for node in self.nodes
         ]
         try:
             return check_bus_load(
@@ -123,7 +195,7 @@ class BenchConfig:
                     master=self.master,
                     extra=extra,
                     bitrate=self.bitrate,
-                    period_s=1e-6 * PERIOD_US,
+                    period_s=self.period_s,
                 )
             )
         except BusLoadError as error:
@@ -190,19 +262,36 @@ class Bench:
     config: BenchConfig
     timing: Timing | None = None
 
-    def play(self, limits: Limits, on_progress: Progress) -> Play:
-        """Return the commander on this bench."""
+    def play(self, limits_of: Callable[[Setpoints], Limits], on_progress: Progress) -> Play:
+        """Return the commander on this bench; limits_of: what holds in a run."""
+        timing = self.config.timing(self.timing or Timing())
 
-        def motion(setpoints: Setpoints) -> MotionResult:
+        def played(setpoints: Setpoints) -> MotionResult:
             with on_time():
                 return play(
                     self.bus,
                     setpoints,
-                    limits,
+                    limits_of(setpoints),
                     on_progress=on_progress,
                     drives=self.config.drives,
                     sensor=self.config.sensor,
-                    timing=self.timing,
+                    timing=timing,
+                    around=self.config.around(setpoints),
                 )
+
+        def motion(setpoints: Setpoints) -> MotionResult:
+            """Play; a joint that is moved alone and stands elsewhere is brought to the middle of its travel first."""
+            try:
+                return played(setpoints)
+            except OutOfPlaceError as away:
+                low, high = limits_of(setpoints).position_rad
+                middle = 0.5 * (low + high)
+                there = approach(setpoints.velocity_joint, away.position_rad, middle, limits_of(setpoints))
+                result = played(there)
+                if result.status == "stopped":
+                    return result._replace(
+                        reason=f"on the way to {middle:g} rad: {result.reason}", played_s=0.0
+                    )
+                return played(setpoints)
 
         return motion

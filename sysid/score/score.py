@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -97,7 +97,7 @@ def errors_on(name: str, table: RunTable, number: int, joint: Joint) -> RunError
             method == "fused" and (joint.fused is None or needs_torsion(table, number, joint))
         ):
             continue
-        settings = recommended(method)
+        settings = replace(recommended(method), track_zeros=False)  # it is the joint file that is scored
         estimate = estimate_columns(joint, settings, None, table.time_s, columns).torque_nm
         sensor = aligned(columns.torque_nm, dt, joint, settings)
         errors[title] = _rms((estimate - sensor)[settled])

@@ -80,7 +80,7 @@ def three_tpdos(node: int) -> DriveProfile:
 def test_drives_with_other_objects_and_layouts_are_moved_as_planned(
     made: Callable[[int], DriveProfile],
 ) -> None:
-    lock = LockStep(drives=(made(1), made(2)))
+    lock = LockStep(profiles=(made(1), made(2)))
     motion = lock.commander(plateau(1.2, 2.5))
     seen = []
     lock.play_until(400)
@@ -97,7 +97,7 @@ def test_drives_with_other_objects_and_layouts_are_moved_as_planned(
     lock.run()
     assert motion.result.status == "done"
     last = motion.inputs.drives[0].units.tpdos[-1]
-    again = LockStep(drives=(made(1), made(2)))
+    again = LockStep(profiles=(made(1), made(2)))
     motion = again.commander(plateau(1.2, 2.5))
     again.play_until(400)
     again.filter = lambda frames: [frame for frame in frames if frame[0] != last.cob_id]
@@ -109,7 +109,7 @@ def test_drives_with_other_objects_and_layouts_are_moved_as_planned(
 def test_a_drive_that_sends_by_itself_is_not_moved() -> None:
     by_itself = pdo_of_words(1, 2, 0x281, (0x606C0020, 0x60780010, 0x60410010), 255, CIA_402)
     layout = (pdo_of_words(1, 1, 0x181, (0x60640020, 0x60E40120), 1, CIA_402), by_itself)
-    lock = LockStep(drives=(DriveProfile(1, layout=layout, by_itself=True), DriveProfile(2)))
+    lock = LockStep(profiles=(DriveProfile(1, layout=layout, by_itself=True), DriveProfile(2)))
     with pytest.raises(BootError, match=r"node 1: 1801h:2 transmission type .*: expected 1, found 255"):
         lock.commander(plateau(1.0, 2.0))
 
