@@ -135,7 +135,7 @@ def bench_config(folder: Path, **changes: object) -> Path:
         ({"sync": {"period_us": 1500}}, ["sync.period_us", "1500", "whole milliseconds"]),
         ({"sensor": {"node": 2, "channels": 1}}, ["bench.yaml", "sensor.node", "not used by joint_2.node"]),
         ({"joint_1": {"node": 1, "file": "none.yaml"}}, ["none.yaml"]),
-        ({"joint_4": {"node": 5, "file": "none.yaml"}}, ["joint_4"]),
+        ({"joint_4": {"node": 5, "file": "none.yaml"}}, ["joint_3", "without a gap"]),
     ],
 )
 def test_a_bench_that_cannot_carry_it_is_refused(

@@ -89,9 +89,9 @@ def test_drives_with_other_objects_and_layouts_are_moved_as_planned(
         seen.append(motion.inputs.sample())
         assert lock.velocities[0] == pytest.approx(1.2, abs=0.06)
         assert lock.source.plant.drives[1].current_a == pytest.approx(2.5, abs=0.005)
-    assert np.mean([each.one.velocity_rad_s for each in seen]) == pytest.approx(1.2, abs=0.01)
-    assert np.mean([each.two.current_a for each in seen]) == pytest.approx(2.5, abs=0.03)
-    assert seen[-1].one.travel_rad - seen[0].one.travel_rad == pytest.approx(
+    assert np.mean([each.joints[0].velocity_rad_s for each in seen]) == pytest.approx(1.2, abs=0.01)
+    assert np.mean([each.joints[1].current_a for each in seen]) == pytest.approx(2.5, abs=0.03)
+    assert seen[-1].joints[0].travel_rad - seen[0].joints[0].travel_rad == pytest.approx(
         1.2 * 1e-3 * (len(seen) - 1), rel=0.05
     )
     lock.run()
