@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from tests.slow.faults import acts
+from tests.slow.faults import acts, proofs
 from tests.slow.faults.case import STALE, STARTING, Case, codes
 from tests.slow.faults.injections import Added
 
@@ -30,6 +30,8 @@ _OTHERWISE: Mapping[str, Mapping[str, Any]] = {
         "may": codes("8250"),
         "recover_ms": _AFTER_A_RESET_MS,
     },
+    # their boot takes longer, and there are no PDOs while it lasts
+    "26": {"proof": proofs.all_of(proofs.frames(1, 0x701, b"\0"), proofs.doubled(1200, 0x181))},
     "28": {"fault": lambda: Added(first=acts.reconfigure_by_the_rules)},
 }
 """Case -> fields that are otherwise with them."""
