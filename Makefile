@@ -94,9 +94,9 @@ deb: $(VENV)/.installed ## Debian package into dist/: jtqd in /opt/jtqd, units, 
 clean: ## remove what make made here; the cached bench kernel stays
 	rm -rf $(VENV) build dist src/*.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
-	find daemon drivers estimator models sim_can sysid -name '*.so' -delete
+	find src daemon drivers estimator models sim_can sysid -name '*.so' -delete
 
-# Three stages of one environment; each stamp is renewed when pyproject.toml changes.
+# Stages of one environment; each stamp is renewed when pyproject.toml changes.
 $(VENV)/.created:
 	@.ci/venv $(VENV)
 	@touch $@
@@ -104,22 +104,25 @@ $(VENV)/.created:
 # Every compiled module and what it is made of: a change installs, and so compiles, again.
 COMPILED := $(shell find daemon drivers estimator models sim_can sysid -name '*.pyx' -o -name '*.pxd')
 
-$(VENV)/.installed: pyproject.toml setup.py $(COMPILED) $(VENV)/.created
-	@echo "installing jtqd into $(VENV)"
-	@$(PIP) install -e .
+# Each has what those above it have, and says so by their stamps.
+SOURCES := pyproject.toml setup.py $(COMPILED) $(VENV)/.created
+
+$(VENV)/.installed: $(SOURCES)
+	@echo "compiling jtqd, installing it into $(VENV)"
+	@.ci/install $(VENV)
 	@touch $@
 
-$(VENV)/.installed-analysis: pyproject.toml $(VENV)/.installed
-	@echo "installing scipy and matplotlib"
-	@$(BIN)/python .ci/extras analysis > $(VENV)/analysis.txt && $(PIP) install -r $(VENV)/analysis.txt
-	@touch $@
+$(VENV)/.installed-analysis: $(SOURCES)
+	@echo "compiling jtqd, installing it into $(VENV) with scipy and matplotlib"
+	@.ci/install $(VENV) analysis
+	@touch $(VENV)/.installed $@
 
-$(VENV)/.installed-dev: pyproject.toml $(VENV)/.installed
-	@echo "installing the development tools"
-	@$(BIN)/python .ci/extras dev > $(VENV)/dev.txt && $(PIP) install -r $(VENV)/dev.txt
-	@touch $@
+$(VENV)/.installed-dev: $(SOURCES)
+	@echo "compiling jtqd, installing it into $(VENV) with the development tools"
+	@.ci/install $(VENV) analysis dev
+	@touch $(VENV)/.installed $(VENV)/.installed-analysis $@
 
-$(VENV)/.installed-test: pyproject.toml $(VENV)/.installed-dev
-	@echo "installing torch for training"
-	@$(BIN)/python .ci/extras train > $(VENV)/train.txt && $(PIP) install -r $(VENV)/train.txt
-	@touch $@
+$(VENV)/.installed-test: $(SOURCES)
+	@echo "compiling jtqd, installing it into $(VENV) with the development tools and torch for training"
+	@.ci/install $(VENV) analysis dev train
+	@touch $(VENV)/.installed $(VENV)/.installed-analysis $(VENV)/.installed-dev $@

@@ -14,6 +14,8 @@ from setuptools.command.build_ext import build_ext
 from setuptools.errors import CompileError, LinkError
 
 SOURCES = Path("src") / "jtqd"
+SHARED = "jtqd._cython"
+"""Cython's own code for memory views, once for all modules: alone it is more than the C of most of them."""
 BUILD = os.environ.get("JTQD_BUILD", "release")
 
 # -ffp-contract=off: no fused multiply-add, so that every machine computes the same bits
@@ -60,17 +62,23 @@ def _needs(what: str) -> str:
 
 
 def extensions() -> list[Extension]:
-    """One extension module per .pyx, by its place in the packages."""
+    """The module that all share, and one extension module per .pyx, by its place in the packages."""
     flags = FLAGS[BUILD]
+    linked = [flag for flag in flags if flag.startswith("-fsanitize")]
+    shared = Path("src", *SHARED.split(".")).with_suffix(".c")  # written by Cython into the build directory
+    sources = [shared] + [
+        source
+        for package in sorted(each for each in SOURCES.iterdir() if each.is_dir())
+        for source in sorted(package.rglob("*.pyx"))
+    ]
     return [
         Extension(
             ".".join(source.relative_to("src").with_suffix("").parts),
             [str(source)],
             extra_compile_args=flags,
-            extra_link_args=[flag for flag in flags if flag.startswith("-fsanitize")],
+            extra_link_args=linked,
         )
-        for package in sorted(each for each in SOURCES.iterdir() if each.is_dir())
-        for source in sorted(package.rglob("*.pyx"))
+        for source in sources
     ]
 
 
@@ -80,6 +88,7 @@ if __name__ == "__main__":
             extensions(),
             nthreads=os.cpu_count() or 0,
             include_path=["src"],
+            shared_utility_qualified_name=SHARED,
             build_dir=str(Path("build") / "cython" / BUILD),
             compiler_directives={
                 "language_level": 3,

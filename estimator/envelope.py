@@ -1,11 +1,12 @@
-"""Envelope of a fused network: what its training data covered, as its file says."""
+"""Envelope: what the data covered that a fused network was trained on, or a joint's section `fused` was fitted to."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Final
 
-from jtqd.estimator.onnx_graph import finite
+from jtqd.estimator.checked import Section
 
 MAX_CELLS: Final = 127
 """Cells of the map in each direction."""
@@ -17,7 +18,7 @@ _MOST: Final = 1e6
 
 @dataclass(frozen=True, slots=True)
 class Envelope:
-    """What the training data of a fused network covered.
+    """What the training data of a fused network, or the runs of a fit, covered.
 
     velocity_step_rad_s, torque_step_nm: distance of cell centres; known: [2 nv + 1][2 nt + 1] of 0 and 1 over velocity
     and motor torque, its middle cell at zero; distance_nm: largest |torsion - current path|; temperature_c: lowest
@@ -47,6 +48,44 @@ class Envelope:
             _checked_range(mapping["temperature_c"]),
         )
 
+    @classmethod
+    def from_section(cls, section: Section) -> Envelope:
+        """Read `fused.envelope` of a joint file, in which a row of `known` is a text such as "0110". Raises ConfigError."""
+        rows = section.raw("known", expected=_ROWS)
+        if not (
+            isinstance(rows, list)
+            and rows
+            and all(isinstance(row, str) and row.strip("01") == "" for row in rows)
+        ):
+            raise section.error("known", rows, _ROWS)
+        steps = {
+            key: section.number(key, unit, _LEAST, _MOST)
+            for key, unit in (
+                ("velocity_step_rad_s", "rad/s"),
+                ("torque_step_nm", "Nm"),
+                ("distance_nm", "Nm"),
+            )
+        }
+        temperature = section.raw("temperature_c", None)
+        section.finish()
+        try:
+            known = _checked_map([[int(cell) for cell in row] for row in rows])
+        except ValueError:
+            raise section.error("known", rows, _ROWS) from None
+        if max(len(known), len(known[0])) > MAX_CELLS:
+            found = f"{len(known)} rows of {len(known[0])} cells"
+            raise section.error("known", found, f"at most {MAX_CELLS} of either")
+        try:
+            return cls(known=known, temperature_c=_checked_range(temperature), **steps)
+        except ValueError:
+            raise section.error("temperature_c", temperature, "[lowest, highest] in degC, or none") from None
+
+    def as_section(self) -> dict[str, Any]:
+        """Return what `from_section` reads."""
+        rows = ["".join(map(str, row)) for row in self.known]
+        values = self.to_mapping() | {"known": rows}
+        return {key: value for key, value in values.items() if value is not None}
+
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for JSON."""
         return {
@@ -56,6 +95,14 @@ class Envelope:
             "distance_nm": self.distance_nm,
             "temperature_c": None if self.temperature_c is None else list(self.temperature_c),
         }
+
+
+_ROWS: Final = 'odd numbers of rows and of cells in each, rows as texts such as "0110"'
+
+
+def finite(value: object) -> bool:
+    """Return whether a value from JSON is a finite number; a bool is none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _checked_map(known: Any) -> tuple[tuple[int, ...], ...]:

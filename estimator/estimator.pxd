@@ -46,6 +46,7 @@ cdef struct FusedLaw:
     AdditiveLaw loss
     FusionLaw fusion
     FusedTrustLaw trust
+    bint with_envelope  # trust is set, of the network or of the joint file
     NetworkLaw network
     ZerosLaw zeros
     double physics_scale[4]

@@ -249,7 +249,7 @@ def quadrants(raw_nm, velocity_rad_s):
 
 
 cdef class FusedEstimator(Estimator):
-    """Our estimator of one joint, method `fused`; without a network its physics alone, status valid.
+    """Our estimator of one joint, method `fused`; without a network its physics alone, degraded outside of the file's envelope.
 
         tau_raw, v, tau_t, waves, s, open  <-  FusedObserver    s: direction, -1 to 1; open: of the torsion's slip
         physics = fusion of tau_raw - loss(tau_raw, v, s, T) and tau_t
@@ -290,8 +290,10 @@ cdef class FusedEstimator(Estimator):
         self.law.fade = FADE_START * self.law.network_limit
         self.law.inverse_fade = 1.0 / max(self.law.network_limit - self.law.fade, 1e-12)
         self.run_one = fill_network(&self.law.network, network, joint)
-        if network is not None:
-            fill_fused_trust(&self.law.trust, network.envelope)
+        envelope = fused.envelope if network is None else network.envelope
+        self.law.with_envelope = envelope is not None
+        if envelope is not None:
+            fill_fused_trust(&self.law.trust, envelope)
         self.state.temperature, self.state.thermal = NAN, 0.0
         self.reset()
 
@@ -422,7 +424,7 @@ cdef class FusedEstimator(Estimator):
         cdef const FusedLaw *law = &self.law
         cdef FusedState *s = &self.state
         cdef double raw = seen.raw_nm, v = seen.joint_velocity_rad_s
-        cdef double scale, weight = 0.0, correction, size
+        cdef double scale, weight = 0.0, correction, size, apart
         cdef int quadrant = quadrant_of(raw, v)
         cdef Loss loss
         cdef Fused physics
@@ -454,6 +456,11 @@ cdef class FusedEstimator(Estimator):
                     out.torque_nm += weight * share_by_speed(v) * correction
                     scale += weight * (law.network_scale[quadrant] - scale)
             if weight < 1.0:
+                lowered = True
+        elif law.with_envelope:
+            # at half the weight ends the cell that the fit has visited; at rest the current path says little of the torque
+            apart = 0.0 if out.status == STANDSTILL else self.features[2]
+            if fused_trust(&law.trust, v, raw, apart, x.temperature_c) < 0.5:
                 lowered = True
         out.sigma_nm = scale * physics.sigma
         wider = widening(&physics, s.zeros.left_nm)

@@ -16,6 +16,7 @@ from typing import Annotated, Any, Final
 from jtqd.estimator.checked import Section, Verbatim
 from jtqd.estimator.decoder import FieldError, Text, check, choice, decode, limits, numbers_text
 from jtqd.estimator.effects.library import EFFECTS, checked_parameters, read_parameters
+from jtqd.estimator.envelope import Envelope
 
 CONVENTIONS: Final = ("joint_over_motor", "motor_over_joint")
 """eta = tau_j/(G Kt i), as in the paper's Table I; or eta = G Kt i/tau_j, its Eq. (6)."""
@@ -211,11 +212,15 @@ class FusedSigma:
 
 @dataclass(frozen=True, slots=True)
 class Fused:
-    """Section `fused` of a joint file; torsion None: a joint whose link encoder says nothing about torque."""
+    """Section `fused` of a joint file; torsion None: a joint whose link encoder says nothing about torque.
+
+    envelope: what the runs of the fit covered; outside of it the status is degraded. None: nothing is known of that.
+    """
 
     loss: AdditiveLoss
     torsion: Torsion | None
     sigma: FusedSigma
+    envelope: Envelope | None = None
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain dicts and lists, as `Joint.to_mapping`."""
@@ -329,6 +334,8 @@ class Joint:
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, Envelope):
+        return value.as_section()
     if is_dataclass(value):
         items = ((each.name, getattr(value, each.name)) for each in fields(value))
         # what a torsion may leave out is not written

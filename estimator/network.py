@@ -14,9 +14,9 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
-from jtqd.estimator.envelope import Envelope
+from jtqd.estimator.envelope import Envelope, finite
 from jtqd.estimator.joint import Fused, Joint
-from jtqd.estimator.onnx_graph import NetworkError, OnnxGraph, RefereedGraph, Verdict, finite
+from jtqd.estimator.onnx_graph import NetworkError, OnnxGraph, RefereedGraph, Verdict
 from jtqd.estimator.perceptron import Perceptron
 from jtqd.estimator.settings import EstimatorSettings
 

@@ -27,6 +27,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.envelope import finite
 from jtqd.estimator.onnx_weights import read_perceptron
 from jtqd.estimator.sha256 import sha256_hex
 
@@ -326,8 +327,3 @@ class OnnxGraph(GraphFile):
             raise self.error(f"does not run: {str(error).strip().splitlines()[0][:160]}") from None
         if not math.isfinite(values[-1]):
             raise self.error(f"found {values[-1]} at the centre of its envelope, expected a finite torque")
-
-
-def finite(value: object) -> bool:
-    """Return whether a value from JSON is a finite number; a bool is none."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -273,7 +273,7 @@ def draw_residuals(results: Sequence[Diagnosed], path: Path) -> None:
     if rows:
         for axis in axes[-1]:
             axis.set_xlabel("time [s]")
-    _save(figure, path, axes[0][0])
+    _save(figure, path)
 
 
 def draw_loads(results: Sequence[Diagnosed], path: Path) -> None:
@@ -306,20 +306,23 @@ def draw_loads(results: Sequence[Diagnosed], path: Path) -> None:
         axis.set_xlabel("load along the motion [Nm]")
     for line in axes:
         line[0].set_ylabel("loss missed [Nm]")
-    _save(figure, path, axes[0][0])
+    _save(figure, path)
 
 
 def _traces(one: Diagnosed) -> list[Any]:
     return [trace for trace in one.findings.traces if trace.balance == "motor" and trace.joint == one.number]
 
 
-def _save(figure: Any, path: Path, named: Any) -> None:
-    """Write a figure with the legend of the panel `named` above all panels: none of them has room for it."""
+def _save(figure: Any, path: Path) -> None:
+    """Write a figure with one legend above all panels: none of them has room for it, and not every line is in each."""
     figure.tight_layout()
-    handles, labels = named.get_legend_handles_labels()
-    if handles:
-        place = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": len(labels)}
-        figure.legend(handles, labels, **place, fontsize=8, frameon=False, markerscale=3.0)
+    named: dict[str, Any] = {}
+    for axis in figure.axes:
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
+            named.setdefault(label, handle)
+    if named:
+        place = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": len(named)}
+        figure.legend(named.values(), named.keys(), **place, fontsize=8, frameon=False, markerscale=3.0)
     figure.savefig(path, dpi=110, bbox_inches="tight", metadata={"Software": None})
     plt.close(figure)
 

@@ -53,7 +53,7 @@ def expected() -> set[str]:
         if path.is_file() and "__pycache__" not in path.parts and path.suffix != ".so"
     }
     compiled = {name.removesuffix(".pyx") + EXT_SUFFIX for name in files if name.endswith(".pyx")}
-    return files | compiled | {"jtqd/__init__.py", "jtqd/py.typed"}
+    return files | compiled | {"jtqd/__init__.py", "jtqd/py.typed", f"jtqd/_cython{EXT_SUFFIX}"}
 
 
 def content(wheel: Path) -> set[str]:

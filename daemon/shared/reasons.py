@@ -74,7 +74,8 @@ def joint_reason(about: About, number: int, view: View, earlier: View) -> str:
         case st.STANDSTILL:
             reason = "below the standstill velocity: the torque is known to an interval, sigma is half of it"
         case st.DEGRADED:
-            reason = degraded_reason(seen, joint.network_limit_nm, view.zeros[number - 1])
+            limit_nm = None if joint.network is None else joint.network_limit_nm
+            reason = degraded_reason(seen, limit_nm, view.zeros[number - 1])
         case st.INVALID:
             faults = seen.input_flags >> 8
             reason = fault_meanings(faults) if faults else f"fault cleared; {_HELD}"
@@ -109,14 +110,17 @@ def _state_bits(statusword: int) -> int:
     )  # bit 5 does not count in the first
 
 
-def degraded_reason(seen: JointView, network_limit_nm: float, zeros: Zeros = NO_ZEROS) -> str:
+def degraded_reason(seen: JointView, network_limit_nm: float | None, zeros: Zeros = NO_ZEROS) -> str:
     """Explain status 3 (degraded): what is wrong with physics, or why the network is not fully used.
 
-    network_limit_nm: of the network against physics; zeros: of the same cycle, with what the two views say.
+    network_limit_nm: of the network against physics, None without a network; zeros: of the same cycle, with what the two
+    views say.
     """
     doubt = _doubt(zeros)
     if doubt:
         return doubt
+    if network_limit_nm is None:
+        return "outside of what the joint file was fitted to, or current and torsion disagree"
     if seen.input_flags & FLAG_NETWORK_SKIPPED:
         return "no time for the network in this cycle: physics only"
     if not isfinite(seen.network_nm):

@@ -241,7 +241,9 @@ class Health:
     def use(self, config: Config) -> None:
         """Take the limits of a configuration that has come into force."""
         limit = config.estimator.network_limit
-        self._network_limits_nm = [limit * joint.joint.rated_torque_nm for joint in config.joints]
+        self._network_limits_nm = [
+            None if joint.network is None else limit * joint.joint.rated_torque_nm for joint in config.joints
+        ]
         self._sensor_zeros_nm = [
             config.estimator.sensor_zero_nm(joint.joint.rated_torque_nm) for joint in config.joints
         ]
@@ -319,7 +321,7 @@ class Health:
             self._conditions.update("zero_jumped", subject, jumped, now_s, text)
 
     def _observe_status(
-        self, joint: _Joint, seen: JointView, limit_nm: float, zeros: Zeros, now_s: float
+        self, joint: _Joint, seen: JointView, limit_nm: float | None, zeros: Zeros, now_s: float
     ) -> None:
         conditions, subject = self._conditions, joint.subject
         present = seen.input_flags >> 8 | seen.latched

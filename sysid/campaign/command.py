@@ -11,7 +11,7 @@ import shutil
 import signal
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import fields, replace
 from pathlib import Path
@@ -24,34 +24,38 @@ from jtqd.drivers.bus_load import LIMIT, BusLoad
 from jtqd.estimator.checked import ConfigError, count, counted, natural, seconds
 from jtqd.estimator.joint import Joint
 from jtqd.models.files import shipped
+from jtqd.sysid.campaign.alone import parsed_limits, room_of, tightest, with_limits
 from jtqd.sysid.campaign.bench import Bench, BenchConfig
 from jtqd.sysid.campaign.pieces import LONGEST_FILLED_S
 from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Plan, check_plan, load_plan, travel_rad
-from jtqd.sysid.campaign.plans import KINDS, OnTried, Scale, make_plan, seed_of
+from jtqd.sysid.campaign.plans import KINDS, OnTried, Scale, make_plan_of, seed_of
 from jtqd.sysid.campaign.processes import EmulatedBench, ProcessError, StopAsked, unix_bus
 from jtqd.sysid.campaign.reporter import BETWEEN_RUNS_S, Designing, Reporter, clock_text
 from jtqd.sysid.campaign.runner import Outcome, attempt, go_through
 from jtqd.sysid.campaign.state import DONE, CampaignDirectory, StateError
+from jtqd.sysid.campaign.units import Pair, Unit, check_joints, said_of, units_of
 from jtqd.sysid.motion.setpoints import Limits, Setpoints, Timing
 
 EMULATED: Final = "sim"
 PLANT: Final = "campaign_plant.yaml"
 EMULATED_TIMING: Final = Timing(sync_lost_s=LONGEST_FILLED_S, late_s=LONGEST_FILLED_S, stale_cycles=50)
 """Nothing can break on the emulated bench: the motion goes on over what can be interpolated."""
-LIMIT_NAMES: Final = tuple(item.name for item in fields(Limits))
+LIMIT_NAMES: Final = tuple(item.name for item in fields(Limits) if item.name != "position_rad")
 _SCALING: Final = ("runs", "seconds", "hold_s", "seed", "evaluations", "quick")
 _EXAMPLES: Final = """examples:
   jtq campaign efficiency --dry-run
   jtq campaign efficiency --bus sim --out campaigns/efficiency
   jtq campaign excitation --bus can0 --config arm.yaml --out campaigns/excitation
-  jtq campaign my.plan.yaml --bus can0 --config arm.yaml --out campaigns/mine"""
+  jtq campaign my.plan.yaml --bus can0 --config arm.yaml --out campaigns/mine
+  jtq campaign excitation --bus can2 --config arm.yaml --limits 3:travel_rad=-1:1,velocity_rad_s=1 --out campaigns/arm"""
 
 
 def parser() -> argparse.ArgumentParser:
     """Return all options; `usage_error` and `missing_option` check their combination."""
     made = argparse.ArgumentParser(
         prog="jtq campaign",
-        description="Drive both joints through a campaign of runs, record and check each; continue an interrupted campaign.",
+        description="Drive the joints of a bus through a campaign of runs, record and check each; continue an interrupted\n"
+        "campaign. Joints on a towing bench drive each other, any other joint is moved alone while the rest is held.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -74,6 +78,23 @@ def parser() -> argparse.ArgumentParser:
         default=[],
         metavar="NAME=VALUE",
         help=f"another limit than the plan's: {', '.join(LIMIT_NAMES)} (temperature_c=none: not supervised)",
+    )
+    add(
+        "--limits",
+        action="append",
+        type=_motion_limits,
+        default=[],
+        metavar="[N:]NAME=VALUE,...",
+        help="where joint N (default: each) may go when it is moved alone: travel_rad=LOW:HIGH, velocity_rad_s, "
+        "acceleration_rad_s2, torque_nm (default: motion_limits of the joint file)",
+    )
+    add(
+        "--towing",
+        action="append",
+        type=_pair,
+        default=[],
+        metavar="A,B",
+        help="joints A and B are coupled on a towing bench (default: those that share a channel of the torque sensor)",
     )
     add("--keep-going", action="store_true", help="continue with the next run after a limit was exceeded")
     add("--json", action="store_true", help="print the result (or the plan) as JSON")
@@ -116,33 +137,83 @@ def emulated(bus: str | None) -> bool:
     return bus is not None and (bus == EMULATED or bus.startswith(f"{EMULATED}:"))
 
 
-def recipe(options: argparse.Namespace, joints: tuple[Joint, Joint]) -> dict[str, Any]:
+def recipe(options: argparse.Namespace, joints: Sequence[Joint]) -> dict[str, Any]:
     """Return what the plan is made from, as plain values; the same recipe is the same plan. Raises ConfigError."""
     limits = {name: None if math.isinf(value) else value for name, value in options.limit}
+    towing = {"towing": [list(pair) for pair in options.towing]} if options.towing else {}
+    files = {"joints_sha256": hashlib.sha256(repr(tuple(joints)).encode()).hexdigest()}
     if options.plan not in KINDS:
-        return {"plan_sha256": load_plan(Path(options.plan)).sha256, "limits": limits}
+        plan = load_plan(Path(options.plan))
+        alone = any(run.current_joint is None for run in plan.runs)  # their limits come from the joint files
+        return {"plan_sha256": plan.sha256, "limits": limits, **towing, **(files if alone else {})}
     return {
         "kind": options.plan,
         **{name: getattr(options, name) for name in _SCALING},
         "limits": limits,
-        "joints_sha256": hashlib.sha256(repr(joints).encode()).hexdigest(),
+        **files,
+        **towing,
     }
 
 
-def scale_of(options: argparse.Namespace, joints: tuple[Joint, Joint]) -> Scale:
+def scale_of(options: argparse.Namespace) -> Scale:
     """Size of a campaign that is not a file."""
     scale = {name: getattr(options, name) for name in _SCALING}
-    return Scale(**scale, limits=replace(DEFAULT_LIMITS, **dict(options.limit)), joints=joints)
+    return Scale(**scale, limits=replace(DEFAULT_LIMITS, **dict(options.limit)))
 
 
 def wanted_plan(
-    options: argparse.Namespace, joints: tuple[Joint, Joint], on_progress: OnTried | None = None
+    options: argparse.Namespace,
+    joints: Sequence[Joint],
+    units: Sequence[Unit],
+    on_progress: OnTried | None = None,
 ) -> Plan:
-    """Read or make the plan; `joints` are those of the bench. Raises ConfigError."""
-    if options.plan not in KINDS:
-        plan = load_plan(Path(options.plan))
-        return replace(plan, limits=replace(plan.limits, **dict(options.limit)))
-    return make_plan(options.plan, scale_of(options, joints), on_progress)
+    """Read or make the plan; `joints`, `units` are those of the bench. Raises ConfigError."""
+    if options.plan in KINDS:
+        return make_plan_of(options.plan, units, joints, scale_of(options), on_progress)
+    plan = load_plan(Path(options.plan))
+    plan = replace(plan, limits=replace(plan.limits, **dict(options.limit)))
+    try:
+        check_joints(plan, units)
+        alone = {}
+        for number in sorted({run.velocity_joint for run in plan.runs if run.current_joint is None}):
+            room = room_of(number, joints[number - 1], plan.limits).limits
+            alone[number] = tightest(plan.alone[number], room) if number in plan.alone else room
+    except ConfigError as error:
+        raise ConfigError(f"{options.plan}: {error}") from None
+    return replace(plan, alone=alone)
+
+
+def _bench_of(options: argparse.Namespace) -> tuple[BenchConfig, tuple[Unit, ...]]:
+    """Return the bench of the configuration, with --limits in its joints, and what is moved together. Raises ConfigError."""
+    config = BenchConfig.load(options.config)
+    joints = list(config.joints)
+    for number, given in options.limits:
+        if number is not None and number > len(joints):
+            raise ConfigError(f"--limits {number}: found no joint {number} in {config.path}")
+        for place in range(len(joints)) if number is None else (number - 1,):
+            joints[place] = with_limits(joints[place], given)
+    units = units_of(config.channels, config.sensor is not None, options.towing)
+    return replace(config, joints=tuple(joints)), units
+
+
+def _motion_limits(text: str) -> tuple[int | None, dict[str, Any]]:
+    """[N:]NAME=VALUE,... Raises argparse.ArgumentTypeError."""
+    head, colon, rest = text.partition(":")
+    number = int(head) if colon and head.isdecimal() else None
+    if number == 0:
+        raise argparse.ArgumentTypeError("found joint 0, expected 1 to 4")
+    try:
+        return number, parsed_limits(text if number is None else rest)
+    except ConfigError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _pair(text: str) -> Pair:
+    """A,B. Raises argparse.ArgumentTypeError."""
+    one, _, two = text.partition(",")
+    if not (one.isdecimal() and two.isdecimal()) or int(one) == int(two):
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected two joints like 1,2")
+    return int(one), int(two)
 
 
 def _limit(text: str) -> tuple[str, float]:
@@ -170,6 +241,7 @@ def rows(plan: Plan, setpoints: Mapping[str, Setpoints]) -> list[dict[str, Any]]
             {
                 "run": run.name,
                 "velocity_joint": run.velocity_joint,
+                "current_joint": run.current_joint,
                 "segments": len(run.segments),
                 "seconds": round(points.duration_s, 3),
                 "peak_velocity_rad_s": round(float(np.abs(points.velocity_rad_s).max()), 4),
@@ -185,7 +257,38 @@ def total_s(setpoints: Mapping[str, Setpoints]) -> float:
     return sum(points.duration_s + BETWEEN_RUNS_S for points in setpoints.values())
 
 
-def dry_run_mapping(plan: Plan, setpoints: Mapping[str, Setpoints], load: BusLoad) -> dict[str, Any]:
+def _moved(row: Mapping[str, Any]) -> str:
+    """Return the velocity joint of a row, and whether nothing tows it."""
+    return f"{row['velocity_joint']}{' alone' if row['current_joint'] is None else ''}"
+
+
+def unit_lines(options: argparse.Namespace, units: Sequence[Unit], plan: Plan) -> list[str]:
+    """Return what the runs of each unit can identify, and why one has none; nothing for the one towing bench of old."""
+    if [unit.joints for unit in units] == [(1, 2)] and units[0].measured:
+        return []
+    kind = options.plan if options.plan in KINDS else ""
+    moved = {run.joints for run in plan.runs}
+    lines = said_of(
+        [unit for unit in units if kind or unit.joints in moved],
+        lambda unit: (kind and unit.refused(kind)) or unit.serves(),
+    )
+    for number, limits in sorted(plan.alone.items()):
+        low, high = limits.position_rad
+        most = f"{limits.velocity_rad_s:g} rad/s, {limits.current_a:g} A, {limits.torque_nm:g} Nm"
+        lines.append(
+            f"joint {number} alone: {low:g} to {high:g} rad, {most}; a run that does not fit where it stands begins at "
+            f"{0.5 * (low + high):g} rad; the other joints are held"
+        )
+    if plan.alone:
+        lines.append(
+            "after each run and every stop all drives are off: a joint that carries a load needs a brake"
+        )
+    return lines
+
+
+def dry_run_mapping(
+    plan: Plan, setpoints: Mapping[str, Setpoints], load: BusLoad, notes: Sequence[str] = ()
+) -> dict[str, Any]:
     """Return what a campaign would do, for a program: its runs, how long they take, the bus load."""
     return {
         "schema": "jtq.campaign_plan/1",
@@ -196,10 +299,13 @@ def dry_run_mapping(plan: Plan, setpoints: Mapping[str, Setpoints], load: BusLoa
         "expected_s": round(total_s(setpoints), 1),
         "bus_load_worst": load.worst,
         "bus_load_limit": LIMIT,
+        "units": list(notes),
     }
 
 
-def dry_run_text(plan: Plan, setpoints: Mapping[str, Setpoints], load: BusLoad) -> str:
+def dry_run_text(
+    plan: Plan, setpoints: Mapping[str, Setpoints], load: BusLoad, notes: Sequence[str] = ()
+) -> str:
     """Return the same for people."""
     table = rows(plan, setpoints)
     width = max(len("run"), *(len(row["run"]) for row in table))
@@ -208,7 +314,7 @@ def dry_run_text(plan: Plan, setpoints: Mapping[str, Setpoints], load: BusLoad) 
         f"{'peak A':>6}  {'travel rad':>10}"
     ]
     lines += [
-        f"{row['run']:<{width}}  {row['velocity_joint']:>14}  {row['segments']:>8}  {row['seconds']:>7.1f}  "
+        f"{row['run']:<{width}}  {_moved(row):>14}  {row['segments']:>8}  {row['seconds']:>7.1f}  "
         f"{row['peak_velocity_rad_s']:>10.2f}  {row['peak_current_a']:>6.2f}  {row['travel_rad']:>10.1f}"
         for row in table
     ]
@@ -225,6 +331,7 @@ def dry_run_text(plan: Plan, setpoints: Mapping[str, Setpoints], load: BusLoad) 
         ),
         f"bus load {load.worst:.1%} in the worst case, {load.worst * load.capacity_bits:.0f} of {load.capacity_bits:.0f} "
         f"bits in a cycle, limit {LIMIT:.0%}",
+        *notes,
     ]
     return "\n".join(lines)
 
@@ -263,12 +370,13 @@ def main(argv: list[str]) -> int:
         return 1
 
 
-def _make_plan(options: argparse.Namespace, config: BenchConfig) -> Plan:
+def _make_plan(options: argparse.Namespace, config: BenchConfig, units: Sequence[Unit]) -> Plan:
     """Return the plan, with a bar or a line where making it takes its time."""
     if options.plan != "excitation":
-        return wanted_plan(options, config.joints)
-    with Designing(scale_of(options, config.joints).motions_tried) as designing:
-        return wanted_plan(options, config.joints, designing.advance)
+        return wanted_plan(options, config.joints, units)
+    pairs = sum(len(unit.joints) == 2 for unit in units)
+    with Designing(pairs * scale_of(options).motions_tried) as designing:
+        return wanted_plan(options, config.joints, units, designing.advance)
 
 
 def _check_plan(plan: Plan, options: argparse.Namespace) -> dict[str, Setpoints]:
@@ -279,26 +387,31 @@ def _check_plan(plan: Plan, options: argparse.Namespace) -> dict[str, Setpoints]
 
 
 def _dry_run(options: argparse.Namespace) -> int:
-    config = BenchConfig.load(options.config)
+    config, units = _bench_of(options)
     load = config.load_with_commander()
-    plan = _make_plan(options, config)
+    plan = _make_plan(options, config, units)
     setpoints = _check_plan(plan, options)
+    config.check_temperature(plan.limits.temperature_c)
+    notes = unit_lines(options, units, plan)
     if options.json:
-        print(json.dumps(dry_run_mapping(plan, setpoints, load)))
+        print(json.dumps(dry_run_mapping(plan, setpoints, load, notes)))
     else:
-        print(dry_run_text(plan, setpoints, load))
+        print(dry_run_text(plan, setpoints, load, notes))
     return 0
 
 
 def _campaign(options: argparse.Namespace) -> int:
-    config = BenchConfig.load(options.config)
+    config, units = _bench_of(options)
     config.load_with_commander()  # refuses what does not fit the bus
     made_from = recipe(options, config.joints)
     directory = CampaignDirectory(options.out)
     try:
-        plan = directory.same_recipe(made_from) or _make_plan(options, config)
+        plan = directory.same_recipe(made_from) or _make_plan(options, config, units)
         setpoints = _check_plan(plan, options)
+        config.check_temperature(plan.limits.temperature_c)
         directory.begin(plan, made_from)
+        for line in unit_lines(options, units, plan):
+            print(f"jtq campaign: {line}", file=sys.stderr)
         outcome = _run(options, config, plan, setpoints, directory)
     finally:
         directory.close()
@@ -324,11 +437,16 @@ def _run(
         if emulated(bus):
             bus = bus.removeprefix(EMULATED).removeprefix(":") or unix_bus(folder)
             process = EmulatedBench(
-                bus, folder, options.plant or shipped(PLANT), _bench_seed(plan, options, done)
+                bus,
+                folder,
+                options.plant or shipped(PLANT),
+                _bench_seed(plan, options, done),
+                len(config.drives),
+                config.sensor is not None,
             )
         with process, Reporter(to_do, len(plan.runs), done) as reporter, _commander_log(reporter):
             bench = Bench(bus, options.config, config, EMULATED_TIMING if emulated(options.bus) else None)
-            motion = bench.play(plan.limits, reporter.on_progress)
+            motion = bench.play(plan.limits_of, reporter.on_progress)
             return go_through(
                 plan,
                 setpoints,

@@ -13,6 +13,7 @@ import json
 import sys
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -49,14 +50,21 @@ def emulated_run(bench: AnyPlant, seed: int, day: int, run: Run) -> RunTable:
 
 
 def emulated_with_truth(bench: AnyPlant, seed: int, day: int, run: Run) -> EmulatedRun:
-    """Return one run on this day of the seed, with the true torques."""
+    """Return one run on this day of the seed, with the true torques.
+
+    A joint that is moved alone is joint 1 of the bench and turns joint 2, which has no current, as in `jtq sim --drives 1`;
+    its table has its own columns only. Any other pair than joints 1 and 2 has a bench like theirs.
+    """
     points = expand(run)
     commands = (
         JointCommand.velocity(_sampled(points.velocity_rad_s)),
         JointCommand.current(_sampled(points.current_a)),
     )
-    one, two = commands if points.velocity_joint == 1 else (commands[1], commands[0])
-    return emulate(bench, (one, two), len(points) / _HZ, seed, day=day)
+    first = points.velocity_joint == points.joints[0]
+    one, two = commands if first else (commands[1], commands[0])
+    made = emulate(bench, (one, two), len(points) / _HZ, seed, day=day)
+    joints = {number: made.table.joints[place] for place, number in enumerate(points.joints, 1)}
+    return made._replace(table=replace(made.table, joints=joints))
 
 
 def _sampled(values: FloatArray) -> TimeFunction:
@@ -74,7 +82,7 @@ def _write_run_files(out: Path, plant: Path, seed: int, numbered: tuple[int, Run
     made = emulated_with_truth(load_any_plant(plant), seed, day, run)
     path = out / f"{run.name}.csv.gz"
     write_run(path, made.table)
-    write_truth(path, {1: made.joint_torque_nm[:, 0], 2: made.joint_torque_nm[:, 1]})
+    write_truth(path, {number: made.joint_torque_nm[:, place] for place, number in enumerate(run.joints)})
     (out / f"{run.name}.json").write_text(json.dumps(marks_of(run, expand(run)), indent=1) + "\n")
     return run.name
 

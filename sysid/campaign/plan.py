@@ -1,15 +1,18 @@
 """Plans of a campaign (schema jtq.plan/1): frozen, checked, to and from YAML, and as set-points at 1 kHz.
 
-A plan gives the commands of both joints in every run, segment by segment. `expand` makes set-points of a run, millisecond
-by millisecond; `check_run` and `check_plan` hold them against the plan's own limits. All but `load_plan` is pure.
+A plan gives the commands of two joints on a towing bench, or of one that is moved alone, segment by segment. `expand` makes
+set-points of a run, millisecond by millisecond; `check_run` and `check_plan` hold them against the plan's own limits. All
+but `load_plan` is pure.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
 import re
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -21,7 +24,18 @@ from jtqd.estimator.checked import ConfigError, Section, finite
 from jtqd.estimator.decoder import decode, limits
 from jtqd.models.files import load_yaml
 from jtqd.sysid.excitation.fourier import FourierSeries, FourierTrajectory
-from jtqd.sysid.motion.setpoints import PERIOD_S, Limits, Mark, MotionError, Setpoints, check_setpoints
+from jtqd.sysid.motion.setpoints import (
+    MOST_JOINTS,
+    OTHER_ONE,
+    PERIOD_S,
+    Limits,
+    Mark,
+    MotionError,
+    Setpoints,
+    check_setpoints,
+    partner_of,
+    path,
+)
 
 SCHEMA: Final = "jtq.plan/1"
 DEFAULT_RAMP_S: Final = 0.5
@@ -136,11 +150,25 @@ Segment = Plateau | Rest | Fourier | Off
 
 @dataclass(frozen=True)
 class Run:
-    """One run: its name (also that of its files), the joint in velocity mode, and its segments in order."""
+    """One run: its name (also that of its files), the joint in velocity mode, its segments in order, the other joint.
+
+    current_joint: in torque mode; left out, the other one of joints 1 and 2; None: the velocity joint is moved alone, and
+    no segment has a current. Raises ValueError for joints that are no pair.
+    """
 
     name: str
     velocity_joint: int
     segments: tuple[Segment, ...]
+    current_joint: int | None = OTHER_ONE
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "current_joint", partner_of(self.velocity_joint, self.current_joint))
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        """Numbers of the joints that are moved, rising."""
+        moved = (self.velocity_joint, *(() if self.current_joint is None else (self.current_joint,)))
+        return tuple(sorted(moved))
 
     @property
     def duration_s(self) -> float:
@@ -149,20 +177,26 @@ class Run:
 
     def to_mapping(self) -> dict[str, Any]:
         """Plain values, ready for YAML."""
-        return {
-            "name": self.name,
-            "velocity_joint": self.velocity_joint,
-            "segments": [segment.to_mapping() for segment in self.segments],
-        }
+        segments = [segment.to_mapping() for segment in self.segments]
+        if self.current_joint is None:
+            for each in segments:
+                each.pop("current", None)
+                each.pop("current_a", None)
+            return {"name": self.name, "joint": self.velocity_joint, "segments": segments}
+        pair: dict[str, Any] = {"velocity_joint": self.velocity_joint}
+        if self.joints != (1, 2):
+            pair["current_joint"] = self.current_joint
+        return {"name": self.name, **pair, "segments": segments}
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A campaign: name, limits that hold in every run, and the runs in order."""
+    """A campaign: name, limits of the runs on a towing bench, the runs in order, and the limits of joints moved alone."""
 
     name: str
     limits: Limits
     runs: tuple[Run, ...]
+    alone: Mapping[int, Limits] = field(default_factory=dict)
 
     @classmethod
     def from_mapping(cls, mapping: object, where: str) -> Plan:
@@ -180,8 +214,9 @@ class Plan:
             if run.name in seen:
                 raise section.error("name", run.name, "a unique name")
             seen.add(run.name)
+        alone = dict(_alone_limits(section, limits) for section in top.sections("alone"))
         top.finish()
-        return cls(name, limits, runs)
+        return cls(name, limits, runs, alone)
 
     def to_mapping(self) -> dict[str, Any]:
         """Plain values, ready for YAML."""
@@ -189,8 +224,19 @@ class Plan:
             "schema": SCHEMA,
             "name": self.name,
             "limits": {name: finite(getattr(self.limits, name)) for name in _LIMIT_UNITS},
+            **({"alone": [_of_joint(*each) for each in sorted(self.alone.items())]} if self.alone else {}),
             "runs": [run.to_mapping() for run in self.runs],
         }
+
+    def limits_of(self, run: Run | Setpoints) -> Limits:
+        """Return what holds in a run. Raises ConfigError for a joint that is moved alone without limits."""
+        if run.current_joint is not None:
+            return self.limits
+        if run.velocity_joint not in self.alone:
+            raise ConfigError(
+                f"alone: found no limits of joint {run.velocity_joint}, expected them of a joint that is moved alone"
+            )
+        return self.alone[run.velocity_joint]
 
     @property
     def sha256(self) -> str:
@@ -225,7 +271,63 @@ def _limits(top: Section) -> Limits:
         if name != "temperature_c" or section.raw(name, 0.0) is not None
     }
     section.finish()
-    return Limits(**values)
+    return _limits_from(values)
+
+
+def _limits_from(values: Mapping[str, float]) -> Limits:
+    """Return limits by their names; a temperature that is left out is not supervised."""
+    return Limits(
+        current_a=values["current_a"],
+        velocity_rad_s=values["velocity_rad_s"],
+        torque_nm=values["torque_nm"],
+        travel_rad=values["travel_rad"],
+        temperature_c=values.get("temperature_c", math.inf),
+    )
+
+
+@dataclass(frozen=True)
+class _AloneLimits:
+    """Limits of a joint that is moved alone; its travel is that of its own encoder, its temperature's limit the plan's."""
+
+    joint: Annotated[int, limits(ge=1, le=MOST_JOINTS)]
+    current_a: Annotated[float, limits("A", gt=0.0)]
+    velocity_rad_s: Annotated[float, limits("rad/s", gt=0.0)]
+    torque_nm: Annotated[float, limits("Nm", gt=0.0)]
+    travel_rad: Annotated[tuple[float, float], limits("rad")]
+
+
+def _of_joint(number: int, limits: Limits) -> dict[str, Any]:
+    """Return limits of a joint that is moved alone, plain."""
+    values = {name: getattr(limits, name) for name in ("current_a", "velocity_rad_s", "torque_nm")}
+    return {"joint": number, **values, "travel_rad": list(limits.position_rad)}
+
+
+def _alone_limits(section: Section, plan: Limits) -> tuple[int, Limits]:
+    found = decode(_AloneLimits, section)
+    low, high = found.travel_rad
+    if not low < high:
+        raise section.error("travel_rad", [low, high], "two rising numbers in rad")
+    return found.joint, Limits(
+        current_a=found.current_a,
+        velocity_rad_s=found.velocity_rad_s,
+        torque_nm=found.torque_nm,
+        travel_rad=high - low,
+        temperature_c=plan.temperature_c,
+        position_rad=(low, high),
+    )
+
+
+def _joints_of(section: Section) -> tuple[int, int | None]:
+    """Velocity joint and current joint of a run; None for one that is moved alone (`joint`)."""
+    if section.has("joint"):
+        return section.integer("joint", low=1, high=MOST_JOINTS), None
+    joint = section.integer("velocity_joint", low=1, high=MOST_JOINTS)
+    if joint <= 2 and not section.has("current_joint"):
+        return joint, OTHER_ONE
+    other = section.integer("current_joint", low=1, high=MOST_JOINTS)
+    if other == joint:
+        raise section.error("current_joint", other, "another joint than velocity_joint")
+    return joint, other
 
 
 def _run(section: Section) -> Run:
@@ -236,36 +338,59 @@ def _run(section: Section) -> Run:
             name,
             "letters, digits and . _ + -, beginning with a letter or digit, not 'plan' or 'campaign'",
         )
-    joint = section.integer("velocity_joint", low=1, high=2)
+    joint, other = _joints_of(section)
     inner = section.sections("segments")
     if not inner:
         raise section.error("segments", section.raw("segments", None), "a list of at least one segment")
-    segments = tuple(_segment(each) for each in inner)
+    segments = tuple(_segment(each, alone=other is None) for each in inner)
     for before, one, each in zip((None, *segments), segments, inner, strict=False):
         if isinstance(one, Fourier | Off) and isinstance(before, Plateau) and before.moving:
             kind = one.to_mapping()["kind"]
             raise each.error("kind", kind, "a rest before it, because the plateau before it ends in motion")
     section.finish()
-    return Run(name, joint, segments)
+    return Run(name, joint, segments, other)
 
 
-def _segment(section: Section) -> Segment:
-    kind = section.text("kind", ("plateau", "rest", "power_off", "fourier"))
+@dataclass(frozen=True)
+class _Turning:
+    """A plateau of a joint that is moved alone."""
+
+    velocity_rad_s: Annotated[float, limits("rad/s")]
+    hold_s: Annotated[float, limits("s", ge=0.0, le=LONGEST_S)]
+    ramp_s: Annotated[float, limits("s", ge=0.0, le=LONGEST_S)] = DEFAULT_RAMP_S
+
+
+def _segment(section: Section, *, alone: bool) -> Segment:
+    """`alone`: no segment has a current; without power a joint that carries a load would fall."""
+    kinds = ("plateau", "rest", "fourier") if alone else ("plateau", "rest", "power_off", "fourier")
+    kind = section.text("kind", kinds)
     if kind == "fourier":
-        return _fourier(section)
+        return _fourier(section, alone=alone)
     if kind == "power_off":
         return decode(Off, section)
-    return decode(Rest, section) if kind == "rest" else decode(Plateau, section)
+    if kind == "rest":
+        return decode(Rest, section)
+    if alone:
+        turning = decode(_Turning, section)
+        return Plateau(turning.velocity_rad_s, 0.0, turning.hold_s, turning.ramp_s)
+    return decode(Plateau, section)
 
 
-def _fourier(section: Section) -> Fourier:
+def no_current(velocity: FourierTrajectory) -> FourierSeries:
+    """Return the current of a joint that nothing tows."""
+    return FourierSeries(velocity.omega_rad_s, (0.0,), (0.0,), velocity.duration_s)
+
+
+def _fourier(section: Section, *, alone: bool) -> Fourier:
     duration_s = section.number("duration_s", "s", low=0.1, high=LONGEST_S)
-    velocity, current = section.required("velocity"), section.required("current")
+    velocity = section.required("velocity")
+    current = None if alone else section.required("current")
     section.finish()
     try:
+        trajectory = FourierTrajectory.from_section(velocity, duration_s)
         return Fourier(
-            FourierTrajectory.from_section(velocity, duration_s),
-            FourierSeries.from_section(current, duration_s),
+            trajectory,
+            no_current(trajectory) if current is None else FourierSeries.from_section(current, duration_s),
         )
     except ConfigError as error:
         if str(error).startswith(section.where):
@@ -324,8 +449,15 @@ def expand(run: Run) -> Setpoints:
             marks.append(Mark(kind, middle, end, *target))
         velocity, current = target
         count += ramp + hold
+    if run.current_joint is None:
+        marks = [replace(mark, current_a=None) for mark in marks]
     return Setpoints(
-        run.velocity_joint, np.concatenate(velocities), np.concatenate(currents), tuple(marks), tuple(off)
+        run.velocity_joint,
+        np.concatenate(velocities),
+        np.concatenate(currents),
+        tuple(marks),
+        tuple(off),
+        run.current_joint,
     )
 
 
@@ -336,8 +468,7 @@ def samples(duration_s: float) -> int:
 
 def travel_rad(setpoints: Setpoints) -> float:
     """Return the largest distance of the velocity joint from where the run begins [rad], joint side, either way."""
-    position = np.cumsum(setpoints.velocity_rad_s) * PERIOD_S
-    return float(np.abs(position).max())
+    return float(np.abs(path(setpoints)).max())
 
 
 def check_run(run: Run, limits: Limits) -> Setpoints:
@@ -363,7 +494,7 @@ def check_run(run: Run, limits: Limits) -> Setpoints:
 
 def check_plan(plan: Plan) -> dict[str, Setpoints]:
     """Set-points of every run by its name. Raises ConfigError as check_run."""
-    return {run.name: check_run(run, plan.limits) for run in plan.runs}
+    return {run.name: check_run(run, plan.limits_of(run)) for run in plan.runs}
 
 
 def marks_of(run: Run, setpoints: Setpoints) -> dict[str, Any]:
@@ -371,6 +502,7 @@ def marks_of(run: Run, setpoints: Setpoints) -> dict[str, Any]:
     return {
         "run": run.name,
         "velocity_joint": run.velocity_joint,
+        "current_joint": run.current_joint,
         "segments": [
             {
                 "kind": mark.kind,

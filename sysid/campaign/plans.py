@@ -1,5 +1,8 @@
 """The campaigns that come with the toolbox: efficiency, excitation, validate; whole or scaled down.
 
+On a bus with other joints than one towing bench of joints 1 and 2 each unit has its runs one after the other: a pair the
+same ones as joints 1 and 2 have, a joint that is moved alone those of `jtqd.sysid.campaign.alone`.
+
 Runs at constant velocity and load are those of section II of the paper (efficiency) and of its section IV.A (validation).
 Runs at varying velocity and load are Fourier trajectories (`jtqd.sysid.excitation.design`): those of `excitation_runs` are
 optimised for the information that they give about the losses; those of `variable_runs` are drawn, because runs to judge
@@ -17,12 +20,15 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Joint
+from jtqd.sysid.campaign import alone
+from jtqd.sysid.campaign.alone import Room, room_of
 from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Fourier, Plan, Plateau, Rest, Run, Segment
+from jtqd.sysid.campaign.units import Unit, said_of
 from jtqd.sysid.excitation.design import POPULATION, STARTS, Design, design, draw
 from jtqd.sysid.excitation.model import ExcitationLimits
 from jtqd.sysid.motion.setpoints import Limits
@@ -225,21 +231,30 @@ def variable_runs(
 
 
 def outside_runs(
-    limits: Limits, count: int, run_s: float, *, seed: int, joints: Joints = None
+    limits: Limits,
+    count: int,
+    run_s: float,
+    *,
+    seed: int,
+    joints: Joints = None,
+    load: float = 1.5,
+    velocity_rad_s: float = FULL_RAD_S,
 ) -> tuple[Run, ...]:
-    """Return runs with half as much load again as any other campaign has: what no model has been trained on.
+    """Return runs with `load` times the currents of any other campaign, or a higher peak velocity: what no model has been
+    trained on.
 
     Raises:
         ConfigError: runs too short for a trajectory.
     """
     wanted = ExcitationLimits(
-        velocity_rad_s=FULL_RAD_S,
+        velocity_rad_s=velocity_rad_s,
+        acceleration_rad_s2=velocity_rad_s / FULL_RAD_S * ExcitationLimits().acceleration_rad_s2,
         travel_rad=_LIMIT_SHARE * limits.travel_rad,
-        current_a=1.5 * CURRENT_A,
-        joint_current_a=1.5 * JOINT_CURRENT_A,
+        current_a=load * CURRENT_A,
+        joint_current_a=load * JOINT_CURRENT_A,
         torque_nm=_LIMIT_SHARE * limits.torque_nm,
     )
-    chosen = seed_of("outside", FULL_RAD_S, seed)
+    chosen = seed_of("outside", velocity_rad_s, seed)
     made = draw(
         wanted,
         count=count,
@@ -297,6 +312,9 @@ def _design_limits(limits: Limits, peak_rad_s: float) -> ExcitationLimits:
 KINDS: Final = ("efficiency", "excitation", "validate")
 RUNS: Final = 24
 QUICK_RUNS: Final = 4
+ALONE_RUNS: Final = 12
+QUICK_ALONE_RUNS: Final = 2
+"""Of a joint that is moved alone."""
 EVALUATIONS: Final = 1000
 QUICK_EVALUATIONS: Final = 160
 _QUICK_VELOCITIES: Final = (0.4, 1.4, 2.4)
@@ -323,6 +341,10 @@ class Scale:
     quick: bool = False
     limits: Limits = DEFAULT_LIMITS
     joints: Joints = None
+
+    def of_pair(self, joints: Joints) -> Scale:
+        """Return the same for the pair of these joint files."""
+        return replace(self, joints=joints)
 
     def or_else(self, name: str, whole: Any, quick: Any) -> Any:
         """Return the value of an option: as given, else by the size of the campaign."""
@@ -379,4 +401,60 @@ def _validate(scale: Scale) -> tuple[Run, ...]:
         scale.or_else("seconds", 12.0, 6.0),
         seed=scale.seed,
         joints=scale.joints,
+    )
+
+
+def make_plan_of(
+    kind: str,
+    units: Sequence[Unit],
+    joints: Sequence[Joint],
+    scale: Scale,
+    on_progress: OnTried | None = None,
+) -> Plan:
+    """The plan of one of KINDS for all units of a bus that can be moved so; joints: files of joints 1, 2, ...
+
+    Raises:
+        ConfigError: nothing to be driven, or a joint that is moved alone without limits.
+    """
+    able = [unit for unit in units if not unit.refused(kind)]
+    if not able:
+        raise ConfigError("; ".join(said_of(units, lambda unit: unit.refused(kind))))
+    if [unit.joints for unit in units] == [(1, 2)]:
+        return make_plan(kind, scale.of_pair((joints[0], joints[1])), on_progress)
+    runs: list[Run] = []
+    limits: dict[int, Limits] = {}
+    for unit in able:
+        if len(unit.joints) == 2:
+            one, two = unit.joints
+            of_pair = scale.of_pair((joints[one - 1], joints[two - 1]))
+            runs += [_driven_by(run, unit) for run in make_plan(kind, of_pair, on_progress).runs]
+            continue
+        [number] = unit.joints
+        room = room_of(number, joints[number - 1], scale.limits)
+        limits[number] = room.limits
+        runs += [replace(run, name=f"{unit.name}_{run.name}") for run in _alone(kind, number, room, scale)]
+    return Plan(kind, scale.limits, tuple(runs), limits)
+
+
+def _driven_by(run: Run, unit: Unit) -> Run:
+    """Return a run of joints 1 and 2 as one of another pair; forward and back drive are seen from its first joint."""
+    one, two = unit.joints
+    name = run.name.replace("forward_1", f"forward_{one}").replace("back_1", f"back_{one}")
+    mover, driver = (one, two) if run.velocity_joint == 1 else (two, one)
+    return Run(f"{unit.name}_{name}", mover, run.segments, driver)
+
+
+def _alone(kind: str, number: int, room: Room, scale: Scale) -> tuple[Run, ...]:
+    count: int = scale.or_else("runs", ALONE_RUNS, QUICK_ALONE_RUNS)
+    seed = seed_of(f"alone/{kind}", float(number), scale.seed)
+    if kind == "validate":
+        return alone.variable_runs(number, room, count, scale.or_else("seconds", 12.0, 6.0), seed=seed)
+    return alone.excitation_runs(
+        number,
+        room,
+        count,
+        scale.or_else("seconds", 24.0, 10.0),
+        seed=seed,
+        evaluations=scale.or_else("evaluations", EVALUATIONS, QUICK_EVALUATIONS),
+        ladder=alone.QUICK_LADDER if scale.quick else alone.LADDER,
     )

@@ -88,11 +88,15 @@ class EmulatedBench:
     Args:
         bus: where it is put; a unix bus is made if there is none.
         folder: for its messages. plant: plant file, None for the one of campaigns. seed: of its noise and its days.
+        drives, sensor: what is on it; drives 1 and 2, and 3 and 4, are coupled.
     """
 
-    def __init__(self, bus: str, folder: Path, plant: Path | None, seed: int) -> None:
+    def __init__(  # noqa: PLR0917
+        self, bus: str, folder: Path, plant: Path | None, seed: int, drives: int = 2, sensor: bool = True
+    ) -> None:
         arguments = ["--bus", bus, "--profile", "rest", "--seed", str(seed)]
         arguments += [] if plant is None else ["--plant", str(plant)]
+        arguments += ["--drives", str(drives), *([] if sensor else ["--no-sensor"])]
         self._messages = folder / "bench.log"
         self._process = _start("jtqd.sim_can", arguments, self._messages, stdout=subprocess.DEVNULL)
 

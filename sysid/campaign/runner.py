@@ -11,7 +11,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -23,7 +23,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.campaign.bench import Bench, BenchConfig, Play
-from jtqd.sysid.campaign.pieces import fill, pieces_of
+from jtqd.sysid.campaign.pieces import fill, gaps_of, pieces_of
 from jtqd.sysid.campaign.plan import Plan, Run, expand, marks_of
 from jtqd.sysid.campaign.processes import Interrupted, Jtqd, ProcessError, StopAsked
 from jtqd.sysid.campaign.reporter import Reporter
@@ -37,9 +37,11 @@ _BUS_WAS_LATE: Final = re.compile(
     r"SYNC missing|missing for \d+ cycles|no heartbeat for|no temperature for|late by|transmit queue"
 )
 _SIGNALLED: Final = re.compile(r"SIGINT|SIGTERM")
-LONGEST_GAP_S: Final = 0.0095
-"""A longer step, of 10 cycles or more: the table would be refused by whoever reads it (jtqd.sysid.runs.files)."""
+LONGEST_GAP: Final = 9.5
+"""In periods of SYNC. A longer step, of 10 cycles or more: the table would be refused by whoever reads it
+(jtqd.sysid.runs.files)."""
 LOST_SHARE: Final = 0.01
+LOST_END_S: Final = 0.1
 FOLLOW_VELOCITY: Final = (0.05, 0.05)
 FOLLOW_CURRENT: Final = (0.1, 0.05)
 """RMS that is allowed between set-point and measurement: rad/s or A, and a part of the peak."""
@@ -126,11 +128,21 @@ def _kept(
     state = replace(state, status=FAILED)
     lost = int((recorded.summary.get("recording") or {}).get("lost", 0))
     try:
-        logged = log_to_run(log, all_needed=True, nodes=config.nodes, sensor=config.sensor is not None)
+        logged = log_to_run(
+            log,
+            joints=run.joints,
+            all_needed=True,
+            nodes=config.nodes,
+            sensor=config.sensor is not None,
+            enabled=range(1, len(config.joints) + 1),
+            last_motion=run.current_joint is None,  # what brought it to its place is none of it
+        )
     except LogError as error:
         _keep(log, out, run.name, ".failed.mcap")
         return Attempt(replace(state, reason=str(error)), again=True)
-    logged, interpolated = fill(logged, LONGEST_GAP_S)
+    longest_gap_s = LONGEST_GAP * config.period_s
+    gaps = gaps_of(logged.table.time_s, longest_gap_s)
+    logged, interpolated = fill(logged, longest_gap_s, config.period_s)
     state = replace(
         state,
         interpolated=interpolated,
@@ -138,18 +150,23 @@ def _kept(
         missed=logged.missed,
         incomplete=logged.incomplete,
         incomplete_by=dict(logged.incomplete_by),
-        findings=findings(logged, setpoints, config.joints, sensor=config.sensor is not None),
+        findings=findings(
+            logged, setpoints, config.joints, measured=[n for n in run.joints if config.measured(n)]
+        ),
     )
     if lost:
         state = replace(
             state, findings=(f"log: found {counted(lost, 'cycle')} lost by the recorder", *state.findings)
         )
-    why = gap_too_long(logged)
+    why = gap_too_long(logged, longest_gap_s) or ends_early(logged, setpoints)
     if why is not None:
         _keep(log, out, run.name, ".failed.mcap")
         return Attempt(replace(state, reason=why), again=True)
     sha256 = write_run(out / f"{run.name}.csv.gz", logged.table)
-    (out / f"{run.name}.json").write_text(json.dumps(marks_of(run, setpoints), indent=1) + "\n")
+    marks = marks_of(run, setpoints)
+    if interpolated:
+        marks["interpolated_s"] = gaps
+    (out / f"{run.name}.json").write_text(json.dumps(marks, indent=1) + "\n")
     _keep(log, out, run.name, ".mcap")
     return Attempt(replace(state, status=DONE, sha256=sha256))
 
@@ -164,20 +181,28 @@ def _keep(paths: Sequence[Path], out: Path, run: str, ending: str) -> None:
             os.replace(path, out / (run + ("" if number == 1 else f"@{number}") + ending))
 
 
-def gap_too_long(logged: LoggedRun) -> str | None:
+def ends_early(logged: LoggedRun, setpoints: Setpoints) -> str | None:
+    """Return that the log has lost the end of the motion, or None; lost cycles only make a motion longer."""
+    last_s = float(logged.table.time_s[-1])
+    if last_s >= setpoints.duration_s - LOST_END_S:
+        return None
+    return f"found the last row of the log at {last_s:.3f} s, expected it after {setpoints.duration_s:.3f} s"
+
+
+def gap_too_long(logged: LoggedRun, longest_gap_s: float) -> str | None:
     """Return why a table cannot be kept at all, or None."""
-    if logged.longest_gap_s > LONGEST_GAP_S:
+    if logged.longest_gap_s > longest_gap_s:
         time_s = logged.table.time_s
         at = time_s[int(np.argmax(np.diff(time_s)))]
         return (
             f"found a gap of {logged.longest_gap_s * 1e3:.1f} ms in the log at {at:.3f} s, "
-            f"expected at most {LONGEST_GAP_S * 1e3:.1f} ms"
+            f"expected at most {longest_gap_s * 1e3:.1f} ms"
         )
     return None
 
 
 def findings(
-    logged: LoggedRun, setpoints: Setpoints, joints: tuple[Joint, Joint], *, sensor: bool
+    logged: LoggedRun, setpoints: Setpoints, joints: Sequence[Joint], *, measured: Collection[int]
 ) -> tuple[str, ...]:
     """Return what is wrong with a run beside its set-points, a line each; empty when nothing is.
 
@@ -186,16 +211,16 @@ def findings(
 
     Args:
         logged: whose first row belongs to the first set-point.
-        joints: as in jtqd's configuration. sensor: the bench has a torque sensor.
+        joints: as in jtqd's configuration, 1, 2, ... measured: those of the run that have a channel of the torque sensor.
     """
-    by_number = dict(zip((1, 2), joints, strict=True))
+    by_number = {number: joints[number - 1] for number in setpoints.joints}
     channels = [issue.text for issue in check_run(logged.table, by_number).refused]
     return (
         *_lost(logged),
-        *(_no_sensor(logged) if sensor else ()),
+        *_no_sensor(logged, measured),
         *channels,
         *_followed(logged, setpoints, joints),
-        *_opposite(logged),
+        *(() if setpoints.current_joint is None else _opposite(logged, setpoints.joints)),
     )
 
 
@@ -209,28 +234,30 @@ def _lost(logged: LoggedRun) -> Iterator[str]:
     )
 
 
-def _no_sensor(logged: LoggedRun) -> Iterator[str]:
+def _no_sensor(logged: LoggedRun, measured: Collection[int]) -> Iterator[str]:
     for number, columns in logged.table.joints.items():
-        if columns.torque_nm is None:
+        if columns.torque_nm is None and number in measured:
             yield f"j{number}.torque_nm: found no value in the whole run, expected the sensor's: dead channel"
 
 
-def _followed(logged: LoggedRun, setpoints: Setpoints, joints: tuple[Joint, Joint]) -> Iterator[str]:
+def _followed(logged: LoggedRun, setpoints: Setpoints, joints: Sequence[Joint]) -> Iterator[str]:
     """Yield the velocity joint against its velocity, the other one against its current."""
     table = logged.table
     place = np.minimum(np.round(table.time_s / PERIOD_S).astype(np.intp), len(setpoints) - 1)
     mover, driver = setpoints.velocity_joint, setpoints.current_joint
-    velocity, current = table.joints[mover].motor_velocity_rad_s, table.joints[driver].current_a
+    velocity = table.joints[mover].motor_velocity_rad_s
     assert velocity is not None  # log_to_run sees to it that these are there
-    assert current is not None
-    joint_side = velocity / joints[mover - 1].gear_ratio
     yield from _follows(
-        joint_side,
+        velocity / joints[mover - 1].gear_ratio,
         setpoints.velocity_rad_s[place],
         FOLLOW_VELOCITY,
         f"j{mover}.motor_velocity_rad_s: through the gear",
         "rad/s",
     )
+    if driver is None:
+        return
+    current = table.joints[driver].current_a
+    assert current is not None
     yield from _follows(current, setpoints.current_a[place], FOLLOW_CURRENT, f"j{driver}.current_a:", "A")
 
 
@@ -248,9 +275,9 @@ def _follows(
     )
 
 
-def _opposite(logged: LoggedRun) -> Iterator[str]:
+def _opposite(logged: LoggedRun, pair: tuple[int, ...]) -> Iterator[str]:
     """The links are one body: in their own frames they turn oppositely."""
-    one, two = (logged.table.joints[number].link_position_rad for number in (1, 2))
+    one, two = (logged.table.joints[number].link_position_rad for number in pair)
     assert one is not None
     assert two is not None
     if max(float(np.ptp(one)), float(np.ptp(two))) < MOVED_RAD:
@@ -259,7 +286,9 @@ def _opposite(logged: LoggedRun) -> Iterator[str]:
     variance = float(dx @ dx)
     slope = float(dx @ (two - two.mean())) / variance if variance else np.inf
     if abs(slope + 1.0) > OPPOSITE_TOLERANCE:
-        yield f"j2.link_position_rad: found it turning {slope:.4g} times as far as j1's, expected -1"
+        yield (
+            f"j{pair[1]}.link_position_rad: found it turning {slope:.4g} times as far as j{pair[0]}'s, expected -1"
+        )
 
 
 ATTEMPTS: Final = 3

@@ -12,13 +12,14 @@ import shlex
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 from jtqd.estimator.checked import ConfigError, counted, make_directory
-from jtqd.estimator.joint import Joint, MotionLimits
+from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTableError
+from jtqd.sysid.campaign.alone import parsed_limits, with_limits
 from jtqd.sysid.campaign.plan import Plan
 from jtqd.sysid.diagnosis.arm_motion import MOTION_FILE, joint_motion_file
 from jtqd.sysid.diagnosis.extended_joint import FILE, write_extended
@@ -63,7 +64,12 @@ def main(argv: list[str]) -> int:
         for run in runs:
             for note in run.notes:
                 print(f"{BY}: {run.name}: {note}", file=sys.stderr)
-        findings = diagnosed(runs, with_limits(joints, options.limits), scope, options.relevance)
+        findings = diagnosed(
+            runs,
+            {number: with_limits(joint, options.limits) for number, joint in joints.items()},
+            scope,
+            options.relevance,
+        )
         findings = replace(findings, joint_files=joints, next_experiment=_with_command(options, findings))
         mapping = _write(options.out, findings, joints, {run.name: run.sha256 for run in runs})
     except UsageError as error:
@@ -80,15 +86,6 @@ def main(argv: list[str]) -> int:
     )
     print(f"{BY}: wrote {options.out / REPORT}", file=sys.stderr)
     return 0 if findings.verdict == NO_GAP else 3
-
-
-def with_limits(joints: Mapping[int, Joint], given: Mapping[str, Any] | None) -> dict[int, Joint]:
-    """Return the joints with `motion_limits` of --limits in the place of their files'. Raises ConfigError."""
-    made = {}
-    for number, joint in joints.items():
-        limits = joint.motion_limits or MotionLimits()
-        made[number] = replace(joint, motion_limits=replace(limits, **given)) if given else joint
-    return made
 
 
 def _with_command(options: argparse.Namespace, findings: Findings) -> dict[str, Any] | None:
@@ -230,25 +227,10 @@ def parser() -> argparse.ArgumentParser:
 
 def motion_limits(text: str) -> dict[str, Any]:
     """Return the limits of a text such as "travel_rad=-0.5:0.5,velocity_rad_s=1". Raises argparse.ArgumentTypeError."""
-    names = [item.name for item in fields(MotionLimits)]
-    found: dict[str, Any] = {}
-    for part in text.split(","):
-        name, _, value = part.strip().partition("=")
-        numbers = value.split(":")
-        try:
-            values = tuple(float(number) for number in numbers)
-        except ValueError:
-            values = ()
-        if name not in names or len(values) != (2 if name == "travel_rad" else 1):
-            raise argparse.ArgumentTypeError(
-                f"found {part.strip()!r}, expected travel_rad=LOW:HIGH or NAME=VALUE with one of {', '.join(names[1:])}"
-            )
-        found[name] = values if name == "travel_rad" else values[0]
     try:
-        MotionLimits(**found)
+        return parsed_limits(text)
     except ConfigError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
-    return found
 
 
 def _percent(text: str) -> float:

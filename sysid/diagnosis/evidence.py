@@ -13,12 +13,14 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
+from scipy import stats
 
 from jtqd.sysid.diagnosis.findings import CandidateEvidence as Evidence
 from jtqd.sysid.diagnosis.findings import JointName, Value
-from jtqd.sysid.diagnosis.mixed_model import Mixed, explained
+from jtqd.sysid.diagnosis.mixed_model import Mixed, explained, solve
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.search import ENTER, HELD_OUT, Hypothesis, Search, order_of
+from jtqd.sysid.diagnosis.steadiness import CHANCE, jackknife, needed
 
 RELEVANT: Final = 1e-3
 """Part of the rated torque below which a contribution (rms over the runs) is not called an effect, however certain."""
@@ -77,9 +79,11 @@ def complete_minimum(search: Search, best: Hypothesis, candidate: EffectCandidat
     return dict(candidate.term.combine([value / step, *rest]))
 
 
-def minimum_size(search: Search, best: Hypothesis, candidate: EffectCandidate) -> dict[str, Value]:
+def minimum_size(
+    search: Search, best: Hypothesis, candidate: EffectCandidate, *, left_over: bool = False
+) -> dict[str, Value]:
     """Return the leading parameter at its minimum detectable size, for a key of the joint file as a difference to it;
-    infinite where no plausible size shows.
+    infinite where no plausible size shows. left_over: something that matters is, see `steady_size`.
     """
     known, share = information(search.mixed, best, candidate)
     for rival in search.candidates:  # found, and at the right joint
@@ -105,6 +109,8 @@ def minimum_size(search: Search, best: Hypothesis, candidate: EffectCandidate) -
     if per_unit <= 0.0:
         return nothing
     size = max(math.sqrt(square / known), search.least_nm / per_unit)
+    if left_over:
+        size = max(size, steady_size(search, best, candidate))
     values = candidate.term.combine([size, *([0.0] * (candidate.size - 1))])
     found = abs(values[lead.name] - none.get(lead.name, 0.0))
     if not math.isfinite(found) or found > min(candidate.largest, max(abs(lead.low), abs(lead.high))):
@@ -114,12 +120,31 @@ def minimum_size(search: Search, best: Hypothesis, candidate: EffectCandidate) -
     return {lead.name: Value(found, (found, found), lead.unit)}
 
 
+def steady_size(search: Search, best: Hypothesis, candidate: EffectCandidate) -> float:
+    """Return the leading coefficient from which a candidate would be steady over the runs (`steadiness`) beside the best
+    set: what it takes of the things left over changes by that much. For waves the worse phase; infinite for one run.
+    """
+    runs = search.mixed.runs
+    if runs < 2:
+        return math.inf
+    base = [k for c in best.chosen if c.key != candidate.key for k in c.columns]
+    marginals, _ = search.mixed.marginal_runs(best.model.variances)
+    places = np.array([*base, *candidate.columns, marginals.shape[1] - 1], np.intp)
+    marginals = marginals[:, places[:, None], places[None, :]]
+    total = marginals.sum(axis=0)
+    errors = jackknife(np.array([solve(total - one, len(places) - 1)[0] for one in marginals]))
+    leading = candidate.size if "phase_rad" in candidate.term.basis[0] else 1
+    return needed(runs) * float(errors[len(base) : len(base) + leading].max())
+
+
 WITHIN: Final = 6.0
 """An alternative this close in BIC is as good (`strong evidence` begins there)."""
 MISFIT: Final = 0.02
 """Part of an effect's evidence that imperfections of the model may be worth: an alternative that explains all but this
 of it is not ruled out by it.
 """
+_COMPARABLE: Final = 0.5
+"""Part of an effect's evidence below which another one is no alternative to it."""
 
 
 def equivalence_class(
@@ -155,10 +180,43 @@ def equivalence_class(
     return tuple(where[key] for key in order)
 
 
+def class_beside(search: Search, best: Hypothesis, cause: EffectCandidate) -> tuple[EffectCandidate, ...]:
+    """Return the candidates that could stand in the place of `cause` where something that matters is left over, best first.
+
+    What is left over is no noise, so that no likelihood says by how much one effect fits better than another. An alternative
+    is ruled out when it is worse on the runs left out by more than that differs from run to run (test of Vuong 1989,
+    Econometrica 57, for models of which none is right).
+    """
+    found = {c.key: c for c in equivalence_class(search, best, cause)}
+    others = [c for c in best.chosen if c is not cause]
+    total, _ = search.mixed.marginal(best.model.variances)
+    base = [k for c in others for k in c.columns]
+    worth = explained(total, base, list(cause.columns))
+    mine = search.held_out_deviances(best)
+    runs = len(mine)
+    enough = float(stats.t.isf(CHANCE, max(runs - 1, 1))) / math.sqrt(runs)
+    worse_by: dict[tuple[str, object], float] = dict.fromkeys(found, -math.inf)
+    for candidate in search.candidates:
+        if candidate.key == cause.key or not search.fits_beside(candidate, others):
+            continue
+        if explained(total, base, list(candidate.columns)) < _COMPARABLE * worth:
+            continue
+        rival = search.hypothesis((*others, candidate), best.model)
+        worse = search.held_out_deviances(rival) - mine
+        refuted = search.reading_misfit(rival) - search.reading_misfit(best) > WITHIN
+        if worse.mean() > enough * worse.std(ddof=1) or refuted or not search.plausible(rival):
+            continue
+        if worse.mean() < worse_by.get(candidate.key, math.inf):
+            found[candidate.key], worse_by[candidate.key] = candidate, float(worse.mean())
+    return tuple(found[key] for key in sorted(found, key=lambda key: worse_by[key]))
+
+
 def candidate_table(
-    search: Search, best: Hypothesis, rivals: Mapping[tuple[str, JointName], str]
+    search: Search, best: Hypothesis, rivals: Mapping[tuple[str, JointName], str], *, left_over: bool = False
 ) -> tuple[Evidence, ...]:
-    """Return one row per effect and joint, most evidence first; rivals: (effect, joint) -> cause it could replace."""
+    """Return one row per effect and joint, most evidence first; rivals: (effect, joint) -> cause it could replace;
+    left_over: something that matters is, so that a size must be steady to be detected.
+    """
     nothing = search.hypothesis(())
     total, _ = search.mixed.marginal(nothing.model.variances)
     rows = []
@@ -167,7 +225,7 @@ def candidate_table(
         groups.setdefault(c.key, []).append(c)
     for terms in groups.values():
         strongest = max(terms, key=lambda c: explained(total, [], list(c.columns)) - search.penalty(c))
-        rows.append(_row(search, best, nothing, strongest, terms, rivals))
+        rows.append(_row(search, best, nothing, strongest, terms, rivals, left_over=left_over))
     return tuple(sorted(rows, key=lambda row: -row.delta_bic))
 
 
@@ -178,12 +236,16 @@ def _row(  # noqa: PLR0917
     candidate: EffectCandidate,
     terms: Sequence[EffectCandidate],
     rivals: Mapping[tuple[str, JointName], str],
+    *,
+    left_over: bool,
 ) -> Evidence:
     alone = search.hypothesis((candidate,))
     delta = nothing.bic - alone.bic
     drop = nothing.model.deviance - alone.model.deviance
     held = search.held_out(alone, candidate) / drop if drop > 1.0 else 0.0
-    minimum = _smallest([minimum_size(search, best, c) for c in terms])
+    sizes = [minimum_size(search, best, c, left_over=left_over) for c in terms]
+    minimum = _smallest(sizes)
+    minimum_rms = min(_rms_of(search, c, m) for c, m in zip(terms, sizes, strict=True))
     chosen = any(c.key == candidate.key for c in best.chosen)
     if chosen:
         reason = "chosen"
@@ -210,7 +272,16 @@ def _row(  # noqa: PLR0917
         minimum,
         reason,
         tuple(m for c in terms if (m := complete_minimum(search, best, c)) is not None),
+        minimum_rms,
     )
+
+
+def _rms_of(search: Search, candidate: EffectCandidate, size: Mapping[str, Value]) -> float:
+    """Return what a candidate of this size of its leading parameter contributes [Nm rms]."""
+    ((name, value),) = size.items()
+    rest = [0.0] * (candidate.size - 1)
+    step = candidate.term.combine([1.0, *rest])[name] - candidate.term.combine([0.0, *rest]).get(name, 0.0)
+    return float(abs(value.value / step) * search.column_rms[candidate.first])
 
 
 def _smallest(found: Sequence[Mapping[str, Value]]) -> Mapping[str, Value]:

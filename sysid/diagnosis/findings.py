@@ -49,7 +49,7 @@ class Cause:
     explained_share: float = float("nan")  # of all that is structure in these runs, as squares
     steadiness: float = float(
         "nan"
-    )  # its size in standard errors over the runs left out (`guards.steadiness`)
+    )  # its size in standard errors where it is least certain (`steadiness.py`)
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,9 @@ class CandidateEvidence:
     minimum: Mapping[str, Value]  # minimum detectable size of its leading parameter(s); value inf: invisible
     reason: str  # "chosen", "class of X", "below threshold", "invisible in these runs", "needs temperature_c", ...
     at_minimum: tuple[Mapping[str, float], ...] = ()  # all parameters at that size, per way of looking for it
+    minimum_rms_nm: float = float(
+        "nan"
+    )  # what it contributes at that size, rms over the runs; inf: invisible
 
 
 @dataclass(frozen=True)
@@ -355,6 +358,7 @@ def _candidate(candidate: CandidateEvidence) -> dict[str, Any]:
         "minimum": {
             name: {"value": each.value, "unit": each.unit} for name, each in candidate.minimum.items()
         },
+        "minimum_rms_nm": candidate.minimum_rms_nm,
         "reason": candidate.reason,
     }
 

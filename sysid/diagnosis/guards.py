@@ -26,8 +26,6 @@ _FACTOR: Final = {"torque_constant_nm_per_a": 2.0, "gain": 2.0}
 """By how much a value may differ from the file's, either way: more is another motor or another unit, not an error."""
 _CANCELLED: Final = 0.3
 """Two effects whose sum is smaller than this part of each cancel each other."""
-STEADY: Final = 20.0
-"""Size of an effect in standard errors over the runs left out, from which it is proven beside what is left over."""
 
 
 def nothing_of(best: Hypothesis) -> list[dict[str, float]]:
@@ -121,26 +119,3 @@ def held_out_gains(dataset: Dataset, refined: Refined) -> list[float]:
 def _rms(parts: Sequence[FloatArray]) -> float:
     whole = np.concatenate(parts) if parts else np.zeros(1)
     return float(np.sqrt(np.mean(whole**2))) if len(whole) else 0.0
-
-
-def steadiness(refined: Refined, nothing: Sequence[dict[str, float]]) -> list[float]:
-    """Return per cause its size in standard errors that its changes give when runs are left out one by one (jackknife):
-    what a model error makes is not the same in all runs, however small its residual.
-    """
-    first_piece = np.unique(refined.mixed.pieces, return_index=True)[1]
-    steps = np.array(left_out_steps(refined))[first_piece]  # [r, p]
-    runs = len(steps)
-    spread = (
-        np.sqrt((runs - 1.0) / runs * np.sum((steps - steps.mean(axis=0)) ** 2, axis=0)) if runs > 1 else None
-    )
-    out, first = [], 0
-    for p, none in zip(refined.present, nothing, strict=True):
-        ratios = []
-        for k, name in enumerate(p.free):
-            size = abs(p.values[name] - none.get(name, 0.0))
-            leading = name not in ("phase_rad", "reference_c")
-            if leading and spread is not None:
-                ratios.append(size / max(float(spread[first + k]), 1e-30))
-        out.append(max(ratios, default=0.0))
-        first += len(p.free)
-    return out

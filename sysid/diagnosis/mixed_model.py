@@ -12,6 +12,7 @@ Source: Laird and Ware 1982, Biometrics 38 (random effects, EM).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Final
 
@@ -72,6 +73,13 @@ class Mixed:
         out.pieces = np.arange(len(runs))
         out.rows = self.rows * len(runs) // max(len(self.grams), 1)
         out._p, out._q, out._fixed_index = self._p, self._q, self._fixed_index
+        return out
+
+    def less(self, grams: FloatArray) -> Mixed:
+        """Return the same without a part of each of the sums that it was made of [s, P+Q+1, P+Q+1]."""
+        out = copy(self)
+        out.grams = self.grams.copy()
+        np.subtract.at(out.grams, self.pieces, grams)
         return out
 
     def _inverse(self, variances: FloatArray) -> FloatArray:

@@ -27,7 +27,7 @@ from jtqd.sysid.diagnosis.arm_motion import KINDS, Room, csv_text, described, mo
 from jtqd.sysid.diagnosis.signals import JointSignals
 from jtqd.sysid.excitation.design import draw
 from jtqd.sysid.excitation.model import Bench as StaticBench
-from jtqd.sysid.excitation.model import ExcitationLimits
+from jtqd.sysid.excitation.model import ExcitationLimits, current_at, rounded_down
 from jtqd.sysid.motion.setpoints import Limits
 
 VELOCITY_RAD_S: Final = 2.0
@@ -107,10 +107,10 @@ def reach_of(
     for allowed in (j.motion_limits for j in pair):
         if allowed is not None:
             rated, velocity_rad_s = min(rated, allowed.torque_nm), min(velocity_rad_s, allowed.velocity_rad_s)
-    currents = [_current_at(j, rated, velocity_rad_s) for j in pair]
+    currents = [current_at(j, rated, velocity_rad_s) for j in pair]
     limits = Limits(
-        current_a=_down(max(currents)),
-        velocity_rad_s=_down(1.15 * velocity_rad_s),
+        current_a=rounded_down(max(currents)),
+        velocity_rad_s=rounded_down(1.15 * velocity_rad_s),
         torque_nm=rated,
         travel_rad=1.0,
         temperature_c=TEMPERATURE_C if temperature else math.inf,
@@ -122,23 +122,6 @@ def reach_of(
     )
     own = [_CURRENT_SHARE * min(current, limits.current_a) for current in currents]
     return Reach(pair, limits, velocity_rad_s, acceleration, (own[0], own[1]))
-
-
-def _current_at(joint: Joint, torque_nm: float, velocity_rad_s: float) -> float:
-    """Current [A] at which the joint, driving at this velocity, gives this torque; of the loss, the largest on the way."""
-    loss = LossModel(joint)
-    highest = _OVER * torque_nm / loss.torque_per_ampere
-    currents = np.linspace(0.0, highest, _STEPS)
-    speeds = np.full_like(currents, velocity_rad_s)
-    given = loss.torque_per_ampere * currents - loss.loss_many(currents, speeds)
-    enough = np.flatnonzero(given >= torque_nm)
-    return float(currents[enough[0]] if len(enough) else highest)
-
-
-def _down(value: float) -> float:
-    """Two significant digits after rounding down: limits are read by people."""
-    place = 10.0 ** (math.floor(math.log10(value)) - 1)
-    return float(round(math.floor(value / place + 1e-9) * place, 6))
 
 
 _RAMP_S: Final = 0.4

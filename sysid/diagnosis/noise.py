@@ -8,7 +8,7 @@ of unit variance: the number of rows times the information each still has is the
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -179,31 +179,52 @@ class Sums:
 def run_sums(run: RunData, noise: Noise, columns: int, nuisances: int) -> Sums:
     """Return the whitened normal equations of one run."""
     width = columns + nuisances + 1
-    order = ORDER
-    present = [c for c in noise.channels if c in run.channels]
-    white: dict[Channel, FloatArray] = {}
-    good: dict[Channel, BoolArray] = {}
-    for c in present:
-        d = run.channels[c]
-        k = noise.channels.index(c)
-        block = np.column_stack((d.regressors, d.nuisances, d.residual))
-        white[c] = whiten(block, noise.ar[c]) / noise.sigma[k]
-        good[c] = past_valid(d.valid, order)
-    pattern = np.zeros(len(run.time_s), np.intp)
-    for bit, c in enumerate(present):
-        pattern += good[c].astype(np.intp) << bit
     gram = np.zeros((width, width))
     rows = 0
+    for at, there, white, weight in _whitened(run, noise):
+        rows += len(at) * len(there)
+        gram += _pattern_gram(run, white, there, weight, width, columns)
+    return Sums(gram / noise.inflation, rows)
+
+
+def whitened_rows(
+    run: RunData, noise: Noise, columns: int, nuisances: int
+) -> tuple[FloatArray, np.ndarray[tuple[int], np.dtype[np.intp]]]:
+    """Return independent rows [m, P + Q + 1] of which `run_sums` is the sum of the products, and the bin of each [m]."""
+    width = columns + nuisances + 1
+    blocks, bins = [np.empty((0, width))], [np.empty(0, np.intp)]
+    for at, there, white, weight in _whitened(run, noise):
+        factor = np.linalg.cholesky(weight) / np.sqrt(noise.inflation)
+        for k in range(len(there)):
+            block = np.zeros((len(at), width))
+            for c, x, w in zip(there, white, factor[:, k], strict=True):
+                block[:, _places(run.channels[c], columns, width)] += w * x
+            blocks.append(block)
+            bins.append(at)
+    return np.vstack(blocks), np.concatenate(bins)
+
+
+def _whitened(
+    run: RunData, noise: Noise
+) -> Iterator[tuple[np.ndarray[tuple[int], np.dtype[np.intp]], list[Channel], list[FloatArray], FloatArray]]:
+    """Yield per pattern of valid channels its bins, the channels, their whitened columns (regressors, nuisances, residual)
+    and the inverse covariance between them.
+    """
+    present = [c for c in noise.channels if c in run.channels]
+    white: dict[Channel, FloatArray] = {}
+    pattern = np.zeros(len(run.time_s), np.intp)
+    for bit, c in enumerate(present):
+        d = run.channels[c]
+        block = np.column_stack((d.regressors, d.nuisances, d.residual))
+        white[c] = whiten(block, noise.ar[c]) / noise.sigma[noise.channels.index(c)]
+        pattern += past_valid(d.valid, ORDER).astype(np.intp) << bit
     for value in np.unique(pattern):
         there = [c for bit, c in enumerate(present) if value >> bit & 1]
-        if not there:
-            continue
-        at = pattern == value
-        places = [noise.channels.index(c) for c in there]
-        weight = np.asarray(np.linalg.inv(noise.correlation[np.ix_(places, places)]), np.float64)
-        rows += int(at.sum()) * len(there)
-        gram += _pattern_gram(run, [white[c][at] for c in there], there, weight, width, columns)
-    return Sums(gram / noise.inflation, rows)
+        if there:
+            at = np.flatnonzero(pattern == value)
+            places = [noise.channels.index(c) for c in there]
+            weight = np.asarray(np.linalg.inv(noise.correlation[np.ix_(places, places)]), np.float64)
+            yield at, there, [white[c][at] for c in there], weight
 
 
 def _places(d: ChannelData, columns: int, width: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:

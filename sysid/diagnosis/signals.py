@@ -220,6 +220,41 @@ class SignalsError(ValueError):
     """A run cannot serve a diagnosis; one line."""
 
 
+@dataclass(frozen=True)
+class _Motion:
+    """Motion of one motor as it is known, at the motor's shaft.
+
+    speed: as recorded or derived; whole: acceleration at the full rate; acceleration, shared: where it is known to
+    `_VISIBLE` and `_SHARED`; visible: the smoother of the first; of_position: all is of the position, else of the velocity;
+    coarse: what its noise costs, in words.
+    """
+
+    position: FloatArray
+    speed: FloatArray
+    whole: FloatArray
+    acceleration: FloatArray
+    shared: FloatArray
+    visible: Smoother
+    of_position: bool
+    coarse: str
+
+
+def _motion(time: FloatArray, raw: JointColumns, columns: JointColumns, joint: Joint) -> _Motion:
+    speed = _motor_speed(time, raw, columns, joint)
+    position = columns.motor_position_rad
+    if position is None:
+        position = np.concatenate(([0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(time))))
+    of_position = raw.motor_position_rad is not None and speed is not raw.motor_velocity_rad_s
+    # of the position where the velocity is that of the position too
+    whole = second_difference(position, time) if of_position else np.gradient(speed, time)
+    known = position if of_position else speed
+    noise = noise_of(known)
+    visible = _smoother(joint, time, noise, _VISIBLE, of_position=of_position)
+    shared = _smoother(joint, time, noise, _SHARED, of_position=of_position)(whole)
+    coarse = _cost(joint, time, known, noise, visible, of_position=of_position)
+    return _Motion(position, speed, whole, visible(whole), shared, visible, of_position, coarse)
+
+
 def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: BaseLoss) -> JointSignals:
     """Return the signals of one joint; raises SignalsError for a column that is missing and cannot be derived."""
     raw = table.joints[number]
@@ -230,21 +265,16 @@ def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: Ba
     assert columns.current_a is not None
     assert columns.torque_nm is not None
     assert columns.motor_position_rad is not None or columns.motor_velocity_rad_s is not None
-    time = table.time_s
-    speed = _motor_speed(time, raw, columns, joint)
-    position = columns.motor_position_rad
-    if position is None:
-        position = np.concatenate(([0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(time))))
-    of_position = raw.motor_position_rad is not None and speed is not raw.motor_velocity_rad_s
-    # of the position where the velocity is that of the position too
-    whole = second_difference(position, time) if of_position else np.gradient(speed, time)
-    noise = noise_of(position if of_position else speed)
-    visible = _smoother(joint, time, noise, _VISIBLE, of_position=of_position)
-    acceleration, velocity = visible(whole), visible(speed) / joint.gear_ratio
+    time, sensor = table.time_s, columns.torque_nm
+    motion = _motion(time, raw, columns, joint)
+    velocity = motion.visible(motion.speed) / joint.gear_ratio
     both = _two_encoders(raw, joint.gear_ratio)
-    link = columns.link_position_rad if columns.link_position_rad is not None else position / joint.gear_ratio
-    link_acceleration = acceleration / joint.gear_ratio
-    sensor = columns.torque_nm
+    link = (
+        columns.link_position_rad
+        if columns.link_position_rad is not None
+        else motion.position / joint.gear_ratio
+    )
+    link_acceleration = motion.acceleration / joint.gear_ratio
     wide = max(1, round(_SMOOTH_S / max(float(np.median(np.diff(time))), 1e-9)))
     if both:
         # not of the link encoder, whose noise is K times over in the torsion balance; the spring's part is small
@@ -252,55 +282,48 @@ def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: Ba
         link_acceleration = link_acceleration - torsion_acceleration
     gear_torque = sensor + joint.link_inertia_kgm2 * link_acceleration
     calm_torque, calm_current = smooth(gear_torque, wide), smooth(columns.current_a, wide)
-    calm_sensor = smooth(sensor, wide)
-    moving = _moving(time, velocity, visible.slowest_hz)
-    shared = _smoother(joint, time, noise, _SHARED, of_position=of_position)(whole)
     state = State(
         current_a=calm_current,
         current_rate_a_s=np.gradient(calm_current, time),
         direction=np.where(np.abs(velocity) > 1e-6, np.sign(velocity), 0.0),
-        link_acceleration_rad_s2=link_acceleration + (shared - acceleration) / joint.gear_ratio,
+        link_acceleration_rad_s2=link_acceleration + (motion.shared - motion.acceleration) / joint.gear_ratio,
         link_position_rad=link,
         link_velocity_rad_s=velocity,
-        motor_acceleration_rad_s2=shared,
-        motor_position_rad=position,
+        motor_acceleration_rad_s2=motion.shared,
+        motor_position_rad=motion.position,
         temperature_c=_or_nan(columns.temperature_c, len(time)),
         time_s=time - time[0],
         torque_nm=calm_torque,
-        torque_rate_nm_s=np.gradient(calm_sensor, time),
+        torque_rate_nm_s=np.gradient(smooth(sensor, wide), time),
         torsion_rad=calm_torque / joint.stiffness_nm_per_rad,
         velocity_rad_s=velocity,
         coupling_position_rad=link if number != 2 else -link,
     )
     motor_torque = joint.gear_ratio * (
-        joint.torque_constant_nm_per_a * columns.current_a - joint.rotor_inertia_kgm2 * whole
+        joint.torque_constant_nm_per_a * columns.current_a - joint.rotor_inertia_kgm2 * motion.whole
     )
-    motor = motor_torque - base.loss(gear_torque, velocity) - gear_torque
     torsion = bent = None
     if both:
-        twist = position / joint.gear_ratio - link
+        twist = motion.position / joint.gear_ratio - link
         rate = velocity - np.gradient(link, time)
         zero = _zero(twist - gear_torque / joint.stiffness_nm_per_rad, calm_torque)
         torsion = joint.stiffness_nm_per_rad * (twist - zero) + joint.damping_nms_per_rad * rate - gear_torque
         bent = smooth(twist - zero, wide)
-    off = None if columns.enabled is None else np.asarray(columns.enabled < 0.5)
     return JointSignals(
         run,
         number,
         joint,
         time,
         state,
-        motor,
+        motor_torque - base.loss(gear_torque, velocity) - gear_torque,
         torsion,
-        moving,
+        _moving(time, velocity, motion.visible.slowest_hz),
         sensor,
         twist_rad=bent,
-        off=off,
-        of_position=of_position,
-        visible=visible,
-        coarse=_cost(
-            joint, time, position if of_position else speed, noise, visible, of_position=of_position
-        ),
+        off=None if columns.enabled is None else np.asarray(columns.enabled < 0.5),
+        of_position=motion.of_position,
+        visible=motion.visible,
+        coarse=motion.coarse,
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -12,13 +12,14 @@ import numpy as np
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.current_zero import offset_at_rest, rest_current
 from jtqd.sysid.diagnosis.dataset import Dataset
-from jtqd.sysid.diagnosis.evidence import RELEVANT, candidate_table, equivalence_class
+from jtqd.sysid.diagnosis.evidence import RELEVANT, candidate_table, class_beside, equivalence_class
 from jtqd.sysid.diagnosis.findings import (
     AMBIGUOUS,
     CAUSE,
     INSUFFICIENT,
     NO_GAP,
     UNEXPLAINED,
+    CandidateEvidence,
     Cause,
     Findings,
     Gap,
@@ -28,7 +29,7 @@ from jtqd.sysid.diagnosis.findings import (
 )
 from jtqd.sysid.diagnosis.gain import held_out_gain, left_out_steps
 from jtqd.sysid.diagnosis.gaps import channel_gaps, traces
-from jtqd.sysid.diagnosis.guards import STEADY, nothing_of, objections, steadiness
+from jtqd.sysid.diagnosis.guards import nothing_of, objections
 from jtqd.sysid.diagnosis.leave_one_out import ENOUGH_RUNS, LeaveOneOut
 from jtqd.sysid.diagnosis.leftover import Leftover, leftover
 from jtqd.sysid.diagnosis.next_experiment import MOST_KINDS, next_experiment
@@ -44,6 +45,7 @@ from jtqd.sysid.diagnosis.refine import (
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.search import Hypothesis, Search
 from jtqd.sysid.diagnosis.signals import Channel
+from jtqd.sysid.diagnosis.steadiness import steadiness
 from jtqd.sysid.fit.friction import student_975
 
 RELEVANCE: Final = 0.005
@@ -60,8 +62,90 @@ INACCURATE: Final = 0.06
 """Half width of the 95 % interval, as part of an effect's size, for what the equations here simplify (smoothing, first
 order in a delay): no interval is narrower. Judged by its coverage of known truths (docs/diagnosis.md).
 """
+_FAR_FROM_CERTAIN: Final = 0.25
+"""Part of the steadiness that is needed below which effects are taken away at once, not one by one."""
 BESIDE: Final = 0.02
 """Part of the largest cause's contribution below which another one is within the model's own inaccuracy."""
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What was found, and what may be named of it.
+
+    whole, refined: all that no guard objects to, and the fit that what is left over is judged with; best, proven: of that
+    what is certain enough, and its fit; few: the rule for few runs, None with enough; share: of all structure that is left
+    over; limits: from where it matters [Nm]; refused: the objections.
+    """
+
+    whole: Hypothesis
+    refined: Refined
+    best: Hypothesis
+    proven: Refined
+    few: LeaveOneOut | None
+    left: Leftover
+    share: float
+    limits: Mapping[Channel, float]
+    refused: Sequence[str]
+
+    @property
+    def large(self) -> bool:
+        """Whether what is left over is relevant by its size."""
+        return any(nm > self.limits[c] for c, nm in self.left.worst_nm.items())
+
+    @property
+    def matters(self) -> bool:
+        """Whether what is left over matters: by its size, and as a part of the gap."""
+        part = UNEXPLAINED_SHARE if self.few is None else FEW_UNEXPLAINED_SHARE
+        return self.large and (self.share > part or not self.whole.chosen)
+
+    @property
+    def beside(self) -> bool:
+        """Whether causes have to be certain beside what is left over, however small a part of the gap it is: a small effect
+        may imitate it. With few runs they have a rule of their own.
+        """
+        return self.large and self.few is None
+
+
+def _found(  # noqa: PLR0917
+    dataset: Dataset,
+    search: Search,
+    best: Hypothesis,
+    refined: Refined,
+    noise: Noise,
+    joints: Mapping[int, Joint],
+    relevance: float,
+) -> _Found:
+    few = LeaveOneOut(dataset, search) if search.mixed.runs < ENOUGH_RUNS else None
+    best, refined, explained, refused = _guarded(
+        dataset, search, best, refined, noise, joints, bounds_only=few is not None
+    )
+    left = leftover(dataset, refined, noise, joints)
+    whole, squares = best, _squares(explained)
+    if few is not None:  # what is left over is judged with all that was found, names need more
+        best = few.confirmed(whole)
+        refined = refine(dataset, present_effects(best), noise)
+        best, refined, explained, refused = _guarded(dataset, search, best, refined, noise, joints)
+        named = leftover(dataset, refined, noise, joints)
+        if named.energy_nm2() < left.energy_nm2():
+            whole, left, squares = best, named, _squares(explained)
+    limits = {c: relevance * joints[c.joint].rated_torque_nm for c in refined.runs[0].channels}
+    found = _Found(whole, refined, best, refined, few, left, left.share(squares), limits, refused)
+    if found.beside:
+        best, proven = _proven(dataset, search, best, refined, noise, joints)
+        found = replace(found, best=best, proven=proven)
+    return found
+
+
+def _squares(explained: Sequence[Mapping[Channel, float]]) -> float:
+    return sum(r * r for e in explained for r in e.values())
+
+
+def _classes(search: Search, found: _Found) -> list[tuple[EffectCandidate, ...]]:
+    """Return per cause the alternatives that these runs do not rule out."""
+    if found.few is not None:
+        return [found.few.rivals(found.best, c) for c in found.best.chosen]
+    alternatives = class_beside if found.beside else equivalence_class
+    return [alternatives(search, found.best, c) for c in found.best.chosen]
 
 
 def conclude(  # noqa: PLR0917
@@ -76,78 +160,71 @@ def conclude(  # noqa: PLR0917
     relevance: float = RELEVANCE,
 ) -> Findings:
     """Return the findings of one diagnosis; relevance: see RELEVANCE."""
-    few = LeaveOneOut(dataset, search) if search.mixed.runs < ENOUGH_RUNS else None
-    best, refined, explained, refused = _guarded(
-        dataset, search, best, refined, noise, joints, bounds_only=few is not None
+    found = _found(dataset, search, best, refined, noise, joints, relevance)
+    few, left, whole, judged, matters = found.few, found.left, found.whole, found.refined, found.matters
+    gain = held_out_gain(dataset, found.proven)
+    best, refined, classes = _without_asymmetry_at_rest(
+        dataset, search, found.best, found.proven, noise, _classes(search, found)
     )
-    left = leftover(dataset, refined, noise, joints)
-    whole, squares = best, sum(r * r for e in explained for r in e.values())
-    if few is not None:  # what is left over is judged with all that was found, names need more
-        best = few.confirmed(whole)
-        refined = refine(dataset, present_effects(best), noise)
-        best, refined, explained, more = _guarded(dataset, search, best, refined, noise, joints)
-        refused = more
-        named = leftover(dataset, refined, noise, joints)
-        if named.energy_nm2() < left.energy_nm2():
-            whole, left, squares = best, named, sum(r * r for e in explained for r in e.values())
-    limits = {c: relevance * joints[c.joint].rated_torque_nm for c in refined.runs[0].channels}
-    matters = any(nm > limits[c] for c, nm in left.worst_nm.items())
-    part = UNEXPLAINED_SHARE if few is None else FEW_UNEXPLAINED_SHARE
-    matters = matters and (left.share(squares) > part or not whole.chosen)
-    judged = refined
-    if matters and few is None:
-        best, refined, explained = _proven(dataset, search, best, refined, noise, joints)
-    gain = held_out_gain(dataset, refined)
-    classes = [
-        few.rivals(best, candidate) if few is not None else equivalence_class(search, best, candidate)
-        for candidate in best.chosen
-    ]
-    best, refined, classes = _without_asymmetry_at_rest(dataset, search, best, refined, noise, classes)
-    explained = [_rms_at(dataset, p) for p in refined.present]
-    rivals = {r.key: c.effect.name for c, found in zip(best.chosen, classes, strict=True) for r in found}
-    causes = [
-        _cause(search, best, refined, k, classes[k], *_largest(explained[k])) for k in range(len(classes))
-    ]
-    energies = [sum(r * r for r in e.values()) for e in explained]
+    causes, energies = _causes(dataset, search, best, refined, noise, classes)
     total = max(sum(energies) + left.energy_nm2(), 1e-30)
-    steady = steadiness(refined, nothing_of(best))
-    causes = [
-        replace(c, explained_share=e / total, steadiness=t)
-        for c, e, t in zip(causes, energies, steady, strict=True)
-    ]
+    causes = [replace(c, explained_share=e / total) for c, e in zip(causes, energies, strict=True)]
     rated = {n: joint.rated_torque_nm for n, joint in joints.items()}
-    rest = _left_over(left, limits, rated, left.energy_nm2() / total, matters=matters)
+    rest = _left_over(left, found.limits, rated, left.energy_nm2() / total, matters=matters)
     unsure = [] if few is None else few.unsure(whole, best, classes, causes)
     doubt = few.doubt(unsure) if few is not None and unsure else ""
+    rivals = {r.key: c.effect.name for c, others in zip(best.chosen, classes, strict=True) for r in others}
+    table = candidate_table(search, best, rivals, left_over=found.beside)
     reasons: list[str] = []
     if matters:
         verdict = UNEXPLAINED
-        reasons += _closest(whole, causes, left.share(squares))
+        reasons += _closest(whole, causes, found.share)
         left, judged = _least_left(dataset, left, judged, noise, joints)
+        reasons += left.reasons
+        reasons += _told_from(table, max(rated.values())) if found.beside else []
     elif not causes:
         verdict = INSUFFICIENT if doubt else NO_GAP
         reasons += [doubt] if doubt else []
     else:
         verdict = CAUSE if all(len(c.names) == 1 for c in causes) and not doubt else AMBIGUOUS
-    reasons += left.reasons if matters else []
     causes.sort(key=lambda c: -c.rms_nm)
     gaps = channel_gaps(dataset, judged if matters else refined, left if matters else None)
     if not reasons:
         reasons = [s for s in (_reason(verdict, causes, gaps), doubt) if s]
     return Findings(
         verdict,
-        tuple(reasons + refused),
+        (*reasons, *found.refused),
         names,
         numbers,
         gaps,
         tuple(causes),
-        candidate_table(search, best, rivals),
+        table,
         gain if causes else None,
         next_experiment=_settling_experiment(verdict, causes, unsure, joints, dataset),
         traces=traces(dataset, judged if matters else refined),
         explained_share=sum(energies) / total if causes else math.nan,
         left_over=rest,
     )
+
+
+def _causes(  # noqa: PLR0917
+    dataset: Dataset,
+    search: Search,
+    best: Hypothesis,
+    refined: Refined,
+    noise: Noise,
+    classes: Sequence[tuple[EffectCandidate, ...]],
+) -> tuple[list[Cause], list[float]]:
+    """Return the causes, and the energy that each explains, summed over channels [Nm^2]."""
+    explained = [_rms_at(dataset, p) for p in refined.present]
+    steady = steadiness(refined, noise, nothing_of(best))
+    causes = [
+        replace(
+            _cause(search, best, refined, k, classes[k], *_largest(explained[k])), steadiness=steady[k].ratio
+        )
+        for k in range(len(classes))
+    ]
+    return causes, [_squares([e]) for e in explained]
 
 
 def _left_over(
@@ -178,6 +255,18 @@ def _closest(whole: Hypothesis, causes: Sequence[Cause], share: float) -> list[s
     return [
         f"the closest {effects} of the library ({others}) would leave {share:.0%} of the structured gap, "
         f"so {are} not named as its cause"
+    ]
+
+
+def _told_from(table: Sequence[CandidateEvidence], rated_nm: float) -> list[str]:
+    """Return how large an effect must be to be told beside what is left over; none is larger than the rated torque."""
+    seen = sorted((c.minimum_rms_nm, c.name) for c in table if c.minimum_rms_nm < rated_nm)
+    if not seen:
+        return []
+    (low, easiest), (high, hardest) = seen[0], seen[-1]
+    return [
+        f"on these runs an effect below {low:.2g} Nm rms ({easiest.replace('_', ' ')}) to {high:.2g} Nm rms"
+        f" ({hardest.replace('_', ' ')}) cannot be told from what is left over"
     ]
 
 
@@ -217,19 +306,19 @@ def _proven(  # noqa: PLR0917
     refined: Refined,
     noise: Noise,
     joints: Mapping[int, Joint],
-) -> tuple[Hypothesis, Refined, list[dict[Channel, float]]]:
-    """Return the same with those causes only that are certain whatever is left over (`guards.STEADY`)."""
+) -> tuple[Hypothesis, Refined]:
+    """Return the same with those causes only that are certain whatever is left over (`steadiness`)."""
     while best.chosen:
-        steady = steadiness(refined, nothing_of(best))
-        weakest = min(range(len(steady)), key=lambda k: steady[k])
-        if steady[weakest] >= STEADY:
+        margins = [s.margin for s in steadiness(refined, noise, nothing_of(best))]
+        if min(margins) >= 1.0:
             break
-        least = max(steady[weakest], 0.25 * STEADY)
+        least = max(min(margins), _FAR_FROM_CERTAIN)
         best = search.hypothesis(
-            [c for c, t in zip(best.chosen, steady, strict=True) if t > least], best.model
+            [c for c, m in zip(best.chosen, margins, strict=True) if m > least], best.model
         )
         refined = refine(dataset, present_effects(best), noise)
-    return _without_negligible(dataset, search, best, refined, noise, joints)
+    best, refined, _ = _without_negligible(dataset, search, best, refined, noise, joints)
+    return best, refined
 
 
 def _least_left(
@@ -291,10 +380,11 @@ def _settling_experiment(
     joints: Mapping[int, Joint],
     dataset: Dataset,
 ) -> dict[str, Any] | None:
-    """Return the experiment that would settle an ambiguous verdict, or one of too few runs; unsure: what does not hold on
-    every held-out run.
+    """Return the experiment that would settle an ambiguous verdict, a class beside something left over, or one of too few
+    runs; unsure: what does not hold on every held-out run.
     """
-    if verdict not in (AMBIGUOUS, INSUFFICIENT):
+    in_class = any(len(c.names) > 1 for c in causes)
+    if verdict not in (AMBIGUOUS, INSUFFICIENT) and not (verdict == UNEXPLAINED and in_class):
         return None
     classes = [tuple(dict.fromkeys(n.split(" of ")[0] for n in c.names)) for c in causes if len(c.names) > 1]
     known = {s.number: joints[s.number] for s in dataset.signals[0]}

@@ -143,10 +143,6 @@ def speed_groups(plateaus: Iterable[PlateauScore]) -> dict[tuple[str, float], li
     return dict(sorted(groups.items(), key=lambda item: (item[0][0] != "forward", item[0][1])))
 
 
-FLAGGED: Final = 0.95
-"""Least share of the samples outside whose status is degraded."""
-
-
 class Range(NamedTuple):
     """Training range of a joint: motor torque, joint side [Nm], and temperature [degC], None where it had none."""
 

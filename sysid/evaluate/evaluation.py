@@ -247,7 +247,6 @@ def _record(judged: _Judged, kind: str) -> RunRecord:
 
 TOB_RANGE_NM2: Final = (7.0, 14.0)
 """MSE of the classical TOB from which on, and up to which, the emulated bench is as hard as the paper's."""
-TOB_TO_PAPER: Final = 46.0
 OURS_TO_PAPER: Final = 0.5
 BACK_DRIVE_PERCENT: Final = 2.0
 EXTRA_US: Final = 15.0
@@ -324,10 +323,10 @@ def _tob_to_paper(result: Evaluation) -> Target:
         "tob_to_paper",
         "MSE ratio TOB : paper's chain, velocity mode",
         f"{PAPER_MSE_NM2['tob'] / PAPER_MSE_NM2['network']:.0f}",
-        f"at least {TOB_TO_PAPER:g}",
+        "-",
         _number(tested, ".1f"),
-        None if tested is None else tested >= TOB_TO_PAPER,
-        (f"all joints: {_number(both, '.1f')}",),
+        None,
+        (f"all joints: {_number(both, '.1f')}; it mostly rewards a baseline without load friction",),
     )
 
 
@@ -352,13 +351,19 @@ def _ours_to_paper(result: Evaluation) -> Target:
 def _every_run(runs: Mapping[tuple[str, int], Row]) -> Target:
     judged = [key for key, one in runs.items() if OURS in one and "physics" in one]
     worse = worse_runs(runs)
+    # a network of share 0 is no network: that ours is not worse then says nothing
+    told = any(runs[key][OURS].mse_nm2 != runs[key]["physics"].mse_nm2 for key in judged)
     return Target(
         "every_run",
         "runs in which ours is worse than its physics",
         "-",
-        "none",
-        f"{len(worse)} of {len(judged)}" if judged else "not known",
-        not worse if judged else None,
+        "none" if told else "-",
+        "none: they are one number"
+        if judged and not told
+        else f"{len(worse)} of {len(judged)}"
+        if judged
+        else "not known",
+        not worse if told else None,
         tuple(
             f"{run} j{number}: {ours:.4f} against {physics:.4f} Nm²" for run, number, ours, physics in worse
         ),
@@ -416,7 +421,6 @@ def _coverage(variable: scores.IntervalTables | None, every: scores.IntervalTabl
 def _outside(found: Sequence[constant.Outside]) -> tuple[Target, Target]:
     worst = max(found, key=lambda each: each.ours.rmse_nm / each.physics.rmse_nm, default=None)
     flagged = min((each.flagged for each in found), default=None)
-    goal = 100.0 * constant.FLAGGED
     return (
         Target(
             "outside_rmse",
@@ -437,11 +441,14 @@ def _outside(found: Sequence[constant.Outside]) -> tuple[Target, Target]:
         ),
         Target(
             "outside_flagged",
-            "flagged degraded outside the envelope",
+            "flagged degraded outside the network's own envelope",
             "-",
-            f"at least {goal:g} %",
+            "-",
             "not evaluated (--outside)" if flagged is None else f"{100.0 * flagged:.2f} %",
-            None if flagged is None else flagged >= constant.FLAGGED,
+            None,
+            (
+                "by definition: 'python -m jtqd.sysid.goals' counts flags outside of what a campaign has driven",
+            ),
         ),
     )
 

@@ -223,6 +223,28 @@ class Candidates:
         return self._trajectory(v), self._series(i), motion
 
 
+_STEPS: Final = 200
+_OVER: Final = 3.0
+"""Largest current tried, in torques over G Kt."""
+
+
+def current_at(joint: Joint, torque_nm: float, velocity_rad_s: float) -> float:
+    """Current [A] at which the joint, driving at this velocity, gives this torque; of the loss, the largest on the way."""
+    loss = LossModel(joint)
+    highest = _OVER * torque_nm / loss.torque_per_ampere
+    currents = np.linspace(0.0, highest, _STEPS)
+    speeds = np.full_like(currents, velocity_rad_s)
+    given = loss.torque_per_ampere * currents - loss.loss_many(currents, speeds)
+    enough = np.flatnonzero(given >= torque_nm)
+    return float(currents[enough[0]] if len(enough) else highest)
+
+
+def rounded_down(value: float) -> float:
+    """Two significant digits after rounding down: limits are read by people."""
+    place = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return float(round(math.floor(value / place + 1e-9) * place, 6))
+
+
 def fundamentals(duration_s: float) -> tuple[float, float]:
     """Angular frequencies [rad/s] of velocity and current: whole periods of about 10 s, and that over the golden ratio.
 

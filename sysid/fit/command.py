@@ -42,7 +42,7 @@ from jtqd.sysid.progress import progress
 from jtqd.sysid.report.figures import check_picture
 from jtqd.sysid.runs.checks import channel_findings
 from jtqd.sysid.runs.files import RunError, RunFile, read_runs
-from jtqd.sysid.runs.joints import joint_number, only
+from jtqd.sysid.runs.joints import joint_number, only, with_joint
 
 
 def fit_parser(kind: str, description: str, examples: str) -> argparse.ArgumentParser:
@@ -139,6 +139,7 @@ def efficiency_main(argv: list[str]) -> int:
             check_picture(options.plot)
         runs = read_runs(options.runs, options.columns, joints=only(options.number))
         number = joint_number(options.number, joint, runs)
+        runs = with_joint(runs, number)
         result = analyse(joint, runs, number, options)
         written = None if result.findings else _new_joint(joint, result, options)
         if written is not None:
@@ -282,6 +283,7 @@ def friction_main(argv: list[str]) -> int:
             check_output(options.out)
         runs = read_runs(options.runs, options.columns, joints=only(options.number))
         number = joint_number(options.number, joint, runs)
+        runs = with_joint(runs, number)
         found = channel_findings(runs, number, joint)
         if found:
             for item in found:
@@ -355,12 +357,13 @@ def losses_main(argv: list[str]) -> int:
             check_output(options.out)
         runs = read_runs(options.runs, options.columns, joints=only(options.number))
         number = joint_number(options.number, joint, runs)
+        runs = with_joint(runs, number)
         findings = channel_findings(runs, number, joint)
         if findings:
             for finding in findings:
                 print(f"{LOSSES_BY}: {finding.text}", file=sys.stderr)
             return 3
-        fit = fit_fused(signals_of(runs, number, joint), joint.friction)
+        fit = fit_fused(signals_of(runs, number, joint), joint.friction, joint.rated_torque_nm)
         written = _with_fused(joint, fit, runs)
         print(json.dumps(_losses_mapping(fit), indent=1) if options.json else "\n".join(_lines(joint, fit)))
         if options.out is not None:

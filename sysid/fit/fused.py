@@ -26,10 +26,12 @@ from scipy.optimize import nnls
 
 from jtqd.estimator.arrays import FloatArray, QuadrantArray
 from jtqd.estimator.checked import counted
+from jtqd.estimator.envelope import MAX_CELLS, Envelope
 from jtqd.estimator.estimator import quadrants
 from jtqd.estimator.fusion import Fusion, held
 from jtqd.estimator.joint import AdditiveLoss, Friction, Fused, FusedSigma, Torsion
 from jtqd.estimator.losses import AdditiveLossModel
+from jtqd.sysid.fit.envelope import FIT_ROOM_K, TORQUE_STEP_SHARE, envelope_of
 from jtqd.sysid.fit.losses import LossFit, fit_loss
 from jtqd.sysid.fit.signals import RunSignals
 from jtqd.sysid.fit.torsion import fit_torsion
@@ -196,10 +198,11 @@ def folds(runs: Sequence[RunSignals], count: int = FOLDS) -> Iterator[tuple[list
         yield [run for n, run in enumerate(runs) if n not in judged], judged
 
 
-def fit_fused(runs: Sequence[RunSignals], friction: Friction) -> FusedFit:
+def fit_fused(runs: Sequence[RunSignals], friction: Friction, rated_nm: float | None = None) -> FusedFit:
     """Fit section `fused` of one joint.
 
-    runs: at least 6 (ValueError); friction: of the joint file. Raises LossFitError, TorsionError.
+    runs: at least 6 (ValueError); friction: of the joint file; rated_nm: its rated torque, of which the envelope's steps are
+    a part, None: without an envelope. Raises LossFitError, TorsionError.
     """
     if len(runs) < _LEAST_RUNS:
         raise ValueError(
@@ -211,7 +214,25 @@ def fit_fused(runs: Sequence[RunSignals], friction: Friction) -> FusedFit:
     sigma = replace(sigma, scale=conformal_scale(errors, sigmas, [quadrants_of(run) for run in unseen]))
     fit = fit_loss(runs, friction)
     rmse = tuple(float(np.sqrt(np.mean(e * e))) for e in errors)
-    return FusedFit(Fused(fit.loss, fit_torsion(runs), sigma), fit, rmse)
+    torsion = fit_torsion(runs)
+    envelope = None if rated_nm is None else _envelope(runs, fit.loss, torsion, rated_nm)
+    return FusedFit(Fused(fit.loss, torsion, sigma, envelope), fit, rmse)
+
+
+def _envelope(
+    runs: Sequence[RunSignals], loss: AdditiveLoss, torsion: Torsion, rated_nm: float
+) -> Envelope | None:
+    """Return what the runs covered; None where that takes a larger map than an envelope may have."""
+    seen = [path_residuals(run, loss, torsion) for run in runs if run.moving.any()]
+    made = envelope_of(
+        np.concatenate([run.velocity_rad_s for run in seen]),
+        np.concatenate([run.raw_nm for run in seen]),
+        np.concatenate([run.torsion_error_nm - run.current_error_nm for run in seen]),
+        [run.temperature_c for run in runs],
+        torque_step_nm=TORQUE_STEP_SHARE * rated_nm,
+        room_k=FIT_ROOM_K,
+    )
+    return made if max(len(made.known), len(made.known[0])) <= MAX_CELLS else None
 
 
 def _unseen(runs: Sequence[RunSignals], friction: Friction) -> list[PathResiduals]:

@@ -4,8 +4,9 @@
        │                      │   └─> powerless ──> playing (where the set-points have no power)
        └── refused: nothing has moved        └── any violation: ramping, or braking at once ──┘
 
-In every cycle one RPDO is sent, to one drive after the other, so that each gets a set-point every second SYNC and the bus
-never carries more than one more frame. All times are CLOCK_MONOTONIC in ns, of frames as of calls.
+In every cycle one RPDO is sent, to one drive after the other (`Commands.order`), so that the bus never carries more than one
+more frame: each of two drives gets a set-point every second SYNC. All times are CLOCK_MONOTONIC in ns, of frames as of
+calls.
 """
 
 from __future__ import annotations
@@ -17,15 +18,24 @@ from jtqd.drivers.devices import COMMANDER_NODE, SYNC_COB_ID
 from jtqd.sysid.motion.cia402 import QUICK_STOP_WORD, State, describe, enabling_word, fast_state
 from jtqd.sysid.motion.commands import Commands, Heartbeat
 from jtqd.sysid.motion.inputs import Inputs, Supervision
-from jtqd.sysid.motion.setpoints import PERIOD_S, Limits, Monitor, MotionResult, Setpoints, Timing, Violation
+from jtqd.sysid.motion.setpoints import (
+    PERIOD_S,
+    Limits,
+    Monitor,
+    MotionResult,
+    Setpoints,
+    Surroundings,
+    Timing,
+    Violation,
+    out_of_room,
+)
 from jtqd.sysid.motion.setup import DriveUnits, SensorUnits
 from jtqd.sysid.motion.stopping import Phase, PowerOff, Stopping
 
-PERIOD_NS: Final = round(PERIOD_S * 1e9)
-UNPACED_NS: Final = 2 * PERIOD_NS
-"""Period of our own clock while there is no SYNC."""
+UNPACED: Final = 2
+"""Period of our own clock while there is no SYNC, in periods of SYNC."""
 LARGEST_ADVANCE: Final = 4
-"""Set-points passed over after lost cycles, at most: what is lost beyond that makes the motion longer, never a jump."""
+"""Cycles passed over after lost ones, at most: what is lost beyond that makes the motion longer, never a jump."""
 
 
 class Pace:
@@ -42,6 +52,9 @@ class Pace:
         self._timing = timing
         self._newest_ns = now_ns  # SYNC, or our own beat while there is none
         self._slots = 0
+        self._steps = timing.steps
+        self._period_ns = round(timing.period_s * 1e9)
+        self._unpaced_ns = UNPACED * self._period_ns
         self._delay_ns = round(timing.setpoint_delay_s * 1e9)
         self._lost_ns = round(timing.sync_lost_s * 1e9)
         self._late_ns = round(timing.late_s * 1e9)
@@ -51,13 +64,13 @@ class Pace:
         """When the frames of the present cycle, or else of the next one, should all have come; 0: unknown."""
         if not self.synced:
             return 0
-        return self._newest_ns + self._delay_ns + (0 if self.pending else PERIOD_NS)
+        return self._newest_ns + self._delay_ns + (0 if self.pending else self._period_ns)
 
     @property
     def due_ns(self) -> int:
         """When something must be done although no frame comes."""
         if not self.synced:
-            return self._newest_ns + UNPACED_NS
+            return self._newest_ns + self._unpaced_ns
         return self._newest_ns + (self._delay_ns if self.pending else self._lost_ns)
 
     def on_sync(self, t_ns: int, now_ns: int) -> Violation | None:
@@ -68,7 +81,7 @@ class Pace:
         self._newest_ns = t_ns
         if not followed:
             return None
-        self._slots += max(1, round(gap_ns / PERIOD_NS))
+        self._slots += max(1, round(gap_ns / self._period_ns))
         if gap_ns > self._lost_ns:
             return self._lost(gap_ns)
         if now_ns - t_ns > self._late_ns:
@@ -82,18 +95,18 @@ class Pace:
         if not self.synced or gap_ns <= self._lost_ns:
             return None
         self.synced = self.pending = False
-        self._newest_ns = now_ns - UNPACED_NS
+        self._newest_ns = now_ns - self._unpaced_ns
         return self._lost(gap_ns)
 
     def ready(self, now_ns: int) -> bool:
         """Return whether a set-point is to be sent now: the inputs of the newest SYNC have had their time on the wire."""
         if not self.synced:
-            return now_ns >= self._newest_ns + UNPACED_NS
+            return now_ns >= self._newest_ns + self._unpaced_ns
         return self.pending and now_ns >= self._newest_ns + self._delay_ns
 
     def served(self, now_ns: int) -> int:
         """Mark the set-point as sent; return by how many set-points the motion has advanced since the last one."""
-        advance = min(self._slots, LARGEST_ADVANCE)
+        advance = self._steps * min(self._slots, LARGEST_ADVANCE)
         self._slots = 0
         self.pending = False
         if not self.synced:
@@ -112,38 +125,44 @@ Frame = tuple[int, bytes, int]
 
 
 class Commander:
-    """One motion of both drives, joints 1 and 2, which are set up already (`jtqd.sysid.motion.setup`).
+    """One motion of all drives of a bus, joints 1, 2, ..., which are set up already (`jtqd.sysid.motion.setup`).
+
+    Those that the set-points do not name are held.
 
     Call `on_frames` with what has arrived, at best at `wake_ns`, and by `due_ns` at the latest; send what it returns.
 
     Attributes:
         phase: see the module's diagram.
         refusal: why nothing was begun; None otherwise, and `result` holds once `over`.
+        out_of_place: the refusal is that the joint stands at the wrong place, at this position [rad]; else None.
     """
 
     def __init__(
         self,
         setpoints: Setpoints,
         limits: Limits,
-        drives: tuple[DriveUnits, DriveUnits],
+        drives: Sequence[DriveUnits],
         sensor: SensorUnits | None,
         *,
         now_ns: int,
         timing: Timing | None = None,
+        around: Surroundings | None = None,
     ) -> None:
         self.timing = timing = timing or Timing()
         self.inputs = Inputs(drives, sensor, COMMANDER_NODE)
         self.phase = Phase.WAITING
         self.refusal: str | None = None
+        self.out_of_place: float | None = None
         self._reason = ""
         self._handlers = self.inputs.handlers
         self._pace = Pace(timing, now_ns)
         self._heartbeat = Heartbeat(timing.own_heartbeat_s, now_ns)
-        self._monitor = Monitor(limits)
+        self._limits = limits
+        self._monitor = Monitor(limits, setpoints.joints, around)
         self._supervision = Supervision(self.inputs, timing)
         self._setpoints = setpoints
         self._commands = Commands(setpoints, drives)
-        self._turn = 0
+        self._cycles = 0
         self._index = -1  # of the set-point in force
         self._unpowered = list(setpoints.off)  # without power, still to come
         self._power_off: PowerOff | None = None
@@ -189,7 +208,7 @@ class Commander:
         return self._stopping is not None and self._stopping.silent
 
     def stop(self, reason: str) -> None:
-        """Lead both joints to a stop; asked for a second time, they brake at once."""
+        """Lead all joints to a stop; asked for a second time, they brake at once."""
         self._stop(Violation(reason, self.phase is Phase.RAMPING))
 
     def frame_refused(self, refused: bool) -> None:
@@ -284,9 +303,12 @@ class Commander:
 
     def _step(self, advance: int) -> bytes | None:
         """Do one cycle of the present phase; return the RPDO for the drive whose turn it is."""
-        self._turn = turn = 1 - self._turn
+        self._cycles += 1
+        turn = self._cycles % len(self.inputs.drives)
         if self.phase is Phase.POWERLESS:
             return self._powerless(turn, advance)
+        if self.phase is Phase.PLAYING or self.phase is Phase.RAMPING:
+            turn = self._commands.order[self._cycles % len(self._commands.order)]
         if self.phase is Phase.PLAYING:
             self._index += advance
             if self._unpowered and self._index >= self._unpowered[0][0]:
@@ -343,7 +365,11 @@ class Commander:
                 self.refusal = missing
                 self.phase = Phase.OVER
         elif self._now_ns - self._still_since_ns >= self.timing.still_s * 1e9:
-            self._enter(Phase.ENABLING)
+            leader = self.inputs.drives[self._setpoints.velocity_joint - 1]
+            self.refusal = out_of_room(self._setpoints, self._limits, leader.position_rad)
+            if self.refusal is not None:
+                self.out_of_place = leader.position_rad
+            self._enter(Phase.ENABLING if self.refusal is None else Phase.OVER)
 
     def _enabling(self, turn: int) -> bytes | None:
         """Send 6040h 6, 7, 15, each after the statusword has confirmed the one before."""
@@ -351,7 +377,11 @@ class Commander:
         if all(state is State.OPERATION_ENABLED for state in states):
             self._enter(Phase.PLAYING)
         elif self._phase_s() > self.timing.enable_s:
-            drive = self.inputs.drives[states[0] is State.OPERATION_ENABLED]
+            drive = next(
+                drive
+                for drive, state in zip(self.inputs.drives, states, strict=True)
+                if state is not State.OPERATION_ENABLED
+            )
             text = (
                 f"{describe(drive.statusword)} after {self.timing.enable_s:g} s, expected operation enabled"
             )

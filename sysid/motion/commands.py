@@ -1,6 +1,8 @@
-"""The frames that the commander sends: RPDOs to both drives, and its own heartbeat. Pure."""
+"""The frames that the commander sends: RPDOs to all drives, and its own heartbeat. Pure."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 from jtqd.drivers import nmt
 from jtqd.drivers.devices import COMMANDER_NODE, drive_rpdo1, drive_rpdo2
@@ -10,19 +12,30 @@ from jtqd.drivers.sdo_client import REQUEST_ID
 from jtqd.sysid.motion.cia402 import ENABLE_OPERATION, QUICK_STOP_WORD
 from jtqd.sysid.motion.setpoints import MotionError, Setpoints
 from jtqd.sysid.motion.setup import DriveUnits
+from jtqd.sysid.motion.turns import turns
 
 _COMMAND, _VELOCITY = drive_rpdo1(1).layout, drive_rpdo2(1).layout
 
 
 class Commands:
-    """RPDOs for drive 0 or 1 (`turn`); set-points are scaled to the drives' units once, beforehand.
+    """RPDOs for drive `turn` (0, 1, ...); set-points are scaled to the drives' units once, beforehand.
 
-    Raises MotionError for set-points that 60FFh (32 bits) or 6071h (16 bits) cannot hold.
+    A drive that is not moved is held: velocity zero. Raises MotionError for set-points that 60FFh (32 bits) or 6071h
+    (16 bits) cannot hold, and for a joint without a drive.
+
+    Attributes:
+        order: drives in the order in which they get set-points, one per cycle: those that are moved in turn, and one of
+            those that are held after each round.
+        round_cycles: cycles from one set-point of a moved drive to its next.
     """
 
-    def __init__(self, setpoints: Setpoints, drives: tuple[DriveUnits, DriveUnits]) -> None:
+    def __init__(self, setpoints: Setpoints, drives: Sequence[DriveUnits]) -> None:
+        if setpoints.joints[-1] > len(drives):
+            raise MotionError(f"plan: joint {setpoints.joints[-1]} is moved, the bus has {len(drives)}")
+        self.order, self.round_cycles = turns(setpoints.joints, len(drives))
         self._leader = setpoints.velocity_joint - 1  # the drive in velocity mode
-        self._lead, self._follow = drives[self._leader], drives[1 - self._leader]
+        self._follower = -1 if setpoints.current_joint is None else setpoints.current_joint - 1
+        self._lead, self._follow = drives[self._leader], drives[self._follower]
         self._velocities = [self._lead.velocity_units(v) for v in setpoints.velocity_rad_s.tolist()]
         self._currents = [self._follow.current_units(i) for i in setpoints.current_a.tolist()]
         for what, units, largest in (
@@ -55,10 +68,11 @@ class Commands:
         return self._target(turn, velocity, current)
 
     def _target(self, turn: int, velocity: int, current: int) -> bytes:
-        """Pack RPDO2 to the drive in velocity mode, RPDO1 to the other."""
-        if turn == self._leader:
-            return FRAME.pack(self._rpdo2[turn], _VELOCITY.size, _VELOCITY.pack(velocity))
-        return FRAME.pack(self._rpdo1[turn], _COMMAND.size, _COMMAND.pack(ENABLE_OPERATION, current))
+        """Pack RPDO2 to a drive in velocity mode, RPDO1 to one in torque mode."""
+        if turn == self._follower:
+            return FRAME.pack(self._rpdo1[turn], _COMMAND.size, _COMMAND.pack(ENABLE_OPERATION, current))
+        velocity = velocity if turn == self._leader else 0
+        return FRAME.pack(self._rpdo2[turn], _VELOCITY.size, _VELOCITY.pack(velocity))
 
 
 class Heartbeat:

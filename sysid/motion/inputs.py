@@ -1,4 +1,4 @@
-"""Measured values of both joints with their age, from frames and stamps, and their supervision. Pure.
+"""Measured values of all joints with their age, from frames and stamps, and their supervision. Pure.
 
     Inputs         decodes TPDOs, heartbeats, EMCY and the answers that matter
     Supervision    what must hold while the joints move: nodes alive, inputs fresh, drives enabled, sensor valid
@@ -10,7 +10,7 @@ grows stale.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from jtqd.drivers.devices import (
@@ -41,7 +41,7 @@ Handler = Callable[[bytes, int], None]
 
 
 class NodeInput:
-    """Heartbeat and EMCY of one node. `who` is "joint 1", "joint 2" or "sensor"; `emergency` is the EMCY in force."""
+    """Heartbeat and EMCY of one node. `who` is "joint 1", "joint 2", ... or "sensor"; `emergency` is the EMCY in force."""
 
     def __init__(self, who: str, node: int, heartbeat_ms: int) -> None:
         self.who, self.node = who, node
@@ -86,12 +86,19 @@ class DriveInput(NodeInput):
         self._link = units.scaling.link_rad_per_count
         self._ampere = units.scaling.ampere_per_unit
         self._counts: tuple[int, int] | None = None
+        self._began = 0  # link counts at `begin_travel`
         self._motor_counts = self._link_counts = 0  # since `begin_travel`
 
     def begin_travel(self) -> None:
         """Count travel from here."""
         self._motor_counts = self._link_counts = 0
+        self._began = 0 if self._counts is None else self._counts[1]
         self.travel_rad = 0.0
+
+    @property
+    def position_rad(self) -> float:
+        """Position by the link's encoder, from its zero; a roll-over within the motion does not show."""
+        return (self._began + self._link_counts) * self._link
 
     def on_position(self, data: bytes, t_ns: int) -> None:
         """Take TPDO1. The counters roll over: differences are modulo 2^32. The larger travel of both encoders counts."""
@@ -129,7 +136,9 @@ class DriveInput(NodeInput):
 
     def sample(self) -> JointSample:
         """Return what was measured last."""
-        return JointSample(self.current_a, self.velocity_rad_s, self.travel_rad, self.temperature_c)
+        return JointSample(
+            self.current_a, self.velocity_rad_s, self.travel_rad, self.temperature_c, self.position_rad
+        )
 
 
 class ChannelInput:
@@ -159,13 +168,10 @@ class Inputs:
         handlers: by COB-ID.
     """
 
-    def __init__(
-        self, drives: tuple[DriveUnits, DriveUnits], sensor: SensorUnits | None, own_node: int
-    ) -> None:
+    def __init__(self, drives: Sequence[DriveUnits], sensor: SensorUnits | None, own_node: int) -> None:
         self.cycle = 0
         self.foreign = False
-        one, two = drives
-        self.drives = (DriveInput(1, one, self), DriveInput(2, two, self))
+        self.drives = tuple(DriveInput(number, units, self) for number, units in enumerate(drives, 1))
         self.sensor = None if sensor is None else NodeInput("sensor", sensor.node, sensor.heartbeat_ms)
         factors = () if sensor is None else sensor.nm_per_unit
         self.channels = tuple(ChannelInput(n, nm, self) for n, nm in enumerate(factors, 1))
@@ -197,8 +203,10 @@ class Inputs:
 
     def sample(self) -> Sample:
         """Return what was measured last, of everything."""
-        one, two = self.drives
-        return Sample(one.sample(), two.sample(), tuple([channel.torque_nm for channel in self.channels]))
+        return Sample(
+            tuple([drive.sample() for drive in self.drives]),
+            tuple([channel.torque_nm for channel in self.channels]),
+        )
 
     def _on_own_node(self, data: bytes, t_ns: int) -> None:
         self.foreign = True
@@ -225,7 +233,7 @@ class Supervision:
         self._temperature_ns = round(timing.temperature_s * 1e9)
 
     def check(self, now_ns: int, *, enabled: bool) -> Violation | None:
-        """Return the first violation; `enabled`: both drives must be in operation enabled, else only without fault."""
+        """Return the first violation; `enabled`: all drives must be in operation enabled, else only without fault."""
         inputs = self._inputs
         oldest = inputs.cycle - self._stale
         for drive in inputs.drives:
@@ -275,7 +283,7 @@ class Supervision:
         return None if found is None else found.reason
 
     def moving(self) -> str | None:
-        """Return which joint does not stand, or cannot be seen to; None when both do."""
+        """Return which joint does not stand, or cannot be seen to; None when all do."""
         oldest = self._inputs.cycle - self._stale
         for drive in self._inputs.drives:
             if not -STILL_RAD_S <= drive.velocity_rad_s <= STILL_RAD_S or drive.cycle_2 < oldest:
@@ -284,13 +292,13 @@ class Supervision:
         return None
 
     def obeyed(self, turn: int) -> bool:
-        """Return whether drive 0 or 1 follows no set-point any more, by a fresh statusword or a confirmed SDO."""
+        """Return whether drive `turn` follows no set-point any more, by a fresh statusword or a confirmed SDO."""
         drive = self._inputs.drives[turn]
         fresh = drive.cycle_2 >= self._inputs.cycle - self._stale
         return drive.sdo_confirmed or (fresh and fast_state(drive.statusword) is not State.OPERATION_ENABLED)
 
-    def both_off(self) -> bool:
-        """Return whether fresh statuswords of both drives show that their motors are not driven."""
+    def all_off(self) -> bool:
+        """Return whether fresh statuswords of all drives show that their motors are not driven."""
         oldest = self._inputs.cycle - self._stale
         return all(
             fast_state(drive.statusword) not in POWERED and drive.cycle_2 >= oldest

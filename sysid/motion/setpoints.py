@@ -1,13 +1,15 @@
 """Set-points of a motion, millisecond by millisecond, its limits, and how it ends. Pure.
 
-One joint follows a velocity, the other a current. `Limits` hold for what is measured (`Monitor`) and for what is planned
+On a towing bench one joint follows a velocity, the other a current. A joint that is on none follows a velocity alone. All
+other joints of the bus are held: velocity zero. `Limits` hold for what is measured (`Monitor`) and for what is planned
 (`check_setpoints`); every refusal is one line that names joint, quantity, what was found, and the limit.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
@@ -17,6 +19,17 @@ from jtqd.estimator.arrays import FloatArray
 
 class MotionError(Exception):
     """The motion was refused before anything moved; one line for the operator."""
+
+
+class OutOfPlaceError(MotionError):
+    """The motion was refused because a joint that is moved alone stands where it would leave its travel.
+
+    position_rad: where it stands, by its own encoder.
+    """
+
+    def __init__(self, reason: str, position_rad: float) -> None:
+        super().__init__(reason)
+        self.position_rad = position_rad
 
 
 class MotionResult(NamedTuple):
@@ -50,6 +63,7 @@ class Timing:
     """Times of the supervision in seconds. ValueError for one that is not positive.
 
     Attributes:
+        period_s: of SYNC, a whole number of `PERIOD_S`.
         sync_lost_s: longest time without SYNC.
         late_s: longest time from SYNC to its set-point.
         stale_cycles: SYNCs that a TPDO may be missing.
@@ -64,6 +78,7 @@ class Timing:
         enable_s, quick_stop_s, disable_s: for the drives to change their state.
     """
 
+    period_s: float = 1e-3
     sync_lost_s: float = 0.02
     late_s: float = 0.02
     stale_cycles: int = 5
@@ -84,9 +99,37 @@ class Timing:
             if not value > 0:
                 raise ValueError(f"timing: {item.name} is {value!r}, expected a positive number")
 
+    @property
+    def steps(self) -> int:
+        """Set-points from one SYNC to the next."""
+        return max(round(self.period_s / PERIOD_S), 1)
+
 
 PERIOD_S: Final = 1e-3
-"""Time from one set-point to the next: the period of SYNC."""
+"""Time from one set-point to the next. With a longer period of SYNC only some of them are sent."""
+OTHER_ONE: Final = 0
+"""`current_joint` that is the other one of joints 1 and 2."""
+
+
+def partner_of(velocity_joint: int, current_joint: int | None) -> int | None:
+    """Return the joint in torque mode: as given, joint 1 or 2 for `OTHER_ONE`, None for a joint that is moved alone.
+
+    Raises ValueError where there is no such pair.
+    """
+    numbers = range(1, MOST_JOINTS + 1)
+    if velocity_joint not in numbers:
+        raise ValueError(f"velocity_joint {velocity_joint!r}, expected 1 to {MOST_JOINTS}")
+    if current_joint == OTHER_ONE and current_joint is not None:
+        if velocity_joint > 2:
+            raise ValueError(f"no current_joint beside velocity_joint {velocity_joint}, expected one")
+        return 3 - velocity_joint
+    if current_joint is not None and (current_joint not in numbers or current_joint == velocity_joint):
+        raise ValueError(f"current_joint {current_joint!r}, expected another joint than {velocity_joint}")
+    return current_joint
+
+
+MOST_JOINTS: Final = 4
+"""Of a bus."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,13 +154,15 @@ class Setpoints:
     """Set-points of one run, `PERIOD_S` apart; number k belongs to time k * PERIOD_S.
 
     Attributes:
-        velocity_joint: 1 or 2, the joint in velocity mode (csv); the other one is in torque mode (cst).
+        velocity_joint: number of the joint in velocity mode (csv).
         velocity_rad_s: [n] joint side, in the own frame of the velocity joint.
-        current_a: [n] motor current of the other joint, in its own frame.
+        current_a: [n] motor current of the current joint, in its own frame.
         marks: what is when, in order of time; for people and files, not for the motion.
         off: (first, end) of set-points during which both drives have no power, in order, end not included.
+        current_joint: the joint in torque mode (cst) that tows the other one; None: there is none, the velocity joint is
+            moved alone and current_a is zero. Left out: the other one of joints 1 and 2.
 
-    Raises ValueError with one line for another joint, arrays that are not one-dimensional, empty, of unequal
+    Raises ValueError with one line for joints that are no pair, arrays that are not one-dimensional, empty, of unequal
     length, or not finite, marks that are not Mark, and times without power that overlap or have a target other than 0.
     The arrays are copied and read-only.
     """
@@ -127,10 +172,14 @@ class Setpoints:
     current_a: FloatArray
     marks: tuple[Mark, ...] = ()
     off: tuple[tuple[int, int], ...] = ()
+    current_joint: int | None = OTHER_ONE
 
     def __post_init__(self) -> None:
-        if self.velocity_joint not in (1, 2):
-            raise ValueError(f"set-points: velocity_joint {self.velocity_joint!r}, expected 1 or 2")
+        try:
+            partner = partner_of(self.velocity_joint, self.current_joint)
+        except ValueError as error:
+            raise ValueError(f"set-points: {error}") from None
+        object.__setattr__(self, "current_joint", partner)
         for name in ("velocity_rad_s", "current_a"):
             array = np.array(getattr(self, name), dtype=np.float64)
             if array.ndim != 1 or not array.size:
@@ -147,6 +196,8 @@ class Setpoints:
         if len(self.velocity_rad_s) != len(self.current_a):
             found = f"{len(self.velocity_rad_s)} velocities and {len(self.current_a)} currents"
             raise ValueError(f"set-points: {found}, expected as many of both")
+        if self.current_joint is None and np.any(self.current_a):
+            raise ValueError("set-points: a current and no joint to follow it, expected zeros")
         object.__setattr__(self, "marks", tuple(self.marks))
         for mark in self.marks:
             if not isinstance(mark, Mark):
@@ -169,9 +220,10 @@ class Setpoints:
         return len(self.velocity_rad_s)
 
     @property
-    def current_joint(self) -> int:
-        """The joint in torque mode: 1 or 2."""
-        return 3 - self.velocity_joint
+    def joints(self) -> tuple[int, ...]:
+        """Numbers of the joints that are moved, in rising order."""
+        moved = (self.velocity_joint, *(() if self.current_joint is None else (self.current_joint,)))
+        return tuple(sorted(moved))
 
     @property
     def duration_s(self) -> float:
@@ -192,14 +244,15 @@ STEEPEST_CURRENT_A_S: Final = 500.0
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Largest magnitudes, for both joints alike; ValueError for one that is not a positive number.
+    """Largest magnitudes, for all joints that are moved; ValueError for one that is not a positive number.
 
     Attributes:
         current_a: motor current.
         velocity_rad_s: joint side (motor encoder through the gear).
-        torque_nm: at the sensor between the joints.
+        torque_nm: at the sensor of these joints, where they have one.
         travel_rad: joint side, from where the motion began, by either encoder.
         temperature_c: of the joint; math.inf where the drives do not measure it.
+        position_rad: lowest and highest position of a joint that is moved alone, by its own encoder.
     """
 
     current_a: float
@@ -207,9 +260,15 @@ class Limits:
     torque_nm: float
     travel_rad: float
     temperature_c: float = math.inf
+    position_rad: tuple[float, float] = (-math.inf, math.inf)
 
     def __post_init__(self) -> None:
+        low, high = self.position_rad
+        if not low < high:
+            raise ValueError(f"limits.position_rad: found {[low, high]}, expected two rising numbers")
         for item in fields(self):
+            if item.name == "position_rad":
+                continue
             value = getattr(self, item.name)
             number = isinstance(value, int | float) and not isinstance(value, bool)
             if not number or not value > 0 or (math.isinf(value) and item.name != "temperature_c"):
@@ -217,80 +276,153 @@ class Limits:
 
 
 class JointSample(NamedTuple):
-    """What was measured of one joint in one cycle: motor current, joint side velocity and travel, temperature.
+    """What was measured of one joint in one cycle: motor current, joint side velocity and travel, temperature, position.
 
-    `temperature_c` is nan as long as none has come.
+    `temperature_c` is nan as long as none has come; `position_rad` counts from the zero of the joint's own encoder.
     """
 
     current_a: float
     velocity_rad_s: float
     travel_rad: float
     temperature_c: float
+    position_rad: float = 0.0
 
 
 class Sample(NamedTuple):
-    """What was measured in one cycle: joints 1 and 2, and the torque [Nm] of each sensor channel in use."""
+    """What was measured in one cycle: joints 1, 2, ..., and the torque [Nm] of each sensor channel in use."""
 
-    one: JointSample
-    two: JointSample
+    joints: tuple[JointSample, ...]
     torque_nm: tuple[float, ...]
 
 
+HELD_RAD: Final = 0.05
+"""Joint side: a joint that is held and has turned so far gives way."""
+HELD_RAD_S: Final = 0.3
+"""Joint side: largest velocity of a joint that is held."""
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What is on the bus beside the joints that are moved.
+
+    Attributes:
+        held_current_a: largest current of each joint that is held, by number; one that is not named: as those moved.
+        channels: joints that a channel of the sensor measures, of the channels that the torque's limit holds for; None: all,
+            and the joints of a single one are 1 and 2.
+    """
+
+    held_current_a: Mapping[int, float] = field(default_factory=dict)
+    channels: Mapping[int, tuple[int, ...]] | None = None
+
+
 class Monitor:
-    """Comparison of samples with the limits, without a state: the same sample gives the same answer."""
+    """Comparison of samples with the limits, without a state: the same sample gives the same answer.
 
-    __slots__ = ("_limits",)
+    Args:
+        limits: of the joints that are moved. moved: their numbers; all others are held.
+    """
 
-    def __init__(self, limits: Limits) -> None:
+    __slots__ = ("_channels", "_limits", "_of", "_temperature")
+
+    def __init__(
+        self, limits: Limits, moved: tuple[int, ...] = (1, 2), around: Surroundings | None = None
+    ) -> None:
+        around = around or Surroundings()
         self._limits = limits
+        self._channels = around.channels
+        self._temperature = limits.temperature_c
+        own = (limits.current_a, limits.velocity_rad_s, limits.travel_rad, limits.position_rad)
+        free = (-math.inf, math.inf)
+        self._of = tuple(
+            own
+            if number in moved
+            else (around.held_current_a.get(number, limits.current_a), HELD_RAD_S, HELD_RAD, free)
+            for number in range(1, MOST_JOINTS + 1)
+        )
 
     def check(self, sample: Sample) -> str | None:
         """Return the first quantity beyond its limit in words; None when there is none.
 
         A nan is beyond every limit but temperature's, which has its own supervision.
         """
-        limits = self._limits
-        current, velocity, travel = limits.current_a, limits.velocity_rad_s, limits.travel_rad
-        for joint in (sample.one, sample.two):
+        for place, joint in enumerate(sample.joints):
+            current, velocity, travel, (low, high) = self._of[place]
             if not (
                 -current <= joint.current_a <= current
                 and -velocity <= joint.velocity_rad_s <= velocity
                 and -travel <= joint.travel_rad <= travel
-            ) or (joint.temperature_c > limits.temperature_c):
-                return self._joint_reason(1 if joint is sample.one else 2, joint)
+                and low <= joint.position_rad <= high
+            ) or (joint.temperature_c > self._temperature):
+                return self._joint_reason(1 + place, joint)
+        limit = self._limits.torque_nm
         for channel, torque in enumerate(sample.torque_nm, 1):
-            if not -limits.torque_nm <= torque <= limits.torque_nm:
-                who = "joints 1 and 2" if len(sample.torque_nm) == 1 else f"joint {channel}"
-                return f"{who}: torque at the sensor {torque:.2f} Nm, limit {limits.torque_nm:g} Nm"
+            if -limit <= torque <= limit or (self._channels is not None and channel not in self._channels):
+                continue
+            return f"{self._whose(channel, len(sample.torque_nm))}: torque at the sensor {torque:.2f} Nm, limit {limit:g} Nm"
         return None
 
+    def _whose(self, channel: int, channels: int) -> str:
+        if self._channels is None:
+            return "joints 1 and 2" if channels == 1 else f"joint {channel}"
+        joints = self._channels[channel]
+        return f"joint{'s' if len(joints) > 1 else ''} {' and '.join(map(str, joints))}"
+
     def _joint_reason(self, number: int, joint: JointSample) -> str:
-        limits = self._limits
+        current, velocity, travel, (low, high) = self._of[number - 1]
         for name, found, limit, unit in (
-            ("current", joint.current_a, limits.current_a, "A"),
-            ("velocity", joint.velocity_rad_s, limits.velocity_rad_s, "rad/s"),
-            ("travel", joint.travel_rad, limits.travel_rad, "rad"),
+            ("current", joint.current_a, current, "A"),
+            ("velocity", joint.velocity_rad_s, velocity, "rad/s"),
+            ("travel", joint.travel_rad, travel, "rad"),
         ):
             if not -limit <= found <= limit:
                 return f"joint {number}: {name} {found:.3f} {unit}, limit {limit:g} {unit}"
-        return f"joint {number}: temperature {joint.temperature_c:.1f} °C, limit {limits.temperature_c:g} °C"
+        if not low <= joint.position_rad <= high:
+            return f"joint {number}: position {joint.position_rad:.3f} rad, limits {low:g} to {high:g} rad"
+        return f"joint {number}: temperature {joint.temperature_c:.1f} °C, limit {self._temperature:g} °C"
 
 
 def check_setpoints(setpoints: Setpoints, limits: Limits) -> None:
     """Refuse a plan that cannot be kept within the limits, or that jumps; before anything moves.
 
     Travel is that of the velocity joint; the other one turns with it. The first set-point is compared with
-    standstill. Raises MotionError naming joint, quantity, time, found and limit.
+    standstill. Where a joint that is moved alone stands is not known before (`out_of_room`). Raises MotionError naming
+    joint, quantity, time, found and limit.
     """
     one, other = setpoints.velocity_joint, setpoints.current_joint
-    travel = np.cumsum(setpoints.velocity_rad_s) * PERIOD_S
     _below(setpoints.velocity_rad_s, limits.velocity_rad_s, f"velocity of joint {one}", "rad/s")
     _below(setpoints.current_a, limits.current_a, f"current of joint {other}", "A")
-    _below(travel, limits.travel_rad, f"travel of joint {one}", "rad")
+    _below(path(setpoints), limits.travel_rad, f"travel of joint {one}", "rad")
+    low, high = way(setpoints)
+    room = limits.position_rad[1] - limits.position_rad[0]
+    if high - low > room:
+        raise MotionError(f"plan: joint {one} moves over {high - low:.3f} rad, limit {room:g} rad")
     _smooth(
         setpoints.velocity_rad_s, STEEPEST_VELOCITY_RAD_S2 * PERIOD_S, f"velocity of joint {one}", "rad/s"
     )
     _smooth(setpoints.current_a, STEEPEST_CURRENT_A_S * PERIOD_S, f"current of joint {other}", "A")
+
+
+def path(setpoints: Setpoints) -> FloatArray:
+    """Return the travel [n] of the velocity joint from where it begins [rad], joint side."""
+    found: FloatArray = np.cumsum(setpoints.velocity_rad_s) * PERIOD_S
+    return found
+
+
+def way(setpoints: Setpoints) -> tuple[float, float]:
+    """Return the lowest and highest of `path`, the start included."""
+    found = path(setpoints)
+    return min(float(found.min()), 0.0), max(float(found.max()), 0.0)
+
+
+def out_of_room(setpoints: Setpoints, limits: Limits, start_rad: float) -> str | None:
+    """Return why the velocity joint cannot begin at start_rad [rad], or None."""
+    (low, high), (down, up) = limits.position_rad, way(setpoints)
+    if low <= start_rad + down and start_rad + up <= high:
+        return None
+    return (
+        f"joint {setpoints.velocity_joint}: stands at {start_rad:.3f} rad, expected {low - down:.3f} to {high - up:.3f} "
+        f"rad, as the motion goes from {down:.3f} to {up:.3f} rad beside its start, travel_rad is {low:g} to {high:g}"
+    )
 
 
 def _below(series: FloatArray, limit: float, what: str, unit: str) -> None:
@@ -309,3 +441,30 @@ def _smooth(series: FloatArray, limit: float, what: str, unit: str) -> None:
         raise MotionError(
             f"plan: {what} {where} of {steps[jumps[0]]:.3f} {unit}, limit {limit:g} {unit} per ms"
         )
+
+
+APPROACH_SHARE: Final = 0.3
+"""Largest velocity of an approach, as a part of its limit."""
+APPROACH_S: Final = 1.0
+"""Shortest ramp of an approach."""
+
+
+def approach(joint: int, start_rad: float, target_rad: float, limits: Limits) -> Setpoints:
+    """Return the motion of one joint, alone, from where it stands to another place, slowly; positions by its own encoder.
+
+    Raises:
+        MotionError: it stands, or shall stand, outside of its travel.
+    """
+    low, high = limits.position_rad
+    for what, position in (("stands at", start_rad), ("shall go to", target_rad)):
+        if not low <= position <= high:
+            raise MotionError(
+                f"joint {joint}: {what} {position:.3f} rad, travel_rad is {low:g} to {high:g}: move it by hand"
+            )
+    distance = target_rad - start_rad
+    speed = min(APPROACH_SHARE * limits.velocity_rad_s, max(abs(distance) / APPROACH_S, 1e-6))
+    ramp, hold = round(APPROACH_S / PERIOD_S), round((abs(distance) / speed - APPROACH_S) / PERIOD_S)
+    rising = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, ramp + 1) / ramp)
+    shape = np.concatenate((rising, np.ones(max(hold, 0)), rising[::-1], np.zeros(1)))
+    velocity = shape * (distance / (float(shape.sum()) * PERIOD_S))
+    return Setpoints(joint, velocity, np.zeros(len(velocity)), current_joint=None)

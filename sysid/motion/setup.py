@@ -1,4 +1,4 @@
-"""Make both drives and the sensor ready for a motion, and put them back after it, by SDO.
+"""Make all drives and the sensor ready for a motion, and put them back after it, by SDO.
 
 jtqd has booted the nodes: TPDOs, heartbeat and the watch over jtqd (1016h:1) are there. Here come mode of operation,
 interpolation time, temperature (TPDO3) and the watch over the commander (1016h:2). What is written is read back. Every
@@ -14,7 +14,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -51,9 +51,10 @@ from jtqd.sysid.motion.cia402 import (
     state_of,
 )
 from jtqd.sysid.motion.setpoints import Limits, MotionError, Setpoints, Timing
+from jtqd.sysid.motion.turns import turns
 
 INTERPOLATION_MS: Final = 2
-"""60C2h: each drive gets every second set-point."""
+"""60C2h where two drives at 1 kHz take turns: each gets every second set-point."""
 _POLL_S, _POLLS = 0.005, 200
 _CONTROLWORD, _STATUSWORD, _MODE_DISPLAY = (0x6040, 0), (0x6041, 0), (0x6061, 0)
 _TARGET_VELOCITY, _TARGET_TORQUE = (0x60FF, 0), (0x6071, 0)
@@ -67,7 +68,7 @@ class DriveUnits:
     """What the commander must know of a drive: identifiers and factors to SI, as read from it.
 
     Attributes:
-        node: node number; also the number of the joint.
+        node: node number.
         mode: 9 (csv) or 10 (cst).
         gear_ratio: 6091h.
         scaling: factors of 6064h, 606Ch, 60E4h:1 and 6078h.
@@ -146,9 +147,16 @@ def reset_fault(access: SdoAccess, node: int, sleep: Sleep) -> str | None:
 
 
 def set_up(
-    access: SdoAccess, profile: DriveProfile, mode: int, timeout_ms: int, sleep: Sleep, *, temperature: bool
+    access: SdoAccess,
+    profile: DriveProfile,
+    mode: int,
+    timeout_ms: int,
+    sleep: Sleep,
+    *,
+    temperature: bool,
+    interpolation_ms: int = INTERPOLATION_MS,
 ) -> DriveUnits:
-    """Set mode, targets of zero, 60C2h, TPDO3 if `temperature` is wanted, and last the watch over the commander.
+    """Set mode, targets of zero, 60C2h [ms], TPDO3 if `temperature` is wanted, and last the watch over the commander.
 
     The drive must be off (`switch_off`, `reset_fault`). Raises BootError.
     """
@@ -170,7 +178,7 @@ def set_up(
     found = _wait(drive, _MODE_DISPLAY, 1, lambda display: display == mode, sleep)
     if found != mode:
         raise mismatch(node, _MODE_DISPLAY, "mode of operation display", expected=str(mode), found=str(found))
-    drive.put((0x60C2, 1), INTERPOLATION_MS, 1, "interpolation time period value")
+    drive.put((0x60C2, 1), interpolation_ms, 1, "interpolation time period value")
     drive.put((0x60C2, 2), -3, 1, "interpolation time index")  # ms
     if temperature:
         _switch_on_temperature(drive)
@@ -272,7 +280,7 @@ class BenchSetup:
     def __init__(
         self,
         bus: str,
-        drives: tuple[DriveProfile, DriveProfile],
+        drives: Sequence[DriveProfile],
         sensor: SensorProfile | None,
         timing: Timing,
     ) -> None:
@@ -280,14 +288,14 @@ class BenchSetup:
         self._socket = open_frame_socket(
             bus, [exact(SYNC_COB_ID), exact(nmt.HEARTBEAT_BASE + COMMANDER_NODE)]
         )
-        self._drives, self._sensor, self._timing = drives, sensor, timing
+        self._drives, self._sensor, self._timing = tuple(drives), sensor, timing
         self._beating = False
         self._access = {node: SdoClient(FrameChannel(self._socket, node)) for node in nodes}
 
     def prepare(
         self, setpoints: Setpoints, limits: Limits
-    ) -> tuple[tuple[DriveUnits, DriveUnits], SensorUnits | None]:
-        """Bring both drives to: off, free of faults, modes set, targets zero, watching our heartbeat; return all units.
+    ) -> tuple[tuple[DriveUnits, ...], SensorUnits | None]:
+        """Bring all drives to: off, free of faults, modes set, targets zero, watching our heartbeat; return all units.
 
         Raises MotionError; what was set is put back then. A second commander is noticed before anything is touched.
         """
@@ -318,7 +326,7 @@ class BenchSetup:
 
     def _prepare(
         self, setpoints: Setpoints, limits: Limits
-    ) -> tuple[tuple[DriveUnits, DriveUnits], SensorUnits | None]:
+    ) -> tuple[tuple[DriveUnits, ...], SensorUnits | None]:
         access = self._access
         for profile in self._drives:
             quick_stop(access[profile.node_id], profile.node_id)
@@ -327,23 +335,25 @@ class BenchSetup:
             fault = reset_fault(access[profile.node_id], profile.node_id, time.sleep)
             if fault is not None:
                 logging.getLogger(__name__).warning("node %d: %s was reset", profile.node_id, fault)
-        units = [
+        round_cycles = turns(setpoints.joints, len(self._drives))[1]
+        units = tuple(
             set_up(
                 access[profile.node_id],
                 profile,
-                CSV if joint == setpoints.velocity_joint else CST,
+                CST if joint == setpoints.current_joint else CSV,
                 round(self._timing.drive_timeout_s * 1e3),
                 time.sleep,
                 temperature=math.isfinite(limits.temperature_c),
+                interpolation_ms=round(round_cycles * self._timing.period_s * 1e3),
             )
             for joint, profile in enumerate(self._drives, 1)
-        ]
+        )
         sensor = self._sensor
         found = None if sensor is None else sensor_units(access[sensor.node_id], sensor)
-        return (units[0], units[1]), found
+        return units, found
 
     def release(self, *, beating: bool) -> str:
-        """Release both drives for certain; return "", or what could not be done, in one line.
+        """Release all drives for certain; return "", or what could not be done, in one line.
 
         `beating`: our heartbeat has been heard, so it goes on until nobody watches it any more.
         """

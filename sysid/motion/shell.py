@@ -11,7 +11,7 @@ import gc
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from types import FrameType
 from typing import Final
@@ -21,7 +21,16 @@ from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import FRAME, FRAME_SIZE
 from jtqd.drivers.frame_socket import CAPACITY, BusError, FrameSocket, open_frame_socket
 from jtqd.sysid.motion.commander import Commander, Frame
-from jtqd.sysid.motion.setpoints import Limits, MotionError, MotionResult, Setpoints, Timing, check_setpoints
+from jtqd.sysid.motion.setpoints import (
+    Limits,
+    MotionError,
+    MotionResult,
+    OutOfPlaceError,
+    Setpoints,
+    Surroundings,
+    Timing,
+    check_setpoints,
+)
 from jtqd.sysid.motion.setup import BenchSetup
 
 Progress = Callable[[float, float], None]
@@ -40,15 +49,17 @@ def play(
     limits: Limits,
     *,
     on_progress: Progress | None = None,
-    drives: tuple[DriveProfile, DriveProfile] = DRIVES,
+    drives: Sequence[DriveProfile] = DRIVES,
     sensor: SensorProfile | None = SENSOR,
     timing: Timing | None = None,
+    around: Surroundings | None = None,
 ) -> MotionResult:
-    """Move both joints as `setpoints` say, within `limits`, on a bus on which jtqd runs; both are disabled afterwards.
+    """Move joints as `setpoints` say, within `limits`, on a bus on which jtqd runs; all are disabled afterwards.
 
     SIGINT and SIGTERM stop the joints, a second one makes them brake at once; the handlers that were there before are
-    back when this returns. `drives` are joints 1 and 2. Without `sensor` the torque is not supervised.
-    Raises MotionError, one line, when the motion was refused and nothing has moved.
+    back when this returns. `drives` are joints 1, 2, ..; those that the set-points do not name are held. Without `sensor`
+    the torque is not supervised.
+    Raises MotionError (OutOfPlaceError), one line, when the motion was refused and nothing has moved.
     """
     timing = timing or Timing()
     check_setpoints(setpoints, limits)
@@ -62,14 +73,19 @@ def play(
             error = left = ""
             beating = False
             try:
-                commander = Commander(setpoints, limits, *units, now_ns=time.monotonic_ns(), timing=timing)
+                commander = Commander(
+                    setpoints, limits, *units, now_ns=time.monotonic_ns(), timing=timing, around=around
+                )
                 beating = True
                 error = _run(bus, commander, taken, on_progress)
                 beating = not commander.silent
             finally:
                 left = setup.release(beating=beating)
     if commander.refusal is not None:
-        raise MotionError("; ".join(reason for reason in (commander.refusal, left) if reason))
+        refusal = "; ".join(reason for reason in (commander.refusal, left) if reason)
+        if commander.out_of_place is not None and not left:
+            raise OutOfPlaceError(refusal, commander.out_of_place)
+        raise MotionError(refusal)
     result = commander.result
     reasons = [reason for reason in (result.reason, error, left) if reason]
     return result._replace(status="stopped" if reasons else "done", reason="; ".join(reasons))

@@ -1,8 +1,8 @@
-"""Both joints brought to rest and made powerless: at the end of a motion (`Stopping`), or within it (`PowerOff`). Pure.
+"""All joints brought to rest and made powerless: at the end of a motion (`Stopping`), or within it (`PowerOff`). Pure.
 
-    ramping      the velocity along a ramp to zero, the current faster than that; then until both joints stand
+    ramping      the velocity along a ramp to zero, the current faster than that; then until all joints stand
     braking      quick stop (6040h 2): each drive brakes by itself
-    disabling    power off (6040h 0), until both statuswords confirm it
+    disabling    power off (6040h 0), until all statuswords confirm it
 
 A drive that does not obey the RPDO gets the quick stop by SDO, which a node that is pre-operational still answers. If that
 does not help either, our heartbeat ends: the drives then stop by 1016h:2.
@@ -33,7 +33,7 @@ UNLOAD_S: Final = 0.1
 SETTLE_S: Final = 0.3
 """After the ramp: time for both joints to stand, before they are braked anyway."""
 SETTLED_S: Final = 0.02
-"""Both joints must have stood for so long before the next step."""
+"""All joints must have stood for so long before the next step."""
 OFF_S: Final = 0.01
 """Time for several frames to each drive that switch it off."""
 BY_SDO_S: Final = 0.01
@@ -91,7 +91,7 @@ class Stopping:
         self._supervision, self._commands, self._timing = supervision, commands, timing
         self._ramp = StopRamp(*start)
         self._ramp_s = 0.0
-        self._sdo_sent = [False, False]
+        self._sdo_sent: set[int] = set()
         self._since_ns = self._moved_ns = now_ns
 
     def brake(self, now_ns: int) -> None:
@@ -134,15 +134,15 @@ class Stopping:
         obeyed = synced and self._supervision.obeyed(turn)
         if not obeyed and synced and elapsed_s > SILENT_S:
             self.silent = True
-        if not obeyed and elapsed_s > BY_SDO_S and not self._sdo_sent[turn]:
-            self._sdo_sent[turn] = True
+        if not obeyed and elapsed_s > BY_SDO_S and turn not in self._sdo_sent:
+            self._sdo_sent.add(turn)
             return self._commands.quick_stop_by_sdo(turn)
         return self._commands.control(turn, QUICK_STOP_WORD)
 
     def _disabling(self, turn: int, now_ns: int, synced: bool) -> bytes | None:
         """Switch off. Where SYNC is gone, the shell asks for the statuswords by SDO afterwards."""
         elapsed_s = (now_ns - self._since_ns) * 1e-9
-        off = synced and elapsed_s > OFF_S and self._supervision.both_off()
+        off = synced and elapsed_s > OFF_S and self._supervision.all_off()
         if off or elapsed_s > self._timing.disable_s:
             self.phase = Phase.OVER
             return None
@@ -234,11 +234,11 @@ class PowerOff:
 
     def _off(self, turn: int, now_ns: int) -> bytes | None:
         self.violation = self._turning()
-        if not self._supervision.both_off():
+        if not self._supervision.all_off():
             self._powered_ns = now_ns
             if self._elapsed_s(now_ns) > self._timing.disable_s:
-                one, two = self._inputs.drives
-                drive = one if fast_state(one.statusword) in POWERED else two
+                drives = self._inputs.drives
+                drive = next((d for d in drives if fast_state(d.statusword) in POWERED), drives[-1])
                 self.violation = Violation(
                     f"{drive.who}: {describe(drive.statusword)} after {self._timing.disable_s:g} s, expected no power",
                     True,

@@ -102,3 +102,12 @@ def joint_number(option: int | None, joint: Joint, runs: Sequence[RunFile]) -> i
     raise ConfigError(
         f"--number: missing, expected the joint that {joint.name} is in the runs, which have {have}"
     )
+
+
+def with_joint(runs: Sequence[RunFile], number: int) -> list[RunFile]:
+    """Return the runs that have columns of the joint; all of them where none has, so that the reader says so.
+
+    A campaign of an arm moves one joint after the other: its directory holds runs of other joints too.
+    """
+    found = [run for run in runs if number in run.table.joints]
+    return found or list(runs)

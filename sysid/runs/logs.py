@@ -81,6 +81,8 @@ def log_to_run(
     all_needed: bool = False,
     nodes: Sequence[int] | None = None,
     sensor: bool = True,
+    enabled: Sequence[int] = (),
+    last_motion: bool = False,
 ) -> LoggedRun:
     """Read joints of a log from the first to the last cycle in which all their drives are in "operation enabled".
 
@@ -96,6 +98,8 @@ def log_to_run(
             configuration that is attached to the log, without one 1, 2, ...
         sensor: a row needs the sensor's value, where a joint has a channel of it; False: the bench has none,
             torque_nm is None.
+        enabled: further joints whose drives must be in "operation enabled" at both ends, although they are not wanted.
+        last_motion: begin behind the last time without power, not at the first cycle with it.
 
     Raises:
         LogError: no such joint or cycle, an input that never came, or topics that do not belong together.
@@ -114,14 +118,16 @@ def log_to_run(
         raise LogError(f"{name}: {'; '.join(left_out.values())}")
     nodes = nodes or _nodes(log, there)
     node_of = dict(zip(there, nodes, strict=False))
+    looked_at = [*wanted, *(number for number in enabled if number not in wanted)]
     states, readings = _read(
-        log, name, {number: node_of.get(number, number) for number in wanted if number in there}
+        log, name, {number: node_of.get(number, number) for number in looked_at if number in there}
     )
+    beside = {number: states.pop(number) for number in list(states) if number not in wanted}
     left_out |= {number: why for number, state in states.items() if (why := _unusable(number, state))}
     if left_out and (all_needed or len(left_out) == len(wanted)):
         raise LogError(f"{name}: {'; '.join(left_out.values())}")
     states = {number: state for number, state in states.items() if number not in left_out}
-    span = _span(states, name)
+    span = _span(states | beside, name, last_motion=last_motion)
     temperatures = {number: _temperature(readings[number], span) for number in states}
     states = {number: state[span] for number, state in states.items()}
     present = {f"joint {number}": _complete(number, state, name) for number, state in states.items()}
@@ -253,9 +259,15 @@ def _unusable(number: int, state: Records) -> str:
     return ""
 
 
-def _span(states: Mapping[int, Records], log: Path) -> slice:
+def _span(states: Mapping[int, Records], log: Path, *, last_motion: bool) -> slice:
     """From the first to the last cycle that counts; what is stale in between is looked at later."""
     rows = np.flatnonzero(np.logical_and.reduce([_enabled(state) for state in states.values()]))
+    if last_motion and len(rows):
+        off: Flags = np.logical_or.reduce(
+            [_unpowered(state["statusword"]) & _fresh(state) for state in states.values()]
+        )
+        before = np.flatnonzero(off[: rows[-1]])
+        rows = rows[rows > before[-1]] if len(before) else rows
     if len(rows) < 2:
         raise LogError(
             f"{log}: found {counted(len(rows), 'cycle')} of the motion with all drives (joints "
@@ -300,9 +312,14 @@ def _columns(state: Records, sensor: bool, temperature: FloatArray | None) -> Jo
     )
 
 
+def _unpowered(statusword: NDArray[Any]) -> Flags:
+    found: Flags = np.logical_or.reduce([(statusword & mask) == value for mask, value in _NO_POWER])
+    return found
+
+
 def _powered(statusword: NDArray[Any]) -> FloatArray | None:
     """Column `enabled` [n]; None for a run in which the power was never off, which is most of them."""
-    off = np.logical_or.reduce([(statusword & mask) == value for mask, value in _NO_POWER])
+    off = _unpowered(statusword)
     return np.where(off, 0.0, 1.0) if off.any() else None
 
 

@@ -18,7 +18,7 @@ from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.checks import check_run
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import RunError, RunFile, read_runs
-from jtqd.sysid.runs.joints import joint_number, only
+from jtqd.sysid.runs.joints import joint_number, only, with_joint
 from jtqd.sysid.score.score import RunErrors, errors_on, rows_of, table_lines, to_mapping
 
 BY: Final = "jtq score"
@@ -38,6 +38,7 @@ def main(argv: list[str]) -> int:
         columns = None if options.columns is None else ColumnMap.load(options.columns)
         runs = read_runs(options.runs, columns, in_pieces=True, joints=only(options.number))
         number = joint_number(options.number, joints[0], runs)
+        runs = with_joint(runs, number)
         notes = [f"{run.name}: {note}" for run in runs for note in run.notes]
         scored, refused = _scored(runs, number, joints)
         for line in (*notes, *refused):

@@ -25,6 +25,7 @@ from jtqd.estimator.fusion import Fusion, turning
 from jtqd.estimator.joint import AdditiveLoss, Fused, FusedSigma, Joint, Torsion
 from jtqd.estimator.network import FUSED_FEATURES
 from jtqd.estimator.settings import EstimatorSettings
+from jtqd.sysid.fit.envelope import envelope_of
 from jtqd.sysid.fit.fused import conformal_scale, folds, loss_and_width
 from jtqd.sysid.fit.losses import fit_loss
 from jtqd.sysid.fit.signals import RunSignals
@@ -82,20 +83,14 @@ def export_gated(trained: Trained, waves: int, metadata: Mapping[str, Any]) -> b
     return data
 
 
-Table = np.ndarray[tuple[int, int], np.dtype[np.bool_]]
-
 _SETTINGS: Final = EstimatorSettings(method="fused", track_zeros=False)
 HIDDEN: Final = (16, 16)
 _CORE: Final = 3
 """Features that set the gains (speed, motor torque, torsion less current); the others are the waves."""
 _WEIGHT_DECAY: Final = 0.05
-_VELOCITY_STEP_RAD_S: Final = 0.25
-_TORQUE_STEP_NM: Final = 3.0
 _SLOW_SAMPLES: Final = 501
 """Half a second at 1 kHz: at 0.1 rad/s the ripple at 2 per motor revolution has turned 1.6 times."""
 _LEAST_SHARE: Final = 0.05
-_VISITS: Final = 20
-"""Samples at 1 kHz in a cell that make it known."""
 
 
 class Seen:
@@ -161,7 +156,7 @@ def train_fused(
     low, high = np.quantile(features, [1e-4, 1.0 - 1e-4], axis=0)
     metadata = {
         "features": list(FUSED_FEATURES),
-        "envelope": envelope_of(blocks, runs).to_mapping(),
+        "envelope": training_envelope(blocks, runs).to_mapping(),
         "sigma_scale": list(
             conformal_scale(errors, [one.sigma_nm for one, _ in unseen], [one.quadrant for one, _ in unseen])
         ),
@@ -221,37 +216,7 @@ def _train(
     )
 
 
-def envelope_of(blocks: Sequence[Seen], runs: Sequence[RunSignals]) -> Envelope:
-    """Return what the data covered: cells of (v, tau_raw) with enough samples, and cells between such cells."""
-    v = np.concatenate([block.features[:, 0] for block in blocks])
-    raw = np.concatenate([block.features[:, 1] for block in blocks])
-    rows = int(np.ceil(np.abs(v).max() / _VELOCITY_STEP_RAD_S)) + 1
-    columns = int(np.ceil(np.abs(raw).max() / _TORQUE_STEP_NM)) + 1
-    counts = np.zeros((2 * rows + 1, 2 * columns + 1), np.int64)
-    at = (
-        np.rint(v / _VELOCITY_STEP_RAD_S).astype(int) + rows,
-        np.rint(raw / _TORQUE_STEP_NM).astype(int) + columns,
-    )
-    np.add.at(counts, at, 1)
-    known = _filled(counts >= _VISITS)
-    temperatures = [run.temperature_c for run in runs if np.isfinite(run.temperature_c)]
-    distance = float(np.quantile(np.abs(np.concatenate([block.features[:, 2] for block in blocks])), 0.999))
-    return Envelope(
-        _VELOCITY_STEP_RAD_S,
-        _TORQUE_STEP_NM,
-        tuple(tuple(int(cell) for cell in row) for row in known),
-        1.25 * distance,
-        (min(temperatures) - 0.5, max(temperatures) + 0.5) if temperatures else None,
-    )
-
-
-def _filled(known: Table) -> Table:
-    """Also call a cell known that lies between known cells in both directions: a hole, not an edge."""
-
-    def between(axis: int) -> Table:
-        before = np.maximum.accumulate(known, axis=axis)
-        after = np.flip(np.maximum.accumulate(np.flip(known, axis), axis=axis), axis)
-        return np.logical_and(before, after)
-
-    result: Table = known | (between(0) & between(1))
-    return result
+def training_envelope(blocks: Sequence[Seen], runs: Sequence[RunSignals]) -> Envelope:
+    """Return what the training data covered."""
+    features = np.concatenate([block.features[:, :_CORE] for block in blocks])
+    return envelope_of(features[:, 0], features[:, 1], features[:, 2], [run.temperature_c for run in runs])

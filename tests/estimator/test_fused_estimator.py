@@ -335,3 +335,23 @@ def test_no_float_raises_and_no_number_is_published_without_a_status() -> None:
             assert math.isfinite(got.torque_nm) == math.isfinite(got.sigma_nm) == published, (seed, round_)
             assert not published or (abs(got.torque_nm) <= 120.0 and got.sigma_nm > 0.0), (seed, round_)
     assert {st.STARTING, st.VALID, st.DEGRADED, st.INVALID} <= seen
+
+
+def test_without_a_network_the_envelope_of_the_joint_file_lowers_the_status_and_nothing_else() -> None:
+    """Half a step beyond the last known cell ends what the fit has seen; so do speed and temperature; rest is its own."""
+    known = everywhere(velocity=2.0, torque=30.0)
+    own = replace(PLAIN, fused=replace(PLAIN.fused, envelope=known))  # type: ignore[type-var]
+    inside, light = steady(estimator(joint=own), 31.0 / GAIN, 1.0), steady(estimator(), 31.0 / GAIN, 1.0)
+    assert inside[:3] == light[:3]
+    assert inside.status == st.VALID
+    heavy, plain = steady(estimator(joint=own), 32.0 / GAIN, 1.0), steady(estimator(), 32.0 / GAIN, 1.0)
+    assert (heavy.torque_nm, heavy.sigma_nm) == (plain.torque_nm, plain.sigma_nm)
+    assert (heavy.status, plain.status) == (st.DEGRADED, st.VALID)
+    assert steady(estimator(joint=own), 3.0, 2.2).status == st.DEGRADED
+    assert steady(estimator(joint=own), 3.0, 1.0, temperature_c=TRAINED_C[1] + 0.4).status == st.VALID
+    assert steady(estimator(joint=own), 3.0, 1.0, temperature_c=TRAINED_C[1] + 0.6).status == st.DEGRADED
+    close = replace(own, fused=replace(own.fused, envelope=replace(known, distance_nm=1.0)))  # type: ignore[type-var]
+    assert steady(estimator(joint=close), 3.0, 1.0).status == st.DEGRADED
+    assert steady(estimator(joint=close), 0.0, 0.0).status == st.STANDSTILL
+    trusted = steady(estimator(says(1.5), own), 32.0 / GAIN, 1.0)
+    assert trusted.status == st.VALID, "a network has an envelope of its own"

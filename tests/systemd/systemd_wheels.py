@@ -87,9 +87,10 @@ def copy_sources(copy: Path) -> Path:
     # Cython's own, which came with the development tools, may be younger than what was made before them.
     shutil.copytree(ROOT / "build" / "cython", copy / "build" / "cython", copy_function=shutil.copy)
     library = f"lib.{sysconfig.get_platform()}-{sys.implementation.cache_tag}"
-    for folder in packages:
-        for module in (copy / folder).rglob("*.so"):
-            target = copy / "build" / library / "jtqd" / module.relative_to(copy)
+    names = copy / "src" / "jtqd"
+    for place in (names, *(names / folder for folder in packages)):
+        for module in place.rglob("*.so"):
+            target = copy / "build" / library / "jtqd" / module.relative_to(names)
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(module, target)
     return copy

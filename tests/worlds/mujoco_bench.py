@@ -82,6 +82,10 @@ class MujocoBench:
         joints = _draw_joints(np.random.default_rng([seed, _JOINTS]))
         return [_draw_day(np.random.default_rng([seed, _DAYS, k]), joints) for k in range(self.runs)]
 
+    def unseen(self) -> MujocoBench:
+        """Return the bench itself: nothing is fitted to its runs."""
+        return self
+
     def draw(self, seed: int, hidden: Sequence[Hidden] = (), *, quiet: bool = False) -> Set:
         """Return one set; about half a second per run."""
         runs = self.runs

@@ -7,10 +7,11 @@ The oracle knows the effect's trace: the same set without noise, with and withou
     a = d' S^-1 r / d' S^-1 d        S = diag(sigma^2) + Z V Z'
 
 gives 1 where the effect is there in its size; r: residuals of both balances of all joints and runs in bins of 10 ms; Z: one
-zero, Coulomb and viscous friction of each run's own; sigma, V: from sets with nothing hidden. The scatter of a over those
-sets, times the size, times `SEEN`, is the smallest visible size; not less than what moves a balance by `RELEVANT` of rated
-torque rms, since nobody asks for less. Nothing of the diagnosis is in it: a better diagnosis does not get smaller effects
-to find, nor a worse one larger ones. What an effect can be confused with is not in it either.
+zero, Coulomb and viscous friction of each run's own; sigma, V: from sets with nothing hidden, with what the joint files
+leave in runs that they were not fitted to. The scatter of a over those sets, times the size, times `SEEN`, is the smallest
+visible size; not less than what moves a balance by `RELEVANT` of rated torque rms, since nobody asks for less. Nothing of
+the diagnosis is in it: a better diagnosis does not get smaller effects to find, nor a worse one larger ones. What an effect
+can be confused with is not in it either.
 """
 
 from __future__ import annotations
@@ -95,7 +96,8 @@ class Oracle:
         self.bench = bench
         self.seeds = [_SEED0 + k for k in range(count)]
         self.quiet = [bench.draw(seed, quiet=True) for seed in self.seeds]
-        noisy = [bench.draw(seed) for seed in self.seeds]
+        unseen = bench.unseen()
+        noisy = [unseen.draw(seed) for seed in self.seeds]
         self.scales = [_scale(s.joints) for s in noisy]
         self.base = [self._balances(q) for q in self.quiet]
         self.left = [self._balances(s) for s in noisy]

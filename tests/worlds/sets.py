@@ -56,5 +56,8 @@ class Bench(Protocol):
         quiet: without noise, quantisation and changes from run to run.
         """
 
+    def unseen(self) -> Bench:
+        """Return the bench with what its joint files leave in runs that they were not fitted to; itself if to none."""
+
     def places(self, name: str) -> Sequence[int | str]:
         """Return where an effect can be: at joints, or at the sensor."""

@@ -270,6 +270,23 @@ def test_the_ladder_is_taken_from_the_recordings_and_the_rest_is_left(size: str)
         assert 1e-3 < rms(left) / joint["rated_torque_nm"] < 0.1
 
 
+@pytest.mark.parametrize("size", ["large", "small"])
+def test_seconds_that_a_ladder_has_not_seen_keep_more_of_everything(size: str) -> None:
+    """Only the current differs; a constant, of which a fit to the run itself leaves nothing, is left in most of them."""
+    joint = JOINTS[size]
+    constants = []
+    for fitted, unseen in zip(recordings(size), recordings(size, unseen=True), strict=True):
+        differ = {c for c in fitted if not np.array_equal(fitted[c], unseen[c], equal_nan=True)}
+        long = fitted["time_s"][-1] > 3.0
+        assert differ == ({"j1.current_a"} if long else set())
+        if long:
+            moving = np.abs(fitted["j1.motor_velocity_rad_s"]) / joint["gear_ratio"] > 0.05
+            more = (unseen["j1.current_a"] - fitted["j1.current_a"])[moving]
+            more_nm = joint["gear_ratio"] * joint["torque_constant_nm_per_a"] * more
+            constants.append(abs(float(more_nm.mean())) / joint["rated_torque_nm"])
+    assert max(constants) > 0.001
+
+
 @pytest.mark.parametrize("name", MeasuredBench.effects)
 def test_an_effect_of_nothing_changes_nothing_and_one_of_some_size_does(name: str) -> None:
     bench = MeasuredBench()

@@ -7,6 +7,7 @@ import subprocess
 import tempfile
 import time
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -181,6 +182,10 @@ def test_degraded_and_invalid(bench: About) -> None:
     assert "Nm from physics, limit" in why(bench, degraded._replace(network_nm=10.0 - far))
     assert "not finite" in why(bench, degraded._replace(network_nm=NAN))
     assert "no time for the network" in why(bench, degraded._replace(input_flags=0x1F))
+    alone = replace(bench, joints=(replace(bench.joints[0], network=None), *bench.joints[1:]))
+    assert why(alone, degraded._replace(network_nm=NAN)).startswith(
+        "outside of what the joint file was fitted to"
+    )
     invalid = WELL._replace(status=st.INVALID, torque_nm=NAN)
     found = why(bench, invalid._replace(input_flags=7 | (MOTOR_JUMP | LINK_JUMP) << 8))
     assert found == "the motor position jumped, the link position jumped"

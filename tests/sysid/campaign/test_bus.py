@@ -106,7 +106,7 @@ def campaign_process(cmdline: Path) -> bool:
 
 def check_done(out: Path, status: int, content: dict[str, Any], runs: list[str]) -> None:
     """The campaign is whole, and nothing is left of its interruption."""
-    assert status == 0
+    assert status == 0, content
     assert content["runs"]["done"] == len(runs)
     assert content["missed_cycles"] == content["incomplete_cycles"] == content["findings"] == {}
     left = sorted(file.name for file in out.iterdir())
@@ -200,3 +200,64 @@ def test_a_limit_stops_the_joints_and_the_campaign_unless_told_to_go_on(
         assert "limit 8 Nm" in content["not_done"][name]
         assert (out / f"{name}.stopped.mcap").exists()
     assert not list(out.glob("*.csv.gz"))
+
+
+@pytest.mark.campaign
+def test_a_joint_is_moved_alone_beside_a_towing_bench(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three joints at 500 Hz: joint 3 is brought to the middle of its travel, moved, and read; 1 and 2 are held."""
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+    config: dict[str, Any] = {
+        "node_id": 32,
+        "sync": {"period_us": 2000},
+        "estimator": {"method": "tob"},
+        "sensor": {"node": 5, "channels": 2},
+    }
+    for number, channel in ((1, 1), (2, 1), (3, 2)):
+        file = str(shipped(f"trained/joint{2 - number % 2}.yaml"))
+        config[f"joint_{number}"] = {
+            "node": number,
+            "file": file,
+            "sensor_channel": channel,
+            "temperature": True,
+        }
+    (tmp_path / "three.yaml").write_text(yaml.safe_dump(config))
+    held = {"kind": "plateau", "hold_s": 1.0}
+    segments = [held | {"velocity_rad_s": speed} for speed in (0.5, -0.5)] + [{"kind": "rest", "hold_s": 0.5}]
+    plan = PLAN | {"runs": [{"name": "third", "joint": 3, "segments": segments}]}
+    (tmp_path / "third.yaml").write_text(yaml.safe_dump(plan))
+    out = tmp_path / "out"
+    status, content, errors = ended(
+        started(
+            [
+                str(tmp_path / "third.yaml"),
+                *(
+                    "--config",
+                    str(tmp_path / "three.yaml"),
+                    "--bus",
+                    "sim:vcan0",
+                    "--out",
+                    str(out),
+                    "--json",
+                ),
+                *("--limits", "3:travel_rad=-1.4:0.6,velocity_rad_s=1"),
+            ]
+        )
+    )
+    check_done(out, status, content, ["third"])
+    assert "joint 3: moved alone" in errors
+    table = read_run(out / "third.csv.gz").table
+    assert list(table.joints) == [3]
+    columns = table.joints[3]
+    assert columns.link_position_rad is not None
+    assert columns.torque_nm is not None
+    assert columns.link_position_rad[0] == pytest.approx(-0.4, abs=0.02), "the way there is not in the table"
+    assert np.ptp(columns.link_position_rad) == pytest.approx(0.72, abs=0.05)
+    assert abs(np.median(np.diff(table.time_s)) - 2e-3) < 1e-5
+    both = log_to_run(out / "third.mcap", joints=[1, 2]).table
+    for number in (1, 2):
+        position = both.joints[number].link_position_rad
+        assert position is not None
+        assert np.ptp(position) < 0.01, "held"
+    all_gone()

@@ -14,6 +14,7 @@ from jtqd.models.files import shipped
 from jtqd.sysid.campaign.bench import BenchConfig
 from jtqd.sysid.campaign.command import main, parser, recipe, wanted_plan
 from jtqd.sysid.campaign.state import DONE, CampaignDirectory, RunState
+from jtqd.sysid.campaign.units import units_of
 from tests.drivers.hub_helpers import until_it_listens
 
 SMALL = {
@@ -131,10 +132,10 @@ def bench_config(folder: Path, **changes: object) -> Path:
     [
         ({"bitrate": 800_000}, ["bench.yaml", "commander", "bus load", "95%"]),
         ({"sensor": {"node": 3, "channels": 2}}, ["bus load"]),
-        ({"sync": {"period_us": 2000}}, ["sync.period_us", "2000"]),
+        ({"sync": {"period_us": 1500}}, ["sync.period_us", "1500", "whole milliseconds"]),
         ({"sensor": {"node": 2, "channels": 1}}, ["bench.yaml", "different node numbers"]),
         ({"joint_1": {"node": 1, "file": "none.yaml"}}, ["none.yaml"]),
-        ({"joint_3": {"node": 4, "file": "none.yaml"}}, ["joint_3", "expected joint_1 and joint_2"]),
+        ({"joint_4": {"node": 5, "file": "none.yaml"}}, ["joint_4", "without a gap"]),
     ],
 )
 def test_a_bench_that_cannot_carry_it_is_refused(
@@ -162,8 +163,9 @@ def test_a_plan_beyond_its_limits_is_refused(plan: str, capsys: pytest.CaptureFi
 def done_directory(path: Path, arguments: list[str]) -> None:
     """A campaign that is done, as it would be left."""
     options = parser().parse_args([*arguments, "--bus", "x", "--out", str(path)])
-    joints = BenchConfig.load(None).joints
-    wanted = wanted_plan(options, joints)
+    config = BenchConfig.load(None)
+    joints = config.joints
+    wanted = wanted_plan(options, joints, units_of(config.channels, sensor=True))
     directory = CampaignDirectory(path)
     directory.begin(wanted, recipe(options, joints))
     for run in wanted.runs:

@@ -33,10 +33,11 @@ from jtqd.sysid.campaign.processes import Interrupted
 from jtqd.sysid.campaign.reporter import BETWEEN_RUNS_S, Remaining, Reporter, clock_text
 from jtqd.sysid.campaign.runner import (
     ATTEMPTS,
-    LONGEST_GAP_S,
+    LONGEST_GAP,
     Attempt,
     Outcome,
     _stopped,
+    ends_early,
     findings,
     gap_too_long,
     go_through,
@@ -47,6 +48,7 @@ from jtqd.sysid.motion.commander import Pace
 from jtqd.sysid.motion.setpoints import JointSample, Limits, Monitor, MotionResult, Sample, Setpoints, Timing
 from jtqd.sysid.runs.logs import LoggedRun
 
+GAP_S = 1e-3 * LONGEST_GAP
 PLAN = Plan("p", DEFAULT_LIMITS, tuple(Run(name, 1, (Rest(1.0),)) for name in ("a", "b", "c")))
 GOOD = Attempt(RunState(DONE, played_s=1.0, rows=1000))
 LIMIT = Attempt(RunState(STOPPED, "joint 1: current 9.1 A, limit 9 A"))
@@ -241,11 +243,11 @@ def limit_reasons() -> list[str]:
     fine = JointSample(0.0, 0.0, 0.0, 20.0)
     monitor = Monitor(Limits(1.0, 1.0, 1.0, 1.0, 30.0))
     samples = [
-        Sample(fine._replace(current_a=2.0), fine, (0.0,)),
-        Sample(fine, fine._replace(velocity_rad_s=-2.0), (0.0,)),
-        Sample(fine, fine._replace(travel_rad=2.0), (0.0,)),
-        Sample(fine, fine._replace(temperature_c=31.0), (0.0,)),
-        Sample(fine, fine, (-2.0,)),
+        Sample((fine._replace(current_a=2.0), fine), (0.0,)),
+        Sample((fine, fine._replace(velocity_rad_s=-2.0)), (0.0,)),
+        Sample((fine, fine._replace(travel_rad=2.0)), (0.0,)),
+        Sample((fine, fine._replace(temperature_c=31.0)), (0.0,)),
+        Sample((fine, fine), (-2.0,)),
     ]
     reasons = [monitor.check(sample) for sample in samples]
     assert all(reasons)
@@ -349,7 +351,7 @@ def found(change: Change | None = None) -> tuple[str, ...]:
     columns = dict(table.joints)
     if change is not None:
         change(columns)
-    return findings(logged(RunTable(table.time_s, columns)), points, joints, sensor=True)
+    return findings(logged(RunTable(table.time_s, columns)), points, joints, measured=(1, 2))
 
 
 def torque(change: Callable[[np.ndarray], np.ndarray]) -> Change:
@@ -413,16 +415,16 @@ def test_a_bench_without_a_sensor_is_not_reproached_for_it() -> None:
     table, points, joints = good_run()
     columns = dict(table.joints)
     without_sensor(columns)
-    assert findings(logged(RunTable(table.time_s, columns)), points, joints, sensor=False) == ()
+    assert findings(logged(RunTable(table.time_s, columns)), points, joints, measured=()) == ()
 
 
 def test_missing_cycles_are_named_above_one_percent_only() -> None:
     table, points, joints = good_run()
     run = logged(table)
     few = replace(run, missed=20, incomplete=10, incomplete_by={"joint 1": 10, "sensor": 0})
-    assert findings(few, points, joints, sensor=True) == ()
+    assert findings(few, points, joints, measured=(1, 2)) == ()
     many = replace(run, missed=50, incomplete=10, incomplete_by={"joint 1": 10, "sensor": 0})
-    (line,) = findings(many, points, joints, sensor=True)
+    (line,) = findings(many, points, joints, measured=(1, 2))
     for word in ("50 without a cycle", "10 incomplete: joint 1 10", "at most 1%"):
         assert word in line
 
@@ -440,7 +442,7 @@ def test_lost_cycles_do_not_make_a_motion_look_wrong() -> None:
         )
         for number, joint in table.joints.items()
     }
-    assert findings(logged(RunTable(table.time_s[keep], columns)), points, joints, sensor=True) == ()
+    assert findings(logged(RunTable(table.time_s[keep], columns)), points, joints, measured=(1, 2)) == ()
 
 
 def with_gaps(*gaps: tuple[int, int]) -> LoggedRun:
@@ -463,9 +465,9 @@ def with_gaps(*gaps: tuple[int, int]) -> LoggedRun:
 
 def test_a_gap_is_interpolated_and_counted() -> None:
     table, _, _ = good_run()
-    whole, made = fill(with_gaps((1000, 15), (2000, 5)), LONGEST_GAP_S)
+    whole, made = fill(with_gaps((1000, 15), (2000, 5)), GAP_S)
     assert made == 15, "a short gap is left to the readers"
-    assert gap_too_long(whole) is None
+    assert gap_too_long(whole, GAP_S) is None
     time_s = np.asarray(whole.table.time_s)
     assert np.abs(np.diff(time_s)[990:1020] - 1e-3).max() < 1e-9
     place = slice(1000, 1015)
@@ -477,17 +479,27 @@ def test_a_gap_is_interpolated_and_counted() -> None:
 @pytest.mark.parametrize("gaps", [((1000, 60),), ((1000, 45), (3000, 45)), ()], ids=["long", "many", "none"])
 def test_what_is_too_long_or_too_much_is_not_interpolated(gaps: tuple[tuple[int, int], ...]) -> None:
     run = with_gaps(*gaps)
-    assert fill(run, LONGEST_GAP_S) == (run, 0)
-    assert (gap_too_long(run) is None) == (not gaps)
+    assert fill(run, GAP_S) == (run, 0)
+    assert (gap_too_long(run, GAP_S) is None) == (not gaps)
+
+
+def test_a_log_that_lost_the_end_of_the_motion_is_not_kept() -> None:
+    table, points, _ = good_run()
+    assert ends_early(logged(table), points) is None
+    keep = table.time_s < points.duration_s - 0.2
+    joints = {n: JointColumns(current_a=columns.current_a[keep]) for n, columns in table.joints.items()}  # type: ignore[index]
+    why = ends_early(logged(RunTable(table.time_s[keep], joints)), points)
+    assert why is not None
+    assert "found the last row of the log at" in why
 
 
 def test_a_gap_that_readers_refuse_makes_a_run_gap_too_long() -> None:
     table, _, _ = good_run()
-    assert gap_too_long(logged(table)) is None
-    assert gap_too_long(replace(logged(table), longest_gap_s=0.009)) is None
+    assert gap_too_long(logged(table), GAP_S) is None
+    assert gap_too_long(replace(logged(table), longest_gap_s=0.009), GAP_S) is None
     shifted = np.array(table.time_s)
     shifted[1000:] += 0.024
-    why = gap_too_long(logged(RunTable(shifted, table.joints)))
+    why = gap_too_long(logged(RunTable(shifted, table.joints)), GAP_S)
     assert why is not None
     assert "25.0 ms" in why
     assert "at 0.999 s" in why

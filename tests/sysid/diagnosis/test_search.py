@@ -12,13 +12,16 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.library import EFFECTS
 from jtqd.sysid.diagnosis.evidence import (
     candidate_table,
+    class_beside,
     complete_minimum,
     equivalence_class,
     information,
     minimum_size,
+    steady_size,
 )
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.search import ENTER, Hypothesis, Search, pinned, units_changed, within
+from jtqd.sysid.diagnosis.steadiness import needed
 from tests.estimator.effects.effect_signals import PLAIN
 from tests.sysid.diagnosis.diagnose_core_helpers import Dense, candidates, dense, search_of
 
@@ -295,6 +298,36 @@ def test_the_smallest_size_has_the_evidence_that_is_asked_for() -> None:
     info, share = information(search.mixed, empty, viscous)
     assert share < 0.01
     assert size**2 * info == pytest.approx(ENTER + search.penalty(viscous), rel=0.02)
+
+
+@pytest.mark.parametrize("of_other", [0, 1])
+def test_an_alternative_that_some_runs_prefer_stays_beside_what_is_left_over(of_other: int) -> None:
+    """Current offset and Coulomb friction of nearly the same column; in some runs it is the one, in the rest the other."""
+    x = columns(21)
+    x[:, :, 3] = 0.9 * x[:, :, 0] + 0.4 * x[:, :, 3]
+    whole = problem(21, {}, x)
+    for r in range(len(whole.y)):
+        whole.y[r] += 1.5 * x[r, :, 3 if r < of_other else 0]
+    search = search_of(whole, LIBRARY)
+    best = search.hypothesis([PLACES["coulomb_friction"]])
+    assert equivalence_class(search, best, best.chosen[0]) == (), "by the noise alone it is decided"
+    others = [c.effect.name for c in class_beside(search, best, best.chosen[0])]
+    assert others == (["current_offset"] if of_other else [])
+
+
+def test_a_steady_size_is_that_of_its_changes_from_run_to_run() -> None:
+    x = columns(22)
+    whole = problem(22, {}, x)
+    sizes = np.array([0.3, -0.2, 0.25, -0.35, 0.1])
+    for r, size in enumerate(sizes):
+        whole.y[r] += size * x[r, :, 1]
+    search = search_of(whole, LIBRARY)
+    empty, viscous = search.hypothesis(()), LIBRARY[1]
+    steady = steady_size(search, empty, viscous)
+    assert steady == pytest.approx(needed(5) * sizes.std(ddof=1) / 5**0.5, rel=0.15)
+    (alone,) = minimum_size(search, empty, viscous).values()
+    (beside,) = minimum_size(search, empty, viscous, left_over=True).values()
+    assert alone.value < beside.value == pytest.approx(steady)
 
 
 def test_a_size_with_which_the_joint_would_move_otherwise_is_invisible() -> None:

@@ -15,13 +15,15 @@ from jtqd.drivers.frame import FRAME
 from jtqd.drivers.sdo import Transfer
 from jtqd.models.files import shipped
 from jtqd.sim_can.bench import Bench
+from jtqd.sim_can.eds_entries import sensor_node
 from jtqd.sim_can.plant_file import load_plant
-from jtqd.sim_can.plant_source import PlantSource
+from jtqd.sim_can.side_by_side import sources_of
 from jtqd.sysid.motion.cia402 import CST, CSV
 from jtqd.sysid.motion.commander import Commander
-from jtqd.sysid.motion.setpoints import Limits, Setpoints, Timing
+from jtqd.sysid.motion.setpoints import Limits, Setpoints, Surroundings, Timing
 from jtqd.sysid.motion.setup import sensor_units, set_up, switch_off
 from jtqd.sysid.motion.stopping import Phase
+from jtqd.sysid.motion.turns import turns
 
 MS = 1_000_000
 PLANT = load_plant(shipped("plant.yaml"))
@@ -70,11 +72,20 @@ class LockStep:
     """A bench, booted as jtqd boots it, and a commander; `sent` is all that the commander has sent: (ms, COB-ID, data).
 
     `filter` sees each batch of frames on its way to the commander and may change it: that is how faults are injected.
+
+    drives: 1 to 4, coupled in pairs; the sensor is node 3, or 5 beside more than two. period_ms: of SYNC.
     """
 
-    def __init__(self, plant: Any = PLANT, profile: str = "rest") -> None:
-        self.source = PlantSource(plant, 1)
-        self.bench = Bench(self.source, profile)
+    def __init__(
+        self, plant: Any = PLANT, profile: str = "rest", drives: int = 2, period_ms: int = 1
+    ) -> None:
+        sources = sources_of(plant, 1, drives)
+        self.source: Any = sources[0]
+        self.bench = Bench(sources[0], profile, sources[1:])
+        self.nodes = range(1, drives + 1)
+        self.sensor_node = sensor_node(drives)
+        self.sensor_profile = SensorProfile(self.sensor_node, channels=(1,) if drives < 3 else (1, 2))
+        self.period_ms = period_ms
         self.now = 1_000 * MS
         self.counter = 0
         self.sent: list[tuple[int, int, bytes]] = []
@@ -84,8 +95,8 @@ class LockStep:
         self.waiting: Frames = []
         self.bench.tick(self.now)
         settings = BusSettings(0x20, counter_overflow=240)
-        for node in (1, 2, 3):
-            profile_of = DriveProfile(node) if node < 3 else SensorProfile(3)
+        for node in (*self.nodes, self.sensor_node):
+            profile_of = DriveProfile(node) if node in self.nodes else self.sensor_profile
             boot = NodeBoot(BenchAccess(self, node), profile_of, settings)
             boot.run(boot.check_device_type())
         self.to_bench(0, b"\x01\x00")
@@ -108,33 +119,40 @@ class LockStep:
         return BenchAccess(self, node)
 
     def commander(
-        self, setpoints: Setpoints, limits: Limits = WIDE, timing: Timing | None = None
+        self,
+        setpoints: Setpoints,
+        limits: Limits = WIDE,
+        timing: Timing | None = None,
+        around: Surroundings | None = None,
     ) -> Commander:
-        """Set up both drives and make the commander; kept as `self.motion`."""
-        timing = timing or Timing()
+        """Set up all drives and make the commander; kept as `self.motion`."""
+        period_s = 1e-3 * self.period_ms
+        timing = replace(timing or Timing(), period_s=period_s, setpoint_delay_s=0.7 * period_s)
         temperature = math.isfinite(limits.temperature_c)
-        for node in (1, 2):
+        round_cycles = turns(setpoints.joints, len(self.nodes))[1]
+        for node in self.nodes:
             switch_off(self.access(node), node, self.sleep)
         units = [
             set_up(
                 self.access(node),
                 DriveProfile(node),
-                CSV if node == setpoints.velocity_joint else CST,
+                CST if node == setpoints.current_joint else CSV,
                 round(timing.drive_timeout_s * 1e3),
                 self.sleep,
                 temperature=temperature,
+                interpolation_ms=round_cycles * self.period_ms,
             )
-            for node in (1, 2)
+            for node in self.nodes
         ]
-        sensor = sensor_units(self.access(3), SensorProfile(3))
+        sensor = sensor_units(self.access(self.sensor_node), self.sensor_profile)
         self.motion = Commander(
-            setpoints, limits, (units[0], units[1]), sensor, now_ns=self.now, timing=timing
+            setpoints, limits, units, sensor, now_ns=self.now, timing=timing, around=around
         )
         return self.motion
 
     def cycle(self) -> None:
-        """One millisecond: timers, SYNC, the bench's answers, and 0.7 ms later the commander's turn."""
-        self.now += MS
+        """One period of SYNC: timers, SYNC, the bench's answers, and 70 % of it later the commander's turn."""
+        self.now += self.period_ms * MS
         frames, self.waiting = self.waiting, []
         frames += self.texts(self.bench.tick(self.now))
         if self.sync_runs:
@@ -146,7 +164,9 @@ class LockStep:
         if self.deaf:
             self.waiting = frames
             return
-        for can_id, data, _ in self.texts(self.motion.on_frames(frames, self.now + 7 * MS // 10)):
+        for can_id, data, _ in self.texts(
+            self.motion.on_frames(frames, self.now + 7 * self.period_ms * MS // 10)
+        ):
             self.sent.append((self.now // MS, can_id, data))
             self.waiting += self.to_bench(can_id, data)
 
@@ -174,10 +194,9 @@ class LockStep:
         return plant.motor_velocity[0] / one, plant.motor_velocity[1] / two
 
     @property
-    def states(self) -> tuple[int, int]:
-        """jtqd.sim_can.drive_node states of both drives."""
-        one, two = self.bench.drives
-        return one.machine.state, two.machine.state
+    def states(self) -> tuple[int, ...]:
+        """jtqd.sim_can.drive_node states of all drives."""
+        return tuple(drive.machine.state for drive in self.bench.drives)
 
     def setpoints_sent(self, after_ms: int = 0) -> list[tuple[int, int, int]]:
         """(ms, COB-ID, target) of each RPDO that carries a target of an enabled drive."""

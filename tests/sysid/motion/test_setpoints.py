@@ -29,7 +29,7 @@ FIELDS = {
 
 def sample(joint: int, **values: float) -> Sample:
     changed = STILL._replace(**values)
-    return Sample(changed, STILL, (0.0,)) if joint == 1 else Sample(STILL, changed, (0.0,))
+    return Sample((changed, STILL) if joint == 1 else (STILL, changed), (0.0,))
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -58,11 +58,11 @@ def test_temperature_has_one_side_and_may_be_unknown(joint: int) -> None:
 @pytest.mark.parametrize("torque", [60.01, -60.01, math.nan])
 def test_torque_is_that_of_both_joints_with_one_sensor_and_of_one_with_two(torque: float) -> None:
     monitor = Monitor(LIMITS)
-    assert monitor.check(Sample(STILL, STILL, (60.0,))) is None
-    found = monitor.check(Sample(STILL, STILL, (torque,)))
+    assert monitor.check(Sample((STILL, STILL), (60.0,))) is None
+    found = monitor.check(Sample((STILL, STILL), (torque,)))
     assert found == f"joints 1 and 2: torque at the sensor {torque:.2f} Nm, limit 60 Nm"
-    assert str(monitor.check(Sample(STILL, STILL, (0.0, torque)))).startswith("joint 2: torque")
-    assert monitor.check(Sample(STILL, STILL, ())) is None
+    assert str(monitor.check(Sample((STILL, STILL), (0.0, torque)))).startswith("joint 2: torque")
+    assert monitor.check(Sample((STILL, STILL), ())) is None
 
 
 @pytest.mark.parametrize("name", ["current_a", "velocity_rad_s", "torque_nm", "travel_rad", "temperature_c"])
@@ -143,7 +143,10 @@ def test_setpoints_are_copied_read_only_and_know_their_times() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((3, [0.0], [0.0]), "velocity_joint 3, expected 1 or 2"),
+        ((5, [0.0], [0.0]), "velocity_joint 5, expected 1 to 4"),
+        ((3, [0.0], [0.0]), "no current_joint beside velocity_joint 3"),
+        ((3, [0.0], [0.0], (), (), 3), "current_joint 3, expected another joint than 3"),
+        ((3, [0.0], [0.1], (), (), None), "a current and no joint to follow it"),
         ((1, [], []), "velocity_rad_s has shape"),
         ((1, [[0.0]], [0.0]), "velocity_rad_s has shape"),
         ((1, [0.0, math.nan], [0.0, 0.0]), "velocity_rad_s is nan at 0.001 s"),

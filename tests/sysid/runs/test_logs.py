@@ -263,6 +263,27 @@ def test_one_joint_alone_has_its_own_cycles(tmp_path: Path) -> None:
     assert len(log_to_run(path, joints=[2, 3]).table.time_s) == 20
 
 
+def test_the_last_motion_of_a_joint_begins_when_all_drives_are_enabled(tmp_path: Path) -> None:
+    """Joint 3 was brought to its place from 5 to 14; then it moves from 20 on, and joint 1 is enabled at 25 only."""
+
+    def wanted(n: int) -> tuple[Joint, ...]:
+        one, two, three, four_ = four(n)
+        if not 5 <= n < 15 and not 20 <= n < 50:
+            three = three._replace(statusword=OFF)
+        if not 5 <= n < 15 and not 25 <= n < 50:
+            one = one._replace(statusword=OFF)
+        return one, two, three, four_._replace(input_flags=0) if n == 40 else four_
+
+    path = write_log(tmp_path / "a.mcap", regular(60, wanted), 4)
+    whole = log_to_run(path, joints=[3])
+    assert len(whole.table.time_s) == 45, "from 5 to 49, without power in between"
+    last = log_to_run(path, joints=[3], enabled=[1, 2, 3], last_motion=True)
+    assert list(last.table.joints) == [3]
+    assert last.table.joints[3].motor_position_rad is not None
+    assert last.table.joints[3].motor_position_rad.tolist() == [3.0 + n for n in range(25, 50)]
+    assert (last.missed, last.incomplete) == (0, 0), "what joint 4 lost does not matter"
+
+
 def test_a_joint_that_was_never_enabled_is_left_out_and_named(tmp_path: Path) -> None:
     def wanted(n: int) -> tuple[Joint, ...]:
         one, two, three, last = four(n)

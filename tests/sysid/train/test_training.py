@@ -8,7 +8,14 @@ import pytest
 
 from jtqd.estimator.network import FEATURES, FUSED_FEATURES, FusedNetwork, TorqueNetwork
 from jtqd.sysid.train.network import forward, train
-from jtqd.sysid.train.ours import envelope_of, export_gated, gated_output, quick_part, safe_share, scaled
+from jtqd.sysid.train.ours import (
+    export_gated,
+    gated_output,
+    quick_part,
+    safe_share,
+    scaled,
+    training_envelope,
+)
 from jtqd.sysid.train.paper import PaperBlock, digest_of, split_by_sample, thinned, train_paper
 
 
@@ -149,7 +156,7 @@ def test_envelope_knows_visited_cells_and_holes_between_them():
     cells = [(v, raw) for v in (-0.5, 0.0, 0.5) for raw in (-6.0, 0.0, 6.0) if (v, raw) != (0.0, 0.0)]
     features = np.repeat([[v, raw, 0.4, *([0.0] * 6)] for v, raw in cells], 30, axis=0)
     runs = [SimpleNamespace(temperature_c=t) for t in (22.0, 27.0, float("nan"))]
-    envelope = envelope_of([SimpleNamespace(features=features)], runs)
+    envelope = training_envelope([SimpleNamespace(features=features)], runs)
     known = np.array(envelope.known)
     middle = known.shape[0] // 2, known.shape[1] // 2
     assert known[middle[0] + 2, middle[1] + 2] == 1
