@@ -13,6 +13,7 @@ from jtqd.drivers.devices import (
     EVENT_MS,
     JTQD_NODE,
     SYNC_COB_ID,
+    contact_tpdos,
     drive_layout,
     drive_tpdo3,
     estimate_tpdos,
@@ -29,6 +30,7 @@ BITRATE = 1_000_000
 PERIOD_S = 1e-3
 HEARTBEAT_BYTES = 1
 _ESTIMATES = ("jtqd estimate", "jtqd estimate 3, 4")
+_CONTACTS = ("jtqd contact", "jtqd contact 3, 4")
 
 
 class BusLoadError(ValueError):
@@ -127,6 +129,7 @@ def configured_load(
     *,
     sync_counter: bool = False,
     temperatures: Iterable[int] = (),
+    contacts: bool = False,
     heartbeat_ms: int = 100,
     master: int = JTQD_NODE,
     extra: Iterable[Row] = (),
@@ -136,12 +139,18 @@ def configured_load(
     """Add up drives (node numbers), sensors (node -> channels), SYNC, estimates, heartbeats and `extra`.
 
     `drives` may hold their TPDOs by node; without, they are as jtqd maps them. `sync_counter`: SYNC has a counter byte
-    (1019h). `temperatures`: nodes among the drives that send their joint's temperature.
+    (1019h). `temperatures`: nodes among the drives that send their joint's temperature. `contacts`: jtqd sends
+    the contact PDOs.
     """
     layouts = drives if isinstance(drives, Mapping) else {node: drive_layout(node) for node in drives}
     rows = [sync_row(sync_counter)]
     for pdo, who in zip(estimate_tpdos(len(layouts), master), _ESTIMATES, strict=False):
         rows.append(pdo_row(who, pdo))
+    if contacts:
+        rows += [
+            pdo_row(who, pdo)
+            for pdo, who in zip(contact_tpdos(len(layouts), master), _CONTACTS, strict=False)
+        ]
     rows.append(heartbeat_row("jtqd", master, heartbeat_ms, period_s))
     for node, tpdos in layouts.items():
         rows += [

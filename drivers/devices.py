@@ -27,6 +27,7 @@ COMMANDER_NODE = 0x21
 """Node that may command the drives beside jtqd; they watch its heartbeat by 1016h:2."""
 SYNC_COB_ID = 0x080
 ESTIMATE_BASES = (0x180, 0x280)
+CONTACT_BASES = (0x380, 0x480)
 """Of jtqd's PDOs with the estimates of joints 1 and 2, and of joints 3 and 4."""
 
 # Objects that scale a drive's numbers, with the largest value that makes sense. All must be at least 1.
@@ -284,6 +285,23 @@ def estimate_tpdos(joints: int, node: int = JTQD_NODE) -> tuple[PdoMap, ...]:
         _estimate_tpdo(pair, base + node)
         for pair, base in zip(range((joints + 1) // 2), ESTIMATE_BASES, strict=False)
     )
+
+
+def contact_tpdos(joints: int, node: int = JTQD_NODE) -> tuple[PdoMap, ...]:
+    """380h+20h: torque rate and contact of joints 1 and 2; with more than two joints also 480h+20h: of joints 3 and 4.
+
+    2106h..2108h and 2103h of jtqd.eds and jtqd4.eds. Four bytes each: a bus of two joints with sensor has room for them.
+    """
+    return tuple(
+        _contact_tpdo(pair, base + node)
+        for pair, base in zip(range((joints + 1) // 2), CONTACT_BASES, strict=False)
+    )
+
+
+def _contact_tpdo(pair: int, cob_id: int) -> PdoMap:
+    rates = [MappedObject(0x2106, n, 8, True, f"torque_rate_{n}") for n in (2 * pair + 1, 2 * pair + 2)]
+    contact = MappedObject((0x2107, 0x2108)[pair], 0, 8, False, "contact")
+    return PdoMap(cob_id, (*rates, contact, MappedObject(0x2103, 0, 8, False, "sequence")))
 
 
 def _estimate_tpdo(pair: int, cob_id: int) -> PdoMap:

@@ -1,5 +1,6 @@
 """The estimators of a joint; the equations stand in estimator.pyx."""
 
+from jtqd.estimator.contact cimport LinkLaw, LinkState
 from jtqd.estimator.fusion cimport Fused, FusionLaw
 from jtqd.estimator.losses cimport AdditiveLaw, EfficiencyLaw
 from jtqd.estimator.observer cimport (
@@ -49,6 +50,7 @@ cdef struct FusedLaw:
     bint with_envelope  # trust is set, of the network or of the joint file
     NetworkLaw network
     ZerosLaw zeros
+    LinkLaw link
     double physics_scale[4]
     double network_scale[4]
     double stand_share, stand_floor, limit, network_limit, fade, inverse_fade
@@ -60,6 +62,7 @@ cdef struct FusedState:
     double half
     double lowered_s  # for how long the status still is, after the paths disagreed
     ZerosState zeros
+    LinkState link
 
 cdef class FusedEstimator(Estimator):
     cdef FusedLaw law

@@ -14,6 +14,7 @@ from libc.math cimport NAN, fabs, fmin, sqrt
 from libc.string cimport memcmp
 
 from jtqd.estimator.block cimport copied, put_back
+from jtqd.estimator.contact cimport LinkSeen, fill_link, follow_link, restart_link
 from jtqd.estimator.fusion cimport Fused, fill_fusion, fuse_paths, keep, share_by_speed, widening
 from jtqd.estimator.losses cimport (
     AdditiveLaw,
@@ -280,6 +281,7 @@ cdef class FusedEstimator(Estimator):
         fill_fusion(&self.law.fusion, fused.sigma, fused.torsion is not None)
         self.law.fusion.reference = 0.0  # sigma is that of the torque, not of a comparison with a sensor
         fill_zeros(&self.law.zeros, joint, fused.sigma, fused.torsion, settings.track_zeros)
+        fill_link(&self.law.link, joint, fused.torsion)
         network_scale = fused.sigma.scale if network is None else network.sigma_scale
         for k in range(4):
             self.law.physics_scale[k], self.law.network_scale[k] = fused.sigma.scale[k], network_scale[k]
@@ -307,6 +309,7 @@ cdef class FusedEstimator(Estimator):
         restart_guard(&self.state.guard)
         self.state.half = self.state.lowered_s = 0.0
         restart_zeros(&self.law.zeros, &self.state.zeros)
+        restart_link(&self.state.link)
 
     @property
     def zeros(self):
@@ -371,6 +374,7 @@ cdef class FusedEstimator(Estimator):
     cdef void advance(self, const Sample *x, bint network_wanted, Values *out) noexcept nogil:
         """Set `out` to the estimate at this sample."""
         cdef FusedObserved seen
+        cdef LinkSeen link
         cdef Sample corrected
         if self.law.zeros.used:
             corrected = x[0]
@@ -382,10 +386,21 @@ cdef class FusedEstimator(Estimator):
         )
         no_values(out, self.state.guard.status)
         if self.observed:
+            follow_link(
+                &self.law.link,
+                &self.state.link,
+                &self.law.observer,
+                &self.state.observer,
+                seen.torsion_nm + seen.ahead_nm,
+                x.dt_s,
+                &link,
+            )
+            out.torque_rate_nm_s, out.load_nm = link.rate_nm_s, link.load_nm
             self.estimate(&seen, x, network_wanted, out)
         else:
             self.state.half = 0.0
             drop_block(&self.state.zeros)
+            restart_link(&self.state.link)
 
     cdef void learn_zeros(
         self, const FusedObserved *seen, const Sample *x, const Fused *physics, double loss, int status

@@ -12,6 +12,7 @@ cdef struct Sample:
 
 cdef struct Values:  # `jtqd.estimator.status.Estimate` as a block; NaN where not computed or not to be published
     double torque_nm, sigma_nm, tob_nm, physics_nm, network_nm
+    double torque_rate_nm_s, load_nm  # `contact`: load of the sample before
     int status
 
 cdef struct Learned:  # `jtqd.estimator.zeros.Zeros` as a block

@@ -15,6 +15,7 @@ cdef int INVALID = st.INVALID
 cdef void no_values(Values *out, int status) noexcept nogil:
     """Set `out` to a status without any number."""
     out.torque_nm = out.sigma_nm = out.tob_nm = out.physics_nm = out.network_nm = NAN
+    out.torque_rate_nm_s = out.load_nm = NAN
     out.status = status
 
 

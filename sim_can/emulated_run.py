@@ -7,13 +7,14 @@ drives' and the sensor's units as the nodes round it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.run import JointColumns, RunTable
+from jtqd.sim_can.effect_plant import EffectPlant
 from jtqd.sim_can.plant_source import PlantSource
 from jtqd.sim_can.plants import AnyDay, AnyPlant
 from jtqd.sim_can.source import CURRENT, OFF, VELOCITY, DriveRatings
@@ -51,6 +52,13 @@ def _zero(_time_s: float) -> float:
     return 0.0
 
 
+class Push(NamedTuple):
+    """From time_s on [s], at any phase of a period, the links are pushed with torque_nm [Nm, joint 1's frame]."""
+
+    time_s: float
+    torque_nm: float
+
+
 class EmulatedRun(NamedTuple):
     """A run and what no instrument knows: the true torque of each gear, [n, 2] in Nm, own frames."""
 
@@ -79,6 +87,7 @@ def emulate(
     period_s: float = 0.001,
     *,
     day: int | AnyDay | None = None,
+    pushes: Sequence[Push] = (),
 ) -> EmulatedRun:
     """Run both joints from rest for duration_s; return what was measured every period_s, and the true torques beside it.
 
@@ -88,6 +97,7 @@ def emulate(
         seed: of the measurement noise and of the days; the same arguments give the same table bit by bit.
         day: number of the day of this seed (0, 1, 2, ...; each has noise of its own), whose values lie within
         the plant's `run_to_run`; or the values themselves; None: the nominal day, without any drift.
+        pushes: on the links between the joints, at least one period apart; each lasts until the next.
 
     Returns:
         A table with joints 1 and 2, n = round(duration_s / period_s) rows from time 0; link_velocity is None
@@ -95,7 +105,7 @@ def emulate(
         the same times.
 
     Raises:
-        ValueError: duration or period not positive and finite.
+        ValueError: duration or period not positive and finite; pushes on joints with effects.
     """
     if not (0.0 < period_s < math.inf and period_s <= duration_s < math.inf):
         raise ValueError(f"a run of {duration_s} s in steps of {period_s} s")
@@ -116,6 +126,9 @@ def emulate(
     one, two = source.drives
     channel = source.channels[0]
     (mode_1, target_1), (mode_2, target_2) = commands
+    pushed = {math.floor(each.time_s / period_s): each for each in pushes}
+    if pushes and isinstance(source.plant, EffectPlant):
+        raise ValueError("found pushes on joints with effects, expected none")
     source.advance(0.0)
     for k in range(count):
         rows[k] = (
@@ -135,6 +148,8 @@ def emulate(
         time_s = k * period_s
         source.command(0, mode_1, scale[0] * target_1(time_s))
         source.command(1, mode_2, scale[1] * target_2(time_s))
+        if k in pushed:
+            source.plant.push(pushed[k].torque_nm, pushed[k].time_s - time_s)
         source.advance(period_s)
     torque = np.round(rows[:, -1] / SENSOR_NM_PER_UNIT) * SENSOR_NM_PER_UNIT
     joints = {

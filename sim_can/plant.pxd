@@ -40,6 +40,7 @@ cdef class Plant:
     cdef double viscous_scale[2]
     cdef double day_viscous[2]
     cdef bint warming
+    cdef double external_nm, next_external_nm, until_next_s  # on link 2, joint 1's frame
     cdef Pair pair(self, double *one, double *two)
     cdef void set_friction(self, int k, JointFriction friction, JointTemperature temperature) noexcept
     cpdef step(self, double dt_s)

@@ -10,7 +10,7 @@ e(θm) = E sin(k θm + ψ), its slope e' = de/dθm, and a Maxwell-slip element z
 The motor's load is τ dδ/dθm: the virtual work of the spring, so a kinematic error makes no energy. Both links
 and the sensor are one rigid body, and the joints face each other, so θl2 = -θl1:
 
-    (Jl1 + Jl2) dwl1/dt = τ1 - τ2                                            (2)
+    (Jl1 + Jl2) dwl1/dt = τ1 - τ2 + τx              τx: of a push, on link 2 (2)
     sensor = τ1 - Jl1 dwl1/dt = τ2 - Jl2 dwl2/dt
 
 The sensor's torque is positive along the positive current of either joint.
@@ -225,6 +225,7 @@ cdef class Plant:
         self.warming = any(side.thermal.kelvin_per_w > 0.0 for side in parameters.joints)
         self.substep_s = substep_limit(parameters)
         self.link_position = self.link_velocity = 0.0
+        self.external_nm = self.next_external_nm = self.until_next_s = 0.0
 
     @property
     def motor_position(self):
@@ -285,6 +286,10 @@ cdef class Plant:
         """Set mode and target of drive 0 or 1; see `jtqd.sim_can.source`."""
         self.drives[drive].command(mode, target, self.state[drive].velocity)
 
+    def push(self, double torque_nm, double after_s=0.0):
+        """Push the links with torque_nm [Nm, joint 1's frame], on joint 2's side of the sensor, from after_s [s] on."""
+        self.next_external_nm, self.until_next_s = torque_nm, after_s
+
     cpdef step(self, double dt_s):
         """Advance by dt_s: whole control cycles of about 1 ms, each in equal integration steps of at most `substep_s`.
 
@@ -330,7 +335,11 @@ cdef class Plant:
             i2 = self.drive_2.step(h, two.velocity)
             torque_1 = push(c1, one, self.friction_1, i1, link_velocity, h)
             torque_2 = push(c2, two, self.friction_2, i2, -link_velocity, h)
-            link_velocity += per_link * (torque_1 - torque_2)  # (2)
+            if self.external_nm != self.next_external_nm:
+                self.until_next_s -= h
+                if self.until_next_s < 0.0:
+                    self.external_nm = self.next_external_nm
+            link_velocity += per_link * (torque_1 - torque_2 + self.external_nm)  # (2)
             link += h * link_velocity
             turn(c1, one, link, h)
             turn(c2, two, -link, h)
@@ -356,7 +365,7 @@ cdef class Plant:
     cpdef double sensor_torque(self) except? -1.0:
         """Return the true torque in the sensor, Nm: τ1 - Jl1 dwl1/dt."""
         cdef double one = self.torque_of(0), two = self.torque_of(1)
-        return one - self.link_inertia[0] / (self.link_inertia[0] + self.link_inertia[1]) * (one - two)
+        return one - self.link_inertia[0] / (self.link_inertia[0] + self.link_inertia[1]) * (one - two + self.external_nm)
 
     def energy(self):
         """Return kinetic and elastic energy and the ripple's potential, J. Without motor current it can only fall."""

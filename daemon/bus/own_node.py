@@ -12,9 +12,12 @@ from functools import partial
 from math import inf, isfinite, nan
 
 from jtqd.daemon.config import Config
+from jtqd.daemon.core import contact_pdo
 from jtqd.daemon.core.estimate_pdo import field
+from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
 from jtqd.daemon.shared.snapshot import NO_ZEROS, SnapshotReader
 from jtqd.drivers.boot_procedure import signature
+from jtqd.drivers.devices import contact_tpdos
 from jtqd.drivers.eds.own_objects import (
     BUS_FIELDS,
     COUNTERS,
@@ -26,8 +29,11 @@ from jtqd.drivers.eds.own_objects import (
     room_for,
 )
 from jtqd.drivers.object_dictionary import ObjectStore
+from jtqd.drivers.pdo import INVALID as PDO_INVALID
+from jtqd.drivers.pdo import NO_RTR
 from jtqd.drivers.sdo_server import SdoServer
 from jtqd.estimator.age import age_ms
+from jtqd.estimator.contact import CONTACT, NONE, UNKNOWN
 from jtqd.estimator.status import OFF, STALE
 
 _STANDSTILL_S = 0.2
@@ -85,6 +91,10 @@ class OwnNode:
             store.on_read(0x2104, joint + 1, partial(self._latched, joint))
         for pair, index in zip(range(0, self._room, 2), (0x2102, 0x2105), strict=False):
             store.on_read(index, 0, partial(self._statuses, pair))
+        for joint in range(self._room):
+            store.on_read(0x2106, joint + 1, partial(self._contact, joint, 0))
+        for pair, index in zip(range(0, self._room, 2), (0x2107, 0x2108), strict=False):
+            store.on_read(index, 0, partial(self._contacts, pair))
         store.on_read(0x2103, 0, lambda: self._reader.read().sync_counter)
         store.on_read(0x2110, 0, lambda: int(self._asked > self._reader.resets_done))
         store.on_write(0x2110, 0, self._reset)
@@ -122,6 +132,22 @@ class OwnNode:
     def _statuses(self, pair: int) -> int:
         """Return the status byte of the PDO that begins with joint `pair`."""
         return self._field(pair, 2) | self._field(pair + 1, 2) << 4
+
+    def _contact(self, joint: int, part: int) -> int:
+        """Return torque rate (0) or code (1) of a joint as in the contact PDO."""
+        if joint >= self._joints or not self._watches:
+            return contact_pdo.field(nan, nan, OFF)[part]
+        view = self._reader.read()
+        if view.cycle == self._last_cycle and time.monotonic() - self._last_change > _STANDSTILL_S:
+            return contact_pdo.field(nan, nan, UNKNOWN)[part]
+        last = view.joints[joint]
+        there = last.input_flags & FLAG_CONTACT
+        told = CONTACT if there else NONE if last.input_flags & FLAG_CONTACT_KNOWN else UNKNOWN
+        return contact_pdo.field(last.torque_rate_nm_s, last.contact_nm, told)[part]
+
+    def _contacts(self, pair: int) -> int:
+        """Return the contact byte of the PDO that begins with joint `pair`."""
+        return self._contact(pair, 1) | self._contact(pair + 1, 1) << 4
 
     def _latched(self, joint: int) -> int:
         """Return the latched bits of `daemon/shared/cycle_record.py`."""
@@ -161,6 +187,10 @@ class OwnNode:
             store.set_number(0x1016, sub, node << 16 | config.heartbeat_timeout_ms)
         store.set_number(0x1017, 0, config.heartbeat_ms)
         store.set_number(0x1019, 0, config.counter_overflow)
+        self._watches = config.contact is not None
+        sends = config.contact is not None and config.contact.pdo
+        for number, pdo in enumerate(contact_tpdos(self._joints, config.node_id), start=2):
+            store.set_number(0x1800 + number, 1, pdo.cob_id | NO_RTR | (0 if sends else PDO_INVALID))
         for sub, word in enumerate(signature(config.sha256), start=1):
             store.set_number(0x1020, sub, word)
         store.set_text(0x2204, 0, config.sha256)

@@ -38,6 +38,7 @@ from jtqd.daemon.cli.reading import (
 )
 from jtqd.daemon.cli.recent import Moment, Recent, page, sparkline
 from jtqd.daemon.shared.conditions import SEVERITIES, Condition
+from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
 from jtqd.daemon.shared.notices import ERROR, WARNING, Notice
 from jtqd.daemon.shared.reasons import drive_state, joint_reason, silent_s
 from jtqd.daemon.shared.runtime_dir import About
@@ -142,6 +143,9 @@ def _joint(reading: Reading, number: int) -> dict[str, Any]:
         "rmse_nm": finite(view.rmse_nm[n]),
         "age_ms": finite(seen.age_ms),
         "zeros": view.zeros[n].content(),
+        "contact": bool(seen.input_flags & FLAG_CONTACT) if seen.input_flags & FLAG_CONTACT_KNOWN else None,
+        "contact_nm": finite(seen.contact_nm),
+        "torque_rate_nm_s": finite(seen.torque_rate_nm_s),
         "current_a": finite(measured.current_a),
         "motor_velocity_rad_s": finite(measured.motor_velocity_rad_s),
         "temperature_c": finite(measured.temperature_c),
@@ -371,11 +375,20 @@ def _inputs(about: About, view: View) -> Columns:
         table.add(
             name,
             Text("never" if not each.used_ns else duration(age_s), style="bold red" if old else ""),
-            f"{each.delay_ns / 1000:.0f} us" if each.used_ns else NOTHING,
+            after_sync(each.delay_ns) if each.used_ns else NOTHING,
             band if each.low_ns <= each.high_ns else NOTHING,
             *map(str, (each.missed, each.late, each.lost, each.duplicates, each.rejected)),
         )
     return table
+
+
+def after_sync(delay_ns: int) -> str:
+    """Return when an input came after its SYNC; what came before it is of a drive that sends by itself, and so old.
+
+    >>> after_sync(426_000), after_sync(-4_803_000)
+    ('426 us', '4803 us old')
+    """
+    return f"{delay_ns / 1000:.0f} us" if delay_ns >= 0 else f"{-delay_ns / 1000:.0f} us old"
 
 
 def _line(heading: str, text: str | Text) -> RenderableType:

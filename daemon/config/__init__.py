@@ -1,6 +1,6 @@
 """Configuration of jtqd as frozen values: `load_config` reads a file.
 
-settings    sections that other modules take as they are: safety, recording, real time, ROS 2
+settings    sections that other modules take as they are: safety, recording, real time, ROS 2, contact
 drive       what a joint's section says of its drive: objects, TPDOs
 sections    the whole file as it is written
 load        with joint files, networks and profiles: `Config`
@@ -12,6 +12,7 @@ from jtqd.daemon.config.settings import (
     HIGHEST_DOMAIN,
     LATCHED_BY_DEFAULT,
     LOOPBACK,
+    ContactSettings,
     Realtime,
     RecordingSettings,
     Ros2Settings,
@@ -24,6 +25,7 @@ __all__ = [
     "LOOPBACK",
     "MAX_NODE_ID",
     "Config",
+    "ContactSettings",
     "Identity",
     "JointConfig",
     "NetworkFile",

@@ -21,7 +21,13 @@ from jtqd.daemon.config.sections import (
     NetworkSection,
     SensorSection,
 )
-from jtqd.daemon.config.settings import Realtime, RecordingSettings, Ros2Settings, SafetySettings
+from jtqd.daemon.config.settings import (
+    ContactSettings,
+    Realtime,
+    RecordingSettings,
+    Ros2Settings,
+    SafetySettings,
+)
 from jtqd.daemon.profiles import path_of, with_profiles
 from jtqd.drivers.devices import DriveObjects
 from jtqd.drivers.layout import chosen, maps_of_json
@@ -141,6 +147,8 @@ class Config:
     """Prometheus text file, written every 5 s; None for none."""
     ros2: Ros2Settings | None = None
     """What is published for ROS 2; None: nothing, unless the command line asks for it."""
+    contact: ContactSettings | None = None
+    """How contacts are told; None: nobody watches."""
 
     @property
     def files_sha256(self) -> str:
@@ -216,6 +224,7 @@ def load_config(path: Path | None) -> Config:
         recording=file.recording,
         metrics_file=None if file.metrics is None else Path(file.metrics.file),
         ros2=file.ros2,
+        contact=_contact(path, file.contact, joints),
     )
 
 
@@ -292,6 +301,18 @@ def _joint(path: Path, number: int, section: JointSection, method: str, sdo_time
     )
     _check_encoders(path, number, made, method)
     return made
+
+
+def _contact(
+    path: Path, contact: ContactSettings | None, joints: tuple[JointConfig, ...]
+) -> ContactSettings | None:
+    """Return the section where every joint has a torsion. Raises ConfigError."""
+    for joint in joints if contact is not None else ():
+        if joint.joint.fused is None or joint.joint.fused.torsion is None:
+            raise ConfigError(
+                f"{joint.joint_path}: key 'fused.torsion': missing, expected because of section contact of {path}"
+            )
+    return contact
 
 
 def _whole(values: Mapping[str, float]) -> dict[str, int]:

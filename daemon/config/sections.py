@@ -7,7 +7,13 @@ from dataclasses import dataclass, field
 from typing import Annotated, Final
 
 from jtqd.daemon.config.drive import ObjectsSection, TpdoSection, check_given
-from jtqd.daemon.config.settings import Realtime, RecordingSettings, Ros2Settings, SafetySettings
+from jtqd.daemon.config.settings import (
+    ContactSettings,
+    Realtime,
+    RecordingSettings,
+    Ros2Settings,
+    SafetySettings,
+)
 from jtqd.drivers.devices import EVERY_SCALING_OBJECT, SENSOR_SCALING_OBJECTS
 from jtqd.estimator.checked import Verbatim, range_text
 from jtqd.estimator.decoder import FieldError, Text, choice, limits
@@ -171,6 +177,7 @@ class ConfigFile:
     recording: RecordingSettings = field(default_factory=RecordingSettings)
     metrics: _Metrics | None = None
     ros2: Ros2Settings | None = None
+    contact: ContactSettings | None = None
 
     def __post_init__(self) -> None:
         self._check_numbers()
@@ -178,6 +185,7 @@ class ConfigFile:
         self._check_channels()
         self._check_node_ids()
         self._check_names()
+        self._check_contact()
 
     @property
     def joints(self) -> tuple[JointSection, ...]:
@@ -236,6 +244,16 @@ class ConfigFile:
         for n, name in enumerate(names):
             if name in names[:n]:
                 raise FieldError("configuration", f"ros2.names.{sections[n]}", name, "a name of its own")
+
+    def _check_contact(self) -> None:
+        if self.contact is None:
+            return
+        if self.estimator.method != "fused":
+            expected = "fused, whose torsion contacts are told by (section contact)"
+            raise FieldError("configuration", "estimator.method", self.estimator.method, expected)
+        if self.contact.opposed and len(self.joints) % 2:
+            expected = f"false with {len(self.joints)} joints: opposed are joints 1 and 2, 3 and 4"
+            raise FieldError("configuration", "contact.opposed", True, expected)
 
     def _check_node_ids(self) -> None:
         users = {self.node_id: "node_id"}

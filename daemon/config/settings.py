@@ -1,4 +1,4 @@
-"""Sections that other modules take as they are: safety, recording, real time, ROS 2. Their keys are their fields."""
+"""Sections that other modules take as they are: safety, recording, real time, contact, ROS 2."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Annotated, Any, Final
 
 from jtqd.daemon.shared import faults
 from jtqd.estimator.checked import Section
+from jtqd.estimator.contact import THRESHOLD
 from jtqd.estimator.decoder import FieldError, Text, check, decode, limits
 from jtqd.estimator.settings import PlausibilityLimits
 
@@ -95,6 +96,28 @@ class Realtime:
     priority: Annotated[int, limits(ge=0, le=98)] = 80
     cpu: Annotated[int, limits(ge=0, le=4095)] | None = None
     lock_memory: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class ContactSettings:
+    """Section `contact`: torque rate and contact of every joint (docs/contact.md); without the section nobody watches.
+
+    Attributes:
+        threshold_nm: torque from outside that is a contact; None: 5 % of the joint's rated torque.
+        opposed: joints 1 and 2, and 3 and 4, turn one link against each other, as on a towing bench.
+        pdo: send 380h and 480h + node_id; without, contacts are in the log only.
+    """
+
+    threshold_nm: Annotated[float, limits("Nm", gt=0.0, le=1e4)] | None = None
+    opposed: bool = False
+    pdo: bool = True
+
+    def __post_init__(self) -> None:
+        check(self, "contact")
+
+    def threshold_of(self, rated_torque_nm: float) -> float:
+        """Return the threshold of a joint [Nm]."""
+        return THRESHOLD * rated_torque_nm if self.threshold_nm is None else self.threshold_nm
 
 
 @dataclass(frozen=True)

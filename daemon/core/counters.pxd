@@ -9,7 +9,7 @@ from jtqd.daemon.core.record cimport MOST_JOINTS
 from jtqd.estimator.sample cimport Learned
 
 cdef struct CounterState:
-    int64_t bus_errors, overruns, latch_resets
+    int64_t bus_errors, overruns, latch_resets, contacts
     int64_t bits
     int64_t used_ns[MOST_INPUTS]
     int64_t delay_ns[MOST_INPUTS]
@@ -24,6 +24,7 @@ cdef struct ViewBlock:  # a `JointView`
     uint8_t status, sensor_status
     uint16_t input_flags, latched
     double reference_nm, age_ms
+    double torque_rate_nm_s, contact_nm
 
 cdef struct MeasuredBlock:  # a `Measured`
     double current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, sensor_nm, temperature_c

@@ -42,6 +42,7 @@ cdef int SYNC_ERRORS = _INDEX["sync_errors"], SYNC_GAPS = _INDEX["sync_gaps"], B
 cdef int TEMPERATURES_LOST = _INDEX["temperatures_lost"]
 cdef int TX_DROPPED = _INDEX["tx_dropped"], RX_DROPPED = _INDEX["rx_dropped"], BUS_ERRORS = _INDEX["bus_errors"]
 cdef int OVERRUNS = _INDEX["overruns"], LATCH_RESETS = _INDEX["latch_resets"]
+cdef int CONTACTS = _INDEX["contacts"]
 
 cdef int FLAG_COMPLETE = cr.FLAG_COMPLETE, FLAG_PUBLISHED = cr.FLAG_PUBLISHED
 cdef int FLAG_BEFORE_NEXT_SYNC = cr.FLAG_BEFORE_NEXT_SYNC
@@ -145,6 +146,8 @@ cdef ViewBlock _view(const JointState *joint) noexcept nogil:
         joint.latched,
         s.reference_nm,
         s.age_ms,
+        s.torque_rate_nm_s,
+        s.contact_nm,
     )
 
 
@@ -268,6 +271,7 @@ cdef class LoopCounters:
         self.counters[BUS_ERRORS] = self.now.bus_errors
         self.counters[OVERRUNS] = self.now.overruns
         self.counters[LATCH_RESETS] = self.now.latch_resets
+        self.counters[CONTACTS] = self.now.contacts
         self.flush_nodes()
         return 0
 

@@ -5,6 +5,7 @@ from libc.stdint cimport int64_t, uint32_t
 
 from jtqd.daemon.core.bus cimport Bus
 from jtqd.daemon.core.clock cimport Clock
+from jtqd.daemon.core.contact cimport ContactWatch
 from jtqd.daemon.core.counters cimport LoopCounters
 from jtqd.drivers.frame_socket cimport Frame
 from jtqd.daemon.core.intake cimport Intake
@@ -31,6 +32,8 @@ cdef class Cycle:
     cdef readonly WakeUp wake_up
     cdef readonly CycleFrames frames
     cdef readonly LoopCounters counters
+    cdef readonly ContactWatch contacts  # None: they are not watched
+    cdef bint watches
     cdef int count  # of joints
     cdef PyObject *at[MOST_JOINTS]  # `joints`, which keeps them
     cdef JointState *states[MOST_JOINTS]  # theirs
@@ -41,6 +44,8 @@ cdef class Cycle:
     cdef int64_t heartbeat_cycles
     cdef int estimates  # PDOs: one for each two joints
     cdef Frame estimate_frames[MOST_ESTIMATES]
+    cdef int contact_pdos
+    cdef Frame contact_frames[MOST_ESTIMATES]
     cdef Frame heartbeat_frame
     cdef CycleState now
     cpdef int begin(self) except -1

@@ -3,6 +3,7 @@ from typing import Any, Final
 
 from jtqd.daemon.core.clock import Clock
 from jtqd.daemon.core.configured_nodes import ConfiguredNodes
+from jtqd.daemon.core.contact import ContactWatch
 from jtqd.daemon.core.counters import LoopCounters
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import JointCycle
@@ -38,6 +39,7 @@ class Cycle:
         deadline_ns: int,
         heartbeat_cycles: int,
         grid: Grid,
+        contacts: ContactWatch | None = None,
     ) -> None: ...
     @property
     def socket(self) -> FrameSocket: ...
@@ -53,6 +55,8 @@ class Cycle:
     def grid(self) -> Grid: ...
     @property
     def joints(self) -> tuple[JointCycle, ...]: ...
+    @property
+    def contacts(self) -> ContactWatch | None: ...
     @property
     def budget(self) -> NetworkBudget: ...
     @property

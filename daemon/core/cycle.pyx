@@ -19,6 +19,7 @@ from typing import Final
 from jtqd.daemon.core.bus cimport Bus, bus_of
 from jtqd.daemon.core.clock cimport Clock
 from jtqd.daemon.core.configured_nodes import ConfiguredNodes
+from jtqd.daemon.core.contact cimport ContactWatch
 from jtqd.daemon.core.counters cimport LoopCounters
 from jtqd.daemon.core.estimate_pdo cimport NOBODY, Published, encode_into
 from jtqd.drivers.frame_socket cimport Frame
@@ -61,6 +62,8 @@ cdef int64_t BYTE = 255, MOST_WORK_NS = 0xFFFF_FFFF, MOST_LATE_NS = 0x7FFF_FFFF
 
 cdef uint32_t ESTIMATE[MOST_ESTIMATES]
 ESTIMATE[:] = devices.ESTIMATE_BASES
+cdef uint32_t CONTACT[MOST_ESTIMATES]
+CONTACT[:] = devices.CONTACT_BASES
 
 clock = Clock()
 """Of all cycles that are made from here on; tests put another one in its place."""
@@ -89,6 +92,8 @@ cdef class Cycle:
         wait_ns, deadline_ns: from SYNC to the wake-up for the inputs (it follows their arrival) and to the end of the wait.
         heartbeat_cycles: cycles between two heartbeats.
         grid: time grid; its slot is the current cycle's.
+        contacts: watches for contacts of all joints, and where it `sends`, sends the contact PDOs 380h + node_id and
+            480h + node_id; None: nobody does.
 
     Attributes:
         joints: what is kept of each joint.
@@ -115,6 +120,7 @@ cdef class Cycle:
         int64_t deadline_ns,
         int64_t heartbeat_cycles,
         Grid grid,
+        ContactWatch contacts=None,
     ):
         cdef JointCycle joint
         cdef int n
@@ -142,6 +148,12 @@ cdef class Cycle:
         self.estimates = (self.count + 1) // 2
         for n in range(self.estimates):
             self.estimate_frames[n] = _frame(ESTIMATE[n] + node_id, 8)
+        self.contacts, self.watches = contacts, contacts is not None
+        if self.watches and contacts.count != self.count:
+            raise ValueError(f"found contacts of {contacts.count} joints, expected {self.count}")
+        self.contact_pdos = self.estimates if self.watches and contacts.sends else 0
+        for n in range(self.contact_pdos):
+            self.contact_frames[n] = _frame(CONTACT[n] + node_id, 4)
         self.heartbeat_frame = _frame(HEARTBEAT + node_id, 1)
         self.heartbeat_frame.data[0] = OPERATIONAL
         self.configured_nodes = ConfiguredNodes(snapshot, intake, self.joints)
@@ -291,6 +303,9 @@ cdef class Cycle:
         for n in range(self.count):
             wanted = self.budget.wanted(n, self.clock.monotonic())
             (<JointCycle> self.at[n]).observe_at(sync_ns, starting, wanted)
+        if self.watches:
+            self.contacts.watch(self.states)
+            self.counters.now.contacts += self.contacts.begun
 
     cpdef int publish(self) except -1:
         """Send the estimate PDOs, and the heartbeat when it is due. A late estimate is withdrawn."""
@@ -309,6 +324,8 @@ cdef class Cycle:
         now.sent_ns = self.clock.monotonic()
         for n in range(self.estimates):
             self.frames.keep_one(&self.estimate_frames[n], now.sent_ns + now.realtime_offset_ns)
+        for n in range(self.contact_pdos):
+            self.frames.keep_one(&self.contact_frames[n], now.sent_ns + now.realtime_offset_ns)
         if now.index >= now.heartbeat_due:
             now.heartbeat_due = now.index + self.heartbeat_cycles
             self.send(&self.heartbeat_frame)
@@ -391,6 +408,8 @@ cdef class Cycle:
         cdef int n
         for n in range(self.count):
             (<JointCycle> self.at[n]).take_back(status)
+        if self.watches:
+            self.contacts.take_back(self.states)
 
     cdef void hold(self, const Frame *frame, int64_t stamp_ns) noexcept nogil:
         """Of a slot without a record, what belongs to no cycle goes into the next one that there is."""
@@ -420,6 +439,9 @@ cdef class Cycle:
                 self.estimate_frames[n].data, &self.states[2 * n].published, second, self.now.counter
             )
             sent = self.send(&self.estimate_frames[n]) and sent
+        for n in range(self.contact_pdos):
+            self.contacts.encode(self.contact_frames[n].data, n, self.now.counter)
+            self.send(&self.contact_frames[n])
         return sent
 
     cdef int receive(self) except -1:

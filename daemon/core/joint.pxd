@@ -31,6 +31,7 @@ cdef struct JointState:
     int status, latched  # as published, and at the last estimate
     Published published
     JointBlock sample
+    double load_nm  # of the link, for `contact`
 
 cdef class JointCycle:
     cdef object given, given_inputs, limits

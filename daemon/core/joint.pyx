@@ -83,7 +83,7 @@ cdef class JointCycle:
     def __init__(self, int number, inputs, estimator, *, Intake intake, snapshot, int64_t period_ns, safety=None):
         cdef JointTemperature temperature
         cdef JointBlock nothing = JointBlock(
-            NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, 0, 0, 0, 0
+            NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, 0, 0, 0, 0
         )
         self.limits = safety or JointSafety()
         self.rules = JointRules(number, snapshot, self.limits, estimator.with_network)
@@ -97,6 +97,7 @@ cdef class JointCycle:
         self.motor, self.link = Unwrap(), Unwrap()
         self.now.status = STARTING
         self.now.sample = nothing
+        self.now.load_nm = NAN
         self.now.published = field_of(NAN, INFINITY, STARTING)
 
     cdef int find_inputs(self, inputs) except -1:
@@ -269,7 +270,7 @@ cdef class JointCycle:
         cdef Scale *scale = &self.scale
         cdef JointBlock *record = &self.now.sample
         cdef Sample sample
-        cdef Values e = Values(NAN, NAN, NAN, NAN, NAN, INVALID)
+        cdef Values e = Values(NAN, NAN, NAN, NAN, NAN, NAN, NAN, INVALID)
         cdef int status, statusword = <int> self.statusword[0]
         sample.dt_s = self.since_last(sync_ns)
         sample.current_a = self.current_count[0] * scale.ampere
@@ -299,6 +300,7 @@ cdef class JointCycle:
         record.torque_nm, record.sigma_nm, record.tob_nm = e.torque_nm, e.sigma_nm, e.tob_nm
         record.physics_nm, record.network_nm = e.physics_nm, e.network_nm
         record.dt_s = sample.dt_s
+        record.torque_rate_nm_s, self.now.load_nm = e.torque_rate_nm_s, e.load_nm
         record.statusword, record.input_flags = statusword, flags
         self.now.status = record.status = status
         self.now.latched = self.rules.status.now.latched
@@ -314,7 +316,7 @@ cdef class JointCycle:
         self.now.published = field_of(NAN, INFINITY, status)
         record.current_a = record.motor_position_rad = record.motor_velocity_rad_s = record.link_position_rad = NAN
         record.torque_nm = record.sigma_nm = record.tob_nm = record.physics_nm = record.network_nm = NAN
-        record.dt_s = record.reference_nm = NAN
+        record.dt_s = record.reference_nm = record.torque_rate_nm_s = self.now.load_nm = NAN
         record.statusword, record.input_flags = 0, flags
         self.now.status = record.status = status
         self.now.latched = self.rules.status.now.latched

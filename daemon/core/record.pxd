@@ -21,6 +21,7 @@ cdef struct Header:
 cdef struct JointBlock:
     double current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, sensor_torque_nm, temperature_c
     double torque_nm, sigma_nm, tob_nm, physics_nm, network_nm, dt_s, reference_nm, age_ms
+    double torque_rate_nm_s, contact_nm
     uint16_t statusword, status, sensor_status, input_flags
 
 cdef struct Layout:  # `jtqd.daemon.shared.cycle_record.Layout`

@@ -34,10 +34,10 @@ def _check_layout():
     if found != expected:
         raise ImportError(f"found a cycle record with {found}, expected {expected}")
     fields = Header(1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15), JointBlock(
-        1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15, 16, 17, 18
+        1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0, 16.0, 17, 18, 19, 20
     )
     named = cr.Header(**fields[0]), cr.JointRecord(**fields[1])
-    if named != (tuple(range(1, 16)), tuple(range(1, 19))):
+    if named != (tuple(range(1, 16)), tuple(range(1, 21))):
         raise ImportError(f"found a cycle record with the fields {named}")
 
 

@@ -21,6 +21,7 @@ from types import FrameType
 from typing import Any, TextIO
 
 from jtqd.daemon.config import Config, JointConfig, as_booted, load_config
+from jtqd.daemon.core.contact import ContactWatch
 from jtqd.daemon.core.counters import frame_counts
 from jtqd.daemon.core.cycle import RUN_ENDED, SLOT_PASSED, Cycle
 from jtqd.daemon.core.intake import Intake
@@ -190,6 +191,17 @@ def joint_inputs(config: Config, report: dict[str, Any]) -> list[JointInputs]:
     return result
 
 
+def contacts_of(config: Config) -> ContactWatch | None:
+    """Return the detectors of contacts as configured; None for none."""
+    contact = config.contact
+    if contact is None:
+        return None
+    thresholds = [contact.threshold_of(joint.joint.rated_torque_nm) for joint in config.joints]
+    return ContactWatch(
+        thresholds, opposed=contact.opposed, sends=contact.pdo, period_s=config.period_ns * 1e-9
+    )
+
+
 def loop_filters(config: Config) -> list[CanFilter]:
     """Return filters for SYNC (own echo and foreign), inputs, temperatures and the nodes' heartbeats.
 
@@ -279,6 +291,7 @@ def build_cycle(
         deadline_ns=config.input_deadline_ns,
         heartbeat_cycles=max(1, config.heartbeat_ms * 1_000_000 // config.period_ns),
         grid=grid,
+        contacts=contacts_of(config),
     )
     return cycle, grid
 

@@ -9,12 +9,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from jtqd.daemon.core.contact_pdo import CODE_NAMES, NO_RATE, RATE_UNIT_NM_S
 from jtqd.daemon.core.estimate_pdo import NO_TORQUE, SIGMA_UNIT_NM, SIGMA_UNKNOWN, TORQUE_UNIT_NM
 from jtqd.daemon.recording.schemas import STATUS_NAMES
 from jtqd.drivers.devices import (
     NOT_MEASURED,
     TEMPERATURE,
     TEMPERATURE_C_PER_UNIT,
+    contact_tpdos,
     drive_tpdo3,
     estimate_tpdos,
     sensor_tpdo1,
@@ -158,6 +160,19 @@ def estimate_quantities(pdo: PdoMap, first: int = 1) -> dict[Key, Quantity]:
     }
 
 
+def contact_quantities(pdo: PdoMap, first: int = 1) -> dict[Key, Quantity]:
+    """Return the contact PDO that begins with joint `first`; see `jtqd.daemon.core.contact_pdo`."""
+    rate = Quantity(RATE_UNIT_NM_S, "Nm/s", {NO_RATE: "no_rate"})
+    fields = tuple((f"contact_{joint}", 4) for joint in (first, first + 1))
+    contact = Quantity(values=CODE_NAMES, fields=fields)
+    by_index = {0x2106: rate, 0x2107: contact, 0x2108: contact}
+    return {
+        (pdo.cob_id, each.index, each.subindex): by_index[each.index]
+        for each in pdo.objects
+        if each.index in by_index
+    }
+
+
 def dbc_text(config: Config, report: Mapping[str, Any] | None) -> str:
     """DBC of a configured bus with the scaling that the boot read from its devices.
 
@@ -170,6 +185,10 @@ def dbc_text(config: Config, report: Mapping[str, Any] | None) -> str:
     quantities: dict[Key, Quantity] = {}
     for pair, own in enumerate(maps):
         quantities |= estimate_quantities(own, 2 * pair + 1)
+    if config.contact is not None and config.contact.pdo:
+        for pair, own in enumerate(contact_tpdos(len(config.joints), config.node_id)):
+            quantities |= contact_quantities(own, 2 * pair + 1)
+            maps.append(own)
     for joint in config.joints:
         node = joint.node_id
         names[node] = f"drive_{joint.number}"

@@ -40,7 +40,7 @@ from jtqd.daemon.shared.ring import RingError, RingReader
 from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader
 
 _REPEAT_EVERY, _REPEAT_EVERY_IN_MEMORY = 60, 10
-"""Chunks after which schemas and channels are repeated; a flight recording begins with any chunk."""
+"""Spans after which schemas and channels are repeated; a flight recording begins with any span."""
 _QUANTILES = (0.5, 0.99, 1.0)
 
 
@@ -235,7 +235,7 @@ class Session:
             self._repair = None
 
     def _has_begun(self) -> bool:
-        """Return whether a chunk has been through; a repair delays nothing any more."""
+        """Return whether a span has been through; a repair delays nothing any more."""
         return self.account.written > 0 or self.account.let_go > 0 or bool(self.parts.obstacle)
 
 
@@ -376,7 +376,7 @@ class Recorder:
                 percent = round(100.0 * (used - cpu) / (now - last_diagnosis), 2)
                 self._session.diagnose(backlog, percent)
                 last_diagnosis, cpu = now, used
-            # Chunks end by recorded time; this is for a loop that stands still.
+            # Spans end by recorded time; this is for a loop that stands still.
             if taken:
                 last_flush = now
             elif now - last_flush >= self._chunk_s:

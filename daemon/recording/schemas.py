@@ -73,6 +73,8 @@ uint16 INPUT_SENSOR=4
 uint16 INPUT_TEMPERATURE=8  # not of this cycle: it was told at most 2 s ago
 uint16 NETWORK_SKIPPED=16  # no time for the network
 uint16 FAULT_LATCHED=32
+uint16 CONTACT_KNOWN=64  # contacts are watched, and known in this cycle
+uint16 CONTACT=128
 # ... and why there is no torque: faults of this cycle, of one not long ago, or latched
 uint16 FAULT_NOT_FINITE=256
 uint16 FAULT_OUT_OF_RANGE=512
@@ -108,6 +110,8 @@ float64 network_nm              # [Nm] stage: network
 float64 dt_s                    # [s] time step that the observer used
 float64 reference_nm            # [Nm] the torque sensor through the estimator's filter: as old as torque_nm
 float64 age_ms                  # [ms] age of torque_nm: group delay of the estimator's filter at low frequency
+float64 torque_rate_nm_s        # [Nm/s] of the torsion
+float64 contact_nm              # [Nm] torque from outside on the link that neither motion nor slow changes explain
 uint16 statusword               # 6041h of the drive
 # Values of `status`: viewers give a field the names of the constants that stand right before it
 {_STATUS_CONSTANTS}uint16 status

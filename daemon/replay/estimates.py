@@ -30,6 +30,7 @@ from jtqd.daemon.core.joint import JointCycle
 from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.core.status import JointStatus, drive_status
 from jtqd.daemon.loop.input_pdos import input_pdos, joint_temperatures
+from jtqd.daemon.loop.process import contacts_of
 from jtqd.daemon.replay.frames import Frames, offsets
 from jtqd.daemon.replay.origin import SAMPLE, Origin
 from jtqd.daemon.replay.pasts import NO_PASTS, Pasts
@@ -109,6 +110,7 @@ class ExactReplay:
         ]
         self._unknown = [True] * len(self._joints)
         self._pasts_differ: list[tuple[int, int]] = []
+        self._contacts = contacts_of(config)
         self._time_ns = [1 << 60] * len(
             self._joints
         )  # any but 0, which would mean that there was no sample yet
@@ -146,6 +148,7 @@ class ExactReplay:
             counter=joints[0]["sync_counter"],
             sync_ns=times,
             wanted=[(each["input_flags"] & FLAG_NETWORK_SKIPPED) == 0 for each in joints],
+            contacts=self._contacts,
             withdrawn=(joints[0]["cycle_flags"] & cr.FLAG_WITHDRAWN) != 0,
         )
         ends = sorted({*happens, *range(0, count, _TOLD), count})

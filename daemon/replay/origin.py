@@ -33,12 +33,12 @@ from jtqd.models.files import load_yaml
 SAMPLE = np.dtype(
     [
         (name, "<f8" if code == "d" else "<u2")
-        for name, code in zip(cr.JointRecord._fields, 14 * "d" + 4 * "H", strict=True)
+        for name, code in zip(cr.JointRecord._fields, 16 * "d" + 4 * "H", strict=True)
     ]
 )
 """What the loop records of a joint: the fields of `cycle_record.JointRecord`."""
 
-ADDED = ("reference_nm", "age_ms")
+ADDED = ("reference_nm", "age_ms", "torque_rate_nm_s", "contact_nm")
 """Fields that logs of before do not have; a replay makes them anew."""
 
 STAMP = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])

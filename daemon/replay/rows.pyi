@@ -3,6 +3,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from jtqd.daemon.core.contact import ContactWatch
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import JointCycle
 from jtqd.estimator.arrays import BoolArray, FloatArray, IntegerArray
@@ -25,5 +26,6 @@ class CycleRows:
         wanted: BoolArray | Sequence[BoolArray],
         withdrawn: BoolArray,
         velocity: FloatArray | Sequence[FloatArray] | None = None,
+        contacts: ContactWatch | None = None,
     ) -> None: ...
     def go_on(self, first: int, end: int) -> None: ...

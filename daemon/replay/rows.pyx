@@ -8,6 +8,7 @@ from libc.string cimport memcpy
 import numpy as np
 
 from jtqd.daemon.core.cycle import STARTING_CYCLES
+from jtqd.daemon.core.contact cimport ContactWatch
 from jtqd.daemon.core.estimate_pdo cimport NOBODY, Published, encode_into
 from jtqd.daemon.core.intake cimport MOST_FIELDS, Intake, Temperature, temperature_at
 from jtqd.daemon.core.joint cimport JointCycle, JointState
@@ -30,6 +31,7 @@ cdef class CycleRows:
         sync_ns: of each joint, when its SYNC went out [joints, n].
         wanted: of each joint, whether there was time for the network [joints, n].
         withdrawn: whether the estimate was too late [n].
+        contacts: the loop's, None where they are not watched.
         velocity: of each joint, the motor velocity as logged [joints, n], for drives that tell none; None: derived again.
 
     Attributes:
@@ -53,13 +55,16 @@ cdef class CycleRows:
     cdef const uint8_t[::1] withdrawn
     cdef const double[:, ::1] velocity
     cdef bint with_velocity
+    cdef ContactWatch contacts
+    cdef bint watches
     cdef uint8_t[:, :, ::1] to_samples
     cdef uint8_t[:, ::1] to_estimates
     cdef readonly object samples, estimates
     cdef readonly int64_t temperatures_from_log
 
     def __init__(
-        self, Intake intake, joints, *, fresh, values, celsius, cycle, counter, sync_ns, wanted, withdrawn, velocity=None
+        self, Intake intake, joints, *, fresh, values, celsius, cycle, counter, sync_ns, wanted, withdrawn, velocity=None,
+        ContactWatch contacts=None
     ):
         cdef JointCycle joint
         n = len(cycle)
@@ -68,6 +73,7 @@ cdef class CycleRows:
             laid[index, : len(columns)] = columns
         self.intake, self.joints, self.count = intake, tuple(joints), len(joints)
         self.pdos = (self.count + 1) // 2
+        self.contacts, self.watches = contacts, contacts is not None
         for index in range(self.count):
             joint = self.joints[index]
             self.states[index] = &joint.now
@@ -99,6 +105,15 @@ cdef class CycleRows:
             self.take(row)
             for n in range(self.count):
                 self.observe(<JointCycle> at[n], n, row)
+            if self.watches:
+                self.contacts.watch(self.states)
+            if self.withdrawn[row]:
+                for n in range(self.count):
+                    (<JointCycle> at[n]).take_back(STALE)
+                if self.watches:
+                    self.contacts.take_back(self.states)
+            for n in range(self.count):
+                memcpy(&self.to_samples[n, row, 0], &self.states[n].sample, sizeof(JointBlock))
             for n in range(self.pdos):
                 second = &self.states[2 * n + 1].published if 2 * n + 1 < self.count else &NOBODY
                 encode_into(
@@ -122,13 +137,10 @@ cdef class CycleRows:
                 temperature.celsius = said
 
     cdef void observe(self, JointCycle joint, int number, Py_ssize_t row) noexcept nogil:
-        """Estimate one joint in a row and keep its block."""
+        """Estimate one joint in a row."""
         joint.derived.is_replayed = self.with_velocity
         joint.derived.replayed_rad_s = self.velocity[number, row]
         joint.observe_at(self.sync_ns[number, row], self.cycle[row] < FIRST_CYCLES, self.wanted[number, row])
-        if self.withdrawn[row]:
-            joint.take_back(STALE)
-        memcpy(&self.to_samples[number, row, 0], &joint.now.sample, sizeof(JointBlock))
 
 
 def _checked(values, kind, shape):

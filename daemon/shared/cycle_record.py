@@ -5,7 +5,7 @@ Little endian, no padding decided by a compiler; how long it is depends on the n
     header   index, times, flags and counters of the cycle
     joints   one block for each joint: inputs in SI units and every stage of the estimate
     frames   frames as `struct can_frame` with their kernel stamps, in order of arrival: up to 16 where there are one or two
-             joints (648 bytes with two), up to 32 where there are more
+             joints (712 bytes with two), up to 32 where there are more
     tail     the index again: a reader that finds head and tail different has met a half-written record
 
 Quantities are NaN where they are not known in that cycle (an input that did not come, a stage that was not computed).
@@ -22,7 +22,7 @@ from typing import Final, NamedTuple
 MOST_JOINTS: Final = 4
 """Joints of one bus: two estimate PDOs of two each."""
 
-JOINT_FORMAT = "14d4H"
+JOINT_FORMAT = "16d4H"
 HEADER_FORMAT = "QqqIIiI8B"
 
 HEADER = struct.Struct("<" + HEADER_FORMAT)
@@ -80,7 +80,9 @@ FLAG_RESET = 0x20
 FLAG_POSITION, FLAG_MOTION, FLAG_SENSOR, FLAG_TEMPERATURE = 1, 2, 4, 8
 """`input_flags` of record and snapshot: TPDO1, TPDO2 and the sensor's PDO are of this cycle; the temperature is known."""
 FLAG_NETWORK_SKIPPED, FLAG_LATCHED = 0x10, 0x20
-"""... no time for the network; a fault is latched. Bits 8 to 15: low byte of the faults below."""
+FLAG_CONTACT_KNOWN, FLAG_CONTACT = 0x40, 0x80
+"""... no time for the network; a fault is latched; contacts are watched and known; there is one. Bits 8 to 15: low byte of
+the faults below."""
 TEMPERATURE_LIFE_S = 2.0
 """Four frames in a row are missing then; a joint needs minutes to become noticeably warmer."""
 
@@ -131,13 +133,19 @@ class JointRecord(NamedTuple):
     """`sensor_torque_nm` through the estimator's filter: as old as `torque_nm`; NaN until it has settled."""
     age_ms: float
     """Group delay of the estimate at low frequency; NaN where no joint file is known."""
+    torque_rate_nm_s: float
+    """Of the torsion, through its own filter (docs/contact.md); NaN without torsion."""
+    contact_nm: float
+    """Torque from outside on the link that neither motion nor slow changes explain; NaN where contacts are not watched or
+    not known in this cycle."""
     statusword: int
     status: int
     sensor_status: int
     input_flags: int
     """Bit n set: input n of this joint (0 TPDO1, 1 TPDO2, 2 sensor) is of this cycle; bit 3: temperature_c is known; bit 4:
-    no time for the network; bit 5: a fault is latched; bits 8 to 15: the faults (`faults.py`) for which there
-    is no torque: of this cycle, of one not long ago, or latched."""
+    no time for the network; bit 5: a fault is latched; bit 6: whether there is a contact is known; bit 7: there
+    is; bits 8 to 15: the faults (`faults.py`) for which there is no torque: of this cycle, of one not long ago, or
+    latched."""
 
 
 def selection(header: Collection[str], joint: Collection[str], joints: int = 2) -> struct.Struct:

@@ -64,6 +64,7 @@ COUNTERS = (
     "fault_deviation",
     "latches",
     "latch_resets",
+    "contacts",
 )
 """In the order of their words; docs/bus.md says what each one means."""
 
@@ -103,6 +104,9 @@ class JointView(NamedTuple):
     """The sensor as old as the estimate (`daemon/shared/cycle_record.py`): what the estimate is compared with."""
     age_ms: float = float("nan")
     """Group delay of the estimate."""
+    torque_rate_nm_s: float = float("nan")
+    contact_nm: float = float("nan")
+    """As in the cycle record; whether there is a contact say bits of `input_flags`."""
 
 
 class Measured(NamedTuple):
@@ -204,7 +208,7 @@ MAX_INPUTS = 20
 _MAGIC = 0x4A54_5144_5354_4109  # "JTQDSTA", layout 9
 _HEAD = struct.Struct("<QQddQ")
 """Magic number, process, period [s], worst load, number of joints."""
-JOINT = struct.Struct("<6dHBBHH2d")
+JOINT = struct.Struct("<6dHBBHH4d")
 _ESTIMATE = struct.Struct(f"<qQqq{MOST_JOINTS}q")
 _MEASURED = struct.Struct("<6d")
 INPUT = struct.Struct("<12q")

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from jtqd.drivers.devices import ESTIMATE_BASES, estimate_tpdos
+from jtqd.drivers.devices import CONTACT_BASES, ESTIMATE_BASES, contact_tpdos, estimate_tpdos
 from jtqd.drivers.eds.own_objects import (
     BUS_FIELDS,
     COUNTERS,
@@ -26,6 +26,7 @@ from jtqd.drivers.eds.own_objects import (
     ZEROS,
     own_sheet,
 )
+from jtqd.drivers.pdo import INVALID as PDO_INVALID
 from jtqd.drivers.pdo import NO_RTR
 
 FOLDER = Path(__file__).parent
@@ -295,12 +296,14 @@ def tpdo(
     *,
     transmission: int = 255,
     fixed: bool = False,
+    off: bool = False,
     event_ms: int = 0,
 ) -> dict[int, Var | Entries]:
-    """Describe TPDO `number` (1..4), valid from power-on. Sub-index 4 is reserved and absent."""
+    """Describe TPDO `number` (1..4), valid from power-on unless `off`. Sub-index 4 is reserved and absent."""
     access = "const" if fixed else "rw"
+    cob_id = NO_RTR + base + (PDO_INVALID if off else 0)
     members = {
-        1: Var("COB-ID used by TPDO", U32, access, f"$NODEID+0x{NO_RTR + base:08X}"),
+        1: Var("COB-ID used by TPDO", U32, "ro" if off else access, f"$NODEID+0x{cob_id:08X}"),
         2: Var("Transmission type", U8, access, transmission),
         3: Var("Inhibit time", U16, access, 0, comment="100 us"),
         5: Var("Event timer", U16, access, event_ms, comment="ms"),
@@ -452,10 +455,20 @@ def jtqd(room: int = ROOM[0]) -> Sheet:
     estimates: dict[int, Var | Entries] = {}
     for number, (pdo, base) in enumerate(zip(estimate_tpdos(room), ESTIMATE_BASES, strict=False), start=1):
         estimates |= tpdo(number, base, pdo.words, transmission=1, fixed=True)
+    for number, (pdo, base) in enumerate(zip(contact_tpdos(room), CONTACT_BASES, strict=False), start=3):
+        estimates |= tpdo(number, base, pdo.words, transmission=1, fixed=True, off=True)
     more: dict[int, Var | Entries] = {}
     if room > ROOM[0]:
         more[0x2105] = Var(
             "Estimate status of joints 3 and 4",
+            U8,
+            "ro",
+            0,
+            pdo=True,
+            comment="low nibble joint 3, high nibble joint 4",
+        )
+        more[0x2108] = Var(
+            "Contact of joints 3 and 4",
             U8,
             "ro",
             0,
@@ -489,6 +502,8 @@ def jtqd(room: int = ROOM[0]) -> Sheet:
         ),
         0x2103: Var("Estimate sequence", U8, "ro", 0, pdo=True, comment="SYNC counter of the inputs, 1..240"),
         0x2104: array("Latched faults", U16, "ro", joints),
+        0x2106: array("Torque rate", I8, "ro", [(name, -128) for name in names], pdo=True),
+        0x2107: Var("Contact", U8, "ro", 0, pdo=True, comment="low nibble joint 1, high nibble joint 2"),
         0x2110: Var(
             "Reset latched faults", U8, "rw", 0, low=0, high=1, comment="write 1; read: 1 not done yet"
         ),
@@ -506,6 +521,8 @@ def jtqd(room: int = ROOM[0]) -> Sheet:
         "2100h in 0.01 Nm, 8000h: no estimate. 2101h in 0.05 Nm, 255: more or unknown.",
         "2104h: bits 0 not finite, 1 out of range, 2 motor jump, 3 link jump, 4 velocity mismatch,",
         "5 torsion, 6 current frozen, 7 deviation, 8 drive fault, 9 stale. 2110h: 1 releases them.",
+        "2106h in 32 Nm/s, 80h: no rate. 2107h: 0 not watched, 1 unknown, 2 none, 3 positive, 4 negative.",
+        "1802h:1 (and 1803h:1) valid where contacts are sent.",
         "2205h:1 0 error active, 1 warning, 2 passive, 3 bus-off, 4 interface down.",
         "2206h: NMT state, heartbeat (1 awaited, 2 heard, 3 lost), configured, node-ID; from the lowest byte.",
         "2207h: error code (2 bytes), error register, number of messages.",

@@ -37,6 +37,7 @@ COUNTERS = (
     "fault_deviation",
     "latches",
     "latch_resets",
+    "contacts",
 )
 """Sub-indices 1.. of 2200h, in order: the loop's counters. New ones come last: receivers know them by number."""
 

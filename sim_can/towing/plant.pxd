@@ -35,6 +35,7 @@ cdef class TowingPlant:
     cdef readonly double substep_s
     cdef public double link_position, link_velocity
     cdef double inertia_1, inertia_2
+    cdef double external_nm, next_external_nm, until_next_s  # on link 2, joint 1's frame
     cpdef step(self, double dt_s)
     cdef void integrate(self, int steps, double h) noexcept
     cpdef double sensor_torque(self) except? -1.0

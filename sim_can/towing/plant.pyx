@@ -3,7 +3,7 @@
 Per joint, own frame, J = Jm G² and v = ω/G on the joint side:
 
     J dv/dt = G (Kt(T) i (1 - s (i/I_r)²) + cogging(θ)) - τ G dδ/dθ - F
-    (J1 + J2) dω_link/dt = τ1 - τ2          sensor = τ1 - J1 dω_link/dt
+    (J1 + J2) dω_link/dt = τ1 - τ2 + τ_x    sensor = τ1 - J1 dω_link/dt        τ_x: of a push, on link 2
 
 Semi-implicit Euler: velocities first, then angles with the new velocities; friction implicit. Pure: no clock.
 """
@@ -90,6 +90,7 @@ cdef class TowingPlant:
         self.inertia_1, self.inertia_2 = (side.link_inertia_kgm2 for side in parameters.joints)
         self.substep_s = parameters.longest_step_s
         self.link_position = self.link_velocity = 0.0
+        self.external_nm = self.next_external_nm = self.until_next_s = 0.0
         self.one.gear.relax(0.0, 0.0)
         self.two.gear.relax(0.0, 0.0)
 
@@ -104,6 +105,10 @@ cdef class TowingPlant:
     def command(self, int drive, int mode, double target):
         """Set mode and target of drive 0 or 1; see `jtqd.sim_can.source`."""
         self.drives[drive].command(mode, target, self.joints[drive].velocity)
+
+    def push(self, double torque_nm, double after_s=0.0):
+        """Push the links with torque_nm [Nm, joint 1's frame], on joint 2's side of the sensor, from after_s [s] on."""
+        self.next_external_nm, self.until_next_s = torque_nm, after_s
 
     cpdef step(self, double dt_s):
         """Advance by dt_s: whole control cycles of about 1 ms, each in equal integration steps. Raises ValueError."""
@@ -131,7 +136,11 @@ cdef class TowingPlant:
         for _ in range(steps):
             torque_1 = one.push(one.drive.step(h, one.velocity), self.link_velocity, h)
             torque_2 = two.push(two.drive.step(h, two.velocity), -self.link_velocity, h)
-            self.link_velocity += per_link * (torque_1 - torque_2)
+            if self.external_nm != self.next_external_nm:
+                self.until_next_s -= h
+                if self.until_next_s < 0.0:
+                    self.external_nm = self.next_external_nm
+            self.link_velocity += per_link * (torque_1 - torque_2 + self.external_nm)
             self.link_position += h * self.link_velocity
             one.turn(self.link_position, h)
             two.turn(-self.link_position, h)
@@ -143,4 +152,4 @@ cdef class TowingPlant:
     cpdef double sensor_torque(self) except? -1.0:
         """Return the true torque in the sensor, Nm: τ1 - J1 dω_link/dt."""
         cdef double one = self.one.torque(self.link_velocity), two = self.two.torque(-self.link_velocity)
-        return one - self.inertia_1 / (self.inertia_1 + self.inertia_2) * (one - two)
+        return one - self.inertia_1 / (self.inertia_1 + self.inertia_2) * (one - two + self.external_nm)

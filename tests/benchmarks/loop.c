@@ -34,7 +34,7 @@ typedef struct {
 } frame;
 
 typedef struct __attribute__((packed)) {
-    double current, motor_position, motor_velocity, link_position, sensor, temperature, torque, sigma, tob, efficiency, network, dt, reference, age;
+    double current, motor_position, motor_velocity, link_position, sensor, temperature, torque, sigma, tob, efficiency, network, dt, reference, age, torque_rate, contact;
     uint16_t statusword, status, sensor_status, flags;
 } joint_record;
 
@@ -253,6 +253,7 @@ static void observe(loop_state *s, int64_t sync, cycle_record *r, uint8_t pdo[8]
         estimate e = nothing(STALE);
         j->sensor = sensor->fresh && !(sensor->data[4] & 7) ? i32(sensor->data) * NM_PER_UNIT : NAN;
         j->reference = NAN, j->age = 1e3 / parameters[n].rate;
+        j->torque_rate = j->contact = NAN;
         j->temperature = NAN; /* the traffic has none */
         j->sensor_status = sensor->fresh ? sensor->data[4] : 0;
         j->flags = position->fresh | motion->fresh << 1 | sensor->fresh << 2;

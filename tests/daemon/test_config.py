@@ -7,7 +7,9 @@ from typing import Any
 import pytest
 import yaml
 
+from jtqd.daemon.bus.boot import bus_load_of
 from jtqd.daemon.config import Identity, Realtime, RecordingSettings, SafetySettings, load_config
+from jtqd.drivers.bus_load import LIMIT
 from jtqd.drivers.devices import CIA_402, DriveObject
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.settings import EstimatorSettings
@@ -240,3 +242,76 @@ def test_files_that_are_no_configuration(tmp_path: Path, text: str) -> None:
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"absent\.yaml"):
         load_config(tmp_path / "absent.yaml")
+
+
+def test_contacts_are_off_by_default_and_5_percent_of_rated(tmp_path: Path) -> None:
+    assert load_config(None).contact is None
+    contact = load_config(write(tmp_path, lambda c: c.update(contact={"opposed": True}))).contact
+    assert contact is not None
+    assert (contact.threshold_of(40.0), contact.opposed, contact.pdo) == (2.0, True, True)
+    contact = load_config(
+        write(tmp_path, lambda c: c.update(contact={"threshold_nm": 0.7, "pdo": False}))
+    ).contact
+    assert contact is not None
+    assert (contact.threshold_of(40.0), contact.opposed, contact.pdo) == (0.7, False, False)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"contact": {"threshold_nm": 0}}, "key 'contact.threshold_nm': found 0, expected a number in Nm"),
+        ({"contact": {"treshold_nm": 1}}, "contact"),
+        (
+            {"contact": {"opposed": True}, "joint_2": None},
+            "key 'contact.opposed': found True, expected false with 1 joints: opposed are joints 1 and 2, 3 and 4",
+        ),
+        (
+            {"contact": {}, "estimator": {"method": "tob"}},
+            "key 'estimator.method': found 'tob', expected fused",
+        ),
+    ],
+)
+def test_contacts_that_cannot_be_told_are_refused(
+    tmp_path: Path, change: dict[str, Any], message: str
+) -> None:
+    def apply(content: dict[str, Any]) -> None:
+        content.update(change)
+        if content["joint_2"] is None:
+            del content["joint_2"]
+        for joint in ("joint_1", "joint_2"):
+            if joint in content and "estimator" in change:
+                content[joint].pop("network", None)
+
+    with pytest.raises(ConfigError) as error:
+        load_config(write(tmp_path, apply))
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_contacts_need_a_torsion(tmp_path: Path) -> None:
+    joint = yaml.safe_load(shipped("trained/joint1.yaml").read_text())
+    del joint["fused"]["torsion"]
+    path = tmp_path / "joint.yaml"
+    path.write_text(yaml.safe_dump(joint))
+
+    def apply(content: dict[str, Any]) -> None:
+        content["contact"] = {}
+        content["joint_1"].pop("network", None)
+
+    config = write(tmp_path, apply)
+    content = yaml.safe_load(config.read_text())
+    content["joint_1"]["file"] = str(path)
+    config.write_text(yaml.safe_dump(content))
+    with pytest.raises(
+        ConfigError, match=r"key 'fused.torsion': missing, expected because of section contact"
+    ):
+        load_config(config)
+
+
+def test_the_contact_pdo_is_part_of_the_bus_load_and_fits_beside_a_sensor(tmp_path: Path) -> None:
+    def load(contact: dict[str, Any] | None) -> float:
+        return bus_load_of(load_config(write(tmp_path, lambda c: c.update(contact=contact)))).worst
+
+    assert load({}) == pytest.approx(load(None) + 0.095)
+    assert load({"pdo": False}) == load(None)
+    assert load({}) < LIMIT

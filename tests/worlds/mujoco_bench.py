@@ -77,14 +77,14 @@ class MujocoBench:
             else (1, 2)
         )
 
+    def unseen(self) -> MujocoBench:
+        """Return the bench itself: nothing is fitted to its runs."""
+        return self
+
     def days(self, seed: int) -> list[Day]:
         """Return what each run of this seed has of its own, unless it is quiet."""
         joints = _draw_joints(np.random.default_rng([seed, _JOINTS]))
         return [_draw_day(np.random.default_rng([seed, _DAYS, k]), joints) for k in range(self.runs)]
-
-    def unseen(self) -> MujocoBench:
-        """Return the bench itself: nothing is fitted to its runs."""
-        return self
 
     def draw(self, seed: int, hidden: Sequence[Hidden] = (), *, quiet: bool = False) -> Set:
         """Return one set; about half a second per run."""

@@ -33,7 +33,7 @@ TPDO = struct.pack("<IB3x8s", 0x181, 8, bytes(range(8)))
 
 def joint_values(index, number, status=2):
     """The block of a joint: every field another function of the cycle."""
-    return (*(number * 1000.0 + index + field / 16 for field in range(14)), 0x1237, status, 0, 7)
+    return (*(number * 1000.0 + index + field / 16 for field in range(16)), 0x1237, status, 0, 7)
 
 
 def record_of(index, *, statuses=(2, 2), missed=0, start_ns=START_NS):

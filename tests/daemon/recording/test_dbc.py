@@ -38,6 +38,7 @@ def database():
         node_id=0x20,
         joints=joints,
         sensor=SimpleNamespace(node_id=3, channels=(1, 2)),
+        contact=SimpleNamespace(pdo=True),
     )
     nodes = {"1": {"scaling": SCALING}, "2": {"scaling": SCALING | {"ampere_per_unit": 0.002}}}
     nodes["3"] = {"scaling": {"nm_per_unit": {"1": 0.001, "2": 0.01}}}
@@ -51,13 +52,25 @@ def decode(database, line):
 
 
 def test_every_frame_of_the_bus_is_there(database):
-    expected = {0x080: 1, 0x181: 8, 0x281: 8, 0x182: 8, 0x282: 8, 0x183: 5, 0x283: 3, 0x1A0: 8}
+    expected = {0x080: 1, 0x181: 8, 0x281: 8, 0x182: 8, 0x282: 8, 0x183: 5, 0x283: 3, 0x1A0: 8, 0x3A0: 4}
     expected[0x382] = 2  # the second drive alone tells a temperature
     for node in (1, 2, 3, 0x20):
         expected |= {0x080 + node: 8, 0x700 + node: 1}
     assert {message.frame_id: message.length for message in database.messages} == expected
     assert database.get_message_by_frame_id(0x182).name == "drive_2_TPDO1"
     assert database.get_message_by_frame_id(0x281).senders == ["drive_1"]
+
+
+def test_contact(database):
+    """Joint 1: +640 Nm/s, pushed along its direction; joint 2 not known; SYNC 17."""
+    values = decode(database, "3A0#14" + "80" + "13" + "11")
+    assert values["torque_rate_1"] == 640.0
+    assert (values["torque_rate_2"], values["contact_1"], values["contact_2"]) == (
+        "no_rate",
+        "positive",
+        "unknown",
+    )
+    assert values["sequence"] == 17
 
 
 def test_drive_position(database):
@@ -108,7 +121,7 @@ def test_services(database):
 
 def test_without_a_sensor():
     joints = tuple(drive(n) for n in (1, 2))
-    config = SimpleNamespace(counter_overflow=0, node_id=0x20, joints=joints, sensor=None)
+    config = SimpleNamespace(counter_overflow=0, node_id=0x20, joints=joints, sensor=None, contact=None)
     text = dbc_text(config, {"nodes": {"1": {"scaling": SCALING}, "2": {"scaling": SCALING}}})
     assert "torque_sensor" not in text
     assert len(cantools.database.load_string(text, "dbc").messages) == 1 + 5 + 2 * 3

@@ -35,7 +35,7 @@ def random_record(seed):
         *(rng.getrandbits(8) for _ in range(6)),
     )
     joints = [
-        (*(rng.gauss(0, 100) for _ in range(14)), *(rng.getrandbits(16) for _ in range(4))) for _ in "12"
+        (*(rng.gauss(0, 100) for _ in range(16)), *(rng.getrandbits(16) for _ in range(4))) for _ in "12"
     ]
     record = bytearray(rng.randbytes(cr.RECORD_SIZE))  # what an earlier lap left behind counts as random
     cr.HEAD.pack_into(record, 0, *header, *joints[0], *joints[1])
@@ -98,9 +98,9 @@ def test_cycle_block_decodes_to_the_record(seed):
 
 def test_sizes_are_constant_and_as_stated():
     sizes = {tuple(len(part[4]) for part in split(block_of(*random_record(seed)[:2]))) for seed in range(20)}
-    assert sizes == {(166, 166, 444)}
-    assert (messages.JOINT_ESTIMATE_SIZE, messages.CAN_FRAMES_SIZE, messages.BLOCK_SIZE) == (166, 444, 869)
-    assert messages.BLOCK_PARTS == ((1, 0), (2, 197), (3, 394))
+    assert sizes == {(182, 182, 444)}
+    assert (messages.JOINT_ESTIMATE_SIZE, messages.CAN_FRAMES_SIZE, messages.BLOCK_SIZE) == (182, 444, 901)
+    assert messages.BLOCK_PARTS == ((1, 0), (2, 213), (3, 426))
 
 
 def test_joint_message_literally():

@@ -141,7 +141,7 @@ def test_it_tells_how_far_the_new_estimates_are_from_the_old_ones(
 
 def test_a_cycle_without_time_for_the_network_is_one_in_the_shadow_too() -> None:
     record = cr.JointRecord(
-        1.0, 0.1, 2.0, 0.01, 3.0, 25.0, *(math.nan,) * 5, 0.001, math.nan, math.nan, 0x27, VALID, 0, 0
+        1.0, 0.1, 2.0, 0.01, 3.0, 25.0, *(math.nan,) * 5, 0.001, *(math.nan,) * 4, 0x27, VALID, 0, 0
     )
     twin = Twin(Estimate(1.0, 0.1, VALID, 1.0, 1.0, math.nan))
     both = cr.FLAG_POSITION | cr.FLAG_MOTION

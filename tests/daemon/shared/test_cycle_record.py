@@ -8,8 +8,8 @@ import pytest
 from jtqd.daemon.shared import cycle_record as cr
 
 HEADER = (7, 1_000, 1_700_000_000_123_456_789, 0xF, 50_000, -3, 2, 240, 2, 255, 1, 2, 3, 4, 0)
-JOINT_1 = (*(0.5 + n for n in range(14)), 0x1237, 2, 0x80, 7)
-JOINT_2 = (*(-0.25 * n for n in range(13)), math.nan, 0x0250, 15, 0, 1)
+JOINT_1 = (*(0.5 + n for n in range(16)), 0x1237, 2, 0x80, 7)
+JOINT_2 = (*(-0.25 * n for n in range(13)), math.nan, -3.5, 4.5, 0x0250, 15, 0, 1)
 SYNC = bytes.fromhex("80000000 01 000000 f000000000000000")
 TPDO = bytes.fromhex("81010000 08 000000 0102030405060708")
 
@@ -24,13 +24,13 @@ def sample():
 
 
 def test_offsets():
-    """48 bytes of header, two joints of 120, 16 frames of 16, 16 stamps of 8, the index."""
+    """48 bytes of header, two joints of 136, 16 frames of 16, 16 stamps of 8, the index."""
     assert cr.HEADER.size == 48
-    assert cr.JOINT.size == 120
-    assert cr.HEAD.size == 288 == cr.FRAMES_OFFSET
-    assert cr.STAMPS_OFFSET == 544
-    assert cr.TAIL_OFFSET == 672
-    assert cr.RECORD_SIZE == 680
+    assert cr.JOINT.size == 136
+    assert cr.HEAD.size == 320 == cr.FRAMES_OFFSET
+    assert cr.STAMPS_OFFSET == 576
+    assert cr.TAIL_OFFSET == 704
+    assert cr.RECORD_SIZE == 712
 
 
 def test_bytes_of_the_header():
@@ -44,12 +44,12 @@ def test_bytes_of_the_header():
     assert sample()[:48] == expected
 
 
-def test_joint_blocks_lie_at_48_and_168():
+def test_joint_blocks_lie_at_48_and_184():
     record = sample()
-    assert record[48:160] == struct.pack("<14d", *JOINT_1[:14])
-    assert record[160:168] == bytes.fromhex("3712 0200 8000 0700")
-    assert record[168:280] == struct.pack("<14d", *JOINT_2[:14])
-    assert record[280:288] == bytes.fromhex("5002 0f00 0000 0100")
+    assert record[48:176] == struct.pack("<16d", *JOINT_1[:16])
+    assert record[176:184] == bytes.fromhex("3712 0200 8000 0700")
+    assert record[184:312] == struct.pack("<16d", *JOINT_2[:16])
+    assert record[312:320] == bytes.fromhex("5002 0f00 0000 0100")
 
 
 def test_fields_by_name():
@@ -66,6 +66,7 @@ def test_fields_by_name():
     assert (two.motor_position_rad, two.status) == (-0.25, 15)
     assert (one.reference_nm, one.age_ms) == (12.5, 13.5)
     assert math.isnan(two.age_ms)
+    assert (one.torque_rate_nm_s, one.contact_nm, two.contact_nm) == (14.5, 15.5, 4.5)
 
 
 def test_a_selection_of_fields_is_what_the_whole_record_says():
@@ -78,7 +79,7 @@ def test_a_selection_of_fields_is_what_the_whole_record_says():
     assert picked[6:] == (two.status,)
     everything = cr.selection(cr.Header._fields, cr.JointRecord._fields)
     assert everything.size == cr.HEAD.size
-    assert everything.unpack_from(record)[:-5] == cr.HEAD.unpack_from(record)[:-5]
+    assert everything.unpack_from(record)[:-7] == cr.HEAD.unpack_from(record)[:-7]
 
 
 def test_a_selection_refuses_fields_that_are_not_there():

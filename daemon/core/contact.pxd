@@ -1,0 +1,20 @@
+"""Contacts of all joints of a cycle; contact.pyx."""
+
+from libc.stdint cimport uint8_t
+
+from jtqd.daemon.core.contact_pdo cimport ToldContact
+from jtqd.daemon.core.joint cimport JointState
+from jtqd.daemon.core.record cimport MOST_JOINTS
+from jtqd.estimator.contact cimport ContactLaw, ContactState
+
+cdef class ContactWatch:
+    cdef readonly int count
+    cdef readonly bint opposed, sends
+    cdef ContactLaw law[MOST_JOINTS]
+    cdef ContactState state[MOST_JOINTS]
+    cdef ToldContact told[MOST_JOINTS]
+    cdef int begun  # contacts that the last cycle has told first
+    cdef void watch(self, JointState **joints) noexcept nogil
+    cdef void tell(self, JointState *joint, int n, double contact_nm, int told) noexcept nogil
+    cdef void take_back(self, JointState **joints) noexcept nogil
+    cdef void encode(self, uint8_t *data, int pair, int sequence) noexcept nogil

@@ -1,0 +1,18 @@
+from collections.abc import Sequence
+
+class ContactWatch:
+    def __init__(
+        self,
+        thresholds_nm: Sequence[float],
+        *,
+        opposed: bool = False,
+        sends: bool = True,
+        period_s: float = 0.001,
+    ) -> None: ...
+    @property
+    def count(self) -> int: ...
+    @property
+    def opposed(self) -> bool: ...
+    @property
+    def sends(self) -> bool: ...
+    def restart(self) -> None: ...

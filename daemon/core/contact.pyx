@@ -1,0 +1,95 @@
+"""Contacts of all joints of a cycle, after their estimates: who explains whose load, the record's fields, the PDO's bytes.
+
+The rules of one detector stand in `jtqd.estimator.contact`. Joints that turn one link against each other (`opposed`: 1 and 2, 3 and 4)
+share a detector, in the frame of the first; alone, each has its own.
+"""
+
+from libc.math cimport NAN
+from libc.stdint cimport uint8_t
+
+from jtqd.daemon.core.contact_pdo cimport NO_JOINT, encode_contact, told_of
+from jtqd.daemon.core.record cimport JointBlock
+from jtqd.daemon.shared import cycle_record as cr
+from jtqd.estimator.contact cimport (
+    CONTACT_NONE,
+    CONTACT_OFF,
+    CONTACT_THERE,
+    CONTACT_UNKNOWN,
+    fill_contact,
+    restart_contact,
+    watch_contact,
+)
+
+cdef int KNOWN = cr.FLAG_CONTACT_KNOWN, THERE = cr.FLAG_CONTACT
+
+
+cdef class ContactWatch:
+    """Detectors of a bus.
+
+    Args:
+        thresholds_nm: of each joint.
+        opposed: joints 1 and 2, and 3 and 4, turn one link against each other; the smaller threshold of the two counts.
+        sends: the contact PDOs are sent.
+        period_s: of SYNC.
+
+    Raises:
+        ValueError: opposed joints that are not in twos; a threshold or period that is none.
+    """
+
+    def __init__(self, thresholds_nm, *, bint opposed=False, bint sends=True, double period_s=0.001):
+        cdef int n
+        self.count, self.opposed, self.sends = len(thresholds_nm), opposed, sends
+        if not 1 <= self.count <= MOST_JOINTS or (opposed and self.count % 2):
+            raise ValueError(f"found {self.count} joints, expected 1 to {MOST_JOINTS}, and 2 or 4 that are opposed")
+        for n in range(self.count):
+            least = min(thresholds_nm[n : n + 2]) if opposed and n % 2 == 0 else thresholds_nm[n]
+            fill_contact(&self.law[n], least, period_s)
+        self.restart()
+
+    def restart(self):
+        """Forget the past: unknown until it has settled."""
+        cdef int n
+        for n in range(MOST_JOINTS):
+            restart_contact(&self.state[n])
+            self.told[n] = NO_JOINT
+
+    cdef void watch(self, JointState **joints) noexcept nogil:
+        """Take the loads of a cycle; sets the joints' fields of the record."""
+        cdef int n = 0, before
+        cdef ContactState *s
+        self.begun = 0
+        while n < self.count:
+            s = &self.state[n]
+            before = s.told
+            if self.opposed:
+                watch_contact(
+                    &self.law[n], s, joints[n + 1].load_nm - joints[n].load_nm, joints[n].sample.motor_position_rad
+                )
+                self.tell(joints[n + 1], n + 1, -s.residual_nm, s.told)
+            else:
+                watch_contact(&self.law[n], s, -joints[n].load_nm, joints[n].sample.motor_position_rad)
+            self.tell(joints[n], n, s.residual_nm, s.told)
+            if s.told == CONTACT_THERE and before == CONTACT_NONE:
+                self.begun += 1
+            n += 2 if self.opposed else 1
+
+    cdef void tell(self, JointState *joint, int n, double contact_nm, int told) noexcept nogil:
+        cdef JointBlock *record = &joint.sample
+        record.contact_nm = contact_nm
+        record.input_flags &= ~(KNOWN | THERE)
+        if told != CONTACT_UNKNOWN:
+            record.input_flags |= KNOWN | THERE if told == CONTACT_THERE else KNOWN
+        self.told[n] = told_of(record.torque_rate_nm_s, contact_nm, told)
+
+    cdef void take_back(self, JointState **joints) noexcept nogil:
+        """Of a cycle whose answer came too late: nothing is known."""
+        cdef int n
+        for n in range(self.count):
+            joints[n].sample.torque_rate_nm_s = NAN
+            self.tell(joints[n], n, NAN, CONTACT_UNKNOWN)
+
+    cdef void encode(self, uint8_t *data, int pair, int sequence) noexcept nogil:
+        """Write the four bytes of joints 2 pair + 1 and 2 pair + 2."""
+        encode_contact(
+            data, &self.told[2 * pair], &self.told[2 * pair + 1] if 2 * pair + 1 < self.count else &NO_JOINT, sequence
+        )

@@ -1,0 +1,37 @@
+from typing import Final
+
+from jtqd.estimator.arrays import CodeArray, FloatArray
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.settings import EstimatorSettings
+
+TREND_RAD_S: Final = 50.0
+NOTCH_RAD_S: Final = 10.0
+RELEASE: Final = 0.5
+LONGEST_S: Final = 0.5
+SETTLE_S: Final = 0.1
+UNEVEN: Final = 0.2
+LONGEST_GAP: Final = 50
+THRESHOLD: Final = 0.05
+OFF: Final = 0
+UNKNOWN: Final = 1
+NONE: Final = 2
+CONTACT: Final = 3
+
+class ContactDetector:
+    def __init__(self, threshold_nm: float, period_s: float = 0.001) -> None: ...
+    @property
+    def residual_nm(self) -> float: ...
+    @property
+    def told(self) -> int: ...
+    def step(self, outside_nm: float, motor_position_rad: float) -> int: ...
+    def run(self, outside_nm: FloatArray, motor_position_rad: FloatArray) -> tuple[FloatArray, CodeArray]: ...
+
+def link_loads(
+    joint: Joint,
+    settings: EstimatorSettings,
+    dt_s: FloatArray,
+    current_a: FloatArray,
+    motor_position_rad: FloatArray,
+    motor_velocity_rad_s: FloatArray,
+    link_position_rad: FloatArray,
+) -> tuple[FloatArray, FloatArray]: ...
