@@ -302,7 +302,9 @@ def test_contacts_need_a_torsion(tmp_path: Path) -> None:
     content = yaml.safe_load(config.read_text())
     content["joint_1"]["file"] = str(path)
     config.write_text(yaml.safe_dump(content))
-    with pytest.raises(ConfigError, match=r"key 'fused.torsion': missing, expected because of section contact"):
+    with pytest.raises(
+        ConfigError, match=r"key 'fused.torsion': missing, expected because of section contact"
+    ):
         load_config(config)
 
 
