@@ -179,6 +179,8 @@ class Swap:
         yield from self._follow(position, [estimator for estimator, _ in new])
         for joint, (estimator, limits) in zip(joints, new, strict=True):
             joint.use(estimator, limits)
+        if self._cycle.contacts is not None:
+            self._cycle.contacts.restart()  # loads by other files step without a contact
         self._report(swapped=True, cycle=self._cycle.index, missed=self._cycle.grid.missed - self._missed)
 
     def _read(self, source: io.RawIOBase | io.BytesIO, order: Order, content: memoryview) -> Iterator[str]:
