@@ -232,8 +232,10 @@ def _below(profile: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _has(mapping: Any, key: str) -> bool:
-    """Whether a dotted key is there; the last part may be in decimals of an object's name."""
+    """Whether a dotted key is there, or nothing is needed there (`link_position: false`)."""
     for name in key.split("."):
+        if mapping is False:
+            return True
         if not isinstance(mapping, Mapping) or name not in mapping:
             return False
         mapping = mapping[name]

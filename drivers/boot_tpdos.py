@@ -16,9 +16,9 @@ from typing import NamedTuple
 
 from jtqd.drivers.boot_error import BootError
 from jtqd.drivers.devices import EVENT_DRIVEN, EVENT_MS, TEMPERATURE, DriveProfile, Profile
-from jtqd.drivers.layout import BY_ITSELF, LayoutError, chosen, pdo_of_words
+from jtqd.drivers.layout import BY_ITSELF, EVERY_SYNC, LayoutError, chosen, pdo_of_words
 from jtqd.drivers.pdo import CAN_ID, EXTENDED, INVALID, NO_RTR, PdoError, PdoMap
-from jtqd.drivers.sdo import label
+from jtqd.drivers.sdo import Key, label
 from jtqd.drivers.sdo_client import NodeObjects
 
 _TPDO_COUNT = 4
@@ -31,14 +31,14 @@ _INHIBIT_TIME, _EVENT_TIMER = 3, 5
 """Sub-indices of a PDO's communication parameter."""
 _MOST_ENTRIES = 8
 """Whole objects in a frame."""
-EVERY_SYNC = 1
 
 
-class _Before(NamedTuple):
-    """What a TPDO had before its first write."""
+class _Change(NamedTuple):
+    """One write, and what the object had before it."""
 
-    cob_id: int
-    entries: int
+    key: Key
+    before: int
+    size: int
 
 
 class TpdoSetup:
@@ -52,7 +52,11 @@ class TpdoSetup:
 
     def __init__(self, objects: NodeObjects, profile: Profile, notes: list[str]) -> None:
         self._objects, self._profile, self._notes = objects, profile, notes
-        self._before: dict[int, _Before] = {}
+        self._cob_ids: dict[int, int] = {}
+        """Of TPDOs that are to be mapped anew, before it."""
+        self._changes: list[_Change] = []
+        self._now: dict[Key, int] = {}
+        """What was written last."""
 
     def run(self) -> tuple[PdoMap, ...]:
         """Set up the TPDOs and return those that are used."""
@@ -78,7 +82,7 @@ class TpdoSetup:
         mapping = communication + _MAPPING
         cob_id = objects.number((communication, 1), 4)
         count = objects.number((mapping, 0), 1)
-        self._before[pdo.number] = _Before(cob_id, count)
+        self._cob_ids[pdo.number] = cob_id
         return (
             cob_id & ~NO_RTR == pdo.cob_id
             and count == len(pdo.words)
@@ -96,18 +100,18 @@ class TpdoSetup:
         """Map a TPDO anew."""
         objects, communication = self._objects, 0x1800 + pdo.number - 1
         mapping = communication + _MAPPING
-        cob_id = self._before[pdo.number].cob_id
-        objects.write((communication, 1), cob_id | INVALID, 4)
-        objects.write((mapping, 0), 0, 1)
+        cob_id = self._cob_ids[pdo.number]
+        self._change((communication, 1), cob_id | INVALID, 4)
+        self._change((mapping, 0), 0, 1)
         for entry, word in enumerate(pdo.words, 1):
-            objects.write((mapping, entry), word, 4)
-        objects.write((mapping, 0), len(pdo.words), 1)
-        objects.write((communication, 2), pdo.transmission_type, 1)
+            self._change((mapping, entry), word, 4)
+        self._change((mapping, 0), len(pdo.words), 1)
+        self._change((communication, 2), pdo.transmission_type, 1)
         if _is_temperature(pdo):
             self._set_timers(communication)
         # the device's own RTR bit is kept: some accept one value only
         valid = cob_id & NO_RTR | pdo.cob_id
-        objects.write((communication, 1), valid, 4)
+        self._change((communication, 1), valid, 4)
         # read back at the end and not after each write: a later write may undo an earlier one
         for entry in range(len(pdo.words) + 1, _MOST_ENTRIES + 1):
             objects.values.pop((mapping, entry), None)  # of the mapping before, and none of this one
@@ -119,15 +123,30 @@ class TpdoSetup:
 
     def _set_timers(self, communication: int) -> None:
         """Set event timer, and inhibit time where the node has one: a value that flickers must not fill the bus."""
-        if self._objects.read((communication, _INHIBIT_TIME)) is not None:
-            self._objects.put((communication, _INHIBIT_TIME), 10 * EVENT_MS, 2, "inhibit time in 100 us")
-        self._objects.put((communication, _EVENT_TIMER), EVENT_MS, 2, "event timer in ms")
+        inhibit, timer = (communication, _INHIBIT_TIME), (communication, _EVENT_TIMER)
+        if self._objects.read(inhibit) is not None:
+            self._change(inhibit, 10 * EVENT_MS, 2)
+            self._objects.require(inhibit, 10 * EVENT_MS, 2, "inhibit time in 100 us")
+        self._change(timer, EVENT_MS, 2)
+        self._objects.require(timer, EVENT_MS, 2, "event timer in ms")
+
+    def _change(self, key: Key, value: int, size: int) -> None:
+        """Write a number, and remember what was there before it."""
+        before = self._now.get(key, self._objects.values.get(key))
+        if before is None:
+            raw = self._objects.read(key)
+            before = None if raw is None else int.from_bytes(raw[:size], "little")
+        self._objects.write(key, value, size)
+        self._now[key] = value
+        if before is not None:
+            self._changes.append(_Change(key, before, size))
 
     def _switch_off(self, number: int) -> None:
         key = (0x1800 + number - 1, 1)
         cob_id = self._objects.optional_number(key, 4)
         if cob_id is not None and not cob_id & INVALID:
-            self._objects.put(key, cob_id | INVALID, 4, "COB-ID")
+            self._change(key, cob_id | INVALID, 4)
+            self._objects.require(key, cob_id | INVALID, 4, "COB-ID")
 
     # As found -------------------------------------------------------------------------------------------------------
 
@@ -151,12 +170,15 @@ class TpdoSetup:
         return used
 
     def _put_back(self) -> None:
-        """Undo what the attempt has changed; what the drive does not take back will show when its TPDOs are read."""
-        for number, before in self._before.items():
-            communication = 0x1800 + number - 1
+        """Undo what the attempt has written, the last first: that is the order of CiA 301 again.
+
+        What the drive does not take back will show when its TPDOs are read.
+        """
+        for change in reversed(self._changes):
             with suppress(BootError):
-                if self._objects.number((communication + _MAPPING, 0), 1) != before.entries:
-                    self._objects.write((communication + _MAPPING, 0), before.entries, 1)
+                self._objects.write(change.key, change.before, change.size)
+        self._changes.clear()
+        self._now.clear()
 
     def _found(self) -> tuple[list[PdoMap], list[str]]:
         """Read all TPDOs that there are; return those that can be used, and why others cannot."""

@@ -26,6 +26,8 @@ from jtqd.drivers.sdo import label
 
 TPDO_BASES = (0x180, 0x280, 0x380, 0x480)
 """COB-IDs of a node's TPDOs 1 to 4 in the predefined connection set (CiA 301, 7.3.5), without the node-ID."""
+EVERY_SYNC = 1
+"""Transmission type of a TPDO that is sent at each SYNC."""
 BY_ITSELF = (0, 254, 255)
 """Transmission types of a TPDO whose frames belong to no SYNC: sent on a change, at the next SYNC (0) or at once."""
 

@@ -43,7 +43,7 @@ _FLOAT_LETTERS = {REAL32: "f", REAL64: "d"}
 _SIGNED = frozenset({0x02, 0x03, 0x04, 0x15})
 _FIRST_REAL_INDEX = 0x1000  # below: dummy entries of [DummyUsage], which are types and not objects
 
-ReadHook = Callable[[], "bytes | int"]
+ReadHook = Callable[[], "bytes | float"]
 WriteHook = Callable[[bytes], None]
 
 

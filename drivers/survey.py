@@ -1,7 +1,7 @@
 """What a device tells of itself, read by SDO or from its EDS: identity, scaling, the objects that jtqd maps.
 
 Reading changes nothing in a device and starts nothing. Objects: CiA 301 (1000h, 1008h to 100Ah, 1018h), CiA 402-2
-(6075h, 6076h, 608Fh, 6090h, 6091h, 60E6h, 60EBh and what the TPDOs carry), CiA 404 (6131h, 6132h, 9130h, 6150h).
+(6075h, 6076h, 6077h, 608Fh, 6090h, 6091h, 60E6h, 60EBh and what the TPDOs carry), CiA 404 (6131h, 6132h, 9130h, 6150h).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ TEXTS: Mapping[str, Key] = {"name": (0x1008, 0), "hardware": (0x1009, 0), "softw
 IDENTITY: Mapping[str, Key] = {
     name: (0x1018, sub) for sub, name in enumerate(("vendor", "product", "revision", "serial"), 1)
 }
-RATED_CURRENT, RATED_TORQUE = (0x6075, 0), (0x6076, 0)
+RATED_CURRENT, RATED_TORQUE, TORQUE = (0x6075, 0), (0x6076, 0), (0x6077, 0)
 GEAR: tuple[Key, Key] = ((0x6091, 1), (0x6091, 2))
 """Motor shaft revolutions per driving shaft revolutions."""
 MAPPED: Mapping[int, tuple[Key, ...]] = {
@@ -45,7 +45,7 @@ MAPPED: Mapping[int, tuple[Key, ...]] = {
 }
 """Objects that jtqd maps into TPDOs, by profile; of a sensor the first channel."""
 _READ: Mapping[int, tuple[Key, ...]] = {
-    DRIVE: (*DRIVE_SCALING_OBJECTS, RATED_TORQUE, *MAPPED[DRIVE]),
+    DRIVE: (*DRIVE_SCALING_OBJECTS, RATED_TORQUE, TORQUE, *MAPPED[DRIVE]),
     SENSOR: (
         *((index, channel) for index in (UNIT_OBJECT, DECIMALS_OBJECT) for channel in (1,)),
         *MAPPED[SENSOR],

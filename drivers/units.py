@@ -10,6 +10,10 @@
 | current | 6075h | 6075h / 10^6 (1/1000 of the rated current in mA) |
 | current | 6076h | 6076h / 10^6 / torque constant (1/1000 of the rated torque in mNm: 6077h) |
 
+Unit codes: CiA DR-303-2, tables 4.1, 4.2 and 4.4 (not at hand themselves; github.com/heig-vd-iai/canopen-stack,
+generator/validation/helpers.py, has them): radian 10h, degree 41h, second 03h, minute 47h. The revolution B4h is that of
+60A9h in the manuals of Synapticon and Nanotec (B4h 47h is rpm).
+
 6092h, 60A8h and 60A9h count at the driving shaft, behind the gear of 6091h (CiA 402-2): the motor's quantities are
 6091h:1 / 6091h:2 times as large, unless the drive counts at the motor's shaft. Pure.
 """
@@ -36,7 +40,7 @@ OTHER_SCALING_OBJECTS: dict[Key, tuple[str, int]] = {
 """Objects that scale a drive's numbers where the configuration says so, with the largest value that makes sense."""
 
 _ANGLES = {0x10: 1.0, 0x41: math.pi / 180.0, 0xB4: TURN}
-"""Codes of CiA 303-2: radian, degree, revolution."""
+"""Radian, degree, revolution."""
 _TIMES = {0x03: 1.0, 0x47: 60.0}
 """Second, minute."""
 _ANGLE_TEXT = "0xXX100000 (rad), 0xXX410000 (degree) or 0xXXB40000 (revolution)"

@@ -14,7 +14,7 @@ from jtqd.estimator.observer cimport (
     ObserverState,
 )
 from jtqd.estimator.perceptron cimport PerceptronLaw
-from jtqd.estimator.sample cimport Estimator, Sample, Values
+from jtqd.estimator.sample cimport Estimator, Learned, Sample, Values
 from jtqd.estimator.validity cimport FusedTrustLaw, TrustLaw, UncertaintyLaw
 from jtqd.estimator.zeros cimport ZerosLaw, ZerosState
 
@@ -70,6 +70,7 @@ cdef class FusedEstimator(Estimator):
     cdef void learn_zeros(
         self, const FusedObserved *seen, const Sample *x, const Fused *physics, double loss, int status
     ) noexcept nogil
+    cdef bint left_behind(self) noexcept nogil
     cdef bint foreign(self, const Fused *physics, double dt) noexcept nogil
     cdef void estimate(self, const FusedObserved *seen, const Sample *x, bint network_wanted, Values *out) noexcept nogil
 

@@ -3,11 +3,11 @@ from typing import Final, Self
 from jtqd.estimator.arrays import FloatArray, QuadrantArray
 from jtqd.estimator.corrections import ExtendedInputs
 from jtqd.estimator.joint import Joint, Torsion
+from jtqd.estimator.learned import Zeros
 from jtqd.estimator.network import FusedNetworkModel, NetworkModel
 from jtqd.estimator.run import EstimateRun, ObservedRun
 from jtqd.estimator.sample import Estimator
 from jtqd.estimator.settings import EstimatorSettings
-from jtqd.estimator.zeros import Zeros
 
 STANDSTILL_SIGMAS: Final = 3.0
 LOWERED_S: Final = 0.1
@@ -35,6 +35,8 @@ class FusedEstimator(Estimator):
     ) -> Self: ...
     @property
     def zeros(self) -> Zeros | None: ...
+    past: bytes | memoryview
+    def shares_past(self, other: FusedEstimator) -> bool: ...
     def run_observed(self, seen: ObservedRun) -> EstimateRun: ...
 
 class ExtendedEstimator(Estimator):
@@ -49,6 +51,8 @@ class ExtendedEstimator(Estimator):
     ) -> None: ...
     @property
     def inner(self) -> Estimator: ...
+    @property
+    def zeros(self) -> Zeros | None: ...
     @property
     def inputs(self) -> ExtendedInputs: ...
 

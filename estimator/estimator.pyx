@@ -11,11 +11,13 @@ loss went through the same filter; how old the result is says `age`.
 """
 
 from libc.math cimport NAN, fabs, fmin, sqrt
+from libc.string cimport memcmp
 
 from jtqd.estimator.block cimport copied, put_back
 from jtqd.estimator.contact cimport LinkSeen, fill_link, follow_link, restart_link
 from jtqd.estimator.fusion cimport Fused, fill_fusion, fuse_paths, keep, share_by_speed, widening
 from jtqd.estimator.losses cimport (
+    AdditiveLaw,
     AdditiveLossModel,
     Loss,
     LossModel,
@@ -25,6 +27,7 @@ from jtqd.estimator.losses cimport (
 )
 from jtqd.estimator.observer cimport (
     FusedObserved,
+    FusedObserverLaw,
     Observed,
     fill_fused_observer,
     fill_guard,
@@ -34,7 +37,7 @@ from jtqd.estimator.observer cimport (
     restart_guard,
 )
 from jtqd.estimator.perceptron cimport Perceptron, evaluate
-from jtqd.estimator.sample cimport Estimator, Sample, Values, no_values
+from jtqd.estimator.sample cimport Estimator, Learned, Sample, Values, no_values
 from jtqd.estimator.validity cimport (
     Spread,
     fill_fused_trust,
@@ -52,6 +55,7 @@ from jtqd.estimator.zeros cimport (
     gather,
     local_stiffness,
     restart_zeros,
+    tell_zeros,
     update_zeros,
     zeros_of,
 )
@@ -68,6 +72,7 @@ from jtqd.estimator.network import FEATURES, FUSED_FEATURES, checked_fused, chec
 from jtqd.estimator.run import EstimateRun, ObservedRun
 from jtqd.estimator.sample import columns
 from jtqd.estimator.validity import FADE_START
+from jtqd.estimator.learned import APART, LEFT
 from jtqd.estimator.zeros import MOVING_RAD_S, ONE_WAY
 
 STANDSTILL_SIGMAS: Final = 3.0
@@ -83,6 +88,7 @@ cdef double STANDSTILL_WIDTH = STANDSTILL_SIGMAS, FOREIGN = FOREIGN_SIGMAS, LOWE
 cdef double MOVING = MOVING_RAD_S, ONE_SIDED = ONE_WAY
 cdef int STARTING = st.STARTING, VALID = st.VALID, DEGRADED = st.DEGRADED, STANDSTILL = st.STANDSTILL
 cdef int INVALID = st.INVALID
+cdef int IS_LEFT = LEFT, IS_APART = APART
 
 
 cdef fill_network(NetworkLaw *law, network, joint):
@@ -310,6 +316,40 @@ cdef class FusedEstimator(Estimator):
         """What is known of the joint's zeros (`Zeros`); None where they are not tracked."""
         return zeros_of(&self.law.zeros, &self.state.zeros) if self.law.zeros.used else None
 
+    cdef const void *learned(self, Learned *out, size_t *size) noexcept nogil:
+        """As `Estimator.learned`; whether the two views disagree is told in any case."""
+        tell_zeros(&self.law.zeros, &self.state.zeros, out)
+        if self.state.lowered_s > 0.0:
+            out.flags |= IS_APART
+        if self.left_behind():
+            out.flags |= IS_LEFT
+        size[0] = sizeof(FusedState)
+        return &self.state
+
+    @property
+    def past(self):
+        """All that it knows of the samples so far, bytes of layout `learned.PAST_LAYOUT`; `past = other.past` goes on there.
+
+        Raises ValueError for bytes of another length.
+        """
+        return copied(&self.state, sizeof(FusedState))
+
+    @past.setter
+    def past(self, content):
+        put_back(&self.state, sizeof(FusedState), content)
+
+    def shares_past(self, FusedEstimator other):
+        """Return whether the past of `other` means the same here: nothing differs that the zeros were learned with.
+
+        That is the observer with its torsion, the losses, and the torque per ampere. Limits, sigmas and networks may differ.
+        """
+        return (
+            self.law.zeros.used == other.law.zeros.used
+            and self.law.zeros.torque_per_ampere == other.law.zeros.torque_per_ampere
+            and memcmp(&self.law.observer, &other.law.observer, sizeof(FusedObserverLaw)) == 0
+            and memcmp(&self.law.loss, &other.law.loss, sizeof(AdditiveLaw)) == 0
+        )
+
     def blocks(self):
         """Return (parameters, state): one block each, of which `of_blocks` makes an estimator that goes on as this one would.
 
@@ -387,10 +427,12 @@ cdef class FusedEstimator(Estimator):
             s.lowered_s -= dt
         if s.lowered_s > 0.0:
             return True
-        return self.law.zeros.used and (
-            s.zeros.left_nm * s.zeros.left_nm > FOREIGN * FOREIGN * self.law.fusion.torsion
-            or beyond(&self.law.zeros, &s.zeros)
-        )
+        return self.left_behind() or (self.law.zeros.used and beyond(&self.law.zeros, &s.zeros))
+
+    cdef bint left_behind(self) noexcept nogil:
+        """Return whether more of a known zero is not yet taken off than the torsion's own sigma can hide."""
+        cdef double left = self.state.zeros.left_nm
+        return self.law.zeros.used and left * left > FOREIGN * FOREIGN * self.law.fusion.torsion
 
     cdef void estimate(self, const FusedObserved *seen, const Sample *x, bint network_wanted, Values *out) noexcept nogil:
         """Set `out`, whose status is the guard's, to the estimate of an observed sample."""
@@ -561,6 +603,15 @@ cdef class ExtendedEstimator(Estimator):
     def with_network(self):
         """Whether a network is used."""
         return self.inner.with_network
+
+    @property
+    def zeros(self):
+        """As `FusedEstimator.zeros`; None with the paper's methods."""
+        return getattr(self.inner, "zeros", None)
+
+    cdef const void *learned(self, Learned *out, size_t *size) noexcept nogil:
+        """As that of the inner estimator: the corrections forget within a second, and are not told."""
+        return self.inner.learned(out, size)
 
     def reset(self):
         """Forget the past: the next step starts."""

@@ -45,6 +45,11 @@ class JointColumns:
             if column is not None:
                 object.__setattr__(self, item.name, _read_only(column, item.name))
 
+    @property
+    def two_encoders(self) -> bool:
+        """Whether both sides of the gear were measured: a torsion made of one encoder is zero, and no torsion."""
+        return self.motor_position_rad is not None and self.link_position_rad is not None
+
     def derived(self, time_s: FloatArray, gear_ratio: float) -> JointColumns:
         """Return a copy in which missing positions and velocities are derived from what is there.
 

@@ -1,5 +1,7 @@
 """One sample of a joint, what an estimator makes of it, and the class that all estimators share."""
 
+from libc.stdint cimport uint64_t
+
 cdef enum:
     MOST_FEATURES = 8
 
@@ -13,6 +15,10 @@ cdef struct Values:  # `jtqd.estimator.status.Estimate` as a block; NaN where no
     double torque_rate_nm_s, load_nm  # `contact`: load of the sample before
     int status
 
+cdef struct Learned:  # `jtqd.estimator.zeros.Zeros` as a block
+    double link_rad, link_sigma_rad, link_used_rad, current_a, current_sigma_a, current_used_a, limit_rad
+    uint64_t flags, jumps
+
 cdef void no_values(Values *out, int status) noexcept nogil
 
 cdef class Estimator:
@@ -23,3 +29,4 @@ cdef class Estimator:
     cdef object run_one  # of a network that is not evaluated natively
     cdef void advance(self, const Sample *sample, bint network_wanted, Values *out) noexcept nogil
     cdef double ask(self) noexcept with gil
+    cdef const void *learned(self, Learned *out, size_t *size) noexcept nogil

@@ -1,6 +1,7 @@
 """One sample of a joint, what an estimator makes of it, and the class that all estimators share."""
 
 from libc.math cimport NAN
+from libc.string cimport memset
 
 import numpy as np
 
@@ -35,6 +36,15 @@ cdef class Estimator:
             return self.run_one(*[self.features[n] for n in range(self.width)])
         except Exception:
             return NAN
+
+    cdef const void *learned(self, Learned *out, size_t *size) noexcept nogil:
+        """Set `out` to what is known of the zeros; return the estimator's whole state and its `size`.
+
+        An estimator that learns nothing: no flag is set, and NULL is returned.
+        """
+        memset(out, 0, sizeof(Learned))
+        size[0] = 0
+        return NULL
 
     @property
     def with_network(self):

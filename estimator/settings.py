@@ -28,7 +28,8 @@ class EstimatorSettings:
     sigma_floor, torque_limit: parts of the rated torque (largest trusted difference between network and
     physics, sigma that nothing undercuts, largest believable torque); friction_uncertainty: standard
     deviation of friction as a part of it; load_uncertainty: of the classical observer, which knows no
-    efficiency, as a part of the load; track_zeros: of link encoder and current, method fused (`zeros`).
+    efficiency, as a part of the load; track_zeros: of link encoder and current, method fused (`zeros`); without the
+    key as before there was one.
     """
 
     method: Annotated[str, choice(METHODS)] = "network"
@@ -68,8 +69,9 @@ class EstimatorSettings:
 
 def recommended(method: str) -> EstimatorSettings:
     """Return the settings of a new configuration with this method. Raises ConfigError for an unknown one."""
-    own = TORSION_BANDWIDTH_RAD_S if method == "fused" else None
-    return EstimatorSettings(method=method, torsion_bandwidth_rad_s=own)
+    if method != "fused":
+        return EstimatorSettings(method=method)
+    return EstimatorSettings(method=method, torsion_bandwidth_rad_s=TORSION_BANDWIDTH_RAD_S, track_zeros=True)
 
 
 @dataclass(frozen=True, slots=True)

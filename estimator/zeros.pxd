@@ -1,6 +1,9 @@
 """Zeros of the link encoder and of the current as slow states; the equations stand in zeros.pyx."""
 
+from libc.stdint cimport uint64_t
+
 from jtqd.estimator.observer cimport FusedObserverLaw
+from jtqd.estimator.sample cimport Learned
 
 cdef enum:
     ZERO_STATES = 5  # link zero [rad], current zero [A], friction [Nm], viscous [Nms/rad], gain
@@ -10,6 +13,8 @@ cdef struct ZerosLaw:
     double prior[ZERO_STATES]  # variances
     double drift[ZERO_STATES]  # variance per second
     double stiffness, torque_per_ampere, limit
+    double floor  # variance of the link zero [rad^2] that the joint file's own sigma covers
+    double known  # variance of the link zero [rad^2] below which it counts as learned
 
 cdef struct Gathered:  # sums over the samples of a block
     double dt, y, direction, velocity, torsion, variance
@@ -21,6 +26,7 @@ cdef struct ZerosState:
     double link_rad, current_a  # what is taken off the readings
     double left_nm  # what is known of the link zero and not yet taken off, as torque
     double apart_s  # for how long the views are farther apart than can be
+    uint64_t jumps  # how often a zero that was known became unknown again
     Gathered block
 
 cdef int fill_zeros(ZerosLaw *law, joint, sigma, torsion, bint used) except -1
@@ -32,4 +38,5 @@ cdef bint gather(
 cdef double local_stiffness(const FusedObserverLaw *law, double deflection) noexcept nogil
 cdef void update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, double slope) noexcept nogil
 cdef bint beyond(const ZerosLaw *law, const ZerosState *s) noexcept nogil
+cdef void tell_zeros(const ZerosLaw *law, const ZerosState *s, Learned *out) noexcept nogil
 cdef zeros_of(const ZerosLaw *law, const ZerosState *s)

@@ -1,4 +1,4 @@
-from typing import Final, NamedTuple
+from typing import Final
 
 MOVING_RAD_S: Final = 0.05
 ONE_WAY: Final = 0.9
@@ -6,6 +6,7 @@ BLOCK: Final = 16
 CORRELATION_S: Final = 0.3
 DOUBT: Final = 2.0
 SURE: Final = 4.0
+COVERED: Final = 0.5
 SLEW_S: Final = 0.25
 LARGEST_LINK: Final = 0.3
 CURRENT_SHARE: Final = 0.2
@@ -13,12 +14,4 @@ LEAST_GAIN: Final = 0.01
 DRIFT_S: Final = 600.0
 JUMP: Final = 4.0
 JUMP_S: Final = 0.3
-
-class Zeros(NamedTuple):
-    link_rad: float
-    link_sigma_rad: float
-    link_used_rad: float
-    current_a: float
-    current_sigma_a: float
-    current_used_a: float
-    plausible: bool
+KNOWN_SHARE: Final = 0.5

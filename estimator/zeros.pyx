@@ -19,15 +19,17 @@ Samples count in motion only, with the friction on one side: |v| > MOVING_RAD_S,
 blocks of BLOCK samples, and a block counts as its length/CORRELATION_S of an independent sample of variance s_c^2 + s_t^2:
 ripple and errors of the encoders are not white.
 
-What is taken off the readings is x w(|x|/sigma_x): nothing below DOUBT standard deviations, all of it above SURE, linear
-between (firm shrinkage, Gao and Bruce 1997): on a day without a zero worth it nothing is changed. It follows with SLEW_S:
+What is taken off the readings is x w(|x|/sigma_x): nothing below DOUBT standard deviations (of the link zero: and of COVERED
+of the torsion's sigma), all of it above SURE, linear between (firm shrinkage, Gao and Bruce 1997): on a day without a zero worth it nothing is changed. It follows with SLEW_S:
 the estimate must not jump.
 """
 
 from libc.math cimport fabs, fmax, sqrt
 from libc.string cimport memset
 
-from typing import Final, NamedTuple
+from typing import Final
+
+from jtqd.estimator.learned import BEYOND, LEARNED, TRACKED, Zeros
 
 MOVING_RAD_S: Final = 0.05
 ONE_WAY: Final = 0.9
@@ -37,6 +39,9 @@ CORRELATION_S: Final = 0.3
 """So long the difference of the views keeps its error; chosen, with the rest, on runs that no figure is reported on."""
 DOUBT: Final = 2.0
 SURE: Final = 4.0
+COVERED: Final = 0.5
+"""Part of the torsion's sigma in the joint file that counts as doubt of a link zero, however long it is seen: the paths have
+errors of model, not of noise, and what the file's sigma covers need not be taken off."""
 SLEW_S: Final = 0.25
 LARGEST_LINK: Final = 0.3
 """Prior standard deviation of the link zero as a torque, part of the rated one."""
@@ -49,27 +54,15 @@ DRIFT_S: Final = 600.0
 JUMP: Final = 4.0
 JUMP_S: Final = 0.3
 """Views that are apart by more than JUMP standard deviations for so long: the encoder has slipped, its zero is unknown again."""
+KNOWN_SHARE: Final = 0.5
+"""Part of the variance of the day's friction below which the variance of the link zero counts as learned: what one
+direction of motion alone never reaches."""
 
 cdef int SAMPLES = BLOCK
 cdef double CORRELATION = CORRELATION_S, INVERSE_SLEW = 1.0 / SLEW_S
 cdef double JUMP_SIGMAS = JUMP, LONGEST_S = JUMP_S
+cdef int IS_TRACKED = TRACKED, IS_LEARNED = LEARNED, IS_BEYOND = BEYOND
 cdef double LOW = DOUBT, HIGH = SURE, INVERSE_RANGE = 1.0 / (SURE - DOUBT)
-
-
-class Zeros(NamedTuple):
-    """What is known of the zeros of a joint, and its standard deviations; 0 and the prior width where nothing is.
-
-    link_rad, current_a: what the readings are off by; link_used_rad, current_used_a: what is taken off them; plausible:
-    whether the link's zero is within the joint file's limit.
-    """
-
-    link_rad: float
-    link_sigma_rad: float
-    link_used_rad: float
-    current_a: float
-    current_sigma_a: float
-    current_used_a: float
-    plausible: bool
 
 
 cdef int fill_zeros(ZerosLaw *law, joint, sigma, torsion, bint used) except -1:
@@ -81,6 +74,8 @@ cdef int fill_zeros(ZerosLaw *law, joint, sigma, torsion, bint used) except -1:
     law.stiffness = torsion.stiffness_nm_per_rad
     law.torque_per_ampere = joint.gear_ratio * joint.torque_constant_nm_per_a
     law.limit = torsion.zero_limit_rad
+    law.floor = (COVERED * sigma.torsion_nm / law.stiffness) ** 2
+    law.known = KNOWN_SHARE * (sigma.current_nm / law.stiffness) ** 2
     law.prior[0] = (LARGEST_LINK * joint.rated_torque_nm / law.stiffness) ** 2
     law.prior[1] = (CURRENT_SHARE * sigma.current_nm / law.torque_per_ampere) ** 2
     law.prior[2] = sigma.current_nm**2
@@ -148,7 +143,7 @@ cdef void update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, dou
     cdef Gathered b = s.block
     cdef double h[ZERO_STATES]
     cdef double ph[ZERO_STATES]
-    cdef double share = 1.0 / SAMPLES, innovation, variance, gain, way, left
+    cdef double share = 1.0 / SAMPLES, innovation, variance, gain, way, left, before = s.apart_s
     cdef int m, n
     memset(&s.block, 0, sizeof(Gathered))
     h[0], h[1] = -stiffness, -law.torque_per_ampere * (1.0 - slope)
@@ -161,6 +156,8 @@ cdef void update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, dou
         innovation -= h[n] * s.x[n]
     s.apart_s = s.apart_s + b.dt if fabs(innovation) > JUMP_SIGMAS * sqrt(b.variance * share) else 0.0
     if s.apart_s > LONGEST_S:
+        if before <= LONGEST_S and s.p[0][0] < law.known:
+            s.jumps += 1
         for n in range(ZERO_STATES):
             s.p[0][n] = s.p[n][0] = 0.0
         s.p[0][0] = law.prior[0]
@@ -178,11 +175,11 @@ cdef void update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, dou
     way = b.dt * INVERSE_SLEW
     if way > 1.0:
         way = 1.0
-    s.link_rad += way * (_used(s.x[0], s.p[0][0]) - s.link_rad)
+    s.link_rad += way * (_used(s.x[0], s.p[0][0] + law.floor) - s.link_rad)
     s.current_a += way * (_used(s.x[1], s.p[1][1]) - s.current_a)
     # beyond what is doubt about the zero: of a joint without one nothing is left, on average
     left = s.x[0] - s.link_rad
-    s.left_nm = law.stiffness * sqrt(fmax(0.0, left * left - s.p[0][0]))
+    s.left_nm = law.stiffness * sqrt(fmax(0.0, left * left - s.p[0][0] - law.floor))
 
 
 cdef bint beyond(const ZerosLaw *law, const ZerosState *s) noexcept nogil:
@@ -190,13 +187,31 @@ cdef bint beyond(const ZerosLaw *law, const ZerosState *s) noexcept nogil:
     return fabs(s.x[0]) > law.limit and fabs(s.x[0]) > HIGH * sqrt(s.p[0][0])
 
 
+cdef void tell_zeros(const ZerosLaw *law, const ZerosState *s, Learned *out) noexcept nogil:
+    """Set `out` to what is known of the zeros; no flag where they are not tracked."""
+    memset(out, 0, sizeof(Learned))
+    if not law.used:
+        return
+    out.link_rad, out.link_sigma_rad, out.link_used_rad = s.x[0], sqrt(s.p[0][0]), s.link_rad
+    out.current_a, out.current_sigma_a, out.current_used_a = s.x[1], sqrt(s.p[1][1]), s.current_a
+    out.limit_rad, out.jumps, out.flags = law.limit, s.jumps, IS_TRACKED
+    if s.p[0][0] < law.known:
+        out.flags |= IS_LEARNED
+    if beyond(law, s):
+        out.flags |= IS_BEYOND
+
+
 cdef zeros_of(const ZerosLaw *law, const ZerosState *s):
+    cdef Learned told
+    tell_zeros(law, s, &told)
     return Zeros(
-        s.x[0],
-        sqrt(s.p[0][0]),
-        s.link_rad,
-        s.x[1],
-        sqrt(s.p[1][1]),
-        s.current_a,
-        not beyond(law, s),
+        told.link_rad,
+        told.link_sigma_rad,
+        told.link_used_rad,
+        told.current_a,
+        told.current_sigma_a,
+        told.current_used_a,
+        told.limit_rad,
+        told.flags,
+        told.jumps,
     )

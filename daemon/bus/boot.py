@@ -17,6 +17,7 @@ from jtqd.daemon.shared.log_lines import RateLimit
 from jtqd.daemon.shared.snapshot import NOT_OPERATIONAL, SnapshotReader, View
 from jtqd.drivers.bus_load import BusLoad, configured_load
 from jtqd.drivers.eds.own_objects import own_sheet
+from jtqd.drivers.emcy import COMMUNICATION
 from jtqd.drivers.layout import tpdos_as_json
 
 _EDS = Path(__file__).resolve().parents[2] / "drivers" / "eds"
@@ -136,6 +137,18 @@ class ReturningNodes:
         self._not_before: dict[int, float] = {}
         self._retry_s: dict[int, float] = {}
         self._limit = RateLimit(_SAY_AGAIN_S)
+        self._in_error: set[int] = set()
+
+    def told(self, node: int, register: int) -> None:
+        """Take the error register (1001h) of a node's EMCY.
+
+        A drive with an error of communication (a SYNC of somebody else, a master that it missed) may refuse to be started
+        until it has been reset.
+        """
+        if register & COMMUNICATION:
+            self._in_error.add(node)
+        else:
+            self._in_error.discard(node)
 
     def request(self, node: int, why: str) -> None:
         """Request a boot of this node; `why` goes into the line about it."""
@@ -191,8 +204,9 @@ class ReturningNodes:
     def _start(self, node: int, restarts: int) -> None:
         self.busy, self._restarts = node, restarts
         self._child = self._start_child("jtqd.drivers.boot", [], f"the boot of node {node}")
-        # A node that has just restarted needs no reset; one that could not be booted may.
-        reset = self._config.reset_communication and node in self._retry_s
+        # A node that has just restarted needs no reset; one that could not be booted, or tells an error of it, may.
+        reset = self._config.reset_communication and (node in self._retry_s or node in self._in_error)
+        self._in_error.discard(node)
         self._child.tell(boot_request(self._config, self._bus, only=node, reset=reset))
         self._child.end_of_input()
 

@@ -375,8 +375,13 @@ class NodeCare:
         self._checks[node] = ConfigurationWatch(report)
 
     def restarted(self, node: int) -> None:
-        """Take a boot-up message: there is no configuration to check."""
+        """Take a boot-up message: there is no configuration to check, and no error of before it."""
         self._checks.pop(node, None)
+        self._returning.told(node, 0)
+
+    def told(self, node: int, register: int) -> None:
+        """Take the error register of a node's EMCY."""
+        self._returning.told(node, register)
 
     def turn(self, view: View, now_s: float) -> list[tuple[int, bytes]]:
         """Return the SDO request that is due, as (node, request)."""

@@ -15,10 +15,19 @@ from jtqd.daemon.config import Config
 from jtqd.daemon.core import contact_pdo
 from jtqd.daemon.core.estimate_pdo import field
 from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
-from jtqd.daemon.shared.snapshot import SnapshotReader
+from jtqd.daemon.shared.snapshot import NO_ZEROS, SnapshotReader
 from jtqd.drivers.boot_procedure import signature
 from jtqd.drivers.devices import contact_tpdos
-from jtqd.drivers.eds.own_objects import BUS_FIELDS, COUNTERS, JOINT_PARAMETERS, PARAMETERS, VERSION, room_for
+from jtqd.drivers.eds.own_objects import (
+    BUS_FIELDS,
+    COUNTERS,
+    JOINT_PARAMETERS,
+    PARAMETERS,
+    VERSION,
+    ZERO_FIELDS,
+    ZEROS,
+    room_for,
+)
 from jtqd.drivers.object_dictionary import ObjectStore
 from jtqd.drivers.pdo import INVALID as PDO_INVALID
 from jtqd.drivers.pdo import NO_RTR
@@ -95,9 +104,20 @@ class OwnNode:
             store.on_read(0x2201, sub, partial(self._work_us, share))
         for sub in range(len(BUS_FIELDS)):
             store.on_read(0x2205, sub + 1, partial(self._bus, sub))
+        for number, index in enumerate(ZEROS[: self._room]):
+            for sub, name in enumerate(ZERO_FIELDS, start=1):
+                store.on_read(index, sub, partial(self._zero, number, name))
+            store.on_read(0x220E, number + 1, partial(self._zero, number, "flags"))
+            store.on_read(0x220F, number + 1, partial(self._zero, number, "jumps"))
         for sub, node in self._watched.items():
             store.on_read(0x2206, sub, partial(self._node, node))
             store.on_read(0x2207, sub, partial(self._emergency, node))
+
+    def _zero(self, joint: int, name: str) -> float:
+        """Return a value of `jtqd.estimator.learned.Zeros`."""
+        zeros = self._reader.read().zeros
+        value: float = getattr(zeros[joint] if joint < len(zeros) else NO_ZEROS, name)
+        return value
 
     def _field(self, joint: int, part: int) -> int:
         """Return torque (0), sigma (1) or status (2) of a joint as on the bus."""

@@ -309,6 +309,8 @@ class BusService:
         if line is not None:
             self._log("emcy", node, line)
         last, subject = self.emergencies.last(node), self._subjects.get(node)
+        if last is not None:
+            self.care.told(node, last.register)
         if last is not None and subject is not None:
             error = last.code != emcy.NO_ERROR or last.register != 0
             self._conditions.update("node_error", subject, error, now_s, describe(last))

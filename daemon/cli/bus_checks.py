@@ -131,6 +131,8 @@ def _input(pdo: PdoCount, traffic: Traffic, config: Config) -> CheckResult:
             (SKIP, "no SYNC on the bus") if not pdo.frames else (WARN, f"{pdo.frames} without any SYNC")
         )
         return CheckResult(pdo.name, level, seen)
+    if pdo.age_ns:
+        return _by_itself(pdo, traffic)
     rate = pdo.counted / traffic.cycles
     faults = [
         f"{kind} {count}"
@@ -156,6 +158,30 @@ def _input(pdo: PdoCount, traffic: Traffic, config: Config) -> CheckResult:
         )  # a few that are late are within the success rate; none may be lost
     level = FAIL if bad > 1 - SUCCESS_FAIL or pdo.wrong_length else WARN
     return CheckResult(pdo.name, level, text, _hint(pdo, config))
+
+
+def _by_itself(pdo: PdoCount, traffic: Traffic) -> CheckResult:
+    """Judge a PDO of transmission type 0, 254 or 255 by its age at SYNC: it belongs to no cycle."""
+    if not pdo.delays.count:
+        return CheckResult(pdo.name, FAIL, "none", "check that the node is on the bus and operational")
+    per_s = pdo.counted / max(traffic.cycles, 1) * traffic.sync_rate
+    limit = f"{pdo.age_ns / 1e6:g} ms"
+    text = f"{per_s:.4g} per s, sent by the drive itself; age at SYNC: {_quantiles(pdo.delays)}"
+    length = f"; wrong length {pdo.wrong_length}" * bool(pdo.wrong_length)
+    if not pdo.missing and not pdo.wrong_length:
+        return CheckResult(pdo.name, GOOD, f"{text}, at most {limit}")
+    share_of = pdo.missing / traffic.cycles
+    level = FAIL if share_of > 1 - SUCCESS_FAIL or pdo.wrong_length else WARN
+    hint = (
+        "joint_N.max_age_ms is below the longest time between two frames: its event timer (180xh:5) must be shorter, or "
+        "max_age_ms longer"
+    )
+    return CheckResult(
+        pdo.name,
+        level,
+        f"{text}, older than {limit} in {pdo.missing} of {traffic.cycles} cycles{length}",
+        hint,
+    )
 
 
 def _hint(pdo: PdoCount, config: Config) -> str:

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from jtqd.daemon.bus.boot import boot_request
 from jtqd.daemon.cli.bus_checks import (
@@ -23,7 +24,7 @@ from jtqd.daemon.cli.bus_checks import (
 from jtqd.daemon.cli.checks import FAIL, GOOD, CheckResult, report
 from jtqd.daemon.cli.reading import Daemon, find_daemons, on_bus
 from jtqd.daemon.cli.traffic import Traffic, drive, leave, listen, silent
-from jtqd.daemon.config import Config, load_config
+from jtqd.daemon.config import Config, as_booted, load_config
 from jtqd.daemon.loop import realtime
 from jtqd.daemon.loop.realtime import stolen_s
 from jtqd.daemon.shared.child_process import Child, ChildError
@@ -85,7 +86,7 @@ def main(argv: list[str]) -> int:
     try:
         daemon = None if arguments.bus == "sim" else on_bus(find_daemons(), arguments.bus)
         path = arguments.config or (Path(daemon.about.configuration) if daemon else None)
-        config = load_config(path)
+        config = _in_force(load_config(path), daemon)
         before_s, began_s = stolen_s(), time.monotonic()
         with _bus(arguments.bus, config, daemon) as bus:
             results = list(
@@ -106,6 +107,13 @@ def main(argv: list[str]) -> int:
         seconds=arguments.seconds,
         configuration=str(config.path),
     )
+
+
+def _in_force(config: Config, daemon: Daemon | None) -> Config:
+    """Return the configuration with the TPDOs that the drives of the running jtqd have, where it is that one's own."""
+    if daemon is None or daemon.about.configuration_sha256 != config.sha256:
+        return config
+    return as_booted(config, {node: {"tpdos": tpdos} for node, tpdos in daemon.about.tpdos.items()})
 
 
 def _progress(text: str) -> None:
@@ -148,11 +156,12 @@ def _drive(bus: str, config: Config, for_s: float, daemon: Daemon | None) -> Ite
     if not silent(socket, _QUIET_S):
         raise CheckError(f"another node sends SYNC on {bus}: without --drive-sync this check listens")
     _progress(f"booting the nodes on {bus}")
-    booted = _boot(bus, config)
+    booted, nodes = _boot(bus, config)
     yield booted
     if booted.level != GOOD:
         return
     refused = _become_real_time(config)
+    config = as_booted(config, nodes)
     traffic = Traffic(config)
     while socket.receive():
         pass  # frames of the boot
@@ -186,7 +195,8 @@ def _become_real_time(config: Config) -> list[str]:
     return refused
 
 
-def _boot(bus: str, config: Config) -> CheckResult:
+def _boot(bus: str, config: Config) -> tuple[CheckResult, dict[str, Any]]:
+    """Return how the boot went, and what it found, by node-ID."""
     child = Child("jtqd.drivers.boot", name="the boot")
     try:
         child.tell(boot_request(config, bus))
@@ -196,11 +206,16 @@ def _boot(bus: str, config: Config) -> CheckResult:
         child.end()
     if not answer["ok"]:
         hint = "identity, mapping or scaling of a node differs from the configuration, or the node is silent"
-        return CheckResult("boot", FAIL, str(answer["error"]["message"]), hint)
-    nodes = ", ".join(sorted(answer["nodes"]))
-    return CheckResult(
-        "boot", GOOD, f"nodes {nodes}: identity, mapping and scaling as configured, operational"
-    )
+        return CheckResult("boot", FAIL, str(answer["error"]["message"]), hint), {}
+    nodes: dict[str, Any] = answer["nodes"]
+    text = f"nodes {', '.join(sorted(nodes))}: identity, mapping and scaling as configured, operational"
+    own = [
+        f"node {node}: {note}"
+        for node, each in nodes.items()
+        for note in each.get("notes", [])
+        if "as it is" in note
+    ]
+    return CheckResult("boot", GOOD, "; ".join((text, *own))), nodes
 
 
 @contextmanager

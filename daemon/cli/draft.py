@@ -24,6 +24,7 @@ from jtqd.drivers.survey import (
     RATED_CURRENT,
     RATED_TORQUE,
     SENSOR,
+    TORQUE,
     Survey,
 )
 
@@ -55,6 +56,8 @@ class Wanted:
     rated_current_a: float | None = None
     encoder_counts: int | None = None
     link_encoder_counts: int | None = None
+    one_encoder: bool = False
+    """The joint has no link encoder, whatever the drive has objects for."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,14 @@ class Value:
 
 
 @dataclass(frozen=True)
+class Instead:
+    """What section `objects` says of a quantity, and why."""
+
+    text: str
+    why: str
+
+
+@dataclass(frozen=True)
 class JointDraft:
     """One joint: `values` by the keys of the joint file, objects of the drive that the configuration gives instead."""
 
@@ -86,6 +97,8 @@ class JointDraft:
     """Profile that the configuration names."""
     own: Mapping[str, Value] = field(default_factory=dict)
     """What the profile leaves to the drive and the operator: keys of the section, such as "objects.current.factor"."""
+    instead: Mapping[str, Instead] = field(default_factory=dict)
+    """Quantities that the drive does not have as CiA 402 or its profile has them."""
 
     @property
     def guesses(self) -> list[str]:
@@ -115,10 +128,36 @@ def plain(number: float) -> str:
 
 def mapped_by(family: Family | None) -> tuple[Key, ...]:
     """Return the objects that jtqd maps, with a profile or without."""
-    if family is None:
-        return MAPPED[DRIVE]
+    return MAPPED[DRIVE] if family is None else tuple(quantities_by(family).values())
+
+
+def quantities_by(family: Family | None) -> dict[str, Key]:
+    """Return the object of each quantity, with a profile or without."""
     standard = {each.name: getattr(CIA_402, each.name) for each in fields(CIA_402)}
-    return tuple(family.mapped(name, (each.index, each.subindex)) for name, each in standard.items())
+    keys = {name: (each.index, each.subindex) for name, each in standard.items()}
+    return keys if family is None else {name: family.mapped(name, key) for name, key in keys.items()}
+
+
+def _instead(survey: Survey | None, wanted: Wanted, family: Family | None) -> dict[str, Instead]:
+    """Return what a drive with fewer objects is told to jtqd as: one encoder, a derived velocity, torque for current."""
+    found: dict[str, Instead] = {}
+    if wanted.one_encoder:
+        found["link_position"] = Instead("false", "--one-encoder")
+    if survey is None:
+        return found
+
+    def lacks(key: Key) -> str:
+        if key in survey.missing:
+            return f"no {label(*key)}, by {survey.source}"
+        return f"{label(*key)} cannot be mapped, by {survey.source}" if key in survey.unmappable else ""
+
+    keys = quantities_by(family)
+    for name in ("link_position", "motor_velocity"):
+        if name not in found and (why := lacks(keys[name])):
+            found[name] = Instead("false", why)
+    if family is None and (why := lacks(keys["current"])) and TORQUE in survey.numbers:
+        found["current"] = Instead(f"{{index: 0x{TORQUE[0]:04X}}}", f"{why}: torque by 6076h")
+    return found
 
 
 def draft_joint(
@@ -126,10 +165,11 @@ def draft_joint(
 ) -> JointDraft:
     """Return what is known and guessed of a joint; `family`: profile of the drive. Raises DraftError."""
     given: dict[Key, Value] = {}
-    problems = _problems(node, survey, family)
+    instead = _instead(survey, wanted, family)
+    problems = _problems(node, survey, family, instead)
     filled: dict[str, Value] = {}
     if family is not None:
-        filled = _filled(number, node, survey, wanted, family)
+        filled = _filled(number, node, survey, wanted, family, instead)
         survey = _translated(survey, filled)
     gear = _gear(number, node, survey, wanted, given)
     current_a = _rated_current(survey, wanted, given)
@@ -138,11 +178,11 @@ def draft_joint(
     constant = _torque_constant(
         number, wanted=wanted, gear=gear, rated=rated, current_a=current_a, motor_mnm=motor_mnm, survey=survey
     )
-    _encoders(node, survey, wanted, given, family)
+    _encoders(node, survey, wanted, given, family, instead)
     for key, value in filled.items():
         if key.startswith("given."):
             given.setdefault(parse_key(key.removeprefix("given.")), value)
-    if family is not None and family.scales("current"):
+    if "current" in instead or (family is not None and family.scales("current")):
         given.pop(RATED_CURRENT, None)
     torque, origin = rated.number, "shipped bench scaled by the rated torque"
     stiffness = STIFFNESS_PER_RAD * torque
@@ -160,11 +200,16 @@ def draft_joint(
         "viscous_nms_per_rad": _guess(VISCOUS * torque, origin, "jtq fit friction"),
     }
     own = {key: value for key, value in filled.items() if key.startswith("objects.")}
-    return JointDraft(number, node, survey, values, given, problems, family, own)
+    return JointDraft(number, node, survey, values, given, problems, family, own, instead)
 
 
-def _filled(
-    number: int, node: int, survey: Survey | None, wanted: Wanted, family: Family
+def _filled(  # noqa: PLR0917
+    number: int,
+    node: int,
+    survey: Survey | None,
+    wanted: Wanted,
+    family: Family,
+    instead: Mapping[str, Instead],
 ) -> dict[str, Value]:
     """Return what a profile leaves to the drive and to the operator. Raises DraftError."""
     options: dict[str, float] = {}
@@ -175,8 +220,10 @@ def _filled(
         if (counts := getattr(wanted, name)) is not None:
             options[name] = counts
     found = family.filled({} if survey is None else survey.numbers, options)
+    unused = tuple(f"objects.{name}." for name in instead)
+    found = {key: value for key, value in found.items() if not key.startswith(unused)}
     for line in family.lines:
-        if line.open and line.key not in found:
+        if line.open and line.key not in found and not (line.key or "").startswith(unused):
             where = f"joint {number} (node {node}): profile {family.name}"
             if line.option is None:
                 raise DraftError(f"{where}: {line.read} has no value ({line.why})")
@@ -281,8 +328,13 @@ def _torque_constant(
     return _guess(constant, f"rated torque / ({EFFICIENCY:g} x gear ratio x rated current)", better)
 
 
-def _encoders(
-    node: int, survey: Survey | None, wanted: Wanted, given: dict[Key, Value], family: Family | None
+def _encoders(  # noqa: PLR0917
+    node: int,
+    survey: Survey | None,
+    wanted: Wanted,
+    given: dict[Key, Value],
+    family: Family | None,
+    instead: Mapping[str, Instead],
 ) -> None:
     """Give what the drive does not tell, or tells otherwise; not what a profile scales. Raises DraftError."""
 
@@ -296,7 +348,7 @@ def _encoders(
             given[keys[1]] = Value(1, option)
 
     def by_cia_402(quantity: str) -> bool:
-        return family is None or not family.scales(quantity)
+        return quantity not in instead and (family is None or not family.scales(quantity))
 
     if by_cia_402("motor_position"):
         give(POSITION, wanted.encoder_counts, "--encoder-counts")
@@ -306,14 +358,16 @@ def _encoders(
             number = given[of_position].number if of_position in given else survey.number(of_position)
             better = "turn the motor at a known speed and compare jtq status; 606Ch may be in rpm"
             given[ours] = Value(number or 1, "606Ch taken for encoder counts per second: no 6090h", better)
-    if by_cia_402("link_position") and (survey is None or (0x60E4, 1) not in survey.missing):
+    if by_cia_402("link_position"):
         give(LINK, wanted.link_encoder_counts, "--link-encoder-counts")
 
 
-def _problems(node: int, survey: Survey | None, family: Family | None) -> tuple[str, ...]:
+def _problems(
+    node: int, survey: Survey | None, family: Family | None, instead: Mapping[str, Instead]
+) -> tuple[str, ...]:
     if survey is None:
         return ()
-    mapped = mapped_by(family)
+    mapped = [key for name, key in quantities_by(family).items() if name not in instead]
     found = [
         f"node {node} ({survey.title}): has no {label(*key)}, which jtqd maps"
         for key in mapped
@@ -430,13 +484,18 @@ def drive_lines(joint: JointDraft) -> list[str]:
             entry = f'    "{label(*key)}": {round(value.number)}'
             lines.append(f"{entry:<26}# {'GUESS, ' * value.guess}{value.origin}")
     if joint.family is not None:
-        lines += [f"  profile: {joint.family.name:<15}# docs/profiles.md", *_own_lines(joint.own)]
-    return lines
+        lines.append(f"  profile: {joint.family.name:<15}# docs/profiles.md")
+    rest = "CiA 402" if joint.family is None else "the profile"
+    if joint.own or joint.instead:
+        lines.append(f"  objects:                # of this drive; all else is as in {rest}")
+    for name, each in joint.instead.items():
+        lines.append(f"{f'    {name}: {each.text}':<26}# {each.why}")
+    return [*lines, *_own_lines(joint.own)]
 
 
 def _own_lines(own: Mapping[str, Value]) -> list[str]:
-    """Return what a profile leaves to the drive as `objects` of the section."""
-    lines = ["  objects:                # of this drive; all else is in the profile"] if own else []
+    """Return what a profile leaves to the drive as lines of `objects` of the section."""
+    lines = []
     for key, value in own.items():
         _, quantity, name = key.split(".")
         lines.append(f"    {quantity}: {{{name}: {value.number:.10e}}}  # {value.origin}")

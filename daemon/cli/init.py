@@ -12,7 +12,7 @@ import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -93,6 +93,11 @@ def parser() -> argparse.ArgumentParser:
         ("link-encoder-counts", _count, "N", "counts per revolution of the joint, at the link"),
     ):
         made.add_argument(f"--{name}", type=kind, action="append", metavar=unit, help=text)
+    made.add_argument(
+        "--one-encoder",
+        action="store_true",
+        help="the joints have no link encoder (default: as the drives have 60E4h:1)",
+    )
     made.add_argument(
         "--bitrate", type=_count, default=1_000_000, metavar="B", help="of the bus [bit/s] (default 1000000)"
     )
@@ -181,12 +186,17 @@ def _run(options: argparse.Namespace) -> int:
     joints = _drafts(options, found)
     files, period_us = _write(options.out, options.name, _config(options, found, joints))
     problems = [each for joint in joints for each in joint.problems]
+    less = [
+        f"joint {joint.number}: objects.{name}: {each.text} ({each.why})"
+        for joint in joints
+        for name, each in joint.instead.items()
+    ]
     if found.sensor is not None:
         problems += sensor_problems(found.sensor, found.surveys.get(found.sensor))
     report = {
         "files": [str(each) for each in files],
         "period_us": period_us,
-        "notes": found.notes,
+        "notes": [*found.notes, *less],
         "guesses": [each for joint in joints for each in joint.guesses],
         "problems": problems,
         "next": f"jtqd --bus {options.bus or 'can0'} --config {files[-1]} --record logs",
@@ -349,7 +359,8 @@ def _drafts(options: argparse.Namespace, found: Found) -> list[JointDraft]:
     ask = sys.stdin.isatty() and not options.no_questions and not options.json
     drafts = []
     for position, node in enumerate(found.nodes):
-        wanted = Wanted(**{each.name: columns[each.name][position] for each in fields(Wanted)})
+        values = {name: column[position] for name, column in columns.items()}
+        wanted = Wanted(**values, one_encoder=options.one_encoder)
         drafts.append(
             _draft((position + 1, node), found.surveys.get(node), wanted, ask, found.families.get(node))
         )

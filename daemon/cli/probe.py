@@ -155,7 +155,7 @@ def text(survey: Survey, tpdos: list[Tpdo], problems: list[str], family: Family 
         lines.append(f"profile {family.name}: {family.title} (docs/profiles.md)")
     lines += [f"  {label(*key):<8} {value}" for key, value in sorted(survey.numbers.items())]
     lines += [f"  {label(*key):<8} not there" for key in sorted(survey.missing)]
-    lines.append("TPDOs as they are now (jtqd writes its own mapping at its start)")
+    lines.append("TPDOs as they are now (jtqd writes its own mapping at its start, where the drive lets it)")
     for each in tpdos:
         kind = f"type {each.transmission_type}" if each.on else "off"
         lines.append(f"  {each.number}  {each.cob_id:X}h  {kind:<8}  {', '.join(each.objects) or 'nothing'}")

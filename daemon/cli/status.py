@@ -142,6 +142,7 @@ def _joint(reading: Reading, number: int) -> dict[str, Any]:
         "error_nm": finite(seen.torque_nm - seen.reference_nm if known else nan),
         "rmse_nm": finite(view.rmse_nm[n]),
         "age_ms": finite(seen.age_ms),
+        "zeros": view.zeros[n].content(),
         "contact": bool(seen.input_flags & FLAG_CONTACT) if seen.input_flags & FLAG_CONTACT_KNOWN else None,
         "contact_nm": finite(seen.contact_nm),
         "torque_rate_nm_s": finite(seen.torque_rate_nm_s),
@@ -235,6 +236,11 @@ class StatusView:
         yield _joints(about, view, still=still)
         if not still:
             yield from _reasons(about, view, reading.earlier)
+            for joint, zeros in zip(about.joints, view.zeros, strict=False):
+                if zeros.tracked:
+                    yield _line(
+                        f"zeros {joint.number}", Text(zeros.text, style="" if zeros.plausible else "yellow")
+                    )
             if self._recent is not None:
                 yield from _last_seconds(self._recent, len(about.joints), width)
         yield ""
@@ -369,11 +375,20 @@ def _inputs(about: About, view: View) -> Columns:
         table.add(
             name,
             Text("never" if not each.used_ns else duration(age_s), style="bold red" if old else ""),
-            f"{each.delay_ns / 1000:.0f} us" if each.used_ns else NOTHING,
+            after_sync(each.delay_ns) if each.used_ns else NOTHING,
             band if each.low_ns <= each.high_ns else NOTHING,
             *map(str, (each.missed, each.late, each.lost, each.duplicates, each.rejected)),
         )
     return table
+
+
+def after_sync(delay_ns: int) -> str:
+    """Return when an input came after its SYNC; what came before it is of a drive that sends by itself, and so old.
+
+    >>> after_sync(426_000), after_sync(-4_803_000)
+    ('426 us', '4803 us old')
+    """
+    return f"{delay_ns / 1000:.0f} us" if delay_ns >= 0 else f"{-delay_ns / 1000:.0f} us old"
 
 
 def _line(heading: str, text: str | Text) -> RenderableType:

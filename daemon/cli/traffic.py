@@ -73,7 +73,7 @@ _LATE = 1000
 
 @dataclass
 class PdoCount:
-    """One synchronous PDO."""
+    """One PDO: sent at each SYNC, or by its node itself."""
 
     name: str
     length: int
@@ -90,7 +90,11 @@ class PdoCount:
     twice: int = 0
     wrong_length: int = 0
     delays: TimeHistogram = field(default_factory=TimeHistogram)
-    """Arrival after SYNC."""
+    """Arrival after SYNC; of one that its node sends by itself, its age at SYNC."""
+    age_ns: int = 0
+    """For how long such a frame counts; 0: it is sent at each SYNC."""
+    last_ns: int = 0
+    """Stamp of its last frame."""
 
 
 @dataclass
@@ -125,7 +129,9 @@ class Traffic:
     def __init__(self, config: Config) -> None:
         self._period_ns, self._deadline_ns = config.period_ns, config.input_deadline_ns
         self._overflow = config.sequence_overflow
-        self.inputs = {pdo.cob_id: PdoCount(pdo.name, pdo.length) for pdo in input_pdos(config)}
+        self.inputs = {
+            pdo.cob_id: PdoCount(pdo.name, pdo.length, age_ns=pdo.age_ns) for pdo in input_pdos(config)
+        }
         self.estimates = {
             pdo.cob_id: PdoCount(f"{pdo.cob_id:03X}h jtqd estimate", pdo.length, is_input=False)
             for pdo in estimate_tpdos(len(config.joints), config.node_id)
@@ -209,9 +215,13 @@ class Traffic:
         if len(data) != pdo.length:
             pdo.wrong_length += 1
             return
+        if pdo.age_ns:
+            pdo.last_ns = stamp_ns
         if not self._sync_ns:
             return
         pdo.in_cycle += 1
+        if pdo.age_ns:
+            return
         delay_ns = stamp_ns - self._sync_ns
         pdo.delays.add(delay_ns)
         if pdo.is_input and delay_ns > self._deadline_ns:
@@ -237,7 +247,9 @@ class Traffic:
         self.cycles += 1
         complete = True
         for pdo in self.inputs.values():
-            if pdo.in_cycle != 1:
+            if pdo.age_ns:
+                complete &= self._fresh(pdo)
+            elif pdo.in_cycle != 1:
                 complete = False
                 pdo.missing += pdo.in_cycle == 0
                 pdo.twice += pdo.in_cycle % _LATE > 1
@@ -246,6 +258,15 @@ class Traffic:
         for pdo in (*self.inputs.values(), *self.estimates.values()):
             pdo.counted += pdo.in_cycle % _LATE
         self.complete += complete
+
+    def _fresh(self, pdo: PdoCount) -> bool:
+        """Count the age of what its node sends by itself, at this cycle's SYNC; return whether it still counts."""
+        age_ns = max(0, self._sync_ns - pdo.last_ns)
+        if pdo.last_ns:
+            pdo.delays.add(age_ns)
+        fresh = pdo.last_ns > 0 and age_ns <= pdo.age_ns
+        pdo.missing += not fresh
+        return fresh
 
     def _node(self, can_id: int, data: bytes, stamp_ns: int) -> None:
         node = self.nodes.get(can_id & 0x7F)

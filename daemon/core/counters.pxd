@@ -4,8 +4,9 @@ from libc.stdint cimport int64_t, uint8_t, uint16_t, uint64_t
 
 from jtqd.daemon.core.bus cimport Bus
 from jtqd.daemon.core.intake cimport MOST_INPUTS, Intake
-from jtqd.daemon.core.joint cimport JointState
+from jtqd.daemon.core.joint cimport JointCycle, JointState
 from jtqd.daemon.core.record cimport MOST_JOINTS
+from jtqd.estimator.sample cimport Learned
 
 cdef struct CounterState:
     int64_t bus_errors, overruns, latch_resets, contacts
@@ -27,6 +28,14 @@ cdef struct ViewBlock:  # a `JointView`
 
 cdef struct MeasuredBlock:  # a `Measured`
     double current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, sensor_nm, temperature_c
+
+cdef enum:
+    PAST_WORDS = 128  # room for the state of an estimator
+
+cdef struct LearnedBlock:  # `LEARNED` of the snapshot: zeros, and the state after the cycle of the last estimate
+    Learned told
+    uint64_t size  # of the state in bytes; 0: there is none
+    uint64_t past[PAST_WORDS]
 
 cdef struct EstimateBlock:
     int64_t cycle
@@ -63,7 +72,7 @@ cdef class LoopCounters:
     cdef Bus bus
     cdef uint64_t[::1] counters, work, late, status_cycles, restarts
     cdef int64_t[::1] node_heard
-    cdef uint8_t[::1] inputs, node_states, unconfigured
+    cdef uint8_t[::1] inputs, node_states, unconfigured, learned
     cdef int64_t bits_of[MOST_INPUTS]
     cdef int64_t bits_complete
     cdef void count(self, int flags, int64_t work_ns, int64_t late_ns, int64_t missed) noexcept nogil
@@ -71,6 +80,7 @@ cdef class LoopCounters:
     cdef int flush_all(self, int64_t missed, int64_t sync_ns) except -1
     cdef void flush_nodes(self) noexcept nogil
     cdef void flush_inputs(self, int64_t sync_ns) noexcept nogil
+    cdef void tell_learned(self, int number, JointCycle joint) noexcept nogil
     cdef void tell(
         self,
         int64_t cycle,

@@ -4,13 +4,14 @@ All of it goes into the memory of the snapshot (`jtqd.daemon.shared.snapshot`), 
 """
 
 from libc.stdint cimport int64_t, uint8_t, uint64_t
+from libc.string cimport memcpy
 
 import struct
 
 from jtqd.estimator.block cimport copied, put_back
 from jtqd.daemon.core.bus cimport Bus, bus_of
 from jtqd.daemon.core.intake cimport MOST_INPUTS, NODES, Input, Intake, NodeState
-from jtqd.daemon.core.joint cimport JointState
+from jtqd.daemon.core.joint cimport JointCycle, JointState
 from jtqd.daemon.core.record cimport JointBlock
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared import snapshot as shared
@@ -51,7 +52,12 @@ cdef int CODES = shared.STATUS_CODES
 cdef enum:
     NOT_HEARD = 0xFF
 
-if (sizeof(InputBlock), sizeof(EstimateBlock), NODES) != (shared.INPUT.size, shared.ESTIMATE_SIZE, shared.MAX_NODE):
+if (sizeof(InputBlock), sizeof(EstimateBlock), sizeof(LearnedBlock), NODES) != (
+    shared.INPUT.size,
+    shared.ESTIMATE_SIZE,
+    shared.LEARNED.size,
+    shared.MAX_NODE,
+):
     raise ImportError("the snapshot has another layout than the one that is compiled in")
 
 
@@ -182,6 +188,7 @@ cdef class LoopCounters:
         self.status_cycles, self.inputs = snapshot.status_cycles, snapshot.inputs
         self.node_heard, self.node_states = snapshot.node_heard, snapshot.node_states
         self.unconfigured, self.restarts = snapshot.unconfigured, snapshot.restarts
+        self.learned = snapshot.learned
         self.last = LastEstimate(snapshot)
         self.bits_complete = worst_case_bits(1) + (snapshot.joints + 1) // 2 * worst_case_bits(8)
         for n in range(intake.count):
@@ -306,6 +313,16 @@ cdef class LoopCounters:
                 state.too_short,
                 state.too_long,
             )
+
+    cdef void tell_learned(self, int number, JointCycle joint) noexcept nogil:
+        """Tell what the estimator of joint `number`, from 0 on, has learned, and its state; between `begin` and `tell`."""
+        cdef LearnedBlock *block = &(<LearnedBlock *> &self.learned[0])[number]
+        cdef size_t size = 0
+        cdef const void *past = joint.learned(&block.told, &size)
+        block.size = 0
+        if past != NULL and size <= sizeof(block.past):
+            block.size = size
+            memcpy(block.past, past, size)
 
     cdef void tell(
         self,

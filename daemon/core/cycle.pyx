@@ -420,8 +420,11 @@ cdef class Cycle:
     cdef int write_snapshot(self) except -1:
         """Copy counters, inputs and the last estimate into the snapshot."""
         cdef CycleState *now = &self.now
+        cdef int n
         self.counters.last.begin_telling()
         self.counters.flush_all(self.grid.now.missed, now.sync_ns)
+        for n in range(self.count):
+            self.counters.tell_learned(n, <JointCycle> self.at[n])
         self.counters.tell(now.index, now.counter, now.sync_realtime_ns, now.sync_ns, self.states)
         return 0
 

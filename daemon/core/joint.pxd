@@ -6,7 +6,7 @@ from jtqd.daemon.core.estimate_pdo cimport Published
 from jtqd.daemon.core.intake cimport Input, Intake, Temperature
 from jtqd.daemon.core.record cimport JointBlock
 from jtqd.daemon.core.status cimport JointRules
-from jtqd.estimator.sample cimport Estimator
+from jtqd.estimator.sample cimport Estimator, Learned
 
 cdef enum:
     MOST_TPDOS = 4  # of a drive
@@ -59,6 +59,7 @@ cdef class JointCycle:
     cdef int find_inputs(self, inputs) except -1
     cdef void observe_at(self, int64_t sync_ns, bint starting, bint network_wanted) noexcept nogil
     cdef void estimate(self, int64_t sync_ns, bint starting, bint network_wanted, int flags) noexcept nogil
+    cdef const void *learned(self, Learned *out, size_t *size) noexcept nogil
     cdef void miss(self, int flags) noexcept nogil
     cdef int reference(self) noexcept nogil
     cdef double since_last(self, int64_t sync_ns) noexcept nogil

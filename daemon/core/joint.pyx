@@ -23,7 +23,7 @@ from jtqd.daemon.core.record cimport JointBlock
 from jtqd.daemon.core.status cimport JointRules
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.estimator import status as st
-from jtqd.estimator.sample cimport Estimator, Sample, Values
+from jtqd.estimator.sample cimport Estimator, Learned, Sample, Values
 from jtqd.estimator.sample import PythonEstimator
 
 STAMP_ACCURACY_NS: Final = 5_000
@@ -304,6 +304,10 @@ cdef class JointCycle:
         record.statusword, record.input_flags = statusword, flags
         self.now.status = record.status = status
         self.now.latched = self.rules.status.now.latched
+
+    cdef const void *learned(self, Learned *out, size_t *size) noexcept nogil:
+        """As `Estimator.learned`, of the estimator in force."""
+        return self.core.learned(out, size)
 
     cdef void miss(self, int flags) noexcept nogil:
         """Handle a missing input: the observer keeps its state (the next dt is longer), nothing is published."""

@@ -37,6 +37,7 @@ from jtqd.daemon.recording.messages import (
     diagnostics,
     event,
     log,
+    zeros_of,
 )
 from jtqd.daemon.recording.recording import SCANNED
 from jtqd.daemon.shared import cycle_record as cycle
@@ -316,6 +317,7 @@ class Source:
             work, late = self._snapshot.work_us(*_QUANTILES), self._snapshot.late_us(*_QUANTILES)
             view, conditions = self._snapshot.read(), read_conditions(self._directory)
             made.append(self._stream.diagnose(view, work, late, time.time_ns(), conditions))
+            made += [Message(topic.number, view.sync_realtime_ns, text) for topic, text in zeros_of(view)]
         return made
 
 

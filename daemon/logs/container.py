@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import os
 import struct
+import threading
 import zlib
 from array import array
 from collections.abc import Iterator
@@ -52,6 +53,8 @@ MESSAGE_HEAD = np.dtype(
         "itemsize": 31,
     }
 )
+MESSAGE_TIME = 15
+"""Offset of the log time in a Message record."""
 _CHUNK = struct.Struct("<QQQII")
 """After the head: start time, end time, unpacked size, CRC, length of the compression's name."""
 _COMPRESSIONS = ("", "lz4", "zstd")
@@ -86,6 +89,10 @@ class Source:
             return b"".join(self.blocks(offset, min(self.size, offset + length)))
         self._block, self._at = os.pread(self._file, _BLOCK, offset), offset
         return self._block[:length]
+
+    def read_apart(self, offset: int, length: int) -> bytes:
+        """As `read`, past the cache: nothing beside these bytes is fetched."""
+        return os.pread(self._file, length, offset)
 
     def blocks(self, start: int, end: int) -> Iterator[bytes]:
         """Yield the bytes from `start` to `end` in pieces of at most 1 MiB."""
@@ -212,7 +219,17 @@ def chunk_head(data: bytes) -> ChunkHead | None:
     return ChunkHead(start, end, size, crc, name, packed, at + 8)
 
 
-def unpack(head: ChunkHead, packed: bytes, limit: int = MAX_CHUNK) -> bytes:
+class _OfThread(threading.local):
+    """A decompressor is for one thread; its tables are made once instead of for every chunk."""
+
+    def __init__(self) -> None:
+        self.decompress = zstandard.ZstdDecompressor().decompress
+
+
+_ZSTD = _OfThread()
+
+
+def unpack(head: ChunkHead, packed: bytes | memoryview, limit: int = MAX_CHUNK) -> bytes:
     """Content of a chunk, checked against its size and CRC; never more than `limit` bytes are made. Raises ChunkError."""
     if head.unpacked_size > limit:
         raise ChunkError(f"says {head.unpacked_size} bytes unpacked, expected at most {limit}")
@@ -226,17 +243,17 @@ def unpack(head: ChunkHead, packed: bytes, limit: int = MAX_CHUNK) -> bytes:
     return data
 
 
-def unpack_data(compression: str, packed: bytes, limit: int) -> bytes:
+def unpack_data(compression: str, packed: bytes | memoryview, limit: int) -> bytes:
     """Unpacked bytes, at most `limit`. Raises ChunkError."""
     if not compression:
-        return packed
+        return bytes(packed)
     try:
         if compression == "zstd":
             said = zstandard.frame_content_size(packed)
             if said > limit:
                 raise ChunkError(f"says {said} bytes unpacked, expected at most {limit}")
             # Where the frame does not say its size, the decompressor makes room for what it is told.
-            return zstandard.ZstdDecompressor().decompress(packed, max_output_size=max(limit, 1))
+            return _ZSTD.decompress(packed, max_output_size=max(limit, 1))
         frame = LZ4FrameDecompressor()
         data: bytes = frame.decompress(packed, max_length=limit + 1)
         if len(data) > limit:
@@ -366,6 +383,44 @@ _KINDS: dict[int, type[McapRecord]] = {
 }
 
 
+_INDEX_START, _INDEX_END = struct.Struct("<QQQQI"), struct.Struct("<QQ")
+
+
+def chunk_index(body: bytes) -> ChunkIndex | None:
+    """Chunk Index record from the bytes behind its head, as `parse` makes it: a summary has many of them."""
+    if len(body) < _INDEX_START.size:
+        return None
+    start_ns, end_ns, offset, length, size = _INDEX_START.unpack_from(body)
+    at = _INDEX_START.size
+    behind = at + size
+    if size % 10 or len(body) < behind + 12:
+        return None
+    offsets = dict(struct.iter_unpack("<HQ", body[at:behind]))
+    index_length, name_length = struct.unpack_from("<QI", body, behind)
+    at = behind + 12 + name_length
+    if (
+        len(offsets) != size // 10
+        or not at + _INDEX_END.size <= len(body) <= at + _INDEX_END.size + _NEW_FIELDS
+    ):
+        return None
+    try:
+        compression = body[behind + 12 : at].decode()
+    except UnicodeDecodeError:
+        return None
+    compressed, unpacked = _INDEX_END.unpack_from(body, at)
+    return ChunkIndex(
+        chunk_length=length,
+        chunk_start_offset=offset,
+        compression=compression,
+        compressed_size=compressed,
+        message_end_time=end_ns,
+        message_index_length=index_length,
+        message_index_offsets=offsets,
+        message_start_time=start_ns,
+        uncompressed_size=unpacked,
+    )
+
+
 @dataclass
 class Summary:
     """Content of a summary section."""
@@ -425,7 +480,11 @@ def read_summary(source: Source) -> Summary | None:
     if data_end < 0 or source.head(data_end) != (Opcode.DATA_END, footer.summary_start):
         return None
     for opcode, body in _records(source, footer.summary_start, end):
-        record = parse(_KINDS[opcode], body) if opcode in _KINDS else None
+        record: McapRecord | None = None
+        if opcode == Opcode.CHUNK_INDEX:
+            record = chunk_index(body)
+        elif opcode in _KINDS:
+            record = parse(_KINDS[opcode], body)
         if record is not None:
             _put(found, record)
         elif opcode == -1 or opcode in _KINDS:

@@ -3,14 +3,17 @@
 Chunks and attachments prove themselves by their CRC; a record without one must parse to its last byte. A record that is
 damaged is left out where its length leads to a whole record, else the scan goes on where the summary says that there is
 one, or at the next chunk of zstd, which is searched for by the mark in its head. Nothing is taken for a message that stands
-in no chunk. Definitions under a CRC are believed before those at the head of the file.
+in no chunk. Definitions under a CRC are believed before those at the head of the file. Where something is missing, chunks of
+our cycles that lack the others of their span are left out (`spans`).
 """
 
 from __future__ import annotations
 
 import struct
+import zlib
+from bisect import bisect
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -46,6 +49,7 @@ from jtqd.daemon.logs.container import (
     unpack,
     walk,
 )
+from jtqd.daemon.logs.spans import cycle_channels, torn
 from jtqd.daemon.recording.mcap_file import MAGIC
 
 _CHUNK_MARK, _CHUNK_MARK_AT = struct.pack("<I4s", 4, b"zstd"), HEAD.size + 28
@@ -70,12 +74,18 @@ _SUMMARY_KINDS: dict[int, type[McapRecord]] = {
 
 
 class WholeChunk(NamedTuple):
-    """A whole chunk. `index` is right; `head_right`, `indexed`: so are the times in its head, its message indexes."""
+    """A whole chunk. `index` is right; `head_right`, `indexed`: so are the times in its head, its message indexes.
+
+    `marks`: of the numbers and times of its messages, by channel; equal in the chunks of one span.
+    `index_end`: offset behind its message indexes.
+    """
 
     index: ChunkIndex
     counts: Counter[int]
     head_right: bool
     indexed: bool
+    marks: dict[int, int]
+    index_end: int
 
     @property
     def end(self) -> int:
@@ -117,12 +127,20 @@ class Contents:
     """Definitions had to be taken that no CRC covers."""
     contradicted: bool = False
     """Definitions at the head are not what the chunks say."""
+    cycles: frozenset[int] = frozenset()
+    """Channels of our cycles."""
     end: int = 0
 
     @property
     def counts(self) -> Counter[int]:
         """Messages of each channel."""
         return sum((chunk.counts for chunk in self.chunks), Counter())
+
+    @property
+    def timed(self) -> list[WholeChunk]:
+        """Return the chunks that tell what time is there: those with cycles, if any, else those with messages."""
+        chunks = [chunk for chunk in self.chunks if chunk.counts]
+        return [chunk for chunk in chunks if not self.cycles.isdisjoint(chunk.counts)] or chunks
 
     @property
     def start_ns(self) -> int:
@@ -158,6 +176,9 @@ def scan(source: Source, own: Summary | None) -> Contents:
         at = end
     found.end = min(at, limit)
     _settle_definitions(found)
+    found.cycles = cycle_channels(found.header, found.summary.channels)
+    if found.gaps or own is None:
+        _leave_out_torn(found)
     return found
 
 
@@ -239,7 +260,8 @@ def _take_chunk(source: Source, at: int, end: int, found: Contents) -> int | Non
         if any(chunk.counts for chunk in found.chunks):
             found.open_gap.seconds = max(0, first - found.end_ns) * 1e-9
         found.open_gap = None
-    found.chunks.append(WholeChunk(index, counts, (first, last) == (head.start_ns, head.end_ns), indexed))
+    head_right = (first, last) == (head.start_ns, head.end_ns)
+    found.chunks.append(WholeChunk(index, counts, head_right, indexed, _marks(records), index_end))
     return index_end
 
 
@@ -279,6 +301,16 @@ def index_entries(records: Walk) -> dict[int, NDArray[np.uint64]]:
     rows = np.stack([records.heads["log_time"], records.offsets.astype(np.uint64)], axis=1)
     channels = records.heads["channel"]
     return {channel: rows[channels == channel] for channel in np.unique(channels).tolist()}
+
+
+def _marks(records: Walk) -> dict[int, int]:
+    heads = records.heads
+    channels, numbers, times = heads["channel"], heads["sequence"], heads["log_time"]
+    found = {}
+    for channel in np.unique(channels).tolist():
+        mine = channels == channel
+        found[channel] = zlib.crc32(times[mine].tobytes(), zlib.crc32(numbers[mine].tobytes()))
+    return found
 
 
 def _definitions(data: bytes, records: Walk) -> Iterator[Schema | Channel]:
@@ -373,6 +405,36 @@ def _settle_definitions(found: Contents) -> None:
     found.unproven = any(
         (Channel, number) in taken or (Schema, channels[number].schema_id) in taken for number in found.counts
     )
+
+
+def _leave_out_torn(found: Contents) -> None:
+    """Leave out chunks whose cycles lack messages of other topics, as one gap with what is missing beside them."""
+    places = torn((chunk.marks for chunk in found.chunks), found.cycles)
+    if not places:
+        return
+    left_out = [found.chunks.pop(place) for place in reversed(places)]
+    gaps = [Gap(chunk.index.chunk_start_offset, chunk.index_end, 1) for chunk in left_out]
+    starts = [chunk.index.chunk_start_offset for chunk in found.chunks]
+    merged: list[Gap] = []
+    for gap in sorted((gap for gap in found.gaps + gaps if not gap.restored), key=lambda gap: gap.start):
+        before = merged[-1] if merged else None
+        if before is None or bisect(starts, before.start) != bisect(starts, gap.start):
+            merged.append(gap)
+        else:
+            merged[-1] = Gap(before.start, gap.end, before.chunks + gap.chunks)
+    for gap in merged:
+        if gap.chunks and gap.seconds is None:
+            gap.seconds = _between(gap, found.timed)
+    found.gaps = [gap for gap in found.gaps if gap.restored] + merged
+
+
+def _between(gap: Gap, timed: Sequence[WholeChunk]) -> float | None:
+    """Time between the neighbours of a gap [s]; None where it has only one."""
+    before = [chunk for chunk in timed if chunk.index.chunk_start_offset < gap.start]
+    behind = [chunk for chunk in timed if chunk.index.chunk_start_offset > gap.start]
+    if not before or not behind:
+        return None
+    return max(0, int(behind[0].index.message_start_time) - int(before[-1].index.message_end_time)) * 1e-9
 
 
 def is_whole(found: Contents, own: Summary | None) -> bool:

@@ -25,6 +25,7 @@ from jtqd.daemon.logs.container import (
     MAX_CHUNK,
     MAX_SMALL,
     MESSAGE_BODY,
+    MESSAGE_TIME,
     ChunkError,
     LogError,
     Source,
@@ -39,6 +40,7 @@ from jtqd.daemon.logs.container import (
     unpack,
     walk,
 )
+from jtqd.daemon.logs.spans import cycle_channels, torn
 from jtqd.daemon.recording.mcap_file import MAGIC
 from jtqd.daemon.recording.own_files import ACTIVE
 
@@ -57,6 +59,8 @@ class Batch(NamedTuple):
     log_times: NDArray[np.uint64]
     lengths: NDArray[np.uint64]
     """Of the payloads, which begin 31 bytes behind the offsets."""
+    step: int = 0
+    """Bytes from each record to the next, where they are all of one length; 0: unknown."""
 
 
 @dataclass
@@ -64,6 +68,7 @@ class _ChunkPlace:
     """A chunk of a file."""
 
     offset: int
+    length: int
     start_ns: int
     end_ns: int
     index: dict[int, int] = field(default_factory=dict)
@@ -130,7 +135,11 @@ class LogFile:
             self.counts = {} if summary.statistics is None else summary.statistics.channel_message_counts
             self._chunks = [
                 _ChunkPlace(
-                    c.chunk_start_offset, c.message_start_time, c.message_end_time, c.message_index_offsets
+                    c.chunk_start_offset,
+                    c.chunk_length,
+                    c.message_start_time,
+                    c.message_end_time,
+                    c.message_index_offsets,
                 )
                 for c in sorted(summary.chunks, key=lambda c: c.chunk_start_offset)
             ]
@@ -161,8 +170,8 @@ class LogFile:
             if opcode == Opcode.CHUNK:
                 head = chunk_head(source.read(at, HEAD_SIZE))
                 if head is None:
-                    return
-                self._chunks.append(_ChunkPlace(at, head.start_ns, head.end_ns))
+                    break
+                self._chunks.append(_ChunkPlace(at, end - at, head.start_ns, head.end_ns))
             elif opcode == Opcode.MESSAGE_INDEX and self._chunks:
                 self._chunks[-1].index[int.from_bytes(source.read(at + HEAD.size, 2), "little")] = at
             elif opcode == Opcode.MESSAGE:
@@ -181,14 +190,21 @@ class LogFile:
             self._learn()
 
     def _learn(self) -> None:
-        """Definitions that stand in chunks only, and indexes that may be incomplete behind the last one."""
+        """Definitions that stand in chunks only, and what may be incomplete at the end: indexes, and our last span."""
         self._chunks[-1].index = {}
-        if self.channels:
-            return
-        for chunk in self._chunks:
+        for chunk in () if self.channels else self._chunks:
             data = self._unpacked(chunk)
             if data is not None:
                 self._definitions(data, walk(data, None).others)
+        cycles = cycle_channels(self.header, self.channels)
+        if self.path.suffix != ACTIVE or len(cycles) < 2:
+            return
+        there = [dict.fromkeys(chunk.index) for chunk in self._chunks]
+        last = self._unpacked(self._chunks[-1])
+        if last is not None:
+            there[-1] = dict.fromkeys(np.unique(walk(last).heads["channel"]).tolist())
+        for place in reversed(torn(there, cycles)):
+            del self._chunks[place]
 
     def _define(self, opcode: int, body: bytes) -> None:
         if opcode == Opcode.SCHEMA:
@@ -249,16 +265,14 @@ class LogFile:
 
     def _unpacked(self, chunk: _ChunkPlace) -> bytes | None:
         """Return the content of a chunk; None for the torn last one of a file that is being written."""
-        source = self._source
-        found = source.head(chunk.offset)
-        head = chunk_head(source.read(chunk.offset, HEAD_SIZE))
         try:
-            if head is None or found is None or found[0] != Opcode.CHUNK:
+            if chunk.length > MAX_CHUNK + HEAD_SIZE:
+                raise ChunkError(f"is {chunk.length} bytes long, expected at most {MAX_CHUNK}")
+            record = self._source.read_apart(chunk.offset, chunk.length)
+            head = chunk_head(record)
+            if head is None or HEAD.unpack_from(record) != (Opcode.CHUNK, chunk.length - HEAD.size):
                 raise ChunkError("there is none")
-            size = found[1] - chunk.offset - head.data_start
-            if size > MAX_CHUNK:
-                raise ChunkError(f"is {size} bytes long, expected at most {MAX_CHUNK}")
-            return unpack(head, source.read(chunk.offset + head.data_start, size))
+            return unpack(head, memoryview(record)[head.data_start :])
         except ChunkError as error:
             if chunk is self._chunks[-1] and self.path.suffix == ACTIVE:
                 return None
@@ -269,6 +283,11 @@ class LogFile:
     def _of_chunk(
         self, chunk: _ChunkPlace, data: bytes, wanted: set[int] | None, first: int, last: int
     ) -> Iterator[Batch]:
+        alone = _of_equal_length(data, wanted)
+        if alone is not None:
+            whole = chunk.start_ns >= first and chunk.end_ns <= last
+            yield alone if whole else _within(alone, first, last)
+            return
         batches = []
         for channel in sorted(chunk.index.keys() if wanted is None else wanted & chunk.index.keys()):
             entries = message_index(self._source, chunk.index[channel], channel)
@@ -336,6 +355,30 @@ class LogFile:
         if data is None:
             raise LogError(f"{self.path}: attachment {index.name!r} is damaged")
         return data
+
+
+def _of_equal_length(data: bytes, wanted: set[int] | None) -> Batch | None:
+    """Return the messages of a chunk that holds nothing but those of one wanted channel, all of one length, else None.
+
+    Records that follow one another from the first byte to the last need no index.
+    """
+    if len(data) < HEAD.size + MESSAGE_BODY:
+        return None
+    length = int.from_bytes(data[1 : HEAD.size], "little")
+    step, channel = HEAD.size + length, int.from_bytes(data[HEAD.size : HEAD.size + 2], "little")
+    if data[0] != Opcode.MESSAGE or length < MESSAGE_BODY or len(data) % step:
+        return None
+    if wanted is not None and channel not in wanted:
+        return None
+    count = len(data) // step
+    fixed = np.ndarray(
+        (count, HEAD.size + 2), np.uint8, data, strides=(step, 1)
+    )  # opcode, length and channel
+    if not (fixed == fixed[0]).all():
+        return None
+    times = np.ndarray((count,), "<u8", data, MESSAGE_TIME, (step,))
+    lengths = np.full(count, length - MESSAGE_BODY, np.uint64)
+    return Batch(channel, data, np.arange(0, len(data), step), times, lengths, step)
 
 
 def _indexed(data: bytes, channel: int, entries: NDArray[np.uint64]) -> Batch | None:

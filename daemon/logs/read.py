@@ -103,14 +103,15 @@ def iter_topics(
     start_ns: int | None = None,
     end_ns: int | None = None,
 ) -> Iterator[dict[str, Messages]]:
-    """Messages of several topics, chunk by chunk; of each chunk those that it has. Raises as `read_topics` does."""
-    chunk: bytes | None = None
+    """Messages of several topics, span by span: of each topic those of one chunk, until the next chunk has that topic too.
+
+    Raises as `read_topics` does.
+    """
     found: dict[str, Messages] = {}
     for part in _pieces(log_parts(path), topics, start_ns, end_ns):
-        if found and (part.batch.data is not chunk or part.topic in found):
+        if part.topic in found:
             yield found
             found = {}
-        chunk = part.batch.data
         collector = _Collector(part.topic, part.path)
         collector.begin(part.path, part.schema)
         collector.add(part.batch)
@@ -307,7 +308,11 @@ class _Collector:
         if (batch.lengths != self._length).any():
             return False
         # The row is the whole payload: its fields begin behind the encapsulation.
-        rows = pieces(batch.data, batch.offsets + _PAYLOAD, self._length)
+        if batch.step:
+            begin = int(batch.offsets[0]) + _PAYLOAD
+            rows = np.ndarray((len(batch.offsets),), f"V{self._length}", batch.data, begin, (batch.step,))
+        else:
+            rows = pieces(batch.data, batch.offsets + _PAYLOAD, self._length)
         if (_column(rows, 0, "<u2") != _ENCAPSULATION).any():
             return False
         for place, length in self._layout.lengths:
@@ -347,7 +352,9 @@ def _grown(old: NDArray[Any], least: int, used: int) -> NDArray[Any]:
 
 def _column(rows: NDArray[np.void], offset: int, kind: str) -> NDArray[Any]:
     """Return one number of each row [n]."""
-    return np.ndarray((len(rows),), np.dtype(kind), rows, offset, (rows.dtype.itemsize,))
+    return rows.view(
+        np.dtype({"names": ["it"], "formats": [kind], "offsets": [offset], "itemsize": rows.itemsize})
+    )["it"]
 
 
 def _payload_dtype(fields: np.dtype[Any], length: int) -> np.dtype[Any]:

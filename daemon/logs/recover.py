@@ -239,10 +239,17 @@ def _seconds(gap: Gap, found: Contents, own: Summary | None) -> float | None:
     if gap.seconds is not None or own is None or own.statistics is None or not found.counts:
         return gap.seconds
     statistics = own.statistics
-    whole = [chunk.index.chunk_start_offset for chunk in found.chunks if chunk.counts]
-    if gap.start < min(whole):
-        return max(0, found.start_ns - int(statistics.message_start_time)) * 1e-9
-    return max(0, int(statistics.message_end_time) - found.end_ns) * 1e-9 if gap.start > max(whole) else None
+    timed = [chunk.index for chunk in found.timed]
+    if gap.start < timed[0].chunk_start_offset:
+        return max(0, int(timed[0].message_start_time) - int(statistics.message_start_time)) * 1e-9
+    if gap.start > timed[-1].chunk_start_offset:
+        return max(0, int(statistics.message_end_time) - _last_ns(found)) * 1e-9
+    return None
+
+
+def _last_ns(found: Contents) -> int:
+    """Log time of the last cycle; of the last message of another writer's log."""
+    return max(int(chunk.index.message_end_time) for chunk in found.timed)
 
 
 def _torn_seconds(source: Source, gap: Gap, found: Contents) -> float | None:
@@ -251,7 +258,7 @@ def _torn_seconds(source: Source, gap: Gap, found: Contents) -> float | None:
         return None
     head = chunk_head(source.read(gap.start, HEAD_SIZE))
     if gap.chunks and head is not None:
-        seconds = (head.end_ns - found.end_ns) * 1e-9
+        seconds = (head.end_ns - _last_ns(found)) * 1e-9
         if 0.0 <= seconds < _LONGEST_TORN_CHUNK_S:
             return seconds
     data = gap.start - int(found.chunks[0].index.chunk_start_offset)

@@ -162,6 +162,16 @@ class Diagnostics:
             "sensor_status": joint.sensor_status,
             "input_flags": joint.input_flags,
         }
+        zeros = view.zeros[number - 1]
+        if zeros.tracked:
+            values |= {
+                "link_zero_rad": zeros.link_rad,
+                "link_zero_sigma_rad": zeros.link_sigma_rad,
+                "link_zero_used_rad": zeros.link_used_rad,
+                "current_zero_a": zeros.current_a,
+                "zero_learned": "yes" if zeros.learned else "no",
+                "zero_jumps": zeros.jumps,
+            }
         level, text = _level(found, f"joint {number}", "")
         title, hardware = f"jtqd: joint {number}", self._joints[number - 1]
         by_status = _JOINT_LEVELS.get(name, WARN)

@@ -8,17 +8,17 @@ from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.mcap_file import ChunkBuilder
 from jtqd.daemon.recording.messages import event, log
 
-_PER_CHUNK = 50
+_PER_SPAN = 50
 """A status that flaps every cycle must not fill the disk; what is left out is counted."""
 _BOUNDED = (schemas.STATUS_CHANGED, schemas.SLOTS_MISSED, schemas.NOTICE)
 INFO, WARN, ERROR = 20, 30, 40
 
 
 class Journal:
-    """Adds events to the chunk that is being collected.
+    """Adds events to the span that is being collected.
 
     Args:
-        builder: of the chunks.
+        builder: of the spans.
         warn: called with one line for the operator.
 
     Attributes:
@@ -31,11 +31,11 @@ class Journal:
         self.warn = warn
         self.newest = (0, 0)
         self.left_out = 0
-        self._in_chunk = 0
+        self._in_span = 0
 
-    def new_chunk(self) -> None:
-        """Reset the number of events for a new chunk."""
-        self._in_chunk = 0
+    def new_span(self) -> None:
+        """Reset the number of events for a new span."""
+        self._in_span = 0
 
     def note(
         self,
@@ -49,8 +49,8 @@ class Journal:
         change: tuple[int, int] = (0, 0),
     ) -> None:
         """Write an event, and its text to /log; the time is the newest cycle's unless one is given."""
-        self._in_chunk += 1
-        if self._in_chunk > _PER_CHUNK and kind in _BOUNDED:
+        self._in_span += 1
+        if self._in_span > _PER_SPAN and kind in _BOUNDED:
             self.left_out += 1
             return
         index, newest = self.newest

@@ -13,11 +13,13 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from jtqd.daemon.recording import schemas
 from jtqd.daemon.shared import cycle_record as cycle
+from jtqd.daemon.shared.snapshot import PAST_WORDS, View
+from jtqd.estimator.learned import PAST_LAYOUT, Zeros
 
 CDR_HEADER = b"\x00\x01\x00\x00"
 _NS = 1_000_000_000
@@ -237,6 +239,29 @@ def log(time_ns: int, level: int, text: str) -> bytes:
     """rcl_interfaces/msg/Log; `level` 20 information, 30 warning, 40 error."""
     builder = CdrBuilder().stamp(time_ns).put("B", level).text("jtqd").text(fit(text, LOG_TEXT_LENGTH))
     return builder.text("").text("").put("I", 0).payload()
+
+
+def zeros(time_ns: int, joint: int, index: int, seen: Zeros, past: bytes) -> bytes:
+    """jtqd_msgs/msg/Zeros of joint `joint`, from 1 on; index: of the cycle after which `past` is its estimator's state."""
+    return (
+        CdrBuilder()
+        .stamp(time_ns)
+        .text(f"joint_{joint}")
+        .put("Q", index)
+        .put("d", *seen[:7])
+        .put("Q", seen.jumps)
+        .put("I", seen.flags)
+        .put("H", PAST_LAYOUT, len(past))
+        .put("Q", *struct.unpack(f"<{PAST_WORDS}Q", past.ljust(8 * PAST_WORDS, b"\0")))
+        .payload()
+    )
+
+
+def zeros_of(view: View) -> Iterator[tuple[schemas.Topic, bytes]]:
+    """Yield topic and message of each joint that tracks its zeros, from one reading of the snapshot."""
+    for number, (seen, past) in enumerate(zip(view.zeros, view.pasts, strict=True), start=1):
+        if seen.tracked:
+            yield schemas.ZEROS[number - 1], zeros(view.sync_realtime_ns, number, view.cycle, seen, past)
 
 
 class Status(NamedTuple):

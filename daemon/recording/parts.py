@@ -14,7 +14,7 @@ from pathlib import Path
 
 from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.journal import ERROR, INFO, WARN, Journal
-from jtqd.daemon.recording.mcap_file import Head, McapFile, NamedData, SealedChunk
+from jtqd.daemon.recording.mcap_file import Head, McapFile, NamedData, Span
 from jtqd.daemon.recording.own_files import (
     ACTIVE,
     MEGABYTE,
@@ -47,7 +47,7 @@ class Rules:
 
 
 class Parts:
-    """Writes sealed chunks, or counts their cycles as lost.
+    """Writes spans, or counts their cycles as lost.
 
     Args:
         rules: of this run.
@@ -167,19 +167,19 @@ class Parts:
             self.end()
             self.open(why)
 
-    # ---- chunks ----
+    # ---- spans ----
 
-    def write(self, chunk: SealedChunk, at_ns: int) -> None:
-        """Write a chunk, or count it as lost; `at_ns` is the CLOCK_MONOTONIC time of its last cycle."""
+    def write(self, span: Span, at_ns: int) -> None:
+        """Write a span, or count its cycles as lost; `at_ns` is the CLOCK_MONOTONIC time of its last cycle."""
         self._now_ns = at_ns
         if self._file is None and not self._try_again():
-            self._miss(chunk.cycles)
+            self._miss(span.cycles)
             return
         # A file that was removed, or must not grow: the next one may do.
-        if not self._append(chunk) and not (
-            self.open("the previous part could not be continued") and self._append(chunk)
+        if not self._append(span) and not (
+            self.open("the previous part could not be continued") and self._append(span)
         ):
-            self._miss(chunk.cycles)
+            self._miss(span.cycles)
         file = self._file
         if file is None:
             return
@@ -195,20 +195,20 @@ class Parts:
         elif file.size >= self._rules.rotate_bytes:
             self.rotate("size")
 
-    def _append(self, chunk: SealedChunk) -> bool:
-        """Append a chunk; return False if it failed and the file was ended."""
+    def _append(self, span: Span) -> bool:
+        """Append a span; return False if it failed and the file was ended."""
         file = self._file
         assert file is not None
         try:
-            file.append(chunk)
+            file.append(span)
         except OSError as error:
             removed = file.removed
             self.end()
             if not removed:
                 self._stop_for(f"recording fails: {error.strerror or error}")
             return False
-        self._account.written += chunk.cycles
-        self._cycles += chunk.cycles
+        self._account.written += span.cycles
+        self._cycles += span.cycles
         if self.obstacle:
             self._went_on()
         return True

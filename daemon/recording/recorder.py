@@ -25,7 +25,7 @@ from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.diagnostics import Diagnostics, RecorderState
 from jtqd.daemon.recording.journal import INFO, WARN, Journal
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head
-from jtqd.daemon.recording.messages import CycleMessages, JointStateMessage, diagnostics
+from jtqd.daemon.recording.messages import CycleMessages, JointStateMessage, diagnostics, zeros_of
 from jtqd.daemon.recording.own_files import MEGABYTE, free_run, own_files, sized
 from jtqd.daemon.recording.parts import Parts, Rules
 from jtqd.daemon.recording.progress import Account, ProgressFile
@@ -40,7 +40,7 @@ from jtqd.daemon.shared.ring import RingError, RingReader
 from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader
 
 _REPEAT_EVERY, _REPEAT_EVERY_IN_MEMORY = 60, 10
-"""Chunks after which schemas and channels are repeated; a flight recording begins with any chunk."""
+"""Spans after which schemas and channels are repeated; a flight recording begins with any span."""
 _QUANTILES = (0.5, 0.99, 1.0)
 
 
@@ -80,6 +80,7 @@ class Session:
         self.recording = Recording(self.journal, sink, overview, int(request.chunk_s * 1e9), account)
         self._snapshot = None if request.snapshot is None else SnapshotReader(request.snapshot)
         self._diagnostics = Diagnostics(request.bus, request.joint_names, request.nodes)
+        self._zeros_cycle = -1
         self._notices: NoticesReader | None = None
         self._repair: Child | None = None
         self._repair_due = request.repair
@@ -149,6 +150,10 @@ class Session:
             view, self.account, state, work_us=work, late_us=late, now_ns=now_ns, conditions=conditions
         )
         self.journal.builder.add(schemas.DIAGNOSTICS.number, now_ns, diagnostics(now_ns, statuses))
+        if view is not None and view.cycle != self._zeros_cycle:
+            self._zeros_cycle = view.cycle
+            for topic, message in zeros_of(view):
+                self.journal.builder.add(topic.number, now_ns, message)
 
     def finish(self) -> dict[str, Any]:
         """End everything; returns the summary of the run."""
@@ -230,7 +235,7 @@ class Session:
             self._repair = None
 
     def _has_begun(self) -> bool:
-        """Return whether a chunk has been through; a repair delays nothing any more."""
+        """Return whether a span has been through; a repair delays nothing any more."""
         return self.account.written > 0 or self.account.let_go > 0 or bool(self.parts.obstacle)
 
 
@@ -371,7 +376,7 @@ class Recorder:
                 percent = round(100.0 * (used - cpu) / (now - last_diagnosis), 2)
                 self._session.diagnose(backlog, percent)
                 last_diagnosis, cpu = now, used
-            # Chunks end by recorded time; this is for a loop that stands still.
+            # Spans end by recorded time; this is for a loop that stands still.
             if taken:
                 last_flush = now
             elif now - last_flush >= self._chunk_s:

@@ -1,6 +1,6 @@
-"""Turn cycle records into sealed chunks: messages of each cycle, the overview, events, and the account of cycles.
+"""Turn cycle records into spans: messages of each cycle, the overview, events, and the account of cycles.
 
-Records and times come in; sealed chunks go to a sink: the files of the run (`jtqd.daemon.recording.parts`), or the flight
+Records and times come in; spans go to a sink: the files of the run (`jtqd.daemon.recording.parts`), or the flight
 recorder, which keeps them in memory until something happens. Nothing raises for a disk that fails.
 """
 
@@ -11,7 +11,7 @@ from typing import Protocol
 
 from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.journal import ERROR, INFO, WARN, Journal
-from jtqd.daemon.recording.mcap_file import SealedChunk
+from jtqd.daemon.recording.mcap_file import Span
 from jtqd.daemon.recording.messages import CycleMessages, JointStateMessage
 from jtqd.daemon.recording.parts import Parts
 from jtqd.daemon.recording.progress import Account
@@ -59,7 +59,7 @@ class FaultTrigger:
 
 
 class FlightRecorder:
-    """Flight recorder: keeps the last seconds in memory, as sealed chunks, and writes them on a trigger.
+    """Flight recorder: keeps the last seconds in memory, as spans, and writes them on a trigger.
 
     Around an occurrence: everything that memory holds before it, and `AFTER_S` behind it; another occurrence in that time
     prolongs it. What falls out of memory unwritten counts as let go, and so does what memory holds.
@@ -77,7 +77,7 @@ class FlightRecorder:
         self._journal = journal
         self._account = account
         self._keep_ns = round((keep_s + _NOTICED_S) * _NS)
-        self._memory: deque[tuple[SealedChunk, int]] = deque()
+        self._memory: deque[tuple[Span, int]] = deque()
         self._until_ns: int | None = None
         self._newest_ns = 0
         self.saved = 0
@@ -90,25 +90,25 @@ class FlightRecorder:
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes of the chunks in memory."""
-        return sum(len(chunk.data) for chunk, _ in self._memory)
+        """Bytes of the spans in memory."""
+        return sum(span.size for span, _ in self._memory)
 
     @property
     def memory_s(self) -> float:
         """Recorded time in memory [s]."""
         return (self._memory[-1][1] - self._memory[0][1]) / _NS if self._memory else 0.0
 
-    def write(self, chunk: SealedChunk, at_ns: int) -> None:
-        """Keep a chunk in memory, or write it while saving."""
+    def write(self, span: Span, at_ns: int) -> None:
+        """Keep a span in memory, or write it while saving."""
         self._newest_ns = max(self._newest_ns, at_ns)
         if self._until_ns is not None:
-            self._parts.write(chunk, at_ns)
+            self._parts.write(span, at_ns)
             if at_ns >= self._until_ns:
                 self._until_ns = None
                 self._parts.end()
             return
-        self._memory.append((chunk, at_ns))
-        self._account.let_go += chunk.cycles
+        self._memory.append((span, at_ns))
+        self._account.let_go += span.cycles
         while self._memory[0][1] < at_ns - self._keep_ns:
             self._memory.popleft()
 
@@ -121,9 +121,9 @@ class FlightRecorder:
         self._journal.report(schemas.FLIGHT_SAVED, f"flight recording: {why}", level=WARN)
         self._parts.open(why)
         while self._memory:
-            chunk, at_ns = self._memory.popleft()
-            self._account.let_go -= chunk.cycles
-            self._parts.write(chunk, at_ns)
+            span, at_ns = self._memory.popleft()
+            self._account.let_go -= span.cycles
+            self._parts.write(span, at_ns)
 
     def finish(self) -> None:
         """End the file if one is being written."""
@@ -135,8 +135,8 @@ class FlightRecorder:
 
 OVERVIEW_PERIOD_NS = 20_000_000
 """/joint_states comes at 50 Hz."""
-MAX_CHUNK_BYTES = 2_000_000
-"""A backlog that is caught up at once still becomes chunks of bounded size."""
+MAX_SPAN_BYTES = 2_000_000
+"""A backlog that is caught up at once still becomes spans of bounded size."""
 
 SCANNED = (
     ("cycle", "sync_monotonic_ns", "sync_realtime_ns", "flags", "missed", "sync_counter", "frame_count"),
@@ -146,20 +146,20 @@ SCANNED = (
 
 
 class Sink(Protocol):
-    """Target of sealed chunks."""
+    """Target of spans."""
 
-    def write(self, chunk: SealedChunk, at_ns: int) -> None:
-        """Take a chunk whose last cycle is of CLOCK_MONOTONIC `at_ns`; count its cycles as written or lost."""
+    def write(self, span: Span, at_ns: int) -> None:
+        """Take a span whose last cycle is of CLOCK_MONOTONIC `at_ns`; count its cycles as written or lost."""
 
 
 class Recording:
     """One run of the loop on its way into files.
 
     Args:
-        journal: with the builder of the chunks.
+        journal: with the builder of the spans.
         sink: takes them.
         overview: makes /joint_states; it knows the number of joints.
-        chunk_ns: length of a chunk in recorded time [ns].
+        chunk_ns: length of a span in recorded time [ns].
         account: of an earlier recorder of the same run, or a new one; shared with the sink.
 
     Attributes:
@@ -216,12 +216,12 @@ class Recording:
             builder.add(schemas.JOINT_STATES.number, realtime, self._overview.payload(record, realtime))
         if self._chunk_end_ns is None:
             self._chunk_end_ns = monotonic + self._chunk_ns
-        elif monotonic >= self._chunk_end_ns or builder.pending >= MAX_CHUNK_BYTES:
+        elif monotonic >= self._chunk_end_ns or builder.pending >= MAX_SPAN_BYTES:
             self.flush()
 
     @property
     def progress(self) -> Account:
-        """Return the account of completed chunks; cycles of the open chunk are not included."""
+        """Return the account of completed spans; cycles of the open span are not included."""
         account = self.account
         settled = account.cycles - self._pending
         return Account(settled, account.written, account.overwritten, account.unwritten, account.let_go)
@@ -257,10 +257,10 @@ class Recording:
         self.journal.note(schemas.RECORDS_LOST, text, level=ERROR, time_ns=time_ns, count=count)
 
     def flush(self) -> None:
-        """End the chunk and hand it on."""
+        """End the span and hand it on."""
         self.fault = self._faults.passed(self._newest_ns) or self.fault
         self._chunk_end_ns, self._pending = None, 0
-        self.journal.new_chunk()
-        chunk = self._builder.seal()
-        if chunk is not None:
-            self._sink.write(chunk, self._newest_ns)
+        self.journal.new_span()
+        span = self._builder.seal()
+        if span is not None:
+            self._sink.write(span, self._newest_ns)

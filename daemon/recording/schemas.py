@@ -12,6 +12,7 @@ from typing import NamedTuple
 from mcap.records import Channel, Schema
 
 from jtqd.daemon.shared.cycle_record import MOST_JOINTS, PAIR, layout_of
+from jtqd.daemon.shared.snapshot import PAST_WORDS
 
 STATUS_NAMES = {
     0: "OFF",
@@ -202,11 +203,40 @@ uint32 line
 """
 
 
+_ZEROS = f"""\
+# What the estimator of one joint has learned of its encoder's and its current's zero, and its whole state: once a second.
+# `past` is the state just after `cycle`: a replay of a log that begins in the middle of a run goes on from there.
+
+# Bits of `flags`
+uint32 TRACKED=1            # the zeros are tracked
+uint32 LEARNED=2            # the link zero is known better than friction of the day alone would let it be
+uint32 BEYOND=4             # the link zero is beyond limit_rad
+uint32 LEFT=8               # what is known of it is not yet taken off
+uint32 APART=16             # current and torsion disagree beyond their sigmas
+
+std_msgs/Header header          # send time of the cycle's SYNC, CLOCK_REALTIME
+uint64 cycle                    # cycles since the start, missed slots included
+float64 link_rad                # [rad] what the link encoder's reading is off by
+float64 link_sigma_rad          # [rad] its standard deviation
+float64 link_used_rad           # [rad] what is taken off the reading
+float64 current_a               # [A] the same of the current
+float64 current_sigma_a         # [A]
+float64 current_used_a          # [A]
+float64 limit_rad               # [rad] of a plausible link zero, by the joint file
+uint64 jumps                    # how often the link zero has jumped
+uint32 flags                    # see the constants
+uint16 past_layout              # number of the layout of `past`
+uint16 past_bytes               # of `past` that are meant; the others are zero
+uint64[{PAST_WORDS}] past               # state of the estimator, as it lies in memory
+"""
+
+
 def _complete(text: str, *nested: tuple[str, str]) -> str:
     """Return a definition followed by those it uses, in the notation of `rosidl`."""
     return text + "".join(f"{'=' * 80}\nMSG: {name}\n{body}" for name, body in nested)
 
 
+ZEROS_SCHEMA = "jtqd_msgs/msg/Zeros"
 _NESTED_HEADER = (("std_msgs/Header", _HEADER), ("builtin_interfaces/Time", _TIME))
 
 
@@ -227,6 +257,7 @@ def schemas_of(joints: int) -> dict[str, str]:
         ),
         "jtqd_msgs/msg/Event": _complete(event, *_NESTED_HEADER),
         "rcl_interfaces/msg/Log": _complete(_LOG, ("builtin_interfaces/Time", _TIME)),
+        ZEROS_SCHEMA: _complete(_ZEROS, *_NESTED_HEADER),
     }
 
 
@@ -261,6 +292,8 @@ DIAGNOSTICS = Topic(5, "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 EVENTS = Topic(6, "/events", "jtqd_msgs/msg/Event")
 LOG = Topic(7, "/log", "rcl_interfaces/msg/Log")
 _OTHERS = (JOINT_STATES, DIAGNOSTICS, EVENTS, LOG)
+ZEROS = tuple(Topic(9 + joint, f"/joint/{joint}/zeros", ZEROS_SCHEMA) for joint in range(1, MOST_JOINTS + 1))
+"""Of the joints that a bus may have; without a message where nothing is tracked."""
 
 
 def joint_topics(joints: int) -> tuple[Topic, ...]:
@@ -270,7 +303,8 @@ def joint_topics(joints: int) -> tuple[Topic, ...]:
 
 def topics_of(joints: int) -> tuple[Topic, ...]:
     """Return all topics in the log of a bus with so many joints."""
-    return *joint_topics(joints), CAN_FRAMES._replace(schema=frames_name(joints)), *_OTHERS
+    frames = CAN_FRAMES._replace(schema=frames_name(joints))
+    return *joint_topics(joints), frames, *_OTHERS, *ZEROS[:joints]
 
 
 TOPICS = topics_of(2)

@@ -10,7 +10,7 @@ wake-up for the inputs.
     limits    its limits and checks
     blocks    its estimator is put together
     follow    one cycle that the new estimators have not seen yet, from the ring
-    swap      none is left: from the next cycle on they are in force
+    swap      none is left: what was learned is handed over, and from the next cycle on they are in force
 
 A step begins only when the pause is longer than such a step has taken so far; after a third of PATIENCE_S it may delay the
 next SYNC by a tenth of a period. Until `swap` nothing of the loop has changed. Everything else that the loop knows - the
@@ -35,6 +35,7 @@ from jtqd.daemon.reload.shadow import follow
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import RingReader
 from jtqd.estimator.blocks import estimator_of, made_of
+from jtqd.estimator.learned import hand_over
 from jtqd.estimator.sample import Estimator
 from jtqd.estimator.sha256 import sha256
 
@@ -177,11 +178,17 @@ class Swap:
             yield "blocks"
             new.append((estimator_of(each, made), limits))
         yield from self._follow(position, [estimator for estimator, _ in new])
+        zeros: dict[str, str] = {}
         for joint, (estimator, limits) in zip(joints, new, strict=True):
+            became = hand_over(joint.estimator, estimator)
+            if became:
+                zeros[f"joint_{joints.index(joint) + 1}"] = became
             joint.use(estimator, limits)
         if self._cycle.contacts is not None:
             self._cycle.contacts.restart()  # loads by other files step without a contact
-        self._report(swapped=True, cycle=self._cycle.index, missed=self._cycle.grid.missed - self._missed)
+        told = {"zeros": zeros} if zeros else {}
+        missed = self._cycle.grid.missed - self._missed
+        self._report(swapped=True, cycle=self._cycle.index, missed=missed, **told)
 
     def _read(self, source: io.RawIOBase | io.BytesIO, order: Order, content: memoryview) -> Iterator[str]:
         digest, at = sha256(), 0

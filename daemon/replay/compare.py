@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -278,6 +278,30 @@ def identity(
         tolerance_nm,
         network_nm,
     )
+
+
+def with_states(found: Identity, states: Sequence[tuple[int, int]]) -> Identity:
+    """Return the same with the estimator's states of the log that are not the replay's: (joint, cycle) of each.
+
+    Where the state was not known at the beginning, corrections of effects need as long to settle as the estimate.
+    """
+
+    def excused(joint: int, cycle: int) -> bool:
+        return any(
+            each.joint == joint
+            and each.first_cycle <= cycle < each.first_cycle + each.cycles + SETTLED_CYCLES
+            for each in found.unknown
+        )
+
+    wrong = [(joint, cycle) for joint, cycle in states if not excused(joint, cycle)]
+    more = [
+        Difference(
+            joint, min(cycle for n, cycle in wrong if n == joint), len(those), "state", np.nan, np.nan, 0.0
+        )
+        for joint in sorted({joint for joint, _ in wrong})
+        if (those := [cycle for n, cycle in wrong if n == joint])
+    ]
+    return replace(found, differences=(*found.differences, *more)) if more else found
 
 
 def _compared(replayed: RecordArray) -> list[str]:

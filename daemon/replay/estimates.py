@@ -33,6 +33,7 @@ from jtqd.daemon.loop.input_pdos import input_pdos, joint_temperatures
 from jtqd.daemon.loop.process import contacts_of
 from jtqd.daemon.replay.frames import Frames, offsets
 from jtqd.daemon.replay.origin import SAMPLE, Origin
+from jtqd.daemon.replay.pasts import NO_PASTS, Pasts
 from jtqd.daemon.replay.rows import CycleRows
 from jtqd.daemon.replay.runs import Steps
 from jtqd.daemon.shared import cycle_record as cr
@@ -41,6 +42,7 @@ from jtqd.daemon.shared.cycle_record import FLAG_LATCHED, FLAG_NETWORK_SKIPPED, 
 from jtqd.daemon.shared.snapshot import COUNTERS
 from jtqd.estimator.arrays import CodeArray, FloatArray, RecordArray
 from jtqd.estimator.joint import Joint
+from jtqd.estimator.learned import learner_of
 from jtqd.estimator.methods import AnyEstimator, AnyNetwork, estimate_steps
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings
@@ -68,11 +70,13 @@ class Replayed:
         joints: of each joint, `SAMPLE` [n].
         estimate: bytes of the estimate PDOs, one after the other [n, 8 * PDOs].
         temperatures_from_log: cycles whose temperature the frames alone do not tell.
+        pasts_differ: (joint from 1 on, cycle) after which the log has another state of the estimator than the replay.
     """
 
     joints: tuple[RecordArray, ...]
     estimate: npt.NDArray[np.uint8]
     temperatures_from_log: int
+    pasts_differ: tuple[tuple[int, int], ...] = ()
 
 
 class ExactReplay:
@@ -104,6 +108,8 @@ class ExactReplay:
                 zip(origin.inputs, estimators, safety, strict=True)
             )
         ]
+        self._unknown = [True] * len(self._joints)
+        self._pasts_differ: list[tuple[int, int]] = []
         self._contacts = contacts_of(config)
         self._time_ns = [1 << 60] * len(
             self._joints
@@ -115,12 +121,18 @@ class ExactReplay:
         frames: Frames,
         steps: Sequence[Steps],
         progress: Callable[[int], None] = lambda _: None,
+        pasts: Sequence[Pasts] = (),
     ) -> Replayed:
-        """Replay the cycles of one part; `joints` are its states as logged. `progress` is called with the cycles done."""
+        """Replay the cycles of one part; `joints` are its states as logged. `progress` is called with the cycles done.
+
+        pasts: of each joint, states of its estimator in the log. The first one after a place where the state was not known
+        is gone on from; the others are compared.
+        """
         count = len(joints[0])
         celsius, happens = self._temperatures(frames, joints)
         for n in range(len(self._joints)):
-            for row, marks in self._marks(n, joints[n], frames, steps[n]).items():
+            known = pasts[n] if pasts else NO_PASTS
+            for row, marks in self._marks(n, joints[n], frames, steps[n], known).items():
                 happens.setdefault(row, []).extend(marks)
         times = np.array(
             [start + np.cumsum(each.dt_ns) for start, each in zip(self._time_ns, steps, strict=True)]
@@ -148,7 +160,8 @@ class ExactReplay:
         if count:
             self._time_ns = times[:, -1].tolist()
         samples = tuple(each.view(SAMPLE)[:, 0] for each in rows.samples)
-        return Replayed(samples, rows.estimates, rows.temperatures_from_log)
+        differ, self._pasts_differ = tuple(self._pasts_differ), []
+        return Replayed(samples, rows.estimates, rows.temperatures_from_log, differ)
 
     def _temperatures(
         self, frames: Frames, joints: Sequence[RecordArray]
@@ -171,19 +184,43 @@ class ExactReplay:
         return celsius, happens
 
     def _marks(
-        self, number: int, records: RecordArray, frames: Frames, steps: Steps
+        self, number: int, records: RecordArray, frames: Frames, steps: Steps, pasts: Pasts
     ) -> dict[int, list[Callable[[], object]]]:
-        """Apply the events of one joint before a row: reset of faults, restart, continuation after a gap in the log."""
+        """Apply the events of one joint before a row: continuation after a gap in the log, reset of faults, restart."""
         joint, each = self._joints[number], self._origin.inputs[number]
         marks: dict[int, list[Callable[[], object]]] = {}
+        for row, _ in steps.breaks:
+            found = offsets(frames.pdos, records, each, row)
+            marks.setdefault(row, []).append(partial(self._lose, number, found))
+        for row, content in pasts.rows(records["cycle"]).items():
+            marks.setdefault(row, []).append(
+                partial(self._meet, number, int(records["cycle"][row]) - 1, content)
+            )
         for row in np.flatnonzero(records["cycle_flags"] & cr.FLAG_RESET).tolist():
             marks.setdefault(row, []).append(joint.reset_latch)
         for row in steps.begins.tolist():
-            marks.setdefault(row, []).append(joint.begin_again)
-        for row, _ in steps.breaks:
-            found = offsets(frames.pdos, records, each, row)
-            marks.setdefault(row, []).append(partial(joint.resume, *found))
+            marks.setdefault(row, []).append(partial(self._begin, number))
         return marks
+
+    def _begin(self, number: int) -> None:
+        """Go on where a joint began anew, so that all about it is known."""
+        self._joints[number].begin_again()
+        self._unknown[number] = False
+
+    def _lose(self, number: int, offset: tuple[int, int]) -> None:
+        """Go on behind cycles that are missing, with these roll-overs of the positions."""
+        self._joints[number].resume(*offset)
+        self._unknown[number] = True
+
+    def _meet(self, number: int, cycle: int, content: bytes) -> None:
+        """Compare the estimator's state with that of the log after `cycle`, and go on from the latter."""
+        learner = learner_of(self._joints[number].estimator)
+        if learner is None or learner.past == content:
+            return
+        if not self._unknown[number]:
+            self._pasts_differ.append((number + 1, cycle))
+        learner.past = content
+        self._unknown[number] = False
 
 
 WHOLE = np.dtype(
@@ -208,10 +245,13 @@ class Model:
     network: AnyNetwork | None
 
 
-def replay_whole(model: Model, safety: JointSafety, records: RecordArray, steps: Steps) -> RecordArray:
+def replay_whole(
+    model: Model, safety: JointSafety, records: RecordArray, steps: Steps, pasts: Pasts = NO_PASTS
+) -> RecordArray:
     """Estimates [n] of the states `records` of one joint, fields as `WHOLE`. Raises ConfigError where nothing fits.
 
-    Faults of the inputs, and those that are latched, are taken from the log.
+    Faults of the inputs, and those that are latched, are taken from the log. `pasts`: states to go on from, where the
+    estimator's own is not known: the first one behind each such place.
     """
     rows: npt.NDArray[np.intp] | slice = slice(None) if steps.used.all() else np.flatnonzero(steps.used)
     flags, word, cycle = (records[name][rows] for name in ("input_flags", "statusword", "cycle"))
@@ -231,7 +271,9 @@ def replay_whole(model: Model, safety: JointSafety, records: RecordArray, steps:
     if len(flags):
         dt_s = steps.dt_ns[rows].astype(np.float64) * 1e-9
         wanted = (flags & FLAG_NETWORK_SKIPPED) == 0
-        made = estimate_steps(model.joint, model.settings, model.network, dt_s, columns, wanted)
+        known = _first_known(pasts, records["cycle"], steps)
+        starts = {int(np.count_nonzero(steps.used[:row])): content for row, content in known.items()}
+        made = estimate_steps(model.joint, model.settings, model.network, dt_s, columns, wanted, starts)
         for name in _STAGES:
             values[name][rows] = getattr(made, name)
         asked = made.status.astype(np.uint16)
@@ -246,6 +288,17 @@ def replay_whole(model: Model, safety: JointSafety, records: RecordArray, steps:
         out[name] = column
     out["status"] = status
     return out
+
+
+def _first_known(pasts: Pasts, cycle: npt.NDArray[np.uint64], steps: Steps) -> dict[int, bytes]:
+    """Return the first state behind each place where it was not known, by the row before which it holds."""
+    rows = pasts.rows(cycle)
+    found = {}
+    for lost, _ in steps.breaks:
+        row = min((row for row in rows if row >= lost), default=None)
+        if row is not None and not any(lost < begun <= row for begun in steps.begins.tolist()):
+            found[row] = rows[row]
+    return found
 
 
 class _Cycles(NamedTuple):

@@ -24,6 +24,7 @@ from jtqd.daemon.loop.input_pdos import JointInputs
 from jtqd.daemon.loop.process import joint_inputs
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.cycle_record import MOST_JOINTS
+from jtqd.daemon.shared.snapshot import PAST_WORDS
 from jtqd.estimator.checked import ConfigError
 from jtqd.models.files import load_yaml
 
@@ -59,6 +60,13 @@ FRAMES: dict[str, np.dtype[Any]] = {
     "frames.data": np.dtype(("u1", 8)),
 }
 """Of /can/frames: path -> type of each element."""
+PAST: dict[str, np.dtype[Any]] = {
+    "cycle": np.dtype("<u8"),
+    "past_layout": np.dtype("<u2"),
+    "past_bytes": np.dtype("<u2"),
+    "past": np.dtype(("<u8", PAST_WORDS)),
+}
+"""Of /joint/N/zeros: path -> type of each element."""
 
 
 def check_fields(

@@ -33,6 +33,7 @@ from jtqd.daemon.logs import (
 )
 from jtqd.daemon.recording.schemas import joint_topics
 from jtqd.daemon.replay.origin import FRAMES, JOINT, Origin, check_fields, open_origin
+from jtqd.daemon.replay.pasts import Pasts, joined, read_pasts
 from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_POSITION
 from jtqd.estimator.arrays import RecordArray
 
@@ -140,7 +141,7 @@ STRETCH_CYCLES = 650_000
 _KEPT_ROWS = 5_000
 """Of the stretch before: whatever the estimator remembers of its inputs, it has forgotten after so many cycles."""
 _LEAST_BYTES = 200
-"""Of a cycle in a log: ours take 256."""
+"""Of a cycle in a log: ours take 300."""
 
 
 @dataclass(frozen=True)
@@ -150,6 +151,8 @@ class Part:
     path: Path
     origin: Origin
     joints: tuple[RecordArray, ...]
+    pasts: tuple[Pasts, ...] = ()
+    """States of the estimators that the log holds."""
     piece: bool = False
 
     def frames(self) -> RecordArray:
@@ -179,16 +182,24 @@ class Run:
         joints: states of each joint over all parts.
         number: the stretches of one run have the same.
         before: last states of the stretch before, none for the first one.
+        pasts: states of the estimators, of each joint; those of the stretch before among them.
     """
 
     parts: tuple[Part, ...]
     joints: tuple[RecordArray, ...]
     number: int = 0
     before: tuple[RecordArray, ...] | None = None
+    pasts: tuple[Pasts, ...] = ()
 
     @classmethod
-    def of(cls, parts: Sequence[Part], number: int = 0, before: tuple[RecordArray, ...] | None = None) -> Run:
-        """Run, or stretch, of parts that follow one another."""
+    def of(
+        cls,
+        parts: Sequence[Part],
+        number: int = 0,
+        before: tuple[RecordArray, ...] | None = None,
+        pasts: Sequence[Pasts] = (),
+    ) -> Run:
+        """Run, or stretch, of parts that follow one another; `pasts`: of the stretch before."""
         joints = tuple(_joined(states) for states in zip(*(part.joints for part in parts), strict=True))
         ends = np.cumsum([len(part.joints[0]) for part in parts]).tolist()
         spans = [slice(begin, end) for begin, end in zip([0, *ends[:-1]], ends, strict=True)]
@@ -196,7 +207,9 @@ class Run:
             replace(part, joints=tuple(each[at] for each in joints))
             for part, at in zip(parts, spans, strict=True)
         ]
-        return cls(tuple(views), joints, number, before)
+        every = [list(each) for each in zip(*(part.pasts for part in parts), strict=True)]
+        merged = [joined([*each, *pasts[n : n + 1]]) for n, each in enumerate(every)]
+        return cls(tuple(views), joints, number, before, tuple(merged))
 
     @property
     def origin(self) -> Origin:
@@ -234,7 +247,8 @@ def _joined(every: Sequence[RecordArray]) -> RecordArray:
 def read_part(path: Path, directory: Path) -> Part:
     """Read one log; its files go to `directory`, which must be empty. Raises LogError, OSError."""
     origin = open_origin(path, read_attachments(path), directory)
-    return _part(path, origin, read_topics(path, topics_of(origin)))
+    topics = topics_of(origin)
+    return _part(path, origin, read_topics(path, topics), read_pasts(path, len(topics)))
 
 
 def read_pieces(path: Path, directory: Path, limit: int = STRETCH_CYCLES) -> Iterator[Part]:
@@ -245,16 +259,17 @@ def read_pieces(path: Path, directory: Path, limit: int = STRETCH_CYCLES) -> Ite
     origin = open_origin(path, read_attachments(path), directory)
     topics = topics_of(origin)
     kept: dict[str, list[RecordArray]] = {topic: [] for topic in topics}
+    pasts = read_pasts(path, len(topics))
     count, made = 0, False
     for found in iter_topics(path, topics):
         for topic, messages in found.items():
             kept[topic].append(messages.records.copy())  # without the room for more
         count += len(found[FIRST_TOPIC].records) if FIRST_TOPIC in found else 0
         if count >= limit and all(kept.values()):
-            yield _piece(path, origin, kept)
+            yield _piece(path, origin, kept, pasts)
             count, made = 0, True
     if all(kept.values()) or not made:
-        yield _piece(path, origin, kept)
+        yield _piece(path, origin, kept, pasts)
 
 
 def _most_cycles(path: Path) -> int:
@@ -264,20 +279,20 @@ def _most_cycles(path: Path) -> int:
         return max(counts) if log.counts and counts else path.stat().st_size // _LEAST_BYTES
 
 
-def _piece(path: Path, origin: Origin, kept: dict[str, list[RecordArray]]) -> Part:
+def _piece(path: Path, origin: Origin, kept: dict[str, list[RecordArray]], pasts: tuple[Pasts, ...]) -> Part:
     """A part of what was kept; what one joint has of a cycle whose others are in the next chunk stays."""
-    joined = {}
+    whole = {}
     for topic, chunks in kept.items():
         if not chunks:
             raise LogError(f"{path}: found no message on {topic}, expected one per cycle")
-        joined[topic] = _joined(chunks)
-        check_fields(joined[topic], JOINT, path, topic)
-    last = min(records["cycle"][-1] for records in joined.values())
-    for topic, records in joined.items():
+        whole[topic] = _joined(chunks)
+        check_fields(whole[topic], JOINT, path, topic)
+    last = min(records["cycle"][-1] for records in whole.values())
+    for topic, records in whole.items():
         behind = records["cycle"] > last
         kept[topic] = [records[behind]] if behind.any() else []
-        joined[topic] = records[~behind]
-    return replace(_part(path, origin, joined), piece=True)
+        whole[topic] = records[~behind]
+    return replace(_part(path, origin, whole, pasts), piece=True)
 
 
 def _frames_between(path: Path, first: int, last: int) -> RecordArray:
@@ -294,7 +309,7 @@ def _frames_between(path: Path, first: int, last: int) -> RecordArray:
     return _joined(found)
 
 
-def _part(path: Path, origin: Origin, found: dict[str, RecordArray]) -> Part:
+def _part(path: Path, origin: Origin, found: dict[str, RecordArray], pasts: tuple[Pasts, ...]) -> Part:
     for topic, records in found.items():
         check_fields(records, JOINT, path, topic)
     joints = tuple(found[topic] for topic in topics_of(origin))
@@ -306,7 +321,8 @@ def _part(path: Path, origin: Origin, found: dict[str, RecordArray]) -> Part:
         raise LogError(f"{path}: found no cycle with every joint, expected one at least")
     if np.any(np.diff(joints[0]["cycle"].astype(np.int64)) <= 0):
         raise LogError(f"{path}: found cycles that do not increase, expected the order of the run")
-    return Part(path, origin, joints)
+    first, last = int(joints[0]["cycle"][0]), int(joints[0]["cycle"][-1])
+    return Part(path, origin, joints, tuple(each.within(first, last) for each in pasts))
 
 
 def in_order(logs: Sequence[Path]) -> list[Path]:
@@ -328,11 +344,14 @@ class _Open:
     number: int
     parts: list[Part]
     before: tuple[RecordArray, ...] | None = field(default=None)
+    pasts: tuple[Pasts, ...] = ()
 
     def close(self, *following: Part) -> Run:
         """Return the stretch so far; the next one begins with `following`."""
-        run = Run.of(self.parts, self.number, self.before)
+        run = Run.of(self.parts, self.number, self.before, self.pasts)
         self.before = tuple(records[-_KEPT_ROWS:].copy() for records in run.joints)
+        first = int(self.before[0]["cycle"][0])
+        self.pasts = tuple(each.within(first, int(run.joints[0]["cycle"][-1])) for each in run.pasts)
         self.parts = list(following)
         return run
 

@@ -18,10 +18,11 @@ import numpy.typing as npt
 from jtqd.daemon.config import Config
 from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.logs import LogError, log_parts
-from jtqd.daemon.replay.compare import Comparison, Identity, compare, identity
+from jtqd.daemon.replay.compare import Comparison, Identity, compare, identity, with_states
 from jtqd.daemon.replay.estimates import ExactReplay, Model, replay_whole
 from jtqd.daemon.replay.frames import decode
 from jtqd.daemon.replay.origin import Origin
+from jtqd.daemon.replay.pasts import NO_PASTS, Pasts
 from jtqd.daemon.replay.runs import (
     STRETCH_CYCLES,
     Part,
@@ -37,6 +38,7 @@ from jtqd.estimator.age import bandwidth_of
 from jtqd.estimator.arrays import RecordArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Joint
+from jtqd.estimator.learned import same_past
 from jtqd.estimator.methods import AnyEstimator, AnyNetwork, load_network, make_estimator
 from jtqd.estimator.network import NATIVE_LIMIT
 from jtqd.estimator.onnx_graph import NetworkError
@@ -327,7 +329,7 @@ def _replay_run(
         if replayer is None:
             safety = models.safety(run.origin.config)
             replayers[run.number] = replayer = ExactReplay(run.origin, models.estimators(), safety)
-        found = _exact(run, replayer, steps, progress)
+        found = _exact(run, replayer, steps, progress, _known_pasts(run, models))
         estimate = (found.sent, found.made, found.recorded)
     else:
         progress("replaying", 0, run.cycles)
@@ -341,6 +343,8 @@ def _replay_run(
         if exact and not same.explained and any(each.network is not None for each in models.joints):
             limit = NATIVE_LIMIT * min(each.joint.rated_torque_nm for each in models.joints)
             same = identity(logged, found.joints, steps, estimate, network_nm=limit)
+    if same is not None and exact:
+        same = with_states(same, found.pasts_differ)
     comparisons = tuple(
         compare(number, *both, _known(run, same, number), _bandwidths(run, models, number))
         for number, both in enumerate(zip(logged, found.joints, strict=True), start=1)
@@ -386,14 +390,16 @@ class _Exact:
     recorded: npt.NDArray[np.bool_]
     from_si: int
     temperatures: int
+    pasts_differ: tuple[tuple[int, int], ...] = ()
 
 
 def _in_arrays(run: Run, models: Models) -> tuple[_Exact, tuple[Steps, ...]]:
     """In arrays; a later stretch of a run begins with states of the one before, whose estimates are dropped."""
     records, steps, kept = run.widened()
     safety = models.safety(run.origin.config)
+    pasts = _known_pasts(run, models)
     with ThreadPoolExecutor(len(records)) as pool:  # numpy and ONNX Runtime let go of the interpreter
-        made = list(pool.map(replay_whole, models.joints, safety, records, steps))
+        made = list(pool.map(replay_whole, models.joints, safety, records, steps, pasts))
     if kept:
         end = len(records[0])
         steps = tuple(cut_before(each.part(kept, end)) for each in steps)
@@ -402,24 +408,38 @@ def _in_arrays(run: Run, models: Models) -> tuple[_Exact, tuple[Steps, ...]]:
     return _Exact(tuple(each[kept:] for each in made), empty, empty, recorded, 0, 0), steps
 
 
-def _exact(run: Run, replayer: ExactReplay, steps: Sequence[Steps], progress: Progress) -> _Exact:
+def _known_pasts(run: Run, models: Models) -> list[Pasts]:
+    """Return the states of the log for each model: none where something differs that the zeros were learned with."""
+    if not any(len(each.cycle) for each in run.pasts):
+        return [NO_PASTS] * len(models.joints)
+    logged = logged_models(run.origin).estimators()
+    pairs = zip(run.pasts, logged, models.estimators(), strict=True)
+    return [pasts if same_past(old, new) else NO_PASTS for pasts, old, new in pairs]
+
+
+def _exact(
+    run: Run, replayer: ExactReplay, steps: Sequence[Steps], progress: Progress, pasts: Sequence[Pasts]
+) -> _Exact:
     """Cycle by cycle, part by part: the raw frames of only one part are in memory at a time.
 
     `replayer`: new, or as the stretch before has left it.
     """
     done, from_si, temperatures = 0, 0, 0
+    states: list[tuple[int, int]] = []
     joints, sent, made, recorded = [], [], [], []
     for part in run.parts:
         end = done + len(part.joints[0])
         frames = decode(run.origin, part.frames(), part.joints)
         here = [each.part(done, end) for each in steps]
-        result = replayer.run(part.joints, frames, here, partial(_tell, progress, done, run.cycles))
+        told = partial(_tell, progress, done, run.cycles)
+        result = replayer.run(part.joints, frames, here, told, pasts)
         joints.append(result.joints)
         sent.append(frames.estimate)
         made.append(result.estimate)
         recorded.append(frames.recorded)
         from_si += frames.from_si
         temperatures += result.temperatures_from_log
+        states += result.pasts_differ
         done = end
     return _Exact(
         tuple(np.concatenate(each) for each in zip(*joints, strict=True)),
@@ -428,4 +448,5 @@ def _exact(run: Run, replayer: ExactReplay, steps: Sequence[Steps], progress: Pr
         np.concatenate(recorded),
         from_si,
         temperatures,
+        tuple(states),
     )

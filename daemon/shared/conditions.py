@@ -129,7 +129,21 @@ _ROWS = (
         hold_s=_HOLD_S,
     ),
     Definition("drive_off", JOINT, INFO, "the drive carries no current: {}", hold_s=_HOLD_S, logged=False),
-    Definition("degraded", JOINT, INFO, "the network is not fully used: {}", hold_s=_HOLD_S, logged=False),
+    Definition("degraded", JOINT, INFO, "the estimate is degraded: {}", hold_s=_HOLD_S, logged=False),
+    Definition(
+        "zero_implausible",
+        JOINT,
+        WARNING,
+        "the link encoder's zero is {}",
+        "the link encoder's zero is plausible again",
+    ),
+    Definition(
+        "zero_jumped",
+        JOINT,
+        WARNING,
+        "the link encoder's zero has jumped, {}, and is not known again yet",
+        "the link encoder's zero is learned anew",
+    ),
     Definition(
         "deviation",
         JOINT,

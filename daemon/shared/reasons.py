@@ -8,8 +8,16 @@ from math import isfinite
 from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_NETWORK_SKIPPED, FLAG_POSITION, FLAG_SENSOR
 from jtqd.daemon.shared.faults import MEANINGS, NAMES
 from jtqd.daemon.shared.runtime_dir import About, AboutJoint
-from jtqd.daemon.shared.snapshot import NMT_STATES, NOT_OPERATIONAL, OPERATIONAL, JointView, View
+from jtqd.daemon.shared.snapshot import (
+    NMT_STATES,
+    NO_ZEROS,
+    NOT_OPERATIONAL,
+    OPERATIONAL,
+    JointView,
+    View,
+)
 from jtqd.estimator import status as st
+from jtqd.estimator.learned import APART, LEFT, Zeros
 
 SILENT_AFTER = 3.0
 """Heartbeat periods without a heartbeat after which a node is silent."""
@@ -67,7 +75,7 @@ def joint_reason(about: About, number: int, view: View, earlier: View) -> str:
             reason = "below the standstill velocity: the torque is known to an interval, sigma is half of it"
         case st.DEGRADED:
             limit_nm = None if joint.network is None else joint.network_limit_nm
-            reason = degraded_reason(seen, limit_nm)
+            reason = degraded_reason(seen, limit_nm, view.zeros[number - 1])
         case st.INVALID:
             faults = seen.input_flags >> 8
             reason = fault_meanings(faults) if faults else f"fault cleared; {_HELD}"
@@ -102,10 +110,15 @@ def _state_bits(statusword: int) -> int:
     )  # bit 5 does not count in the first
 
 
-def degraded_reason(seen: JointView, network_limit_nm: float | None) -> str:
-    """Explain status 3 (degraded): why the network is not fully used; `network_limit_nm`: limit against physics, None
-    without a network.
+def degraded_reason(seen: JointView, network_limit_nm: float | None, zeros: Zeros = NO_ZEROS) -> str:
+    """Explain status 3 (degraded): what is wrong with physics, or why the network is not fully used.
+
+    network_limit_nm: of the network against physics, None without a network; zeros: of the same cycle, with what the two
+    views say.
     """
+    doubt = _doubt(zeros)
+    if doubt:
+        return doubt
     if network_limit_nm is None:
         return "outside of what the joint file was fitted to, or current and torsion disagree"
     if seen.input_flags & FLAG_NETWORK_SKIPPED:
@@ -116,6 +129,18 @@ def degraded_reason(seen: JointView, network_limit_nm: float | None) -> str:
     if apart > network_limit_nm:
         return f"the network is {apart:.1f} Nm from physics, limit {network_limit_nm:.1f} Nm: physics only"
     return "outside the network's training range: physics with a reduced share of the network"
+
+
+def _doubt(zeros: Zeros) -> str:
+    """Explain what is wrong with the physics of method fused; "" where nothing is."""
+    if not zeros.plausible:
+        return f"the link encoder's zero is {zeros.implausible}"
+    if zeros.flags & LEFT:
+        left = 1e6 * (zeros.link_rad - zeros.link_used_rad)
+        return f"a zero of the link encoder has been found, {left:+.0f} µrad of it are not yet taken off"
+    if zeros.flags & APART:
+        return "current and torsion disagree beyond their sigmas: one of them is not what the joint file says"
+    return ""
 
 
 def _stale(about: About, joint: AboutJoint, seen: JointView, view: View, earlier: View) -> str:

@@ -16,7 +16,7 @@ import platform
 import re
 import time
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -166,6 +166,8 @@ class About:
     log_directory: str | None
     log_prefix: str
     versions: dict[str, str]
+    tpdos: dict[str, Any] = field(default_factory=dict)
+    """TPDOs of the drives as they are in force, by node-ID (`layout.tpdos_as_json`)."""
 
     @property
     def nodes(self) -> dict[int, str]:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jtqd.daemon.shared.cycle_record import MOST_JOINTS
+from jtqd.estimator.learned import Zeros
 
 STATUS_CODES = 16
 MAX_NODE = 128
@@ -143,6 +144,8 @@ class InputView(NamedTuple):
 
 
 NOT_MEASURED = Measured(*(float("nan"),) * 6)
+NO_ZEROS = Zeros(*(0.0,) * 7, 0, 0)
+"""Of an estimator that learns nothing."""
 
 
 class View(NamedTuple):
@@ -175,6 +178,10 @@ class View(NamedTuple):
     """Boot-up messages of each node-ID."""
     rmse_now_nm: tuple[float, ...] = ()
     """As `rmse_nm`, against the sensor now: with the estimate's age as an error."""
+    zeros: tuple[Zeros, ...] = (NO_ZEROS,) * MOST_JOINTS
+    """What the estimator of each joint has learned of its zeros."""
+    pasts: tuple[bytes, ...] = ()
+    """State of each joint's estimator after this cycle (`FusedEstimator.past`); empty where it learns nothing."""
 
 
 def quantiles(bins: tuple[int, ...], bin_ns: int, largest_ns: int, shares: tuple[float, ...]) -> list[float]:
@@ -198,7 +205,7 @@ LATE_BINS, LATE_BIN_NS = 250, 4_000
 MAX_INPUTS = 20
 """Four TPDOs of each of four drives and two sensor channels are eighteen."""
 
-_MAGIC = 0x4A54_5144_5354_4108  # "JTQDSTA", layout 8
+_MAGIC = 0x4A54_5144_5354_4109  # "JTQDSTA", layout 9
 _HEAD = struct.Struct("<QQddQ")
 """Magic number, process, period [s], worst load, number of joints."""
 JOINT = struct.Struct("<6dHBBHH4d")
@@ -206,6 +213,10 @@ _ESTIMATE = struct.Struct(f"<qQqq{MOST_JOINTS}q")
 _MEASURED = struct.Struct("<6d")
 INPUT = struct.Struct("<12q")
 """An `InputView`."""
+PAST_WORDS = 128
+"""Room for the state of an estimator."""
+LEARNED = struct.Struct(f"<7d3Q{8 * PAST_WORDS}s")
+"""`Zeros`, length of the state [byte], the state."""
 _ORDERS_OFFSET = _HEAD.size
 _COUNTERS_OFFSET = _ORDERS_OFFSET + 5 * 8
 _SEQUENCE_OFFSET = _COUNTERS_OFFSET + 8 * len(COUNTERS)
@@ -226,7 +237,8 @@ _FACTORS = struct.Struct("<4d")
 _RESTARTS_OFFSET = _FACTORS_OFFSET + _FACTORS.size * MAX_NODE
 _CONFIGURED_FOR_OFFSET = _RESTARTS_OFFSET + 8 * MAX_NODE
 _DOUBTS_OFFSET = _CONFIGURED_FOR_OFFSET + 8 * MAX_NODE
-SIZE = _DOUBTS_OFFSET + MAX_NODE
+_LEARNED_OFFSET = _DOUBTS_OFFSET + MAX_NODE
+SIZE = _LEARNED_OFFSET + MOST_JOINTS * LEARNED.size
 _WORD = struct.Struct("<Q")
 _PATIENCE_S = 0.05
 """Of a reader, with a loop in the midst of a write: many times what a preempted loop may take."""
@@ -259,6 +271,7 @@ class Snapshot:
         restarts: boot-up messages of each node-ID.
         configured_for: of each node-ID, the `restarts` after which it was last configured; written by the supervisor.
         doubts: number of times each node-ID was found to be configured otherwise; written by the supervisor.
+        learned: of each joint a `LEARNED`; as `estimate`, guarded by the sequence.
         sequence: odd while the snapshot is being written.
         estimate: the last estimate: times, status, `JointView` and `Measured` of all joints.
     """
@@ -286,7 +299,8 @@ class Snapshot:
         self.unconfigured = view[_UNCONFIGURED_OFFSET:_FACTORS_OFFSET]
         self.restarts = view[_RESTARTS_OFFSET:_CONFIGURED_FOR_OFFSET].cast("Q")
         self.configured_for = view[_CONFIGURED_FOR_OFFSET:_DOUBTS_OFFSET].cast("Q")
-        self.doubts = view[_DOUBTS_OFFSET:SIZE]
+        self.doubts = view[_DOUBTS_OFFSET:_LEARNED_OFFSET]
+        self.learned = view[_LEARNED_OFFSET:SIZE]
         self.sequence = view[_SEQUENCE_OFFSET:_ESTIMATE_OFFSET].cast("Q")
         self.estimate = view[_ESTIMATE_OFFSET:_ERRORS_OFFSET]
 
@@ -349,6 +363,7 @@ class SnapshotReader:
             for n in range(MAX_INPUTS)
         )
         sums = struct.unpack_from(f"<{3 * count}d", memory, _ERRORS_OFFSET)
+        learned = [LEARNED.unpack_from(memory, _LEARNED_OFFSET + n * LEARNED.size) for n in numbers]
         aligned, now = (
             tuple(
                 (sums[3 * n + k] / sums[3 * n + 2]) ** 0.5 if sums[3 * n + 2] else float("nan")
@@ -376,6 +391,8 @@ class SnapshotReader:
             struct.unpack_from(f"<{MAX_NODE}q", memory, _HEARD_OFFSET),
             struct.unpack_from(f"<{MAX_NODE}Q", memory, _RESTARTS_OFFSET),
             now,
+            tuple(Zeros._make(each[:9]) for each in learned),
+            tuple(each[10][: each[9]] for each in learned),
         )
 
     def work_us(self, *shares: float) -> list[float]:

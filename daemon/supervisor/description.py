@@ -10,6 +10,7 @@ from pathlib import Path
 from jtqd.daemon.config import Config, JointConfig
 from jtqd.daemon.loop.input_pdos import input_pdos, names_of_inputs, sensor_index
 from jtqd.daemon.shared.runtime_dir import About, AboutJoint, start_ticks, versions
+from jtqd.drivers.layout import tpdos_as_json
 
 
 def about(config: Config, *, bus: str, instance: str, log_directory: Path | None) -> About:
@@ -35,6 +36,7 @@ def about(config: Config, *, bus: str, instance: str, log_directory: Path | None
         log_directory=str(log_directory.resolve()) if log_directory else None,
         log_prefix=f"jtqd-{instance}-",
         versions=versions() | {"kernel": platform.release()},
+        tpdos={str(joint.node_id): tpdos_as_json(joint.tpdos) for joint in config.joints},
     )
 
 

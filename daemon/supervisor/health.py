@@ -35,6 +35,7 @@ from jtqd.daemon.shared.reasons import (
 from jtqd.daemon.shared.snapshot import NMT_STATES, NOT_OPERATIONAL, InputView, JointView, View
 from jtqd.drivers.emcy import PDO_LONG, PDO_SHORT, PDO_TIMEOUT
 from jtqd.estimator import status as st
+from jtqd.estimator.learned import Zeros
 
 NEAR_SIGMAS = 2.0
 """A deviation ends within so many sigmas: on the edge it does not begin again and again."""
@@ -192,6 +193,7 @@ class _Joint:
     """One joint's PDOs by name, and the counters when it was last well."""
 
     subject: Subject
+    number: int
     node: int
     names: tuple[str, str]
     sensor: str | None
@@ -200,6 +202,7 @@ class _Joint:
     well: dict[str, int] = field(default_factory=dict)
     faults: int = 0
     latched: int = 0
+    jumps: int = 0
     deviation: Deviation = field(default_factory=Deviation)
 
 
@@ -221,6 +224,7 @@ class Health:
             self._joints.append(
                 _Joint(
                     subject,
+                    n + 1,
                     joint.node_id,
                     names_of_inputs(config, n),
                     None if sensor is None else names[sensor],
@@ -276,7 +280,9 @@ class Health:
         limits = zip(self._joints, view.joints, self._network_limits_nm, self._sensor_zeros_nm, strict=True)
         for joint, seen, limit_nm, zero_nm in limits:
             self._observe_inputs(joint, seen, view, now_s)
-            self._observe_status(joint, seen, limit_nm, now_s)
+            zeros = view.zeros[joint.number - 1]
+            self._observe_status(joint, seen, limit_nm, zeros, now_s)
+            self._observe_zeros(joint, zeros, now_s)
             if advanced:
                 far = joint.deviation.update(seen, now_s, zero_nm)
                 text = f"{seen.torque_nm:.2f} Nm against {seen.reference_nm:.2f} Nm, sigma {seen.sigma_nm:.2f} Nm"
@@ -303,7 +309,20 @@ class Health:
             )
             conditions.update("temperature_lost", subject, gone, now_s, text)
 
-    def _observe_status(self, joint: _Joint, seen: JointView, limit_nm: float | None, now_s: float) -> None:
+    def _observe_zeros(self, joint: _Joint, zeros: Zeros, now_s: float) -> None:
+        subject = joint.subject
+        why = zeros.implausible
+        self._conditions.update("zero_implausible", subject, not zeros.plausible, now_s, why)
+        before = self._conditions.is_present("zero_jumped", subject.name)
+        jumped = zeros.jumps > joint.jumps or (before and zeros.tracked and not zeros.learned)
+        joint.jumps = zeros.jumps
+        if jumped != before:
+            text = f"from {1e6 * zeros.link_used_rad:+.0f} µrad"
+            self._conditions.update("zero_jumped", subject, jumped, now_s, text)
+
+    def _observe_status(
+        self, joint: _Joint, seen: JointView, limit_nm: float | None, zeros: Zeros, now_s: float
+    ) -> None:
         conditions, subject = self._conditions, joint.subject
         present = seen.input_flags >> 8 | seen.latched
         faults = fault_meanings(present, names=True)
@@ -316,7 +335,7 @@ class Health:
         drive = partial(drive_reason, seen)
         conditions.update("drive_fault", subject, seen.status == st.DRIVE_FAULT, now_s, drive)
         conditions.update("drive_off", subject, seen.status == st.OFF, now_s, drive)
-        why = partial(degraded_reason, seen, limit_nm)
+        why = partial(degraded_reason, seen, limit_nm, zeros)
         conditions.update("degraded", subject, seen.status == st.DEGRADED, now_s, why)
 
     def _observe_counter(

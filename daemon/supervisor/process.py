@@ -43,7 +43,7 @@ from jtqd.daemon.supervisor.summary import Summary, summary_of
 from jtqd.daemon.supervisor.table import Display
 from jtqd.drivers import nmt
 from jtqd.drivers.bus_load import BusLoad, BusLoadError, check_bus_load
-from jtqd.drivers.frame_socket import BusError, open_frame_socket
+from jtqd.drivers.frame_socket import BusError, FrameSocket, open_frame_socket
 from jtqd.drivers.long_frames import LongFrames
 from jtqd.drivers.object_dictionary import ObjectStore, entries_from_json
 
@@ -100,14 +100,19 @@ def log_directory(record: str | None) -> Path | None:
 
 
 def start_bench(config: Config, bus: str, start_child: StartChild) -> Child:
-    """Start the emulated bench on `bus` ("unix:PATH"). Raises SupervisorError."""
+    """Start the emulated bench on `bus` ("unix:PATH"); `await_bench` waits for the bus."""
     path = Path(bus.removeprefix("unix:"))
     path.unlink(missing_ok=True)
     arguments = ["--bus", bus]
     if len(config.joints) != 2:
         arguments += ["--drives", str(len(config.joints))]
         arguments += [] if config.sensor else ["--no-sensor"]
-    bench = start_child("jtqd.sim_can", arguments, "the emulated bench")
+    return start_child("jtqd.sim_can", arguments, "the emulated bench")
+
+
+def await_bench(config: Config, bus: str, bench: Child) -> None:
+    """Wait until the emulated bench has opened its bus. Raises SupervisorError."""
+    path = Path(bus.removeprefix("unix:"))
     deadline = time.monotonic() + _WARM_UP_TIMEOUT_S
     while not path.exists():
         if not bench.alive():
@@ -119,7 +124,6 @@ def start_bench(config: Config, bus: str, start_child: StartChild) -> Child:
         # The emulated nodes stand for hardware: they come before everything but the loop.
         with suppress(PermissionError):
             os.sched_setscheduler(bench.pid, os.SCHED_FIFO, os.sched_param(_BENCH_PRIORITY))
-    return bench
 
 
 def boot_nodes(config: Config, bus: str, child: Child, stopped: Stopped) -> dict[str, Any] | None:
@@ -302,9 +306,13 @@ class Supervisor:
         self._about = self._own_description()
         write_about(self._directory, self._about)
         bench = start_bench(self._config, self._bus, self._child) if self._emulate else None
-        socket = open_frame_socket(self._bus, service_filters(self._config), error_frames=True)
+        # A bus that is not there starts nothing; the emulated one comes up while the others load.
+        socket = None if bench is not None else self._open_bus()
         loop = self._child("jtqd.daemon.loop.process", [json.dumps(self._loop_request())], "the loop")
         boot = self._child("jtqd.drivers.boot", [], "the boot")
+        if bench is not None:
+            await_bench(self._config, self._bus, bench)
+        socket = self._open_bus() if socket is None else socket
         report = boot_nodes(self._config, self._bus, boot, self._stopped)
         if report is None:
             return None
@@ -366,6 +374,10 @@ class Supervisor:
             began_s=began_s,
             stolen_s=stolen,
         )
+
+    def _open_bus(self) -> FrameSocket:
+        """Open the supervisor's socket. Raises BusError."""
+        return open_frame_socket(self._bus, service_filters(self._config), error_frames=True)
 
     def _take_layout(self, report: dict[str, Any]) -> None:
         """Go on with the TPDOs that the drives have, where their mapping is fixed. Raises SupervisorError."""

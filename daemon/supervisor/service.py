@@ -24,6 +24,7 @@ from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.daemon.shared.systemd import Notifier
 from jtqd.daemon.supervisor.control import FILE, Answer, ControlError, ControlServer, Reply
 from jtqd.estimator import status as st
+from jtqd.estimator.learned import KEPT
 
 _GAUGES = frozenset(("work_max_ns", "late_max_ns"))
 _SHARES = (0.5, 0.99, 1.0)
@@ -59,6 +60,16 @@ def metrics_text(
     )
     metric("sigma_nm", "gauge", "Its standard deviation.", [(at, each.sigma_nm) for at, each in joints])
     metric("status", "gauge", "Status as in the estimate PDO.", [(at, each.status) for at, each in joints])
+    tracked = [(f',joint="{n}"', each) for n, each in enumerate(view.zeros, start=1) if each.tracked]
+    if tracked:
+        rows = [(at, each.link_rad) for at, each in tracked]
+        metric("link_zero_rad", "gauge", "Zero of the link encoder.", rows)
+        rows = [(at, each.link_sigma_rad) for at, each in tracked]
+        metric("link_zero_sigma_rad", "gauge", "Its standard deviation.", rows)
+        rows = [(at, each.link_used_rad) for at, each in tracked]
+        metric("link_zero_used_rad", "gauge", "What of it is taken off the reading.", rows)
+        rows = [(at, each.jumps) for at, each in tracked]
+        metric("link_zero_jumps_total", "counter", "How often it has jumped.", rows)
     present = Counter(each.name for each in conditions)
     metric(
         "condition",
@@ -289,6 +300,7 @@ class Service:
                 "missed": missed,
                 "shadowed_cycles": cycles,
                 "changes": about["changes"],
+                "zeros": about.get("zeros", {}),
             }
         )
         changes = ", ".join(
@@ -296,10 +308,12 @@ class Service:
             for name, change in about["changes"].items()
             if change["rms_change_nm"] is not None
         )
+        zeros = about.get("zeros", {})
         self._log(
             f"reloaded {self._config.path}: in force from cycle {cycle} on, "
             f"{missed} cycle{'s' if missed != 1 else ''} missed; "
-            f"on the last {cycles} cycles the estimates change: {changes or 'nothing to compare'}",
+            f"on the last {cycles} cycles the estimates change: {changes or 'nothing to compare'}"
+            + "".join(_of_zeros(name, became) for name, became in zeros.items()),
             NOTICE,
         )
         self._notifier.send("READY=1")
@@ -329,6 +343,14 @@ class Service:
             write_metrics(path, metrics_text(view, self._reader, self._bus, recorder_lost, present))
         except OSError as error:
             self._log(f"metrics: {path}: {error.strerror}", WARNING, "metrics")
+
+
+def _of_zeros(name: str, became: str) -> str:
+    """Return what a reload has done to the zeros of a joint (`jtqd.estimator.learned`)."""
+    joint = name.replace("_", " ")
+    if became == KEPT:
+        return f"; {joint}: its learned zeros are kept"
+    return f"; {joint}: its learned zeros are forgotten, what they were learned with has changed"
 
 
 def _status(view: View) -> str:

@@ -11,6 +11,7 @@ from jtqd.daemon.shared.conditions import CATALOGUE, Occurrences
 from jtqd.daemon.shared.notices import INFO
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.estimator.checked import finite
+from jtqd.estimator.learned import Zeros
 
 _REFUSED = ("overruns", "latches", "latch_resets")
 """Counters beside those of the faults (docs/safety.md)."""
@@ -40,6 +41,8 @@ class Summary:
     rmse_now_nm: tuple[float, ...] = ()
     """Against the sensor now: with the estimate's age as an error, as a controller meets it."""
     age_ms: tuple[float, ...] = ()
+    zeros: tuple[Zeros, ...] = ()
+    """Of each joint at the end."""
 
     @property
     def exit_status(self) -> int:
@@ -59,6 +62,7 @@ class Summary:
             "rmse_nm": {f"joint_{n}": finite(rmse) for n, rmse in enumerate(self.rmse_nm, start=1)},
             "rmse_now_nm": {f"joint_{n}": finite(rmse) for n, rmse in enumerate(self.rmse_now_nm, start=1)},
             "age_ms": {f"joint_{n}": finite(age) for n, age in enumerate(self.age_ms, start=1)},
+            "zeros": {f"joint_{n}": each.content() for n, each in enumerate(self.zeros, start=1)},
             "deviations": {f"joint_{n}": self._deviations(n) for n in range(1, len(self.rmse_nm) + 1)},
             "conditions": [
                 each._asdict() | {"total_s": round(each.total_s, 3), "first_s": round(each.first_s, 3)}
@@ -98,6 +102,11 @@ class Summary:
             if isfinite(rmse):
                 shown = f"{rmse:.3f} Nm against the sensor in motion, both {age:.2f} ms old ({now:.3f} Nm against it now)"
             lines.append(f"RMSE joint {joint}  {shown}")
+        lines += [
+            f"zeros joint {joint} {zeros.text}"
+            for joint, zeros in enumerate(self.zeros, start=1)
+            if zeros.tracked
+        ]
         happened = [each for each in self.conditions if CATALOGUE[each.name].severity > INFO]
         for n, each in enumerate(happened):
             times = "once" if each.times == 1 else f"{each.times} times"
@@ -186,6 +195,7 @@ def summary_of(
         rmse_nm=view.rmse_nm,
         rmse_now_nm=view.rmse_now_nm,
         age_ms=tuple(each.age_ms for each in view.joints),
+        zeros=view.zeros,
         counters=view.counters,
         refused=tuple(refused),
         recording=recording,

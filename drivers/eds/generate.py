@@ -22,6 +22,8 @@ from jtqd.drivers.eds.own_objects import (
     PARAMETERS,
     ROOM,
     VERSION,
+    ZERO_FIELDS,
+    ZEROS,
     own_sheet,
 )
 from jtqd.drivers.pdo import INVALID as PDO_INVALID
@@ -476,6 +478,9 @@ def jtqd(room: int = ROOM[0]) -> Sheet:
     for joint, index in enumerate(PARAMETERS[:room], start=1):
         title = f"Parameters of joint {joint}"
         more[index] = array(title, REAL32, "ro", [(name, 0.0) for name in JOINT_PARAMETERS])
+    for joint, index in enumerate(ZEROS[:room], start=1):
+        title = f"Zeros of joint {joint}"
+        more[index] = array(title, REAL32, "ro", [(name, 0.0) for name in ZERO_FIELDS])
     objects: dict[int, Var | Entries] = {
         **device(0, "jtqd", "none", VERSION),
         **errors(behaviour_access="const", behaviour=1, inhibit=100),
@@ -509,6 +514,8 @@ def jtqd(room: int = ROOM[0]) -> Sheet:
         0x2205: array("Bus state", U32, "ro", [(name, 0) for name in BUS_FIELDS]),
         0x2206: array("Nodes", U32, "ro", nodes),
         0x2207: array("Last EMCY of nodes", U32, "ro", nodes),
+        0x220E: array("Zero flags", U8, "ro", joints),
+        0x220F: array("Zero jumps", U32, "ro", joints),
     }
     note = [
         "2100h in 0.01 Nm, 8000h: no estimate. 2101h in 0.05 Nm, 255: more or unknown.",
@@ -519,6 +526,7 @@ def jtqd(room: int = ROOM[0]) -> Sheet:
         "2205h:1 0 error active, 1 warning, 2 passive, 3 bus-off, 4 interface down.",
         "2206h: NMT state, heartbeat (1 awaited, 2 heard, 3 lost), configured, node-ID; from the lowest byte.",
         "2207h: error code (2 bytes), error register, number of messages.",
+        "220Eh: bits 0 tracked, 1 learned, 2 beyond its limit, 3 not yet taken off, 4 current and torsion disagree.",
     ]
     return Sheet(
         own_sheet(room), "joint torque estimator daemon", "jtqd", 0x001, revision, "JTQD", objects, note

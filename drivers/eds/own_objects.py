@@ -1,4 +1,4 @@
-"""Sub-indices of jtqd's own objects 2200h..2209h by name: one list for the data sheet and for the daemon."""
+"""Sub-indices of jtqd's own objects 2200h..220Fh by name: one list for the data sheet and for the daemon."""
 
 COUNTERS = (
     "cycles",
@@ -78,6 +78,20 @@ PARAMETERS = (0x2202, 0x2203, 0x2208, 0x2209)
 """Objects with the parameters of joint 1, 2, 3, 4. Nodes (1016h, 2206h, 2207h) stand in this order: joints, sensor."""
 VERSION = "0.2.0"
 """100Ah."""
+
+ZEROS = (0x220A, 0x220B, 0x220C, 0x220D)
+"""Objects with what has been learned of the zeros of joint 1, 2, 3, 4; 220Eh and 220Fh: flags and jumps of all."""
+
+ZERO_FIELDS = (
+    "link_rad",
+    "link_sigma_rad",
+    "link_used_rad",
+    "current_a",
+    "current_sigma_a",
+    "current_used_a",
+    "limit_rad",
+)
+"""Sub-indices 1.. of `ZEROS` (`jtqd.estimator.learned.Zeros`)."""
 
 JOINT_PARAMETERS = (
     "gear_ratio",

@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from jtqd.drivers.boot_request import RequestError, parse_request
+from jtqd.daemon.config import JointConfig, load_config
 from jtqd.drivers.bus_load import BusLoad, BusLoadError, Row, check_bus_load, configured_load, heartbeat_row
-from jtqd.drivers.devices import COMMANDER_NODE, DriveProfile, SensorProfile
-from jtqd.estimator.checked import ConfigError, Section
+from jtqd.drivers.devices import (
+    CIA_402,
+    COMMANDER_NODE,
+    DriveProfile,
+    Identity,
+    SensorProfile,
+    parse_key,
+)
+from jtqd.drivers.pdo import PdoMap
+from jtqd.drivers.sdo import Key, label
+from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Joint
-from jtqd.models.files import load_joint, load_yaml, shipped
 from jtqd.sysid.campaign.alone import allowed_torque
 from jtqd.sysid.campaign.processes import on_time
 from jtqd.sysid.excitation.model import current_at
@@ -29,7 +37,6 @@ from jtqd.sysid.motion.setpoints import (
 )
 from jtqd.sysid.motion.shell import Progress, play
 
-DEFAULT_CONFIG: Final = "bench.yaml"
 PERIOD_US: Final = 1000
 LONGEST_PERIOD_US: Final = 10_000
 _SETPOINT_RPDO: Final = 0x200  # or 300h+n: either way four bytes
@@ -44,7 +51,7 @@ class BenchConfig:
     Attributes:
         path: the file. drives: of joints 1, 2, ... joints: their joint files. channels: of the sensor, for each joint; None:
             it has none. temperatures: jtqd takes that of the joint. sensor: None without one. master: jtqd's own node-ID.
-        period_us: of SYNC, whole milliseconds.
+        period_us: of SYNC, whole milliseconds. tpdos: by node-ID, as they are wanted.
     """
 
     path: Path
@@ -57,58 +64,51 @@ class BenchConfig:
     heartbeat_ms: int
     bitrate: int
     period_us: int
+    tpdos: Mapping[int, tuple[PdoMap, ...]]
 
     @classmethod
     def load(cls, path: Path | None) -> BenchConfig:
-        """Read a configuration of jtqd (None: the one that ships); what is not asked for here jtqd checks itself.
+        """Read a configuration of jtqd (None: the one that ships).
 
         Raises:
-            ConfigError: naming file, key, found and expected; also for a period of SYNC that is no whole milliseconds.
+            ConfigError: naming file, key, found and expected; also for a period of SYNC that is no whole milliseconds up to
+                10, for joints whose numbers have a gap, and for drives that tell what they are commanded by otherwise than
+                CiA 402.
         """
-        path = path if path is not None else shipped(DEFAULT_CONFIG)
-        mapping = load_yaml(path)
-        top = Section(mapping, str(path))
-        joints = [
-            name for name in (f"joint_{number}" for number in range(1, MOST_JOINTS + 1)) if top.has(name)
-        ]
-        if not joints or joints[-1] != f"joint_{len(joints)}":
+        config = load_config(path)
+        joints = config.joints
+        if [joint.number for joint in joints] != list(range(1, len(joints) + 1)):
             raise ConfigError(
-                f"{path}: found {', '.join(joints) or 'no joint'}, expected joint_1 to joint_{MOST_JOINTS} without a gap"
+                f"{config.path}: found {', '.join(f'joint_{joint.number}' for joint in joints)}, expected joint_1 to "
+                f"joint_{MOST_JOINTS} without a gap"
             )
-        sync = top.section("sync", optional=True)
-        period_us = PERIOD_US
-        if sync is not None:
-            period_us = sync.integer("period_us", low=PERIOD_US, high=LONGEST_PERIOD_US, default=PERIOD_US)
-            if period_us % PERIOD_US:
-                raise sync.error("period_us", period_us, "whole milliseconds: set-points are that far apart")
-        sections = [top.required(name) for name in joints]
-        files = [load_joint(path.parent / joint.text("file")) for joint in sections]
-        nodes = [_node(joint, "drive") for joint in sections]
-        sensor = top.section("sensor", optional=True)
-        if sensor is not None:
-            nodes.append(_node(sensor, "sensor"))
-        master = top.integer("node_id", low=1, high=127)
-        try:
-            request = parse_request({"bus": "-", "nodes": nodes, "master_node": master})
-        except RequestError as error:
-            raise ConfigError(f"{path}: {error}") from None
-        timing = top.section("nodes", optional=True)
+        period_us, rest_ns = divmod(config.period_ns, 1000)
+        if rest_ns or period_us % PERIOD_US or period_us > LONGEST_PERIOD_US:
+            raise ConfigError(
+                f"{config.path}: key 'sync.period_us': found {period_us}, expected whole milliseconds up to "
+                f"{LONGEST_PERIOD_US // PERIOD_US} for a campaign: set-points are that far apart"
+            )
+        sensor = config.sensor
         return cls(
-            path=path,
-            drives=tuple(each for each in request.profiles if isinstance(each, DriveProfile)),
-            joints=tuple(files),
-            channels=tuple(
-                joint.integer("sensor_channel", low=1, high=2) if joint.has("sensor_channel") else None
-                for joint in sections
+            path=config.path,
+            drives=tuple(_drive(config.path, joint) for joint in joints),
+            joints=tuple(joint.joint for joint in joints),
+            channels=tuple(joint.sensor_channel for joint in joints),
+            temperatures=tuple(joint.temperature for joint in joints),
+            sensor=None
+            if sensor is None
+            else SensorProfile(
+                sensor.node_id,
+                Identity(**asdict(sensor.identity)),
+                sensor.channels,
+                _by_key(sensor.given),
+                {int(word, 16): nm for word, nm in sensor.unit_words.items()},
             ),
-            temperatures=tuple(
-                joint.has("temperature") and joint.raw("temperature") is True for joint in sections
-            ),
-            sensor=next((each for each in request.profiles if isinstance(each, SensorProfile)), None),
-            master=master,
-            heartbeat_ms=100 if timing is None else timing.integer("heartbeat_ms", low=10, default=100),
-            bitrate=top.integer("bitrate", low=10_000, high=1_000_000, default=1_000_000),
+            master=config.node_id,
+            heartbeat_ms=config.heartbeat_ms,
+            bitrate=config.bitrate,
             period_us=period_us,
+            tpdos={joint.node_id: joint.tpdos for joint in joints},
         )
 
     @property
@@ -188,7 +188,7 @@ class BenchConfig:
         try:
             return check_bus_load(
                 configured_load(
-                    self.nodes,
+                    self.tpdos,
                     {} if self.sensor is None else {self.sensor.node_id: self.sensor.channels},
                     temperatures=self.nodes,  # the commander switches TPDO3 on where jtqd does not
                     heartbeat_ms=self.heartbeat_ms,
@@ -202,13 +202,48 @@ class BenchConfig:
             raise ConfigError(f"{self.path}: with the commander's set-points: {error}") from None
 
 
-def _node(section: Section, kind: str) -> dict[str, Any]:
-    """Return a node of the configuration as the boot takes it: the commander asks of it what jtqd's boot asks."""
-    node = {"node": section.integer("node", low=1, high=127), "kind": kind}
-    node |= {key: section.raw(key) for key in ("identity", "given", "unit_words") if section.has(key)}
-    if kind == "sensor":
-        node["channels"] = list(range(1, section.integer("channels", low=1, high=2, default=1) + 1))
-    return node
+def _by_key(given: Mapping[str, int]) -> dict[Key, int]:
+    return {parse_key(name): value for name, value in given.items()}
+
+
+def _drive(path: Path, joint: JointConfig) -> DriveProfile:
+    """Return the drive as the commander takes it: by jtqd's configuration, as far as it can be commanded.
+
+    60FFh counts as 606Ch does, and 6071h as 6077h, or as 6078h of 6075h. Raises ConfigError where the drive's velocity and
+    current are told by other objects, with another sign, or not at each SYNC: it could be moved otherwise than is planned.
+    """
+    where, objects = f"{path}: key 'joint_{joint.number}", joint.objects
+    if joint.max_age_ms:
+        raise ConfigError(
+            f"{where}.max_age_ms': found {joint.max_age_ms:g}, expected none for a campaign: a motion needs every value at "
+            "each SYNC"
+        )
+    if objects.motor_velocity is None:
+        raise ConfigError(
+            f"{where}.objects.motor_velocity': found false, expected 606Ch for a campaign: it counts as 60FFh does, by "
+            "which the drive is commanded"
+        )
+    for name, each, indices in (
+        ("motor_velocity", objects.motor_velocity, (0x606C,)),
+        ("current", objects.current, (0x6078, 0x6077)),
+    ):
+        if each.index not in indices or each.sign != 1:
+            found = f"{label(each.index, each.subindex)}, sign {each.sign}"
+            wanted = " or ".join(f"{index:04X}h" for index in indices)
+            raise ConfigError(
+                f"{where}.objects.{name}': found {found}, expected {wanted} with sign 1 for a campaign: the drive is "
+                "commanded in its units"
+            )
+    if objects.statusword != CIA_402.statusword:
+        raise ConfigError(f"{where}.objects.statusword': found another one, expected 6041h for a campaign")
+    return DriveProfile(
+        joint.node_id,
+        Identity(**asdict(joint.identity)),
+        _by_key(joint.given),
+        objects=objects,
+        layout=joint.tpdos,
+        torque_constant_nm_per_a=joint.joint.torque_constant_nm_per_a,
+    )
 
 
 Play = Callable[[Setpoints], MotionResult]

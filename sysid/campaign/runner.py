@@ -220,7 +220,7 @@ def findings(
         *_no_sensor(logged, measured),
         *channels,
         *_followed(logged, setpoints, joints),
-        *(() if setpoints.current_joint is None else _opposite(logged, setpoints.joints)),
+        *(() if setpoints.current_joint is None else _opposite(logged, setpoints.joints, joints)),
     )
 
 
@@ -275,9 +275,11 @@ def _follows(
     )
 
 
-def _opposite(logged: LoggedRun, pair: tuple[int, ...]) -> Iterator[str]:
-    """The links are one body: in their own frames they turn oppositely."""
-    one, two = (logged.table.joints[number].link_position_rad for number in pair)
+def _opposite(logged: LoggedRun, pair: tuple[int, ...], joints: Sequence[Joint]) -> Iterator[str]:
+    """The links are one body: in their own frames they turn oppositely. With one encoder the motor's, through the gear."""
+    one, two = (
+        logged.table.joint(number, joints[number - 1].gear_ratio).link_position_rad for number in pair
+    )
     assert one is not None
     assert two is not None
     if max(float(np.ptp(one)), float(np.ptp(two))) < MOVED_RAD:
@@ -286,9 +288,9 @@ def _opposite(logged: LoggedRun, pair: tuple[int, ...]) -> Iterator[str]:
     variance = float(dx @ dx)
     slope = float(dx @ (two - two.mean())) / variance if variance else np.inf
     if abs(slope + 1.0) > OPPOSITE_TOLERANCE:
-        yield (
-            f"j{pair[1]}.link_position_rad: found it turning {slope:.4g} times as far as j{pair[0]}'s, expected -1"
-        )
+        link = logged.table.joints[pair[1]].link_position_rad is not None
+        name = "link_position_rad:" if link else "motor_position_rad: through the gear"
+        yield f"j{pair[1]}.{name} found it turning {slope:.4g} times as far as j{pair[0]}'s, expected -1"
 
 
 ATTEMPTS: Final = 3

@@ -363,7 +363,12 @@ def losses_main(argv: list[str]) -> int:
             for finding in findings:
                 print(f"{LOSSES_BY}: {finding.text}", file=sys.stderr)
             return 3
-        fit = fit_fused(signals_of(runs, number, joint), joint.friction, joint.rated_torque_nm)
+        two = two_encoders(runs, number)
+        fit = fit_fused(
+            signals_of(runs, number, joint), joint.friction, joint.rated_torque_nm, with_torsion=two
+        )
+        if not two:
+            print(f"{LOSSES_BY}: {ONE_ENCODER}", file=sys.stderr)
         written = _with_fused(joint, fit, runs)
         print(json.dumps(_losses_mapping(fit), indent=1) if options.json else "\n".join(_lines(joint, fit)))
         if options.out is not None:
@@ -373,6 +378,21 @@ def losses_main(argv: list[str]) -> int:
         print(f"{LOSSES_BY}: {error}", file=sys.stderr)
         return 1
     return 0
+
+
+ONE_ENCODER: Final = (
+    "the runs have one encoder of this joint: no torsion is fitted, sigma is that of motor current less loss"
+)
+
+
+def two_encoders(runs: list[RunFile], number: int) -> bool:
+    """Return whether the runs have both encoders of a joint. Raises RunTableError where some have and some have not."""
+    without = [run.name for run in runs if not run.table.joints[number].two_encoders]
+    if without and len(without) < len(runs):
+        raise RunTableError(
+            f"{without[0]}: j{number}: found one position, other runs have both, expected both in all runs or in none"
+        )
+    return not without
 
 
 def signals_of(runs: list[RunFile], number: int, joint: Joint) -> list[RunSignals]:
@@ -418,8 +438,12 @@ def _lines(joint: Joint, fit: FusedFit) -> list[str]:
         f"  loss: {fit.loss.samples} samples, viscous friction falls {100 * loss.viscous_per_k:.1f} "
         f"+- {196 * fit.loss.viscous_per_k_sigma:.1f} % per kelvin",
         f"  sigma of the current path {sigma.current_nm:.2f} Nm, {sigma.viscous_nms_per_rad:.2f} Nms/rad, "
-        f"{100 * sigma.load:.1f} % of load; of the torsion {sigma.torsion_nm:.2f} Nm; of the sensor's zero "
-        f"{sigma.reference_nm:.2f} Nm",
+        f"{100 * sigma.load:.1f} % of load"
+        + (
+            ""
+            if torsion is None
+            else f"; of the torsion {sigma.torsion_nm:.2f} Nm; of the sensor's zero {sigma.reference_nm:.2f} Nm"
+        ),
     ]
     if torsion is not None:
         amplitude = np.hypot(torsion.cos_rad, torsion.sin_rad) * 1e6

@@ -11,6 +11,9 @@ With residuals e_c = tau_raw - loss - sensor and e_t = tau_t - sensor on runs no
     scale_q = 90 % quantile of |error|/sigma in quadrant q, over 1.645: split conformal prediction by runs
               (Vovk et al. 2005), every run weighted alike, its level set so that a run left out is covered to 90 %
 
+A joint with one encoder has the current path alone (torsion None): nothing tells the sensor's zero from that path's
+own error, so reference is 0 and sigma holds both.
+
 The level of 90 % is unbiased, not the conservative one that guarantees at least 90 %. Where a whole run shares its error
 (its zeros), n runs have not shown the largest yet: 8 of them cover 87 % of others.
 """
@@ -49,7 +52,10 @@ _LEAST_SCALE: Final = 0.05
 
 
 class PathResiduals(NamedTuple):
-    """One unseen run: arrays [n] of its moving samples (Nm, rad/s); half: `AdditiveLossModel.loss`; open: of the slip."""
+    """One unseen run: arrays [n] of its moving samples (Nm, rad/s); half: `AdditiveLossModel.loss`; open: of the slip.
+
+    torsion_nm, open_nm and torsion_error_nm are 0 where there is no torsion.
+    """
 
     raw_nm: FloatArray
     velocity_rad_s: FloatArray
@@ -60,8 +66,8 @@ class PathResiduals(NamedTuple):
     torsion_error_nm: FloatArray
 
 
-def fit_sigma(runs: Sequence[PathResiduals]) -> FusedSigma:
-    """Return the standard deviations of both paths, scale 1.
+def fit_sigma(runs: Sequence[PathResiduals], *, with_torsion: bool = True) -> FusedSigma:
+    """Return the standard deviations of both paths, scale 1; without torsion those of the current path.
 
     Raises ValueError for fewer than three runs with samples, or none above 0.1 rad/s.
     """
@@ -73,7 +79,7 @@ def fit_sigma(runs: Sequence[PathResiduals]) -> FusedSigma:
     products = (current - current.mean()) * (torsion - torsion.mean())
     # less its standard error: what is not surely the sensor's stays in the sigma of the torque
     doubt = float(np.std(products)) / np.sqrt(len(runs))
-    shared = max(float(np.mean(products)) - doubt, _FLOOR_NM**2)
+    shared = max(float(np.mean(products)) - doubt, _FLOOR_NM**2) if with_torsion else 0.0
     fast = [np.abs(run.velocity_rad_s) > _FAST_RAD_S for run in runs]
     if not any(map(np.any, fast)):
         raise ValueError(f"found no held-out sample above {_FAST_RAD_S} rad/s, expected some")
@@ -90,9 +96,15 @@ def fit_sigma(runs: Sequence[PathResiduals]) -> FusedSigma:
     )
     ones = np.ones_like(v)
     a = nnls(np.column_stack((ones, v * v, raw * raw)), e_c * e_c - shared)[0]
-    b = nnls(np.column_stack((ones, t * t)), e_t * e_t - shared - open_nm * open_nm)[0]
+    current_nm = max(float(np.sqrt(a[0])), _FLOOR_NM)
+    # without torsion the estimator does not read its sigma; the file must have a number above 0
+    b = (
+        nnls(np.column_stack((ones, t * t)), e_t * e_t - shared - open_nm * open_nm)[0]
+        if with_torsion
+        else np.array((current_nm**2, 0.0))
+    )
     return FusedSigma(
-        current_nm=max(float(np.sqrt(a[0])), _FLOOR_NM),
+        current_nm=current_nm,
         viscous_nms_per_rad=float(np.sqrt(a[1])),
         load=float(np.sqrt(a[2])),
         torsion_nm=max(float(np.sqrt(b[0])), _FLOOR_NM),
@@ -198,24 +210,31 @@ def folds(runs: Sequence[RunSignals], count: int = FOLDS) -> Iterator[tuple[list
         yield [run for n, run in enumerate(runs) if n not in judged], judged
 
 
-def fit_fused(runs: Sequence[RunSignals], friction: Friction, rated_nm: float | None = None) -> FusedFit:
+def fit_fused(
+    runs: Sequence[RunSignals],
+    friction: Friction,
+    rated_nm: float | None = None,
+    *,
+    with_torsion: bool = True,
+) -> FusedFit:
     """Fit section `fused` of one joint.
 
     runs: at least 6 (ValueError); friction: of the joint file; rated_nm: its rated torque, of which the envelope's steps are
-    a part, None: without an envelope. Raises LossFitError, TorsionError.
+    a part, None: without an envelope; with_torsion: False for a joint with one encoder, which has no envelope either. Raises
+    LossFitError, TorsionError.
     """
     if len(runs) < _LEAST_RUNS:
         raise ValueError(
             f"found {counted(len(runs), 'run')}, expected at least {_LEAST_RUNS}: standard deviations need held-out runs"
         )
-    unseen = _unseen(runs, friction)
-    sigma = fit_sigma(unseen)
-    errors, sigmas = zip(*(fused_error(run, sigma) for run in unseen), strict=True)
+    unseen = _unseen(runs, friction, with_torsion=with_torsion)
+    sigma = fit_sigma(unseen, with_torsion=with_torsion)
+    errors, sigmas = zip(*(fused_error(run, sigma, with_torsion=with_torsion) for run in unseen), strict=True)
     sigma = replace(sigma, scale=conformal_scale(errors, sigmas, [quadrants_of(run) for run in unseen]))
     fit = fit_loss(runs, friction)
     rmse = tuple(float(np.sqrt(np.mean(e * e))) for e in errors)
-    torsion = fit_torsion(runs)
-    envelope = None if rated_nm is None else _envelope(runs, fit.loss, torsion, rated_nm)
+    torsion = fit_torsion(runs) if with_torsion else None
+    envelope = None if rated_nm is None or torsion is None else _envelope(runs, fit.loss, torsion, rated_nm)
     return FusedFit(Fused(fit.loss, torsion, sigma, envelope), fit, rmse)
 
 
@@ -235,23 +254,28 @@ def _envelope(
     return made if max(len(made.known), len(made.known[0])) <= MAX_CELLS else None
 
 
-def _unseen(runs: Sequence[RunSignals], friction: Friction) -> list[PathResiduals]:
+def _unseen(runs: Sequence[RunSignals], friction: Friction, *, with_torsion: bool) -> list[PathResiduals]:
     """Return the residuals of every run with motion, in order, from fits on the runs of the other folds."""
     found: dict[int, PathResiduals] = {}
     for known, judged in folds(runs):
-        torsion, loss = fit_torsion(known), fit_loss(known, friction).loss
+        torsion = fit_torsion(known) if with_torsion else None
+        loss = fit_loss(known, friction).loss
         found |= {n: path_residuals(runs[n], loss, torsion) for n in judged if runs[n].moving.any()}
     return [found[n] for n in sorted(found)]
 
 
-def path_residuals(run: RunSignals, loss: AdditiveLoss, torsion: Torsion) -> PathResiduals:
+def path_residuals(run: RunSignals, loss: AdditiveLoss, torsion: Torsion | None) -> PathResiduals:
     """Return what both paths miss on a run's moving samples, with a loss and a torsion from elsewhere."""
     keep, seen = run.moving, run.seen
     loss_nm, wide = loss_and_width(run, loss)
     raw, sensor = seen.raw_nm[keep], run.sensor_nm[keep]
-    tau, open_nm = (each[keep] for each in torsion_torque(torsion, run))
     current = raw - loss_nm[keep] - sensor
-    return PathResiduals(raw, seen.velocity_rad_s[keep], wide[keep], tau, open_nm, current, tau - sensor)
+    velocity, half = seen.velocity_rad_s[keep], wide[keep]
+    if torsion is None:
+        none = np.zeros(len(raw))
+        return PathResiduals(raw, velocity, half, none, none, current, none)
+    tau, open_nm = (each[keep] for each in torsion_torque(torsion, run))
+    return PathResiduals(raw, velocity, half, tau, open_nm, current, tau - sensor)
 
 
 def loss_and_width(run: RunSignals, loss: AdditiveLoss) -> tuple[FloatArray, FloatArray]:
@@ -263,9 +287,11 @@ def loss_and_width(run: RunSignals, loss: AdditiveLoss) -> tuple[FloatArray, Flo
     return value, held(half, seen.dt_s, running)
 
 
-def fused_error(run: PathResiduals, sigma: FusedSigma) -> tuple[FloatArray, FloatArray]:
+def fused_error(
+    run: PathResiduals, sigma: FusedSigma, *, with_torsion: bool = True
+) -> tuple[FloatArray, FloatArray]:
     """Return error and standard deviation [n] of the fused physics: its weights apply to the paths' errors alike."""
-    alpha, spread = Fusion(sigma, True).weigh_many(
+    alpha, spread = Fusion(sigma, with_torsion).weigh_many(
         run.raw_nm, run.half_nm, run.velocity_rad_s, run.torsion_nm, run.open_nm
     )
     return run.current_error_nm + alpha * (run.torsion_error_nm - run.current_error_nm), spread

@@ -11,26 +11,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final
 
 from jtqd.drivers.devices import (
     NOT_MEASURED,
     SYNC_COB_ID,
     TEMPERATURE_C_PER_UNIT,
-    drive_tpdo1,
-    drive_tpdo2,
     drive_tpdo3,
     sensor_tpdo1,
     sensor_tpdo2,
 )
 from jtqd.drivers.emcy import NO_ERROR, Emergency, parse
+from jtqd.drivers.layout import places
 from jtqd.drivers.nmt import BOOT_UP, HEARTBEAT_BASE, OPERATIONAL, STATES
 from jtqd.sysid.motion.cia402 import FAULTED, POWERED, State, describe, fast_state
 from jtqd.sysid.motion.setpoints import JointSample, Sample, Timing, Violation
 from jtqd.sysid.motion.setup import DriveUnits, SensorUnits
 
-_MOTION: Final = drive_tpdo2(1).layout
-_POSITION: Final = drive_tpdo1(1).layout
 _SENSOR: Final = (sensor_tpdo1(3).layout, sensor_tpdo2(3).layout)
 _TEMPERATURE: Final = drive_tpdo3(1).layout
 _NEVER_NS: Final = -(1 << 62)
@@ -67,7 +65,7 @@ class DriveInput(NodeInput):
     """Values of one drive in SI units, joint side.
 
     Attributes:
-        cycle_1, cycle_2: SYNCs seen when TPDO1 and TPDO2 came last.
+        cycles: SYNCs seen when each of `units.tpdos` came last.
         sdo_confirmed: it has confirmed an SDO that wrote its controlword.
     """
 
@@ -78,48 +76,85 @@ class DriveInput(NodeInput):
         self.current_a = self.velocity_rad_s = self.travel_rad = 0.0
         self.temperature_c = math.nan
         self.temperature_ns = _NEVER_NS
-        self.cycle_1 = self.cycle_2 = 0
+        self.cycles = [0] * len(units.tpdos)
         self.sdo_confirmed = False
         self._inputs = inputs
         self._velocity = units.scaling.motor_rad_s_per_unit / units.gear_ratio
         self._motor = units.scaling.motor_rad_per_count / units.gear_ratio
         self._link = units.scaling.link_rad_per_count
         self._ampere = units.scaling.ampere_per_unit
-        self._counts: tuple[int, int] | None = None
-        self._began = 0  # link counts at `begin_travel`
+        self._last: dict[str, int] = {}  # counts of the encoders
+        self._began: dict[str, int] = {}  # the same at `begin_travel`
         self._motor_counts = self._link_counts = 0  # since `begin_travel`
+        taken = {
+            "motor_position": self._on_motor,
+            "link_position": self._on_link,
+            "motor_velocity": self._on_velocity,
+            "current": self._on_current,
+            "statusword": self._on_statusword,
+        }
+        where = places(units.objects, units.tpdos)
+        self._takers = [
+            [(place.entry, taken[name]) for name, place in where.items() if place.pdo == at]
+            for at in range(len(units.tpdos))
+        ]
+        self._moving_pdos = tuple({where[name].pdo for name in ("motor_velocity", "statusword")})
 
     def begin_travel(self) -> None:
         """Count travel from here."""
         self._motor_counts = self._link_counts = 0
-        self._began = 0 if self._counts is None else self._counts[1]
+        self._began = dict(self._last)
         self.travel_rad = 0.0
 
     @property
     def position_rad(self) -> float:
-        """Position by the link's encoder, from its zero; a roll-over within the motion does not show."""
-        return (self._began + self._link_counts) * self._link
+        """Position by the link's encoder, else the motor's, from its zero; a roll-over within the motion does not show."""
+        if "link" in self._last:
+            return (self._began.get("link", 0) + self._link_counts) * self._link
+        return (self._began.get("motor", 0) + self._motor_counts) * self._motor
 
-    def on_position(self, data: bytes, t_ns: int) -> None:
-        """Take TPDO1. The counters roll over: differences are modulo 2^32. The larger travel of both encoders counts."""
-        if len(data) != _POSITION.size:
-            return
-        motor, link = counts = _POSITION.unpack(data)
-        if self._counts is not None:
-            self._motor_counts += _difference(motor - self._counts[0])
-            self._link_counts += _difference(link - self._counts[1])
-            one, other = self._motor_counts * self._motor, self._link_counts * self._link
-            self.travel_rad = one if abs(one) > abs(other) else other
-        self._counts = counts
-        self.cycle_1 = self._inputs.cycle
+    @property
+    def handlers(self) -> dict[int, Handler]:
+        """Takers of its TPDOs, by COB-ID."""
+        return {pdo.cob_id: partial(self._on_tpdo, at) for at, pdo in enumerate(self.units.tpdos)}
 
-    def on_motion(self, data: bytes, t_ns: int) -> None:
-        """Take TPDO2."""
-        if len(data) == _MOTION.size:
-            velocity, current, self.statusword = _MOTION.unpack(data)
-            self.velocity_rad_s = velocity * self._velocity
-            self.current_a = current * self._ampere
-            self.cycle_2 = self._inputs.cycle
+    @property
+    def moved_cycle(self) -> int:
+        """SYNCs seen when velocity and statusword came last."""
+        return min(self.cycles[at] for at in self._moving_pdos)
+
+    def _on_tpdo(self, at: int, data: bytes, t_ns: int) -> None:
+        layout = self.units.tpdos[at].layout
+        if len(data) == layout.size:
+            values = layout.unpack(data)
+            for entry, take in self._takers[at]:
+                take(values[entry])
+            self.cycles[at] = self._inputs.cycle
+
+    def _on_motor(self, counts: int) -> None:
+        """The counters roll over: differences are modulo 2^32."""
+        self._motor_counts += _difference(counts - self._last.get("motor", counts))
+        self._last["motor"] = counts
+        self._set_travel()
+
+    def _on_link(self, counts: int) -> None:
+        self._link_counts += _difference(counts - self._last.get("link", counts))
+        self._last["link"] = counts
+        self._set_travel()
+
+    def _set_travel(self) -> None:
+        """The larger travel of both encoders counts."""
+        one, other = self._motor_counts * self._motor, self._link_counts * self._link
+        self.travel_rad = one if abs(one) > abs(other) else other
+
+    def _on_velocity(self, units: int) -> None:
+        self.velocity_rad_s = units * self._velocity
+
+    def _on_current(self, units: int) -> None:
+        self.current_a = units * self._ampere
+
+    def _on_statusword(self, word: int) -> None:
+        self.statusword = word
 
     def on_temperature(self, data: bytes, t_ns: int) -> None:
         """Take TPDO3, 0.1 °C, 8000h: not measured; more may follow behind it."""
@@ -186,8 +221,7 @@ class Inputs:
             handlers[HEARTBEAT_BASE + node.node] = node.on_heartbeat
             handlers[0x080 + node.node] = node.on_emergency
         for drive in self.drives:
-            handlers[0x180 + drive.node] = drive.on_position
-            handlers[0x280 + drive.node] = drive.on_motion
+            handlers |= drive.handlers
             handlers[0x580 + drive.node] = drive.on_sdo
             if drive.units.temperature:
                 handlers[drive_tpdo3(drive.node).cob_id] = drive.on_temperature
@@ -270,8 +304,9 @@ class Supervision:
             if node.nmt_state < 0:
                 return f"{node.who}: no heartbeat {HEARTBEAT_BASE + node.node:03X}h"
         for drive in inputs.drives:
-            if not (drive.cycle_1 and drive.cycle_2):
-                return f"{drive.who}: no TPDO1 or TPDO2; start jtqd, which configures them"
+            if not all(drive.cycles):
+                names = " or ".join(f"TPDO{pdo.number}" for pdo in drive.units.tpdos)
+                return f"{drive.who}: no {names}; start jtqd, which configures them"
             if drive.units.temperature and drive.temperature_c != drive.temperature_c:
                 return (
                     f"{drive.who}: no temperature ({0x380 + drive.node:03X}h), which is required by its limit"
@@ -286,7 +321,7 @@ class Supervision:
         """Return which joint does not stand, or cannot be seen to; None when all do."""
         oldest = self._inputs.cycle - self._stale
         for drive in self._inputs.drives:
-            if not -STILL_RAD_S <= drive.velocity_rad_s <= STILL_RAD_S or drive.cycle_2 < oldest:
+            if not -STILL_RAD_S <= drive.velocity_rad_s <= STILL_RAD_S or drive.moved_cycle < oldest:
                 velocity = f"velocity {drive.velocity_rad_s:.3f} rad/s before the start"
                 return f"{drive.who}: {velocity}, limit {STILL_RAD_S:g} rad/s"
         return None
@@ -294,14 +329,14 @@ class Supervision:
     def obeyed(self, turn: int) -> bool:
         """Return whether drive `turn` follows no set-point any more, by a fresh statusword or a confirmed SDO."""
         drive = self._inputs.drives[turn]
-        fresh = drive.cycle_2 >= self._inputs.cycle - self._stale
+        fresh = drive.moved_cycle >= self._inputs.cycle - self._stale
         return drive.sdo_confirmed or (fresh and fast_state(drive.statusword) is not State.OPERATION_ENABLED)
 
     def all_off(self) -> bool:
         """Return whether fresh statuswords of all drives show that their motors are not driven."""
         oldest = self._inputs.cycle - self._stale
         return all(
-            fast_state(drive.statusword) not in POWERED and drive.cycle_2 >= oldest
+            fast_state(drive.statusword) not in POWERED and drive.moved_cycle >= oldest
             for drive in self._inputs.drives
         )
 
@@ -321,14 +356,12 @@ class Supervision:
         return None
 
     def _fresh(self, drive: DriveInput, oldest: int) -> Violation | None:
-        if drive.cycle_1 >= oldest and drive.cycle_2 >= oldest:
+        if min(drive.cycles) >= oldest:
             return None
-        number, base, cycle = (
-            (2, 0x280, drive.cycle_2) if drive.cycle_2 < oldest else (1, 0x180, drive.cycle_1)
-        )
-        missing = self._inputs.cycle - cycle
-        text = f"TPDO{number} ({base + drive.node:03X}h) missing for {missing} cycles, limit {self._stale}"
-        return Violation(f"{drive.who}: {text}", drive.cycle_1 < oldest and drive.cycle_2 < oldest)
+        late = [at for at, cycle in enumerate(drive.cycles) if cycle < oldest]
+        pdo, missing = drive.units.tpdos[late[-1]], self._inputs.cycle - drive.cycles[late[-1]]
+        text = f"TPDO{pdo.number} ({pdo.cob_id:03X}h) missing for {missing} cycles, limit {self._stale}"
+        return Violation(f"{drive.who}: {text}", max(drive.cycles) < oldest)
 
     def _stale_channel(self, channel: ChannelInput) -> Violation:
         missing = self._inputs.cycle - channel.cycle

@@ -15,6 +15,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
@@ -25,6 +26,7 @@ from jtqd.drivers.devices import (
     COMMANDER_NODE,
     JTQD_NODE,
     SYNC_COB_ID,
+    DriveObjects,
     DriveProfile,
     DriveScaling,
     SensorProfile,
@@ -36,7 +38,8 @@ from jtqd.drivers.devices import (
 from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import FRAME, FRAME_SIZE
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
-from jtqd.drivers.pdo import CAN_ID, INVALID, PdoMap, split_word
+from jtqd.drivers.layout import EVERY_SYNC, LayoutError, chosen, pdo_of_words
+from jtqd.drivers.pdo import CAN_ID, INVALID, PdoError, PdoMap, split_word
 from jtqd.drivers.sdo import Key
 from jtqd.drivers.sdo_client import RESPONSE_ID, FrameChannel, NodeObjects, SdoAccess, SdoClient
 from jtqd.sysid.motion.cia402 import (
@@ -74,6 +77,7 @@ class DriveUnits:
         scaling: factors of 6064h, 606Ch, 60E4h:1 and 6078h.
         heartbeat_ms: 1017h.
         temperature: True when TPDO3 (380h+n) brings the temperature in 0.1 °C.
+        objects: which of its objects hold the quantities. tpdos: those that carry them, as they are mapped in it.
     """
 
     node: int
@@ -82,6 +86,8 @@ class DriveUnits:
     scaling: DriveScaling
     heartbeat_ms: int
     temperature: bool
+    objects: DriveObjects
+    tpdos: tuple[PdoMap, ...]
 
     def velocity_units(self, velocity_rad_s: float) -> int:
         """Return 60FFh of a joint side velocity: it counts as 606Ch does, on the motor side."""
@@ -173,6 +179,7 @@ def set_up(
     heartbeat_ms = _heartbeat(drive)
     for communication, pdo in ((0x1400, drive_rpdo1(node)), (0x1401, drive_rpdo2(node))):
         _require_rpdo(drive, communication, pdo)
+    tpdos = _tpdos(drive, profile)
     _zero_targets(drive)
     drive.write((0x6060, 0), mode, 1)
     found = _wait(drive, _MODE_DISPLAY, 1, lambda display: display == mode, sleep)
@@ -183,7 +190,7 @@ def set_up(
     if temperature:
         _switch_on_temperature(drive)
     drive.put(_COMMANDER_WATCH, COMMANDER_NODE << 16 | timeout_ms, 4, "consumer heartbeat time")
-    return DriveUnits(node, mode, gear_ratio, scaling, heartbeat_ms, temperature)
+    return DriveUnits(node, mode, gear_ratio, scaling, heartbeat_ms, temperature, profile.objects, tpdos)
 
 
 def sensor_units(access: SdoAccess, profile: SensorProfile) -> SensorUnits:
@@ -251,6 +258,31 @@ def _require_rpdo(drive: NodeObjects, communication: int, pdo: PdoMap) -> None:
     if words != pdo.words:
         wanted, found = (" ".join(f"{word:08X}" for word in each) for each in (pdo.words, words))
         raise mismatch(drive.node, (mapping, 1), "mapping of RPDO", expected=wanted, found=found or "nothing")
+
+
+def _tpdos(drive: NodeObjects, profile: DriveProfile) -> tuple[PdoMap, ...]:
+    """Return the TPDOs that carry the drive's quantities, as they are mapped now, by jtqd or for good. Raises BootError."""
+    maps = []
+    for number in range(1, 5):
+        communication = 0x1800 + number - 1
+        cob_id = drive.optional_number((communication, 1), 4)
+        if cob_id is None or cob_id & INVALID:
+            continue
+        count = drive.number((communication + 0x200, 0), 1)
+        words = [drive.number((communication + 0x200, entry), 4) for entry in range(1, min(count, 8) + 1)]
+        kind = drive.number((communication, 2), 1)
+        with suppress(PdoError):  # whatever else it sends
+            maps.append(pdo_of_words(drive.node, number, cob_id & CAN_ID, words, kind, profile.objects))
+    try:
+        used = chosen(profile.objects, maps)
+    except LayoutError as error:
+        raise BootError(drive.node, "1A00h", detail=f"{error}; start jtqd, which configures it") from None
+    for pdo in used:
+        if pdo.transmission_type != EVERY_SYNC:
+            key, found = (0x1800 + pdo.number - 1, 2), str(pdo.transmission_type)
+            what = "transmission type (a motion needs every value at each SYNC)"
+            raise mismatch(drive.node, key, what, expected=str(EVERY_SYNC), found=found)
+    return used
 
 
 def _switch_on_temperature(drive: NodeObjects) -> None:

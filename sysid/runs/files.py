@@ -513,6 +513,10 @@ def _read_log(path: Path, *parts: Path, joints: Sequence[int] | None = None) -> 
         raise RunError(f"{path}: cannot be read: {error.strerror or error}") from None
     notes = [f"{len(parts) + 1} parts of one run: {path.name} to {parts[-1].name}"] if parts else []
     notes += [f"joint {number} left out: {why}" for number, why in logged.left_out.items()]
+    one = [n for n, columns in logged.table.joints.items() if columns.link_position_rad is None]
+    if one:
+        which = f"joint{'s' * (len(one) > 1)} {', '.join(map(str, one))}"
+        notes.append(f"{which}: one encoder, no link position: nothing is known of the torsion of the gear")
     if logged.missed or logged.incomplete:
         by = ", ".join(f"{count} of {name}" for name, count in logged.incomplete_by.items() if count)
         notes.append(

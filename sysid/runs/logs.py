@@ -28,7 +28,9 @@ DRIVE_INPUTS: Final = 3
 _ENABLED_MASK, _ENABLED = 0x6F, 0x27  # 6041h: "operation enabled" of CiA 402
 _NO_POWER: Final = ((0x4F, 0x40), (0x6F, 0x21), (0x6F, 0x23))
 """Mask and value of 6041h: switch on disabled, ready to switch on, switched on."""
-_INPUTS: Final = ("current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad")
+_LINK: Final = "link_position_rad"
+"""Not there in the log of a joint with one encoder."""
+_INPUTS: Final = ("current_a", "motor_position_rad", "motor_velocity_rad_s", _LINK)
 _STATE: Final = np.dtype(
     [
         ("cycle", "<u8"),
@@ -52,7 +54,8 @@ class LoggedRun:
     """The run table of a log and the account of its cycles: rows + incomplete + missed are all slots of SYNC.
 
     Attributes:
-        table: torque_nm is None where the log has no value of the sensor at all, temperature_c where the drive sent none.
+        table: torque_nm is None where the log has no value of the sensor at all, temperature_c where the drive sent none,
+            link_position_rad of a joint with one encoder.
         missed: slots without a cycle (missed by the loop, or left silent on purpose).
         incomplete: cycles left out because an input was not fresh.
         incomplete_by: the same by input, e.g. {"joint 2": 3, "sensor": 1}; a cycle may miss several.
@@ -253,10 +256,15 @@ def _unusable(number: int, state: Records) -> str:
         cycles = counted(len(enabled), "cycle")
         return f"found {cycles} of joint {number} in 'operation enabled', expected at least 2"
     there = state[enabled[0] : enabled[-1] + 1]
-    for name in _INPUTS:
+    for name in _inputs_of(there):
         if not np.isfinite(there[name]).any():
             return f"j{number}.{name}: found no value in {counted(len(there), 'cycle')}, expected one in each"
     return ""
+
+
+def _inputs_of(state: Records) -> tuple[str, ...]:
+    """Return the names of the inputs that the joint's drive sends: with one encoder no link position."""
+    return _INPUTS if np.isfinite(state[_LINK]).any() else tuple(name for name in _INPUTS if name != _LINK)
 
 
 def _span(states: Mapping[int, Records], log: Path, *, last_motion: bool) -> slice:
@@ -277,9 +285,9 @@ def _span(states: Mapping[int, Records], log: Path, *, last_motion: bool) -> sli
 
 
 def _complete(number: int, state: Records, log: Path) -> Flags:
-    """Return cycles [n] with all four inputs of a joint; LogError for one that never came."""
+    """Return cycles [n] with all inputs of a joint; LogError for one that never came."""
     there = _fresh(state)
-    for name in _INPUTS:
+    for name in _inputs_of(state):
         finite = np.isfinite(state[name])
         if not finite.any():
             raise LogError(
@@ -305,7 +313,7 @@ def _columns(state: Records, sensor: bool, temperature: FloatArray | None) -> Jo
 
     torque = column("sensor_torque_nm") if sensor else None
     return JointColumns(
-        **{name: column(name) for name in _INPUTS},
+        **{name: column(name) for name in _inputs_of(state)},
         torque_nm=torque if torque is not None and np.isfinite(torque).all() else None,
         temperature_c=temperature,
         enabled=_powered(state["statusword"]),

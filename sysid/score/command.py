@@ -19,7 +19,14 @@ from jtqd.sysid.runs.checks import check_run
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import RunError, RunFile, read_runs
 from jtqd.sysid.runs.joints import joint_number, only, with_joint
-from jtqd.sysid.score.score import RunErrors, errors_on, rows_of, table_lines, to_mapping
+from jtqd.sysid.score.score import (
+    RunErrors,
+    errors_on,
+    needs_torsion,
+    rows_of,
+    table_lines,
+    to_mapping,
+)
 
 BY: Final = "jtq score"
 
@@ -40,7 +47,8 @@ def main(argv: list[str]) -> int:
         number = joint_number(options.number, joints[0], runs)
         runs = with_joint(runs, number)
         notes = [f"{run.name}: {note}" for run in runs for note in run.notes]
-        scored, refused = _scored(runs, number, joints)
+        scored, refused, less = _scored(runs, number, joints)
+        notes += less
         for line in (*notes, *refused):
             print(f"{BY}: {line}", file=sys.stderr)
         if not scored[0]:
@@ -62,10 +70,11 @@ def main(argv: list[str]) -> int:
 
 def _scored(
     runs: Sequence[RunFile], number: int, joints: Sequence[Joint]
-) -> tuple[list[list[RunErrors]], list[str]]:
-    """Return the errors [file][run] of the runs that can be used, and why others cannot."""
+) -> tuple[list[list[RunErrors]], list[str], list[str]]:
+    """Return the errors [file][run] of the runs that can be used, why others cannot, and what is not scored of those."""
     scored: list[list[RunErrors]] = [[] for _ in joints]
     refused: list[str] = []
+    less: list[str] = []
     for run in progress(runs, "scoring"):
         checked = check_run(run.table, {number: joints[0]}, run.name, thorough=True)
         refused += [issue.text for issue in checked.refused]
@@ -73,6 +82,10 @@ def _scored(
             if not checked.refused:
                 refused.append(f"{run.name}: found no columns of j{number}")
             continue
+        if any(needs_torsion(checked.table, number, joint) for joint in joints):
+            less.append(
+                f"{run.name}: j{number}: found one encoder: method fused, which estimates from the torsion, is not scored"
+            )
         try:
             errors = [errors_on(run.name, checked.table, number, joint) for joint in joints]
         except (SignalsError, ValueError) as error:
@@ -80,7 +93,7 @@ def _scored(
             continue
         for each, one in zip(scored, errors, strict=True):
             each.append(one)
-    return scored, refused
+    return scored, refused, less
 
 
 def parser() -> argparse.ArgumentParser:

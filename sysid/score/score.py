@@ -5,14 +5,15 @@
     free run    error of the simulated velocity after half a second on its own (`jtqd.sysid.diagnosis.gain.free_run`)
     estimators  estimate less sensor, the sensor passed through the same low-pass, rms over the samples in motion
 
-Nothing is fitted. A method that needs what a joint file does not have (efficiency, section `fused`) is left out.
+Nothing is fitted. A method that needs what a joint file does not have (efficiency, section `fused`), or a run does not
+have (both encoders, for a torsion), is left out.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -93,14 +94,20 @@ def errors_on(name: str, table: RunTable, number: int, joint: Joint) -> RunError
     dt = table.dt_s
     for method, title in ESTIMATORS.items():
         if (method == "efficiency" and joint.efficiency is None) or (
-            method == "fused" and joint.fused is None
+            method == "fused" and (joint.fused is None or needs_torsion(table, number, joint))
         ):
             continue
-        settings = recommended(method)
+        settings = replace(recommended(method), track_zeros=False)  # it is the joint file that is scored
         estimate = estimate_columns(joint, settings, None, table.time_s, columns).torque_nm
         sensor = aligned(columns.torque_nm, dt, joint, settings)
         errors[title] = _rms((estimate - sensor)[settled])
     return RunErrors(name, errors, int(np.count_nonzero(moving)))
+
+
+def needs_torsion(table: RunTable, number: int, joint: Joint) -> bool:
+    """Return whether the joint's method fused estimates from a torsion that this run does not have: one encoder."""
+    torsion = joint.fused is not None and joint.fused.torsion is not None
+    return torsion and not table.joints[number].two_encoders
 
 
 def rows_of(scored: Sequence[Sequence[RunErrors]]) -> list[Row]:

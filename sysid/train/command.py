@@ -17,7 +17,7 @@ from jtqd.estimator.checked import ConfigError, count, make_directory, natural
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTableError
 from jtqd.models.files import load_joint
-from jtqd.sysid.fit.command import signals_of
+from jtqd.sysid.fit.command import signals_of, two_encoders
 from jtqd.sysid.fit.losses import LossFitError
 from jtqd.sysid.fit.torsion import TorsionError
 from jtqd.sysid.progress import progress
@@ -245,6 +245,11 @@ def _train_joint(
         if (n + 1) % 100 == 0:
             print(f"{joint.name}: iteration {n + 1} of {iterations}, mse {loss:.4f} Nm^2", file=sys.stderr)
 
+    if not two_encoders(runs, number):
+        raise ConfigError(
+            f"{joint.name}: the runs have one encoder of this joint, expected both: "
+            "jtqd uses no network without a link position"
+        )
     settings = {"iterations": iterations, "seed": options.seed, "progress": say}
     if options.network == "ours":
         result = train_fused(signals_of(runs, number, joint), joint, hashes, **settings)

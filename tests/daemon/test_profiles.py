@@ -99,6 +99,15 @@ def test_a_configuration_has_the_values_of_its_profile_and_its_own_go_before(
     assert {key: joint.given[key] for key in section.get("given", {})} == section.get("given", {})
 
 
+def test_a_joint_with_one_encoder_needs_nothing_of_its_link_encoder(tmp_path: Path) -> None:
+    given = {"608Fh:1": 65536, "6090h:1": 65536, "6091h:1": 100, "6091h:2": 1}
+    section = {"profile": "elmo_gold", "objects": {"link_position": False}, "given": given}
+    (joint,) = load_config(configuration(tmp_path, **section)).joints
+    assert joint.objects.link_position is None
+    with pytest.raises(ConfigError, match=r"objects\.link_position\.factor': missing"):
+        load_config(configuration(tmp_path, profile="elmo_gold", given=given))
+
+
 def test_what_the_profile_leaves_open_must_be_there(tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         load_config(configuration(tmp_path, profile="epos4"))

@@ -238,6 +238,29 @@ def test_refused_mapping(bench):
     assert error.letter == "J"
 
 
+def test_what_was_written_before_a_refusal_is_put_back(bench):
+    """TPDO1 was mapped, and the second entry of TPDO2 is refused: entries, numbers, types and COB-IDs are as before."""
+
+    def objects():
+        store = bench.drive1.store
+        keys = [(0x1A00 + n, sub) for n in range(3) for sub in range(3)]
+        keys += [(0x1800 + n, sub) for n in range(3) for sub in (1, 2)]
+        return {key: store.number(*key) for key in keys}
+
+    store = bench.drive1.store
+    store.set_number(0x1A00, 0, 1)
+    store.set_number(0x1A00, 1, 0x6041_0010)
+    store.set_number(0x1A01, 0, 2)
+    store.set_number(0x1A01, 1, 0x6061_0008)
+    store.set_number(0x1A01, 2, 0x6077_0010)
+    store.set_number(0x1800, 2, 255)
+    before = objects()
+
+    store.entries[0x1A01, 2] = dataclasses.replace(store.entries[0x1A01, 2], access="ro")
+    assert "no TPDO carries 6064h:0" in str(bench.fails())
+    assert objects() == before
+
+
 def test_mapping_that_reads_back_different(bench):
     bench.drive1.store.on_read(0x1A01, 2, lambda: 0x60770010)
     error = bench.fails()

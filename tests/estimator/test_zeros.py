@@ -15,10 +15,10 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.blocks import EstimatorBlocks, blocks_of, estimator_of, made_of
 from jtqd.estimator.estimator import FusedEstimator, observe_run
 from jtqd.estimator.joint import Joint
+from jtqd.estimator.learned import Zeros
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.run import EstimateRun
 from jtqd.estimator.settings import EstimatorSettings
-from jtqd.estimator.zeros import Zeros
 from tests.estimator.fused_helpers import SIGMA
 from tests.estimator.test_fused_estimator import NARROW
 
@@ -90,6 +90,15 @@ def test_where_there_is_no_zero_nothing_is_changed() -> None:
     run, zeros = tracked(columns)
     assert (zeros.link_used_rad, zeros.current_used_a) == (0.0, 0.0)
     np.testing.assert_array_equal(run.torque_nm, FusedEstimator(NARROW, OFF).run(*columns).torque_nm)
+
+
+def test_a_zero_that_the_files_sigma_covers_is_known_and_left_alone() -> None:
+    """0.3 Nm where the file's sigma of the torsion is 0.35: however long it is seen, it may be an error of model."""
+    columns, _ = driven(8.0, link_zero_rad=2.5e-5)
+    zeros = tracked(columns)[1]
+    assert zeros.link_rad == pytest.approx(2.5e-5, abs=8e-6)
+    assert abs(zeros.link_used_rad) < 5e-6
+    assert 4.0 * zeros.link_sigma_rad < 4e-5
 
 
 def test_friction_is_no_zero_and_motion_one_way_tells_them_apart_not_at_all() -> None:

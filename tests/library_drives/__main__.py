@@ -1,7 +1,7 @@
 """Program of the nodes.
 
     python -m tests.library_drives BUS [--boot-ups N] [--sdo S] [--without 1016,1029] [--family epos4]
-        [--fixed mapping]
+        [--fixed mapping|valid|event]
 
 BUS is unix:PATH or a SocketCAN interface. Orders come as lines, each is answered by one: "off 1", "on 1", "cut 1", "join 1",
 "emcy 1 2310", "well 1 2310", "mute 1" (no heartbeat), "state".
@@ -26,7 +26,7 @@ def main() -> None:
     parser.add_argument("--boot-ups", type=int, default=1)
     parser.add_argument("--sdo", type=float, default=0.0)
     parser.add_argument("--without", default="")
-    parser.add_argument("--fixed", choices=("mapping", "valid"), default="")
+    parser.add_argument("--fixed", choices=("mapping", "valid", "event"), default="")
     parser.add_argument("--family", choices=FAMILIES, default="standard", help="of drive 1")
     arguments = parser.parse_args()
     logging.getLogger("canopen").setLevel(logging.CRITICAL)

@@ -44,6 +44,7 @@ class LibraryBench:
         self.torques_nm: list[tuple[float | None, float | None]] = []
         self.heard: list[tuple[int, bytes]] = []
         self.logs: list[Path] = []
+        self.runs: list[Path] = []
         self._sync_s = 0.0
 
     def __enter__(self) -> Self:
@@ -84,14 +85,16 @@ class LibraryBench:
         self.nodes.stdin.flush()
         return json.loads(self.nodes.stdout.readline())
 
-    def start(self, **changes: Any) -> subprocess.Popen[str]:
-        """Start a jtqd, with these sections of its configuration changed."""
+    def start(self, config: Path | None = None, **changes: Any) -> subprocess.Popen[str]:
+        """Start a jtqd, with these sections of its configuration changed, or with a configuration of one's own."""
         self.listen_anew()
         log = self.directory / f"stderr{len(self.logs)}"
         self.logs.append(log)
         run = self.directory / f"run{len(self.logs)}"
         run.mkdir()
-        arguments = ["--bus", self.bus, "--record", "none", "--config", self._configuration(changes)]
+        self.runs.append(run)
+        path = str(config) if config is not None else self.configuration(**changes)
+        arguments = ["--bus", self.bus, "--record", "none", "--config", path]
         with open(log, "w") as stream:
             environment = {**os.environ, "RUNTIME_DIRECTORY": str(run)}
             return self._run("jtqd.daemon.jtqd", *arguments, stderr=stream, env=environment)
@@ -100,7 +103,8 @@ class LibraryBench:
         """What the last jtqd has said."""
         return self.logs[-1].read_text()
 
-    def _configuration(self, changes: dict[str, Any]) -> str:
+    def configuration(self, **changes: Any) -> str:
+        """Write a configuration for these nodes and return its path."""
         content = yaml.safe_load(shipped("bench.yaml").read_text())
         content["sync"] = {"period_us": _PERIOD_US}
         del content["inputs"]

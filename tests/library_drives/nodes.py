@@ -7,6 +7,8 @@ What the library leaves to the device is added here, as strictly as drives have 
     1016h        counts from the first heartbeat; without it, or at a boot-up message, 8130h, and no start before it is over
     1019h        SYNC of another length than it tells is 8240h until a reset; not to be written while 1006h is set
     SYNC         a TPDO of type 1 is sent at each, with the values of that moment
+    events       one of type 254 or 255 when a value has changed, not sooner than its inhibit time (1800h:3, in 100 us) after
+                 the last one, and when its event timer (1800h:5, in ms) has run out
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import can
 import canopen
@@ -54,8 +56,8 @@ class Manners:
         sdo_s: time for an SDO answer.
         without: objects that it does not have.
         reset_s: from a reset to its boot-up message.
-        fixed: its TPDOs have a layout of the maker's (`FIXED`), and what can be written of them is nothing ("mapping") or
-            bit 31 of the COB-ID and the transmission type ("valid"); "": all can be written.
+        fixed: its TPDOs have a layout of the maker's (`FIXED`), and what can be written of them is nothing ("mapping";
+            "event": of type 255, too) or bit 31 of the COB-ID and the transmission type ("valid"); "": all can be written.
     """
 
     boot_ups: int = 1
@@ -171,6 +173,19 @@ FIXED = (
     (0x480, (0x60E40120,)),
 )
 """TPDOs of a drive whose maker has thought of other readers: COB-IDs without the node-ID, and mapping."""
+INHIBIT_MS, EVENT_TIMER_MS = 10, 30
+"""Of a drive that sends by itself ("event")."""
+
+
+class Tpdo(NamedTuple):
+    """One that is valid, as it was when the node was started."""
+
+    cob_id: int
+    objects: list[tuple[int, int]]
+    layout: str
+    kind: int
+    inhibit_s: float
+    timer_s: float
 
 
 class StrictNode:
@@ -179,6 +194,7 @@ class StrictNode:
     device_type = 0
     process: ClassVar[dict[tuple[int, int], tuple[int, Any, str]]] = {}
     unmappable: ClassVar[frozenset[tuple[int, int]]] = frozenset()
+    cable_class: type[Cable] = Cable
 
     def __init__(self, number: int, open_bus: Callable[[], can.BusABC], manners: Manners) -> None:
         self.number, self.manners = number, manners
@@ -193,20 +209,25 @@ class StrictNode:
     # Power --------------------------------------------------------------------------------------------------
 
     def power_on(self) -> None:
-        self.cable = Cable()
+        self.cable = self.cable_class()
         self.cable.bus = self._open_bus()
         self.cable.NOTIFIER_CYCLE = 0.01
         numbers = {**_common(self.device_type, self.number), **self.process}
         if self.fixed:
             for number, (base, words) in enumerate(FIXED):
                 cob_id = 0x40000000 + base + self.number
-                valid = self.manners.fixed == "mapping"
+                valid = self.manners.fixed in ("mapping", "event")
+                event = self.manners.fixed == "event"
                 numbers[0x1800 + number, 1] = (
                     UNSIGNED32,
                     cob_id if valid else cob_id | 0x80000000,
                     "ro" if valid else "rw",
                 )
-                numbers[0x1800 + number, 2] = (UNSIGNED8, 1 if valid else 255, "ro" if valid else "rw")
+                kind = 1 if valid and not event else 255
+                numbers[0x1800 + number, 2] = (UNSIGNED8, kind, "ro" if valid else "rw")
+                if event:
+                    numbers[0x1800 + number, 3] = (UNSIGNED16, 10 * INHIBIT_MS, "ro")
+                    numbers[0x1800 + number, 5] = (UNSIGNED16, EVENT_TIMER_MS, "ro")
                 numbers[0x1A00 + number, 0] = (UNSIGNED8, len(words), "ro")
                 for entry in range(1, 5):
                     word = words[entry - 1] if entry <= len(words) else 0
@@ -223,6 +244,8 @@ class StrictNode:
         self._start()
         self.cable.connect()
         threading.Thread(target=self._watch, args=(self.cable,), daemon=True).start()
+        if self.manners.fixed == "event":
+            threading.Thread(target=self._send_events, args=(self.cable,), daemon=True).start()
 
     @property
     def fixed(self) -> bool:
@@ -243,7 +266,7 @@ class StrictNode:
             for index, members in self._stored.items():
                 node.data_store[index] = dict(members)
             self.errors.clear()
-            self._tpdos: list[tuple[int, list[tuple[int, int]], str]] = []
+            self._tpdos: list[Tpdo] = []
             self._master_due = math.inf
             node.nmt.stop_heartbeat()
             node.nmt._state = 0
@@ -252,6 +275,14 @@ class StrictNode:
             self.cable.send_message(0x700 + self.number, [0])
         node.nmt._state = PRE_OPERATIONAL
         node.nmt.start_heartbeat(self.number_of(0x1017))
+
+    def restart(self) -> None:
+        """Restart, as after a dip of the supply; returns before it has."""
+        threading.Thread(target=self._start, daemon=True).start()
+
+    def keep(self, index: int, subindex: int) -> None:
+        """Store one object, as 1010h does all."""
+        self._stored.setdefault(index, {})[subindex] = self.node.get_data(index, subindex)
 
     def number_of(self, index: int, subindex: int = 0) -> int:
         return int.from_bytes(self.node.get_data(index, subindex), "little")
@@ -262,7 +293,7 @@ class StrictNode:
     def state(self) -> int:
         return int(self.node.nmt._state)
 
-    def _set_state(self, state: int) -> None:
+    def set_state(self, state: int) -> None:
         self.node.nmt._state = state
         self.node.nmt.update_heartbeat()
 
@@ -271,10 +302,10 @@ class StrictNode:
         if len(data) != 2 or data[1] not in (0, self.number):
             return
         if data[0] in (0x81, 0x82):
-            threading.Thread(target=self._start, daemon=True).start()
+            self.restart()
         elif self.state == OPERATIONAL:
             if self.errors:
-                self._set_state(PRE_OPERATIONAL)
+                self.set_state(PRE_OPERATIONAL)
             else:
                 self._tpdos = list(self._compiled())
 
@@ -316,9 +347,26 @@ class StrictNode:
         if self.state != OPERATIONAL:
             return
         now = time.monotonic()
-        for cob_id, objects, layout in self._tpdos:
-            values = [self.value(index, subindex, now) for index, subindex in objects]
-            self.cable.send_message(cob_id, struct.pack(layout, *values))
+        for pdo in self._tpdos:
+            if pdo.kind == 1:
+                self.cable.send_message(pdo.cob_id, self._data(pdo, now))
+
+    def _data(self, pdo: Tpdo, now: float) -> bytes:
+        return struct.pack(pdo.layout, *(self.value(index, subindex, now) for index, subindex in pdo.objects))
+
+    def _send_events(self, cable: Cable) -> None:
+        last: dict[int, tuple[float, bytes]] = {}
+        while self.on and self.cable is cable:
+            time.sleep(0.001)
+            now = time.monotonic()
+            for pdo in self._tpdos if self.state == OPERATIONAL else ():
+                at, before = last.get(pdo.cob_id, (-math.inf, b""))
+                if pdo.kind not in (254, 255) or now - at < pdo.inhibit_s:
+                    continue
+                data = self._data(pdo, now)
+                if data != before or (pdo.timer_s and now - at >= pdo.timer_s):
+                    last[pdo.cob_id] = now, data
+                    cable.send_message(pdo.cob_id, data)
 
     # Errors -------------------------------------------------------------------------------------------------
 
@@ -330,7 +378,7 @@ class StrictNode:
         self._show()
         self.node.emcy.send(code, self._register())
         if register & 0x10 and self.state == OPERATIONAL:
-            self._set_state(PRE_OPERATIONAL)
+            self.set_state(PRE_OPERATIONAL)
 
     def clear_error(self, code: int) -> None:
         if self.errors.pop(code, None) is None:
@@ -399,14 +447,18 @@ class StrictNode:
     def _compiled(self) -> Any:
         for number in range(4):
             cob_id = self.number_of(0x1800 + number, 1)
-            if cob_id >> 31 or self.number_of(0x1800 + number, 2) != 1:
+            kind = self.number_of(0x1800 + number, 2)
+            if cob_id >> 31 or kind not in (1, 254, 255):
                 continue
             words = [
                 self.number_of(0x1A00 + number, entry + 1)
                 for entry in range(self.number_of(0x1A00 + number, 0))
             ]
             objects = [(word >> 16, word >> 8 & 0xFF) for word in words]
-            yield cob_id & 0x7FF, objects, "<" + "".join(_SIZES[self.process[key][0]] for key in objects)
+            layout = "<" + "".join(_SIZES[self.process[key][0]] for key in objects)
+            inhibit_s = self.number_of(0x1800 + number, 3) * 1e-4
+            timer_s = self.number_of(0x1800 + number, 5) * 1e-3
+            yield Tpdo(cob_id & 0x7FF, objects, layout, kind, inhibit_s, timer_s)
 
     def value(self, index: int, subindex: int, now: float) -> int:
         raise NotImplementedError
@@ -446,6 +498,8 @@ class StrictDrive(StrictNode):
     """A CiA 402 drive whose motor swings to and fro; it counts its torque backwards, mA and rpm, too."""
 
     device_type = 0x00020192
+    swing_turns: ClassVar[float] = 1.0
+    statusword = 0x1237
     process: ClassVar = {
         (0x1001, 0): (UNSIGNED8, 0, "ro"),
         (0x2030, 0): (INTEGER16, 0, "ro"),
@@ -477,12 +531,13 @@ class StrictDrive(StrictNode):
 
     def value(self, index: int, subindex: int, now: float) -> int:
         phase = 2.0 * math.pi * 0.2 * now
-        turns, per_s = math.sin(phase), 2.0 * math.pi * 0.2 * math.cos(phase)
+        turns = self.swing_turns * math.sin(phase)
+        per_s = self.swing_turns * 2.0 * math.pi * 0.2 * math.cos(phase)
         return {
             0x1001: 0,
             0x2030: round(-1000 * math.sin(phase)),
             0x2031: round(60 * per_s),
-            0x6041: 0x1237,
+            0x6041: self.statusword,
             0x6061: 9,
             0x6064: round(MOTOR_COUNTS * turns),
             0x606C: round(MOTOR_COUNTS * per_s),

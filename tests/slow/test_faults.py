@@ -11,6 +11,7 @@ from tests.slow.faults.__main__ import CASES
 from tests.slow.faults.case import Case
 from tests.slow.faults.elsewhere import ELSEWHERE, NOT_COVERED
 from tests.slow.faults.injections import Fault
+from tests.slow.faults.library import LEFT_OUT, with_library
 from tests.slow.faults.runner import play
 from tests.slow.faults.table import line
 from tests.slow.faults.watcher import Watcher
@@ -26,10 +27,9 @@ REMOVED = [
 """Nothing is injected: most of these expect that nothing happens, so that only the proof can tell."""
 
 
-def _play(cases: list) -> list:
-    outcomes = play(
-        cases, os.environ.get("JTQD_CAN_INTERFACE", "vcan0"), lambda outcome: print(line(outcome))
-    )
+def _play(cases: list, *, library: bool = False) -> list:
+    bus = os.environ.get("JTQD_CAN_INTERFACE", "vcan0")
+    outcomes = play(cases, bus, lambda outcome: print(line(outcome)), library=library)
     assert len(outcomes) == len(cases)
     return outcomes
 
@@ -53,6 +53,28 @@ def test_the_long_cases() -> None:
 def test_a_case_without_its_fault_is_found_out() -> None:
     for each in _play(REMOVED):
         assert any(text.startswith("not injected") for text in each.wrong), each.case.key
+
+
+@pytest.mark.socketcan
+@pytest.mark.skipif(not os.environ.get("JTQD_BENCH_TIME_TRAVEL"), reason="needs exact time")
+def test_some_cases_with_nodes_that_share_no_code_with_ours() -> None:
+    some = [case for case in with_library(CASES) if case.key in ("1", "16c", "21a", "23", "24b")]
+    assert len(some) == 5
+    assert [each.case.key for each in _play(some, library=True) if each.wrong] == []
+
+
+@pytest.mark.socketcan
+@pytest.mark.campaign
+@pytest.mark.skipif(not os.environ.get("JTQD_BENCH_TIME_TRAVEL"), reason="needs exact time")
+def test_every_case_with_nodes_that_share_no_code_with_ours() -> None:
+    assert [each.case.key for each in _play(with_library(CASES), library=True) if each.wrong] == []
+
+
+def test_what_is_left_out_with_those_nodes_is_a_case_and_named_on_the_page() -> None:
+    page = (ROOT / "docs" / "faults.md").read_text()
+    assert {case.key for case in CASES} - {case.key for case in with_library(CASES)} == set(LEFT_OUT)
+    for key, why in LEFT_OUT.items():
+        assert f"{key} ({why})" in page, key
 
 
 def test_the_list_is_whole() -> None:

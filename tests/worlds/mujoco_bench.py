@@ -81,12 +81,17 @@ class MujocoBench:
         """Return the bench itself: nothing is fitted to its runs."""
         return self
 
+    def days(self, seed: int) -> list[Day]:
+        """Return what each run of this seed has of its own, unless it is quiet."""
+        joints = _draw_joints(np.random.default_rng([seed, _JOINTS]))
+        return [_draw_day(np.random.default_rng([seed, _DAYS, k]), joints) for k in range(self.runs)]
+
     def draw(self, seed: int, hidden: Sequence[Hidden] = (), *, quiet: bool = False) -> Set:
         """Return one set; about half a second per run."""
         runs = self.runs
         joints = _draw_joints(np.random.default_rng([seed, _JOINTS]))
         motions = _draw_motions(np.random.default_rng([seed, _MOTIONS]), joints, runs, self.seconds)
-        days = [_draw_day(np.random.default_rng([seed, _DAYS, k]), joints) for k in range(runs)]
+        days = self.days(seed)
         instruments = Instruments()
         plants = [[_plant(j) for j in joints] for _ in range(runs)]
         truth = []

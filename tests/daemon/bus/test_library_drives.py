@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import signal
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -13,11 +16,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
+from jtqd.daemon.cli import init, probe
+from jtqd.drivers.filters import exact
+from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.models.files import shipped
 from tests.library_drives.bench import LibraryBench
 from tests.library_drives.families import PULSES, RATED_MA
-from tests.library_drives.nodes import GEAR, LINK_COUNTS
+from tests.library_drives.nodes import GEAR, LINK_COUNTS, TORQUE_CONSTANT
 
 
 @contextmanager
@@ -155,6 +162,88 @@ def test_a_fixed_mapping_is_used_as_it_is(fixed: str) -> None:
         bench.listen_anew()
         bench.order("on 1")
         assert bench.until(bench.both_used), bench.said()
+        assert bench.stop(jtqd) == 0
+
+
+def test_what_init_writes_for_drives_that_tell_less_runs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No 60E4h, 606Ch, 6078h: `jtq probe` and `jtq init` say so, and jtqd runs with the files as they are."""
+    with a_bench("--without", "60E4,60E6,60EB,606C,6090,6078,6075") as bench:
+        assert probe.main(["--bus", bench.bus, "--node", "1"]) == 0
+        told = capsys.readouterr().out
+        for line in ("link_position: false", "motor_velocity: false", "current: {index: 0x6077}"):
+            assert line in told
+        known = ["--rated-torque", "30", "--torque-constant", str(TORQUE_CONSTANT)]
+        assert init.main(["--bus", bench.bus, "--out", str(tmp_path), *known]) == 0
+        assert "joint 2: objects.link_position: false (no 60E4h:1, by the bus)" in capsys.readouterr().out
+        path = tmp_path / "jtqd.yaml"
+        content = yaml.safe_load(path.read_text()) | {"sync": {"period_us": 10_000}}
+        path.write_text(yaml.safe_dump(content))
+        jtqd = bench.start(path)
+        assert bench.until(bench.both_used), bench.said()
+        assert bench.until(lambda: any(torque and abs(torque) > 2.0 for torque, _ in bench.torques_nm))
+        assert bench.stop(jtqd) == 0
+
+
+def test_check_knows_the_mapping_of_the_drives() -> None:
+    """By its own boot, and of a jtqd that runs: also where the configuration does not name it."""
+    with a_bench("--fixed", "mapping") as bench:
+
+        def items(*arguments: str, **environment: str) -> dict[str, str]:
+            command = [
+                sys.executable,
+                "-m",
+                "jtqd.daemon.jtq",
+                "check",
+                *arguments,
+                "--bus",
+                bench.bus,
+                "--json",
+            ]
+            command += ["--config", bench.configuration()]
+            done = subprocess.run(
+                command, capture_output=True, text=True, env={**os.environ, **environment}, check=False
+            )
+            return {each["item"]: each["text"] for each in json.loads(done.stdout)["items"]}
+
+        booted = items("0.5", "--drive-sync")
+        assert "node 1: its mapping is used as it is: TPDO1 (181h)" in booted["boot"]
+        jtqd = bench.start()
+        assert bench.until(bench.both_used), bench.said()
+        beside = items("0.5", RUNTIME_DIRECTORY=str(bench.runs[-1]))
+        for found in (booted, beside):
+            assert "481h drive 1 TPDO4" in found
+            assert all("wrong length" not in text for text in found.values())
+            assert "281h drive 1 TPDO2" not in found
+        assert bench.stop(jtqd) == 0
+
+
+def test_a_drive_that_sends_by_itself_needs_an_age_and_is_used_by_its_stamps() -> None:
+    """Type 255 for good, inhibit time 10 ms, event timer 30 ms; one TPDO changes always, one (1001h) never."""
+    with a_bench("--fixed", "event") as bench:
+        refused = bench.start()
+        assert refused.wait(20) == 1
+        assert "TPDO1 has transmission type 255: joint_N.max_age_ms allows it" in bench.said()
+        ages = {f"joint_{n}": {"max_age_ms": 100} for n in (1, 2)}
+        jtqd = bench.start(**ages)
+        assert bench.until(bench.both_used), bench.said()
+        assert "TPDO1 keeps transmission type 255" in bench.said()
+        assert bench.until(
+            lambda: any(torque and abs(torque) > 2.0 for pair in bench.torques_nm for torque in pair)
+        )
+        socket = open_frame_socket(bench.bus, [exact(0x181), exact(0x281)])
+        stamps: dict[int, list[int]] = {0x181: [], 0x281: []}
+        until = time.monotonic() + 1.0
+        while time.monotonic() < until:
+            socket.wait(0.05)
+            for n in range(socket.receive()):
+                can_id = int.from_bytes(socket.frames[16 * n : 16 * n + 4], "little")
+                stamps[can_id].append(socket.stamps_ns[n])
+        socket.close()
+        changing, constant = (len(stamps[can_id]) for can_id in (0x181, 0x281))
+        assert 40 < changing < 110, "at most one in 10 ms"
+        assert 10 < constant < 40, "by its timer alone"
         assert bench.stop(jtqd) == 0
 
 

@@ -55,7 +55,8 @@ class Case:
         self.starts.append(self.time)
         found = self.now[self.nodes.busy]
         error = {"ok": False, "error": {"message": f"node {self.nodes.busy}: no answer"}}
-        return Boot(error if found is None else {"ok": True, "nodes": {str(self.nodes.busy): found}})
+        self.boot = Boot(error if found is None else {"ok": True, "nodes": {str(self.nodes.busy): found}})
+        return self.boot
 
     def run(self, seconds: float, present: tuple[int, ...] = (1,)) -> None:
         for _ in range(round(seconds / 0.05)):
@@ -91,6 +92,24 @@ def test_a_boot_that_fails_is_tried_less_and_less_often_and_from_the_beginning_a
     case.starts.clear()
     case.run(2.0)
     assert case.starts[1] - case.starts[0] == pytest.approx(0.5, abs=0.16)
+
+
+@pytest.mark.parametrize(
+    ("registers", "reset"), [((), False), ((0x11,), True), ((0x03,), False), ((0x11, 0), False)]
+)
+def test_a_node_that_tells_an_error_of_communication_is_reset_at_once(
+    case: Case, registers: tuple[int, ...], reset: bool
+) -> None:
+    """And not once more at the boot after it."""
+    for register in registers:
+        case.nodes.told(1, register)
+    case.nodes.request(1, "changed")
+    case.run(0.1)
+    assert case.boot.request["reset"] is reset
+    case.run(1.0)
+    case.nodes.request(1, "changed")
+    case.run(0.1)
+    assert case.boot.request["reset"] is False
 
 
 def test_just_after_a_boot_the_last_heartbeat_may_still_say_pre_operational(case: Case) -> None:

@@ -9,6 +9,7 @@ from io import StringIO
 from pathlib import Path
 
 import pytest
+import yaml
 from rich.console import Console
 
 from jtqd.daemon.cli.bus_checks import check_bus, check_conditions, check_own_timing, check_stolen_time
@@ -20,6 +21,7 @@ from jtqd.daemon.loop.realtime import stolen_s
 from jtqd.daemon.shared.conditions import Condition
 from jtqd.daemon.shared.notices import ERROR, WARNING
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, stuffed_bits
+from jtqd.models.files import shipped
 from tests.drivers.hub_helpers import until_it_listens
 
 pytestmark = pytest.mark.native
@@ -127,6 +129,48 @@ def test_late_twice_and_wrong_frames_are_told_apart(config: Config) -> None:
     assert found["183h sensor 3 channel 1"].level == FAIL
     assert "1000 of a wrong length" in found["183h sensor 3 channel 1"].text
     assert found["success rate"].text.startswith("0.0000: 0 of 1000")
+
+
+def by_itself(tmp_path: Path) -> Config:
+    """Drive 1 sends its positions by itself; they count for 5 ms."""
+    content = yaml.safe_load(shipped("bench.yaml").read_text())
+    for number in (1, 2):
+        joint = content[f"joint_{number}"]
+        joint["file"] = str(shipped(joint["file"]))
+        del joint["network"]
+    content["joint_1"] |= {
+        "max_age_ms": 5,
+        "tpdos": [
+            {"number": 1, "cob_id": 0x181, "objects": [0x60640020, 0x60E40120], "type": 255},
+            {"number": 2, "cob_id": 0x281, "objects": [0x606C0020, 0x60780010, 0x60410010]},
+        ],
+    }
+    (tmp_path / "c.yaml").write_text(yaml.safe_dump(content))
+    return load_config(tmp_path / "c.yaml")
+
+
+def test_what_a_drive_sends_by_itself_is_judged_by_its_age(tmp_path: Path) -> None:
+    """Every fourth cycle and twice then: good within 5 ms; every twelfth: too old in six of twelve cycles."""
+    config = by_itself(tmp_path)
+
+    def every(cycles: int) -> Change:
+        def change(n: int, can_id: int, data: bytes, delay: int) -> list[tuple[int, bytes, int]]:
+            if can_id != 0x181:
+                return [(can_id, data, delay)]
+            return [(can_id, data, delay), (can_id, data, delay + 30)] if n % cycles == 0 else []
+
+        return change
+
+    name = "181h drive 1 TPDO1"
+    good = judged(config, bus(1200, every(4)))
+    assert good[name].level == GOOD, good[name]
+    assert "500 per s, sent by the drive itself; age at SYNC" in good[name].text
+    assert good["success rate"].level == GOOD
+    old = judged(config, bus(1200, every(12)))
+    assert old[name].level == FAIL
+    assert "older than 5 ms in 60" in old[name].text
+    assert "max_age_ms" in old[name].hint
+    assert old["success rate"].level == FAIL
 
 
 def test_a_few_late_frames_are_within_the_success_rate(config: Config) -> None:

@@ -11,7 +11,15 @@ import pytest
 import yaml
 
 from jtqd.daemon.cli import init, probe
-from jtqd.daemon.cli.draft import DraftError, Wanted, draft_joint
+from jtqd.daemon.cli.draft import (
+    ConfigDraft,
+    DraftError,
+    Wanted,
+    config_text,
+    draft_joint,
+    drive_lines,
+    joint_text,
+)
 from jtqd.daemon.config import load_config
 from jtqd.drivers.devices import DriveProfile, drive_scaling
 from jtqd.drivers.object_dictionary import ObjectStore, read_eds
@@ -112,8 +120,43 @@ def test_a_drive_without_scaling_is_scaled_by_options_as_the_boot_does():
 
 
 def test_a_drive_that_jtqd_cannot_use_is_told():
-    (problem,) = draft_joint(1, NODE, drive(without=[(0x60E4, 1)]), Wanted()).problems
-    assert problem == "node 5 (emulated joint drive): has no 60E4h:1, which jtqd maps"
+    (problem,) = draft_joint(1, NODE, drive(without=[(0x6041, 0)]), Wanted()).problems
+    assert problem == "node 5 (emulated joint drive): has no 6041h:0, which jtqd maps"
+
+
+LINK = ((0x60E4, 1), (0x60E6, 1), (0x60EB, 1))
+VELOCITY = ((0x606C, 0), (0x6090, 1), (0x6090, 2))
+CURRENT = ((0x6078, 0), (0x6075, 0))
+
+
+@pytest.mark.parametrize(
+    ("without", "wanted", "objects", "why"),
+    [
+        (LINK, Wanted(), {"link_position": False}, "no 60E4h:1"),
+        ((), Wanted(one_encoder=True), {"link_position": False}, "--one-encoder"),
+        (VELOCITY, Wanted(), {"motor_velocity": False}, "no 606Ch:0"),
+        (CURRENT, Wanted(rated_current_a=8.0), {"current": {"index": 0x6077}}, "no 6078h:0"),
+    ],
+)
+def test_a_drive_that_tells_less_gets_objects_that_say_so(without, wanted, objects, why, tmp_path):
+    """And no scaling of what it does not tell; jtqd reads the section, and its boot takes the drive as it is."""
+    found = drive({(0x6075, 0): 8000, (0x6076, 0): 500}, without)
+    draft = draft_joint(1, NODE, found, wanted)
+    assert draft.problems == ()
+    assert draft.given == {}
+    text = "\n".join(drive_lines(draft))
+    assert yaml.safe_load(text)["joint_1"]["objects"] == objects
+    assert why in text
+    (tmp_path / "joint_1.yaml").write_text(joint_text(draft))
+    config = tmp_path / "c.yaml"
+    config.write_text(config_text(ConfigDraft("can0", 1_000_000, 1000, [draft], None, None, (), 2000, 9)))
+    joint = load_config(config).joints[0]
+    profile = DriveProfile(NODE, objects=joint.objects, torque_constant_nm_per_a=0.05)
+    scaling, _ = drive_scaling(profile, found.numbers)
+    assert scaling.motor_rad_per_count > 0.0
+    assert (scaling.link_rad_per_count == 0.0) == ("link_position" in objects)
+    assert (scaling.motor_rad_s_per_unit == 0.0) == ("motor_velocity" in objects)
+    assert scaling.ampere_per_unit > 0.0
 
 
 def run(capsys, *arguments):
@@ -265,10 +308,13 @@ def test_probe_of_a_bus_and_of_its_devices(bench, capsys):
 
 
 def test_probe_names_what_a_drive_lacks():
-    found = drive(without=[(0x60E4, 1)])
+    found = drive(without=[(0x6041, 0)])
     (problem,) = probe.problems_of(found)
-    assert "60E4h:1" in problem
-    assert "60E4h:1  not there" in probe.text(found, [], [problem])
+    assert "6041h:0" in problem
+    assert "6041h:0  not there" in probe.text(found, [], [problem])
+    less = drive(without=[(0x60E4, 1)])
+    assert probe.problems_of(less) == []
+    assert "link_position: false" in probe.text(less, [], [])
 
 
 def test_on_a_terminal_what_is_missing_is_asked_for(tmp_path):

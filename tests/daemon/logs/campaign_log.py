@@ -6,8 +6,10 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from mcap.records import Channel, Schema
+
 from jtqd.daemon.recording.journal import Journal
-from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData, SealedChunk
+from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData, Span
 from jtqd.daemon.recording.messages import CycleMessages, JointStateMessage
 from jtqd.daemon.recording.progress import Account
 from jtqd.daemon.recording.recording import Recording
@@ -40,23 +42,57 @@ class Cycle(NamedTuple):
 
 
 class _OneFile:
-    """Where the chunks go."""
+    """Where the spans go."""
 
     def __init__(self, file: McapFile) -> None:
         self._file = file
 
-    def write(self, chunk: SealedChunk, at_ns: int) -> None:
+    def write(self, span: Span, at_ns: int) -> None:
         """Append it."""
-        self._file.append(chunk)
+        self._file.append(span)
 
 
-def write_log(path: Path, cycles: Iterable[Cycle], joints: int = 2, configuration: str = "") -> Path:
+class _Together(ChunkBuilder):
+    """All topics in one chunk, as the recorder wrote them before 0.2."""
+
+    def __init__(self, schemas: Sequence[Schema], channels: Sequence[Channel], joints: int) -> None:
+        super().__init__(schemas, channels, [], 60)
+        messages = CycleMessages(joints)
+        starts = [start for _, start in messages.parts]
+        self._spans = list(
+            zip((channel for channel, _ in messages.parts), starts, [*starts[1:], messages.size], strict=True)
+        )
+
+    def add_block(self, block: bytes, time_ns: int) -> None:
+        """Add the messages one by one."""
+        (sequence,) = struct.unpack_from("<I", block, 11)
+        for channel, start, end in self._spans:
+            self.add(channel, time_ns, block[start + 31 : end], sequence)
+
+
+def builder_of(
+    schemas: Sequence[Schema], channels: Sequence[Channel], joints: int = 2, *, together: bool = False
+) -> ChunkBuilder:
+    """The recorder's builder; `together`: one that puts all topics in one chunk, as before 0.2."""
+    if together:
+        return _Together(schemas, channels, joints)
+    return ChunkBuilder(schemas, channels, CycleMessages(joints).parts, 60)
+
+
+def write_log(
+    path: Path,
+    cycles: Iterable[Cycle],
+    joints: int = 2,
+    configuration: str = "",
+    *,
+    together: bool = False,
+) -> Path:
     """An MCAP file of these cycles, each of so many joints; `configuration` is attached to it."""
     schemas, channels = definitions(None, joints)
     attached = [NamedData("configuration.yaml", "application/yaml", configuration.encode())]
     head = Head(schemas, channels, attached if configuration else [])
     file = McapFile(path, head, {"run": "test", "part": "1"}, 1)
-    journal = Journal(ChunkBuilder(schemas, channels, CycleMessages(joints).parts, 60), print)
+    journal = Journal(builder_of(schemas, channels, joints, together=together), print)
     overview = JointStateMessage("abcd"[:joints], (1.0,) * joints)
     recording = Recording(journal, _OneFile(file), overview, 500_000_000, Account())
     for cycle in cycles:

@@ -10,12 +10,12 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 from jtqd.daemon.recording.journal import Journal
-from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData
-from jtqd.daemon.recording.messages import BLOCK_PARTS, JointStateMessage
+from jtqd.daemon.recording.mcap_file import Head, McapFile, NamedData
+from jtqd.daemon.recording.messages import JointStateMessage
 from jtqd.daemon.recording.progress import Account
 from jtqd.daemon.recording.recording import Recording
 from jtqd.daemon.recording.schemas import definitions
-from tests.daemon.logs.campaign_log import Cycle, Joint, write_log
+from tests.daemon.logs.campaign_log import Cycle, Joint, builder_of, write_log
 
 ATTACHMENTS = [
     NamedData("configuration.yaml", "application/yaml", b"a: 1\n" * 50),
@@ -32,8 +32,8 @@ def cycles(count, seed=1):
         yield Cycle(100 + n, 7_000_000_000 + n * 1_000_000, joints, frames)
 
 
-def ours(path, count=120, chunk_ns=20_000_000, seed=1):
-    """A log by the recorder's own code, with attachments."""
+def ours(path, count=120, chunk_ns=20_000_000, seed=1, *, together=False):
+    """A log by the recorder's own code, with attachments; `together`: all topics in one chunk, as before 0.2."""
     from tests.daemon.logs import campaign_log
 
     schemas, channels = definitions(None)
@@ -44,7 +44,7 @@ def ours(path, count=120, chunk_ns=20_000_000, seed=1):
         def write(self, chunk, at_ns):
             file.append(chunk)
 
-    journal = Journal(ChunkBuilder(schemas, channels, BLOCK_PARTS, 60), print)
+    journal = Journal(builder_of(schemas, channels, together=together), print)
     recording = Recording(journal, OneFile(), JointStateMessage(("a", "b"), (1.0, 1.0)), chunk_ns, Account())
     for cycle in cycles(count, seed):
         recording.add(campaign_log._record(cycle))

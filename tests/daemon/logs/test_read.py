@@ -13,6 +13,7 @@ import pytest
 import zstandard
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
+from mcap.records import Channel, ChunkIndex, Schema
 from mcap.writer import CompressionType, Writer
 from mcap_ros2.decoder import DecoderFactory
 from numpy.lib.recfunctions import repack_fields
@@ -20,6 +21,7 @@ from numpy.lib.recfunctions import repack_fields
 from jtqd.daemon.logs import (
     LogError,
     iter_messages,
+    iter_topics,
     log_parts,
     read,
     read_attachments,
@@ -29,9 +31,10 @@ from jtqd.daemon.logs import (
     topics_of,
 )
 from jtqd.daemon.logs.can_frames import iter_frames
-from jtqd.daemon.logs.container import ChunkError, Source, message_index, unpack_data
+from jtqd.daemon.logs.container import ChunkError, Source, chunk_index, message_index, parse, unpack_data
 from jtqd.daemon.logs.export import main as export
 from jtqd.daemon.logs.log_file import LogFile, _indexed
+from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, bytes_of
 from jtqd.daemon.recording.schemas import SCHEMAS
 from jtqd.daemon.replay.command import main as replay
 from jtqd.daemon.replay.session import ReplayOptions
@@ -189,6 +192,74 @@ def test_text_of_another_length_in_the_middle_of_a_topic(tmp_path):
     ] * 2
 
 
+def write_texts(path, messages):
+    """(channel, text) in one chunk, which holds no definitions; they stand in the chunk before."""
+    schemas = [Schema(id=1, name="x/Text", encoding="ros2msg", data=b"string a\n")]
+    channels = [
+        Channel(id=n + 1, topic=f"/{n}", message_encoding="cdr", metadata={}, schema_id=1) for n in (0, 1, 2)
+    ]
+    file = McapFile(path, Head(schemas, channels, []), {}, 0)
+    builder = ChunkBuilder(schemas, channels, [], 60)
+    builder.add(3, 0, b"\0\1\0\0\1\0\0\0\0")
+    file.append(builder.seal())
+    for n, (channel, text) in enumerate(messages):
+        builder.add(channel + 1, n, b"\0\1\0\0" + struct.pack("<I", len(text) + 1) + text + b"\0")
+    file.append(builder.seal())
+    file.finish(path.name)
+
+
+@pytest.mark.parametrize(
+    "messages",
+    [
+        pytest.param([(n % 2, b"text%3d" % n) for n in range(20)], id="two topics of one length"),
+        pytest.param([(0, b"x" * length) for length in (8, 5, 11)], id="lengths that fill up a multiple"),
+        pytest.param([(0, b"x" * 8)] * 3 + [(1, b"y" * 8)], id="another topic at the end"),
+    ],
+)
+def test_a_chunk_that_only_looks_like_rows_of_one_length(tmp_path, messages):
+    """It begins with a message, and is as long as a whole number of such messages."""
+    path = tmp_path / "a.mcap"
+    write_texts(path, messages)
+    for channel in {channel for channel, _ in messages}:
+        found = [row["a"] for row in read_topic(path, f"/{channel}")]
+        texts = [each if isinstance(each, bytes) else each.encode() for each in found]
+        assert [text.rstrip(b"\0") for text in texts] == [
+            text for which, text in messages if which == channel
+        ]
+
+
+def test_a_log_of_before_is_read_alike(tmp_path):
+    """All topics in one chunk, or each in its own."""
+    paths = [tmp_path / name for name in ("before.mcap", "now.mcap")]
+    for path in paths:
+        ours(path, together=path is paths[0])
+    before, now = (read_messages(path, INDEXED) for path in paths)
+    for topic in INDEXED:
+        assert before[topic].log_times.tolist() == now[topic].log_times.tolist()
+        assert before[topic].records.tobytes() == now[topic].records.tobytes()
+
+
+def test_several_topics_come_span_by_span(log):
+    spans = list(iter_topics(log, (JOINT, "/joint/2/state", FRAMES)))
+    assert len(spans) > 3
+    for span in spans:
+        one, *others = (messages.records["cycle"].tolist() for messages in span.values())
+        assert len(others) == 2
+        assert others == [one, one]
+
+
+def test_a_chunk_index_is_what_the_library_makes_of_it():
+    """And one that is cut, has a wrong length or no text is none."""
+    index = ChunkIndex(9, 1, "zstd", 2, 3, 4, {5: 6, 7: 8}, 10, 11)
+    body = bytes_of(index)[9:]
+    assert chunk_index(body) == parse(ChunkIndex, body) == index
+    assert chunk_index(body + bytes(8)) == index  # a field of a later version
+    for wrong in (body[:-1], body[:40], b"", body + bytes(65), body.replace(b"zstd", b"\xff\xfe\xfd\xfc")):
+        assert chunk_index(wrong) is None
+    for at in (32, 64):  # lengths of the map and of the compression's name
+        assert chunk_index(body[:at] + b"\x07" + body[at + 1 :]) is None
+
+
 def test_time_selection(log):
     times = read_messages(log, (JOINT,))[JOINT].log_times
     start, end = START_NS + 17_000_000, START_NS + 45_000_000
@@ -232,13 +303,17 @@ def test_file_that_is_being_written_is_read_as_far_as_it_is_there(log, tmp_path)
     for cut, lost in (
         (chunks[-1] + 200, 1),
         (chunks[-1], 1),
-        (chunks[1] + 9, None),
+        (chunks[-2], 1),
+        (chunks[-2] + 200, 1),
+        (chunks[4] + 9, None),
         (record_starts(data)[-4] - 3, None),
     ):
         active = tmp_path / "a.mcap.active"
         active.write_bytes(data[:cut])
-        count = len(read_topic(active, JOINT))
-        assert 0 < count < whole if lost or cut < chunks[2] else 0 < count <= whole
+        counts = [len(read_topic(active, topic)) for topic in (JOINT, "/joint/2/state", FRAMES)]
+        assert len(set(counts)) == 1
+        count = counts[0]
+        assert 0 < count < whole if lost or cut < chunks[5] else 0 < count <= whole
         assert read_attachments(active)["configuration.yaml"] == ATTACHMENTS[0].data
         finished = tmp_path / "a.mcap"
         finished.write_bytes(data[:cut])
@@ -401,7 +476,7 @@ def message(channel, time_ns, payload):
 @pytest.mark.parametrize("cut", range(4))
 def test_the_last_chunk_is_read_whole_whatever_of_its_indexes_is_there(tmp_path, cut):
     """The writer was killed between the message indexes of its last chunk: some channels have one, others none."""
-    data = ours(tmp_path / "a.mcap")
+    data = ours(tmp_path / "a.mcap", together=True)
     starts = record_starts(data)
     last = max(n for n, at in enumerate(starts[:-1]) if data[at] == Opcode.CHUNK)
     end = starts[last + 1 + cut]

@@ -25,7 +25,7 @@ CHUNK, INDEX, DATA_END, ATTACHMENT, SCHEMA = 0x06, 0x07, 0x0F, 0x09, 0x03
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
-    """A whole log of 120 cycles in 6 chunks, and the offset of every record in it."""
+    """A whole log of 120 cycles in 6 spans of 4 chunks (the last of 3), and the offset of every record in it."""
     data = ours(tmp_path_factory.mktemp("log") / "whole.mcap")
     return data, record_starts(data)
 
@@ -53,13 +53,21 @@ def contents(data):
     return [(channel.topic, message.log_time, message.data) for _, channel, message in messages]
 
 
+def cycles_of(data):
+    """Numbers of the cycles on each of their topics, as the library reads them."""
+    found = {topic: [] for topic in ("/joint/1/state", "/joint/2/state", "/can/frames")}
+    for _, channel, message in make_reader(io.BytesIO(data)).iter_messages(list(found), log_time_order=False):
+        found[channel.topic].append(message.sequence)
+    return list(found.values())
+
+
 def test_whole_file_is_not_touched(log, tmp_path):
     path = tmp_path / "a.mcap"
     path.write_bytes(log[0])
     os.utime(path, ns=(1, 1))
     result = recover(path)
     assert (result.changed, result.renamed, result.lossy) == (False, False, False)
-    assert (result.messages, result.chunks, result.attachments) == (by_index(log[0])[0], 6, 2)
+    assert (result.messages, result.chunks, result.attachments) == (by_index(log[0])[0], 23, 2)
     assert path.read_bytes() == log[0]
     assert path.stat().st_mtime_ns == 1
 
@@ -84,16 +92,37 @@ def test_killed_between_two_chunks_loses_nothing(log, tmp_path):
     assert [(a.name, a.data) for a in attached] == [(a.name, a.data) for a in ATTACHMENTS]
 
 
-def test_torn_last_chunk_costs_that_chunk_and_says_its_time(log, tmp_path):
-    """Chunks of 20 cycles: the last one, of 15 cycles, torn in the middle of its packed bytes."""
-    at, end = starts_of(log, CHUNK)[-1]
+def test_spans_of_half_a_second_are_whole_without_a_summary(tmp_path):
+    data = ours(tmp_path / "whole.mcap", count=1200, chunk_ns=500_000_000)
+    data_end = starts_of((data, record_starts(data)), DATA_END)[0][0]
+    result, now = repaired(tmp_path / "a.mcap.active", data[:data_end])
+    assert (result.lossy, result.chunks) == (False, 3 * 4)
+    assert cycles_of(now) == [list(range(100, 1300))] * 3
+
+
+@pytest.mark.parametrize("chunk", [-3, -2, -1], ids=["joint 1", "joint 2", "frames"])
+def test_torn_last_span_costs_that_span_and_says_its_time(log, tmp_path, chunk):
+    """Spans of 21 cycles; the last one, of 15 cycles, torn within one of its chunks: no joint ends later than another."""
+    chunks = starts_of(log, CHUNK)
+    at, end = chunks[chunk]
+    begin = chunks[-3][0]
     result, now = repaired(tmp_path / "a.mcap.active", log[0][: (at + end) // 2])
-    lost = by_index(log[0])[0] - result.messages
     assert result.lossy
-    assert (result.chunks, result.lost_chunks, result.lost_bytes) == (5, 1, (at + end) // 2 - at)
-    assert 0 < lost <= 3 * 21 + 1
+    assert (result.chunks, result.lost_chunks, result.lost_bytes) == (20, 4 + chunk, (at + end) // 2 - begin)
+    assert by_index(log[0])[0] - result.messages == 3 * 15
     assert result.lost_s == pytest.approx(0.015, abs=0.001)
-    assert now[:at] == log[0][:at]
+    assert now[:begin] == log[0][:begin]
+    assert cycles_of(now) == [list(range(100, 205))] * 3
+
+
+@pytest.mark.parametrize("chunk", [-2, -1])
+def test_killed_between_the_chunks_of_a_span(log, tmp_path, chunk):
+    """Every record is whole, but not every joint is there."""
+    begin, at = starts_of(log, CHUNK)[-3][0], starts_of(log, CHUNK)[chunk][0]
+    result, now = repaired(tmp_path / "a.mcap.active", log[0][:at])
+    assert (result.lossy, result.chunks, result.lost_bytes) == (True, 20, at - begin)
+    assert result.lost_s == pytest.approx(0.015, abs=0.001)
+    assert cycles_of(now) == [list(range(100, 205))] * 3
 
 
 def test_torn_message_index_is_made_anew(log, tmp_path):
@@ -107,22 +136,66 @@ def test_torn_message_index_is_made_anew(log, tmp_path):
 
 
 def test_zeros_at_the_end_are_cut_off(log, tmp_path):
-    at = starts_of(log, CHUNK)[-1][0]
+    at = starts_of(log, CHUNK)[-3][0]
     result, _ = repaired(tmp_path / "a.mcap.active", log[0][:at] + bytes(1 << 20))
-    assert result.chunks == 5
+    assert result.chunks == 20
     assert result.lost_bytes == 1 << 20
     assert "zeros" in result.findings[0]
 
 
-def test_bad_chunk_in_the_middle_is_left_out(log, tmp_path):
-    at, end = starts_of(log, CHUNK)[2]
+def test_zeros_within_a_span_cost_that_span(log, tmp_path):
+    """What a disk has left of a write that a power cut met: one joint, and zeros."""
+    begin, at = starts_of(log, CHUNK)[-3][0], starts_of(log, CHUNK)[-2][0]
+    result, now = repaired(tmp_path / "a.mcap.active", log[0][:at] + bytes(5000))
+    assert (result.chunks, result.lost_bytes) == (20, at + 5000 - begin)
+    assert cycles_of(now) == [list(range(100, 205))] * 3
+
+
+@pytest.mark.parametrize("chunk", [8, 9, 10], ids=["joint 1", "joint 2", "frames"])
+def test_bad_chunk_in_the_middle_is_left_out_with_those_of_its_cycles(log, tmp_path, chunk):
+    """The rest of its span (/joint_states, events) stays."""
+    chunks = starts_of(log, CHUNK)
+    data = bytearray(log[0])
+    data[chunks[chunk][1] - 30] ^= 0x10
+    result, now = repaired(tmp_path / "a.mcap", bytes(data))
+    begin, end = chunks[8][0], chunks[11][0] if chunk < 10 else chunks[10][1]
+    assert (result.chunks, result.lost_chunks, result.lost_bytes) == (20, 3, end - begin)
+    assert result.lost_s == pytest.approx(0.022, abs=0.001)
+    assert data[slice(*chunks[chunk])] not in now
+    assert log[0][slice(*chunks[11])] in now
+    assert set(contents(now)) < set(contents(log[0]))
+    assert cycles_of(now) == [[*range(100, 142), *range(163, 220)]] * 3
+
+
+def test_bad_chunk_of_the_rest_costs_no_cycle(log, tmp_path):
+    at, end = starts_of(log, CHUNK)[11]
     data = bytearray(log[0])
     data[end - 30] ^= 0x10
     result, now = repaired(tmp_path / "a.mcap", bytes(data))
+    assert (result.chunks, result.lost_chunks, result.lost_bytes) == (22, 1, end - at)
+    assert cycles_of(now) == [list(range(100, 220))] * 3
+
+
+def test_two_damaged_spans_do_not_make_one(log, tmp_path):
+    """Of one the joints are left, of the next the frames: together they have every topic, but not of the same cycles."""
+    chunks = starts_of(log, CHUNK)
+    data = bytearray(log[0])
+    for number in (6, 8, 9):
+        data[chunks[number][1] - 30] ^= 0x10
+    _, now = repaired(tmp_path / "a.mcap", bytes(data))
+    assert cycles_of(now) == [[*range(100, 121), *range(163, 220)]] * 3
+
+
+def test_a_log_of_before_loses_a_chunk_as_it_did(tmp_path):
+    """All topics in one chunk."""
+    data = ours(tmp_path / "whole.mcap", together=True)
+    at, end = starts_of((data, record_starts(data)), CHUNK)[2]
+    damaged = bytearray(data)
+    damaged[end - 30] ^= 0x10
+    result, now = repaired(tmp_path / "a.mcap", bytes(damaged))
     assert (result.chunks, result.lost_chunks, result.lost_bytes) == (5, 1, end - at)
-    assert result.lost_s == pytest.approx(0.022, abs=0.003)
-    assert data[at:end] not in now
-    assert set(contents(now)) < set(contents(log[0]))
+    assert result.lost_s == pytest.approx(0.022, abs=0.001)
+    assert cycles_of(now) == [[*range(100, 142), *range(163, 220)]] * 3
 
 
 @pytest.mark.parametrize("byte", [9, 17], ids=lambda b: f"head byte {b}")
@@ -138,15 +211,16 @@ def test_times_of_a_chunk_are_restored(log, tmp_path, byte):
 
 @pytest.mark.parametrize("byte", [0, 1, 2, 8, 25, 33, 37, 41, 45], ids=lambda b: f"head byte {b}")
 @pytest.mark.parametrize("ended", [True, False], ids=["ended", "no summary"])
-def test_wrong_head_of_a_chunk_costs_that_chunk_only(log, tmp_path, byte, ended):
+def test_wrong_head_of_a_chunk_costs_its_cycles_only(log, tmp_path, byte, ended):
     """Opcode, length, size, CRC, compression, packed length: the next chunk is found in the summary, or by its mark."""
-    at, end = starts_of(log, CHUNK)[3]
+    at, end = starts_of(log, CHUNK)[13]
     data = bytearray(log[0][: None if ended else starts_of(log, DATA_END)[0][0]])
     data[at + byte] ^= 0x40
     result, now = repaired(tmp_path / "a.mcap", bytes(data))
     assert result.lossy
-    assert (result.chunks, result.attachments) == (5, 2)
+    assert (result.chunks, result.attachments) == (20, 2)
     assert result.lost_bytes >= end - at
+    assert cycles_of(now) == [[*range(100, 163), *range(184, 220)]] * 3
     assert set(contents(now)) < set(contents(log[0]))
 
 
@@ -192,7 +266,7 @@ def test_first_chunk_and_all_definitions_before_it_gone(log, tmp_path):
     data = bytearray(log[0])
     data[first:end] = bytes(end - first)
     result, _ = repaired(tmp_path / "a.mcap", bytes(data))
-    assert (result.chunks, result.attachments) == (5, 2)
+    assert (result.chunks, result.attachments) == (20, 2)
     assert result.messages > 0.75 * by_index(log[0])[0]
 
 
@@ -474,6 +548,11 @@ def whole(request, tmp_path_factory):
     return data
 
 
+def of_no_cycle(whole):
+    """Messages of a span that lacks a chunk: readers get them, but of no cycle all."""
+    return 2 * 21 if b"/can/frames" in whole else 0
+
+
 def judge(path, whole, damaged, what):
     """Recover: only messages of the whole file, all that an orderly reader gets, and no loss that is not reported."""
     path.write_bytes(damaged)
@@ -481,14 +560,17 @@ def judge(path, whole, damaged, what):
         result = recover(path)
     except RecoverError:
         assert path.read_bytes() == damaged, what
-        assert in_order(damaged)[0] == 0, what
+        assert in_order(damaged)[0] <= of_no_cycle(whole), what
         return "refused"
     now = path.read_bytes()
     assert by_index(now) == in_order(now) == (result.messages, None), what
     before, after = MESSAGES[whole], Counter(contents(now))
     assert not after - before, what
     if b"zstd" in whole:  # the library reads on over wrong lengths of an unpacked chunk
-        assert result.messages >= in_order(damaged)[0], what
+        assert result.messages >= in_order(damaged)[0] - of_no_cycle(whole), what
+    if b"/can/frames" in whole:
+        one, *others = cycles_of(now)
+        assert all(each == one for each in others), what
     assert result.lossy or len(damaged) < len(whole) or after == before, what
     assert result.changed or now == damaged, what
     again = recover(path)
@@ -502,7 +584,8 @@ def test_cut_at_every_interesting_offset(whole, tmp_path):
     places = sorted(at for at in offsets if 8 <= at < len(whole))
     places = places[:: max(1, len(places) // 120)]
     found = Counter(judge(tmp_path / "a.mcap", whole, whole[:at], f"cut at {at}") for at in places)
-    empty = sum(in_order(whole[:at])[0] == 0 for at in places)  # a file without any message is not replaced
+    # a file without any message, or without one whole cycle, is not replaced
+    empty = sum(in_order(whole[:at])[0] <= of_no_cycle(whole) for at in places)
     assert found["refused"] <= empty, found
     assert found["repaired"] + found["lossy"] > 0.9 * (len(places) - empty), found
 

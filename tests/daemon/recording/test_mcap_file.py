@@ -1,4 +1,4 @@
-"""One file of whole chunks, on a disk that fails for a while, against the library's reader."""
+"""One file of whole spans, on a disk that fails for a while, against the library's reader."""
 
 import errno
 import fcntl
@@ -7,14 +7,14 @@ import struct
 
 import pytest
 import zstandard
-from mcap.reader import make_reader
+from mcap.reader import NonSeekingReader, SeekingReader, make_reader
 from mcap.records import Channel, Chunk, ChunkIndex, MessageIndex, Schema
 from mcap.stream_reader import StreamReader
 
 from jtqd.daemon.recording import mcap_file as appender
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData
 from jtqd.daemon.recording.schemas import definitions
-from tests.daemon.recording.recorder_bench import cycles_of, metadata_of, one_file, record_of
+from tests.daemon.recording.recorder_bench import START_NS, cycles_of, metadata_of, one_file, record_of
 
 
 @pytest.fixture
@@ -35,8 +35,8 @@ def failing_disk(monkeypatch):
     return knob
 
 
-def test_chunk_that_did_not_fit_is_taken_back(tmp_path, failing_disk):
-    """The third of five chunks is written by half and refused: the file is whole without it."""
+def test_span_that_did_not_fit_is_taken_back(tmp_path, failing_disk):
+    """The third of five spans is written by half and refused: the file is whole without it."""
     path = tmp_path / "log.mcap"
     recording, sink = one_file(path, chunk_ns=10**9)
     for n in range(500):
@@ -55,7 +55,7 @@ def test_chunk_that_did_not_fit_is_taken_back(tmp_path, failing_disk):
     assert cycles_of(path) == [*range(200), *range(300, 500)]
     with open(path, "rb") as file:
         summary = make_reader(file).get_summary()
-    assert len(summary.chunk_indexes) == summary.statistics.chunk_count == 4
+    assert len(summary.chunk_indexes) == summary.statistics.chunk_count == 4 * 4
 
 
 def test_disk_that_stays_full_leaves_whole_chunks(tmp_path, failing_disk):
@@ -197,6 +197,38 @@ def test_messages_of_several_channels_are_found_by_their_index(tmp_path):
     assert (statistics.message_start_time, statistics.message_end_time, statistics.chunk_count) == (5, 30, 2)
 
 
+@pytest.mark.parametrize("stream", [False, True], ids=["by the index", "from a pipe"])
+def test_readers_get_the_messages_of_a_span_in_the_order_of_time(tmp_path, stream):
+    """Its chunks lie behind one another and are of the same time; what is of one time comes in the order of the topics."""
+    path = tmp_path / "log.mcap"
+    recording, sink = one_file(path)
+    for n in range(250):
+        recording.add(record_of(n))
+    recording.flush()
+    sink.end()
+    with open(path, "rb") as file:
+        make = NonSeekingReader if stream else SeekingReader
+        messages = make(file, validate_crcs=True).iter_messages()
+        found = [(message.log_time, channel.topic) for _, channel, message in messages]
+    topics = ["/joint/1/state", "/joint/2/state", "/can/frames", "/joint_states"]
+    assert found == [
+        (START_NS + n * 1_000_000, topic) for n in range(250) for topic in topics[: 4 if n % 20 == 0 else 3]
+    ]
+
+
+def test_a_joint_is_read_without_the_chunks_of_the_others(tmp_path):
+    path = tmp_path / "log.mcap"
+    recording, sink = one_file(path)
+    for n in range(250):
+        recording.add(record_of(n))
+    recording.flush()
+    sink.end()
+    with open(path, "rb") as file:
+        index = make_reader(file).get_summary().chunk_indexes
+    topics = [{*each.message_index_offsets} for each in index]
+    assert topics == 3 * [{1}, {2}, {3}, {4}]
+
+
 def test_every_index_entry_points_at_its_message(tmp_path):
     """Readers that go by offset (numpy views of a chunk, seeking) rely on it; the library's reader does not."""
     path = tmp_path / "log.mcap"
@@ -217,10 +249,19 @@ def test_every_index_entry_points_at_its_message(tmp_path):
                 assert (opcode, channel, log_time) == (0x05, record.channel_id, time_ns)
                 entries += 1
     index = [record for record in records if isinstance(record, ChunkIndex)]
+    chunks = [record for record in records if isinstance(record, Chunk)]
     data = path.read_bytes()
+    for record, chunk in zip(index, chunks, strict=True):
+        assert (record.message_start_time, record.message_end_time, record.uncompressed_size) == (
+            chunk.message_start_time,
+            chunk.message_end_time,
+            chunk.uncompressed_size,
+        )
+        behind = record.chunk_start_offset + record.chunk_length + record.message_index_length
+        assert behind in {each.chunk_start_offset for each in index} or data[behind] == 0x0F
     for record in index:
         assert data[record.chunk_start_offset] == 0x06
         for channel, offset in record.message_index_offsets.items():
             assert struct.unpack_from("<BQH", data, offset)[::2] == (0x07, channel)
-    assert len(index) == 3
+    assert len(index) == 3 * 4
     assert entries == 3 * 250 + 13 + 2 * 2

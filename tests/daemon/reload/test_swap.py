@@ -44,6 +44,8 @@ from tests.daemon.loop.cycle_helpers import (
 )
 from tests.estimator.effects.effect_signals import extended
 from tests.estimator.fused_configuration import joint_of, network_of
+from tests.estimator.test_fused_estimator import NARROW
+from tests.estimator.test_zeros import ON, driven
 
 FAR = 1 << 62
 """A pause without end."""
@@ -119,6 +121,31 @@ class Loop:
 @pytest.fixture
 def loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Loop:
     return Loop(tmp_path, monkeypatch)
+
+
+@pytest.mark.parametrize("changed", ["sigma", "torsion"])
+def test_zeros_are_kept_where_what_they_were_learned_with_is_the_same(loop: Loop, changed: str) -> None:
+    fused = NARROW.fused
+    assert fused is not None
+    assert fused.torsion is not None
+    new = {
+        "sigma": replace(fused, sigma=replace(fused.sigma, torsion_nm=0.3)),
+        "torsion": replace(fused, torsion=replace(fused.torsion, zero_rad=1e-4)),
+    }[changed]
+    for joint in loop.cycle.joints:
+        old = make_estimator(NARROW, ON)
+        old.run(*driven(link_zero_rad=2e-4)[0])
+        joint.use(old, limits(1))
+    loop.turn(100)
+    known = [joint.estimator.past for joint in loop.cycle.joints]
+    loop.swap.begin(loop.prepared([make_estimator(replace(NARROW, fused=new), ON) for _ in (1, 2)]))
+    loop.swap.work(FAR)
+    became = "kept" if changed == "sigma" else "forgotten"
+    (report,) = loop.reports
+    assert report["zeros"] == {"joint_1": became, "joint_2": became}
+    assert [joint.estimator.past == past for joint, past in zip(loop.cycle.joints, known, strict=True)] == [
+        became == "kept"
+    ] * 2
 
 
 @pytest.mark.parametrize("kind", ["tob", "fused", "effects"])

@@ -4,8 +4,9 @@ from collections.abc import Collection
 
 from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.shared.conditions import Conditions
-from jtqd.daemon.shared.snapshot import COUNTERS, JointView, View
+from jtqd.daemon.shared.snapshot import COUNTERS, NO_ZEROS, JointView, View
 from jtqd.daemon.supervisor.health import Health
+from jtqd.estimator.learned import Zeros
 from jtqd.estimator.status import VALID
 
 NAN = float("nan")
@@ -19,6 +20,7 @@ def view(
     *,
     states: dict[int, int] | None = None,
     unconfigured: tuple[int, ...] = (),
+    zeros: tuple[Zeros, Zeros] = (NO_ZEROS, NO_ZEROS),
     **counters: int,
 ) -> View:
     """One reading; `states` are heartbeat states by node, the rest are operational."""
@@ -37,6 +39,7 @@ def view(
         (NAN, NAN),
         bytes(nodes),
         unconfigured,
+        zeros=zeros,
     )
 
 

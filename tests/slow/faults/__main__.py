@@ -12,6 +12,7 @@ from tests.slow.faults.cases_bus import CASES as BUS
 from tests.slow.faults.cases_nodes import CASES as NODES
 from tests.slow.faults.cases_pdos import CASES as PDOS
 from tests.slow.faults.cases_values import CASES as VALUES
+from tests.slow.faults.library import with_library
 from tests.slow.faults.runner import Outcome, play
 from tests.slow.faults.table import HEAD, as_json, cells, line, row
 
@@ -20,6 +21,7 @@ _EXAMPLES = """examples:
   python -m tests.slow.faults                 every case that is played on the bus, as a table
   python -m tests.slow.faults --case 16 12    only these (16: all its parts; 16a: this part)
   python -m tests.slow.faults --markdown      the table of docs/faults.md
+  python -m tests.slow.faults --library       with nodes that share no code with jtqd or its bench
 
 Where this machine has no SocketCAN, it runs in the bench kernel, with exact time. Exit status 1: a case does not hold.
 """
@@ -37,9 +39,15 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--json", action="store_true", help="as JSON")
     parser.add_argument("--markdown", action="store_true", help="as the table of docs/faults.md")
+    parser.add_argument(
+        "--library",
+        action="store_true",
+        help="with nodes of the canopen library instead of the emulated bench",
+    )
     options = parser.parse_args(arguments)
     wanted = options.case
-    chosen = [each for each in CASES if not wanted or each.key in wanted or str(each.number) in wanted]
+    played = with_library(CASES) if options.library else CASES
+    chosen = [each for each in played if not wanted or each.key in wanted or str(each.number) in wanted]
     unknown = set(wanted or ()) - {each.key for each in CASES} - {str(each.number) for each in CASES}
     if unknown:
         parser.error(
@@ -59,7 +67,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     if options.markdown:
         print(row(HEAD), row("---" for _ in HEAD), sep="\n", flush=True)
-    outcomes = play(chosen, bus, tell)
+    outcomes = play(chosen, bus, tell, library=options.library)
     if options.json:
         print(json.dumps([as_json(each) for each in outcomes], indent=1))
     return 1 if any(each.wrong for each in outcomes) else 0

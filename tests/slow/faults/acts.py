@@ -127,6 +127,16 @@ def reconfigure(rig: Rig) -> None:
     rig.inject(0x000, b"\x01\x01")
 
 
+def reconfigure_by_the_rules(rig: Rig) -> None:
+    """The same, of a node that lets a TPDO be changed only while it is not valid."""
+    cob_id = store(rig, 1).number(0x1800, 1)
+    rig.inject(0x000, b"\x80\x01")
+    rig.inject(0x601, b"\x23\x00\x18\x01" + (cob_id | 0x8000_0000).to_bytes(4, "little"))
+    rig.inject(0x601, b"\x2f\x00\x18\x02\x0a\0\0\0")
+    rig.inject(0x601, b"\x23\x00\x18\x01" + cob_id.to_bytes(4, "little"))
+    rig.inject(0x000, b"\x01\x01")
+
+
 def reconfigure_signed(rig: Rig) -> None:
     """The same, and 1020h holds the signature all the while."""
     words = [store(rig, 1).number(0x1020, subindex) for subindex in (1, 2)]
@@ -138,11 +148,13 @@ def reconfigure_signed(rig: Rig) -> None:
 def changes(number: int, index: int, subindex: int, factor: float) -> Fault:
     """An object of a node that runs is another for a while, and nothing else shows it."""
 
-    def scale(rig: Rig, by: float) -> None:
-        objects = store(rig, number)
-        objects.set_number(index, subindex, round(objects.number(index, subindex) * by))
+    was: list[int] = []
 
-    return Added(first=lambda rig: scale(rig, factor), last=lambda rig: scale(rig, 1.0 / factor))
+    def first(rig: Rig) -> None:
+        was.append(store(rig, number).number(index, subindex))
+        store(rig, number).set_number(index, subindex, round(was[0] * factor))
+
+    return Added(first=first, last=lambda rig: store(rig, number).set_number(index, subindex, was[0]))
 
 
 def sdo_reads(rig: Rig) -> None:

@@ -27,17 +27,19 @@ class Heard:
     Args:
         frames: [n] of `id`, `length`, `data` [8].
         stamps_ns: [n] kernel receive stamps, CLOCK_REALTIME.
+        sync_length: bytes of jtqd's SYNC.
     """
 
-    def __init__(self, frames: NDArray[np.void], stamps_ns: NDArray[np.int64]) -> None:
+    def __init__(self, frames: NDArray[np.void], stamps_ns: NDArray[np.int64], sync_length: int = 1) -> None:
+        self.sync_length = sync_length
         self.frames = frames
         self.ids, self.lengths, self.data = frames["id"], frames["length"], frames["data"]
         self.stamps_ns = stamps_ns
-        self._syncs = (self.ids == SYNC) & (self.lengths == 1)
+        self._syncs = (self.ids == SYNC) & (self.lengths == sync_length)
 
     def tail(self) -> Heard:
         """The last frames: what follows is then seen to follow, or to be missing."""
-        return Heard(self.frames[-_TAIL:], self.stamps_ns[-_TAIL:])
+        return Heard(self.frames[-_TAIL:], self.stamps_ns[-_TAIL:], self.sync_length)
 
     def at(self, *ids: int) -> NDArray[np.intp]:
         """Indices of the frames with one of these identifiers [m]."""
@@ -56,7 +58,7 @@ class Heard:
 
     @property
     def syncs(self) -> NDArray[np.intp]:
-        """Indices of jtqd's SYNCs: those with a counter [m]."""
+        """Indices of jtqd's SYNCs, by their length [m]."""
         return np.flatnonzero(self._syncs)
 
     def delays_ns(self, can_id: int) -> NDArray[np.int64]:
@@ -94,8 +96,9 @@ class Ears(threading.Thread):
         dropped: frames that the listener itself has lost, as the kernel counts them.
     """
 
-    def __init__(self, bus: str) -> None:
+    def __init__(self, bus: str, sync_length: int = 1) -> None:
         super().__init__(daemon=True)
+        self._sync_length = sync_length
         self._socket = open_frame_socket(bus, None, error_frames=True, capacity=_CAPACITY)
         self._chunks: deque[tuple[bytes, NDArray[np.int64]]] = deque()
         self._ended, self._lock = False, threading.Lock()
@@ -137,7 +140,8 @@ class Ears(threading.Thread):
         """Everything since the last call."""
         chunks = [self._chunks.popleft() for _ in range(len(self._chunks))]
         frames = np.frombuffer(b"".join(data for data, _ in chunks), FRAME)
-        return Heard(frames, np.concatenate([np.empty(0, np.int64), *(stamps for _, stamps in chunks)]))
+        stamps_ns = np.concatenate([np.empty(0, np.int64), *(stamps for _, stamps in chunks)])
+        return Heard(frames, stamps_ns, self._sync_length)
 
     def end(self) -> None:
         """Stop listening; `heard` still gives what has come."""
@@ -150,4 +154,5 @@ class Ears(threading.Thread):
 def joined(parts: list[Heard]) -> Heard:
     """Several in a row as one."""
     frames = np.concatenate([np.empty(0, FRAME), *(each.frames for each in parts)])
-    return Heard(frames, np.concatenate([np.empty(0, np.int64), *(each.stamps_ns for each in parts)]))
+    stamps_ns = np.concatenate([np.empty(0, np.int64), *(each.stamps_ns for each in parts)])
+    return Heard(frames, stamps_ns, parts[0].sync_length if parts else 1)

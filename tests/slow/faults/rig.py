@@ -28,6 +28,7 @@ from jtqd.models.files import shipped
 from jtqd.sim_can.bench import Bench, bench_filters
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sim_can.plant_source import PlantSource
+from tests.library_drives.in_step import LibraryNodes
 from tests.slow.faults.ears import Ears
 from tests.slow.faults.injections import Fault
 from tests.slow.faults.watcher import Watcher
@@ -48,16 +49,20 @@ class Rig:
     """Bench, jtqd and watcher. Context manager.
 
     Attributes:
-        bench: the nodes (`jtqd.sim_can.bench.Bench`); a fault may reach into them.
+        bench: the nodes (`jtqd.sim_can.bench.Bench`, or those of the library); a fault may reach into them.
         fault: what is between them and the bus now.
         cycle: SYNCs of jtqd heard so far.
         watcher: what jtqd publishes and says.
         ears: an independent listener.
     """
 
-    def __init__(self, bus: str, directory: Path, seed: int = 1) -> None:
-        self.bus, self._directory = bus, directory
-        self.bench = Bench(PlantSource(load_plant(shipped("campaign_plant.yaml")), seed), "demo")
+    def __init__(self, bus: str, directory: Path, seed: int = 1, *, library: bool = False) -> None:
+        self.bus, self._directory, self._library = bus, directory, library
+        self.bench: Any = (
+            LibraryNodes()
+            if library
+            else Bench(PlantSource(load_plant(shipped("campaign_plant.yaml")), seed), "demo")
+        )
         self.fault = self.healthy = Fault()
         self.watcher = Watcher()
         self.cycle = 0
@@ -66,7 +71,7 @@ class Rig:
         self._down = False
         self._sync_at_ns = 0
         self._open()
-        self.ears = Ears(bus)
+        self.ears = Ears(bus, sync_length=0 if library else 1)
 
     def __enter__(self) -> Rig:
         (self._directory / "run").mkdir()
@@ -101,18 +106,24 @@ class Rig:
             if self.process.poll() is None:
                 self.process.kill()
             self.process.wait()
+        if self._library:
+            self.bench.close()
         self.ears.end()
         self.socket.close()
 
     def _configuration(self) -> str:
         content: dict[str, Any] = yaml.safe_load(shipped("bench.yaml").read_text())
-        content["sync"]["counter_overflow"] = 240  # so that each frame on the bus shows its cycle
+        # so that each frame on the bus shows its cycle; a strict node loses 1019h when it restarts
+        content["sync"]["counter_overflow"] = 0 if self._library else 240
         content["estimator"] = {"method": "efficiency"}  # the start is short, and no network decides a status
         for number in (1, 2):
             joint = content[f"joint_{number}"]
             joint.pop("network")
             joint["file"] = str(shipped(f"joint{number}.yaml"))
-            joint["identity"] = {"vendor": 0x7A1, "product": self.bench.drives[0].store.number(0x1018, 2)}
+            identity = self.bench.drives[0].store
+            joint["identity"] = {"vendor": identity.number(0x1018, 1), "product": identity.number(0x1018, 2)}
+            if self._library:  # no 3001h; its sensor tells another torque than its current
+                del joint["temperature"], joint["sensor_channel"]
         path = self._directory / "configuration.yaml"
         path.write_text(yaml.safe_dump(content))
         return str(path)
@@ -195,20 +206,21 @@ class Rig:
             can_id, length, data = FRAME.unpack_from(frames, 16 * n)
             if can_id & (CAN_EFF_FLAG | CAN_RTR_FLAG | CAN_ERR_FLAG):
                 continue
-            data = data[:length]
+            number, data = data[0], data[:length]
             if can_id == ESTIMATE:
                 self.watcher.estimate(data, now_ns)
             elif can_id == OWN_EMCY:
                 self.watcher.emcy(data, now_ns)
             elif can_id == SYNC:
-                self._on_sync(data, stamps[n], now_ns)
+                self._on_sync(number, data, stamps[n], now_ns)
             elif self.fault.hears(can_id):
                 self.emit(self.bench.on_frame(can_id, data, stamps[n], now_ns))
 
-    def _on_sync(self, data: bytes, stamp_ns: int, now_ns: int) -> None:
+    def _on_sync(self, number: int, data: bytes, stamp_ns: int, now_ns: int) -> None:
+        """Take jtqd's SYNC; its number lies behind the end of the data where it has no counter."""
         self.cycle += 1
         self._sync_at_ns = now_ns
-        self.watcher.sync(data[0])
+        self.watcher.sync(number)
         if self.fault.hears(SYNC):
             sent = self.emit(self.bench.on_frame(SYNC, data, stamp_ns, now_ns))
             one, two = (needed <= sent for needed in _NEEDED)

@@ -51,15 +51,22 @@ class Outcome:
 
 
 def play(
-    cases: Iterable[Case], bus: str, tell: Callable[[Outcome], None] = lambda outcome: None
+    cases: Iterable[Case],
+    bus: str,
+    tell: Callable[[Outcome], None] = lambda outcome: None,
+    *,
+    library: bool = False,
 ) -> list[Outcome]:
-    """Play them with one jtqd; each outcome is told as soon as it is known.
+    """Play them with one jtqd; each outcome is told as soon as it is known. library: with the nodes of the library.
 
     Raises:
         DaemonEndedError: jtqd did not start, or ended in a case.
     """
     outcomes = []
-    with tempfile.TemporaryDirectory(prefix="jtq") as directory, Rig(bus, Path(directory)) as rig:
+    with (
+        tempfile.TemporaryDirectory(prefix="jtq") as directory,
+        Rig(bus, Path(directory), library=library) as rig,
+    ):
         for case in cases:
             outcome = _play_one(rig, case)
             tell(outcome)

@@ -133,9 +133,9 @@ def bench_config(folder: Path, **changes: object) -> Path:
         ({"bitrate": 800_000}, ["bench.yaml", "commander", "bus load", "95%"]),
         ({"sensor": {"node": 3, "channels": 2}}, ["bus load"]),
         ({"sync": {"period_us": 1500}}, ["sync.period_us", "1500", "whole milliseconds"]),
-        ({"sensor": {"node": 2, "channels": 1}}, ["bench.yaml", "different node numbers"]),
+        ({"sensor": {"node": 2, "channels": 1}}, ["bench.yaml", "sensor.node", "not used by joint_2.node"]),
         ({"joint_1": {"node": 1, "file": "none.yaml"}}, ["none.yaml"]),
-        ({"joint_4": {"node": 5, "file": "none.yaml"}}, ["joint_4", "without a gap"]),
+        ({"joint_4": {"node": 5, "file": "none.yaml"}}, ["joint_4"]),
     ],
 )
 def test_a_bench_that_cannot_carry_it_is_refused(
@@ -148,6 +148,49 @@ def test_a_bench_that_cannot_carry_it_is_refused(
     assert len(captured.err.splitlines()) == 1
     for word in words:
         assert word in captured.err
+
+
+def drives_with(folder: Path, **section: object) -> Path:
+    """The bench with both drives so."""
+    joints = {
+        f"joint_{n}": {"node": n, "file": f"trained/joint{n}.yaml", "sensor_channel": 1, **section}
+        for n in (1, 2)
+    }
+    return bench_config(folder, estimator={"method": "efficiency"}, **joints)
+
+
+@pytest.mark.parametrize(
+    ("section", "words"),
+    [
+        ({"max_age_ms": 5}, "key 'joint_1.max_age_ms': found 5, expected none for a campaign"),
+        ({"objects": {"motor_velocity": False}}, "key 'joint_1.objects.motor_velocity': found false, expected 606Ch"),
+        (
+            {"objects": {"motor_velocity": {"index": 0x2031, "type": "I16", "factor": 0.1}}},
+            "key 'joint_1.objects.motor_velocity': found 2031h:0, sign 1, expected 606Ch with sign 1",
+        ),
+        (
+            {"objects": {"current": {"sign": -1}}},
+            "key 'joint_1.objects.current': found 6078h:0, sign -1, expected 6078h or 6077h with sign 1",
+        ),
+    ],
+)  # fmt: skip
+def test_a_drive_that_would_be_moved_otherwise_than_planned_is_refused(
+    section: dict[str, object], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["efficiency", "--dry-run", "--config", str(drives_with(tmp_path, **section))]) == 1
+    said = capsys.readouterr().err
+    assert words in said
+    assert len(said.splitlines()) == 1
+
+
+def test_the_bus_load_of_a_campaign_is_that_of_the_layout(tmp_path: Path) -> None:
+    """Four bytes less of each drive, and torque instead of current, are no reason against it."""
+    less = {"link_position": False, "current": {"index": 0x6077}}
+    config = BenchConfig.load(drives_with(tmp_path, objects=less))
+    assert config.drives[0].objects.link_position is None
+    assert config.drives[0].torque_constant_nm_per_a == config.joints[0].torque_constant_nm_per_a
+    whole = BenchConfig.load(None).load_with_commander()
+    assert whole.worst - config.load_with_commander().worst == pytest.approx(0.08)
 
 
 def test_a_plan_beyond_its_limits_is_refused(plan: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -411,6 +411,27 @@ def test_every_fault_is_named(change: Change, words: list[str]) -> None:
     assert any(all(word in line for word in words) for line in lines), lines
 
 
+def one_encoder(columns: dict[int, JointColumns]) -> None:
+    for number, each in columns.items():
+        columns[number] = replace(each, link_position_rad=None)
+
+
+def test_joints_with_one_encoder_are_judged_by_it() -> None:
+    """The motors' positions through the gears say how the links turn."""
+    assert found(one_encoder) == ()
+
+    def turned(columns: dict[int, JointColumns]) -> None:
+        one_encoder(columns)
+        two = columns[2].motor_position_rad
+        assert two is not None
+        columns[2] = replace(columns[2], motor_position_rad=1.05 * two)
+
+    assert any(
+        "j2.motor_position_rad: through the gear found it turning -1.049 times" in each
+        for each in found(turned)
+    )
+
+
 def test_a_bench_without_a_sensor_is_not_reproached_for_it() -> None:
     table, points, joints = good_run()
     columns = dict(table.joints)

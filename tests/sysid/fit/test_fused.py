@@ -250,6 +250,28 @@ def test_the_error_of_the_fused_value(runs: list[RunSignals], fit: FusedFit) -> 
     assert parts.torsion_nm - parts.torsion_error_nm == pytest.approx(sensor, abs=1e-9)
 
 
+def test_one_encoder_has_the_current_path_alone(runs: list[RunSignals]) -> None:
+    """No torsion; what nobody can tell from the sensor's zero stays in sigma, so that the interval holds with it."""
+    blind = [
+        replace(run, seen=replace(run.seen, torsion_nm=np.full_like(run.sensor_nm, np.nan))) for run in runs
+    ]
+    found = fit_fused(blind, FRICTION, with_torsion=False)
+    assert found.fused.torsion is None
+    assert found.fused.sigma.reference_nm == 0.0
+    judged = []
+    for known, indices in folds(blind):
+        loss = fit_loss(known, FRICTION).loss
+        for n in indices:
+            parts = path_residuals(blind[n], loss, None)
+            error, sigma = fused_error(parts, found.fused.sigma, with_torsion=False)
+            assert np.array_equal(error, parts.current_error_nm)
+            scale = np.array(found.fused.sigma.scale)[quadrants_of(parts)]
+            judged.append(np.mean(np.abs(error) <= GAUSS * scale * sigma))
+    assert np.mean(judged) == pytest.approx(0.9, abs=0.03)
+    joint = replace(fused_joint(), fused=found.fused)
+    assert Joint.from_mapping(joint.to_mapping(), "x").fused == found.fused
+
+
 def test_runs_without_motion_are_left_out(runs: list[RunSignals]) -> None:
     still = replace(runs[0], moving=runs[0].standing)
     assert len(fit_fused([*runs[:6], still], FRICTION).unseen_rmse_nm) == 6

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -73,15 +73,22 @@ class LockStep:
 
     `filter` sees each batch of frames on its way to the commander and may change it: that is how faults are injected.
 
-    drives: 1 to 4, coupled in pairs; the sensor is node 3, or 5 beside more than two. period_ms: of SYNC.
+    drives: 1 to 4, coupled in pairs; the sensor is node 3, or 5 beside more than two. period_ms: of SYNC. profiles: of the
+    drives, where they are not as CiA 402 has them.
     """
 
     def __init__(
-        self, plant: Any = PLANT, profile: str = "rest", drives: int = 2, period_ms: int = 1
+        self,
+        plant: Any = PLANT,
+        profile: str = "rest",
+        drives: int = 2,
+        period_ms: int = 1,
+        profiles: Sequence[DriveProfile] = (),
     ) -> None:
         sources = sources_of(plant, 1, drives)
         self.source: Any = sources[0]
         self.bench = Bench(sources[0], profile, sources[1:])
+        self.drives = tuple(profiles) or tuple(DriveProfile(node) for node in range(1, drives + 1))
         self.nodes = range(1, drives + 1)
         self.sensor_node = sensor_node(drives)
         self.sensor_profile = SensorProfile(self.sensor_node, channels=(1,) if drives < 3 else (1, 2))
@@ -95,9 +102,8 @@ class LockStep:
         self.waiting: Frames = []
         self.bench.tick(self.now)
         settings = BusSettings(0x20, counter_overflow=240)
-        for node in (*self.nodes, self.sensor_node):
-            profile_of = DriveProfile(node) if node in self.nodes else self.sensor_profile
-            boot = NodeBoot(BenchAccess(self, node), profile_of, settings)
+        for profile_of in (*self.drives, self.sensor_profile):
+            boot = NodeBoot(BenchAccess(self, profile_of.node_id), profile_of, settings)
             boot.run(boot.check_device_type())
         self.to_bench(0, b"\x01\x00")
 
@@ -135,7 +141,7 @@ class LockStep:
         units = [
             set_up(
                 self.access(node),
-                DriveProfile(node),
+                self.drives[node - 1],
                 CST if node == setpoints.current_joint else CSV,
                 round(timing.drive_timeout_s * 1e3),
                 self.sleep,

@@ -1,11 +1,15 @@
 """The commander leads the emulated bench through a motion, in lock-step: what it sends, and that the joints follow."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from jtqd.drivers.boot_error import BootError
+from jtqd.drivers.devices import CIA_402, DriveObject, DriveProfile
+from jtqd.drivers.layout import pdo_of_words
 from jtqd.sim_can import drive_node as cia402
 from jtqd.sysid.motion.setpoints import MotionError, MotionResult, Setpoints
 from jtqd.sysid.motion.stopping import Phase
@@ -46,6 +50,68 @@ def test_the_joints_do_what_was_planned(lock: LockStep, joint: int, sign: int) -
     assert np.mean(velocities) == pytest.approx(sign * 1.2, abs=0.005)
     assert np.ptp(velocities) < 0.1
     assert currents == pytest.approx([2.5] * len(currents), abs=0.005), "1/1000 of 8 A is 8 mA"
+
+
+def one_encoder_and_torque(node: int) -> DriveProfile:
+    """No link position, torque (6077h) for current."""
+    objects = replace(CIA_402, link_position=None, current=DriveObject(0x6077, bits=16, by="6076h"))
+    store = LockStep().bench.drives[node - 1].store
+    return DriveProfile(
+        node, objects=objects, torque_constant_nm_per_a=store.number(0x6076) / store.number(0x6075)
+    )
+
+
+def three_tpdos(node: int) -> DriveProfile:
+    """Every quantity where nobody would look for it."""
+    words = (
+        (0x60410010, 0x60640020),
+        (0x606C0020,),
+        (0x60780010, 0x60E40120),
+    )
+    bases = (0x180, 0x380, 0x280)
+    layout = [
+        pdo_of_words(node, number, base + node, each, 1, CIA_402)
+        for number, (base, each) in enumerate(zip(bases, words, strict=True), 1)
+    ]
+    return DriveProfile(node, layout=tuple(layout))
+
+
+@pytest.mark.parametrize("made", [one_encoder_and_torque, three_tpdos])
+def test_drives_with_other_objects_and_layouts_are_moved_as_planned(
+    made: Callable[[int], DriveProfile],
+) -> None:
+    lock = LockStep(profiles=(made(1), made(2)))
+    motion = lock.commander(plateau(1.2, 2.5))
+    seen = []
+    lock.play_until(400)
+    while motion.played_s < 0.7:
+        lock.cycle()
+        seen.append(motion.inputs.sample())
+        assert lock.velocities[0] == pytest.approx(1.2, abs=0.06)
+        assert lock.source.plant.drives[1].current_a == pytest.approx(2.5, abs=0.005)
+    assert np.mean([each.one.velocity_rad_s for each in seen]) == pytest.approx(1.2, abs=0.01)
+    assert np.mean([each.two.current_a for each in seen]) == pytest.approx(2.5, abs=0.03)
+    assert seen[-1].one.travel_rad - seen[0].one.travel_rad == pytest.approx(
+        1.2 * 1e-3 * (len(seen) - 1), rel=0.05
+    )
+    lock.run()
+    assert motion.result.status == "done"
+    last = motion.inputs.drives[0].units.tpdos[-1]
+    again = LockStep(profiles=(made(1), made(2)))
+    motion = again.commander(plateau(1.2, 2.5))
+    again.play_until(400)
+    again.filter = lambda frames: [frame for frame in frames if frame[0] != last.cob_id]
+    again.run()
+    text = f"joint 1: TPDO{last.number} ({last.cob_id:03X}h) missing for 6 cycles, limit 5"
+    assert motion.result.reason.startswith(text)
+
+
+def test_a_drive_that_sends_by_itself_is_not_moved() -> None:
+    by_itself = pdo_of_words(1, 2, 0x281, (0x606C0020, 0x60780010, 0x60410010), 255, CIA_402)
+    layout = (pdo_of_words(1, 1, 0x181, (0x60640020, 0x60E40120), 1, CIA_402), by_itself)
+    lock = LockStep(profiles=(DriveProfile(1, layout=layout, by_itself=True), DriveProfile(2)))
+    with pytest.raises(BootError, match=r"node 1: 1801h:2 transmission type .*: expected 1, found 255"):
+        lock.commander(plateau(1.0, 2.0))
 
 
 def test_each_drive_gets_every_second_setpoint_and_no_cycle_carries_two(lock: LockStep) -> None:

@@ -201,11 +201,11 @@ def test_logs_without_a_motion_are_refused_in_one_line(tmp_path: Path) -> None:
 
     def deaf(n: int) -> tuple[Joint, Joint]:
         one, two = joints(n)
-        return one._replace(link_position_rad=NAN), two
+        return one._replace(motor_position_rad=NAN), two
 
     for name, wanted, words in (
         ("off", off, ["operation enabled", "found 0"]),
-        ("deaf", deaf, ["j1.link_position_rad", "found no value"]),
+        ("deaf", deaf, ["j1.motor_position_rad", "found no value"]),
     ):
         path = write_log(tmp_path / f"{name}.mcap", regular(30, wanted))
         with pytest.raises(LogError) as caught:
@@ -213,6 +213,25 @@ def test_logs_without_a_motion_are_refused_in_one_line(tmp_path: Path) -> None:
         assert len(str(caught.value).splitlines()) == 1
         for word in [str(path), *words]:
             assert word in str(caught.value)
+
+
+def test_a_joint_with_one_encoder_has_no_link_position_and_the_reader_says_so(tmp_path: Path) -> None:
+    """The cycles of the other joint, which has one, are complete only with it."""
+
+    def wanted(n: int) -> tuple[Joint, Joint]:
+        one, two = joints(n)
+        return one._replace(link_position_rad=NAN), two._replace(link_position_rad=NAN if n == 7 else 0.1 * n)
+
+    path = write_log(tmp_path / "a.mcap", regular(30, wanted))
+    logged = log_to_run(path, all_needed=True)
+    one, two = logged.table.joints[1], logged.table.joints[2]
+    assert (one.two_encoders, two.two_encoders) == (False, True)
+    assert one.link_position_rad is None
+    assert one.current_a is not None
+    assert len(one.current_a) == 29
+    assert logged.incomplete_by == {"joint 1": 0, "joint 2": 1, "sensor": 0}
+    [run] = read_runs([path])
+    assert "joint 1: one encoder, no link position: nothing is known of the torsion of the gear" in run.notes
 
 
 def four(n: int) -> tuple[Joint, ...]:
@@ -287,19 +306,19 @@ def test_the_last_motion_of_a_joint_begins_when_all_drives_are_enabled(tmp_path:
 def test_a_joint_that_was_never_enabled_is_left_out_and_named(tmp_path: Path) -> None:
     def wanted(n: int) -> tuple[Joint, ...]:
         one, two, three, last = four(n)
-        return one._replace(statusword=OFF), two._replace(link_position_rad=NAN), three, last
+        return one._replace(statusword=OFF), two._replace(current_a=NAN), three, last
 
     path = write_log(tmp_path / "a.mcap", regular(120, wanted), 4)
     logged = log_to_run(path)
     assert list(logged.table.joints) == [3, 4]
     assert "operation enabled" in logged.left_out[1]
-    assert "j2.link_position_rad" in logged.left_out[2]
+    assert "j2.current_a" in logged.left_out[2]
     [run] = read_runs([path])
     assert [note.split(":")[0] for note in run.notes] == ["joint 1 left out", "joint 2 left out"]
     for joints_wanted, needed, words in (
         ([1], False, "operation enabled"),
         ([3, 5], True, "found no joint 5, the log has 1, 2, 3, 4"),
-        (None, True, "j2.link_position_rad"),
+        (None, True, "j2.current_a"),
     ):
         with pytest.raises(LogError, match=words):
             log_to_run(path, joints=joints_wanted, all_needed=needed)

@@ -16,6 +16,7 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.fit.joint_writer import write_joint
 from jtqd.sysid.runs.files import write_run
 from jtqd.sysid.score.score import FREE, MOTOR, errors_on, rows_of
+from tests.estimator.fused_helpers import fused_joint
 
 TRUE = Joint(
     name="rig_joint1",
@@ -55,6 +56,25 @@ def test_a_true_file_has_no_error_and_a_wrong_one_what_is_wrong() -> None:
     assert right.errors["estimator tob"] < 0.6 * wrong.errors["estimator tob"]
     assert "estimator efficiency" not in right.errors
     assert "simulation, torsion balance" not in right.errors  # one encoder
+
+
+def test_with_one_encoder_there_is_no_torsion_to_estimate_from(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Derived from the motor's, a link position makes a torsion of zero: method fused would be wrong by the whole torque."""
+    path, run = tmp_path / "rig_joint1.yaml", tmp_path / "r.csv"
+    write_joint(path, replace(TRUE, fused=fused_joint().fused), "test")
+    write_run(run, swing(0.3))
+    assert jtq(["score", str(path), str(run)]) == 0
+    said = capsys.readouterr()
+    assert "estimator tob" in said.out
+    assert "fused" not in said.out
+    assert (
+        "r.csv: j1: found one encoder: method fused, which estimates from the torsion, is not scored"
+        in said.err
+    )
+    rigid = replace(TRUE, fused=fused_joint(torsion=None).fused)
+    assert "estimator fused, without network" in errors_on("r", swing(0.3), 1, rigid).errors
 
 
 def test_an_effect_of_the_file_is_part_of_its_simulation() -> None:
