@@ -11,11 +11,10 @@ LONGEST_S: Final = 0.5
 SETTLE_S: Final = 0.1
 UNEVEN: Final = 0.2
 LONGEST_GAP: Final = 50
-THRESHOLD: Final = 0.05
-OFF: Final = 0
-UNKNOWN: Final = 1
-NONE: Final = 2
-CONTACT: Final = 3
+OFF: int
+UNKNOWN: int
+NONE: int
+CONTACT: int
 
 class ContactDetector:
     def __init__(self, threshold_nm: float, period_s: float = 0.001) -> None: ...

@@ -29,6 +29,9 @@ from jtqd.estimator.sample cimport Sample
 from jtqd.estimator.zeros cimport local_stiffness
 
 from jtqd.estimator.sample import columns
+from jtqd.estimator.status import CONTACT_CODES
+
+OFF, UNKNOWN, NONE, CONTACT = CONTACT_CODES
 
 TREND_RAD_S: Final = 50.0
 """Of z: loads that change slower are load."""
@@ -44,12 +47,6 @@ UNEVEN: Final = 0.2
 """Two steps in a row that differ by more have no acceleration between them."""
 LONGEST_GAP: Final = 50
 """Samples without inputs, after which the past is forgotten."""
-THRESHOLD: Final = 0.05
-"""Default, as a part of the rated torque."""
-OFF: Final = 0
-UNKNOWN: Final = 1
-NONE: Final = 2
-CONTACT: Final = 3
 
 cdef double RATE = TREND_RAD_S, LEARNED = NOTCH_RAD_S, BACK = RELEASE, MOST_S = LONGEST_S, BELIEVED_S = SETTLE_S
 cdef double UNEVEN_STEPS = UNEVEN

@@ -10,6 +10,9 @@ from jtqd.estimator.decoder import FieldError, check, choice, limits
 TORSION_BANDWIDTH_RAD_S: Final = 800.0
 """Of new configurations, and of what is fitted and scored here: chosen from a table, docs/estimator.md."""
 
+CONTACT_THRESHOLD: Final = 0.05
+"""Torque from outside that is a contact, as a part of the rated torque."""
+
 METHODS: Final = ("tob", "efficiency", "network", "fused")
 """tob: Eq. (4) with additive friction; efficiency: Eq. (7); network: the paper's section III on top; fused: ours."""
 

@@ -40,6 +40,10 @@ CURRENT_FROZEN: Final = 0x40
 """Bits of faults that `jtqd.estimator.plausibility` finds."""
 
 
+CONTACT_CODES: Final = (0, 1, 2, 3)
+"""Of a contact: not watched, not known, none, there (docs/contact.md)."""
+
+
 class Estimate(NamedTuple):
     """Result of one step, whatever the method [Nm, joint side]; NaN where not computed or not to be published.
 

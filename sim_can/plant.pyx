@@ -10,8 +10,8 @@ e(θm) = E sin(k θm + ψ), its slope e' = de/dθm, and a Maxwell-slip element z
 The motor's load is τ dδ/dθm: the virtual work of the spring, so a kinematic error makes no energy. Both links
 and the sensor are one rigid body, and the joints face each other, so θl2 = -θl1:
 
-    (Jl1 + Jl2) dwl1/dt = τ1 - τ2 + τx              τx: of a push, on link 2 (2)
-    sensor = τ1 - Jl1 dwl1/dt = τ2 - Jl2 dwl2/dt
+    (Jl1 + Jl2) dwl1/dt = τ1 - τ2 + τx                                       (2)
+    sensor = τ1 - Jl1 dwl1/dt              τx: of a push, on link 2
 
 The sensor's torque is positive along the positive current of either joint.
 

@@ -33,9 +33,9 @@ from jtqd.drivers.pdo import INVALID as PDO_INVALID
 from jtqd.drivers.pdo import NO_RTR
 from jtqd.drivers.sdo_server import SdoServer
 from jtqd.estimator.age import age_ms
-from jtqd.estimator.contact import CONTACT, NONE, UNKNOWN
-from jtqd.estimator.status import OFF, STALE
+from jtqd.estimator.status import CONTACT_CODES, OFF, STALE
 
+_NOT_WATCHED, _UNKNOWN, _NONE, _CONTACT = CONTACT_CODES
 _STANDSTILL_S = 0.2
 """A loop whose snapshot has not moved for so long is not running (it moves every 8 cycles)."""
 _MS_TO_INHIBIT = 10
@@ -136,13 +136,13 @@ class OwnNode:
     def _contact(self, joint: int, part: int) -> int:
         """Return torque rate (0) or code (1) of a joint as in the contact PDO."""
         if joint >= self._joints or not self._watches:
-            return contact_pdo.field(nan, nan, OFF)[part]
+            return contact_pdo.field(nan, nan, _NOT_WATCHED)[part]
         view = self._reader.read()
         if view.cycle == self._last_cycle and time.monotonic() - self._last_change > _STANDSTILL_S:
-            return contact_pdo.field(nan, nan, UNKNOWN)[part]
+            return contact_pdo.field(nan, nan, _UNKNOWN)[part]
         last = view.joints[joint]
         there = last.input_flags & FLAG_CONTACT
-        told = CONTACT if there else NONE if last.input_flags & FLAG_CONTACT_KNOWN else UNKNOWN
+        told = _CONTACT if there else _NONE if last.input_flags & FLAG_CONTACT_KNOWN else _UNKNOWN
         return contact_pdo.field(last.torque_rate_nm_s, last.contact_nm, told)[part]
 
     def _contacts(self, pair: int) -> int:

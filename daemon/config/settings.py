@@ -9,9 +9,8 @@ from typing import Annotated, Any, Final
 
 from jtqd.daemon.shared import faults
 from jtqd.estimator.checked import Section
-from jtqd.estimator.contact import THRESHOLD
 from jtqd.estimator.decoder import FieldError, Text, check, decode, limits
-from jtqd.estimator.settings import PlausibilityLimits
+from jtqd.estimator.settings import CONTACT_THRESHOLD, PlausibilityLimits
 
 LATCHED_BY_DEFAULT: Final = faults.NOT_FINITE | faults.BITS["motor_jump"] | faults.BITS["link_jump"]
 """What leaves numbers behind that look right and are not: a broken estimator, an encoder that has lost its zero."""
@@ -117,7 +116,7 @@ class ContactSettings:
 
     def threshold_of(self, rated_torque_nm: float) -> float:
         """Return the threshold of a joint [Nm]."""
-        return THRESHOLD * rated_torque_nm if self.threshold_nm is None else self.threshold_nm
+        return CONTACT_THRESHOLD * rated_torque_nm if self.threshold_nm is None else self.threshold_nm
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from libc.stdint cimport int8_t, uint8_t
 import struct
 from typing import NamedTuple
 
-from jtqd.estimator.contact cimport CONTACT_OFF, CONTACT_THERE, CONTACT_UNKNOWN
+from jtqd.estimator.status import CONTACT_CODES
 
 LAYOUT = struct.Struct("<bbBB")
 NO_RATE = -0x80
@@ -22,7 +22,8 @@ RATE_UNIT_NM_S = 32.0
 POSITIVE, NEGATIVE = 3, 4
 CODE_NAMES = {0: "off", 1: "unknown", 2: "none", POSITIVE: "positive", NEGATIVE: "negative"}
 
-cdef int NONE = NO_RATE, AGAINST = NEGATIVE
+cdef int NONE = NO_RATE, AGAINST = NEGATIVE, NOT_WATCHED, UNKNOWN, THERE
+NOT_WATCHED, UNKNOWN, _, THERE = CONTACT_CODES
 cdef double PER_NM_S = 1.0 / RATE_UNIT_NM_S, LARGEST = 127.0
 
 
@@ -40,9 +41,9 @@ cdef ToldContact told_of(double torque_rate_nm_s, double contact_nm, int told) n
     cdef int rate = NONE, code = told
     if not isnan(counts):
         rate = <int> nearbyint(-LARGEST if counts < -LARGEST else LARGEST if counts > LARGEST else counts)
-    if told == CONTACT_THERE:
+    if told == THERE:
         if isnan(contact_nm):
-            code = CONTACT_UNKNOWN
+            code = UNKNOWN
         elif contact_nm < 0.0:
             code = AGAINST
     return ToldContact(rate, code)
@@ -55,7 +56,7 @@ cdef void encode_contact(uint8_t *data, const ToldContact *one, const ToldContac
     data[3] = sequence
 
 
-NO_JOINT = told_of(NAN, NAN, CONTACT_OFF)
+NO_JOINT = told_of(NAN, NAN, NOT_WATCHED)
 
 
 def field(double torque_rate_nm_s, double contact_nm, int told):

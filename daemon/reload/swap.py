@@ -184,6 +184,8 @@ class Swap:
             if became:
                 zeros[f"joint_{joints.index(joint) + 1}"] = became
             joint.use(estimator, limits)
+        if self._cycle.contacts is not None:
+            self._cycle.contacts.restart()  # loads by other files step without a contact
         told = {"zeros": zeros} if zeros else {}
         missed = self._cycle.grid.missed - self._missed
         self._report(swapped=True, cycle=self._cycle.index, missed=missed, **told)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from jtqd.daemon.bus.own_node import OwnNode
+from jtqd.daemon.config import ContactSettings, load_config
 from jtqd.daemon.core.contact import ContactWatch
-from jtqd.daemon.core.contact_pdo import ContactPdo, decode
+from jtqd.daemon.core.contact_pdo import NO_RATE, ContactPdo, decode
 from jtqd.daemon.core.cycle import Cycle
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import JointCycle
@@ -21,6 +24,7 @@ from jtqd.daemon.replay.rows import CycleRows
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import Ring, RingReader
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
+from jtqd.drivers.object_dictionary import ObjectStore, read_eds
 from jtqd.estimator.contact import CONTACT, NONE, ContactDetector, link_loads
 from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.settings import recommended
@@ -28,6 +32,7 @@ from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, Push, emulate
 from jtqd.sim_can.plants import load_any_plant
 from tests.daemon.loop.cycle_helpers import ENABLED, I32, MOTION, ExactTime, ScriptedSocket, frame
+from tests.paths import JTQD_EDS
 
 CYCLES = 400
 PUSHED, MISSING = 300, 200
@@ -194,6 +199,23 @@ def test_alone_at_rest_each_joint_sees_its_half_of_the_push(tmp_path: Path, exac
     after = [cr.joint_of(record, n).contact_nm for n in (1, 2)]
     assert loop.sent()[PUSHED + 10].contact == (3, 4)
     assert after == pytest.approx([1.5, -1.5], abs=0.5)
+
+
+def test_the_node_says_what_was_sent(tmp_path: Path, exact: ExactTime) -> None:
+    loop = Loop(tmp_path, ContactWatch([THRESHOLD_NM] * 2, opposed=True))
+    config = load_config(None)
+    for contact, expected in (
+        (ContactSettings(opposed=True), (0x4000_03A0, 0x43)),
+        (ContactSettings(pdo=False), (0xC000_03A0, 0x43)),
+        (None, (0xC000_03A0, 0)),
+    ):
+        if contact is not None and contact.pdo:
+            exact.turn(loop.cycle, PUSHED + 20)
+        store = ObjectStore(read_eds(JTQD_EDS, 0x20), 0x20)
+        OwnNode(store, replace(config, contact=contact), SnapshotReader(loop.path, supervisor=True))
+        assert (store.number(0x1802, 1), int.from_bytes(store.read(0x2107, 0), "little")) == expected
+        rate = int.from_bytes(store.read(0x2106, 1), "little", signed=True)
+        assert (rate == NO_RATE) == (contact is None)
 
 
 def test_without_contacts_nothing_of_it_goes_out(tmp_path: Path, exact: ExactTime) -> None:
