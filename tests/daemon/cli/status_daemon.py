@@ -16,8 +16,8 @@ from jtqd.daemon.shared.snapshot import COUNTERS, INPUT, Snapshot
 from jtqd.daemon.supervisor.description import about
 
 NAN = float("nan")
-ONE = (-117.94, 0.48, NAN, -117.0, -117.9, -118.48, 0x27, 2, 0, 15, 0, -118.48, 1.25)
-TWO = (NAN, NAN, NAN, NAN, NAN, NAN, 0, 4, 0, 1, 0, NAN, 1.25)
+ONE = (-117.94, 0.48, NAN, -117.0, -117.9, -118.48, 0x27, 2, 0, 15, 0, -118.48, 1.25, NAN, NAN)
+TWO = (NAN, NAN, NAN, NAN, NAN, NAN, 0, 4, 0, 1, 0, NAN, 1.25, NAN, NAN)
 SAMPLE = (3.21, 100.0, -155.25, 1.0, -118.48, 31.5)
 
 

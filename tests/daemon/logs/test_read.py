@@ -340,7 +340,7 @@ def test_attachments_and_topics(log):
     assert read_attachments(log) == {each.name: each.data for each in ATTACHMENTS}
     found = topics_of(log)
     assert found[FRAMES] == "jtqd_msgs/msg/CanFrames"
-    assert len(found) == 7
+    assert len(found) == 9
 
 
 def damage(log, tmp_path, at, byte):

@@ -27,8 +27,8 @@ from tests.daemon.loop.cycle_helpers import frame, inputs, make, turn
 
 pytestmark = pytest.mark.native
 
-ONE = (1.0, 0.1, 1.1, 1.2, math.nan, 0.9, 0x27, 2, 0, 7, 0, 0.8, 1.25)
-TWO = (-2.0, 0.2, -2.1, -2.2, -2.3, math.nan, 0x0F, 5, 1, 0x2403, 0x104, math.nan, 5.0)
+ONE = (1.0, 0.1, 1.1, 1.2, math.nan, 0.9, 0x27, 2, 0, 7, 0, 0.8, 1.25, 40.0, math.nan)
+TWO = (-2.0, 0.2, -2.1, -2.2, -2.3, math.nan, 0x0F, 5, 1, 0x2403, 0x104, math.nan, 5.0, math.nan, 0.3)
 
 
 def test_states_of_nodes_are_those_of_the_drivers() -> None:
@@ -49,8 +49,9 @@ def test_round_trip(tmp_path: Path) -> None:
     assert view.joints[0][:4] == ONE[:4]
     assert math.isnan(view.joints[0].network_nm)
     assert tuple(view.joints[1])[6:11] == (0x0F, 5, 1, 0x2403, 0x104)
-    assert view.joints[0][11:] == (0.8, 1.25)
-    assert view.joints[1].age_ms == 5.0
+    assert view.joints[0][11:14] == (0.8, 1.25, 40.0)
+    assert math.isnan(view.joints[0].contact_nm)
+    assert (view.joints[1].age_ms, view.joints[1].contact_nm) == (5.0, 0.3)
     assert view.counters == {name: n + 100 for n, name in enumerate(COUNTERS)}
     assert (view.rmse_nm[0], view.rmse_now_nm[0]) == (2.0, 3.0)
     assert math.isnan(view.rmse_nm[1])
@@ -163,7 +164,7 @@ def test_a_reading_is_of_one_moment_while_the_loop_writes(tmp_path: Path) -> Non
     writer.start()
     try:
         while reader.read().cycle < 10:
-            pass
+            assert writer.is_alive()
         for _ in range(2000):
             view = reader.read()
             assert (

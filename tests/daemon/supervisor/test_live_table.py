@@ -12,7 +12,7 @@ from jtqd.daemon.supervisor.table import LiveTable
 
 NAN = float("nan")
 JOINTS = (
-    (-117.94, 0.48, NAN, NAN, NAN, -118.48, 0x27, 2, 0, 7, 0, -118.48, 1.25),
+    (-117.94, 0.48, NAN, NAN, NAN, -118.48, 0x27, 2, 0, 7, 0, -118.48, 1.25, NAN, NAN),
     (
         3.0,
         0.5,
@@ -27,6 +27,8 @@ JOINTS = (
         0,
         NAN,
         1.25,
+        NAN,
+        NAN,
     ),  # drive_fault, the longest status: its torque must not show
 )
 

@@ -135,7 +135,7 @@ ELSEWHERE = (
     Shown(
         41,
         "kill -9 while the log is written",
-        "repaired at the next start; no complete chunk is lost",
+        "repaired at the next start; no complete span is lost",
         (
             "tests/daemon/test_vcan.py::test_a_recorder_that_dies_or_stalls_costs_the_loop_nothing",
             "tests/daemon/logs/test_recover.py::test_killed_between_two_chunks_loses_nothing",

@@ -72,7 +72,8 @@ def _read_log(path: Path) -> None:
     from jtqd.daemon.logs import read_attachments, read_topics, topics_of
 
     read_attachments(path)
-    read_topics(path, [each for each in topics_of(path) if not each.startswith(("/diag", "/events", "/log"))])
+    seldom = ("/diagnostics", "/events", "/log", "/joint/1/zeros", "/joint/2/zeros")
+    read_topics(path, [each for each in topics_of(path) if each not in seldom])
 
 
 def _read_request(path: Path) -> None:

@@ -61,6 +61,7 @@ def test_a_worker_that_is_killed_costs_nothing(tmp_path, cluster, capsys):
     assert results(out) == kept
 
 
+@pytest.mark.campaign
 def test_a_scheduler_that_goes_ends_the_batch_in_one_line(tmp_path, cluster, capsys):
     logs, out = fleet(tmp_path / "logs", ["a", "b", "c"]), tmp_path / "out"
 

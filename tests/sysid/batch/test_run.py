@@ -223,6 +223,7 @@ def test_the_same_logs_in_two_places_are_worked_on_once(tmp_path):
     assert len(results(out)) == 1
 
 
+@pytest.mark.campaign
 def test_a_batch_that_is_killed_goes_on_where_it_was(tmp_path):
     """kill -9 after the first result: what was finished is kept."""
     logs, out = fleet(tmp_path / "logs", ["a", "b", "c"]), tmp_path / "out"

@@ -220,6 +220,7 @@ def test_driven_runs_have_the_truth_of_both_joints() -> None:
     assert run.columns(2, nominal_joints(the_three()[0])[1]).torque_nm is not None
 
 
+@pytest.mark.campaign
 def test_a_network_finds_a_ripple_that_physics_leaves_and_no_zero_of_a_run() -> None:
     """A wave of the motor's turn in proportion to the load is in every run; each run's zero is its own."""
     rng = np.random.default_rng(8)
