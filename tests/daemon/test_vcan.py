@@ -182,7 +182,13 @@ def test_layout_of_can_frame() -> None:
 
 @pytest.mark.socketcan
 @pytest.mark.usefixtures("bench")
-@pytest.mark.parametrize("harm", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
+@pytest.mark.parametrize(
+    "harm",
+    [
+        pytest.param(signal.SIGKILL, marks=pytest.mark.campaign, id="killed"),
+        pytest.param(signal.SIGSTOP, id="stopped"),
+    ],
+)
 def test_a_recorder_that_dies_or_stalls_costs_the_loop_nothing(
     tmp_path: Path, start: Start, harm: signal.Signals
 ) -> None:

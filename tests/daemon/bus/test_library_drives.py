@@ -134,7 +134,7 @@ def test_bus_off_of_one_node() -> None:
         ("--boot-ups", "2"),
         ("--without", "1016,1029,1014"),
         ("--without", "1019,1008"),
-        ("--sdo", "0.06", "--boot-ups", "2"),
+        pytest.param(("--sdo", "0.06", "--boot-ups", "2"), marks=pytest.mark.campaign),
     ],
     ids=["boot-up twice", "no 1016h 1029h 1014h", "no 1019h 1008h", "slow, boot-up twice"],
 )

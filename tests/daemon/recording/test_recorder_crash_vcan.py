@@ -107,6 +107,7 @@ def check_loop(summary) -> None:
 
 
 @pytest.mark.socketcan
+@pytest.mark.campaign  # natively in test_recorder_crash and test_recorder_flight
 def test_full_disk(start, small_disk) -> None:
     """Full for 2 s in the middle: two whole parts, what is between them is counted, the loop does not notice."""
     daemon = start(9, small_disk / "logs", "reserve_mb: 4, chunk_s: 0.2")
@@ -128,6 +129,7 @@ def test_full_disk(start, small_disk) -> None:
 
 
 @pytest.mark.socketcan
+@pytest.mark.campaign  # natively in test_recorder_crash and test_recorder_flight
 def test_everything_is_killed_and_the_next_start_repairs(start, tmp_path) -> None:
     """kill -9 of supervisor, loop and recorder at once: of the first run at most 1 s is missing, and it opens."""
     logs = tmp_path / "logs"
@@ -191,6 +193,7 @@ def test_clock_is_set_back_and_forward_by_an_hour(start, tmp_path) -> None:
 
 
 @pytest.mark.socketcan
+@pytest.mark.campaign  # natively in test_recorder_crash and test_recorder_flight
 def test_flight_recording_of_a_lost_drive(start, tmp_path) -> None:
     """Flight recorder: the interface goes down for 2 s; what was before is in a file, and nothing else."""
     daemon = start(14, tmp_path / "logs", "flight_recorder_s: 2")

@@ -20,7 +20,7 @@ def measured() -> dict[int, Findings]:
     return {one.number: one.findings for one in diagnose_all(range(2, 8))}
 
 
-@pytest.mark.parametrize("runs", [2, 3])
+@pytest.mark.parametrize("runs", [2, pytest.param(3, marks=pytest.mark.campaign)])
 def test_nothing_hidden_in_few_runs_names_nothing(runs: int) -> None:
     findings = found(206, runs=runs)
     assert findings.verdict == NO_GAP
@@ -29,7 +29,11 @@ def test_nothing_hidden_in_few_runs_names_nothing(runs: int) -> None:
 
 @pytest.mark.parametrize(
     ("seed", "name", "joint"),
-    [(207, "torque_ripple", 1), (208, "load_dependent_friction", 2), (212, "sensor_gain", "sensor")],
+    [
+        pytest.param(207, "torque_ripple", 1, marks=pytest.mark.campaign),
+        pytest.param(208, "load_dependent_friction", 2, marks=pytest.mark.campaign),
+        (212, "sensor_gain", "sensor"),
+    ],
 )
 def test_two_runs_of_a_strong_effect_name_it(seed: int, name: str, joint: int | str) -> None:
     findings = found(seed, (name, joint, None))
