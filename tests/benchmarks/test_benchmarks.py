@@ -148,6 +148,7 @@ def benchmark(*arguments):
 
 
 @needs_gcc
+@pytest.mark.campaign
 def test_quick_prints_the_table_and_the_ratios():
     text = benchmark("cycle", "--quick")
     for wanted in (

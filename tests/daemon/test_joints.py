@@ -117,7 +117,16 @@ class Run:
         return found
 
 
-@pytest.mark.parametrize(("joints", "sensor"), [(1, True), (1, False), (3, True), (4, True), (4, False)])
+@pytest.mark.parametrize(
+    ("joints", "sensor"),
+    [
+        pytest.param(1, True, marks=pytest.mark.campaign),
+        (1, False),
+        (3, True),
+        (4, True),
+        pytest.param(4, False, marks=pytest.mark.campaign),
+    ],
+)
 def test_a_run_and_its_log(tmp_path: Path, joints: int, sensor: bool) -> None:
     run = Run(tmp_path, joints, sensor=sensor)
     numbers = range(1, joints + 1)
@@ -125,7 +134,8 @@ def test_a_run_and_its_log(tmp_path: Path, joints: int, sensor: bool) -> None:
     assert all((value is not None) == sensor for value in run.summary["rmse_nm"].values())
     assert not [each for each in run.summary["conditions"] if each["name"] in ("sensor_lost", "deviation")]
     topics = topics_of(run.log)
-    assert {name for name in topics if name.startswith("/joint/")} == {f"/joint/{n}/state" for n in numbers}
+    own = {f"/joint/{n}/{kind}" for n in numbers for kind in ("state", "zeros")}
+    assert {name for name in topics if name.startswith("/joint/")} == own
     states = read_topics(run.log, [f"/joint/{number}/state" for number in numbers])
     for state in states.values():
         assert np.isin(2, state["status"])

@@ -78,7 +78,7 @@ def test_a_second_jtqd_is_refused_and_the_first_goes_on(bench: LibraryBench) -> 
     assert bench.stop(first) == 0
 
 
-@pytest.mark.parametrize("node", [1, 2, 3])
+@pytest.mark.parametrize("node", [1, pytest.param(2, marks=pytest.mark.campaign), 3])
 def test_power_cycle_of_a_node_in_service(node: int) -> None:
     """It comes back with 1019h = 0, nothing mapped and no heartbeat, and is used again."""
     with a_bench() as bench:

@@ -36,7 +36,7 @@ def feed(session, first, count, statuses=(2, 2)):
             session.poll()
 
 
-@pytest.mark.parametrize("status", ["DRIVE_FAULT", "INVALID"])
+@pytest.mark.parametrize("status", [pytest.param("DRIVE_FAULT", marks=pytest.mark.campaign), "INVALID"])
 def test_fault_writes_the_time_before_and_after_it(tmp_path, status):
     said = []
     session = session_on(tmp_path, warn=said.append, flight_recorder_s=3.0)
