@@ -9,7 +9,7 @@ NOTCH_RAD_S: Final = 10.0
 RELEASE: Final = 0.5
 LONGEST_S: Final = 0.5
 SETTLE_S: Final = 0.1
-UNEVEN: Final = 0.2
+UNEVEN: Final = 0.05
 LONGEST_GAP: Final = 50
 OFF: int
 UNKNOWN: int

@@ -43,8 +43,9 @@ LONGEST_S: Final = 0.5
 """What lasts longer is load."""
 SETTLE_S: Final = 0.1
 """After a start nothing is told for so long."""
-UNEVEN: Final = 0.2
-"""Two steps in a row that differ by more have no acceleration between them."""
+UNEVEN: Final = 0.05
+"""Two steps in a row that differ by more have no acceleration between them: at 1 rad/s a stamp that is 50 us off, of samples
+that are not, looks like 1 Nm on a link of 0.01 kg m2."""
 LONGEST_GAP: Final = 50
 """Samples without inputs, after which the past is forgotten."""
 
