@@ -127,13 +127,13 @@ def test_a_native_evaluation_that_differs_is_refused(tmp_path: Path) -> None:
 
 def test_a_check_that_dies_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = load_config(configured(tmp_path, "fused", networks()))
-    (tmp_path / "dies.py").write_text("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
+    (tmp_path / "dies.py").write_text("import os, signal; os.kill(os.getpid(), signal.SIGKILL)")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(referee, "PROGRAM", "dies")
     for joint, verdict in zip(config.joints, judged(config), strict=True):
         with pytest.raises(NetworkError) as caught:
             build_estimator(config, joint, verdict)
         assert str(caught.value) == (
-            f"{tmp_path}/n{joint.number}.onnx: the check by ONNX Runtime ended with exit status -11 "
+            f"{tmp_path}/n{joint.number}.onnx: the check by ONNX Runtime ended with exit status -9 "
             f"({tmp_path}/c.yaml: 'joint_{joint.number}', estimator.method is fused)"
         )
