@@ -20,6 +20,7 @@ from jtqd.estimator.decoder import FieldError, Text, choice, limits
 from jtqd.estimator.settings import EstimatorSettings
 
 MAX_NODE_ID: Final = 127
+LONGEST_CONTACT_PERIOD_US: Final = 5000
 ERROR_BEHAVIOURS: Final = ("pre_operational", "none", "stopped")
 """1029h:1 in the order of its values."""
 
@@ -251,6 +252,9 @@ class ConfigFile:
         if self.estimator.method != "fused":
             expected = "fused, whose torsion contacts are told by (section contact)"
             raise FieldError("configuration", "estimator.method", self.estimator.method, expected)
+        if self.sync.period_us > LONGEST_CONTACT_PERIOD_US:
+            expected = f"at most {LONGEST_CONTACT_PERIOD_US} us with section contact: a slower cycle sees no contact in time"
+            raise FieldError("configuration", "sync.period_us", self.sync.period_us, expected)
         if self.contact.opposed and len(self.joints) % 2:
             expected = f"false with {len(self.joints)} joints: opposed are joints 1 and 2, 3 and 4"
             raise FieldError("configuration", "contact.opposed", True, expected)

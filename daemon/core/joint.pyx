@@ -300,6 +300,8 @@ cdef class JointCycle:
         record.torque_nm, record.sigma_nm, record.tob_nm = e.torque_nm, e.sigma_nm, e.tob_nm
         record.physics_nm, record.network_nm = e.physics_nm, e.network_nm
         record.dt_s = sample.dt_s
+        if status == INVALID:  # what its inputs say is not believed: no rate, and no word about contacts
+            e.torque_rate_nm_s = e.load_nm = NAN
         record.torque_rate_nm_s, self.now.load_nm = e.torque_rate_nm_s, e.load_nm
         record.statusword, record.input_flags = statusword, flags
         self.now.status = record.status = status

@@ -50,7 +50,7 @@ class BenchConfig:
     Attributes:
         path: the file. drives: of joints 1, 2, ... joints: their joint files. channels: of the sensor, for each joint; None:
             it has none. temperatures: jtqd takes that of the joint. sensor: None without one. master: jtqd's own node-ID.
-        period_us: of SYNC, whole milliseconds. tpdos: by node-ID, as they are wanted.
+        period_us: of SYNC, whole milliseconds. tpdos: by node-ID, as they are wanted. contacts: jtqd sends their PDOs.
     """
 
     path: Path
@@ -64,6 +64,7 @@ class BenchConfig:
     bitrate: int
     period_us: int
     tpdos: Mapping[int, tuple[PdoMap, ...]]
+    contacts: bool
 
     @classmethod
     def load(cls, path: Path | None) -> BenchConfig:
@@ -102,6 +103,7 @@ class BenchConfig:
             bitrate=config.bitrate,
             period_us=period_us,
             tpdos={joint.node_id: joint.tpdos for joint in joints},
+            contacts=config.contact is not None and config.contact.pdo,
         )
 
     @property
@@ -184,6 +186,7 @@ class BenchConfig:
                     self.tpdos,
                     {} if self.sensor is None else {self.sensor.node_id: self.sensor.channels},
                     temperatures=self.nodes,  # the commander switches TPDO3 on where jtqd does not
+                    contacts=self.contacts,
                     heartbeat_ms=self.heartbeat_ms,
                     master=self.master,
                     extra=extra,

@@ -51,13 +51,11 @@ def pieces_of(run: Run) -> tuple[Run, ...]:
 def _between_rests(run: Run) -> list[list[Segment]]:
     """Cut in the middle of each rest behind a motion that another one follows."""
     pieces: list[list[Segment]] = [[]]
-    position = 0.0
-    position_of = dict(zip(range(len(run.segments)), _ends(run), strict=True))
+    ends = _ends(run)
     last = max(place for place, each in enumerate(run.segments) if not isinstance(each, Rest))
     moved = False
     for place, each in enumerate(run.segments):
-        position = position_of[place]
-        home = run.current_joint is not None or abs(position) <= BACK_RAD
+        home = run.current_joint is not None or abs(ends[place]) <= BACK_RAD
         if isinstance(each, Rest) and moved and place < last and home:
             before = isinstance(run.segments[place - 1], Plateau)  # which the rest ramps down
             ramp_s = each.ramp_s if before else 0.0

@@ -244,6 +244,16 @@ def test_a_file_that_is_not_there(tmp_path: Path) -> None:
         load_config(tmp_path / "absent.yaml")
 
 
+def test_contacts_need_a_cycle_that_sees_them_in_time(tmp_path: Path) -> None:
+    def slow(content: dict[str, Any]) -> None:
+        content.update(contact={}, sync={"period_us": 10_000}, inputs={})
+
+    with pytest.raises(
+        ConfigError, match=r"sync\.period_us.*found 10000.*at most 5000 us with section contact"
+    ):
+        load_config(write(tmp_path, slow))
+
+
 def test_contacts_are_off_by_default_and_5_percent_of_rated(tmp_path: Path) -> None:
     assert load_config(None).contact is None
     contact = load_config(write(tmp_path, lambda c: c.update(contact={"opposed": True}))).contact

@@ -28,6 +28,7 @@ from jtqd.drivers.object_dictionary import ObjectStore, read_eds
 from jtqd.estimator.contact import CONTACT, NONE, ContactDetector, link_loads
 from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.settings import recommended
+from jtqd.estimator.status import INVALID
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, Push, emulate
 from jtqd.sim_can.plants import load_any_plant
@@ -80,6 +81,7 @@ class Loop:
 
     def __init__(self, directory: Path, contacts: ContactWatch | None, moves: bool = True) -> None:
         self.moves = moves
+        self.jumps_at = CYCLES
         self.socket = ScriptedSocket(self.answers)
         self.path = directory / "snapshot"
         self.cycle = Cycle(
@@ -109,7 +111,8 @@ class Loop:
         row, self.sync = self.sync, self.sync + 1
         found = []
         for n, (motor, speed, link, current) in enumerate(counts(self.moves)[row], start=1):
-            found.append(frame(0x180 + n, I32.pack(motor, link)))
+            jumped = 65536 * (n == 1 and row >= self.jumps_at)
+            found.append(frame(0x180 + n, I32.pack(motor + jumped, link)))
             if row != MISSING or n != 1:
                 found.append(frame(0x280 + n, MOTION.pack(speed, current, ENABLED)))
         return found
@@ -248,6 +251,22 @@ def test_an_answer_that_comes_too_late_knows_of_no_contact(tmp_path: Path, exact
     assert last.contact == (1, 1)
     assert last.torque_rate_nm_s == (None, None)
     assert math.isnan(cr.joint_of(record, 1).contact_nm)
+
+
+def test_an_encoder_that_is_not_believed_says_nothing_about_contacts(
+    tmp_path: Path, exact: ExactTime
+) -> None:
+    loop = Loop(tmp_path, ContactWatch([THRESHOLD_NM] * 2))
+    loop.jumps_at = PUSHED - 50
+    exact.turn(loop.cycle, CYCLES)
+    records, sent = loop.records(), loop.sent()
+    before, after = records[loop.jumps_at - 1], records[PUSHED + 10]
+    assert cr.joint_of(before, 1).input_flags & cr.FLAG_CONTACT_KNOWN
+    assert cr.joint_of(after, 1).status == INVALID
+    assert not cr.joint_of(after, 1).input_flags & (cr.FLAG_CONTACT | cr.FLAG_CONTACT_KNOWN)
+    assert math.isnan(cr.joint_of(after, 1).contact_nm)
+    assert {(told.contact[0], told.torque_rate_nm_s[0]) for told in sent[loop.jumps_at + 2 :]} == {(1, None)}
+    assert sent[-1].contact[1] != 1, "joint 2 goes on"
 
 
 def test_rows_of_a_log_give_the_same_bits(tmp_path: Path, exact: ExactTime) -> None:

@@ -132,6 +132,7 @@ def bench_config(folder: Path, **changes: object) -> Path:
     [
         ({"bitrate": 800_000}, ["bench.yaml", "commander", "bus load", "95%"]),
         ({"sensor": {"node": 3, "channels": 2}}, ["bus load"]),
+        ({"contact": {"opposed": True}}, ["commander", "bus load"]),
         ({"sync": {"period_us": 1500}}, ["sync.period_us", "1500", "whole milliseconds"]),
         ({"sensor": {"node": 2, "channels": 1}}, ["bench.yaml", "sensor.node", "not used by joint_2.node"]),
         ({"joint_1": {"node": 1, "file": "none.yaml"}}, ["none.yaml"]),
