@@ -77,7 +77,10 @@ def counts(moves: bool = True) -> tuple[tuple[tuple[int, int, int, int], ...], .
 
 
 class Loop:
-    """A loop whose bus answers the emulated run; in cycle MISSING the motion of joint 1 does not come."""
+    """A loop whose bus answers the emulated run; in cycle MISSING the motion of joint 1 does not come.
+
+    In three cycles from `jumps_at` on its motor is a turn further: a fault that stays latched.
+    """
 
     def __init__(self, directory: Path, contacts: ContactWatch | None, moves: bool = True) -> None:
         self.moves = moves
@@ -111,7 +114,7 @@ class Loop:
         row, self.sync = self.sync, self.sync + 1
         found = []
         for n, (motor, speed, link, current) in enumerate(counts(self.moves)[row], start=1):
-            jumped = 65536 * (n == 1 and row >= self.jumps_at)
+            jumped = 65536 * (n == 1 and 0 <= row - self.jumps_at < 3)
             found.append(frame(0x180 + n, I32.pack(motor + jumped, link)))
             if row != MISSING or n != 1:
                 found.append(frame(0x280 + n, MOTION.pack(speed, current, ENABLED)))
@@ -260,13 +263,15 @@ def test_an_encoder_that_is_not_believed_says_nothing_about_contacts(
     loop.jumps_at = PUSHED - 50
     exact.turn(loop.cycle, CYCLES)
     records, sent = loop.records(), loop.sent()
-    before, after = records[loop.jumps_at - 1], records[PUSHED + 10]
-    assert cr.joint_of(before, 1).input_flags & cr.FLAG_CONTACT_KNOWN
-    assert cr.joint_of(after, 1).status == INVALID
-    assert not cr.joint_of(after, 1).input_flags & (cr.FLAG_CONTACT | cr.FLAG_CONTACT_KNOWN)
-    assert math.isnan(cr.joint_of(after, 1).contact_nm)
-    assert {(told.contact[0], told.torque_rate_nm_s[0]) for told in sent[loop.jumps_at + 2 :]} == {(1, None)}
-    assert sent[-1].contact[1] != 1, "joint 2 goes on"
+    assert cr.joint_of(records[loop.jumps_at - 1], 1).input_flags & cr.FLAG_CONTACT_KNOWN
+    invalid = [row for row, record in enumerate(records) if cr.joint_of(record, 1).status == INVALID]
+    assert len(invalid) > 20, "longer than the jump itself"
+    for row in invalid:
+        joint = cr.joint_of(records[row], 1)
+        assert not joint.input_flags & (cr.FLAG_CONTACT | cr.FLAG_CONTACT_KNOWN)
+        assert math.isnan(joint.contact_nm)
+        assert (sent[row].contact[0], sent[row].torque_rate_nm_s[0]) == (1, None)
+    assert sent[invalid[-1]].contact[1] != 1, "joint 2 goes on"
 
 
 def test_rows_of_a_log_give_the_same_bits(tmp_path: Path, exact: ExactTime) -> None:
