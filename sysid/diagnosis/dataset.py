@@ -94,6 +94,21 @@ class Dataset:
         valid = self.runs[run].channels[channel].valid
         return valid | self.events[channel][run] if channel in self.events else valid
 
+    def without_recording(self, number: int) -> Dataset:
+        """Return the dataset without the runs that are pieces of recording `number`; candidates, families and lines stay."""
+        pieces = range(len(self.runs)) if self.pieces is None else self.pieces
+        keep = [r for r, piece in enumerate(pieces) if piece != number]
+        left = sorted({pieces[r] for r in keep})
+        return replace(
+            self,
+            signals=[self.signals[r] for r in keep],
+            runs=[self.runs[r] for r in keep],
+            unexplained={c: [x[r] for r in keep] for c, x in self.unexplained.items()},
+            readings=[self.readings[r] for r in keep] if self.readings else (),
+            pieces=[left.index(pieces[r]) for r in keep],
+            events={c: [x[r] for r in keep] for c, x in self.events.items()},
+        )
+
     def without_events(self, events: Mapping[Channel, Events]) -> Dataset:
         """Return the runs with these events taken for not valid, and what is then unexplained."""
         runs, hidden = [], {c: list(e.masks) for c, e in events.items()}
@@ -155,13 +170,18 @@ def usable_signals(
             *reasons,
             f"found {found}, expected at least {FEWEST_RUNS}: a gain is measured on held-out runs",
         ]
-    moving = sum(float(s.moving.sum()) * float(np.median(np.diff(s.time_s))) for run in out for s in run)
+    moving = moving_s(out)
     if moving < SHORTEST_MOVING_S:
         return [], [
             *reasons,
             f"found {moving:.1f} s in motion in all runs, expected at least {SHORTEST_MOVING_S:.0f} s",
         ]
     return out, reasons
+
+
+def moving_s(signals: Sequence[Sequence[JointSignals]]) -> float:
+    """Return the time in motion [s], over all joints and runs."""
+    return sum(float(s.moving.sum()) * float(np.median(np.diff(s.time_s))) for run in signals for s in run)
 
 
 def resolution_notes(signals: Sequence[Sequence[JointSignals]]) -> list[str]:

@@ -25,6 +25,11 @@ JointName = int | str
 """1 to 7, or "sensor"."""
 
 
+def joint_text(joint: JointName) -> str:
+    """Return "joint 2", or "the sensor"."""
+    return "the sensor" if joint == "sensor" else f"joint {joint}"
+
+
 @dataclass(frozen=True)
 class Value:
     """A parameter with its 95 % interval."""
@@ -427,7 +432,7 @@ def _where(place: Place) -> str:
 
 
 def _summary_cause(cause: Cause, joints: Mapping[int, Joint]) -> str:
-    at = "the sensor" if cause.joint == "sensor" else f"joint {cause.joint}"
+    at = joint_text(cause.joint)
     known = file_values(cause.name, cause.joint, cause.parameters, joints)
     values = ", ".join(_value(name, each, known.get(name)) for name, each in cause.parameters.items())
     others = [name for name in cause.names if name != cause.name]

@@ -16,6 +16,7 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import TORSION
 from jtqd.sysid.diagnosis.dataset import Dataset
+from jtqd.sysid.diagnosis.findings import joint_text
 from jtqd.sysid.diagnosis.gain import left_out_steps
 from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, contributions, parameter
 from jtqd.sysid.diagnosis.search import Hypothesis
@@ -54,8 +55,7 @@ def objections(
     if pair is None:
         return []
     other = refined.present[pair[1]]
-    at = "the sensor" if other.joint == "sensor" else f"joint {other.joint}"
-    return [(pair[0], f"it cancels {other.effect.name} of {at}")]
+    return [(pair[0], f"it cancels {other.effect.name} of {joint_text(other.joint)}")]
 
 
 def beyond_bounds(p: PresentEffect, nothing: dict[str, float]) -> str:

@@ -67,12 +67,12 @@ class Mixed:
         return len(self.grams)
 
     def subset(self, runs: Sequence[int]) -> Mixed:
-        """Return the same with these runs only."""
-        out = object.__new__(Mixed)
-        out.columns, out.prior, out.grams = self.columns, self.prior, self.grams[list(runs)]
-        out.pieces = np.arange(len(runs))
+        """Return the same with these runs only; its pieces are those of these runs."""
+        out = copy(self)
+        out.grams = self.grams[list(runs)]
+        place = {run: k for k, run in enumerate(runs)}
+        out.pieces = np.array([place[int(p)] for p in self.pieces if int(p) in place], np.intp)
         out.rows = self.rows * len(runs) // max(len(self.grams), 1)
-        out._p, out._q, out._fixed_index = self._p, self._q, self._fixed_index
         return out
 
     def less(self, grams: FloatArray) -> Mixed:

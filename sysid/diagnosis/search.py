@@ -90,6 +90,20 @@ class Search:
         self.rejected: set[tuple[str, object]] = set()
         """Effects (with joint) that shall not be chosen again (`guards`)."""
 
+    def without_run(self, number: int) -> Search:
+        """Return the search on the other runs, with nothing rejected; the sizes of columns stay those of all runs."""
+        runs = [r for r in range(self.mixed.runs) if r != number]
+        of_runs = [r for r, piece in enumerate(self.mixed.pieces) if piece != number]
+        return Search(
+            self.mixed.subset(runs),
+            self.candidates,
+            math.exp(self.log_n) * len(runs) / self.mixed.runs,
+            self._moments,
+            self.least_nm,
+            [self._readings[r] for r in of_runs] if self._readings else (),
+            self._unpowered,
+        )
+
     def penalty(self, candidate: EffectCandidate) -> float:
         """Return what the candidate costs in BIC: its parameters, and the choice among its terms."""
         return candidate.size * self._log_n[candidate.first] + self._choice[candidate.key]

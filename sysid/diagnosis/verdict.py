@@ -13,6 +13,7 @@ from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.current_zero import offset_at_rest, rest_current
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.evidence import RELEVANT, candidate_table, class_beside, equivalence_class
+from jtqd.sysid.diagnosis.fewer_runs import Compared, Gone, Key, kept_text, named_by_fewer
 from jtqd.sysid.diagnosis.findings import (
     AMBIGUOUS,
     CAUSE,
@@ -26,6 +27,7 @@ from jtqd.sysid.diagnosis.findings import (
     JointName,
     LeftOver,
     Value,
+    joint_text,
 )
 from jtqd.sysid.diagnosis.gain import held_out_gain, left_out_steps
 from jtqd.sysid.diagnosis.gaps import channel_gaps, traces
@@ -137,11 +139,74 @@ def _found(  # noqa: PLR0917
         if weak and not found.matters:  # what is not certain is left over, too
             left = leftover(dataset, proven, noise, joints)
             share = left.share(_squares([_rms_at(dataset, p) for p in proven.present]))
-            said = [f"{c.effect.name} of {_owner(c.joint)} fits but is not named: {_UNSTEADY}" for c in weak]
+            said = [
+                f"{c.effect.name} of {joint_text(c.joint)} fits but is not named: {_UNSTEADY}" for c in weak
+            ]
             refused = [*refused, *said]
             found = replace(found, whole=best, refined=proven, left=left, share=share, refused=refused)
         found = replace(found, best=best, proven=proven)
     return found
+
+
+def _with_fewer(  # noqa: PLR0917
+    dataset: Dataset,
+    search: Search,
+    found: _Found,
+    noise: Noise,
+    joints: Mapping[int, Joint],
+    relevance: float,
+) -> tuple[_Found, list[tuple[EffectCandidate, ...]], list[str]]:
+    """Return what was found with what fewer runs name and the runs left out bear out, its classes, and a line about each
+    effect that fewer runs name (`fewer_runs`).
+    """
+    classes = _classes(search, found)
+    here = {c.key for c in found.best.chosen} | {c.key for others in classes for c in others}
+
+    def names(part: Dataset, of_part: Search) -> Sequence[EffectCandidate]:
+        best = of_part.confirmed()
+        quick = LeaveOneOut(part, of_part).confirmed(best) if of_part.mixed.runs < ENOUGH_RUNS else best
+        if all(c.key in here for c in quick.chosen):
+            return quick.chosen  # nothing to look at closer
+        refined = refine(part, present_effects(best), noise)
+        return _found(part, of_part, best, refined, noise, joints, relevance).best.chosen
+
+    gone: dict[Key, tuple[EffectCandidate, list[str]]] = {}
+    sets: list[Sequence[EffectCandidate]] = []
+    for without, chosen in named_by_fewer(dataset, search, names):
+        new = [c for c in chosen if c.key not in here]
+        for c in new:
+            gone.setdefault(c.key, (c, []))[1].append(without)
+        sets += [chosen] if new else []
+    if not gone:
+        return found, classes, []
+    compared = Compared(dataset, search, found.best)
+    beside = {
+        key: search.hypothesis((*found.best.chosen, c), found.best.model)
+        for key, (c, _) in gone.items()
+        if search.fits_beside(c, found.best.chosen)
+    }
+    kept = found.best
+    for other in (*beside.values(), *(search.hypothesis(chosen, found.best.model) for chosen in sets)):
+        if compared.clearly_better(other) and compared.nm(other) < compared.nm(kept):
+            refined = refine(dataset, present_effects(other), noise)
+            if not objections(dataset, other, refined):
+                kept = other
+    proven = refine(
+        dataset, present_effects(kept), noise
+    )  # also where nothing is kept: torsion is set by the last one
+    said = [kept_text(c, compared.nm(found.best), compared.nm(kept)) for c in kept.chosen if c.key in gone]
+    there = {c.key for c in kept.chosen}
+    for key, (c, runs) in gone.items():
+        if key not in there:
+            with_it = beside.get(key) or search.hypothesis([c], found.best.model)
+            said.append(Gone(c, tuple(runs), (compared.nm(with_it), compared.nm(kept))).text)
+    if kept is not found.best:
+        same = found.whole is found.best
+        found = replace(found, best=kept, proven=proven)
+        if same:
+            found = replace(found, whole=kept, refined=proven)
+        classes = _classes(search, found)
+    return found, classes, said
 
 
 def _squares(explained: Sequence[Mapping[Channel, float]]) -> float:
@@ -169,10 +234,11 @@ def conclude(  # noqa: PLR0917
 ) -> Findings:
     """Return the findings of one diagnosis; relevance: see RELEVANCE."""
     found = _found(dataset, search, best, refined, noise, joints, relevance)
+    found, classes, became = _with_fewer(dataset, search, found, noise, joints, relevance)
     few, left, whole, judged, matters = found.few, found.left, found.whole, found.refined, found.matters
     gain = held_out_gain(dataset, found.proven)
     best, refined, classes = _without_asymmetry_at_rest(
-        dataset, search, found.best, found.proven, noise, _classes(search, found)
+        dataset, search, found.best, found.proven, noise, classes
     )
     causes, energies = _causes(dataset, search, best, refined, noise, classes)
     total = max(sum(energies) + left.energy_nm2(), 1e-30)
@@ -201,7 +267,7 @@ def conclude(  # noqa: PLR0917
         reasons = [s for s in (_reason(verdict, causes, gaps), doubt) if s]
     return Findings(
         verdict,
-        (*reasons, *found.refused),
+        (*reasons, *found.refused, *became),
         names,
         numbers,
         gaps,
@@ -255,7 +321,9 @@ def _left_over(
 def _closest(whole: Hypothesis, causes: Sequence[Cause], share: float) -> list[str]:
     """Return what to say of effects that were found although something matters that they leave."""
     named = {(c.name, c.joint) for c in causes}
-    others = ", ".join(f"{c.effect.name} of {_owner(c.joint)}" for c in whole.chosen if c.key not in named)
+    others = ", ".join(
+        f"{c.effect.name} of {joint_text(c.joint)}" for c in whole.chosen if c.key not in named
+    )
     if not others:
         return []
     one = len(whole.chosen) - len(named) == 1
@@ -300,7 +368,7 @@ def _guarded(  # noqa: PLR0917
         weak = [best.chosen[k] for k, _ in found]
         again = not said and search.mixed.runs >= ENOUGH_RUNS
         for c, (_, why) in zip(weak, found, strict=True):
-            said.append(f"{c.effect.name} of {_owner(c.joint)} fits but is not named: {why}")
+            said.append(f"{c.effect.name} of {joint_text(c.joint)} fits but is not named: {why}")
             search.rejected.add(c.key)
         rest = [c for c in best.chosen if c not in weak]
         best = search.confirmed() if again else search.hypothesis(rest, best.model)
@@ -441,10 +509,6 @@ def _largest(rms: Mapping[Channel, float]) -> tuple[float, str]:
     return rms[channel], channel.balance
 
 
-def _owner(joint: JointName) -> str:
-    return "the sensor" if joint == "sensor" else f"joint {joint}"
-
-
 def _cause(  # noqa: PLR0917
     search: Search,
     best: Hypothesis,
@@ -484,7 +548,7 @@ def _cause(  # noqa: PLR0917
     for rival in rivals:
         label = rival.effect.name
         if rival.joint != candidate.joint:
-            label += f" of {_owner(rival.joint)}"
+            label += f" of {joint_text(rival.joint)}"
         if label not in names:
             names.append(label)
     evidence = max(without.model.deviance - best.model.deviance, 1e-9)
@@ -531,5 +595,5 @@ def _reason(verdict: str, causes: Sequence[Cause], gaps: Sequence[Gap]) -> str:
         text = c.name.replace("_", " ")
         if len(c.names) > 1:
             text += " (or " + ", ".join(n.replace("_", " ") for n in c.names[1:]) + ")"
-        parts.append(f"{text} of {_owner(c.joint)}, {c.rms_nm:.3g} Nm rms")
+        parts.append(f"{text} of {joint_text(c.joint)}, {c.rms_nm:.3g} Nm rms")
     return "the simulation lacks " + "; ".join(parts)

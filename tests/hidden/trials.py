@@ -49,7 +49,7 @@ def trial(
     seen = findings if recorder is None else judged(plain.runs, plain.joints, recorder, own)
     allowed = recorder.explains if recorder is not None else ()
     out = [score("nothing", own, plain.truth, seen, not_wrong=allowed)]
-    orders = _orders(number, own, rng, plain, findings, kinds, out)
+    orders = orders_of(number, own, rng, plain, findings, kinds, out)
     cases = draw_many([order for _, order in orders]) if orders else []
     for (kind, order), case in zip(orders, cases, strict=True):
         if recorder is not None:
@@ -78,7 +78,7 @@ def _short(truth: Mapping[str, Any]) -> str:
     return text + (f"; right: {'; '.join(right[:4])}" if right else "")
 
 
-def _orders(  # noqa: PLR0917
+def orders_of(  # noqa: PLR0917
     number: int,
     own: int,
     rng: np.random.Generator,
@@ -87,7 +87,7 @@ def _orders(  # noqa: PLR0917
     kinds: Sequence[str],
     out: list[Outcome],
 ) -> list[tuple[str, Order]]:
-    """Return what to draw for one trial; effects that these motions cannot show are noted as invisible in `out`."""
+    """Return (kind, what to draw) for one trial; effects that these motions cannot show are noted as invisible in `out`."""
     names = list(MENU)
     orders: list[tuple[str, Order]] = []
     name = names[number % len(names)]

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from itertools import islice
+
 import numpy as np
 import pytest
 
 from jtqd.sysid.diagnosis.findings import Cause, Findings, Value
-from tests.worlds.campaign import Counts, jobs
 from tests.worlds.measured_bench import MeasuredBench
-from tests.worlds.more_data import held_out_rms, step, steps
-from tests.worlds.mujoco_bench import MujocoBench
+from tests.worlds.more_data import OWN, held_out_rms, sets_of, step, steps
 from tests.worlds.recorder import PRESETS
-from tests.worlds.sets import SENSOR, Bench, Hidden
+from tests.worlds.sets import SENSOR, Hidden
 
 
 def found(*causes: Cause, reasons: tuple[str, ...] = ()) -> Findings:
@@ -33,7 +33,7 @@ def test_the_error_on_a_held_out_run_is_least_with_the_truth() -> None:
     assert errors[1] < errors[0] < errors[2]
 
 
-def test_a_cause_may_go_only_for_a_better_prediction_and_with_a_word() -> None:
+def test_a_cause_may_go_only_with_a_word() -> None:
     drawn = MeasuredBench().draw(3, [Hidden("sensor_gain", SENSOR, 0.2)])
     true = drawn.truth[0]["parameters"]["gain"]
 
@@ -41,29 +41,30 @@ def test_a_cause_may_go_only_for_a_better_prediction_and_with_a_word() -> None:
         each = step(4, fewer, more, drawn.runs[-1], drawn.joints)
         return each.lost, each.worse
 
-    right, wrong = gain(true), gain(2.0 - true)
+    said = "sensor_gain of the sensor would be named without run3.csv"
+    right = gain(true)
     assert judge(found(right), found(right)) == ((), False)
     assert judge(found(right), found(gain(true, "torque_constant"))) == ((), False)
     assert judge(found(right), found()) == (("sensor_gain",), True)
-    assert judge(found(wrong), found()) == (("sensor_gain",), True)  # better, but not a word
-    assert judge(found(wrong), found(reasons=("sensor gain of 4 runs is not confirmed",))) == (
-        ("sensor_gain",),
-        False,
-    )
+    assert judge(found(right), found(reasons=("sensor_gain of joint 2 fits",))) == (("sensor_gain",), True)
+    assert judge(found(right), found(reasons=(said,))) == (("sensor_gain",), False)
+    lost = step(4, found(right), found(reasons=(said,)), drawn.runs[-1], drawn.joints)
+    assert lost.missed
+    wrong = step(4, found(gain(2.0 - true)), found(reasons=(said,)), drawn.runs[-1], drawn.joints)
+    assert not wrong.missed
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("bench", [MujocoBench, MeasuredBench])
-def test_more_runs_never_make_a_diagnosis_worse(bench: type[Bench]) -> None:
+@pytest.mark.parametrize("bench", ["mujoco", "measured", OWN])
+def test_more_runs_never_make_a_diagnosis_worse(bench: str) -> None:
     pytest.importorskip(
         "mujoco", reason="mujoco is not installed: pip install -e '.[dev]'; more data was NOT tested"
     )
     seed = int(np.random.default_rng().integers(10**6))
-    chosen = [job for job in jobs(bench(), seed, Counts()) if job.kind in ("single", "pair")][:6]
     worse = [
-        (job.key, each)
-        for job in chosen
-        for each in steps(bench().draw(job.seed, job.hidden), PRESETS["full"], job.seed)
+        (key, each)
+        for key, own, drawn in islice(sets_of(bench, seed), 6)
+        for each in steps(drawn, PRESETS["full"], own)
         if each.worse
     ]
     assert not worse, f"seed {seed}: {worse}"

@@ -4,8 +4,11 @@ import pytest
 
 from examples.kinova_diagnosis import diagnose_all
 from jtqd.sysid.diagnosis import verdict
+from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import AMBIGUOUS, CAUSE, INSUFFICIENT, NO_GAP, UNEXPLAINED, Findings
+from jtqd.sysid.diagnosis.leave_one_out import ENOUGH_RUNS, LeaveOneOut
+from jtqd.sysid.diagnosis.search import Search
 from tests.hidden.case import draw
 from tests.hidden.trials import joint_files, tables
 
@@ -50,10 +53,12 @@ def test_a_parameter_whose_interval_holds_the_files_value_is_no_settled_cause() 
 
 
 def test_with_four_runs_nothing_of_this_applies(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise AssertionError("asked for with four runs")
+    class Refusing(LeaveOneOut):
+        def __init__(self, dataset: Dataset, search: Search) -> None:
+            assert search.mixed.runs < ENOUGH_RUNS, "asked for with four runs"
+            super().__init__(dataset, search)
 
-    monkeypatch.setattr(verdict, "LeaveOneOut", refuse)
+    monkeypatch.setattr(verdict, "LeaveOneOut", Refusing)
     assert found(206, runs=4).verdict == NO_GAP
 
 

@@ -1,0 +1,80 @@
+"""One more run must not take a cause away without a word, and not where it predicts the runs left out clearly better."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+
+from jtqd.sysid.diagnosis.fewer_runs import Compared, Gone
+from jtqd.sysid.diagnosis.findings import UNEXPLAINED
+from jtqd.sysid.diagnosis.mixed_model import Mixed
+from jtqd.sysid.diagnosis.search import Hypothesis
+from tests.sysid.diagnosis.diagnose_core_helpers import Dense, search_of
+from tests.sysid.diagnosis.test_search import LIBRARY, problem
+from tests.worlds.judge import judged
+from tests.worlds.measured_bench import MeasuredBench
+from tests.worlds.oracle import hidden_size
+from tests.worlds.recorder import Recorder
+from tests.worlds.sets import Hidden
+
+
+def test_a_search_without_a_run_is_the_search_of_the_others() -> None:
+    one = problem(3, {0: 0.8, 2: 0.3})
+    part = search_of(one, LIBRARY).without_run(1)
+    there = [0, 2, 3, 4]
+    others = search_of(Dense(*([part[k] for k in there] for part in (one.x, one.z, one.y))), LIBRARY)
+    assert [c.key for c in part.run().chosen] == [c.key for c in others.run().chosen]
+    chosen = [c for c in LIBRARY if c.first in (0, 2)]
+    assert part.hypothesis(chosen).model.beta == pytest.approx(others.hypothesis(chosen).model.beta)
+    assert part.mixed.runs == 4
+
+
+def test_a_subset_keeps_its_pieces() -> None:
+    whole = problem(3, {0: 0.8}).mixed([0.3])
+    pieces = copy.copy(whole)
+    pieces.pieces = np.array([0, 0, 1, 2, 2])
+    pieces.grams = np.array([whole.grams[:2].sum(axis=0), whole.grams[2], whole.grams[3:].sum(axis=0)])
+    part: Mixed = pieces.subset([0, 2])
+    assert part.pieces.tolist() == [0, 0, 1, 1]
+    assert part.grams == pytest.approx(pieces.grams[[0, 2]])
+
+
+@pytest.mark.parametrize(
+    ("squares", "better"),
+    [([0.5, 0.9, 1.0], True), ([0.97, 0.98, 0.96], False), ([0.1, 0.2, 1.2], False)],
+    ids=["all together", "as good", "one run worse"],
+)
+def test_clearly_better_is_on_all_runs_together_and_worse_on_none(squares: list[float], better: bool) -> None:
+    search = search_of(problem(3, {0: 0.8}), LIBRARY)
+    named, other = search.hypothesis(()), search.hypothesis(LIBRARY[:1])
+
+    class LeftOut:
+        def squares(self, h: Hypothesis) -> list[dict[str, float]]:
+            return [{"motor": x} for x in (squares if h is other else [1.0, 1.0, 1.0])]
+
+    compared = object.__new__(Compared)
+    compared.search, compared.named = search, named
+    vars(compared)["_left_out"] = LeftOut()
+    assert compared.clearly_better(other) is better
+    assert compared.nm(named) == pytest.approx(1.0)
+
+
+def test_a_line_says_what_went_and_what_the_runs_left_out_say() -> None:
+    text = Gone(LIBRARY[0], ("a.csv", "b.csv", "c.csv", "d.csv"), (0.5, 0.4), "it cancels x").text
+    assert text == (
+        "coulomb_friction of joint 1 would be named without a.csv, b.csv, c.csv, .., but is not with all runs: "
+        "the error on runs left out is 0.5 Nm rms with it, 0.4 as named; it cancels x"
+    )
+
+
+def test_what_two_recordings_of_a_real_arm_name_does_not_go_without_a_word() -> None:
+    size = hidden_size("measured", "torque_constant_saturation", 3.0)
+    assert size is not None
+    drawn = MeasuredBench().draw(1042395857, [Hidden("torque_constant_saturation", 1, size)])
+    two, three = (judged(drawn.runs[:k], drawn.joints, Recorder(), 1) for k in (2, 3))
+    assert [c.name for c in two.causes] == ["coulomb_friction"]
+    assert three.verdict == UNEXPLAINED
+    assert not three.causes
+    assert any(r.startswith("coulomb_friction of joint 1 would be named without") for r in three.reasons)
