@@ -1,6 +1,7 @@
 """Somebody's test rig: a servo swings a known weight. Recorded in a layout of its own, with a joint file that is wrong.
 
     python -m examples.own_rig --out rig
+    python -m examples.own_rig --out flat --upright       the axis upright: the weight swings level and pulls at nothing
 
 writes rig/runs (six recordings) and rig/new (two more) as CSV, rig/columns.yaml, which maps their columns, and
 rig/servo.yaml, the data sheet's joint file. The servo gives its duty and no current, there is no torque sensor, it has one
@@ -47,8 +48,9 @@ DATA_SHEET: Final = Servo()
 TRUE: Final = replace(DATA_SHEET, coulomb=0.22, viscous=0.11)
 
 
-def recorded(servo: Servo, seed: int) -> FloatArray:
+def recorded(servo: Servo, seed: int, *, upright: bool = False) -> FloatArray:
     """Return one run as recorded [n, 4]: time [ms], angle [counts], duty [-1000..1000], temperature of the board [degC]."""
+    weight = 0.0 if upright else MASS_KG * 9.80665 * LEVER_M
     rng = np.random.default_rng(seed)
     sizes = rng.uniform(0.2, 0.55, 3)
     rates = np.array([0.5, 1.1, 1.9]) * rng.uniform(0.8, 1.25, 3)
@@ -68,7 +70,7 @@ def recorded(servo: Servo, seed: int) -> FloatArray:
         current = (duty * SUPPLY_V - kt * g * v) / servo.resistance
         if k % every == 0:
             rows.append((1e3 * t, q, duty, 31.0 + 0.02 * t))
-        push = g * kt * current - MASS_KG * 9.80665 * LEVER_M * math.sin(q) - servo.viscous * v
+        push = g * kt * current - weight * math.sin(q) - servo.viscous * v
         free = v + STEP_S * push / inertia
         stop = STEP_S * servo.coulomb / inertia  # Coulomb friction stops and never turns round
         v = math.copysign(max(abs(free) - stop, 0.0), free)
@@ -86,8 +88,9 @@ j1.motor_position_rad: "rev2rad(counts / {COUNTS})"
 j1.link_position_rad: "rev2rad(counts / {COUNTS}) / {DATA_SHEET.gear_ratio:g}"   # one encoder
 j1.drive: {{voltage_v: "{SUPPLY_V:g} * duty / 1000", resistance_ohm: {DATA_SHEET.resistance:g}, \
 back_emf_vs_per_rad: {DATA_SHEET.torque_constant:g}}}
-j1.load: {{mass_kg: {MASS_KG:g}, lever_m: {LEVER_M:g}, inertia_kgm2: {INERTIA_KGM2:.4g}}}
 """
+LOAD: Final = f"j1.load: {{mass_kg: {MASS_KG:g}, lever_m: {LEVER_M:g}, inertia_kgm2: {INERTIA_KGM2:.4g}}}\n"
+LEVEL: Final = f"j1.load: {{inertia_kgm2: {INERTIA_KGM2:.4g}}}   # no torque acts but the joint's own\n"
 
 JOINT: Final = f"""\
 # What the data sheet of the servo says.
@@ -108,17 +111,19 @@ def main(argv: list[str] | None = None) -> int:
     """Write recordings, column map and joint file."""
     parser = argparse.ArgumentParser(description="Record a made-up test rig in a layout of its own.")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
-    out: Path = parser.parse_args(argv).out
+    parser.add_argument("--upright", action="store_true", help="axis upright: no torque of the weight")
+    options = parser.parse_args(argv)
+    out: Path = options.out
     for folder, seeds in (("runs", range(1, 7)), ("new", range(7, 9))):
         (out / folder).mkdir(parents=True, exist_ok=True)
         for seed in seeds:
-            table = recorded(TRUE, seed)
+            table = recorded(TRUE, seed, upright=options.upright)
             if seed == 3:
                 table = table[(table[:, 0] < 9000.0) | (table[:, 0] > 9400.0)]
             lines = ["t [ms],counts,duty,board [C]"]
             lines += [f"{t:.1f},{q:.0f},{duty:.0f},{board:.1f}" for t, q, duty, board in table]
             (out / folder / f"swing_{seed}.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    (out / "columns.yaml").write_text(COLUMNS, encoding="utf-8")
+    (out / "columns.yaml").write_text(COLUMNS + (LEVEL if options.upright else LOAD), encoding="utf-8")
     (out / "servo.yaml").write_text(JOINT, encoding="utf-8")
     (out / "truth.txt").write_text(f"{TRUE}\ndata sheet: {DATA_SHEET}\n", encoding="utf-8")
     print(f"wrote {out}: 6 runs, 2 new ones, columns.yaml, servo.yaml")

@@ -69,6 +69,7 @@ class Dataset:
         families: of nuisances. unknown_lines: those among them at orders or frequencies of no effect.
         readings: per run what the current reads without power.
         pieces: number of the recording that each run is a piece of (None: each is one).
+        no_torque: no torque was measured, the reference is a known load or a model's: the free run is asked too (`guards`).
         events: what is not valid in `runs` only because it is an event, per channel and run [n].
     """
 
@@ -83,6 +84,7 @@ class Dataset:
     readings: Sequence[Readings] = ()
     pieces: Sequence[int] | None = None
     events: Mapping[Channel, Sequence[BoolArray]] = field(default_factory=dict)
+    no_torque: bool = False
 
     @property
     def joints(self) -> dict[int, Joint]:
@@ -238,7 +240,17 @@ def build_dataset(
     unexplained = {c: saturated_residuals(runs, c, leave) for c in runs[0].channels}
     pieces = recordings(signals)
     return Dataset(
-        signals, runs, candidates, samples, step, unexplained, groups, lines, readings(signals), pieces
+        signals,
+        runs,
+        candidates,
+        samples,
+        step,
+        unexplained,
+        groups,
+        lines,
+        readings(signals),
+        pieces,
+        no_torque=bool(scope.known_references & set(joints)),
     )
 
 

@@ -124,6 +124,8 @@ class Gain:
     free_run_before: float = float("nan")  # rad/s, joint side
     free_run_after: float = float("nan")
     runs: tuple[RunGain, ...] = ()
+    free_run_position_before: float = float("nan")  # rad, joint side
+    free_run_position_after: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -376,6 +378,8 @@ def _gain(gain: Gain) -> dict[str, Any]:
         "ci95": gain.ci95,
         "free_run_before_rad_s": gain.free_run_before,
         "free_run_after_rad_s": gain.free_run_after,
+        "free_run_position_before_rad": gain.free_run_position_before,
+        "free_run_position_after_rad": gain.free_run_position_after,
         "runs": [each._asdict() for each in gain.runs],
     }
 
@@ -414,6 +418,11 @@ def summary_lines(findings: Findings) -> list[str]:
         lines.append(
             f"gain on held-out runs: {gain.rmse_before_nm:.3g} -> {gain.rmse_after_nm:.3g} Nm rms "
             f"(reduced by {low:.3g} to {high:.3g} Nm, 95 % interval)"
+        )
+    if gain is not None and math.isfinite(gain.free_run_position_before):
+        lines.append(
+            f"free run of half a second on held-out runs: position {gain.free_run_position_before:.3g} -> "
+            f"{gain.free_run_position_after:.3g} rad rms"
         )
     if findings.next_experiment:
         lines.append(f"next experiment: {findings.next_experiment['why']}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -18,7 +19,7 @@ from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.findings import Gain, RunGain
 from jtqd.sysid.diagnosis.mixed_model import solve
-from jtqd.sysid.diagnosis.refine import Refined
+from jtqd.sysid.diagnosis.refine import PresentEffect, Refined
 from jtqd.sysid.diagnosis.signals import BaseLoss, Channel, JointSignals
 
 _BOOTSTRAPS: Final = 2000
@@ -50,26 +51,34 @@ def held_out_gain(dataset: Dataset, refined: Refined, seed: int = 0) -> Gain:
     sums = table[picks].sum(axis=1)
     drawn = np.sqrt(sums[:, 0] / sums[:, 2]) - np.sqrt(sums[:, 1] / sums[:, 2])
     low, high = np.percentile(drawn, (2.5, 97.5))
-    free = _free_runs(dataset, refined, steps)
+    velocity, position = free_run_errors(dataset, refined, steps)
     return Gain(
         _rms(table, 0),
         _rms(table, 1),
         f"each of {len(table)} runs left out once; {channel.balance} balance of joint {channel.joint}",
         (float(low), float(high)),
-        *free,
+        *velocity,
         tuple(
             RunGain(name, _rms(row, 0), _rms(row, 1))
             for name, row in zip(names, table[:, None, :], strict=True)
             if row[0, 2] > 0.0
         ),
+        *position,
     )
 
 
-def _free_runs(dataset: Dataset, refined: Refined, steps: Sequence[FloatArray]) -> tuple[float, float]:
-    """Return the rms error of the simulation running free, before and after [rad/s, joint side], over all joints and runs;
-    each run with the parameters of all others.
+Before = tuple[float, float]
+"""Without and with; NaN where there is nothing to simulate."""
+
+
+def free_run_errors(
+    dataset: Dataset, refined: Refined, steps: Sequence[FloatArray], cause: int | None = None
+) -> tuple[Before, Before]:
+    """Return the rms errors of the simulation running free, of its velocity [rad/s] and its position [rad], joint side: over
+    all joints and runs, each run with the parameters of all others (steps: `left_out_steps`). cause: without and with
+    this one beside the others; None: without and with all of them.
     """
-    squares = np.zeros(2)
+    squares = np.zeros((2, 2))
     count = 0
     for run, step in zip(dataset.signals, steps, strict=True):
         place, causes = 0, []
@@ -77,21 +86,27 @@ def _free_runs(dataset: Dataset, refined: Refined, steps: Sequence[FloatArray]) 
             causes.append(p.moved([float(x) for x in step[place : place + len(p.free)]]))
             place += len(p.free)
         for s in run:
-            mine = [p for p in causes if p.joint in ("sensor", s.number)]
-            if not mine:
+            there = [k for k, p in enumerate(causes) if p.joint in ("sensor", s.number)]
+            asked = there if cause is None else [cause]
+            if not set(asked) & set(there):
                 continue
-            effects = [*s.joint.effects, *(Effect_parameters(p.effect.name, dict(p.values)) for p in mine)]
             try:
-                after = free_run(s, replace(s.joint, effects=tuple(effects))).rmse_rad_s
+                after = free_run(s, _extended(s.joint, [causes[k] for k in there]))
+                rest = [causes[k] for k in there if k not in asked]
+                before = free_run(s, _extended(s.joint, rest))
             except ConfigError:
                 continue  # a run left out can take a parameter out of its range
-            before = free_run(s, s.joint).rmse_rad_s
-            squares += (before**2, after**2)
+            squares += [[r.rmse_rad_s**2 for r in (before, after)], [r.rmse_rad**2 for r in (before, after)]]
             count += 1
     if not count:
-        return float("nan"), float("nan")
-    root = np.sqrt(squares / count)
-    return float(root[0]), float(root[1])
+        return (math.nan, math.nan), (math.nan, math.nan)
+    velocity, position = np.sqrt(squares / count).tolist()
+    return (velocity[0], velocity[1]), (position[0], position[1])
+
+
+def _extended(joint: Joint, causes: Sequence[PresentEffect]) -> Joint:
+    effects = [*joint.effects, *(Effect_parameters(p.effect.name, dict(p.values)) for p in causes)]
+    return replace(joint, effects=tuple(effects))
 
 
 def _rms(table: FloatArray, column: int) -> float:
@@ -125,13 +140,15 @@ _NEARLY_ZERO_RAD_S: Final = 1e-9
 class FreeRun:
     """Error of a free run of one joint over one run.
 
-    rmse_rad_s: of the velocity, joint side, over all samples of all windows but their first ones; windows_rad_s [w]: the
-    same for each window, which begins at start_s [w] (time since the run's first sample) and is window_s long.
+    rmse_rad_s: of the velocity, joint side, over all samples of all windows but their first ones; rmse_rad: of the position
+    turned since the window's start; windows_rad_s [w]: of the velocity of each window, which begins at start_s [w] (time
+    since the run's first sample) and is window_s long.
     """
 
     run: str
     joint: int
     rmse_rad_s: float
+    rmse_rad: float
     window_s: float
     start_s: FloatArray
     windows_rad_s: FloatArray
@@ -173,10 +190,25 @@ def free_run(
         signals.run,
         signals.number,
         float(np.sqrt(np.mean(squares))),
+        _position_error(signals, joint, simulated, index),
         float(time[index[-1, 0]] - time[index[0, 0]]),
         time[index[0]],
         np.sqrt(squares),
     )
+
+
+def _position_error(signals: JointSignals, joint: Joint, simulated: FloatArray, index: Index) -> float:
+    """Return the rms error [rad, joint side] of what the simulation has turned since the windows' starts; of the motor's
+    position, else the link's, else of the integral of the measured velocity.
+    """
+    seen = signals.state
+    step = np.diff(seen.time_s[index], axis=0)
+    turned = np.cumsum(0.5 * step * (simulated[1:] + simulated[:-1]), axis=0)
+    for position in (seen.motor_position_rad / joint.gear_ratio, seen.link_position_rad):
+        if np.isfinite(position).all() and np.ptp(position) > 0.0:
+            return float(np.sqrt(np.mean((turned - (position[index[1:]] - position[index[0]])) ** 2)))
+    v = seen.velocity_rad_s[index]
+    return float(np.sqrt(np.mean((turned - np.cumsum(0.5 * step * (v[1:] + v[:-1]), axis=0)) ** 2)))
 
 
 def _inputs(signals: JointSignals, joint: Joint, terms: Sequence[Term]) -> tuple[FloatArray, FloatArray]:

@@ -17,7 +17,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import TORSION
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.findings import joint_text
-from jtqd.sysid.diagnosis.gain import left_out_steps
+from jtqd.sysid.diagnosis.gain import free_run_errors, left_out_steps
 from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, contributions, parameter
 from jtqd.sysid.diagnosis.search import Hypothesis
 
@@ -38,7 +38,8 @@ def objections(
     dataset: Dataset, best: Hypothesis, refined: Refined, *, bounds_only: bool = False
 ) -> list[tuple[int, str]]:
     """Return causes (by place) that are none, and why: all at a bound; else the one that does most harm on runs left out;
-    else the smaller of two that cancel each other. What is left must be fitted again before it is asked again.
+    else, where no torque was measured, one that raises the error of the position in a free run; else the smaller of two that
+    cancel each other. What is left must be fitted again before it is asked again.
     """
     nothing = nothing_of(best)
     bound = [
@@ -51,6 +52,11 @@ def objections(
     worst = int(np.argmin(falls))
     if falls[worst] <= 0.0:
         return [(worst, "it raises the error on runs left out")]
+    if dataset.no_torque:
+        places = [k for k, p in enumerate(refined.present) if free_run_fall(dataset, refined, k) < 0.0]
+        if places:
+            worst = min(places, key=lambda k: falls[k])
+            return [(worst, "it raises the error of the position in a free run on runs left out")]
     pair = cancelling(dataset, refined.present)
     if pair is None:
         return []
@@ -114,6 +120,14 @@ def held_out_gains(dataset: Dataset, refined: Refined) -> list[float]:
                 without += float((left + part) @ (left + part))
         out.append(1.0 - within / without if without > 0.0 else 0.0)
     return out
+
+
+def free_run_fall(dataset: Dataset, refined: Refined, cause: int) -> float:
+    """Return which part of the squared error of the position in a free run one cause takes away on runs left out; 0 where
+    it has no part in it (the spring is on the other side of the torque).
+    """
+    _, (before, after) = free_run_errors(dataset, refined, left_out_steps(refined), cause)
+    return 1.0 - (after / before) ** 2 if before > 0.0 else 0.0
 
 
 def _rms(parts: Sequence[FloatArray]) -> float:

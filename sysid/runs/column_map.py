@@ -3,6 +3,7 @@
     time_s: "stamp_s + 1e-9 * stamp_ns"                    a column, or an expression of columns (`expressions`)
     j1.link_position_rad: {column: angle, scale: 0.0175}   value = scale * cell + offset
     j1.load: {mass_kg: 1.5, lever_m: 0.2}                  the torque reference is a known load
+    j2.load: {inertia_kgm2: 0.03}                          ... or what turns, and nothing pulls at it
     j3.load: {torque_nm: "model_torque - payload_torque"}  ... or a rigid-body model's torque
     j1.drive: {voltage_v: "duty * 12", resistance_ohm: 2.0, back_emf_vs_per_rad: 0.01}
     j1.joint_file: joint1.yaml                             beside the map
@@ -261,7 +262,11 @@ def _load(section: Section, joint: int, columns: Mapping[str, Column]) -> KnownL
     if inner.has("torque_nm"):
         load = KnownLoad(inner.text("torque_nm"))
     else:
-        mass, lever = inner.number("mass_kg", unit="kg", low=0.0), inner.number("lever_m", unit="m", low=0.0)
+        bare = inner.has("inertia_kgm2") and not inner.has(
+            "mass_kg"
+        )  # a wheel, or nothing: no weight, no angle
+        mass = 0.0 if bare else inner.number("mass_kg", unit="kg", low=0.0)
+        lever = 0.0 if bare else inner.number("lever_m", unit="m", low=0.0)
         inertia = inner.number("inertia_kgm2", unit="kg m2", low=0.0, default=mass * lever * lever)
         load = KnownLoad(
             None,

@@ -2,7 +2,7 @@
 
     simulation  residuals of the motor and the torsion balance with all effects of the file, averaged over
                 5 ms as there, rms in motion; the torsion's without its mean in each run, whose zero differs
-    free run    error of the simulated velocity after half a second on its own (`jtqd.sysid.diagnosis.gain.free_run`)
+    free run    error of the simulated velocity and position in half a second alone (`jtqd.sysid.diagnosis.gain.free_run`)
     estimators  estimate less sensor, the sensor passed through the same low-pass, rms over the samples in motion
 
 Nothing is fitted. A method that needs what a joint file does not have (efficiency, section `fused`), or a run does not
@@ -34,13 +34,14 @@ SCHEMA: Final = "jtq.score/1"
 MOTOR: Final = "simulation, motor balance"
 TORSION: Final = "simulation, torsion balance"
 FREE: Final = "simulation, free run"
+FREE_POSITION: Final = "simulation, free run, position"
 ESTIMATORS: Final = {
     "tob": "estimator tob",
     "efficiency": "estimator efficiency",
     "fused": "estimator fused, without network",
 }
 """Method of jtqd -> name of its row. Networks are no part of a joint file (`jtq evaluate` scores them)."""
-UNITS: Final = {FREE: "rad/s"}
+UNITS: Final = {FREE: "rad/s", FREE_POSITION: "rad"}
 SETTLE_S: Final = 0.1
 """From the first sample on for so long the filters' starts are in the estimates."""
 
@@ -87,7 +88,10 @@ def errors_on(name: str, table: RunTable, number: int, joint: Joint) -> RunError
     if signals.torsion_nm is not None:
         rest = binned(signals.torsion_nm, samples)[whole]
         errors[TORSION] = _rms(rest - rest.mean()) if len(rest) else math.nan
-    errors[FREE] = free_run(raw, plain).rmse_rad_s if moving.any() else math.nan
+    errors[FREE] = errors[FREE_POSITION] = math.nan
+    if moving.any():
+        free = free_run(raw, plain)
+        errors[FREE], errors[FREE_POSITION] = free.rmse_rad_s, free.rmse_rad
     columns = table.joint(number, joint.gear_ratio)
     assert columns.torque_nm is not None
     settled = moving & (table.time_s - table.time_s[0] >= SETTLE_S)
@@ -116,7 +120,7 @@ def rows_of(scored: Sequence[Sequence[RunErrors]]) -> list[Row]:
     All runs together: root of the mean square, weighted by the samples in motion.
     """
     rows = []
-    for what in (MOTOR, TORSION, FREE, *ESTIMATORS.values()):
+    for what in (MOTOR, TORSION, FREE, FREE_POSITION, *ESTIMATORS.values()):
         each = [[run.errors.get(what, math.nan) for run in runs] for runs in scored]
         if not any(math.isfinite(error) for errors in each for error in errors):
             continue

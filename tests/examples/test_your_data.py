@@ -115,6 +115,16 @@ def test_the_rig_is_found_as_it_is(place: Path) -> None:
     assert any("taken as true" in note for note in found["channel_notes"])
 
 
+def test_with_no_torque_known_the_target_is_the_position_in_a_free_run(place: Path) -> None:
+    found = json.loads((place / "flat" / "diagnosis" / "findings.json").read_text())
+    assert found["verdict"] == "cause"
+    for cause, attribute in zip(found["causes"], ("coulomb", "viscous"), strict=True):
+        (each,) = cause["parameters"].values()
+        assert each["ci95"][0] <= getattr(TRUE, attribute) <= each["ci95"][1]
+    gain = found["gain"]
+    assert gain["free_run_position_after_rad"] < 0.01 * gain["free_run_position_before_rad"]
+
+
 def test_the_gain_is_there_on_new_runs_in_our_simulation_and_in_mujoco(
     place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

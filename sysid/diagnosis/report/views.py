@@ -364,6 +364,9 @@ def gain_views(gain: Gain | None) -> list[BarView]:
         unknown = (math.nan, math.nan)
         errors = (gain.free_run_before, gain.free_run_after)
         views.append(_bar("free run, velocity", "rad/s", errors, unknown, ""))
+    errors = (gain.free_run_position_before, gain.free_run_position_after)
+    if all(math.isfinite(error) for error in errors):
+        views.append(_bar("free run, position", "rad", errors, (math.nan, math.nan), ""))
     return views
 
 

@@ -12,6 +12,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
+from jtqd.sysid.diagnosis import guards
 from jtqd.sysid.diagnosis import refine as refine_module
 from jtqd.sysid.diagnosis import regressors as columns_module
 from jtqd.sysid.diagnosis.current_zero import RestCurrent, offset_at_rest, rest_current
@@ -20,9 +21,11 @@ from jtqd.sysid.diagnosis.diagnose import combined, one_sensor, with_effects_app
 from jtqd.sysid.diagnosis.findings import AMBIGUOUS, CAUSE, INSUFFICIENT, NO_GAP, UNEXPLAINED, Findings, Gap
 from jtqd.sysid.diagnosis.gain import held_out_gain
 from jtqd.sysid.diagnosis.gaps import _repeats
+from jtqd.sysid.diagnosis.guards import free_run_fall
 from jtqd.sysid.diagnosis.noise import ORDER, Noise
 from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, free_names, parameter, refine
 from jtqd.sysid.diagnosis.regressors import contribution, families
+from jtqd.sysid.diagnosis.search import Hypothesis
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
 from jtqd.sysid.diagnosis.verdict import _normal_phase
 from tests.estimator.effects.effect_signals import PLAIN, extended
@@ -141,6 +144,8 @@ def test_the_gain_is_that_of_the_truth(refined: tuple[Dataset, Refined]) -> None
         "equal runs"
     )
     assert gain.free_run_after < gain.free_run_before
+    assert gain.free_run_position_after < gain.free_run_position_before
+    assert free_run_fall(dataset, result, 0) > 0.0
 
 
 def test_a_step_stays_in_range_and_is_not_too_long() -> None:
@@ -324,3 +329,15 @@ def test_terms_of_the_search_are_where_a_refinement_starts() -> None:
     columns = [contribution(one.effect, p, s)["motor"] for p in one.term.basis]
     whole = contribution(one.effect, one.term.combine([0.7, -1.1]), s)["motor"]
     assert whole == pytest.approx(0.7 * columns[0] - 1.1 * columns[1], abs=1e-9)
+
+
+def test_where_no_torque_was_measured_a_cause_must_lower_the_position_error_of_a_free_run(
+    refined: tuple[Dataset, Refined], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset, result = refined
+    monkeypatch.setattr(guards, "nothing_of", lambda _: [{}])
+    monkeypatch.setattr(guards, "free_run_fall", lambda *_: -0.1)
+    best = Hypothesis((), result, 0.0)  # type: ignore[arg-type]
+    assert guards.objections(dataset, best, result) == []
+    found = guards.objections(replace(dataset, no_torque=True), best, result)
+    assert found == [(0, "it raises the error of the position in a free run on runs left out")]
