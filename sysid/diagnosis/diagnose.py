@@ -13,11 +13,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
-from jtqd.sysid.diagnosis.current_zero import unpowered_columns, with_readings
 from jtqd.sysid.diagnosis.dataset import Dataset, build_dataset, resolution_notes, usable_signals
 from jtqd.sysid.diagnosis.evidence import RELEVANT
 from jtqd.sysid.diagnosis.findings import (
@@ -30,20 +28,19 @@ from jtqd.sysid.diagnosis.findings import (
     OddRun,
 )
 from jtqd.sysid.diagnosis.leftover import events_left
-from jtqd.sysid.diagnosis.mixed_model import Mixed
 from jtqd.sysid.diagnosis.next_experiment import each_joint, next_experiment
-from jtqd.sysid.diagnosis.noise import Noise, noise_model, run_sums
+from jtqd.sysid.diagnosis.noise import Noise
 from jtqd.sysid.diagnosis.odd_runs import odd_run
 from jtqd.sysid.diagnosis.recordings import piece_notes, recordings
-from jtqd.sysid.diagnosis.refine import present_effects, refine
-from jtqd.sysid.diagnosis.regressors import RunData, column_moments
+from jtqd.sysid.diagnosis.refine import Refined, present_effects, refine, set_torsion
+from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope
 from jtqd.sysid.diagnosis.search import Hypothesis, Search
-from jtqd.sysid.diagnosis.signals import Channel, JointSignals
-from jtqd.sysid.diagnosis.verdict import RELEVANCE, conclude
+from jtqd.sysid.diagnosis.searched import searched
+from jtqd.sysid.diagnosis.signals import JointSignals
+from jtqd.sysid.diagnosis.verdict import RELEVANCE, conclude, named
 
 _WORST_FIRST: Final = (UNEXPLAINED, AMBIGUOUS, CAUSE, INSUFFICIENT, NO_GAP)
-_PASSES: Final = 2
 
 
 def diagnose(
@@ -92,16 +89,33 @@ def _diagnosed(
         return Findings(INSUFFICIENT, tuple(reasons), names, numbers, next_experiment=plan)
     usable, dataset, odd = without_odd_runs(usable, joints, scope)
     least = RELEVANT * max(joints[n].rated_torque_nm for n in numbers)
-    noise, search, best = _searched(dataset, least)
-    refined = refine(dataset, present_effects(best), noise)
-    events = events_left(dataset, refined, noise, joints)
-    if events:  # no effect makes them: they shall bend none
-        dataset = dataset.without_events(events)
-        noise, search, best = _searched(dataset, least)
-        refined = refine(dataset, present_effects(best), noise)
-    findings = conclude(dataset, search, best, refined, noise, joints, names, numbers, relevance)
+    dataset, noise, search, best, refined = _fitted(dataset, least, joints)
+    pieces = recordings(usable)
+
+    def anew(number: int) -> Sequence[EffectCandidate]:
+        part = [run for run, piece in zip(usable, pieces, strict=True) if piece != number]
+        for s in (joint for run in part for joint in run):
+            set_torsion(s, ())  # it is as the last fit left it
+        data, whiter, part_search, found, fit = _fitted(build_dataset(part, joints, scope), least, joints)
+        return named(data, part_search, found, fit, whiter, joints, relevance)
+
+    findings = conclude(dataset, search, best, refined, noise, joints, names, numbers, relevance, anew)
     notes = (*reasons, *(o.text for o in odd), *resolution_notes(usable), *piece_notes(usable))
     return replace(findings, channel_notes=notes, odd_runs=tuple(odd))
+
+
+def _fitted(
+    dataset: Dataset, least_nm: float, joints: Mapping[int, Joint]
+) -> tuple[Dataset, Noise, Search, Hypothesis, Refined]:
+    """Return dataset, noise, search, best hypothesis and its refinement; again without the events that no effect makes."""
+    noise, search, best = searched(dataset, least_nm)
+    refined = refine(dataset, present_effects(best), noise)
+    events = events_left(dataset, refined, noise, joints)
+    if events:  # they shall bend none
+        dataset = dataset.without_events(events)
+        noise, search, best = searched(dataset, least_nm)
+        refined = refine(dataset, present_effects(best), noise)
+    return dataset, noise, search, best, refined
 
 
 def without_odd_runs(
@@ -192,41 +206,3 @@ def _with_value(joint: Joint, path: list[str], value: float) -> Joint:
         return replace(joint, **changed)
     inner: dict[str, Any] = {path[1]: value}
     return replace(joint, friction=replace(joint.friction, **inner))
-
-
-def _searched(dataset: Dataset, least_nm: float) -> tuple[Noise, Search, Hypothesis]:
-    """Return noise model and best hypothesis: the noise first from what nothing explains, then from what the best
-    hypothesis leaves, which is more by what the many columns of the first have fitted of the noise itself.
-    """
-    runs, candidates = dataset.runs, dataset.candidates
-    columns = candidates[-1].columns.stop if candidates else 0
-    groups = dataset.families
-    sigma = np.array([g.sigma for g in groups])
-    moments = column_moments(runs, columns)
-    unpowered = unpowered_columns(candidates, dataset.joints)
-    residuals = dataset.unexplained
-    for k in range(_PASSES):
-        noise = noise_model(runs, residuals, dataset.step_s)
-        sums = [run_sums(run, noise, columns, len(groups)) for run in runs]
-        sums = with_readings(sums, dataset.readings, unpowered)
-        mixed = Mixed(sums, columns, sigma, dataset.pieces)
-        effective = mixed.rows / noise.inflation
-        search = Search(mixed, candidates, effective, moments, least_nm, dataset.readings, unpowered)
-        best = search.confirmed()
-        if k + 1 < _PASSES:
-            residuals = {c: unexplained_residual(runs, best, c) for c in residuals}
-    return noise, search, best
-
-
-def unexplained_residual(runs: Sequence[RunData], best: Hypothesis, channel: Channel) -> list[FloatArray]:
-    """Return the residual less the chosen effects and each run's own changes [n], NaN where not valid."""
-    out = []
-    columns = {c: float(b) for c, b in zip(best.model.columns, best.model.beta, strict=True)}
-    for run, u in zip(runs, best.model.nuisances, strict=True):
-        if channel not in run.channels:
-            continue
-        d = run.channels[channel]
-        weights = np.array([columns.get(int(k), 0.0) for k in d.index])
-        rest = d.residual - d.regressors @ weights - d.nuisances @ u[d.families]
-        out.append(np.where(d.valid, rest, np.nan))
-    return out

@@ -23,8 +23,12 @@ from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.search import Hypothesis, Search
 
 Key = tuple[str, JointName]
-Names = Callable[[Dataset, Search], Sequence[EffectCandidate]]
-"""What is named of a dataset, searched anew."""
+Names = Callable[[int], Sequence[EffectCandidate]]
+"""What is named without a recording, by its number."""
+MOST_ANEW: Final = 5
+"""Recordings up to which the others are diagnosed anew from their signals on, where it matters (few runs, or something is
+left over); else the sums of all runs are searched again, which costs a tenth.
+"""
 _NAMED_RUNS: Final = 3
 """Runs listed in a line."""
 
@@ -64,11 +68,21 @@ def named_by_fewer(
 ) -> Iterator[tuple[str, Sequence[EffectCandidate]]]:
     """Yield (run left out, what the others name) of every recording, where the others are enough."""
     for number in range(search.mixed.runs):
-        part = dataset.without_recording(number)
-        if search.mixed.runs - 1 < FEWEST_RUNS or moving_s(part.signals) < SHORTEST_MOVING_S:
+        others = dataset.without_recording(number).signals
+        if search.mixed.runs - 1 < FEWEST_RUNS or moving_s(others) < SHORTEST_MOVING_S:
             continue
         left_out = dataset.runs[int(np.argmax(search.mixed.pieces == number))].name
-        yield left_out, names(part, search.without_run(number))
+        yield left_out, names(number)
+
+
+def same_candidates(search: Search, chosen: Sequence[EffectCandidate]) -> list[EffectCandidate]:
+    """Return the search's own candidates of these effects, of the same term where it has that."""
+    out = []
+    for c in chosen:
+        mine = [o for o in search.candidates if o.key == c.key]
+        same = [o for o in mine if dict(o.term.basis[0]) == dict(c.term.basis[0])]
+        out += (same or mine)[:1]
+    return out
 
 
 class Compared:

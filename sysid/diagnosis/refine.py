@@ -124,7 +124,7 @@ def refine(dataset: Dataset, present: Sequence[PresentEffect], noise: Noise) -> 
     model = best.model
     for run_signals in dataset.signals:
         for s in run_signals:
-            _set_torsion(s, best.present)
+            set_torsion(s, best.present)
     certain = best.mixed.marginal(np.full_like(model.variances, 1e-12))[0]
     count = len(model.columns)
     share = np.zeros(count)
@@ -146,7 +146,7 @@ def _linearised(dataset: Dataset, present: Sequence[PresentEffect], noise: Noise
     signals, runs, samples, groups = dataset.signals, dataset.runs, dataset.samples, dataset.families
     for run_signals in signals:
         for s in run_signals:
-            _set_torsion(s, present)
+            set_torsion(s, present)
     data = [_run_at(s, run, present, samples) for s, run in zip(signals, runs, strict=True)]
     count = sum(len(p.free) for p in present)
     sums = [run_sums(d, noise, count, len(groups)) for d in data]
@@ -169,7 +169,7 @@ def _stepped(iterate: _Iterate) -> tuple[list[PresentEffect], bool]:
     return now, settled
 
 
-def _set_torsion(s: JointSignals, present: Sequence[PresentEffect]) -> None:
+def set_torsion(s: JointSignals, present: Sequence[PresentEffect]) -> None:
     """Set the torsion that effects see to what it is: that of the encoders for what follows it with memory or play, else
     what the spring does with the causes, K d = tau + their contributions.
     """

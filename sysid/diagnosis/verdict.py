@@ -13,7 +13,16 @@ from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.current_zero import offset_at_rest, rest_current
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.evidence import RELEVANT, candidate_table, class_beside, equivalence_class
-from jtqd.sysid.diagnosis.fewer_runs import Compared, Gone, Key, kept_text, named_by_fewer
+from jtqd.sysid.diagnosis.fewer_runs import (
+    MOST_ANEW,
+    Compared,
+    Gone,
+    Key,
+    Names,
+    kept_text,
+    named_by_fewer,
+    same_candidates,
+)
 from jtqd.sysid.diagnosis.findings import (
     AMBIGUOUS,
     CAUSE,
@@ -155,6 +164,7 @@ def _with_fewer(  # noqa: PLR0917
     noise: Noise,
     joints: Mapping[int, Joint],
     relevance: float,
+    anew: Names | None,
 ) -> tuple[_Found, list[tuple[EffectCandidate, ...]], list[str]]:
     """Return what was found with what fewer runs name and the runs left out bear out, its classes, and a line about each
     effect that fewer runs name (`fewer_runs`).
@@ -162,7 +172,10 @@ def _with_fewer(  # noqa: PLR0917
     classes = _classes(search, found)
     here = {c.key for c in found.best.chosen} | {c.key for others in classes for c in others}
 
-    def names(part: Dataset, of_part: Search) -> Sequence[EffectCandidate]:
+    def names(number: int) -> Sequence[EffectCandidate]:
+        if anew is not None and (found.large or found.few is not None) and search.mixed.runs <= MOST_ANEW:
+            return same_candidates(search, anew(number))
+        part, of_part = dataset.without_recording(number), search.without_run(number)
         best = of_part.confirmed()
         quick = LeaveOneOut(part, of_part).confirmed(best) if of_part.mixed.runs < ENOUGH_RUNS else best
         if all(c.key in here for c in quick.chosen):
@@ -209,6 +222,19 @@ def _with_fewer(  # noqa: PLR0917
     return found, classes, said
 
 
+def named(  # noqa: PLR0917
+    dataset: Dataset,
+    search: Search,
+    best: Hypothesis,
+    refined: Refined,
+    noise: Noise,
+    joints: Mapping[int, Joint],
+    relevance: float,
+) -> Sequence[EffectCandidate]:
+    """Return what may be named of a dataset, without a look at fewer runs."""
+    return _found(dataset, search, best, refined, noise, joints, relevance).best.chosen
+
+
 def _squares(explained: Sequence[Mapping[Channel, float]]) -> float:
     return sum(r * r for e in explained for r in e.values())
 
@@ -231,10 +257,11 @@ def conclude(  # noqa: PLR0917
     names: tuple[str, ...],
     numbers: tuple[int, ...],
     relevance: float = RELEVANCE,
+    anew: Names | None = None,
 ) -> Findings:
-    """Return the findings of one diagnosis; relevance: see RELEVANCE."""
+    """Return the findings of one diagnosis; relevance: see RELEVANCE; anew: what is named without a recording."""
     found = _found(dataset, search, best, refined, noise, joints, relevance)
-    found, classes, became = _with_fewer(dataset, search, found, noise, joints, relevance)
+    found, classes, became = _with_fewer(dataset, search, found, noise, joints, relevance, anew)
     few, left, whole, judged, matters = found.few, found.left, found.whole, found.refined, found.matters
     gain = held_out_gain(dataset, found.proven)
     best, refined, classes = _without_asymmetry_at_rest(
