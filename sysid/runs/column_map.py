@@ -262,9 +262,7 @@ def _load(section: Section, joint: int, columns: Mapping[str, Column]) -> KnownL
     if inner.has("torque_nm"):
         load = KnownLoad(inner.text("torque_nm"))
     else:
-        bare = inner.has("inertia_kgm2") and not inner.has(
-            "mass_kg"
-        )  # a wheel, or nothing: no weight, no angle
+        bare = inner.has("inertia_kgm2") and not inner.has("mass_kg")  # it only turns
         mass = 0.0 if bare else inner.number("mass_kg", unit="kg", low=0.0)
         lever = 0.0 if bare else inner.number("lever_m", unit="m", low=0.0)
         inertia = inner.number("inertia_kgm2", unit="kg m2", low=0.0, default=mass * lever * lever)

@@ -66,11 +66,10 @@ def test_the_text_holds_the_values(name: str) -> None:
     assert np.array_equal(cells, np.column_stack(list(table.values())))
 
 
-@pytest.mark.parametrize("name", sorted(set(PRESETS) - {"one_file"}))
+@pytest.mark.parametrize("name", sorted(PRESETS))
 def test_every_preset_can_be_read(name: str, tmp_path: Path) -> None:
-    """That runs in one file are refused today is the reader's matter."""
     paths, _ = write(tmp_path, [a_run(), a_run(0.4)], {1: JOINT}, PRESETS[name], 3)
-    runs = read_runs(paths)
+    runs = read_runs(paths, in_pieces=True)
     assert len(runs) == 2
     assert len(runs[0].table.time_s) > 90
 
