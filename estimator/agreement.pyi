@@ -9,7 +9,7 @@ DOWN_S: Final = 5.0
 LEVEL: Final = 1.4
 GAIN: Final = 2.0
 LOWER_SIGMAS: Final = 4.0
-LEAST_SHARE: Final = 0.01
+LEAST_SHARE: Final = 0.02
 
 def levels(
     fused: Fused,

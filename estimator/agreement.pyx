@@ -36,7 +36,7 @@ GAIN: Final = 2.0
 """Errors that the slow states take for friction or for a zero, and a gain's prior, hide a part: chosen, with the rest, on
 runs that no figure is reported on."""
 LOWER_SIGMAS: Final = 4.0
-LEAST_SHARE: Final = 0.01
+LEAST_SHARE: Final = 0.02
 """The status is lowered where the doubt is this many times the estimate's own sigma, and this part of the rated torque."""
 
 cdef double INVERSE_TREND = 1.0 / TREND_S, INVERSE_UP = 1.0 / UP_S, INVERSE_DOWN = 1.0 / DOWN_S
