@@ -9,8 +9,8 @@ from jtqd.estimator.run import EstimateRun, ObservedRun
 from jtqd.estimator.sample import Estimator
 from jtqd.estimator.settings import EstimatorSettings
 
-STANDSTILL_SIGMAS: Final = 3.0
-LOWERED_S: Final = 0.1
+STANDSTILL_SIGMAS: Final[float]
+LOWERED_S: Final[float]
 
 def quadrants(raw_nm: FloatArray, velocity_rad_s: FloatArray) -> QuadrantArray: ...
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from jtqd.drivers.devices import COMMANDER_NODE, JTQD_NODE, SYNC_COB_ID
 from jtqd.drivers.filters import CanFilter, exact
 from jtqd.drivers.nmt import HEARTBEAT_BASE
+from jtqd.drivers.sdo import REQUEST_ID
 from jtqd.sim_can.canopen_node import CanopenNode
 from jtqd.sim_can.demo import demo_current, demo_velocity
 from jtqd.sim_can.drive_node import DEFAULT_INTERPOLATION_S, OPERATION_ENABLED, DriveNode
@@ -31,7 +32,7 @@ def bench_filters(drives: int = 2) -> tuple[CanFilter, ...]:
     """
     ids = [0x000, SYNC_COB_ID, HEARTBEAT_BASE + JTQD_NODE, HEARTBEAT_BASE + COMMANDER_NODE]
     nodes = range(1, drives + 1)
-    ids += [0x600 + node for node in (*nodes, sensor_node(drives))]
+    ids += [REQUEST_ID + node for node in (*nodes, sensor_node(drives))]
     ids += [base + node for base in (0x200, 0x300) for node in nodes]
     return tuple(exact(can_id) for can_id in ids)
 

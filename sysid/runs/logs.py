@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jtqd.daemon.logs import LogError, LogFile, Records, iter_topics, log_parts, topics_of
+from jtqd.drivers.cia402 import STATES, TOLD, State
 from jtqd.drivers.devices import NOT_MEASURED, TEMPERATURE_C_PER_UNIT, drive_tpdo3
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError, counted
@@ -25,9 +26,10 @@ from jtqd.models.files import parse_yaml
 
 DRIVE_INPUTS: Final = 3
 """input_flags of the log: both PDOs of the drive are of this cycle."""
-_ENABLED_MASK, _ENABLED = 0x6F, 0x27  # 6041h: "operation enabled" of CiA 402
-_NO_POWER: Final = ((0x4F, 0x40), (0x6F, 0x21), (0x6F, 0x23))
-"""Mask and value of 6041h: switch on disabled, ready to switch on, switched on."""
+_ENABLED: Final = np.array([state is State.OPERATION_ENABLED for state in STATES])
+_NO_POWER: Final = np.array(
+    [state in (State.SWITCH_ON_DISABLED, State.READY, State.SWITCHED_ON) for state in STATES]
+)
 _LINK: Final = "link_position_rad"
 """Not there in the log of a joint with one encoder."""
 _INPUTS: Final = ("current_a", "motor_position_rad", "motor_velocity_rad_s", _LINK)
@@ -261,7 +263,7 @@ def _temperatures(frames: Records, nodes: Mapping[int, int]) -> dict[int, Readin
 
 def _enabled(state: Records) -> Flags:
     """Return cycles [n] in which the drive is in "operation enabled", by a fresh statusword."""
-    found: Flags = (state["statusword"] & _ENABLED_MASK) == _ENABLED
+    found: Flags = _ENABLED[state["statusword"] & TOLD]
     return found & _fresh(state)
 
 
@@ -342,7 +344,7 @@ def _columns(state: Records, sensor: bool, temperature: FloatArray | None) -> Jo
 
 
 def _unpowered(statusword: NDArray[Any]) -> Flags:
-    found: Flags = np.logical_or.reduce([(statusword & mask) == value for mask, value in _NO_POWER])
+    found: Flags = _NO_POWER[statusword & TOLD]
     return found
 
 

@@ -184,8 +184,7 @@ def test_one_joint_alone(tmp_path, capsys):
     status, _, err = run(capsys, *arguments, "--out", tmp_path)
     assert (status, err) == (0, "")
     config = load_config(tmp_path / "jtqd.yaml")
-    assert config.joints[0].node_id == 9
-    assert [each.node_id for each in config.joints if each.mandatory] == [9]
+    assert [(each.number, each.node_id) for each in config.joints] == [(1, 9)]
 
 
 def test_a_slower_bus_gets_a_longer_period(tmp_path, capsys):
