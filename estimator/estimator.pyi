@@ -11,6 +11,7 @@ from jtqd.estimator.settings import EstimatorSettings
 
 STANDSTILL_SIGMAS: Final[float]
 LOWERED_S: Final[float]
+SLOPE_NM: Final[float]
 
 def quadrants(raw_nm: FloatArray, velocity_rad_s: FloatArray) -> QuadrantArray: ...
 
