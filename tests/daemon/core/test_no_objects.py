@@ -23,7 +23,7 @@ from tests.benchmarks import host
 from tests.benchmarks.fixture import Fixture
 
 Count = Callable[[Callable[[], object]], int]
-SLOTS, CYCLES, ROUNDS = 200, 100, 20
+SLOTS, CYCLES, ROUNDS = 200, 40, 20
 _SOURCE = Path(__file__).with_name("allocations.c")
 
 
