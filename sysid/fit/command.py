@@ -454,8 +454,8 @@ def _lines(joint: Joint, fit: FusedFit) -> list[str]:
     agreement = fit.fused.agreement
     if agreement is not None:
         lines.append(
-            f"  current and torsion differ by up to {agreement.slow_nm:.2f} Nm slowly and {agreement.fast_nm:.2f} Nm over the motor's "
-            "turn; sigma grows beyond"
+            f"  current and torsion differ by up to {agreement.slow_nm:.2f} Nm slowly and {agreement.fast_nm:.2f} Nm "
+            "over the motor's turn; sigma grows beyond"
         )
     return lines
 
