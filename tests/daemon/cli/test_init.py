@@ -149,7 +149,7 @@ def test_a_drive_that_tells_less_gets_objects_that_say_so(without, wanted, objec
     assert why in text
     (tmp_path / "joint_1.yaml").write_text(joint_text(draft))
     config = tmp_path / "c.yaml"
-    config.write_text(config_text(ConfigDraft("can0", 1_000_000, 1000, [draft], None, None, (), 2000, 9)))
+    config.write_text(config_text(ConfigDraft("can0", 1_000_000, 1000, [draft], None, None)))
     joint = load_config(config).joints[0]
     profile = DriveProfile(NODE, objects=joint.objects, torque_constant_nm_per_a=0.05)
     scaling, _ = drive_scaling(profile, found.numbers)
@@ -184,8 +184,7 @@ def test_one_joint_alone(tmp_path, capsys):
     status, _, err = run(capsys, *arguments, "--out", tmp_path)
     assert (status, err) == (0, "")
     config = load_config(tmp_path / "jtqd.yaml")
-    assert config.joints[0].node_id == 9
-    assert [each.node_id for each in config.joints if each.mandatory] == [9]
+    assert [each.node_id for each in config.joints] == [9], "no other joint is made up"
 
 
 def test_a_slower_bus_gets_a_longer_period(tmp_path, capsys):
@@ -277,6 +276,18 @@ def test_the_devices_of_a_bus(bench, tmp_path, capsys):
     assert "given" not in content["joint_1"]
     config = load_config(tmp_path / "arm" / "jtqd.yaml")
     assert config.joints[0].sensor_channel == 1
+
+    status, out, err = run(capsys, "--bus", bench, "--from-eds", EDS, "--out", tmp_path / "with_eds")
+    assert (status, err) == (0, "")
+    assert [line.rsplit("by ")[-1] for line in out.splitlines() if line.startswith("node 1:")] == [
+        "the bus)",
+        f"defaults of {EDS.name})",
+    ]
+    other = tmp_path / "other.eds"
+    other.write_text(EDS.read_text().replace("DefaultValue=1953", "DefaultValue=154"))
+    status, _, err = run(capsys, "--bus", bench, "--from-eds", other, "--out", tmp_path / "other")
+    assert (status, err.count("\n")) == (2, 1)
+    assert "is of vendor 0000009Ah, but node 1 says 000007A1h" in err
 
     status, _, err = run(capsys, "--bus", bench, "--node", 8, "--out", tmp_path / "other")
     assert status == 2
