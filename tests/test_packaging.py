@@ -4,7 +4,9 @@ Environments are made without network, from the packages that are installed here
 `daemon`, is fetched.
 """
 
+import json
 import os
+import re
 import subprocess
 import sys
 import sysconfig
@@ -217,3 +219,21 @@ def test_the_wheel_alone_runs_the_bench_from_an_empty_folder(wheels: Path, tmp_p
     assert done.returncode == 0, done.stderr
     assert "RMSE joint 2" in done.stdout
     assert [path.suffix for path in (empty / "logs").iterdir()] == [".mcap"]
+
+
+def test_what_the_container_file_names_exists() -> None:
+    text = (ROOT / "packaging" / "Containerfile").read_text(encoding="utf-8")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    copied = [
+        word
+        for line in re.findall(r"^COPY (?!--from)(.*)$", text, re.MULTILINE)
+        for word in line.split()[:-1]
+    ]
+    assert {*PACKAGES, "src", "setup.py", "pyproject.toml"} <= {*copied}
+    assert [word for word in copied if not (ROOT / word).exists()] == []
+    for extras in re.findall(r"EXTRAS=([\w,]+)", text):
+        assert set(extras.split(",")) <= set(project["optional-dependencies"]), extras
+    assert json.loads(text.split("ENTRYPOINT ")[1].splitlines()[0])[0] in project["scripts"]
+    named = re.search(r"python:(3\.\d+)", text)
+    assert named is not None
+    assert project["requires-python"] == f">={named[1]}"

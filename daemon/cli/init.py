@@ -253,14 +253,25 @@ def _found(options: argparse.Namespace) -> Found:
         raise UsageError(f"--node: {len(nodes)} drives, this version of jtqd has at most {MAX_JOINTS} joints")
     for node, path in zip(nodes, _each("from_eds", options.from_eds, len(nodes)), strict=True):
         if path is not None:
-            surveys[node] = merged(eds_survey(path, node, options.profile), surveys.get(node))
-            notes.append(f"node {node}: {description(surveys[node])}")
+            eds, device = eds_survey(path, node, options.profile), surveys.get(node)
+            _refuse_the_eds_of_another(node, path, eds, device)
+            surveys[node] = merged(eds, device)
+            notes.append(f"node {node}: {description(eds)}")
     for node in nodes:
         if node in surveys and surveys[node].profile != DRIVE:
             raise UsageError(f"node {node} is no CiA 402 drive: {description(surveys[node])}")
     families = {node: family_of(surveys.get(node), options.profile) for node in nodes}
     notes += [f"node {node}: profile {each.name} ({each.title})" for node, each in families.items() if each]
     return Found(nodes, surveys, sensor or None, notes, families)
+
+
+def _refuse_the_eds_of_another(node: int, path: Path, eds: Survey, device: Survey | None) -> None:
+    vendor = IDENTITY["vendor"]
+    told, found = eds.numbers.get(vendor), device.numbers.get(vendor) if device else None
+    if told and found and told != found:
+        raise UsageError(
+            f"--from-eds {path}: is of vendor {told:08X}h, but node {node} says {found:08X}h (1018h:1)"
+        )
 
 
 def family_of(survey: Survey | None, name: str | None) -> Family | None:

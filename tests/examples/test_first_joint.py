@@ -24,7 +24,6 @@ NOT_HERE = {
     "sudo ip link set can0 type can bitrate 1000000": "a virtual interface has no bit rate",
     "sudo ip link set can0 type can restart-ms 100": "and no bus-off",
     "sudo ip link set can0 txqueuelen 1000 up": "other tests use the interface",
-    "jtq sim --bus vcan0 --profile rest": "started by the fixture",
 }
 FINDINGS = {"jtq doctor": {0, 1, 3}, "jtq check": {0, 3}, "jtq diagnose": {0, 3}, "jtq evaluate": {0, 3}}
 """Exit statuses that are fine; 0 alone for all others. The guest is no good machine, which `doctor` rightly says."""
@@ -49,6 +48,23 @@ def test_every_command_is_known_and_everything_that_is_left_out_stands_in_the_pa
         assert any(each.startswith(needed) for each in run), needed
 
 
+def emulated(command: str) -> subprocess.Popen[str]:
+    """Start the emulated bench as the page says it, on the interface of the tests."""
+    options = command.replace("vcan0", INTERFACE).split()[2:]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "jtqd.sim_can", *options], stderr=subprocess.PIPE, text=True
+    )
+    assert process.stderr is not None
+    assert "ready" in process.stderr.readline()
+    return process
+
+
+def end(process: subprocess.Popen[str] | None) -> None:
+    if process is not None and process.poll() is None:
+        process.terminate()
+        process.communicate(timeout=60)
+
+
 @pytest.mark.campaign
 @pytest.mark.socketcan
 @pytest.mark.skipif(shutil.which("cc") is None, reason="NOT TESTED: no cc")
@@ -60,20 +76,18 @@ def test_every_command_of_the_page(tmp_path: Path) -> None:
         "RUNTIME_DIRECTORY": str(tmp_path / "run"),
     }
     (tmp_path / "run").mkdir()
-    bench = subprocess.Popen(
-        [sys.executable, "-m", "jtqd.sim_can", "--bus", INTERFACE, "--profile", "rest"],
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    assert bench.stderr is not None
-    assert "ready" in bench.stderr.readline()
+    bench: subprocess.Popen[str] | None = None
     beside: subprocess.Popen[str] | None = None
     said = {}
     try:
         for command in commands():
             if command in NOT_HERE:
                 continue
-            line = command.replace("can0", INTERFACE)
+            if command.startswith("jtq sim"):
+                end(bench)
+                bench = emulated(command)
+                continue
+            line = re.sub(r"\bcan0\b", INTERFACE, command)
             if beside is not None and not command.startswith(IN_A_SECOND_TERMINAL):
                 _, err = beside.communicate(timeout=60)
                 assert beside.returncode == 0, err
@@ -107,12 +121,11 @@ def test_every_command_of_the_page(tmp_path: Path) -> None:
             assert "Traceback" not in done.stderr
             said[command] = done.stdout
     finally:
-        for process in (beside, bench):
-            if process is not None and process.poll() is None:
-                process.terminate()
-                process.communicate(timeout=60)
+        end(beside)
+        end(bench)
     (received,) = (out for command, out in said.items() if command.startswith("./receive"))
     assert " lost 0," in received
+    assert "USE   valid" in received
     fitted = [out for command, out in said.items() if command.startswith("jtq fit")]
     assert all("coulomb_nm = " in out for out in fitted)
     assert (tmp_path / "diagnosis" / "report.html").is_file()

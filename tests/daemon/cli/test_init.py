@@ -277,6 +277,18 @@ def test_the_devices_of_a_bus(bench, tmp_path, capsys):
     config = load_config(tmp_path / "arm" / "jtqd.yaml")
     assert config.joints[0].sensor_channel == 1
 
+    status, out, err = run(capsys, "--bus", bench, "--from-eds", EDS, "--out", tmp_path / "with_eds")
+    assert (status, err) == (0, "")
+    assert [line.rsplit("by ")[-1] for line in out.splitlines() if line.startswith("node 1:")] == [
+        "the bus)",
+        f"defaults of {EDS.name})",
+    ]
+    other = tmp_path / "other.eds"
+    other.write_text(EDS.read_text().replace("DefaultValue=1953", "DefaultValue=154"))
+    status, _, err = run(capsys, "--bus", bench, "--from-eds", other, "--out", tmp_path / "other")
+    assert (status, err.count("\n")) == (2, 1)
+    assert "is of vendor 0000009Ah, but node 1 says 000007A1h" in err
+
     status, _, err = run(capsys, "--bus", bench, "--node", 8, "--out", tmp_path / "other")
     assert status == 2
     assert "node 8 does not answer" in err
