@@ -38,7 +38,7 @@ from jtqd.daemon.cli.reading import (
 )
 from jtqd.daemon.cli.recent import Moment, Recent, page, sparkline
 from jtqd.daemon.shared.conditions import SEVERITIES, Condition
-from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
+from jtqd.daemon.shared.contacts import contact_line, contact_of
 from jtqd.daemon.shared.notices import ERROR, WARNING, Notice
 from jtqd.daemon.shared.reasons import drive_state, joint_reason, silent_s
 from jtqd.daemon.shared.runtime_dir import About
@@ -126,7 +126,8 @@ def _joint(reading: Reading, number: int) -> dict[str, Any]:
     assert earlier is not None
     n = number - 1
     seen, measured = view.joints[n], view.measured[n]
-    known = seen.status in PUBLISHED and reading.state == RUNNING
+    running = reading.state == RUNNING
+    known = seen.status in PUBLISHED and running
     return {
         "joint": number,
         "name": about.joints[n].name,
@@ -143,9 +144,10 @@ def _joint(reading: Reading, number: int) -> dict[str, Any]:
         "rmse_nm": finite(view.rmse_nm[n]),
         "age_ms": finite(seen.age_ms),
         "zeros": view.zeros[n].content(),
-        "contact": bool(seen.input_flags & FLAG_CONTACT) if seen.input_flags & FLAG_CONTACT_KNOWN else None,
-        "contact_nm": finite(seen.contact_nm),
-        "torque_rate_nm_s": finite(seen.torque_rate_nm_s),
+        "contact": contact_of(seen) if running else None,
+        "contact_nm": finite(seen.contact_nm if running else nan),
+        "contact_threshold_nm": about.joints[n].contact_threshold_nm,
+        "torque_rate_nm_s": finite(seen.torque_rate_nm_s if running else nan),
         "current_a": finite(measured.current_a),
         "motor_velocity_rad_s": finite(measured.motor_velocity_rad_s),
         "temperature_c": finite(measured.temperature_c),
@@ -241,6 +243,7 @@ class StatusView:
                     yield _line(
                         f"zeros {joint.number}", Text(zeros.text, style="" if zeros.plausible else "yellow")
                     )
+            yield from _contacts(about, view, self._recent)
             if self._recent is not None:
                 yield from _last_seconds(self._recent, len(about.joints), width)
         yield ""
@@ -260,6 +263,27 @@ class StatusView:
         yield from _log(reading.log)
         yield from _conditions(reading.conditions)
         yield from _notices(reading.notices)
+
+
+def _contacts(about: About, view: View, recent: Recent | None) -> Iterator[RenderableType]:
+    """Return a line per joint that is watched, and one with how many there were: a short one falls between two readings."""
+    watched = False
+    for joint, seen in zip(about.joints, view.joints, strict=False):
+        if joint.contact_threshold_nm is None:
+            continue
+        watched = True
+        told = contact_of(seen)
+        style = "bold red" if told else "yellow" if told is None else ""
+        yield _line(
+            f"contact {joint.number}", Text(contact_line(seen, joint.contact_threshold_nm), style=style)
+        )
+    if watched:
+        count = view.counters["contacts"]
+        lately = recent.contacts if recent is not None else 0
+        text = Text(f"{count or 'none'} since the start")
+        if recent is not None:
+            text.append(f", {lately} in the last {recent.seconds:.0f} s", style="bold red" if lately else "")
+        yield _line("contacts", text)
 
 
 def _last_seconds(recent: Recent, joints: int, width: int) -> Iterator[RenderableType]:
@@ -626,7 +650,9 @@ def _remember(recent: Recent, reading: Reading) -> None:
     if view is None or reading.state != RUNNING:
         return
     torques = tuple(each.torque_nm if each.status in PUBLISHED else nan for each in view.joints)
-    recent.add(Moment(time.monotonic(), torques, tuple(reading.work), tuple(reading.late)))
+    recent.add(
+        Moment(time.monotonic(), torques, tuple(reading.work), tuple(reading.late), view.counters["contacts"])
+    )
 
 
 def _lines(daemon: Daemon) -> int:
@@ -638,6 +664,8 @@ def _lines(daemon: Daemon) -> int:
             print(f"not running: {reading.why}", flush=True)
         else:
             reader = SnapshotReader(daemon.directory / "snapshot")
-            print(plain_line(reader, reading.earlier, reading.view, daemon.about.bitrate), flush=True)
+            watched = any(each.contact_threshold_nm is not None for each in daemon.about.joints)
+            line = plain_line(reader, reading.earlier, reading.view, daemon.about.bitrate, contacts=watched)
+            print(line, flush=True)
         time.sleep(_PLAIN_PERIOD_S)
     return 0

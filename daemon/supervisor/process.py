@@ -373,6 +373,7 @@ class Supervisor:
             history=self._conditions.history(time.monotonic()),
             began_s=began_s,
             stolen_s=stolen,
+            contacts=self._config.contact is not None,
         )
 
     def _open_bus(self) -> FrameSocket:
@@ -434,7 +435,8 @@ class Supervisor:
         """Serve table, SDO requests and recorder until the loop ends; return the loop's last answer."""
         title = f"jtqd on {self._instance}, node {self._config.node_id:02X}h, {self._config.estimator.method}"
         stopping = 0.0
-        with Display(reader, self._config.bitrate, title, self._log) as display:
+        watched = self._config.contact is not None
+        with Display(reader, self._config.bitrate, title, self._log, contacts=watched) as display:
             while True:
                 sockets = [] if self._bus_gone else [self._bus_service.socket.fd]
                 select.select([*loop.outputs, *sockets, *self._service.descriptors], [], [], 0.05)
