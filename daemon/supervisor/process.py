@@ -31,7 +31,7 @@ from jtqd.daemon.reload.files import Reload, ReloadError
 from jtqd.daemon.ros2.keeper import Ros2Keeper
 from jtqd.daemon.shared.child_process import Child, ChildError, ChildSilence
 from jtqd.daemon.shared.conditions import JOINT, PDO, THE_MACHINE, Conditions, ConditionsFile
-from jtqd.daemon.shared.log_lines import ERROR, WARNING, EventLog, OperatorLog
+from jtqd.daemon.shared.log_lines import ERROR, INFO, WARNING, EventLog, OperatorLog
 from jtqd.daemon.shared.notices import FILE as NOTICES
 from jtqd.daemon.shared.notices import Notices
 from jtqd.daemon.shared.runtime_dir import About, claim, instance_name, remove, write_about
@@ -321,8 +321,11 @@ class Supervisor:
         if wrong is not None:
             raise SupervisorError(wrong)
         self._take_layout(report)
-        if wait_for(loop, self._stopped) is None:
+        ready = wait_for(loop, self._stopped)
+        if ready is None:
             return None
+        for line in ready["notes"]:
+            self._log(line, INFO)
         loop.tell({**report, "worst_load": self._load.worst})
         running = wait_for(loop, self._stopped)
         if running is None:
