@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -36,12 +36,10 @@ def envelope_of(
     velocity_step_rad_s: float = VELOCITY_STEP_RAD_S,
     torque_step_nm: float = TORQUE_STEP_NM,
     room_k: float = ROOM_K,
-    between: Callable[[Table], Table] | None = None,
 ) -> Envelope:
     """Return what moving samples [n] covered: cells of velocity and motor torque with enough of them, and cells between.
 
-    apart_nm: torsion less current path [n]; temperatures_c: of the runs, NaN where one has none; room_k: known beside them;
-    between: what else is known beside the cells that were visited, None: `filled`.
+    apart_nm: torsion less current path [n]; temperatures_c: of the runs, NaN where one has none; room_k: known beside them.
     """
     rows = int(np.ceil(np.abs(velocity_rad_s).max() / velocity_step_rad_s)) + 1
     columns = int(np.ceil(np.abs(raw_nm).max() / torque_step_nm)) + 1
@@ -51,7 +49,7 @@ def envelope_of(
         np.rint(raw_nm / torque_step_nm).astype(int) + columns,
     )
     np.add.at(counts, at, 1)
-    known = (between or filled)(counts >= _VISITS)
+    known = filled(counts >= _VISITS)
     temperatures = [each for each in temperatures_c if np.isfinite(each)]
     return Envelope(
         velocity_step_rad_s,
@@ -67,43 +65,6 @@ def velocity_step(velocity_rad_s: FloatArray) -> float:
     wanted = VELOCITY_STEP_SHARE * float(np.quantile(np.abs(velocity_rad_s), 0.999))
     power = 10.0 ** np.floor(np.log10(wanted))
     return float(f"{power * min(_ROUND, key=lambda each: abs(np.log(each * power / wanted))):.6g}")
-
-
-def convex(known: Table) -> Table:
-    """Also call a cell known that lies between any two known ones: the convex hull of their centres.
-
-    For a law that is smooth in speed and load, such as the additive loss: between what was driven it holds. Fast and heavy
-    at once stays unknown where the runs were fast or heavy.
-    """
-    at = np.argwhere(known)
-    if not len(at):
-        return known
-    result = np.ones_like(known)
-    grid = np.indices(known.shape)
-    corners = _hull([(int(row), int(column)) for row, column in at])
-    for (r, c), (r2, c2) in zip(corners, [*corners[1:], corners[0]], strict=True):
-        result &= (r2 - r) * (grid[1] - c) - (c2 - c) * (grid[0] - r) >= 0
-    if len(corners) < 3:  # all on one line: the half planes do not end it
-        low, high = at.min(axis=0)[:, None, None], at.max(axis=0)[:, None, None]
-        result &= ((grid >= low) & (grid <= high)).all(axis=0)
-    return result
-
-
-def _hull(points: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the corners of the convex hull, counter-clockwise (Andrew's monotone chain); points: sorted."""
-
-    def half(ordered: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
-        chain: list[tuple[int, int]] = []
-        for p in ordered:
-            while len(chain) >= 2:
-                (a, b), (c, d) = chain[-2:]
-                if (c - a) * (p[1] - b) - (d - b) * (p[0] - a) > 0:
-                    break
-                chain.pop()
-            chain.append(p)
-        return chain
-
-    return half(points)[:-1] + half(reversed(points))[:-1] or points
 
 
 def filled(known: Table) -> Table:

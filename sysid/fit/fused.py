@@ -36,7 +36,7 @@ from jtqd.estimator.fusion import Fusion, held
 from jtqd.estimator.joint import AdditiveLoss, Agreement, Friction, Fused, FusedSigma, Torsion
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.sysid.fit.agreement import fit_agreement
-from jtqd.sysid.fit.envelope import FIT_ROOM_K, TORQUE_STEP_SHARE, convex, envelope_of, velocity_step
+from jtqd.sysid.fit.envelope import FIT_ROOM_K, TORQUE_STEP_SHARE, envelope_of, velocity_step
 from jtqd.sysid.fit.losses import LossFit, fit_loss
 from jtqd.sysid.fit.signals import RunSignals
 from jtqd.sysid.fit.torsion import fit_torsion
@@ -281,7 +281,6 @@ def _envelope(
         [run.temperature_c for run in runs],
         velocity_step_rad_s=velocity_step(velocity),
         torque_step_nm=TORQUE_STEP_SHARE * rated_nm,
-        between=convex,
         room_k=FIT_ROOM_K,
     )
     return made if max(len(made.known), len(made.known[0])) <= MAX_CELLS else None

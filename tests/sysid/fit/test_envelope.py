@@ -1,53 +1,9 @@
-"""What the runs of a fit covered: steps in proportion to the joint, and what lies between cells that were driven."""
+"""What the runs of a fit covered: steps in proportion to the joint."""
 
 import numpy as np
 import pytest
 
-from jtqd.sysid.fit.envelope import convex, velocity_step
-
-
-def table(*rows: str) -> np.ndarray:
-    return np.array([[cell == "1" for cell in row] for row in rows])
-
-
-def test_between_two_known_cells_is_known_and_a_corner_beyond_them_is_not() -> None:
-    fast_or_heavy = table("00100", "00000", "10001", "00000", "00100")
-    assert (convex(fast_or_heavy) == table("00100", "01110", "11111", "01110", "00100")).all()
-    assert not convex(fast_or_heavy)[0, 0]
-
-
-@pytest.mark.parametrize(
-    ("known", "expected"),
-    [
-        (table("000", "010", "000"), table("000", "010", "000")),
-        (table("100", "000", "001"), table("100", "010", "001")),
-        (table("101", "000", "000"), table("111", "000", "000")),
-        (table("10", "00", "10"), table("10", "10", "10")),
-        (table("000", "000"), table("000", "000")),
-        (table("0110", "1000", "0001"), table("0110", "1110", "0001")),
-    ],
-)
-def test_the_hull_of_few_cells(known: np.ndarray, expected: np.ndarray) -> None:
-    assert (convex(known) == expected).all()
-
-
-def test_the_hull_is_the_smallest_convex_one() -> None:
-    """Against all segments between two known cells, in a map of 9 by 9."""
-    rng = np.random.default_rng(5)
-    for _ in range(20):
-        known = rng.uniform(size=(9, 9)) < 0.1
-        made = convex(known)
-        assert (made >= known).all()
-        at = np.argwhere(known)
-        for a in at:
-            for b in at:
-                for part in np.linspace(0.0, 1.0, 25):
-                    cell = a + part * (b - a)
-                    if (cell == np.rint(cell)).all():
-                        assert made[tuple(cell.astype(int))]
-        low, high = (at.min(axis=0), at.max(axis=0)) if len(at) else (np.zeros(2), np.zeros(2))
-        inside = np.argwhere(made)
-        assert not len(inside) or ((inside >= low) & (inside <= high)).all()
+from jtqd.sysid.fit.envelope import envelope_of, velocity_step
 
 
 @pytest.mark.parametrize(
@@ -57,3 +13,13 @@ def test_the_hull_is_the_smallest_convex_one() -> None:
 def test_steps_of_speed_are_in_proportion_to_the_joint(largest: float, expected: float) -> None:
     v = np.linspace(-largest, largest, 40_001)
     assert velocity_step(v) == expected
+
+
+def test_a_slow_joint_is_outside_of_its_speeds_a_tenth_beyond_them() -> None:
+    """With the step of the shipped joints its map would go to twice its speed."""
+    v = 0.5 * np.sin(np.linspace(0.0, 60.0, 20_000))
+    made = envelope_of(
+        v, 2.0 * v, np.zeros_like(v) + 0.1, [25.0], velocity_step_rad_s=velocity_step(v), torque_step_nm=0.3
+    )
+    visited = np.flatnonzero(np.array(made.known).any(axis=1)) - len(made.known) // 2
+    assert 0.5 <= (visited.max() + 0.5) * made.velocity_step_rad_s <= 0.55
