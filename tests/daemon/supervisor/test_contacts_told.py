@@ -13,7 +13,8 @@ from rich.console import Console
 from jtqd.daemon.cli import status
 from jtqd.daemon.cli.reading import Daemon, Watch
 from jtqd.daemon.cli.recent import Moment, Recent
-from jtqd.daemon.cli.status import StatusView, content
+from jtqd.daemon.cli.status import StatusView
+from jtqd.daemon.cli.status_json import content
 from jtqd.daemon.config import ContactSettings, load_config
 from jtqd.daemon.core.counters import LastEstimate
 from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
