@@ -200,6 +200,8 @@ FUSED_FEATURES: Final = (
 )
 """The last four are waves: an absolute angle, or one that turns as slowly as the link, would identify the run."""
 
+_ZERO_PROBES: Final = 8
+"""Samples that tell a network whose last layer is zero from one that corrects something."""
 _FUSED_KEYS: Final = ("envelope", "sigma_scale", "input_low", "input_high", "joint", "data_sha256")
 
 
@@ -233,7 +235,8 @@ class FusedNetwork:
     training data per feature), joint, data_sha256.
 
     Public: `name`, `sha256`, `envelope`, `sigma_scale`, `joint`, `data_sha256`, `bound`; `run_one(x0..x6)` correction
-    of one sample [Nm], `run_many([n, 7])` of many.
+    of one sample [Nm], `run_many([n, 7])` of many; `corrects`: False where the correction is 0 everywhere (share 0: the
+    file holds envelope and calibration only).
     """
 
     def __init__(
@@ -269,6 +272,9 @@ class FusedNetwork:
         self.run_one: Final = graph.run_one
         self.perceptron: Final = graph.perceptron
         self.native_error_nm: Final = graph.native_error_nm
+        shares = np.linspace(0.05, 0.95, _ZERO_PROBES)[:, None]
+        probes = np.array(lows) + shares * (np.array(highs) - np.array(lows))
+        self.corrects: Final = any(self.run_one(*probe) != 0.0 for probe in probes.tolist())
 
     def run_many(self, features: FloatArray) -> FloatArray:
         """Return the corrections [n] of samples [n, 7]; equal to run_one to rounding."""

@@ -1,4 +1,4 @@
-"""`jtq plot`: draw a log: estimate with its standard deviation beside the sensor, and their difference."""
+"""`jtq plot`: draw a log: estimate with its standard deviation beside the sensor, their difference, contacts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from jtqd.daemon.logs import LogError, Records, read_topic
-from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.observer import reference_of
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import (
@@ -38,6 +38,9 @@ _SHADES = {
 }
 """By status; a torque was published with the first two only."""
 _OTHER = "#c0c0c0"
+_CONTACT = "#e58fb1"
+CONTACT_KNOWN, CONTACT = 64, 128
+"""Bits of `input_flags` in a log (schema jtqd_msgs/msg/JointEstimate)."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -94,8 +97,18 @@ def reference(log: Records) -> tuple[FloatArray, float]:
     return reference_of(log["sensor_torque_nm"], log["dt_s"], rate), 1e3 / rate
 
 
+def contacts(log: Records) -> BoolArray | None:
+    """Return where a contact was told [n]; None where contacts were not watched, or the log is of before there were any."""
+    if "contact_nm" not in (log.dtype.names or ()) or not (log["input_flags"] & CONTACT_KNOWN).any():
+        return None
+    there: BoolArray = (log["input_flags"] & CONTACT) != 0
+    return there
+
+
 def draw(log: Records, joint: int, path: Path) -> float:
-    """Draw two panels over time: torque and sensor, then their difference; shaded where the status is not valid.
+    """Draw panels over time: torque and sensor, then their difference; shaded where the status is not valid.
+
+    Where contacts were watched, two more: the torque from outside, its contacts shaded, and the torque rate.
 
     Returns:
         The RMSE in the title [Nm], over what was published while the joint moved and the sensor was valid, both of one age;
@@ -111,7 +124,12 @@ def draw(log: Records, joint: int, path: Path) -> float:
     published = np.isin(status, (VALID, DEGRADED, STANDSTILL))
     torque = np.where(published, log["torque_nm"], np.nan)
     sigma, sensor, age = log["sigma_nm"], *reference(log)
-    figure, (above, below) = plt.subplots(2, 1, figsize=(11, 5.2), sharex=True, height_ratios=(3, 1.3))
+    told = contacts(log)
+    ratios = (3, 1.3) if told is None else (3, 1.3, 1.3, 1.3)
+    figure, axes = plt.subplots(
+        len(ratios), 1, figsize=(11, 1.2 + sum(ratios)), sharex=True, height_ratios=ratios
+    )
+    above, below = axes[:2]
     above.fill_between(
         time_s, torque - sigma, torque + sigma, color="#9ec5e8", linewidth=0, label="estimate ± sigma"
     )
@@ -132,7 +150,20 @@ def draw(log: Records, joint: int, path: Path) -> float:
     above.set_title(f"joint {joint}: {title}", fontsize=10)
     above.set_ylabel("joint torque [Nm]")
     below.set_ylabel("difference [Nm]")
-    below.set_xlabel("time [s]")
+    if told is not None:
+        for axis, values, what in zip(
+            axes[2:],
+            (log["contact_nm"], log["torque_rate_nm_s"]),
+            ("from outside\n[Nm]", "torque rate\n[Nm/s]"),
+            strict=True,
+        ):
+            axis.plot(time_s, values, color="#444444", linewidth=0.6)
+            axis.set_ylabel(what)
+            axis.margins(x=0)
+        begun = int(told[0]) + int((np.diff(told.astype(np.int8)) > 0).sum())
+        shade(axes[2], time_s, told, _CONTACT, None)
+        axes[2].set_title(f"{begun} contact{'s' * (begun != 1)}", fontsize=9, color=_CONTACT)
+    axes[-1].set_xlabel("time [s]")
     for axis in (above, below):
         axis.margins(x=0)
         for code in np.unique(status[status != VALID]):

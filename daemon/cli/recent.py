@@ -42,12 +42,13 @@ def largest_bin(now: Sequence[int], before: Sequence[int]) -> int | None:
 
 @dataclass(frozen=True)
 class Moment:
-    """One reading: time of the view [s], torques [Nm] (NaN: none), histograms of work and lateness."""
+    """One reading: time of the view [s], torques [Nm] (NaN: none), histograms of work and lateness, contacts until then."""
 
     time_s: float
     torques: tuple[float, ...]
     work: tuple[int, ...]
     late: tuple[int, ...]
+    contacts: int = 0
 
 
 class Recent:
@@ -72,6 +73,11 @@ class Recent:
     def torques(self, joint: int) -> list[float]:
         """Return the torques of a joint (0, 1, ...), oldest first."""
         return [each.torques[joint] for each in self._moments if joint < len(each.torques)]
+
+    @property
+    def contacts(self) -> int:
+        """Return how many contacts have begun in the window."""
+        return self._moments[-1].contacts - self._moments[0].contacts if self._moments else 0
 
     def largest_us(self, bin_us: float, *, late: bool) -> float | None:
         """Return the upper edge of the largest work time (or lateness) in the window [us]; None without a cycle."""

@@ -34,6 +34,7 @@ from jtqd.daemon.cli.recent import Moment, Recent, sparkline
 from jtqd.daemon.cli.status_json import content
 from jtqd.daemon.cli.terminal import HEAD, HEADING, Columns, Keys, line, paged
 from jtqd.daemon.shared.conditions import SEVERITIES, Condition
+from jtqd.daemon.shared.contacts import contact_line, contact_of
 from jtqd.daemon.shared.notices import ERROR, WARNING, Notice
 from jtqd.daemon.shared.reasons import joint_reason, silent_s
 from jtqd.daemon.shared.runtime_dir import About
@@ -99,6 +100,7 @@ class StatusView:
                     yield line(
                         f"zeros {joint.number}", Text(zeros.text, style="" if zeros.plausible else "yellow")
                     )
+            yield from _contacts(about, view, self._recent)
             if self._recent is not None:
                 yield from _last_seconds(self._recent, len(about.joints), width)
         yield ""
@@ -118,6 +120,27 @@ class StatusView:
         yield from _log(reading.log)
         yield from _conditions(reading.conditions)
         yield from _notices(reading.notices)
+
+
+def _contacts(about: About, view: View, recent: Recent | None) -> Iterator[RenderableType]:
+    """Return a line per joint that is watched, and one with how many there were: a short one falls between two readings."""
+    watched = False
+    for joint, seen in zip(about.joints, view.joints, strict=False):
+        if joint.contact_threshold_nm is None:
+            continue
+        watched = True
+        told = contact_of(seen)
+        style = "bold red" if told else "yellow" if told is None else ""
+        yield line(
+            f"contact {joint.number}", Text(contact_line(seen, joint.contact_threshold_nm), style=style)
+        )
+    if watched:
+        count = view.counters["contacts"]
+        lately = recent.contacts if recent is not None else 0
+        text = Text(f"{count or 'none'} since the start")
+        if recent is not None:
+            text.append(f", {lately} in the last {recent.seconds:.0f} s", style="bold red" if lately else "")
+        yield line("contacts", text)
 
 
 def _last_seconds(recent: Recent, joints: int, width: int) -> Iterator[RenderableType]:
@@ -397,7 +420,9 @@ def _remember(recent: Recent, reading: Reading) -> None:
     if view is None or reading.state != RUNNING:
         return
     torques = tuple(each.torque_nm if each.status in PUBLISHED else nan for each in view.joints)
-    recent.add(Moment(time.monotonic(), torques, tuple(reading.work), tuple(reading.late)))
+    recent.add(
+        Moment(time.monotonic(), torques, tuple(reading.work), tuple(reading.late), view.counters["contacts"])
+    )
 
 
 def _lines(daemon: Daemon) -> int:
@@ -409,6 +434,8 @@ def _lines(daemon: Daemon) -> int:
             print(f"not running: {reading.why}", flush=True)
         else:
             reader = SnapshotReader(daemon.directory / "snapshot")
-            print(plain_line(reader, reading.earlier, reading.view, daemon.about.bitrate), flush=True)
+            watched = any(each.contact_threshold_nm is not None for each in daemon.about.joints)
+            shown = plain_line(reader, reading.earlier, reading.view, daemon.about.bitrate, contacts=watched)
+            print(shown, flush=True)
         time.sleep(_PLAIN_PERIOD_S)
     return 0

@@ -11,7 +11,7 @@ from typing import Any
 
 from jtqd.daemon.cli.reading import RUNNING, CurrentLog, Reading
 from jtqd.daemon.shared.conditions import SEVERITIES, Condition
-from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
+from jtqd.daemon.shared.contacts import contact_of
 from jtqd.daemon.shared.notices import Notice
 from jtqd.daemon.shared.reasons import drive_state, joint_reason
 from jtqd.daemon.shared.snapshot import NMT_STATES, InputView, View
@@ -64,7 +64,8 @@ def _joint(reading: Reading, number: int) -> dict[str, Any]:
     assert earlier is not None
     n = number - 1
     seen, measured = view.joints[n], view.measured[n]
-    known = seen.status in PUBLISHED and reading.state == RUNNING
+    running = reading.state == RUNNING
+    known = seen.status in PUBLISHED and running
     return {
         "joint": number,
         "name": about.joints[n].name,
@@ -81,9 +82,10 @@ def _joint(reading: Reading, number: int) -> dict[str, Any]:
         "rmse_nm": finite(view.rmse_nm[n]),
         "age_ms": finite(seen.age_ms),
         "zeros": view.zeros[n].content(),
-        "contact": bool(seen.input_flags & FLAG_CONTACT) if seen.input_flags & FLAG_CONTACT_KNOWN else None,
-        "contact_nm": finite(seen.contact_nm),
-        "torque_rate_nm_s": finite(seen.torque_rate_nm_s),
+        "contact": contact_of(seen) if running else None,
+        "contact_nm": finite(seen.contact_nm if running else nan),
+        "contact_threshold_nm": about.joints[n].contact_threshold_nm,
+        "torque_rate_nm_s": finite(seen.torque_rate_nm_s if running else nan),
         "current_a": finite(measured.current_a),
         "motor_velocity_rad_s": finite(measured.motor_velocity_rad_s),
         "temperature_c": finite(measured.temperature_c),

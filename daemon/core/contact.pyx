@@ -11,7 +11,6 @@ from jtqd.daemon.core.contact_pdo cimport NO_JOINT, encode_contact, told_of
 from jtqd.daemon.core.record cimport JointBlock
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.estimator.contact cimport (
-    CONTACT_NONE,
     CONTACT_OFF,
     CONTACT_THERE,
     CONTACT_UNKNOWN,
@@ -69,7 +68,7 @@ cdef class ContactWatch:
             else:
                 watch_contact(&self.law[n], s, -joints[n].load_nm, joints[n].sample.motor_position_rad)
             self.tell(joints[n], n, s.residual_nm, s.told)
-            if s.told == CONTACT_THERE and before == CONTACT_NONE:
+            if s.told == CONTACT_THERE and before != CONTACT_THERE:  # a receiver stops on it, whatever was known before
                 self.begun += 1
             n += 2 if self.opposed else 1
 

@@ -2,8 +2,8 @@
 
 The messages hold torque, sigma and sensor torque; a viewer's message path cannot add two fields. So the layout
 brings user scripts, which the viewer compiles and runs itself, on a file as on the live view: they make the sigma band, the
-residual to the sensor and the cycle time, and cost no byte in the log. They are TypeScript: `inputs`, `output` (a topic
-below /studio_script/) and a default export that turns one message into one message.
+residual to the sensor, whether there is a contact, and the cycle time, and cost no byte in the log. They are TypeScript:
+`inputs`, `output` (a topic below /studio_script/) and a default export that turns one message into one message.
 """
 
 from __future__ import annotations
@@ -18,22 +18,23 @@ from pathlib import Path
 from typing import Any
 
 from jtqd.daemon.recording import schemas
-from jtqd.daemon.shared.cycle_record import MOST_JOINTS
+from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN, MOST_JOINTS
 from jtqd.estimator.checked import seconds
 
 # ---- user scripts ----
 
 _PREFIX = "/studio_script/"
 JOINT_TOPICS = {joint: f"{_PREFIX}joint_{joint}" for joint in range(1, MOST_JOINTS + 1)}
-"""Joint -> topic with upper_nm, lower_nm, minus_sigma_nm, residual_nm [Nm]."""
+"""Joint -> topic with upper_nm, lower_nm, minus_sigma_nm, residual_nm [Nm], contact (1, 0; NaN: not known)."""
 CYCLE_TOPIC = f"{_PREFIX}cycle"
 """Topic with period_us, work_us, late_us [us]."""
 
 _JOINT_SCRIPT = """\
-// Sigma band of the estimate, and its residual to the torque sensor of the same age. NaN where either is not known.
+// Sigma band of the estimate, its residual to the torque sensor of the same age, and whether there is a contact. NaN where
+// one is not known.
 import { Input } from "./types";
 
-type Output = { upper_nm: number; lower_nm: number; minus_sigma_nm: number; residual_nm: number };
+type Output = { upper_nm: number; lower_nm: number; minus_sigma_nm: number; residual_nm: number; contact: number };
 
 export const inputs = ["%(state)s"];
 export const output = "%(output)s";
@@ -45,6 +46,7 @@ export default function script(event: Input<"%(state)s">): Output {
     lower_nm: message.torque_nm - message.sigma_nm,
     minus_sigma_nm: -message.sigma_nm,
     residual_nm: message.torque_nm - message.reference_nm,
+    contact: (message.input_flags & %(known)d) === 0 ? NaN : (message.input_flags & %(there)d) === 0 ? 0 : 1,
   };
 }
 """
@@ -88,7 +90,13 @@ def scripts(joints: int = 2) -> dict[str, dict[str, str]]:
     made = {
         f"jtqd-joint-{joint}": {
             "name": f"joint_{joint}",
-            "sourceCode": _JOINT_SCRIPT % {"state": topic.name, "output": JOINT_TOPICS[joint]},
+            "sourceCode": _JOINT_SCRIPT
+            % {
+                "state": topic.name,
+                "output": JOINT_TOPICS[joint],
+                "known": FLAG_CONTACT_KNOWN,
+                "there": FLAG_CONTACT,
+            },
         }
         for joint, topic in enumerate(schemas.joint_topics(joints), start=1)
     }
@@ -189,6 +197,20 @@ def _stage_panels(joint: int) -> dict[str, dict[str, Any]]:
     }
 
 
+def _contact_panels(joint: int) -> dict[str, dict[str, Any]]:
+    state, made = _JOINTS[joint], JOINT_TOPICS[joint]
+    return {
+        f"Plot!contact{joint}": _plot(
+            f"Joint {joint}: torque from outside, Nm",
+            _series(f"{made}.contact", "contact (1)", _RED, 1.5),
+            _series(f"{state}.contact_nm", "from outside", _BLUE),
+        ),
+        f"Plot!rate{joint}": _plot(
+            f"Joint {joint}: torque rate, Nm/s", _series(f"{state}.torque_rate_nm_s", "torque rate", _GREEN)
+        ),
+    }
+
+
 def _cycle_panels() -> dict[str, dict[str, Any]]:
     return {
         "Plot!cycle": _plot(
@@ -269,7 +291,7 @@ def layout(follow_s: float | None = None, joints: int = 2) -> dict[str, Any]:
     topics = {joint: _JOINTS[joint] for joint in range(1, joints + 1)}
     panels: dict[str, dict[str, Any]] = {}
     for joint in topics:
-        panels |= _torque_panels(joint) | _stage_panels(joint)
+        panels |= _torque_panels(joint) | _stage_panels(joint) | _contact_panels(joint)
     panels |= _cycle_panels() | _side_panels()
     panels["StateTransitions!status"] = _transitions(
         "Status", {f"joint {joint}": f"{topic}.status" for joint, topic in topics.items()}
@@ -300,6 +322,7 @@ def layout(follow_s: float | None = None, joints: int = 2) -> dict[str, Any]:
         "tabs": [
             {"title": "Torque", "layout": torque},
             {"title": "Inputs", "layout": inputs},
+            {"title": "Contact", "layout": _joint_columns("contact", "rate", joints)},
             {"title": "Cycle", "layout": _split("column", ["Plot!cycle", "Plot!work", "Plot!counts"])},
         ],
     }
@@ -331,7 +354,7 @@ def parser() -> argparse.ArgumentParser:
     result = argparse.ArgumentParser(
         prog="jtq layout",
         description="Write the layout file for Foxglove and Lichtblick: torque with its sigma band, residual to the "
-        "sensor, status, stages, inputs, cycle time, diagnostics and log.",
+        "sensor, status, stages, inputs, contacts, cycle time, diagnostics and log.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

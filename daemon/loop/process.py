@@ -48,7 +48,8 @@ from jtqd.drivers.filters import CanFilter, look_alikes
 from jtqd.drivers.frame_socket import BusError, BusGone, FrameSocket, open_frame_socket
 from jtqd.drivers.nmt import HEARTBEAT_BASE
 from jtqd.estimator.checked import ConfigError
-from jtqd.estimator.methods import AnyEstimator, load_network, make_estimator
+from jtqd.estimator.methods import AnyEstimator, AnyNetwork, load_network, make_estimator
+from jtqd.estimator.network import FusedNetwork
 from jtqd.estimator.onnx_graph import NetworkError, Verdict
 
 _PATIENCE_S = 1.0
@@ -146,10 +147,26 @@ class Stop:
         self.requested = True
 
 
-def build_estimator(config: Config, joint: JointConfig, verdict: Verdict | str | None = None) -> AnyEstimator:
+def physics_only(joint: JointConfig, network: AnyNetwork | None) -> str:
+    """Return the line for the operator where no network corrects the physics of method `fused`; "" where one does."""
+    if network is None or joint.network is None:
+        return f"joint {joint.number}: no network, physics only"
+    if isinstance(network, FusedNetwork) and not network.corrects:
+        name = joint.network.path.name
+        return f"joint {joint.number}: no network, physics only ({name} has the share 0: envelope and calibration only)"
+    return ""
+
+
+def build_estimator(
+    config: Config,
+    joint: JointConfig,
+    verdict: Verdict | str | None = None,
+    notes: list[str] | None = None,
+) -> AnyEstimator:
     """Build the estimator of one joint as configured; raises ConfigError or NetworkError.
 
     verdict: of `referee.judged` on its network, or why it is refused; None: ONNX Runtime judges in this process.
+    notes: takes what the operator is to know of it.
     """
     method, network = config.estimator.method, None
     try:
@@ -157,6 +174,9 @@ def build_estimator(config: Config, joint: JointConfig, verdict: Verdict | str |
             raise NetworkError(verdict)
         if joint.network is not None:
             network = load_network(method, str(joint.network.path), joint.network.sha256, verdict)
+        note = physics_only(joint, network) if method == "fused" else ""
+        if note and notes is not None:
+            notes.append(note)
         return make_estimator(joint.joint, config.estimator, network)
     except (ConfigError, NetworkError) as error:
         key = f"joint_{joint.number}"
@@ -296,13 +316,18 @@ def build_cycle(
     return cycle, grid
 
 
-def build_estimators(request: dict[str, Any]) -> tuple[Config, list[AnyEstimator]]:
-    """Load the configuration and warm up the estimators of all joints; raises ConfigError or NetworkError."""
+def build_estimators(
+    request: dict[str, Any], notes: list[str] | None = None
+) -> tuple[Config, list[AnyEstimator]]:
+    """Load the configuration and warm up the estimators of all joints; raises ConfigError or NetworkError.
+
+    notes: as in `build_estimator`.
+    """
     config = load_config(Path(request["config"]) if request["config"] else None)
     if config.files_sha256 != request["config_sha256"]:
         raise ConfigError(f"{config.path}: it or one of its joint files was changed during reading")
     estimators = [
-        build_estimator(config, joint, verdict)
+        build_estimator(config, joint, verdict, notes)
         for joint, verdict in zip(config.joints, judged(config), strict=True)
     ]
     warm_up(estimators)
@@ -312,8 +337,9 @@ def build_estimators(request: dict[str, Any]) -> tuple[Config, list[AnyEstimator
 def serve(request: dict[str, Any]) -> int:
     """Build, report ready, wait for the boot report, run, report the end. Returns the exit status."""
     stop = Stop()
-    config, estimators = build_estimators(request)
-    answer(ready=True)
+    notes: list[str] = []
+    config, estimators = build_estimators(request, notes)
+    answer(ready=True, notes=notes)
     line = read_line(stop)
     if line is None:
         return 0

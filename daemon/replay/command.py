@@ -19,6 +19,7 @@ from jtqd.daemon.recording.messages import CDR_HEADER, JOINT_ESTIMATE_SIZE
 from jtqd.daemon.recording.own_files import ACTIVE
 from jtqd.daemon.recording.schemas import SCHEMAS
 from jtqd.daemon.replay.compare import Comparison, Difference, Identity, Unknown
+from jtqd.daemon.replay.contacts import Contacts
 from jtqd.daemon.replay.origin import SAMPLE
 from jtqd.daemon.replay.session import SHORT_CYCLES, ReplayOptions, Result, replay_each
 from jtqd.estimator.arrays import RecordArray
@@ -96,6 +97,9 @@ def _identity(result: Result, same: Identity) -> list[str]:
                 f"  joint {each.joint}: same estimate PDO in {number(each.pdo_equal)} of {number(each.cycles)} cycles, "
                 f"largest difference {_nm(each.max_nm, 'g')}"
             )
+    lines += [_contacts(each) for each in same.contacts]
+    if not result.exact and result.run.origin.config.contact is not None:
+        lines.append("  contacts are compared cycle by cycle only (--exact)")
     lines += [_unknown(each) for each in same.unknown]
     lines += [_difference(each) for each in same.differences]
     return lines
@@ -103,6 +107,27 @@ def _identity(result: Result, same: Identity) -> list[str]:
 
 def _first_cycle(result: Result) -> int:
     return int(result.run.joints[0]["cycle"][0])
+
+
+def _contacts(each: Contacts) -> str:
+    count = (
+        "no contact"
+        if each.logged == 0
+        else "1 contact"
+        if each.logged == 1
+        else f"{number(each.logged)} contacts"
+    )
+    if not each.different:
+        return f"  joint {each.joint}: {count} in the log, told again in the same cycles ({number(each.known)} cycles known)"
+    why = (
+        " (the detector remembers seconds, and its state was not known at the beginning)"
+        if each.excused
+        else ""
+    )
+    return (
+        f"  joint {each.joint}: {count} in the log, {number(each.replayed)} replayed; other in {number(each.different)} "
+        f"cycles, first in {number(each.first_cycle or 0)}, by {_nm(each.largest_nm, '.3g')} at most{why}"
+    )
 
 
 def _unknown(each: Unknown) -> str:

@@ -140,6 +140,8 @@ class AboutJoint:
     inputs: tuple[str, ...]
     sensor: str | None
     temperature: bool
+    contact_threshold_nm: float | None = None
+    """None: nobody watches for contacts."""
 
 
 @dataclass(frozen=True)

@@ -54,4 +54,5 @@ def _joint(config: Config, number: int, joint: JointConfig, names: tuple[str, ..
         inputs=names_of_inputs(config, number),
         sensor=None if sensor is None else names[sensor],
         temperature=joint.temperature,
+        contact_threshold_nm=None if config.contact is None else config.contact.threshold_of(rated),
     )

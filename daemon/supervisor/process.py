@@ -31,7 +31,7 @@ from jtqd.daemon.reload.files import Reload, ReloadError
 from jtqd.daemon.ros2.keeper import Ros2Keeper
 from jtqd.daemon.shared.child_process import Child, ChildError, ChildSilence
 from jtqd.daemon.shared.conditions import JOINT, PDO, THE_MACHINE, Conditions, ConditionsFile
-from jtqd.daemon.shared.log_lines import ERROR, WARNING, EventLog, OperatorLog
+from jtqd.daemon.shared.log_lines import ERROR, INFO, WARNING, EventLog, OperatorLog
 from jtqd.daemon.shared.notices import FILE as NOTICES
 from jtqd.daemon.shared.notices import Notices
 from jtqd.daemon.shared.runtime_dir import About, claim, instance_name, remove, write_about
@@ -321,8 +321,11 @@ class Supervisor:
         if wrong is not None:
             raise SupervisorError(wrong)
         self._take_layout(report)
-        if wait_for(loop, self._stopped) is None:
+        ready = wait_for(loop, self._stopped)
+        if ready is None:
             return None
+        for line in ready["notes"]:
+            self._log(line, INFO)
         loop.tell({**report, "worst_load": self._load.worst})
         running = wait_for(loop, self._stopped)
         if running is None:
@@ -373,6 +376,7 @@ class Supervisor:
             history=self._conditions.history(time.monotonic()),
             began_s=began_s,
             stolen_s=stolen,
+            contacts=self._config.contact is not None,
         )
 
     def _open_bus(self) -> FrameSocket:
@@ -434,7 +438,8 @@ class Supervisor:
         """Serve table, SDO requests and recorder until the loop ends; return the loop's last answer."""
         title = f"jtqd on {self._instance}, node {self._config.node_id:02X}h, {self._config.estimator.method}"
         stopping = 0.0
-        with Display(reader, self._config.bitrate, title, self._log) as display:
+        watched = self._config.contact is not None
+        with Display(reader, self._config.bitrate, title, self._log, contacts=watched) as display:
             while True:
                 sockets = [] if self._bus_gone else [self._bus_service.socket.fd]
                 select.select([*loop.outputs, *sockets, *self._service.descriptors], [], [], 0.05)

@@ -43,6 +43,8 @@ class Summary:
     age_ms: tuple[float, ...] = ()
     zeros: tuple[Zeros, ...] = ()
     """Of each joint at the end."""
+    contacts: int | None = None
+    """How many were told; None where nobody watched."""
 
     @property
     def exit_status(self) -> int:
@@ -63,6 +65,7 @@ class Summary:
             "rmse_now_nm": {f"joint_{n}": finite(rmse) for n, rmse in enumerate(self.rmse_now_nm, start=1)},
             "age_ms": {f"joint_{n}": finite(age) for n, age in enumerate(self.age_ms, start=1)},
             "zeros": {f"joint_{n}": each.content() for n, each in enumerate(self.zeros, start=1)},
+            "contacts": self.contacts,
             "deviations": {f"joint_{n}": self._deviations(n) for n in range(1, len(self.rmse_nm) + 1)},
             "conditions": [
                 each._asdict() | {"total_s": round(each.total_s, 3), "first_s": round(each.first_s, 3)}
@@ -107,6 +110,8 @@ class Summary:
             for joint, zeros in enumerate(self.zeros, start=1)
             if zeros.tracked
         ]
+        if self.contacts is not None:
+            lines.append(f"contacts      {self.contacts or 'none'}")
         happened = [each for each in self.conditions if CATALOGUE[each.name].severity > INFO]
         for n, each in enumerate(happened):
             times = "once" if each.times == 1 else f"{each.times} times"
@@ -171,6 +176,7 @@ def summary_of(
     history: Sequence[Occurrences],
     began_s: float,
     stolen_s: float,
+    contacts: bool = False,
 ) -> Summary:
     """Return the summary of a finished run.
 
@@ -182,6 +188,7 @@ def summary_of(
         history: conditions that happened.
         began_s: begin of the run (CLOCK_MONOTONIC).
         stolen_s: as in `Summary`.
+        contacts: they were watched.
     """
     view = reader.read()
     p50, p99, worst = reader.work_us(0.5, 0.99, 1.0)
@@ -203,4 +210,5 @@ def summary_of(
         inputs=result.get("counters", {}),
         conditions=tuple(each._replace(first_s=max(0.0, each.first_s - began_s)) for each in history),
         stolen_s=stolen_s,
+        contacts=view.counters["contacts"] if contacts else None,
     )

@@ -14,6 +14,7 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
+from jtqd.daemon.shared.contacts import contact_of, contact_text
 from jtqd.daemon.shared.log_lines import INFO, OperatorLog
 from jtqd.daemon.shared.snapshot import JointView, SnapshotReader, View
 from jtqd.estimator.status import NAMES, PUBLISHED
@@ -27,10 +28,13 @@ _COLUMNS = {
     "sigma [Nm]": 10,
     "sensor [Nm]": 10,
     "error [Nm]": 10,
+    "contact": 8,
     "status": max(map(len, NAMES.values())),
 }
 """Heading and least width, so that the table does not jump when a value gets longer."""
 _DISPENSABLE = ("sensor [Nm]", "error [Nm]", "sigma [Nm]")
+_CONTACT = "contact"
+"""A column, and in the line below a count, where contacts are watched."""
 
 
 def bus_load(previous: View, now: View, bitrate: int) -> float:
@@ -55,9 +59,19 @@ class LiveTable:
     In a narrow terminal columns go in the order of `_DISPENSABLE`, then the frame, and in the end each joint is a line.
     """
 
-    def __init__(self, reader: SnapshotReader, previous: View, view: View, bitrate: int, title: str) -> None:
+    def __init__(
+        self,
+        reader: SnapshotReader,
+        previous: View,
+        view: View,
+        bitrate: int,
+        title: str,
+        *,
+        contacts: bool = False,
+    ) -> None:
         self._title = title
-        self._line = loop_line(reader, previous, view, bitrate)
+        self._columns = [name for name in _COLUMNS if contacts or name != _CONTACT]
+        self._line = loop_line(reader, previous, view, bitrate, contacts=contacts)
         self._rows = [_cells(number, joint) for number, joint in enumerate(view.joints, start=1)]
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
@@ -67,7 +81,7 @@ class LiveTable:
 
     def _widest_that_fits(self, console: Console, options: ConsoleOptions) -> RenderableType:
         tables = (
-            self._table([name for name in _COLUMNS if name not in _DISPENSABLE[:dropped]], box)
+            self._table([name for name in self._columns if name not in _DISPENSABLE[:dropped]], box)
             for dropped in range(len(_DISPENSABLE) + 1)
             for box in ((HEAVY_HEAD, None) if dropped == len(_DISPENSABLE) else (HEAVY_HEAD,))
         )
@@ -75,10 +89,17 @@ class LiveTable:
         if table is not None:
             return table
         lines = (
-            Text.assemble(f"{row['joint']}: {_with_unit(row['torque [Nm]'])}", row["status"])
+            Text.assemble(
+                f"{row['joint']}: {_with_unit(row['torque [Nm]'])}", row["status"], self._touched(row)
+            )
             for row in self._rows
         )
         return Group(self._title, *lines)
+
+    def _touched(self, row: dict[str, str | Text]) -> str | Text:
+        shown = row[_CONTACT]
+        there = _CONTACT in self._columns and isinstance(shown, Text)
+        return Text.assemble(" contact ", shown) if there else ""
 
     def _table(self, names: list[str], box: Box | None) -> Table:
         table = Table(title=self._title, title_justify="left", box=box, pad_edge=box is not None)
@@ -95,18 +116,20 @@ def _cells(number: int, joint: JointView) -> dict[str, str | Text]:
     """Return the cells of one joint."""
     name = NAMES.get(joint.status, str(joint.status))
     known = joint.status in PUBLISHED
+    touched = contact_text(joint)
     return {
         "joint": str(number),
         "torque [Nm]": _number(joint.torque_nm) if known else "-",
         "sigma [Nm]": _number(joint.sigma_nm) if known else "-",
         "sensor [Nm]": _number(joint.reference_nm),
         "error [Nm]": _number(joint.torque_nm - joint.reference_nm) if known else "-",
+        _CONTACT: Text(touched, style="bold red") if contact_of(joint) else touched,
         "status": Text(name, style=COLOURS.get(name, "bold red")),
     }
 
 
-def loop_line(reader: SnapshotReader, previous: View, view: View, bitrate: int) -> str:
-    """Return cycle time, missed cycles and bus load in one line."""
+def loop_line(reader: SnapshotReader, previous: View, view: View, bitrate: int, *, contacts: bool) -> str:
+    """Return cycle time, missed cycles, bus load and, where they are watched, contacts in one line."""
     p50, p99, worst = reader.work_us(0.5, 0.99, 1.0)
     counters = view.counters
     load = bus_load(previous, view, bitrate)
@@ -114,20 +137,24 @@ def loop_line(reader: SnapshotReader, previous: View, view: View, bitrate: int) 
     return (
         f"cycle {counters['cycles']}  work p50 {p50:.0f} us, p99 {p99:.0f} us, max {worst:.0f} us  "
         f"missed {counters['missed']}  stale inputs {counters['stale_inputs']}  bus load {load_text}"
+        + (f"  contacts {counters['contacts']}" if contacts else "")
     )
 
 
-def plain_line(reader: SnapshotReader, previous: View, view: View, bitrate: int) -> str:
+def plain_line(
+    reader: SnapshotReader, previous: View, view: View, bitrate: int, *, contacts: bool = False
+) -> str:
     """Return the state as one line without control characters, for a log."""
     joints = "  ".join(f"joint {n} {_plain(joint)}" for n, joint in enumerate(view.joints, start=1))
-    return f"{joints}  {loop_line(reader, previous, view, bitrate)}"
+    return f"{joints}  {loop_line(reader, previous, view, bitrate, contacts=contacts)}"
 
 
 def _plain(joint: JointView) -> str:
     name = NAMES.get(joint.status, str(joint.status))
+    touched = f", contact {contact_text(joint)}" if contact_of(joint) else ""
     if joint.status not in PUBLISHED:
-        return name
-    return f"{name} {_number(joint.torque_nm)} +- {_number(joint.sigma_nm)} Nm"
+        return name + touched
+    return f"{name} {_number(joint.torque_nm)} +- {_number(joint.sigma_nm)} Nm{touched}"
 
 
 def _with_unit(torque: str | Text) -> str:
@@ -150,13 +177,17 @@ class Display:
         bitrate: of the bus [bit/s].
         title: of the table.
         log: takes the lines.
+        contacts: they are watched.
     """
 
-    def __init__(self, reader: SnapshotReader, bitrate: int, title: str, log: OperatorLog) -> None:
+    def __init__(
+        self, reader: SnapshotReader, bitrate: int, title: str, log: OperatorLog, *, contacts: bool = False
+    ) -> None:
         console = Console(stderr=True)
         self._terminal = console.is_terminal
         self._live = Live(console=console, auto_refresh=False, transient=False)
         self._reader, self._bitrate, self._title, self._log = reader, bitrate, title, log
+        self._contacts = contacts
         self._previous = reader.read()
         self._shown = time.monotonic()
 
@@ -175,9 +206,11 @@ class Display:
             return
         view = self._reader.read()
         if self._terminal:
-            table = LiveTable(self._reader, self._previous, view, self._bitrate, self._title)
+            table = LiveTable(
+                self._reader, self._previous, view, self._bitrate, self._title, contacts=self._contacts
+            )
             self._live.update(table, refresh=True)
         else:
-            line = plain_line(self._reader, self._previous, view, self._bitrate)
+            line = plain_line(self._reader, self._previous, view, self._bitrate, contacts=self._contacts)
             self._log(line.removeprefix("jtqd: "), INFO)
         self._previous, self._shown = view, now

@@ -10,6 +10,11 @@
  * and 4 where jtqd has them: torque I16 and I16 [0.01 Nm], sigma U8 and U8 [0.05 Nm], status (low nibble: first joint),
  * SYNC counter of the inputs. docs/bus.md describes it, docs/safety.md what a receiver must do.
  *
+ * With section `contact` the contact PDO follows it, COB-ID 380h + node (joints 1 and 2) and 480h + node (3 and 4): torque
+ * rate I8 and I8 [32 Nm/s], contact (low nibble: first joint), SYNC counter. docs/contact.md says what it can promise.
+ *     jtqd_contact touched = jtqd_read_contact(&receiver, 1, now_ns);
+ *     if (touched.code >= JTQD_CONTACT_POSITIVE) ... stop; else if (touched.code != JTQD_CONTACT_NONE) ... nothing is known
+ *
  * A torque is usable only when all of this holds:
  *   - status 2 (valid), 3 (degraded) or 6 (standstill), and the torque field is not 8000h;
  *   - its SYNC counter is that of the last SYNC or of the one before (checked once a SYNC with a counter was taken);
@@ -38,7 +43,15 @@ enum {
     JTQD_INVALID = 15,
 };
 
-enum { JTQD_SYNC = 0x080, JTQD_LENGTH = 8, JTQD_JOINTS = 4, JTQD_PDOS = 2 };
+enum {
+    JTQD_CONTACT_OFF = 0,     /* nobody watches */
+    JTQD_CONTACT_UNKNOWN = 1, /* also: too old, or no PDO yet */
+    JTQD_CONTACT_NONE = 2,    /* the only one that says that there is none */
+    JTQD_CONTACT_POSITIVE = 3, /* pushed along the joint's positive direction */
+    JTQD_CONTACT_NEGATIVE = 4,
+};
+
+enum { JTQD_SYNC = 0x080, JTQD_LENGTH = 8, JTQD_CONTACT_LENGTH = 4, JTQD_JOINTS = 4, JTQD_PDOS = 2 };
 
 /* Why a torque is not usable. */
 typedef enum {
@@ -74,6 +87,20 @@ typedef struct {
     int64_t age_ns; /* since the SYNC of its inputs, or since its arrival where no SYNC is received */
 } jtqd_torque;
 
+/* One contact PDO: two joints and the SYNC counter of their inputs. */
+typedef struct {
+    uint8_t code[2];
+    double rate_nm_s[2]; /* NaN: none; what is beyond +-4064 stands there */
+    uint8_t sequence;
+} jtqd_contacts;
+
+/* What is known now about a contact of one joint. */
+typedef struct {
+    uint8_t code;     /* JTQD_CONTACT_... */
+    double rate_nm_s; /* of the torque; NaN where it is not known */
+    int64_t age_ns;   /* as in jtqd_torque */
+} jtqd_contact;
+
 typedef struct {
     jtqd_estimate last;
     bool any;
@@ -82,17 +109,25 @@ typedef struct {
 } jtqd_pdo;
 
 typedef struct {
+    jtqd_contacts last;
+    bool any;
+    int64_t stamp_ns, inputs_ns; /* as above */
+} jtqd_contact_pdo;
+
+typedef struct {
     /* settings */
     uint16_t node;
     uint8_t overflow;
     int64_t max_age_ns;
     /* state */
     jtqd_pdo pdo[JTQD_PDOS];
+    jtqd_contact_pdo contact[JTQD_PDOS];
     bool counted_sync; /* a SYNC with a counter was taken */
     uint8_t sync;
     int64_t sync_ns, sync_before_ns;
     /* counters */
     uint64_t received, lost, repeated, malformed; /* lost: at least, by gaps of the SYNC counter */
+    uint64_t contacts;                            /* contact PDOs received */
 } jtqd_receiver;
 
 static inline const char *jtqd_status_name(uint8_t status)
@@ -109,6 +144,12 @@ static inline const char *jtqd_reason_name(jtqd_reason reason)
 {
     static const char *const NAMES[] = {"usable", "never received", "withheld", "too old", "behind SYNC", "clock"};
     return NAMES[reason];
+}
+
+static inline const char *jtqd_contact_name(uint8_t code)
+{
+    static const char *const NAMES[] = {"off", "unknown", "none", "positive", "negative"};
+    return NAMES[code <= JTQD_CONTACT_NEGATIVE ? code : (uint8_t)JTQD_CONTACT_UNKNOWN];
 }
 
 static inline jtqd_joint jtqd_decode_joint(const uint8_t torque[2], uint8_t sigma, uint8_t status)
@@ -133,6 +174,20 @@ static inline bool jtqd_decode(const uint8_t *data, size_t length, jtqd_estimate
     return true;
 }
 
+/* Decode the data of a contact PDO; false for another length than 4. A code of a later version is not known. */
+static inline bool jtqd_decode_contacts(const uint8_t *data, size_t length, jtqd_contacts *result)
+{
+    if (length != JTQD_CONTACT_LENGTH)
+        return false;
+    for (int joint = 0; joint < 2; joint++) {
+        const uint8_t code = joint == 0 ? data[2] & 0x0F : data[2] >> 4;
+        result->code[joint] = code <= JTQD_CONTACT_NEGATIVE ? code : (uint8_t)JTQD_CONTACT_UNKNOWN;
+        result->rate_nm_s[joint] = data[joint] == 0x80 ? NAN : 32.0 * (data[joint] < 0x80 ? data[joint] : data[joint] - 256);
+    }
+    result->sequence = data[3];
+    return true;
+}
+
 /* Begin. node: jtqd's node-ID (20h); overflow: `sync.counter_overflow` of its configuration. */
 static inline void jtqd_begin(jtqd_receiver *receiver, uint8_t node, uint8_t overflow, int64_t max_age_ns)
 {
@@ -154,7 +209,41 @@ static inline bool jtqd_counter(const jtqd_receiver *receiver, uint8_t value)
     return value >= 1 && value <= receiver->overflow;
 }
 
-/* Take a data frame with an 11-bit identifier; others are ignored. Return 1 or 2 for a new estimate PDO, else 0. */
+/* When the inputs of a PDO were taken: the SYNC with its counter, else its arrival. */
+static inline int64_t jtqd_inputs(const jtqd_receiver *receiver, uint8_t sequence, int64_t stamp_ns)
+{
+    const int behind = receiver->counted_sync ? jtqd_steps(receiver, sequence, receiver->sync) : -1;
+    return behind == 0 ? receiver->sync_ns : behind == 1 ? receiver->sync_before_ns : stamp_ns;
+}
+
+static inline int jtqd_take_contacts(jtqd_receiver *receiver, int number, const uint8_t *data, size_t length,
+                                     int64_t stamp_ns)
+{
+    jtqd_contact_pdo *pdo = &receiver->contact[number];
+    jtqd_contacts told;
+
+    if (!jtqd_decode_contacts(data, length, &told) || !jtqd_counter(receiver, told.sequence)) {
+        receiver->malformed++;
+        return 0;
+    }
+    if (pdo->any && told.sequence == pdo->last.sequence) {
+        /* Not a new one, so its age stays; but what is worse than "none" is heard. */
+        for (int joint = 0; joint < 2; joint++)
+            if (told.code[joint] != JTQD_CONTACT_NONE && pdo->last.code[joint] < JTQD_CONTACT_POSITIVE)
+                pdo->last.code[joint] = told.code[joint];
+        receiver->repeated++;
+        return 0;
+    }
+    pdo->inputs_ns = jtqd_inputs(receiver, told.sequence, stamp_ns);
+    pdo->last = told;
+    pdo->any = true;
+    pdo->stamp_ns = stamp_ns;
+    receiver->contacts++;
+    return JTQD_PDOS + number + 1;
+}
+
+/* Take a data frame with an 11-bit identifier; others are ignored.
+ * Return 1 or 2 for a new estimate PDO, 3 or 4 for a new contact PDO, else 0. */
 static inline int jtqd_take(jtqd_receiver *receiver, uint32_t can_id, const uint8_t *data, size_t length,
                             int64_t stamp_ns)
 {
@@ -172,6 +261,8 @@ static inline int jtqd_take(jtqd_receiver *receiver, uint32_t can_id, const uint
         jtqd_pdo *pdo = &receiver->pdo[number];
         jtqd_estimate estimate;
 
+        if (can_id == (number == 0 ? 0x380u : 0x480u) + receiver->node)
+            return jtqd_take_contacts(receiver, number, data, length, stamp_ns);
         if (can_id != (number == 0 ? 0x180u : 0x280u) + receiver->node)
             continue;
         if (!jtqd_decode(data, length, &estimate) || !jtqd_counter(receiver, estimate.sequence)) {
@@ -188,8 +279,7 @@ static inline int jtqd_take(jtqd_receiver *receiver, uint32_t can_id, const uint
         }
         if (pdo->any)
             receiver->lost += (uint64_t)(jtqd_steps(receiver, pdo->last.sequence, estimate.sequence) - 1);
-        const int behind = receiver->counted_sync ? jtqd_steps(receiver, estimate.sequence, receiver->sync) : -1;
-        pdo->inputs_ns = behind == 0 ? receiver->sync_ns : behind == 1 ? receiver->sync_before_ns : stamp_ns;
+        pdo->inputs_ns = jtqd_inputs(receiver, estimate.sequence, stamp_ns);
         pdo->last = estimate;
         pdo->any = true;
         pdo->stamp_ns = stamp_ns;
@@ -224,6 +314,23 @@ static inline jtqd_torque jtqd_read(const jtqd_receiver *receiver, int joint, in
         result.usable = true;
         result.torque_nm = told->torque_nm;
     }
+    return result;
+}
+
+/* What is known of a contact of joint 1..4 at the time now_ns: not known where the PDO is too old or of an earlier SYNC. */
+static inline jtqd_contact jtqd_read_contact(const jtqd_receiver *receiver, int joint, int64_t now_ns)
+{
+    jtqd_contact result = {JTQD_CONTACT_UNKNOWN, NAN, 0};
+
+    if (joint < 1 || joint > JTQD_JOINTS || !receiver->contact[(joint - 1) / 2].any)
+        return result;
+    const jtqd_contact_pdo *pdo = &receiver->contact[(joint - 1) / 2];
+    result.age_ns = now_ns - pdo->inputs_ns;
+    if (now_ns < pdo->stamp_ns || now_ns < pdo->inputs_ns || result.age_ns > receiver->max_age_ns ||
+        (receiver->counted_sync && jtqd_steps(receiver, pdo->last.sequence, receiver->sync) > 1))
+        return result;
+    result.code = pdo->last.code[(joint - 1) % 2];
+    result.rate_nm_s = pdo->last.rate_nm_s[(joint - 1) % 2];
     return result;
 }
 

@@ -4,6 +4,8 @@
 //     receiver.take(frame.can_id, frame.data, frame.can_dlc, stamp);            // every frame, with its time stamp
 //     if (auto torque = receiver.torque(1, now)) use(torque->nm, torque->sigma_nm);
 //     else hold(receiver.reason(1, now));
+//     if (auto contact = receiver.contact(1, now); !contact) hold("contact not known");      // with section `contact`
+//     else if (contact->there) stop();
 #pragma once
 
 #include <chrono>
@@ -31,6 +33,13 @@ struct Torque {
     Nanoseconds age;
 };
 
+struct Contact {
+    bool there;
+    bool positive;      // of one that is there: pushed along the joint's positive direction
+    double rate_nm_s;   // of the torque; NaN where it is not known
+    Nanoseconds age;
+};
+
 class Receiver {
 public:
     explicit Receiver(const Settings &settings = Settings{})
@@ -41,7 +50,8 @@ public:
     // Take any frame, with its stamp since the epoch of the clock that `torque` is asked with; true for a new estimate.
     bool take(std::uint32_t can_id, const std::uint8_t *data, std::size_t length, Nanoseconds stamp)
     {
-        return jtqd_take(&state_, can_id, data, length, stamp.count()) != 0;
+        const int taken = jtqd_take(&state_, can_id, data, length, stamp.count());
+        return taken >= 1 && taken <= JTQD_PDOS;
     }
 
     // What may be used of joint 1..4 now; nothing where `reason` says why.
@@ -51,6 +61,16 @@ public:
         if (!found.usable)
             return std::nullopt;
         return Torque{found.torque_nm, found.sigma_nm, found.status, Nanoseconds(found.age_ns)};
+    }
+
+    // Whether joint 1..4 is pushed from outside; nothing where that is not known or not watched.
+    std::optional<Contact> contact(int joint, Nanoseconds now) const
+    {
+        const jtqd_contact found = jtqd_read_contact(&state_, joint, now.count());
+        if (found.code < JTQD_CONTACT_NONE)
+            return std::nullopt;
+        return Contact{found.code != JTQD_CONTACT_NONE, found.code == JTQD_CONTACT_POSITIVE, found.rate_nm_s,
+                       Nanoseconds(found.age_ns)};
     }
 
     // Why there is no torque, with the status that jtqd told last.

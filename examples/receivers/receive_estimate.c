@@ -2,12 +2,15 @@
  *
  *     cc -O2 -o receive_estimate receive_estimate.c && ./receive_estimate can0
  *     ./receive_estimate can0 --joint 2 --max-age-ms 3 --stop-after-ms 20 --max-sigma-nm 2
+ *     ./receive_estimate can0 --on-contact stop             with section `contact` of jtqd (docs/contact.md)
  *
  * A bus is a SocketCAN interface, or unix:PATH, the hub of an emulated bench. Replace `react` by your controller:
  *
  *   USE   a torque may be used now: torque, sigma and age are given
  *   HOLD  none may be used, for less than --stop-after-ms: go on without torque feedback, never with the last number
  *   STOP  none for longer: bring the joint to rest. It stays until an operator starts anew (here: exit status 3)
+ *
+ * With --on-contact stop a contact is STOP, too, and a torque is used only while it is known that there is none.
  *
  * jtqd is not a safety function (docs/safety.md): this reaction limits damage, it replaces no emergency stop.
  * Exit status: 0 done (--seconds, Ctrl-C), 1 no such bus, 2 usage, 3 stopped.
@@ -36,6 +39,7 @@ typedef struct {
     const char *bus;
     int joint, node, overflow;
     double max_age_ms, stop_after_ms, max_sigma_nm, seconds;
+    int on_contact; /* 1: stop */
 } settings;
 
 static volatile sig_atomic_t ended;
@@ -47,9 +51,12 @@ static void on_signal(int number)
 }
 
 /* The controller: here it prints when the reaction changes, with the reason. */
-static void react(reaction now, const jtqd_torque *torque)
+static void react(reaction now, const jtqd_torque *torque, const jtqd_contact *contact)
 {
-    if (now == USE)
+    if (contact != NULL && torque->usable && now != USE)
+        printf("%s  contact %s, torque rate %.0f Nm/s, age %.2f ms\n", now == STOP ? "STOP" : "HOLD",
+               jtqd_contact_name(contact->code), contact->rate_nm_s, 1e-6 * (double)contact->age_ns);
+    else if (now == USE)
         printf("USE   %s %.2f Nm +- %.2f, age %.2f ms\n", jtqd_status_name(torque->status), torque->torque_nm,
                torque->sigma_nm, 1e-6 * (double)torque->age_ns);
     else
@@ -83,7 +90,12 @@ static int open_bus(const settings *set)
     } else {
         const canid_t mask = CAN_SFF_MASK | CAN_EFF_FLAG | CAN_RTR_FLAG;
         const struct can_filter filters[] = {
-            {JTQD_SYNC, mask}, {0x180u + (canid_t)set->node, mask}, {0x280u + (canid_t)set->node, mask}};
+            {JTQD_SYNC, mask},
+            {0x180u + (canid_t)set->node, mask},
+            {0x280u + (canid_t)set->node, mask},
+            {0x380u + (canid_t)set->node, mask},
+            {0x480u + (canid_t)set->node, mask},
+        };
         struct sockaddr_can address = {.can_family = AF_CAN, .can_ifindex = (int)if_nametoindex(set->bus)};
         file = socket(PF_CAN, SOCK_RAW | SOCK_NONBLOCK, CAN_RAW);
         if (file < 0 || address.can_ifindex == 0 ||
@@ -148,32 +160,37 @@ static int control(const settings *set, int file)
 
         const int64_t time_ns = now_ns(CLOCK_MONOTONIC);
         const jtqd_torque torque = jtqd_read(&receiver, set->joint, now_ns(CLOCK_REALTIME));
-        const int good = torque.usable && torque.sigma_nm <= set->max_sigma_nm;
+        const jtqd_contact contact = jtqd_read_contact(&receiver, set->joint, now_ns(CLOCK_REALTIME));
+        const int pushed = set->on_contact && contact.code >= JTQD_CONTACT_POSITIVE;
+        const int touched = set->on_contact && contact.code != JTQD_CONTACT_NONE; /* or nobody knows */
+        const int good = torque.usable && torque.sigma_nm <= set->max_sigma_nm && !touched;
         if (good)
             used_ns = time_ns;
-        const reaction now = good ? USE
+        const reaction now = good     ? USE
+                             : pushed ? STOP
                              : used_ns != 0 && time_ns - used_ns > (int64_t)(set->stop_after_ms * MS) ? STOP
                                                                                                      : HOLD;
         cycles++;
         used += (uint64_t)good;
         if (now != before || first)
-            react(now, &torque);
+            react(now, &torque, touched ? &contact : NULL);
         before = now;
         first = 0;
         if (now == STOP)
             break;
     }
-    printf("received %llu, lost %llu, repeated %llu, malformed %llu; usable in %llu of %llu cycles\n",
+    printf("received %llu, lost %llu, repeated %llu, malformed %llu; usable in %llu of %llu cycles; contact PDOs %llu\n",
            (unsigned long long)receiver.received, (unsigned long long)receiver.lost,
            (unsigned long long)receiver.repeated, (unsigned long long)receiver.malformed, (unsigned long long)used,
-           (unsigned long long)cycles);
+           (unsigned long long)cycles, (unsigned long long)receiver.contacts);
     return before == STOP ? 3 : 0;
 }
 
 static int usage(void)
 {
     fprintf(stderr, "usage: receive_estimate INTERFACE|unix:PATH [--joint 1..4] [--node N] [--overflow N]\n"
-                    "       [--max-age-ms MS] [--stop-after-ms MS] [--max-sigma-nm NM] [--seconds S]\n");
+                    "       [--max-age-ms MS] [--stop-after-ms MS] [--max-sigma-nm NM] [--seconds S]\n"
+                    "       [--on-contact stop|ignore]\n");
     return 2;
 }
 
@@ -189,6 +206,12 @@ int main(int count, char **arguments)
         char *rest;
         const double value = strtod(arguments[at + 1], &rest);
 
+        if (strcmp(name, "--on-contact") == 0) {
+            set.on_contact = strcmp(arguments[at + 1], "stop") == 0;
+            if (!set.on_contact && strcmp(arguments[at + 1], "ignore") != 0)
+                return usage();
+            continue;
+        }
         if (*rest != '\0' || !(value > 0))
             return usage();
         if (strcmp(name, "--joint") == 0 && value <= JTQD_JOINTS)

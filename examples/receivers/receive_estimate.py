@@ -19,7 +19,14 @@ import can
 
 COB_IDS = {0x1A0: (1, 2), 0x2A0: (3, 4)}
 """COB-ID of the estimate PDOs of node 20h, and their joints."""
+CONTACT_COB_IDS = {0x3A0: (1, 2), 0x4A0: (3, 4)}
+"""Of the contact PDOs, with section `contact` (docs/contact.md)."""
 LAYOUT = struct.Struct("<hhBBBB")  # torque 1, torque 2, sigma 1, sigma 2, status of both, SYNC counter
+CONTACT_LAYOUT = struct.Struct("<bbBB")  # torque rate 1, torque rate 2, contact of both, SYNC counter
+NO_RATE = -0x80
+RATE_UNIT_NM_S = 32.0
+CONTACT = {0: "off", 1: "unknown", 2: "none", 3: "positive", 4: "negative"}
+"""What a controller stops on are the last two, and only "none" says that there is none."""
 NO_TORQUE = -0x8000
 UNKNOWN_SIGMA = 255
 STATUS = {
@@ -56,9 +63,29 @@ def decode(data: bytes) -> tuple[JointEstimate, JointEstimate, int]:
     return joint(torque_1, sigma_1, status & 0x0F), joint(torque_2, sigma_2, status >> 4), sequence
 
 
+class JointContact(NamedTuple):
+    """One joint: torque rate [Nm/s], None where the PDO has none; name of the contact."""
+
+    rate_nm_s: float | None
+    contact: str
+
+
+def decode_contact(data: bytes) -> tuple[JointContact, JointContact, int]:
+    """Decode the four bytes: both joints, and the SYNC counter of their inputs. Raises struct.error on another length."""
+    rate_1, rate_2, codes, sequence = CONTACT_LAYOUT.unpack(data)
+
+    def joint(rate: int, code: int) -> JointContact:
+        told = None if rate == NO_RATE else RATE_UNIT_NM_S * rate
+        return JointContact(told, CONTACT.get(code, f"unknown ({code})"))
+
+    return joint(rate_1, codes & 0x0F), joint(rate_2, codes >> 4), sequence
+
+
 def open_bus(name: str) -> can.BusABC:
     """Open a SocketCAN interface, or the unix bus unix:PATH. Raises can.CanError, OSError."""
-    filters = [{"can_id": each, "can_mask": 0x7FF, "extended": False} for each in COB_IDS]
+    filters = [
+        {"can_id": each, "can_mask": 0x7FF, "extended": False} for each in (*COB_IDS, *CONTACT_COB_IDS)
+    ]
     if name.startswith("unix:"):
         return can.Bus(interface="jtq_unix", channel=name.removeprefix("unix:"), can_filters=filters)
     return can.Bus(interface="socketcan", channel=name, can_filters=filters)
@@ -71,17 +98,24 @@ def line(joint: JointEstimate) -> str:
     return f"{torque} +- {sigma:>5}  {joint.status:<11}"
 
 
+def contact_line(joint: JointContact) -> str:
+    """Return one joint as text, e.g. "positive at 640 Nm/s"."""
+    rate = "" if joint.rate_nm_s is None else f" at {joint.rate_nm_s:.0f} Nm/s"
+    return f"{joint.contact}{rate}"
+
+
 def main(arguments: list[str] | None = None) -> int:
-    """Print every estimate; exit status 0 after --count or Ctrl-C, 1 without bus or estimate."""
+    """Print every estimate, and contacts that change; exit status 0 after --count or Ctrl-C, 1 without bus or estimate."""
     parser = argparse.ArgumentParser(
         prog="receive_estimate.py",
-        description="Print the torque estimate that jtqd publishes.",
+        description="Print the torque estimate that jtqd publishes, and contacts where they are watched.",
     )
     parser.add_argument("--bus", required=True, help="can0, vcan0 or unix:PATH")
     parser.add_argument("--count", type=int, default=0, metavar="N", help="end after N estimates")
     parser.add_argument("--timeout", type=float, default=1.0, metavar="S", help="longest pause (default 1)")
     options = parser.parse_args(arguments)
     received = 0
+    contacts: dict[int, tuple[str, ...]] = {}
     try:
         with open_bus(options.bus) as bus:
             while not options.count or received < options.count:
@@ -89,6 +123,18 @@ def main(arguments: list[str] | None = None) -> int:
                 if message is None:
                     print(f"no estimate on {options.bus} for {options.timeout:g} s", file=sys.stderr)
                     return 1
+                touched = CONTACT_COB_IDS.get(message.arbitration_id)
+                if touched is not None and message.dlc == CONTACT_LAYOUT.size:
+                    *told_contacts, sequence = decode_contact(bytes(message.data))
+                    names = tuple(each.contact for each in told_contacts)
+                    if names != contacts.get(message.arbitration_id):  # every cycle has one: changes only
+                        contacts[message.arbitration_id] = names
+                        text = (
+                            f"{joint}: {contact_line(each)}"
+                            for joint, each in zip(touched, told_contacts, strict=True)
+                        )
+                        print(f"{sequence:3}  contact {'  '.join(text)}", flush=True)
+                    continue
                 joints = COB_IDS.get(message.arbitration_id)
                 if joints is None or message.dlc != LAYOUT.size:
                     continue

@@ -11,6 +11,10 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.envelope import Envelope
 
 VELOCITY_STEP_RAD_S: Final = 0.25
+VELOCITY_STEP_SHARE: Final = 1.0 / 12.0
+"""Of the largest speed of the runs: the same 0.25 rad/s on the shipped joints (3 rad/s)."""
+_ROUND: Final = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
+"""Steps of speed, times a power of ten: a file is to be read, and the same whatever the noise of the fastest sample."""
 TORQUE_STEP_NM: Final = 3.0
 TORQUE_STEP_SHARE: Final = 0.075
 """Of rated torque: the same 3 Nm on the shipped joints."""
@@ -29,6 +33,7 @@ def envelope_of(
     apart_nm: FloatArray,
     temperatures_c: Sequence[float],
     *,
+    velocity_step_rad_s: float = VELOCITY_STEP_RAD_S,
     torque_step_nm: float = TORQUE_STEP_NM,
     room_k: float = ROOM_K,
 ) -> Envelope:
@@ -36,23 +41,30 @@ def envelope_of(
 
     apart_nm: torsion less current path [n]; temperatures_c: of the runs, NaN where one has none; room_k: known beside them.
     """
-    rows = int(np.ceil(np.abs(velocity_rad_s).max() / VELOCITY_STEP_RAD_S)) + 1
+    rows = int(np.ceil(np.abs(velocity_rad_s).max() / velocity_step_rad_s)) + 1
     columns = int(np.ceil(np.abs(raw_nm).max() / torque_step_nm)) + 1
     counts = np.zeros((2 * rows + 1, 2 * columns + 1), np.int64)
     at = (
-        np.rint(velocity_rad_s / VELOCITY_STEP_RAD_S).astype(int) + rows,
+        np.rint(velocity_rad_s / velocity_step_rad_s).astype(int) + rows,
         np.rint(raw_nm / torque_step_nm).astype(int) + columns,
     )
     np.add.at(counts, at, 1)
     known = filled(counts >= _VISITS)
     temperatures = [each for each in temperatures_c if np.isfinite(each)]
     return Envelope(
-        VELOCITY_STEP_RAD_S,
+        velocity_step_rad_s,
         torque_step_nm,
         tuple(tuple(int(cell) for cell in row) for row in known),
         1.25 * float(np.quantile(np.abs(apart_nm), 0.999)),
         (min(temperatures) - room_k, max(temperatures) + room_k) if temperatures else None,
     )
+
+
+def velocity_step(velocity_rad_s: FloatArray) -> float:
+    """Return the step of speed for moving samples [n]: a round number near VELOCITY_STEP_SHARE of the largest speed."""
+    wanted = VELOCITY_STEP_SHARE * float(np.quantile(np.abs(velocity_rad_s), 0.999))
+    power = 10.0 ** np.floor(np.log10(wanted))
+    return float(f"{power * min(_ROUND, key=lambda each: abs(np.log(each * power / wanted))):.6g}")
 
 
 def filled(known: Table) -> Table:

@@ -36,7 +36,7 @@ from jtqd.estimator.fusion import GAUSS, Fusion, held
 from jtqd.estimator.joint import AdditiveLoss, Agreement, Friction, Fused, FusedSigma, Torsion
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.sysid.fit.agreement import fit_agreement
-from jtqd.sysid.fit.envelope import FIT_ROOM_K, TORQUE_STEP_SHARE, envelope_of
+from jtqd.sysid.fit.envelope import FIT_ROOM_K, TORQUE_STEP_SHARE, envelope_of, velocity_step
 from jtqd.sysid.fit.losses import LossFit, fit_loss
 from jtqd.sysid.fit.signals import RunSignals
 from jtqd.sysid.fit.torsion import fit_torsion
@@ -271,11 +271,13 @@ def _envelope(
 ) -> Envelope | None:
     """Return what the runs covered; None where that takes a larger map than an envelope may have."""
     seen = [path_residuals(run, loss, torsion) for run in runs if run.moving.any()]
+    velocity = np.concatenate([run.velocity_rad_s for run in seen])
     made = envelope_of(
-        np.concatenate([run.velocity_rad_s for run in seen]),
+        velocity,
         np.concatenate([run.raw_nm for run in seen]),
         np.concatenate([run.torsion_error_nm - run.current_error_nm for run in seen]),
         [run.temperature_c for run in runs],
+        velocity_step_rad_s=velocity_step(velocity),
         torque_step_nm=TORQUE_STEP_SHARE * rated_nm,
         room_k=FIT_ROOM_K,
     )

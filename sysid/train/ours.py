@@ -31,6 +31,7 @@ from jtqd.sysid.fit.losses import fit_loss
 from jtqd.sysid.fit.signals import RunSignals
 from jtqd.sysid.fit.torsion import fit_torsion
 from jtqd.sysid.fit.torsion_signals import torsion_torque
+from jtqd.sysid.train.gate import judge
 from jtqd.sysid.train.network import IR_VERSION, OPSET, Trained, folded_layers, hidden_output, train
 from jtqd.sysid.train.paper import TrainedNetwork, digest_of, thinned
 
@@ -135,7 +136,8 @@ def train_fused(
             f"found {counted(len(runs), 'run')}, expected at least 8: standard deviations need held-out runs"
         )
     unseen: list[tuple[Seen, FloatArray]] = []
-    for known, judged in folds(runs):
+    fold_of: list[int] = []
+    for fold, (known, judged) in enumerate(folds(runs)):
         loss, torsion = fit_loss(known, joint.friction).loss, fit_torsion(known)
         trained = _train(
             [Seen(run, joint, loss, torsion, fused.sigma) for run in known], iterations, seed, progress
@@ -143,12 +145,11 @@ def train_fused(
         for n in judged:
             one = Seen(runs[n], joint, loss, torsion, fused.sigma)
             unseen.append((one, gated_output(trained, one.features[:, :_CORE], one.waves)))
-    share = safe_share([(one.residual_nm, correction) for one, correction in unseen])
-    errors = [one.residual_nm - share * correction for one, correction in unseen]
-    scores = {
-        one.name: (float(np.mean(error**2)), float(np.mean(one.residual_nm**2)))
-        for (one, _), error in zip(unseen, errors, strict=True)
-    }
+            fold_of.append(fold)
+    pairs = [(one.residual_nm, correction) for one, correction in unseen]
+    share = safe_share(pairs)
+    errors = [residual - share * correction for residual, correction in pairs]
+    scores = {one.name: score for (one, _), score in zip(unseen, judged_scores(pairs, fold_of), strict=True)}
     blocks = [Seen(run, joint, fused.loss, fused.torsion, fused.sigma) for run in runs]
     trained = _train(blocks, iterations, seed, progress)
     trained = scaled(trained, share)
@@ -161,6 +162,7 @@ def train_fused(
             conformal_scale(errors, [one.sigma_nm for one, _ in unseen], [one.quadrant for one, _ in unseen])
         ),
         "share": share,
+        "gate": judge(list(scores.values())).to_mapping(),
         "input_low": low.tolist(),
         "input_high": high.tolist(),
         "joint": joint.name,
@@ -189,6 +191,26 @@ def safe_share(unseen: Sequence[tuple[FloatArray, FloatArray]]) -> float:
     squares = np.maximum(squares, 1e-12)
     share = min(1.0, float(products.sum() / squares.sum()), float(np.min(1.8 * products / squares)))
     return share if share >= _LEAST_SHARE else 0.0
+
+
+def judged_scores(
+    unseen: Sequence[tuple[FloatArray, FloatArray]], fold_of: Sequence[int]
+) -> list[tuple[float, float]]:
+    """Return the MSE of each run left out, with and without its correction: (residual [n], correction [n]) and fold of each.
+
+    The share of a run is that of the other folds alone. One that is chosen to harm no run cannot be judged on these runs.
+    """
+    shares = {
+        fold: safe_share([pair for pair, other in zip(unseen, fold_of, strict=True) if other != fold])
+        for fold in set(fold_of)
+    }
+    return [
+        (
+            float(np.mean((residual - shares[fold] * correction) ** 2)),
+            float(np.mean(residual**2)),
+        )
+        for (residual, correction), fold in zip(unseen, fold_of, strict=True)
+    ]
 
 
 def quick_part(residual_nm: FloatArray) -> FloatArray:

@@ -104,6 +104,10 @@ def test_a_run_on_the_emulated_bench(tmp_path: Path, environment: dict[str, str]
     )
     assert result.returncode == 0, result.stderr
     no_traceback(result)
+    said = [line for line in result.stderr.splitlines() if "physics only" in line]
+    assert [line.partition("joint ")[2].partition(" (")[0] for line in said] == [
+        f"{number}: no network, physics only" for number in (1, 2)
+    ]
     summary = json.loads(result.stdout)
     slots = summary["cycles"] + summary["missed"] + summary["counters"]["sync_gaps"]
     assert slots == pytest.approx(3000, abs=2)
@@ -146,6 +150,7 @@ def test_method_fused_on_the_emulated_bench(tmp_path: Path, environment: dict[st
     result = run(*options, environment=environment)
     assert result.returncode == 0, result.stderr
     no_traceback(result)
+    assert "physics only" not in result.stderr
     recording = json.loads(result.stdout)["recording"]
     for number in (1, 2):
         state = read_topic(Path(recording["path"]), f"/joint/{number}/state")[-1000:]

@@ -1,6 +1,6 @@
 /* Drives jtqd_estimate.h from a transcript on stdin; compiled as C99 and, through jtqd_estimate.hpp, as C++17.
  *
- *     begin OVERFLOW MAX_AGE_NS     take ID STAMP_NS LENGTH HEX     read JOINT NOW_NS     counters
+ *     begin OVERFLOW MAX_AGE_NS     take ID STAMP_NS LENGTH HEX     read JOINT NOW_NS     touched JOINT NOW_NS     counters
  */
 #include <stdio.h>
 #ifdef __cplusplus
@@ -41,7 +41,9 @@ int main(void)
             }
             printf("%d\n", jtqd_take(&receiver, id, data, length, stamp));
 #ifdef __cplusplus
-            twin.take(id, data, length, jtqd::Nanoseconds(stamp));
+            const bool estimate = id == 0x1A0 || id == 0x2A0;
+            if (twin.take(id, data, length, jtqd::Nanoseconds(stamp)) && !estimate)
+                return 1;
 #endif
         } else if (strcmp(word, "read") == 0) {
             int joint;
@@ -57,6 +59,21 @@ int main(void)
             if (twin.torque(joint, jtqd::Nanoseconds(now)).has_value() != found.usable)
                 return 1;
             if (found.usable && twin.torque(joint, jtqd::Nanoseconds(now))->nm != found.torque_nm)
+                return 1;
+#endif
+        } else if (strcmp(word, "touched") == 0) {
+            int joint;
+            long long now;
+            if (scanf("%d %lld", &joint, &now) != 2)
+                return 1;
+            const jtqd_contact found = jtqd_read_contact(&receiver, joint, now);
+            printf("%s %.0f %lld\n", jtqd_contact_name(found.code), found.rate_nm_s, (long long)found.age_ns);
+#ifdef __cplusplus
+            const auto told = twin.contact(joint, jtqd::Nanoseconds(now));
+            if (told.has_value() != (found.code >= JTQD_CONTACT_NONE))
+                return 1;
+            if (told && (told->there != (found.code > JTQD_CONTACT_NONE) ||
+                         told->positive != (found.code == JTQD_CONTACT_POSITIVE)))
                 return 1;
 #endif
         } else if (strcmp(word, "counters") == 0)

@@ -16,12 +16,14 @@ from pathlib import Path
 
 import can
 import pytest
+import yaml
 
 from examples.receivers import receive_estimate
-from jtqd.daemon.core import estimate_pdo
+from jtqd.daemon.core import contact_pdo, estimate_pdo
 from jtqd.drivers.can_unix import UnixBus
 from jtqd.drivers.hub import Hub
-from jtqd.estimator import status
+from jtqd.estimator import contact, status
+from jtqd.models.files import shipped
 from tests.paths import ROOT
 
 # -7.75 Nm, sigma 0.2 Nm, valid; joint 2 stale; SYNC counter 42
@@ -54,6 +56,26 @@ def test_what_the_daemon_encodes_is_decoded():
         receive_estimate.decode(FRAME[:7])
 
 
+def pushed(sequence, one=contact.NONE, two=contact.NONE, rate=640.0, push=2.9):
+    """A contact PDO; a push of joint 1 along its positive direction is one of joint 2 against its own."""
+    return contact_pdo.encode(
+        contact_pdo.field(rate, push, one), contact_pdo.field(-rate, -push, two), sequence
+    )
+
+
+def test_contacts_that_the_daemon_encodes_are_decoded():
+    assert receive_estimate.decode_contact(pushed(17, contact.CONTACT, contact.CONTACT)) == (
+        (640.0, "positive"),
+        (-640.0, "negative"),
+        17,
+    )
+    data = pushed(1, contact.OFF, contact.UNKNOWN, rate=math.nan)
+    assert receive_estimate.decode_contact(data)[:2] == ((None, "off"), (None, "unknown"))
+    assert contact_pdo.CODE_NAMES == receive_estimate.CONTACT
+    with pytest.raises(struct.error):
+        receive_estimate.decode_contact(FRAME)
+
+
 def test_it_prints_what_comes_over_a_unix_bus(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(can.interfaces.BACKENDS, "jtq_unix", ("jtqd.drivers.can_unix", "UnixBus"))
     path = str(tmp_path / "bus")
@@ -73,6 +95,8 @@ def test_it_prints_what_comes_over_a_unix_bus(tmp_path, monkeypatch, capsys):
                 while not ended.wait(0.01):
                     sender.send(can.Message(arbitration_id=0x1A1, data=FRAME, is_extended_id=False))
                     sender.send(can.Message(arbitration_id=0x1A0, data=FRAME, is_extended_id=False))
+                    touch = pushed(42, contact.CONTACT)
+                    sender.send(can.Message(arbitration_id=0x3A0, data=touch, is_extended_id=False))
 
             worker = threading.Thread(target=send)
             worker.start()
@@ -88,7 +112,11 @@ def test_it_prints_what_comes_over_a_unix_bus(tmp_path, monkeypatch, capsys):
         thread.join()
         hub.close()
     lines = capsys.readouterr().out.splitlines()
-    assert lines == [" 42  1:     -7.75 Nm +-  0.20  valid        2:    no torque +-     ?  stale"] * 2
+    said = [line for line in lines if "contact" in line]
+    assert said == [" 42  contact 1: positive at 640 Nm/s  2: none at -640 Nm/s"], "once, until it changes"
+    assert [line for line in lines if "contact" not in line] == [
+        " 42  1:     -7.75 Nm +-  0.20  valid        2:    no torque +-     ?  stale"
+    ] * 2
 
 
 def test_no_bus_is_one_line(tmp_path, monkeypatch, capsys):
@@ -221,6 +249,47 @@ def test_lost_and_malformed_pdos_are_counted(transcript):
     assert transcript(*frames, "counters")[-6:] == ["0"] * 5 + ["received 5 lost 5 repeated 0 malformed 3"]
 
 
+def test_the_header_tells_contacts(transcript):
+    lines = transcript(
+        f"touched 1 {MS}",
+        take(0x080, 1.0, bytes([7])),
+        take(0x3A0, 1.8, pushed(7, contact.CONTACT, contact.CONTACT)),
+        take(0x4A0, 1.8, pushed(7, contact.NONE, contact.UNKNOWN, rate=-9e9)),
+        *(f"touched {joint} {2 * MS}" for joint in (1, 2, 3, 4, 5)),
+        "counters",
+    )
+    assert lines == [
+        "unknown nan 0",
+        *("0", "3", "4"),
+        *("positive 640 1000000", "negative -640 1000000", "none -4064 1000000", "unknown 4064 1000000"),
+        "unknown nan 0",
+        "received 0 lost 0 repeated 0 malformed 0",
+    ]
+
+
+def test_no_contact_is_believed_of_a_young_pdo_of_the_last_two_syncs_only(transcript):
+    none = take(0x3A0, 1.8, pushed(7))
+    sync = [take(0x080, n, bytes([7 + n - 1])) for n in (1, 2, 3)]
+    assert transcript(sync[0], none, sync[1], f"touched 1 {2 * MS}")[-1].startswith("none ")
+    assert transcript(sync[0], none, *sync[1:], f"touched 1 {3 * MS}")[-1].startswith("unknown nan")
+    assert transcript(none, f"touched 1 {7 * MS}")[-1] == "unknown nan 5200000", "too old"
+    assert transcript(none, f"touched 1 {MS}")[-1].startswith("unknown nan"), "the clock was set back"
+    later = bytearray(pushed(7))
+    later[2] = 0x2F
+    assert transcript(take(0x3A0, 1.8, bytes(later)), f"touched 1 {2 * MS}")[-1].startswith("unknown 640")
+
+
+def test_a_repeated_contact_is_heard_and_malformed_ones_are_not(transcript):
+    again = pushed(7, contact.CONTACT)
+    lines = transcript(take(0x3A0, 1.8, pushed(7)), take(0x3A0, 1.9, again), f"touched 1 {2 * MS}")
+    assert lines[1:] == ["0", "positive 640 200000"]
+    bad = [take(0x3A0, 1.8, each) for each in (again[:3], pushed(0), pushed(241), bytes(8))]
+    assert transcript(*bad, f"touched 1 {2 * MS}", "counters")[4:] == [
+        "unknown nan 0",
+        "received 0 lost 0 repeated 0 malformed 4",
+    ]
+
+
 @pytest.fixture(scope="module")
 def program(tmp_path_factory):
     if shutil.which("cc") is None:
@@ -238,6 +307,7 @@ def test_a_wrong_command_line_and_no_bus(program, tmp_path):
         ["vcan0", "--joint"],
         ["vcan0", "--joint", "5"],
         ["vcan0", "--max-age-ms", "x"],
+        ["vcan0", "--on-contact", "run"],
     ):
         done = subprocess.run([program, *arguments], capture_output=True, text=True, check=False, timeout=10)
         assert done.returncode == 2
@@ -293,6 +363,8 @@ def test_beside_jtqd_withheld_late_and_lost_estimates(program, tmp_path: Path) -
             "none",
             "--duration",
             "60",
+            "--config",
+            with_contacts(tmp_path),
         )
         first = until(receiver.stdout, "USE")
         assert first[0] == "HOLD  never received, status off"
@@ -311,11 +383,23 @@ def test_beside_jtqd_withheld_late_and_lost_estimates(program, tmp_path: Path) -
         out = receiver.stdout.read()  # not communicate(): a line may wait in the buffer of the lines before
         assert receiver.wait(30) == 3
         assert " repeated 0, malformed 0;" in out
+        assert int(out.rpartition(" ")[2]) > 300, "contact PDOs, with section contact"
     finally:
         for side in sides:
             for process in (*children_of(side.pid), side.pid) if side.poll() is None else ():
                 os.kill(process, signal.SIGKILL)
             side.communicate(timeout=30)
+
+
+def with_contacts(directory: Path) -> Path:
+    """Write the shipped configuration with section contact; return its path."""
+    content = yaml.safe_load(shipped("bench.yaml").read_text())
+    for joint in (content["joint_1"], content["joint_2"]):
+        for section in (joint, joint["network"]):
+            section["file"] = str(shipped(section["file"]))
+    path = directory / "contact.yaml"
+    path.write_text(yaml.safe_dump(content | {"contact": {"opposed": True}}))
+    return path
 
 
 def children_of(pid: int) -> list[int]:
@@ -379,3 +463,59 @@ def test_estimates_that_are_lost_on_the_way(program, tmp_path):
         hub.close()
     assert "STOP" not in rest + "".join(held)
     assert rest.splitlines()[-1].startswith("received 107, lost 3, repeated 0, malformed 0; usable in ")
+    assert rest.endswith("; contact PDOs 0\n")
+
+
+def test_the_program_stops_on_a_contact_and_uses_nothing_before_it_knows_of_none(program, tmp_path):
+    path = str(tmp_path / "bus")
+    hub, stop = Hub(path), threading.Event()
+
+    def serve():
+        while not stop.is_set():
+            hub.run_once(0.01)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    receiver = None
+    try:
+        with UnixBus(path) as sender:
+            receiver = subprocess.Popen(
+                [
+                    program,
+                    f"unix:{path}",
+                    "--on-contact",
+                    "stop",
+                    "--max-age-ms",
+                    "2000",
+                    "--stop-after-ms",
+                    "9000",
+                ],
+                stdout=subprocess.PIPE,
+                text=True,
+            )
+            assert until(receiver.stdout, "HOLD") == ["HOLD  never received, status off"]
+
+            def send(counter, cob_id, data):
+                for each, content in ((0x080, bytes([counter])), (cob_id, data)):
+                    sender.send(
+                        can.Message(arbitration_id=each, data=content, is_extended_id=False), timeout=1
+                    )
+
+            send(1, 0x1A0, valid(1))
+            time.sleep(0.2)
+            send(1, 0x3A0, pushed(1))
+            assert until(receiver.stdout, "USE")[-1].startswith("USE   valid 1.00 Nm"), (
+                "not while nobody knows"
+            )
+            send(2, 0x3A0, pushed(2, contact.CONTACT))
+            assert until(receiver.stdout, "STOP")[-1].startswith(
+                "STOP  contact positive, torque rate 640 Nm/s, age "
+            )
+            assert receiver.wait(10) == 3
+    finally:
+        if receiver is not None and receiver.poll() is None:
+            receiver.kill()
+            receiver.wait()
+        stop.set()
+        thread.join()
+        hub.close()

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from jtqd.daemon.logs import LogError
+from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
 from jtqd.estimator.status import DEGRADED, NAMES, STALE, STANDSTILL, VALID
 from jtqd.sysid import plot as plot_command
 from tests.daemon.logs.campaign_log import Joint, regular, write_log
@@ -122,3 +123,25 @@ def test_joint_four_without_a_reference_is_drawn(tmp_path, capsys):
     path = write_log(tmp_path / "a.mcap", cycles, 4)
     assert plot_command.main([str(path), "--joint", "4", "--out", str(tmp_path / "a.png"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["rmse_nm"] == {"joint_4": None}
+
+
+def with_contacts(flags):
+    names = ("sync_monotonic_ns", "status", "torque_nm", "sigma_nm", "reference_nm", "age_ms")
+    more = ("contact_nm", "torque_rate_nm_s")
+    table = np.zeros(len(flags), [(name, "f8") for name in (*names, *more)] + [("input_flags", "<u2")])
+    table["sync_monotonic_ns"], table["status"] = np.arange(len(flags)) * 1e6, VALID
+    table["contact_nm"], table["input_flags"] = 2.5, flags
+    return table
+
+
+def test_contacts_have_panels_where_they_were_watched(tmp_path):
+    """Two contacts, told in 3 of 6 cycles; the flags are those of the loop."""
+    known, there = FLAG_CONTACT_KNOWN, FLAG_CONTACT_KNOWN | FLAG_CONTACT
+    log = with_contacts([7, known, there, there, known, there])
+    assert plot_command.contacts(log).tolist() == [False, False, True, True, False, True]
+    assert plot_command.contacts(with_contacts([7, 7])) is None
+    for name, flags in (("watched", log["input_flags"]), ("not", [7] * 6)):
+        plot_command.draw(with_contacts(flags), 1, tmp_path / f"{name}.svg")
+    texts = {name: (tmp_path / f"{name}.svg").read_text() for name in ("watched", "not")}
+    for words in ("<!-- 2 contacts -->", "<!-- torque rate -->"):
+        assert (words in texts["watched"], words in texts["not"]) == (True, False), words

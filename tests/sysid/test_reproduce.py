@@ -123,6 +123,17 @@ def test_configuration_written_beside_the_models_is_one_that_jtqd_takes(tmp_path
         assert hashlib.sha256(joint.network.path.read_bytes()).hexdigest() == joint.network.sha256
 
 
+def test_a_network_that_was_not_written_is_not_in_the_configuration(tmp_path):
+    for file in shipped("trained/joint1.yaml").parent.iterdir():
+        if file.name != "joint1.fused.onnx":
+            (tmp_path / file.name).write_bytes(file.read_bytes())
+    write_config(tmp_path / "bench.yaml", "bench.yaml")
+    config = load_config(tmp_path / "bench.yaml")
+    assert [joint.network is None for joint in config.joints] == [True, False]
+    for joint in config.joints:
+        assert joint.temperature
+
+
 @pytest.mark.parametrize("number", [1, 2])
 def test_shipped_models_come_from_the_same_runs(number):
     import onnx

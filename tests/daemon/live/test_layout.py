@@ -10,6 +10,7 @@ import pytest
 from jtqd.daemon.jtq import main as jtq
 from jtqd.daemon.live.layout import layout
 from jtqd.daemon.recording import schemas
+from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
 from tests.daemon.live.viewer_log import Log, bench_log
 
 pytestmark = pytest.mark.native
@@ -119,12 +120,23 @@ def test_the_scripts_make_band_and_residual(made, log):
     value = {
         name: eval(text, {"NaN": math.nan}, {"message": types.SimpleNamespace(**message)})
         for name, text in fields.items()
+        if name != "contact"  # not an expression of Python as well
     }
     torque, sigma = message["torque_nm"], message["sigma_nm"]
     assert math.isfinite(torque)
     assert (value["upper_nm"], value["lower_nm"]) == (torque + sigma, torque - sigma)
     assert value["minus_sigma_nm"] == -sigma
     assert value["residual_nm"] == torque - message["reference_nm"]
+
+
+def test_the_scripts_know_a_contact_from_none_and_from_not_known(made):
+    _, fields = scripted(made)["/studio_script/joint_2"]
+    test = re.fullmatch(
+        r"\(message\.input_flags & (\d+)\) === 0 \? NaN : \(message\.input_flags & (\d+)\) === 0 \? 0 : 1",
+        fields["contact"],
+    )
+    assert test is not None
+    assert tuple(map(int, test.groups())) == (FLAG_CONTACT_KNOWN, FLAG_CONTACT)
 
 
 def test_viewers_name_status_and_kind_of_event(log):

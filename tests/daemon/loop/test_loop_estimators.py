@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from jtqd.daemon.config import load_config
+from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.loop.process import build_estimator, loop_filters, warm_up
 from jtqd.drivers.filters import CanFilter
 from jtqd.estimator.checked import ConfigError
@@ -41,6 +41,26 @@ def test_method_fused_without_networks_is_its_physics(tmp_path: Path) -> None:
     estimator = build_estimator(config, config.joints[1])
     found = [estimator.step(1e-3, 2.0, 0.1 * n, 100.0, 0.001 * n, 25.0) for n in range(50)][-1]
     assert (found.status, found.torque_nm) == (2, found.physics_nm)
+
+
+def notes(config: Config) -> list[str]:
+    found: list[str] = []
+    for joint in config.joints:
+        build_estimator(config, joint, None, found)
+    return found
+
+
+def test_a_joint_that_is_its_physics_alone_is_told(tmp_path: Path) -> None:
+    shipped_ones = load_config(None)
+    expected = "joint {0}: no network, physics only (joint{0}.fused.onnx has the share 0: envelope and calibration only)"
+    assert notes(shipped_ones) == [expected.format(number) for number in JOINTS]
+    half = load_config(configured(tmp_path, "fused", {1: networks()[1]}))
+    assert notes(half) == ["joint 2: no network, physics only"]
+
+
+@pytest.mark.parametrize("method", ["tob", "efficiency", "network"])
+def test_methods_that_are_no_correction_of_it_say_nothing(tmp_path: Path, method: str) -> None:
+    assert notes(load_config(configured(tmp_path, method, the_papers()))) == []
 
 
 @pytest.mark.parametrize("method", ["tob", "efficiency"])
