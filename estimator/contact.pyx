@@ -44,8 +44,8 @@ LONGEST_S: Final = 0.5
 SETTLE_S: Final = 0.1
 """After a start nothing is told for so long."""
 UNEVEN: Final = 0.05
-"""Two steps in a row that differ by more have no acceleration between them: at 1 rad/s a stamp that is 50 us off, of samples
-that are not, looks like 1 Nm on a link of 0.01 kg m2."""
+"""Two steps in a row that differ by more have no acceleration between them, and neither has the one after: at 1 rad/s a stamp
+that is 50 us off, of samples that are not, looks like 1 Nm on a link of 0.01 kg m2."""
 LONGEST_GAP: Final = 50
 """Samples without inputs, after which the past is forgotten."""
 
@@ -92,7 +92,9 @@ cdef void follow_link(
     step = (now.link - s.q) / dt
     if s.samples >= 1:
         torque += law.damping * (behind - s.behind) / dt
-    if s.samples >= 3 and fabs(dt - s.dt) <= UNEVEN_STEPS * dt:
+    if s.samples >= 1 and fabs(dt - s.dt) > UNEVEN_STEPS * dt:
+        s.samples = 1
+    if s.samples >= 3:
         out.load_nm = s.torque - law.inertia * (step - s.step) / dt
     if s.samples < 3:
         s.samples += 1

@@ -172,9 +172,9 @@ def test_a_gap_in_the_inputs_is_unknown_and_no_contact() -> None:
     angle = made.table.joints[1].motor_position_rad
     assert angle is not None
     _, told = ContactDetector(THRESHOLD_NM).run(two - one, angle[keep])
-    assert (told[1000:1002] == UNKNOWN).all(), "two steps of one length give an acceleration"
+    assert (told[1000:1003] == UNKNOWN).all(), "three steps of one length give an acceleration"
     assert (told[104:1000] == NONE).all()
-    assert (told[1002:] == NONE).all()
+    assert (told[1003:] == NONE).all()
 
 
 def test_after_a_long_gap_it_settles_again() -> None:

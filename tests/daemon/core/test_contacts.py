@@ -141,10 +141,10 @@ def test_a_push_goes_out_is_recorded_and_counted(tmp_path: Path, exact: ExactTim
     assert len(sent) == len(records) == CYCLES
     codes = [each.contact for each in sent]
     assert set(codes[:100]) == {(1, 1)}, "not known before it has settled"
-    assert codes[MISSING : MISSING + 4] == [(1, 1)] * 4, (
-        "nor where an input is missing, until two steps are even again"
+    assert codes[MISSING : MISSING + 5] == [(1, 1)] * 5, (
+        "nor where an input is missing, until three steps are even again"
     )
-    assert set(codes[110:MISSING] + codes[MISSING + 4 : PUSHED]) == {(2, 2)}
+    assert set(codes[110:MISSING] + codes[MISSING + 5 : PUSHED]) == {(2, 2)}
     assert codes[PUSHED + 2 : PUSHED + 90] == [(3, 4)] * 88, (
         "joint 1 along, joint 2 against its own direction"
     )
