@@ -34,7 +34,7 @@ from jtqd.drivers.bus_load import LIMIT, BusLoadError
 from jtqd.drivers.frame_socket import BusError
 from jtqd.drivers.object_dictionary import EdsError
 from jtqd.drivers.survey import DRIVE, IDENTITY, SENSOR, BusSurvey, Survey, survey_of_eds
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.checked import ConfigError, counted
 
 MAX_JOINTS = 2
 _PERIODS_US = (1000, 2000, 4000, 5000, 10_000)
@@ -191,6 +191,12 @@ def _run(options: argparse.Namespace) -> int:
         for joint in joints
         for name, each in joint.instead.items()
     ]
+    less += [
+        f"joint {joint.number}: tpdos: {counted(len(joint.layout.tpdos), 'TPDO')} of the drive "
+        f"({joint.layout.why}); without this section jtqd maps its own, where the drive lets it"
+        for joint in joints
+        if joint.layout.tpdos
+    ]
     if found.sensor is not None:
         problems += sensor_problems(found.sensor, found.surveys.get(found.sensor))
     report = {
@@ -275,6 +281,8 @@ def family_of(survey: Survey | None, name: str | None) -> Family | None:
 def surveyed(reader: BusSurvey, node: int, profile: str | None) -> Survey | None:
     """Survey one node, with the objects that its profile needs; None when it does not answer. Raises ConfigError."""
     found = reader.read(node)
+    if found is not None:
+        found = replace(found, tpdos=reader.tpdos(node))
     if found is None or (family := family_of(found, profile)) is None:
         return found
     wanted = {*family.objects, *mapped_by(family)}
@@ -307,8 +315,19 @@ def _survey(bus: str) -> Iterator[BusSurvey]:
 
 
 def merged(eds: Survey, bus: Survey | None) -> Survey:
-    """A device on the bus knows its values; its EDS knows what can be mapped."""
-    return eds if bus is None else replace(bus, unmappable=eds.unmappable)
+    """A device on the bus knows its values; its EDS knows what can be mapped, and what cannot be written."""
+    if bus is None:
+        return eds
+    known = {each.number: each for each in eds.tpdos}
+    tpdos = tuple(
+        replace(
+            each, mapping_fixed=known[each.number].mapping_fixed, type_fixed=known[each.number].type_fixed
+        )
+        if each.number in known
+        else each
+        for each in bus.tpdos
+    )
+    return replace(bus, unmappable=eds.unmappable, tpdos=tpdos)
 
 
 def description(survey: Survey) -> str:

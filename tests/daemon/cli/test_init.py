@@ -311,10 +311,10 @@ def test_probe_names_what_a_drive_lacks():
     found = drive(without=[(0x6041, 0)])
     (problem,) = probe.problems_of(found)
     assert "6041h:0" in problem
-    assert "6041h:0  not there" in probe.text(found, [], [problem])
+    assert "6041h:0  not there" in probe.text(found, [problem])
     less = drive(without=[(0x60E4, 1)])
     assert probe.problems_of(less) == []
-    assert "link_position: false" in probe.text(less, [], [])
+    assert "link_position: false" in probe.text(less, [])
 
 
 def test_on_a_terminal_what_is_missing_is_asked_for(tmp_path):
