@@ -81,7 +81,7 @@ def test_counts_need_no_word(numbers: dict[tuple[int, int], int]) -> None:
     assert entries(numbers) == {}
 
 
-def test_each_object_scales_what_it_tells() -> None:
+def test_each_unit_is_scaled_by_its_object() -> None:
     position = {"motor_position": {"by": "60A8h"}, "link_position": {"by": "60A8h"}}
     assert entries({(0x60A8, 0): MILLIDEGREE, (0x60A9, 0): 0x00B4_4700}) == {
         **position,
@@ -95,9 +95,7 @@ def test_each_object_scales_what_it_tells() -> None:
 
 @pytest.mark.parametrize(("told", "gear"), [(100, 100.0), (1, 100.0), (0, 100.0), (50, 100.0), (1, 1.0)])
 @pytest.mark.parametrize("velocity", [0, 0xFD41_0300])
-def test_the_factor_is_right_whatever_gear_the_drive_counts_with(
-    told: int, gear: float, velocity: int
-) -> None:
+def test_the_unit_is_right_whatever_gear_the_drive_counts_with(told: int, gear: float, velocity: int) -> None:
     """One millidegree of the shaft behind the drive's own gear; the link's position has nothing to do with a gear."""
     numbers = {(0x60A8, 0): MILLIDEGREE, (0x60A9, 0): velocity, (0x6091, 1): told, (0x6091, 2): told and 1}
     survey = drive(numbers)
