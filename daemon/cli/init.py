@@ -30,6 +30,7 @@ from jtqd.daemon.cli.draft import (
 )
 from jtqd.daemon.config import MAX_NODE_ID, load_config
 from jtqd.daemon.profiles import Family, named, of_vendor
+from jtqd.daemon.profiles import names as profile_names
 from jtqd.drivers.bus_load import LIMIT, BusLoadError
 from jtqd.drivers.frame_socket import BusError
 from jtqd.drivers.object_dictionary import EdsError
@@ -109,7 +110,7 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument(
         "--profile",
-        metavar="NAME|none",
+        choices=[*profile_names(), "none"],
         help="profile of the drives' family (default: by their vendor-ID; docs/profiles.md)",
     )
     made.add_argument("--out", type=Path, required=True, metavar="DIR", help="directory for the files")
@@ -448,13 +449,17 @@ def _config(options: argparse.Namespace, found: Found, joints: list[JointDraft])
 def _write(directory: Path, name: str, draft: ConfigDraft) -> tuple[list[Path], int]:
     """Write the files with the shortest period whose bus load fits; returns paths and period [us]. Raises ConfigError."""
     directory.mkdir(parents=True, exist_ok=True)
-    files = []
-    for joint in draft.joints:
-        files.append(directory / f"joint_{joint.number}.yaml")
-        files[-1].write_text(joint_text(joint), encoding="utf-8")
+    files = [directory / f"joint_{joint.number}.yaml" for joint in draft.joints]
     files.append(directory / f"{name}.yaml")
-    for period_us in _PERIODS_US:
-        files[-1].write_text(config_text(replace(draft, period_us=period_us)), encoding="utf-8")
-        if bus_load_of(load_config(files[-1])).worst <= LIMIT:
-            return files, period_us
-    raise ConfigError(f"{files[-1]}: at {draft.bitrate} bit/s not even 100 Hz fit the bus")
+    try:
+        for path, joint in zip(files, draft.joints, strict=False):
+            path.write_text(joint_text(joint), encoding="utf-8")
+        for period_us in _PERIODS_US:
+            files[-1].write_text(config_text(replace(draft, period_us=period_us)), encoding="utf-8")
+            if bus_load_of(load_config(files[-1])).worst <= LIMIT:
+                return files, period_us
+        raise ConfigError(f"{files[-1]}: at {draft.bitrate} bit/s not even 100 Hz fit the bus")
+    except (ConfigError, BusLoadError):
+        for path in files:  # what jtqd refuses does not stay
+            path.unlink(missing_ok=True)
+        raise

@@ -16,6 +16,7 @@ from jtqd.daemon.cli.as_told import unit_problems
 from jtqd.daemon.cli.draft import DraftError, Wanted, draft_joint, drive_lines, sensor_lines, sensor_problems
 from jtqd.daemon.cli.init import description, eds_survey, family_of, merged, node_id, surveyed
 from jtqd.daemon.profiles import Family
+from jtqd.daemon.profiles import names as profile_names
 from jtqd.drivers.frame_socket import BusError
 from jtqd.drivers.object_dictionary import EdsError
 from jtqd.drivers.sdo import label
@@ -42,7 +43,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--eds", type=Path, metavar="FILE", help="its EDS, which tells what can be mapped")
     made.add_argument(
         "--profile",
-        metavar="NAME|none",
+        choices=[*profile_names(), "none"],
         help="profile of its family (default: by its vendor-ID; docs/profiles.md)",
     )
     made.add_argument("--json", action="store_true", help="print as JSON")

@@ -7,7 +7,6 @@ cycle is late for it.
 from __future__ import annotations
 
 import json
-import math
 import os
 import select
 import signal
@@ -30,7 +29,7 @@ from jtqd.daemon.recording.keeper import Keeper, recording_request
 from jtqd.daemon.reload.files import Reload, ReloadError
 from jtqd.daemon.ros2.keeper import Ros2Keeper
 from jtqd.daemon.shared.child_process import Child, ChildError, ChildSilence
-from jtqd.daemon.shared.conditions import JOINT, PDO, THE_MACHINE, Conditions, ConditionsFile
+from jtqd.daemon.shared.conditions import THE_MACHINE, Conditions, ConditionsFile
 from jtqd.daemon.shared.log_lines import ERROR, WARNING, EventLog, OperatorLog
 from jtqd.daemon.shared.notices import FILE as NOTICES
 from jtqd.daemon.shared.notices import Notices
@@ -477,11 +476,8 @@ class Supervisor:
     def _report_conditions(self, now: float) -> None:
         """Log the lines that are due and keep `conditions.json` up to date."""
         for line in self._conditions.lines(now):
-            # What concerns a joint may come and go with its cable: few lines of each joint reach the operator.
-            kind = line.subject.name if line.definition.about in (JOINT, PDO) else ""
-            if kind and line.definition.repeat_s < math.inf:
-                kind += f" {line.definition.name}"  # what waits for the operator is not held back by the inputs' lines
-            self._log_event(line.definition.topic, line.subject.node, line.text, kind, line.severity)
+            topic, node = line.definition.topic, line.subject.node
+            self._log_event(topic, node, line.text, line.rate_class, line.severity)
         self._conditions_file.write(self._conditions.present())
 
     def _serve(self, view: View, now: float) -> None:
