@@ -1,5 +1,6 @@
 """The estimators of a joint; the equations stand in estimator.pyx."""
 
+from jtqd.estimator.agreement cimport AgreementLaw, AgreementState
 from jtqd.estimator.contact cimport LinkLaw, LinkState
 from jtqd.estimator.fusion cimport Fused, FusionLaw
 from jtqd.estimator.losses cimport AdditiveLaw, EfficiencyLaw
@@ -50,6 +51,7 @@ cdef struct FusedLaw:
     bint with_envelope  # trust is set, of the network or of the joint file
     NetworkLaw network
     ZerosLaw zeros
+    AgreementLaw agreement
     LinkLaw link
     double physics_scale[4]
     double network_scale[4]
@@ -62,12 +64,13 @@ cdef struct FusedState:
     double half
     double lowered_s  # for how long the status still is, after the paths disagreed
     ZerosState zeros
+    AgreementState agreement
     LinkState link
 
 cdef class FusedEstimator(Estimator):
     cdef FusedLaw law
     cdef FusedState state
-    cdef void learn_zeros(
+    cdef void learn(
         self, const FusedObserved *seen, const Sample *x, const Fused *physics, double loss, int status
     ) noexcept nogil
     cdef bint left_behind(self) noexcept nogil

@@ -11,6 +11,7 @@ from jtqd.estimator.settings import EstimatorSettings
 
 STANDSTILL_SIGMAS: Final = 3.0
 LOWERED_S: Final = 0.1
+SLOPE_NM: Final = 0.5
 
 def quadrants(raw_nm: FloatArray, velocity_rad_s: FloatArray) -> QuadrantArray: ...
 

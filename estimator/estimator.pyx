@@ -13,6 +13,13 @@ loss went through the same filter; how old the result is says `age`.
 from libc.math cimport NAN, fabs, fmin, sqrt
 from libc.string cimport memcmp
 
+from jtqd.estimator.agreement cimport (
+    doubt_of,
+    fill_agreement,
+    follow_agreement,
+    lowers,
+    restart_agreement,
+)
 from jtqd.estimator.block cimport copied, put_back
 from jtqd.estimator.contact cimport LinkSeen, fill_link, follow_link, restart_link
 from jtqd.estimator.fusion cimport Fused, fill_fusion, fuse_paths, keep, share_by_speed, widening
@@ -50,9 +57,10 @@ from jtqd.estimator.validity cimport (
 )
 from jtqd.estimator.zeros cimport (
     beyond,
+    completes,
     drop_block,
     fill_zeros,
-    gather,
+    left_behind_nm,
     local_stiffness,
     restart_zeros,
     tell_zeros,
@@ -73,7 +81,6 @@ from jtqd.estimator.run import EstimateRun, ObservedRun
 from jtqd.estimator.sample import columns
 from jtqd.estimator.validity import FADE_START
 from jtqd.estimator.learned import APART, LEFT
-from jtqd.estimator.zeros import MOVING_RAD_S, ONE_WAY
 
 STANDSTILL_SIGMAS: Final = 3.0
 """Half width of the standstill interval in standard deviations, where torsion narrows what friction leaves open."""
@@ -81,11 +88,10 @@ STANDSTILL_SIGMAS: Final = 3.0
 LOWERED_S: Final = 0.1
 """So long the status stays lowered after the two paths have disagreed: it must not flicker."""
 
-_SLOPE_NM: Final = 0.5
+SLOPE_NM: Final = 0.5
 """Step of the motor torque over which the slope of the loss is taken."""
 
-cdef double STANDSTILL_WIDTH = STANDSTILL_SIGMAS, FOREIGN = FOREIGN_SIGMAS, LOWERED = LOWERED_S, STEP = _SLOPE_NM
-cdef double MOVING = MOVING_RAD_S, ONE_SIDED = ONE_WAY
+cdef double STANDSTILL_WIDTH = STANDSTILL_SIGMAS, FOREIGN = FOREIGN_SIGMAS, LOWERED = LOWERED_S, STEP = SLOPE_NM
 cdef int STARTING = st.STARTING, VALID = st.VALID, DEGRADED = st.DEGRADED, STANDSTILL = st.STANDSTILL
 cdef int INVALID = st.INVALID
 cdef int IS_LEFT = LEFT, IS_APART = APART
@@ -280,7 +286,10 @@ cdef class FusedEstimator(Estimator):
         self.law.loss = (<AdditiveLossModel>AdditiveLossModel(fused.loss)).law
         fill_fusion(&self.law.fusion, fused.sigma, fused.torsion is not None)
         self.law.fusion.reference = 0.0  # sigma is that of the torque, not of a comparison with a sensor
-        fill_zeros(&self.law.zeros, joint, fused.sigma, fused.torsion, settings.track_zeros)
+        per_ampere = joint.gear_ratio * joint.torque_constant_nm_per_a
+        watched = fused.agreement is not None
+        fill_zeros(&self.law.zeros, per_ampere, joint.rated_torque_nm, fused, settings.track_zeros, watched)
+        fill_agreement(&self.law.agreement, fused.agreement, joint.rated_torque_nm)
         fill_link(&self.law.link, joint, fused.torsion)
         network_scale = fused.sigma.scale if network is None else network.sigma_scale
         for k in range(4):
@@ -309,6 +318,7 @@ cdef class FusedEstimator(Estimator):
         restart_guard(&self.state.guard)
         self.state.half = self.state.lowered_s = 0.0
         restart_zeros(&self.law.zeros, &self.state.zeros)
+        restart_agreement(&self.state.agreement)
         restart_link(&self.state.link)
 
     @property
@@ -402,21 +412,26 @@ cdef class FusedEstimator(Estimator):
             drop_block(&self.state.zeros)
             restart_link(&self.state.link)
 
-    cdef void learn_zeros(
+    cdef void learn(
         self, const FusedObserved *seen, const Sample *x, const Fused *physics, double loss, int status
     ) noexcept nogil:
-        """Take a sample into the zeros, where it tells something of them."""
+        """Take a sample into what the difference of the two views tells: the zeros, and whether the joint is that of its file."""
         cdef const FusedLaw *law = &self.law
         cdef FusedState *s = &self.state
-        cdef double v = seen.joint_velocity_rad_s, raw = seen.raw_nm
+        cdef double v = seen.joint_velocity_rad_s, raw = seen.raw_nm, dt, innovation
         cdef Loss next
-        if status != VALID or fabs(v) < MOVING or fabs(seen.direction) < ONE_SIDED:
+        if status != VALID:
             drop_block(&s.zeros)
-        elif gather(&s.zeros, x.dt_s, physics.apart, seen.direction, v, seen.torsion_nm, physics.variance):
+        elif completes(&s.zeros, x.dt_s, physics.apart, seen.direction, v, seen.torsion_nm, physics.variance):
+            dt = s.zeros.block.dt
             next = additive_loss(&law.loss, raw + STEP, v, s.thermal, seen.direction)
-            update_zeros(
+            innovation = update_zeros(
                 &law.zeros, &s.zeros, local_stiffness(&law.observer, s.observer.d), (next.nm - loss) / STEP
             )
+            if law.agreement.used:
+                follow_agreement(
+                    &law.agreement, &s.agreement, innovation, dt, s.zeros.x[4], left_behind_nm(&law.zeros, &s.zeros)
+                )
 
     cdef bint foreign(self, const Fused *physics, double dt) noexcept nogil:
         """Return whether the two paths are not of this joint file: they disagree, or the link's zero is impossible."""
@@ -439,7 +454,7 @@ cdef class FusedEstimator(Estimator):
         cdef const FusedLaw *law = &self.law
         cdef FusedState *s = &self.state
         cdef double raw = seen.raw_nm, v = seen.joint_velocity_rad_s
-        cdef double scale, weight = 0.0, correction, size, apart
+        cdef double scale, weight = 0.0, correction, size, apart, doubt
         cdef int quadrant = quadrant_of(raw, v)
         cdef Loss loss
         cdef Fused physics
@@ -450,8 +465,8 @@ cdef class FusedEstimator(Estimator):
         s.half = keep(loss.half, s.half, x.dt_s)
         physics = fuse_paths(&law.fusion, raw, loss.nm, s.half, v, seen.torsion_nm, seen.open_nm)
         lowered = self.foreign(&physics, x.dt_s)
-        if law.zeros.used:
-            self.learn_zeros(seen, x, &physics, loss.nm, out.status)
+        if law.zeros.watched:
+            self.learn(seen, x, &physics, loss.nm, out.status)
         out.torque_nm = out.physics_nm = physics.value + seen.ahead_nm  # both paths fused at one age, then made younger
         scale = law.physics_scale[quadrant]
         self.features[0], self.features[1], self.features[2] = v, raw, seen.torsion_nm - (raw - loss.nm)
@@ -478,9 +493,15 @@ cdef class FusedEstimator(Estimator):
             if fused_trust(&law.trust, v, raw, apart, x.temperature_c) < 0.5:
                 lowered = True
         out.sigma_nm = scale * physics.sigma
-        wider = widening(&physics, s.zeros.left_nm)
+        # a zero that is not taken off counts once: as doubt, where the file has what is usual
+        wider = widening(&physics, 0.0 if law.agreement.used else s.zeros.left_nm)
         if wider > 0.0:
             out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + wider * wider)
+        if law.agreement.used:
+            doubt = doubt_of(&s.agreement, physics.alpha, seen.torsion_nm)
+            if lowers(&law.agreement, doubt, out.sigma_nm):
+                s.lowered_s, lowered = LOWERED, True
+            out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + doubt)
         if lowered:
             out.status = DEGRADED
         elif out.status == STANDSTILL:
@@ -512,16 +533,21 @@ cdef class FusedEstimator(Estimator):
         cdef int m
         sample = Sample(NAN, NAN, NAN, NAN, NAN, NAN)
         self.state.half = self.state.lowered_s = 0.0
+        restart_zeros(&self.law.zeros, &self.state.zeros)
+        restart_agreement(&self.state.agreement)
         with nogil:
             for k in range(row.shape[0]):
                 if asked[k] != VALID and asked[k] != STANDSTILL:
                     self.state.half = 0.0
+                    drop_block(&self.state.zeros)
                     continue
                 one.raw_nm, one.joint_velocity_rad_s, one.torsion_nm = row[k, 0], row[k, 1], row[k, 2]
                 one.cos2, one.sin2, one.cos4, one.sin4 = row[k, 3], row[k, 4], row[k, 5], row[k, 6]
                 one.direction, one.open_nm, one.ahead_nm = row[k, 7], row[k, 8], row[k, 9]
                 sample.dt_s, sample.temperature_c = dt[k], temperature[k]
                 no_values(&out, asked[k])
+                if self.law.zeros.watched:
+                    self.state.observer.d = one.torsion_nm / self.law.zeros.stiffness
                 self.estimate(&one, &sample, True, &out)
                 to[0, k], to[1, k] = out.torque_nm, out.sigma_nm
                 to[2, k], to[3, k], to[4, k] = out.tob_nm, out.physics_nm, out.network_nm

@@ -32,6 +32,14 @@ class Fusion:
         torsion_nm: FloatArray,
         open_nm: FloatArray | float = 0.0,
     ) -> tuple[FloatArray, FloatArray]: ...
+    def variance_many(
+        self,
+        raw_nm: FloatArray,
+        half_nm: FloatArray,
+        velocity_rad_s: FloatArray,
+        torsion_nm: FloatArray,
+        open_nm: FloatArray | float = 0.0,
+    ) -> FloatArray: ...
     def weigh_many(
         self,
         raw_nm: FloatArray,

@@ -144,22 +144,26 @@ cdef class Fusion:
 
     def fuse_many(self, raw_nm, loss_nm, half_nm, velocity_rad_s, torsion_nm, open_nm=0.0):
         """Return the same for arrays [n]."""
-        _, value, sigma = self._run(raw_nm, loss_nm, half_nm, velocity_rad_s, torsion_nm, open_nm)
+        _, value, sigma, _ = self._run(raw_nm, loss_nm, half_nm, velocity_rad_s, torsion_nm, open_nm)
         return value, sigma
 
     def weigh_many(self, raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm=0.0):
         """Return (alpha, sigma), arrays [n]: share of the torsion, and standard deviation of the fused value [Nm]."""
-        alpha, _, sigma = self._run(raw_nm, 0.0, half_nm, velocity_rad_s, torsion_nm, open_nm)
+        alpha, _, sigma, _ = self._run(raw_nm, 0.0, half_nm, velocity_rad_s, torsion_nm, open_nm)
         return alpha, sigma
+
+    def variance_many(self, raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm=0.0):
+        """Return the variance of the difference of the two paths [n], Nm^2."""
+        return self._run(raw_nm, 0.0, half_nm, velocity_rad_s, torsion_nm, open_nm)[3]
 
     def _run(self, *columns):
         laid = np.ascontiguousarray(np.broadcast_arrays(*columns), np.float64)
-        out = np.empty((3, laid.shape[1]))
+        out = np.empty((4, laid.shape[1]))
         cdef const double[:, ::1] x = laid
         cdef double[:, ::1] to = out
         cdef Fused fused
         cdef Py_ssize_t k
         for k in range(x.shape[1]):
             fused = fuse_paths(&self.law, x[0, k], x[1, k], x[2, k], x[3, k], x[4, k], x[5, k])
-            to[0, k], to[1, k], to[2, k] = fused.alpha, fused.value, fused.sigma
+            to[0, k], to[1, k], to[2, k], to[3, k] = fused.alpha, fused.value, fused.sigma, fused.variance
         return out

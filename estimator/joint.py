@@ -211,15 +211,34 @@ class FusedSigma:
 
 
 @dataclass(frozen=True, slots=True)
+class Agreement:
+    """How far the two paths differ on runs that the fit had not seen, zeros of the day apart; beyond it sigma grows.
+
+    slow_nm, fast_nm: RMS levels of the difference's trend and of the rest; gain: of one path against the other; zero_nm: a
+    link zero that is not taken off, as torque. Definitions: agreement.pyx.
+    """
+
+    slow_nm: Annotated[float, limits("Nm", gt=0.0)]
+    fast_nm: Annotated[float, limits("Nm", gt=0.0)]
+    gain: Annotated[float, limits(ge=0.0)]
+    zero_nm: Annotated[float, limits("Nm", ge=0.0)]
+
+    def __post_init__(self) -> None:
+        check(self, "fused.agreement")
+
+
+@dataclass(frozen=True, slots=True)
 class Fused:
     """Section `fused` of a joint file; torsion None: a joint whose link encoder says nothing about torque.
 
-    envelope: what the runs of the fit covered; outside of it the status is degraded. None: nothing is known of that.
+    agreement: of the two paths on runs that the fit had not seen. envelope: what the runs of the fit covered; outside of it
+    the status is degraded. None: nothing is known of that.
     """
 
     loss: AdditiveLoss
     torsion: Torsion | None
     sigma: FusedSigma
+    agreement: Agreement | None = None
     envelope: Envelope | None = None
 
     def to_mapping(self) -> dict[str, Any]:

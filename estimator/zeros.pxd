@@ -9,7 +9,8 @@ cdef enum:
     ZERO_STATES = 5  # link zero [rad], current zero [A], friction [Nm], viscous [Nms/rad], gain
 
 cdef struct ZerosLaw:
-    bint used
+    bint used  # zeros are taken off
+    bint watched  # the states are followed
     double prior[ZERO_STATES]  # variances
     double drift[ZERO_STATES]  # variance per second
     double stiffness, torque_per_ampere, limit
@@ -29,14 +30,17 @@ cdef struct ZerosState:
     uint64_t jumps  # how often a zero that was known became unknown again
     Gathered block
 
-cdef int fill_zeros(ZerosLaw *law, joint, sigma, torsion, bint used) except -1
+cdef int fill_zeros(
+    ZerosLaw *law, double torque_per_ampere, double rated_nm, fused, bint used, bint watched
+) except -1
 cdef void restart_zeros(const ZerosLaw *law, ZerosState *s) noexcept nogil
 cdef void drop_block(ZerosState *s) noexcept nogil
-cdef bint gather(
+cdef bint completes(
     ZerosState *s, double dt, double y, double direction, double velocity, double torsion, double variance
 ) noexcept nogil
 cdef double local_stiffness(const FusedObserverLaw *law, double deflection) noexcept nogil
-cdef void update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, double slope) noexcept nogil
+cdef double update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, double slope) noexcept nogil
+cdef double left_behind_nm(const ZerosLaw *law, const ZerosState *s) noexcept nogil
 cdef bint beyond(const ZerosLaw *law, const ZerosState *s) noexcept nogil
 cdef void tell_zeros(const ZerosLaw *law, const ZerosState *s, Learned *out) noexcept nogil
 cdef zeros_of(const ZerosLaw *law, const ZerosState *s)

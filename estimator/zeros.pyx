@@ -29,6 +29,8 @@ from libc.string cimport memset
 
 from typing import Final
 
+import numpy as np
+
 from jtqd.estimator.learned import BEYOND, LEARNED, TRACKED, Zeros
 
 MOVING_RAD_S: Final = 0.05
@@ -47,8 +49,11 @@ LARGEST_LINK: Final = 0.3
 """Prior standard deviation of the link zero as a torque, part of the rated one."""
 CURRENT_SHARE: Final = 0.2
 """Prior standard deviation of the current zero as a torque, part of the current path's: the rest is friction."""
-LEAST_GAIN: Final = 0.01
+LEAST_GAIN: Final = 0.03
 """Prior standard deviation of the gain, where the paths' sigmas say less."""
+FRICTION_SHARE: Final = 0.2
+"""Prior standard deviation of the day's friction, part of the joint file's without load, beside what the path's sigma says: grease that
+is cold must not be taken for a zero."""
 DRIFT_S: Final = 600.0
 """In so long a zero or a friction may change by a tenth of its prior width: grease warms, encoders do not."""
 JUMP: Final = 4.0
@@ -60,26 +65,44 @@ direction of motion alone never reaches."""
 
 cdef int SAMPLES = BLOCK
 cdef double CORRELATION = CORRELATION_S, INVERSE_SLEW = 1.0 / SLEW_S
+cdef double SLOWEST = MOVING_RAD_S, ONE_SIDED = ONE_WAY
 cdef double JUMP_SIGMAS = JUMP, LONGEST_S = JUMP_S
 cdef int IS_TRACKED = TRACKED, IS_LEARNED = LEARNED, IS_BEYOND = BEYOND
 cdef double LOW = DOUBT, HIGH = SURE, INVERSE_RANGE = 1.0 / (SURE - DOUBT)
 
 
-cdef int fill_zeros(ZerosLaw *law, joint, sigma, torsion, bint used) except -1:
-    """Set the parameters from a joint and its sections fused.sigma and fused.torsion (None: not used)."""
+cdef (double, double) _friction(loss):
+    """Return constant [Nm] and viscous [Nms/rad] part of a loss without load, mean of both directions."""
+    nodes, sides = loss.load_nodes_nm, (loss.positive, loss.negative)
+    return (
+        max(0.0, sum(np.interp(0.0, nodes, side.constant_nm) for side in sides) / 2.0),
+        max(0.0, sum(np.interp(0.0, nodes, side.viscous_nms_per_rad) for side in sides) / 2.0),
+    )
+
+
+cdef int fill_zeros(
+    ZerosLaw *law, double torque_per_ampere, double rated_nm, fused, bint used, bint watched
+) except -1:
+    """Set the parameters from section `fused` of a joint; used: zeros are taken off; watched: they are told apart at least.
+
+    A joint without torsion has no two views: nothing is watched.
+    """
+    cdef double constant, viscous
     memset(law, 0, sizeof(ZerosLaw))
-    law.used = used and torsion is not None
-    if not law.used:
+    sigma, torsion = fused.sigma, fused.torsion
+    law.used, law.watched = used and torsion is not None, (used or watched) and torsion is not None
+    if not law.watched:
         return 0
+    constant, viscous = _friction(fused.loss)
     law.stiffness = torsion.stiffness_nm_per_rad
-    law.torque_per_ampere = joint.gear_ratio * joint.torque_constant_nm_per_a
+    law.torque_per_ampere = torque_per_ampere
     law.limit = torsion.zero_limit_rad
     law.floor = (COVERED * sigma.torsion_nm / law.stiffness) ** 2
     law.known = KNOWN_SHARE * (sigma.current_nm / law.stiffness) ** 2
-    law.prior[0] = (LARGEST_LINK * joint.rated_torque_nm / law.stiffness) ** 2
+    law.prior[0] = (LARGEST_LINK * rated_nm / law.stiffness) ** 2
     law.prior[1] = (CURRENT_SHARE * sigma.current_nm / law.torque_per_ampere) ** 2
-    law.prior[2] = sigma.current_nm**2
-    law.prior[3] = sigma.viscous_nms_per_rad**2
+    law.prior[2] = sigma.current_nm**2 + (FRICTION_SHARE * constant) ** 2
+    law.prior[3] = sigma.viscous_nms_per_rad**2 + (FRICTION_SHARE * viscous) ** 2
     law.prior[4] = sigma.load**2 + sigma.torsion_load**2 + LEAST_GAIN**2
     # the link's prior is as wide as a zero may be; it drifts like the rest of its path
     law.drift[0] = (0.1 * sigma.torsion_nm / law.stiffness) ** 2 / DRIFT_S
@@ -102,14 +125,17 @@ cdef void drop_block(ZerosState *s) noexcept nogil:
         memset(&s.block, 0, sizeof(Gathered))
 
 
-cdef bint gather(
+cdef bint completes(
     ZerosState *s, double dt, double y, double direction, double velocity, double torsion, double variance
 ) noexcept nogil:
-    """Add a sample to the block; return whether it is complete and `update_zeros` is due.
+    """Add a sample in motion to the block; return whether it is complete and `update_zeros` is due.
 
-    y: tau_t - tau_c [Nm]; variance: of y [Nm^2].
+    y: tau_t - tau_c [Nm]; variance: of y [Nm^2]. A sample that does not count, near a reversal, drops the block.
     """
     cdef Gathered *b = &s.block
+    if fabs(velocity) < SLOWEST or fabs(direction) < ONE_SIDED:
+        drop_block(s)
+        return False
     b.dt += dt
     b.y += y
     b.direction += direction
@@ -138,8 +164,11 @@ cdef double _used(double x, double variance) noexcept nogil:
     return x * w if w > 0.0 else 0.0
 
 
-cdef void update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, double slope) noexcept nogil:
-    """Take the complete block; stiffness: local, of the spring; slope: dL/draw of the loss."""
+cdef double update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, double slope) noexcept nogil:
+    """Take the complete block; return its innovation [Nm].
+
+    stiffness: local, of the spring; slope: dL/draw of the loss.
+    """
     cdef Gathered b = s.block
     cdef double h[ZERO_STATES]
     cdef double ph[ZERO_STATES]
@@ -172,6 +201,8 @@ cdef void update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, dou
         for m in range(n + 1):
             s.p[n][m] -= gain * ph[m]
             s.p[m][n] = s.p[n][m]
+    if not law.used:
+        return innovation
     way = b.dt * INVERSE_SLEW
     if way > 1.0:
         way = 1.0
@@ -180,6 +211,12 @@ cdef void update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, dou
     # beyond what is doubt about the zero: of a joint without one nothing is left, on average
     left = s.x[0] - s.link_rad
     s.left_nm = law.stiffness * sqrt(fmax(0.0, left * left - s.p[0][0] - law.floor))
+    return innovation
+
+
+cdef double left_behind_nm(const ZerosLaw *law, const ZerosState *s) noexcept nogil:
+    """Return what is believed of the link zero and not taken off, as torque [Nm]."""
+    return law.stiffness * (s.x[0] - s.link_rad)
 
 
 cdef bint beyond(const ZerosLaw *law, const ZerosState *s) noexcept nogil:

@@ -27,13 +27,15 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.optimize import nnls
 
+from jtqd.estimator.agreement import levels
 from jtqd.estimator.arrays import FloatArray, QuadrantArray
 from jtqd.estimator.checked import counted
 from jtqd.estimator.envelope import MAX_CELLS, Envelope
-from jtqd.estimator.estimator import quadrants
+from jtqd.estimator.estimator import SLOPE_NM, quadrants
 from jtqd.estimator.fusion import Fusion, held
-from jtqd.estimator.joint import AdditiveLoss, Friction, Fused, FusedSigma, Torsion
+from jtqd.estimator.joint import AdditiveLoss, Agreement, Friction, Fused, FusedSigma, Torsion
 from jtqd.estimator.losses import AdditiveLossModel
+from jtqd.sysid.fit.agreement import fit_agreement
 from jtqd.sysid.fit.envelope import FIT_ROOM_K, TORQUE_STEP_SHARE, envelope_of
 from jtqd.sysid.fit.losses import LossFit, fit_loss
 from jtqd.sysid.fit.signals import RunSignals
@@ -49,12 +51,14 @@ _FAST_RAD_S: Final = 0.1
 _FEWEST: Final = 50
 """Samples of a run that a quadrant needs for the run to count there."""
 _LEAST_SCALE: Final = 0.05
+_NONE: Final = np.zeros(0)
 
 
 class PathResiduals(NamedTuple):
     """One unseen run: arrays [n] of its moving samples (Nm, rad/s); half: `AdditiveLossModel.loss`; open: of the slip.
 
-    torsion_nm, open_nm and torsion_error_nm are 0 where there is no torsion.
+    torsion_nm, open_nm and torsion_error_nm are 0 where there is no torsion. dt_s, direction and slope (dL/draw of the loss)
+    are for `fused.agreement`; empty: the run does not count there.
     """
 
     raw_nm: FloatArray
@@ -64,6 +68,9 @@ class PathResiduals(NamedTuple):
     open_nm: FloatArray
     current_error_nm: FloatArray
     torsion_error_nm: FloatArray
+    dt_s: FloatArray = _NONE
+    direction: FloatArray = _NONE
+    slope: FloatArray = _NONE
 
 
 def fit_sigma(runs: Sequence[PathResiduals], *, with_torsion: bool = True) -> FusedSigma:
@@ -235,7 +242,30 @@ def fit_fused(
     rmse = tuple(float(np.sqrt(np.mean(e * e))) for e in errors)
     torsion = fit_torsion(runs) if with_torsion else None
     envelope = None if rated_nm is None or torsion is None else _envelope(runs, fit.loss, torsion, rated_nm)
-    return FusedFit(Fused(fit.loss, torsion, sigma, envelope), fit, rmse)
+    fused = Fused(fit.loss, torsion, sigma, envelope=envelope)
+    if rated_nm is not None and torsion is not None:
+        fused = replace(fused, agreement=_agreement(unseen, fused, rated_nm))
+    return FusedFit(fused, fit, rmse)
+
+
+def _agreement(unseen: Sequence[PathResiduals], fused: Fused, rated_nm: float) -> Agreement | None:
+    """Return how far the two paths differ on unseen runs; None for too little motion."""
+    fusion = Fusion(fused.sigma, True)
+    return fit_agreement(
+        levels(
+            fused,
+            rated_nm,
+            run.dt_s,
+            run.torsion_error_nm - run.current_error_nm,
+            run.direction,
+            run.velocity_rad_s,
+            run.torsion_nm,
+            fusion.variance_many(run.raw_nm, run.half_nm, run.velocity_rad_s, run.torsion_nm, run.open_nm),
+            run.slope,
+        )
+        for run in unseen
+        if len(run.dt_s)
+    )
 
 
 def _envelope(
@@ -275,7 +305,12 @@ def path_residuals(run: RunSignals, loss: AdditiveLoss, torsion: Torsion | None)
         none = np.zeros(len(raw))
         return PathResiduals(raw, velocity, half, none, none, current, none)
     tau, open_nm = (each[keep] for each in torsion_torque(torsion, run))
-    return PathResiduals(raw, velocity, half, tau, open_nm, current, tau - sensor)
+    more, _ = AdditiveLossModel(loss).loss_many(
+        raw + SLOPE_NM, velocity, seen.temperature_c[keep], seen.direction[keep]
+    )
+    slope = (more - loss_nm[keep]) / SLOPE_NM
+    dt, direction = seen.dt_s[keep], seen.direction[keep]
+    return PathResiduals(raw, velocity, half, tau, open_nm, current, tau - sensor, dt, direction, slope)
 
 
 def loss_and_width(run: RunSignals, loss: AdditiveLoss) -> tuple[FloatArray, FloatArray]:

@@ -143,8 +143,17 @@ def report(found: list[tuple[Figures, Figures] | None]) -> None:
     print(f"worse with zeros: {np.count_nonzero(worse)} of {len(pairs)}; RMSE at most {most:+.3f} Nm")
 
 
-def of_the_world(link_zero_rad: float, seed: int) -> list[tuple[Figures, Figures] | None]:
-    """Return the figures of the runs of one seed that its joints were not fitted on."""
+class WorldRun(NamedTuple):
+    """One joint in a run of the bench of others that it was not fitted on, and its true torque [n]."""
+
+    joint: Joint
+    number: int
+    table: RunTable
+    truth_nm: FloatArray
+
+
+def world_runs(seed: int) -> list[WorldRun]:
+    """Return the runs of one seed that its joints were not fitted on."""
     bench = MujocoBench(WORLD_RUNS, WORLD_SECONDS)
     drawn, days = bench.draw(seed), bench.days(seed)
     found = []
@@ -169,8 +178,15 @@ def of_the_world(link_zero_rad: float, seed: int) -> list[tuple[Figures, Figures
                 table = read_run(path).table
                 sensor = table.joints[number].torque_nm
                 assert sensor is not None
-                found.append(compared(joint, table, number, sensor - day.sensor_nm, link_zero_rad))
+                found.append(WorldRun(joint, number, table, sensor - day.sensor_nm))
     return found
+
+
+def of_the_world(link_zero_rad: float, seed: int) -> list[tuple[Figures, Figures] | None]:
+    """Return the figures of the runs of one seed that its joints were not fitted on."""
+    return [
+        compared(run.joint, run.table, run.number, run.truth_nm, link_zero_rad) for run in world_runs(seed)
+    ]
 
 
 def pushed(  # noqa: PLR0917 - of a process pool
