@@ -47,6 +47,8 @@ from jtqd.drivers.long_frames import LongFrames
 from jtqd.drivers.object_dictionary import ObjectStore, entries_from_json
 
 _WARM_UP_TIMEOUT_S = 60.0
+_BOOT_REQUESTS = 100
+"""SDO requests of a node's boot, at most; each may take the time that the configuration allows it."""
 """Generous: a controller that loads its libraries from a slow card may take its time; nothing is published meanwhile."""
 _BENCH_PRIORITY = 40
 
@@ -131,7 +133,11 @@ def boot_nodes(config: Config, bus: str, child: Child, stopped: Stopped) -> dict
     The child sends jtqd's heartbeat until its input ends.
     """
     child.tell(boot_request(config, bus))
-    report = wait_for(child, stopped)
+    waits_ms = [joint.sdo_timeout_ms for joint in config.joints]
+    if config.sensor is not None:
+        waits_ms.append(config.sensor.sdo_timeout_ms)
+    slowest_s = _BOOT_REQUESTS * 1e-3 * sum(waits_ms)
+    report = wait_for(child, stopped, _WARM_UP_TIMEOUT_S + slowest_s)
     if report is None:
         return None
     if not report["ok"]:
@@ -148,20 +154,20 @@ def check_gears(config: Config, report: dict[str, Any]) -> str | None:
     return None
 
 
-def wait_for(child: Child, stopped: Stopped) -> dict[str, Any] | None:
+def wait_for(child: Child, stopped: Stopped, longest_s: float = _WARM_UP_TIMEOUT_S) -> dict[str, Any] | None:
     """Return the child's next answer; None after a stop order.
 
     Raises:
         ChildError: it ended, or kept silent for too long.
         SupervisorError: it reports that it has failed; ConfigurationRefused where a file is the reason.
     """
-    deadline = time.monotonic() + _WARM_UP_TIMEOUT_S
+    deadline = time.monotonic() + longest_s
     while not stopped():
         try:
             answer = child.answer(0.25)
         except ChildSilence:
             if time.monotonic() > deadline:
-                raise
+                raise ChildSilence(f"{child.name} did not answer within {longest_s:g} s") from None
             continue
         if "failed" in answer:
             failure = ConfigurationRefused if answer.get("configuration") else SupervisorError
