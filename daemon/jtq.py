@@ -46,7 +46,7 @@ GROUPS = {
     "identify: parameters and networks from measured runs": {
         "campaign": (
             "jtqd.sysid.campaign.command",
-            "drive both joints through a campaign of runs, and record them",
+            "move the joints of a bus through a campaign of runs, and record them",
         ),
         "excitation": ("jtqd.sysid.excitation.command", "design excitation trajectories"),
         "fit": ("jtqd.sysid.fit.command", "fit efficiency, friction or losses of a joint file to runs"),

@@ -9,7 +9,7 @@ and canopen's EDS parser by `object_dictionary.read_eds` when it is called. Impo
     hub, relay, wire            hub of a unix bus, `python -m jtqd.drivers.hub`; its members; a wire's times
     object_dictionary, pdo      objects typed by an EDS, PDO mappings as `struct`, rules for changing them
     sdo, sdo_client, sdo_server the protocol and a queue; blocking clients; the server
-    nmt, emcy                   NMT commands and states, EMCY codes
+    nmt, emcy, cia402           NMT commands and states, EMCY codes, states of a drive
     devices, survey, bus_load   what drives and sensor must map and scale; what a device tells; load of a configuration
     boot_procedure, boot        one node by SDO (CiA 302-2); the whole bus, `python -m jtqd.drivers.boot`
     can_unix, eds               unix bus for python-can; data sheets

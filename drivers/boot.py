@@ -32,11 +32,11 @@ from jtqd.drivers.boot_procedure import BootedNode, NodeBoot, reset_during_boot
 from jtqd.drivers.boot_request import BootRequest, RequestError, node_report, parse_request
 from jtqd.drivers.can_unix import UnixBus
 from jtqd.drivers.devices import Profile
-from jtqd.drivers.emcy import HISTORY_INDEX, Emergency, name_of, parse, register_text
+from jtqd.drivers.emcy import EMCY_BASE, HISTORY_INDEX, Emergency, name_of, parse, register_text
 from jtqd.drivers.frame import CAN_RTR_FLAG, CAN_SFF_MASK
 from jtqd.drivers.object_dictionary import entries_to_json, read_eds
-from jtqd.drivers.sdo import Key, SdoAbort
-from jtqd.drivers.sdo_client import RESPONSE_ID, NetworkChannel, SdoClient, SdoTimeout
+from jtqd.drivers.sdo import RESPONSE_ID, Key, SdoAbort
+from jtqd.drivers.sdo_client import NetworkChannel, SdoClient, SdoTimeout
 
 _BOOT_UP_AGAIN_S = 0.05
 """After a reset: some devices send their boot-up message twice."""
@@ -49,7 +49,6 @@ _LONGEST_HOLD_S = 60.0
 SYNC_LISTEN_S = 0.12  # a little more than the longest period that jtqd itself may have
 NOTIFIER_S = 0.01  # canopen's default of 1 s is what closing the network would wait for
 _UNIX = "unix:"
-EMCY_BASE = 0x080
 _SILENCES = 2.6
 """Of a node's longest silence: two repetitions of a request, and half of it again."""
 

@@ -13,6 +13,7 @@ from jtqd.drivers.boot_error import BootError, mismatch
 from jtqd.drivers.boot_tpdos import TpdoSetup
 from jtqd.drivers.devices import (
     OPERATING_MODE_OBJECT,
+    SYNC_COB_ID,
     TEMPERATURE,
     DriveProfile,
     DriveScaling,
@@ -55,7 +56,7 @@ class BusSettings:
     master_node: int
     master_timeout_ms: int = 500
     heartbeat_ms: int = 100
-    sync_cob_id: int = 0x080
+    sync_cob_id: int = SYNC_COB_ID
     counter_overflow: int | None = None
     error_behaviour: int | None = None
 

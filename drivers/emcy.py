@@ -8,6 +8,8 @@ from typing import NamedTuple
 from jtqd.drivers.object_dictionary import ObjectStore
 from jtqd.drivers.sdo import VALUE_RANGE, SdoAbort
 
+EMCY_BASE = 0x080
+"""COB-ID of a node's messages, less its node-ID."""
 EMCY = struct.Struct("<HB5s")
 """Error code, error register (1001h), manufacturer's field."""
 NO_ERROR = 0x0000

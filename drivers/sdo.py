@@ -116,6 +116,8 @@ HEADER = struct.Struct("<BHB")
 INITIATE = struct.Struct("<BHBI")
 """The same with a number of four bytes: a size, or an abort code."""
 TOGGLE = 0x10
+REQUEST_ID, RESPONSE_ID = 0x600, 0x580
+"""COB-IDs of the default SDO, plus the node number."""
 _ABORT, _SPECIFIER = 0x80, 0xE0
 _UPLOAD, _UPLOAD_SEGMENT, _DOWNLOAD_SEGMENT = 0x40, 0x60, 0x00
 _UPLOADED, _SEGMENT_UPLOADED, _DOWNLOADED, _SEGMENT_DOWNLOADED = 0x40, 0x00, 0x60, 0x20

@@ -15,10 +15,19 @@ from typing import Any, Protocol
 
 from jtqd.drivers.boot_error import BootError, mismatch
 from jtqd.drivers.frame import FRAME, FRAME_SIZE, pack
-from jtqd.drivers.sdo import ANSWER_S, NO_OBJECT, NO_SUBINDEX, Exchange, Key, SdoAbort, describe_abort, label
+from jtqd.drivers.sdo import (
+    ANSWER_S,
+    NO_OBJECT,
+    NO_SUBINDEX,
+    REQUEST_ID,
+    RESPONSE_ID,
+    Exchange,
+    Key,
+    SdoAbort,
+    describe_abort,
+    label,
+)
 
-REQUEST_ID, RESPONSE_ID = 0x600, 0x580
-"""COB-IDs of the default SDO, plus the node number."""
 _MAX_QUEUED = 64
 """Answers that wait to be looked at: a flood of them must not fill the memory."""
 

@@ -26,8 +26,8 @@ from jtqd.drivers.frame import FRAME, FRAME_SIZE, pack
 from jtqd.drivers.frame_socket import FrameSocket, open_frame_socket
 from jtqd.drivers.object_dictionary import VISIBLE_STRING, Entry, read_eds
 from jtqd.drivers.pdo import CAN_ID, INVALID
-from jtqd.drivers.sdo import Key, SdoAbort, Transfer, label
-from jtqd.drivers.sdo_client import REQUEST_ID, RESPONSE_ID, FrameChannel, SdoAccess, SdoClient, SdoTimeout
+from jtqd.drivers.sdo import REQUEST_ID, RESPONSE_ID, Key, SdoAbort, Transfer, label
+from jtqd.drivers.sdo_client import FrameChannel, SdoAccess, SdoClient, SdoTimeout
 from jtqd.drivers.units import OTHER_SCALING_OBJECTS
 
 DRIVE, SENSOR = 402, 404

@@ -3,13 +3,13 @@ from typing import Final
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Fused
 
-TREND_S: Final = 0.1
-UP_S: Final = 0.15
-DOWN_S: Final = 5.0
-LEVEL: Final = 1.4
-GAIN: Final = 2.0
-LOWER_SIGMAS: Final = 4.0
-LEAST_SHARE: Final = 0.02
+TREND_S: Final[float]
+UP_S: Final[float]
+DOWN_S: Final[float]
+LEVEL: Final[float]
+GAIN: Final[float]
+LOWER_SIGMAS: Final[float]
+LEAST_SHARE: Final[float]
 
 def levels(
     fused: Fused,

@@ -4,13 +4,13 @@ from jtqd.estimator.arrays import CodeArray, FloatArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.settings import EstimatorSettings
 
-TREND_RAD_S: Final = 50.0
-NOTCH_RAD_S: Final = 10.0
-RELEASE: Final = 0.5
-LONGEST_S: Final = 0.5
-SETTLE_S: Final = 0.1
-UNEVEN: Final = 0.05
-LONGEST_GAP: Final = 50
+TREND_RAD_S: Final[float]
+NOTCH_RAD_S: Final[float]
+RELEASE: Final[float]
+LONGEST_S: Final[float]
+SETTLE_S: Final[float]
+UNEVEN: Final[float]
+LONGEST_GAP: Final[int]
 OFF: int
 UNKNOWN: int
 NONE: int

@@ -9,9 +9,9 @@ from jtqd.estimator.run import EstimateRun, ObservedRun
 from jtqd.estimator.sample import Estimator
 from jtqd.estimator.settings import EstimatorSettings
 
-STANDSTILL_SIGMAS: Final = 3.0
-LOWERED_S: Final = 0.1
-SLOPE_NM: Final = 0.5
+STANDSTILL_SIGMAS: Final[float]
+LOWERED_S: Final[float]
+SLOPE_NM: Final[float]
 
 def quadrants(raw_nm: FloatArray, velocity_rad_s: FloatArray) -> QuadrantArray: ...
 

@@ -3,11 +3,12 @@ from typing import Final
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.joint import FusedSigma
 
-SLOW_RAD_S: Final = 0.05
-FAST_RAD_S: Final = 0.2
-HOLD_S: Final = 0.05
-DISAGREE_SIGMAS: Final = 3.0
-FOREIGN_SIGMAS: Final = 4.0
+SLOW_RAD_S: Final[float]
+FAST_RAD_S: Final[float]
+HOLD_S: Final[float]
+DISAGREE_SIGMAS: Final[float]
+FOREIGN_SIGMAS: Final[float]
+GAUSS: Final[float]
 
 def turning(velocity_rad_s: FloatArray) -> FloatArray: ...
 def held(half_nm: FloatArray, dt_s: FloatArray, running: BoolArray) -> FloatArray: ...

@@ -31,8 +31,11 @@ DISAGREE_SIGMAS: Final = 3.0
 FOREIGN_SIGMAS: Final = 4.0
 """Distance from which the status is lowered: at least one of the paths is not what the joint file says."""
 
+GAUSS: Final = 1.6448536269514722
+"""Half width of a normal distribution's 90 % interval in standard deviations: the interval is value +- GAUSS sigma."""
+
 cdef double SLOW = SLOW_RAD_S, FAST = FAST_RAD_S, HOLD = HOLD_S
-cdef double DISAGREE = DISAGREE_SIGMAS, INTERVAL = 1.0 / 1.6448536269514722  # half width of the 90 % interval in sigmas
+cdef double DISAGREE = DISAGREE_SIGMAS, INTERVAL = 1.0 / GAUSS
 cdef double INVERSE_RANGE = 1.0 / (FAST_RAD_S - SLOW_RAD_S)
 
 

@@ -3,13 +3,13 @@ from typing import Final
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import AdditiveLoss, Friction, Joint
 
-DIRECTION_VELOCITY_RAD_S: Final = 0.02
-VELOCITY_RANGE_RAD_S: Final = (0.2, 3.0)
-DRIVING_CURRENT_MAX_A: Final = 7.0
-BACKDRIVING_CURRENT_MAX_A: Final = 5.0
-DRIVING_ETA: Final = (0.05, 1.0)
-BACKDRIVING_ETA: Final = (1.0, 4.0)
-BLEND_CURRENT_A: Final = 0.35
+DIRECTION_VELOCITY_RAD_S: Final[float]
+VELOCITY_RANGE_RAD_S: Final[tuple[float, float]]
+DRIVING_CURRENT_MAX_A: Final[float]
+BACKDRIVING_CURRENT_MAX_A: Final[float]
+DRIVING_ETA: Final[tuple[float, float]]
+BACKDRIVING_ETA: Final[tuple[float, float]]
+BLEND_CURRENT_A: Final[float]
 
 def static_friction(friction: Friction) -> float: ...
 

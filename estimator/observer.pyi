@@ -3,9 +3,9 @@ from typing import Final, NamedTuple
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Joint, Torsion
 
-RAW_LIMIT: Final = 10.0
-LINK_SPEED_LIMIT_RAD_S: Final = 1e3
-RIPPLE_ORDERS: Final = (2, 4)
+RAW_LIMIT: Final[float]
+LINK_SPEED_LIMIT_RAD_S: Final[float]
+RIPPLE_ORDERS: Final[tuple[int, int]]
 
 def first_order_hold(rate_rad_s: float, dt_s: float) -> tuple[float, float, float]: ...
 def slipped(d_rad: FloatArray, travel_rad: float) -> tuple[FloatArray, FloatArray]: ...

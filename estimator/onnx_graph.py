@@ -28,7 +28,7 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.envelope import finite
-from jtqd.estimator.onnx_weights import read_perceptron
+from jtqd.estimator.onnx_weights import fault_of, read_perceptron
 from jtqd.estimator.sha256 import sha256_hex
 
 _PROBES: Final = (0.25, -0.5)  # two different inputs: the binding must see the second one
@@ -144,8 +144,9 @@ class OnnxGraph(GraphFile):
 
     source, sha256: as `GraphFile`; features: names and order of the inputs, which the metadata must repeat; keys:
     metadata that must be there. Raises NetworkError for an unreadable or corrupt file, another hash, shape, type or
-    missing metadata. Public: `run_one`, `bound` (after `prepare`: samples go through the binding, not through run()),
-    `perceptron` (the same graph for native evaluation, None for a graph that is not one of ours).
+    missing metadata, weights that are not finite or stand in another file, and no answer or several to one input. Public:
+    `run_one`, `bound` (after `prepare`: samples go through the binding, not through run()), `perceptron` (the same graph for
+    native evaluation, None for a graph that is not one of ours).
     """
 
     def __init__(
@@ -157,7 +158,10 @@ class OnnxGraph(GraphFile):
     ) -> None:
         super().__init__(source, sha256)
         self._width: Final = len(features)
+        readable = self._check_weights()
         self._session: Final = self._open(self._data)
+        if not readable:
+            raise self.error("found a file whose weights cannot be checked")
         self.perceptron: Final = read_perceptron(self._data)
         self._output: Final = self._check_graph()
         self.metadata = self._read_metadata(features, keys)
@@ -249,6 +253,16 @@ class OnnxGraph(GraphFile):
             reason = lines[0][:160] if lines else type(error).__name__
             raise self.error(f"not a usable ONNX model: {reason}") from None
 
+    def _check_weights(self) -> bool:
+        """Raises NetworkError for weights not finite or in another file. False where only the runtime can tell."""
+        try:
+            fault = fault_of(self._data)
+        except ValueError:
+            return False
+        if fault is not None:
+            raise self.error(fault)
+        return True
+
     def _check_graph(self) -> str:
         """Return the output's name; NetworkError unless there is one input "x" [N, features] and one output [N, 1]."""
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
@@ -327,3 +341,7 @@ class OnnxGraph(GraphFile):
             raise self.error(f"does not run: {str(error).strip().splitlines()[0][:160]}") from None
         if not math.isfinite(values[-1]):
             raise self.error(f"found {values[-1]} at the centre of its envelope, expected a finite torque")
+        if len(set(values)) > 1:
+            raise self.error(
+                "found different answers to one input, expected the same: a log could not be replayed"
+            )

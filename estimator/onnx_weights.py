@@ -1,4 +1,4 @@
-"""Weights of the project's own ONNX graphs, read from the file: what `perceptron` needs.
+"""Weights of ONNX graphs, read from the file: of the project's own what `perceptron` needs, of any whether they may be used.
 
 ONNX Runtime does not give a graph's constants to Python, and the package onnx would cost the daemon 10 MB. Of the protocol
 buffers' wire format (protobuf.dev/programming-guides/encoding) and of onnx.proto a few fields are enough.
@@ -18,6 +18,11 @@ from jtqd.estimator.perceptron import Perceptron
 _DOUBLE: Final = 11
 """TensorProto.DataType of float64."""
 
+_FLOATS: Final = {1: ("<f4", 4), 10: ("<f2", 5), 11: ("<f8", 10), 16: ("<u2", 5)}
+"""Of the data types FLOAT, FLOAT16, DOUBLE and BFLOAT16: values in raw_data, and the field that holds them otherwise."""
+_EXTERNAL: Final = 1
+"""TensorProto.DataLocation: in another file."""
+
 _Message = dict[int, list[bytes | int]]
 
 
@@ -27,6 +32,87 @@ def read_perceptron(data: bytes) -> Perceptron | None:
         return _read(data)
     except (KeyError, IndexError, ValueError, OverflowError, struct.error):
         return None  # ONNX Runtime, which has loaded the file, evaluates it
+
+
+def fault_of(data: bytes) -> str | None:
+    """Return what is wrong with the constants of any ONNX file: not in the file that the hash is of, or not finite.
+
+    Infinity is a weight that saturates a layer unseen. Raises ValueError for bytes that are no protocol buffer.
+    """
+    try:
+        model = _message(data)
+        for graph in _all(model, 7):
+            if fault := _fault_of_graph(_message(graph)):
+                return fault
+        for function in _all(model, 25):
+            if fault := _fault_of_nodes(_all(_message(function), 7)):
+                return fault
+    except (IndexError, OverflowError, RecursionError, struct.error) as error:
+        raise ValueError(f"no protocol buffer: {error}") from None
+    return None
+
+
+def _fault_of_graph(graph: _Message) -> str | None:
+    tensors = [_message(each) for each in _all(graph, 5)]
+    for sparse in _all(graph, 15):
+        tensors += [_message(each) for each in _all(_message(sparse), 1)]
+    return _fault_of_tensors(tensors) or _fault_of_nodes(_all(graph, 1))
+
+
+def _fault_of_nodes(nodes: list[bytes]) -> str | None:
+    """Look into the attributes of nodes: constants, and the graphs of loops and branches."""
+    for attribute in (_message(each) for node in nodes for each in _all(_message(node), 5)):
+        tensors = [_message(each) for key in (5, 10) for each in _all(attribute, key)]
+        for sparse in (each for key in (22, 23) for each in _all(attribute, key)):
+            tensors += [_message(each) for each in _all(_message(sparse), 1)]
+        if fault := _fault_of_tensors(tensors):
+            return fault
+        if not np.isfinite(np.frombuffer(b"".join(_all(attribute, 2) + _all(attribute, 7)), "<f4")).all():
+            return f"found attribute '{_name(attribute, 1)}' with a value that is not finite"
+        for graph in (each for key in (6, 11) for each in _all(attribute, key)):
+            if fault := _fault_of_graph(_message(graph)):
+                return fault
+    return None
+
+
+def _fault_of_tensors(tensors: list[_Message]) -> str | None:
+    for tensor in tensors:
+        name = _name(tensor, 8)
+        if _EXTERNAL in tensor.get(14, []) or 13 in tensor:
+            return (
+                f"found weights '{name}' in another file, expected them in this one, which the SHA-256 is of"
+            )
+        if not _is_finite(tensor):
+            return f"found weights '{name}' with a value that is not finite"
+    return None
+
+
+def _is_finite(tensor: _Message) -> bool:
+    """Return whether all values of a tensor are finite; those that are no floating-point numbers are."""
+    for kind in tensor.get(2, []):
+        if kind not in _FLOATS:
+            continue
+        form, field = _FLOATS[kind]
+        values = [np.frombuffer(each, form) for each in _all(tensor, 9)]
+        if field != 5:
+            values += [np.frombuffer(each, form) for each in _all(tensor, field)]
+        else:  # halves, each in an int32
+            whole = [
+                value
+                for each in tensor.get(5, [])
+                for value in ([each] if isinstance(each, int) else _varints(each))
+            ]
+            values.append(np.array(whole, np.uint64).astype("<u2").view(form))
+        for each in values:
+            numbers = (each.astype(np.uint32) << 16).view(np.float32) if form == "<u2" else each
+            if not np.isfinite(numbers).all():
+                return False
+    return True
+
+
+def _name(message: _Message, key: int) -> str:
+    """Return a name as it may be printed."""
+    return b"".join(_all(message, key)).decode("utf-8", "replace").encode("unicode_escape").decode()[:60]
 
 
 def _read(data: bytes) -> Perceptron | None:

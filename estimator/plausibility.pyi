@@ -3,11 +3,11 @@ from typing import Final
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.settings import PlausibilityLimits
 
-FORGET_S: Final = 1.0
-JUMP_RAD_S: Final = 300.0
-LAG_S: Final = 0.05
-FROZEN_RAD: Final = 5.0
-LONGEST_STEP_S: Final = 0.05
+FORGET_S: Final[float]
+JUMP_RAD_S: Final[float]
+LAG_S: Final[float]
+FROZEN_RAD: Final[float]
+LONGEST_STEP_S: Final[float]
 
 class Plausibility:
     mismatch_rad: float

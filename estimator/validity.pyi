@@ -5,9 +5,9 @@ from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import LossModel
 from jtqd.estimator.settings import EstimatorSettings
 
-FADE_START: Final = 0.75
-TEMPERATURE_MARGIN_K: Final = 1.0
-DISTANCE_MARGIN: Final = 0.25
+FADE_START: Final[float]
+TEMPERATURE_MARGIN_K: Final[float]
+DISTANCE_MARGIN: Final[float]
 
 class Uncertainty:
     def __init__(self, joint: Joint, settings: EstimatorSettings, losses: LossModel) -> None: ...

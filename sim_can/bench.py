@@ -10,9 +10,10 @@ from collections.abc import Sequence
 from jtqd.drivers.devices import COMMANDER_NODE, JTQD_NODE, SYNC_COB_ID
 from jtqd.drivers.filters import CanFilter, exact
 from jtqd.drivers.nmt import HEARTBEAT_BASE
+from jtqd.drivers.sdo import REQUEST_ID
 from jtqd.sim_can.canopen_node import CanopenNode
 from jtqd.sim_can.demo import demo_current, demo_velocity
-from jtqd.sim_can.drive_node import OPERATION_ENABLED, DriveNode
+from jtqd.sim_can.drive_node import DEFAULT_INTERPOLATION_S, OPERATION_ENABLED, DriveNode
 from jtqd.sim_can.eds_entries import sensor_node
 from jtqd.sim_can.sensor_node import SensorNode
 from jtqd.sim_can.source import CURRENT, OFF, VELOCITY, DriveSignals, Source
@@ -31,7 +32,7 @@ def bench_filters(drives: int = 2) -> tuple[CanFilter, ...]:
     """
     ids = [0x000, SYNC_COB_ID, HEARTBEAT_BASE + JTQD_NODE, HEARTBEAT_BASE + COMMANDER_NODE]
     nodes = range(1, drives + 1)
-    ids += [0x600 + node for node in (*nodes, sensor_node(drives))]
+    ids += [REQUEST_ID + node for node in (*nodes, sensor_node(drives))]
     ids += [base + node for base in (0x200, 0x300) for node in nodes]
     return tuple(exact(can_id) for can_id in ids)
 
@@ -73,6 +74,7 @@ class Bench:
         self.sync_count = 0
         self._profile = profile
         self._profile_s = 0.0
+        self._target_period_s = DEFAULT_INTERPOLATION_S  # of the built-in motion: as a master sets 60C2h
         self._first_stamp_ns = 0
         self._last_time_ns = 0  # of the last SYNC, since the first one
         self._last_steady_ns = 0  # steady clock at the last step, for idle steps
@@ -124,6 +126,7 @@ class Bench:
         self.sync_count += 1
         self._last_steady_ns = self._sync_steady_ns = now_ns
         self._idle_ns = 0
+        self._target_period_s = max(round(step_ns * 1e-9, 3), DEFAULT_INTERPOLATION_S)
         frames = self._advance(step_ns * 1e-9)
         if self.over:
             return frames
@@ -161,7 +164,7 @@ class Bench:
         drives = iter(self.drives)
         for source in self._sources:
             gear = source.ratings[0].gear_ratio
-            frames += next(drives).run_by_itself(VELOCITY, velocity * gear)
+            frames += next(drives).run_by_itself(VELOCITY, velocity * gear, self._target_period_s)
             if len(source.drives) > 1:
                 frames += next(drives).run_by_itself(CURRENT, current)
         return frames

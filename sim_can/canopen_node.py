@@ -13,11 +13,11 @@ from collections.abc import Callable, Mapping, Set
 from functools import partial
 
 from jtqd.drivers import nmt
-from jtqd.drivers.emcy import ErrorHistory
+from jtqd.drivers.emcy import EMCY_BASE, ErrorHistory
 from jtqd.drivers.frame import pack
 from jtqd.drivers.object_dictionary import ObjectStore
 from jtqd.drivers.pdo import LAST_SYNC_TYPE, PdoMap, PdoParameters
-from jtqd.drivers.sdo import SdoAbort
+from jtqd.drivers.sdo import REQUEST_ID, RESPONSE_ID, SdoAbort
 from jtqd.drivers.sdo_server import SdoServer
 from jtqd.sim_can.transmit import NEVER_NS, TransmitPdo
 
@@ -171,7 +171,7 @@ class Emergency:
         for bits in self._present.values():
             register |= bits
         self._store.set_number(0x1001, 0, register)
-        return pack(0x080 + self._store.node_id, _EMCY.pack(code, register))
+        return pack(EMCY_BASE + self._store.node_id, _EMCY.pack(code, register))
 
 
 HEARTBEAT_LOST = 0x8130
@@ -263,7 +263,7 @@ class CanopenNode:
 
     def on_frame(self, can_id: int, data: bytes, t_ns: int) -> list[bytes]:
         """Handle any frame but SYNC: NMT, SDO request, RPDO, a watched heartbeat; others are ignored."""
-        if can_id == 0x600 + self.node_id:
+        if can_id == REQUEST_ID + self.node_id:
             if self.state == nmt.STOPPED:
                 return []
             return self._on_sdo(data, t_ns)
@@ -332,7 +332,7 @@ class CanopenNode:
         if self.store.number(0x1017) != before:
             self._plan_heartbeat(t_ns)
         self.due_ns = 0  # whatever was written, the next tick plans again
-        frames = [] if reply is None else [pack(0x580 + self.node_id, reply)]
+        frames = [] if reply is None else [pack(RESPONSE_ID + self.node_id, reply)]
         return frames + self.after_command()
 
     def _forget_signature(self, request: bytes, reply: bytes | None) -> None:

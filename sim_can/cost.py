@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 
 from jtqd.drivers.devices import SYNC_COB_ID, drive_tpdo1, drive_tpdo2, sensor_tpdo1
 from jtqd.drivers.pdo import PdoMap
+from jtqd.drivers.sdo import REQUEST_ID
 from jtqd.sim_can.bench import Bench
 from jtqd.sim_can.plant_source import PlantSource
 from jtqd.sim_can.plants import AnyPlant
@@ -38,7 +39,7 @@ def map_pdos(bench: Bench) -> None:
         number = (pdo.cob_id - 0x80) // 0x100 - 1
         for index, subindex, value, size in _mapping_writes(0x1800 + number, pdo):
             request = bytes([0x23 | (4 - size) << 2]) + index.to_bytes(2, "little") + bytes([subindex])
-            bench.on_frame(0x600 + node, request + value.to_bytes(4, "little"), 0, 0)
+            bench.on_frame(REQUEST_ID + node, request + value.to_bytes(4, "little"), 0, 0)
     bench.on_frame(0x000, b"\x01\x00", 0, 0)
 
 

@@ -139,7 +139,7 @@ class StateMachine:
 OVERCURRENT = 0x2310
 STANDSTILL_RAD_S = 0.01  # joint side: a quick stop has ended below this
 HALT = 0x0100
-_INTERPOLATION_S = 0.001  # 60C2h after power-on
+DEFAULT_INTERPOLATION_S = 0.001  # 60C2h after power-on
 _INTERPOLATION_UNITS = (-6, 0)  # 60C2h:2: microseconds to seconds
 
 
@@ -161,7 +161,7 @@ class DriveNode(CanopenNode):
         self._ran = False  # since it was set up: 6060h written, or power-on
         self._own_target = 0.0
         self._sent = (OFF, 0.0)
-        self._interpolation_s = _INTERPOLATION_S
+        self._interpolation_s = DEFAULT_INTERPOLATION_S
         ratings = self._ratings
         self._motor_units = ratings.motor_counts_per_rev / (2.0 * math.pi)
         self._link_units = ratings.link_counts_per_rev / (2.0 * math.pi)
@@ -244,7 +244,9 @@ class DriveNode(CanopenNode):
 
     def _interpolate(self, value: int, index: int) -> None:
         """Apply 60C2h: value * 10^index seconds from one target velocity to the next."""
-        period_s = value / 10**-index
+        self._targets_come_every(value / 10**-index)
+
+    def _targets_come_every(self, period_s: float) -> None:
         if period_s != self._interpolation_s:
             self._interpolation_s = period_s
             self._source.interpolate(self._number, period_s)
@@ -258,16 +260,23 @@ class DriveNode(CanopenNode):
         """End the built-in motion of this drive."""
         if not self.commanded:
             self.commanded = True
+            self._interpolate(self.store.number(0x60C2, 1), self.store.number(0x60C2, 2))
             self.machine.release()
             self._mode = 0
 
-    def run_by_itself(self, mode: int, target: float) -> list[bytes]:
-        """Enable operation for built-in motion or play-back, with a target in the units of `Source.command`."""
+    def run_by_itself(
+        self, mode: int, target: float, period_s: float = DEFAULT_INTERPOLATION_S
+    ) -> list[bytes]:
+        """Enable operation for built-in motion or play-back, with a target in the units of `Source.command`.
+
+        period_s: until the next target, in place of 60C2h.
+        """
         machine = self.machine
         if self.commanded or machine.state in (FAULT, FAULT_REACTION):
             return []
         self._mode = mode
         self._own_target = target
+        self._targets_come_every(period_s)
         if machine.state == OPERATION_ENABLED:
             self._send_command()
             return []

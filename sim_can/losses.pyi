@@ -1,10 +1,10 @@
 from collections.abc import Callable
 from typing import Final
 
-LOWEST_TABLE_VELOCITY_RAD_S: Final = 0.2
-VELOCITY_STEP_RAD_S: Final = 0.1
-HIGHEST_TABLE_VELOCITY_RAD_S: Final = 3.6
-TORQUE_STEPS: Final = 400
+LOWEST_TABLE_VELOCITY_RAD_S: Final[float]
+VELOCITY_STEP_RAD_S: Final[float]
+HIGHEST_TABLE_VELOCITY_RAD_S: Final[float]
+TORQUE_STEPS: Final[int]
 
 class LossTable:
     torque_limit: float

@@ -6,7 +6,7 @@ from jtqd.sim_can.losses import JointFriction, LossTable
 from jtqd.sim_can.plant_file import JointPlant, PlantParameters
 from jtqd.sim_can.temperature import JointTemperature
 
-CONTROL_CYCLE_S: Final = 0.001
+CONTROL_CYCLE_S: Final[float]
 
 class JointConstants(NamedTuple):
     gear_ratio: float

@@ -2,7 +2,7 @@ from typing import Final
 
 from jtqd.sim_can.days import Thermal
 
-UPDATE_S: Final = 0.1
+UPDATE_S: Final[float]
 
 class JointTemperature:
     celsius: float

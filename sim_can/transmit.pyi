@@ -4,12 +4,12 @@ from typing import Final
 from jtqd.drivers.pdo import PdoMap
 from jtqd.sim_can.signals import ChannelSignal, DriveSignals
 
-NEVER_NS: Final = 1 << 62
-NOT_VALID: Final = 1
-POSITIVE_OVERLOAD: Final = 2
-NEGATIVE_OVERLOAD: Final = 4
-MAX_16: Final = 0x7FFF
-MAX_32: Final = 0x7FFF_FFFF
+NEVER_NS: Final[int]
+NOT_VALID: Final[int]
+POSITIVE_OVERLOAD: Final[int]
+NEGATIVE_OVERLOAD: Final[int]
+MAX_16: Final[int]
+MAX_32: Final[int]
 
 class Value:
     def __call__(self) -> int: ...

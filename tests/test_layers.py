@@ -177,3 +177,14 @@ def test_every_room_says_what_it_is_for() -> None:
             assert len(lines) >= 3, (
                 f"{name}: its __init__ has {len(lines)} lines of docstring, expected at least 3"
             )
+
+
+def test_constants_of_compiled_modules_have_no_second_home() -> None:
+    """What mypy reads of a compiled module names the type of a constant; its value stands in the .pyx."""
+    twice = re.compile(r"^(\w+)(?:: Final(?:\[[^\]]*\])?)? = ", re.MULTILINE)
+    assert {
+        str(path.relative_to(ROOT)): found
+        for package in PACKAGES
+        for path in sorted((ROOT / package).rglob("*.pyi"))
+        if (found := [name for name in twice.findall(path.read_text()) if name.isupper()])
+    } == {}

@@ -39,6 +39,7 @@ from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, 
 from jtqd.drivers.frame_socket import BusDown, FrameSocket
 from jtqd.drivers.long_frames import LongFrames
 from jtqd.drivers.object_dictionary import ObjectStore
+from jtqd.drivers.sdo import REQUEST_ID, RESPONSE_ID
 
 FILE = "bus.json"
 _HEARTBEATS = ("not watched", "awaited", "heard", "lost")
@@ -121,8 +122,13 @@ LogEvent = Callable[[str, int, str], None]
 def service_filters(config: Config) -> list[CanFilter]:
     """Return filters for SDO requests to jtqd, SDO traffic of the nodes, EMCY, heartbeats and NMT commands."""
     heartbeats = CanFilter(nmt.HEARTBEAT_BASE, 0x780 | CAN_EFF_FLAG | CAN_RTR_FLAG)
-    nodes = [base + node for node in nodes_of(config) for base in (0x080, 0x580, 0x600)]
-    return [exact(0x600 + config.node_id), exact(0x000), heartbeats, *(exact(cob_id) for cob_id in nodes)]
+    nodes = [base + node for node in nodes_of(config) for base in (emcy.EMCY_BASE, RESPONSE_ID, REQUEST_ID)]
+    return [
+        exact(REQUEST_ID + config.node_id),
+        exact(0x000),
+        heartbeats,
+        *(exact(cob_id) for cob_id in nodes),
+    ]
 
 
 def nodes_of(config: Config) -> list[int]:
@@ -210,7 +216,7 @@ class BusService:
                 for can_id, data in self._frames(count):
                     if 0x080 < can_id <= 0x0FF:
                         self._on_emergency(can_id - 0x080, data, now_s)
-                    elif can_id == 0x600 + self._config.node_id:
+                    elif can_id == REQUEST_ID + self._config.node_id:
                         self._on_request(data)
         for number, node in self._first["nodes"].items():
             self.care.configured(int(number), node, now_s)
@@ -240,7 +246,7 @@ class BusService:
             self._conditions.update("node_changed", subject, text is not None, now_s, text or "")
         with suppress(BusDown):
             for node, request in requests:
-                self.socket.send(pack(0x600 + node, request))
+                self.socket.send(pack(REQUEST_ID + node, request))
             if self.bus.state not in (BUS_OFF, DOWN):
                 message = self.errors.tick(now_s)
                 if message is not None:
@@ -275,14 +281,14 @@ class BusService:
             return
         self._heard = True
         self._bus_change(self.bus.alive(), now_s)
-        if can_id == 0x600 + self._config.node_id:
+        if can_id == REQUEST_ID + self._config.node_id:
             self._on_request(data)
         elif can_id >= nmt.HEARTBEAT_BASE:
             self._node_events(self.heartbeats.receive(can_id - nmt.HEARTBEAT_BASE, data, now_s), now_s)
-        elif can_id >= 0x600:
-            self.care.on_foreign_request(can_id - 0x600, now_s)
-        elif can_id >= 0x580:
-            self.care.on_reply(can_id - 0x580, data, now_s)
+        elif can_id >= REQUEST_ID:
+            self.care.on_foreign_request(can_id - REQUEST_ID, now_s)
+        elif can_id >= RESPONSE_ID:
+            self.care.on_reply(can_id - RESPONSE_ID, data, now_s)
         elif can_id == 0x000:
             self._on_nmt(data, now_s)
         else:
@@ -302,7 +308,7 @@ class BusService:
         answer = self.own.answer(data)
         if answer is not None:
             with suppress(BusDown):
-                self.socket.send(pack(0x580 + self._config.node_id, answer))
+                self.socket.send(pack(RESPONSE_ID + self._config.node_id, answer))
 
     def _on_emergency(self, node: int, data: bytes, now_s: float) -> None:
         line = self.emergencies.receive(node, data, now_s)

@@ -10,13 +10,14 @@ from collections.abc import Iterator, Sequence
 
 from jtqd.daemon.bus.boot import bus_load_of
 from jtqd.daemon.cli.checks import FAIL, GOOD, SKIP, WARN, CheckResult, share
-from jtqd.daemon.cli.traffic import SYNC, NodeCount, PdoCount, TimeHistogram, Timing, Traffic, described
+from jtqd.daemon.cli.traffic import NodeCount, PdoCount, TimeHistogram, Timing, Traffic, described
 from jtqd.daemon.config import Config
 from jtqd.daemon.shared.conditions import Condition
 from jtqd.daemon.shared.notices import ERROR
 from jtqd.daemon.shared.snapshot import LATE_BIN_NS, View
 from jtqd.drivers import nmt
 from jtqd.drivers.bus_load import LIMIT
+from jtqd.drivers.devices import SYNC_COB_ID
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_SFF_MASK
 from jtqd.estimator.checked import counted
 from jtqd.estimator.status import NAMES, PUBLISHED
@@ -293,7 +294,7 @@ def _foreign(traffic: Traffic) -> CheckResult:
     text = ", ".join(f"{described(can_id)} {count / seconds:.3g} per s" for can_id, count in most)
     left = len(traffic.strangers) - len(most)
     text += f" and {counted(left, 'more identifier')}" if left else ""
-    ours = traffic.inputs.keys() | {SYNC}
+    ours = traffic.inputs.keys() | {SYNC_COB_ID}
     disguised = [
         each
         for each in traffic.strangers

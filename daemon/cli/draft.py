@@ -452,13 +452,11 @@ class ConfigDraft:
     sensor_node: int | None
     joints_of_sensor: Sequence[int] = ()
     budget_mb: int = 2000
-    spare_node: int | None = field(default=None)
-    """Node-ID of the second joint that this version's configuration names, where the bench has one joint only."""
 
     @property
     def node_id(self) -> int:
         """jtqd's own node-ID: 20h, or the next that no node has."""
-        used = [*(each.node for each in self.joints), self.sensor_node, COMMANDER_NODE, self.spare_node]
+        used = [*(each.node for each in self.joints), self.sensor_node, COMMANDER_NODE]
         free: list[int] = [each for each in (JTQD_NODE, *range(JTQD_NODE + 2, 128)) if each not in used]
         return free[0]
 
@@ -474,13 +472,6 @@ def config_text(draft: ConfigDraft) -> str:
     ]
     for joint in draft.joints:
         lines += _joint_section(joint, draft)
-    if draft.spare_node is not None:
-        lines += [
-            "joint_2:                  # this version's configuration names two joints; this one is not there",
-            f"  node: {draft.spare_node}",
-            "  file: joint_1.yaml",
-            "  mandatory: false",
-        ]
     if draft.sensor_node is not None:
         lines += sensor_lines(draft.sensor_node, draft.sensor)
     lines += [

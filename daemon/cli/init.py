@@ -430,10 +430,6 @@ def _config(options: argparse.Namespace, found: Found, joints: list[JointDraft])
         measured = []
     if not set(measured) <= set(numbers):
         raise UsageError(f"--sensor-joint: found {measured}, expected among {numbers}")
-    taken = {*found.nodes, *found.surveys, found.sensor}
-    spare = (
-        next(node for node in range(MAX_NODE_ID, 0, -1) if node not in taken) if len(joints) == 1 else None
-    )
     return ConfigDraft(
         bus=options.bus or "a bus that was not looked at",
         bitrate=options.bitrate,
@@ -442,7 +438,6 @@ def _config(options: argparse.Namespace, found: Found, joints: list[JointDraft])
         sensor=None if found.sensor is None else found.surveys.get(found.sensor),
         sensor_node=found.sensor,
         joints_of_sensor=measured,
-        spare_node=spare,
     )
 
 

@@ -1,6 +1,6 @@
 """`jtq status`: state of a running jtqd, read from shared memory without any effect on the loop.
 
-A reading is shown as a picture at the width of the terminal (`StatusView`), or as plain data for JSON (`content`).
+A reading is shown as a picture at the width of the terminal (`StatusView`), or as plain data (`status_json.content`).
 """
 
 from __future__ import annotations
@@ -8,19 +8,13 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import select
 import sys
-import termios
 import time
-import tty
 from collections.abc import Iterator, Sequence
 from math import isfinite, nan
-from typing import Any
 
-from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.live import Live
-from rich.padding import Padding
-from rich.segment import Segment, Segments
 from rich.table import Table
 from rich.text import Text
 
@@ -36,11 +30,12 @@ from jtqd.daemon.cli.reading import (
     find_daemons,
     on_bus,
 )
-from jtqd.daemon.cli.recent import Moment, Recent, page, sparkline
+from jtqd.daemon.cli.recent import Moment, Recent, sparkline
+from jtqd.daemon.cli.status_json import content
+from jtqd.daemon.cli.terminal import HEAD, HEADING, Columns, Keys, line, paged
 from jtqd.daemon.shared.conditions import SEVERITIES, Condition
-from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
 from jtqd.daemon.shared.notices import ERROR, WARNING, Notice
-from jtqd.daemon.shared.reasons import drive_state, joint_reason, silent_s
+from jtqd.daemon.shared.reasons import joint_reason, silent_s
 from jtqd.daemon.shared.runtime_dir import About
 from jtqd.daemon.shared.snapshot import (
     BUS_COUNTERS,
@@ -48,18 +43,13 @@ from jtqd.daemon.shared.snapshot import (
     NMT_STATES,
     OPERATIONAL,
     WORK_BIN_NS,
-    InputView,
     SnapshotReader,
     View,
 )
-from jtqd.daemon.supervisor.table import COLOURS, bus_load, first_that_fits, plain_line
-from jtqd.estimator.checked import counted, finite
+from jtqd.daemon.supervisor.table import COLOURS, bus_load, plain_line
+from jtqd.estimator.checked import counted
 from jtqd.estimator.status import NAMES, PUBLISHED
 
-SCHEMA = "jtq.status/1"
-_HEAD = "bold"
-_HEADING = 9
-"""Width of the headings of lines."""
 _FAULTS = (
     "stale_inputs",
     "published_late",
@@ -84,138 +74,6 @@ _BETWEEN_S = 0.3
 """Between the two readings of one picture: bus load and causes need what has changed."""
 
 
-def content(reading: Reading) -> dict[str, Any]:
-    """Return everything the view shows; null for unknown numbers."""
-    about, view = reading.daemon.about, reading.view
-    result: dict[str, Any] = {
-        "schema": SCHEMA,
-        "bus": about.bus,
-        "instance": about.instance,
-        "pid": about.pid,
-        "state": reading.state,
-        "why": reading.why or None,
-        "started": about.started,
-        "configuration": {"path": about.configuration, "sha256": about.configuration_sha256},
-        "method": about.method,
-        "versions": about.versions,
-    }
-    if view is None or reading.earlier is None:
-        return result
-    return result | {
-        "cycle": view.cycle,
-        "joints": [_joint(reading, number) for number in range(1, len(view.joints) + 1)],
-        "inputs": [_input(name, each, view) for name, each in zip(about.inputs, view.inputs, strict=False)],
-        "work_us": _quantiles(reading.work_us),
-        "late_us": _quantiles(reading.late_us),
-        "bus_load": {
-            "now": finite(bus_load(reading.earlier, view, about.bitrate)),
-            "worst_case": view.worst_load,
-        },
-        "bus_state": dict(reading.bus),
-        "counters": view.counters,
-        "nodes": [_node(node, what, view) for node, what in sorted(about.nodes.items())],
-        "notices": [_notice(each) for each in reading.notices],
-        "conditions": [_condition(each, time.monotonic_ns()) for each in reading.conditions],
-        "recorder": reading.log and _recorder(reading.log),
-    }
-
-
-def _joint(reading: Reading, number: int) -> dict[str, Any]:
-    about, view, earlier = reading.daemon.about, reading.view, reading.earlier
-    assert view is not None
-    assert earlier is not None
-    n = number - 1
-    seen, measured = view.joints[n], view.measured[n]
-    known = seen.status in PUBLISHED and reading.state == RUNNING
-    return {
-        "joint": number,
-        "name": about.joints[n].name,
-        "status": NAMES.get(seen.status, str(seen.status)),
-        "reason": joint_reason(about, number, view, earlier) or None,
-        "since_s": (view.cycle - view.status_since[n]) * view.period_s,
-        "torque_nm": finite(seen.torque_nm if known else nan),
-        "sigma_nm": finite(seen.sigma_nm if known else nan),
-        "physics_nm": finite(seen.physics_nm),
-        "network_nm": finite(seen.network_nm),
-        "sensor_nm": finite(seen.sensor_nm),
-        "reference_nm": finite(seen.reference_nm),
-        "error_nm": finite(seen.torque_nm - seen.reference_nm if known else nan),
-        "rmse_nm": finite(view.rmse_nm[n]),
-        "age_ms": finite(seen.age_ms),
-        "zeros": view.zeros[n].content(),
-        "contact": bool(seen.input_flags & FLAG_CONTACT) if seen.input_flags & FLAG_CONTACT_KNOWN else None,
-        "contact_nm": finite(seen.contact_nm),
-        "torque_rate_nm_s": finite(seen.torque_rate_nm_s),
-        "current_a": finite(measured.current_a),
-        "motor_velocity_rad_s": finite(measured.motor_velocity_rad_s),
-        "temperature_c": finite(measured.temperature_c),
-        "drive": drive_state(seen.statusword),
-        "cycles": {
-            NAMES.get(code, str(code)): count for code, count in enumerate(view.status_cycles[n]) if count
-        },
-    }
-
-
-def _input(name: str, each: InputView, view: View) -> dict[str, Any]:
-    return {
-        "name": name,
-        "age_s": (view.sync_monotonic_ns - each.used_ns) * 1e-9 if each.used_ns else None,
-        "after_sync_us": each.delay_ns / 1000 if each.used_ns else None,
-        "usual_us": [each.low_ns / 1000, each.high_ns / 1000] if each.low_ns <= each.high_ns else None,
-        "late": each.late,
-        "lost": each.lost,
-        "duplicates": each.duplicates,
-        "rejected": each.rejected,
-    }
-
-
-def _node(node: int, what: str, view: View) -> dict[str, Any]:
-    heard_ns = view.node_heard_ns[node]
-    return {
-        "node": node,
-        "what": what,
-        "state": NMT_STATES.get(view.node_states[node]) if heard_ns else None,
-        "heartbeat_age_s": (view.sync_realtime_ns - heard_ns) * 1e-9 if heard_ns else None,
-        "configured": node not in view.unconfigured,
-    }
-
-
-def _notice(each: Notice) -> dict[str, Any]:
-    return {
-        "realtime_ns": each.realtime_ns,
-        "level": each.level,
-        "node": each.node or None,
-        "topic": each.topic,
-        "text": each.text,
-    }
-
-
-def _condition(each: Condition, now_ns: int) -> dict[str, Any]:
-    return {
-        "name": each.name,
-        "subject": each.subject,
-        "severity": SEVERITIES[each.severity],
-        "text": each.text,
-        "for_s": (now_ns - each.since_ns) * 1e-9,
-    }
-
-
-def _recorder(log: CurrentLog) -> dict[str, Any]:
-    return {
-        "path": str(log.path) if log.path else None,
-        "bytes": log.size,
-        "written": log.account.written,
-        "lost": log.account.lost,
-        "let_go": log.account.let_go,
-        "disk_free": log.disk_free,
-        "disk_size": log.disk_size,
-    }
-
-
-def _quantiles(values: tuple[float, float, float]) -> dict[str, float | None]:
-    return dict(zip(("p50", "p99", "max"), map(finite, values), strict=True))
-
-
 class StatusView:
     """Rich view of one reading; `recent`: with what a live view remembers of the last seconds."""
 
@@ -238,7 +96,7 @@ class StatusView:
             yield from _reasons(about, view, reading.earlier)
             for joint, zeros in zip(about.joints, view.zeros, strict=False):
                 if zeros.tracked:
-                    yield _line(
+                    yield line(
                         f"zeros {joint.number}", Text(zeros.text, style="" if zeros.plausible else "yellow")
                     )
             if self._recent is not None:
@@ -253,7 +111,7 @@ class StatusView:
             f"{name.replace('_', ' ')} {view.counters[name]}" for name in _FAULTS if view.counters[name]
         ]
         if faults:
-            yield _line("counted", ", ".join(faults))
+            yield line("counted", ", ".join(faults))
         yield ""
         yield _nodes(about, view)
         yield ""
@@ -269,56 +127,24 @@ def _last_seconds(recent: Recent, joints: int, width: int) -> Iterator[Renderabl
         torques = recent.torques(joint)
         known = [each for each in torques if isfinite(each)]
         extent = f"{min(known):.2f} to {max(known):.2f} Nm" if known else "no torque"
-        yield _line(f"torque {joint + 1}", Text.assemble((sparkline(torques, columns), "cyan"), f" {extent}"))
+        yield line(f"torque {joint + 1}", Text.assemble((sparkline(torques, columns), "cyan"), f" {extent}"))
     work = recent.largest_us(WORK_BIN_NS / 1000, late=False)
     late = recent.largest_us(LATE_BIN_NS / 1000, late=True)
     if work is not None and late is not None:
-        yield _line(
+        yield line(
             f"last {recent.seconds:.0f} s", f"work at most {work:.0f} us, SYNC late by at most {late:.0f} us"
         )
 
 
 def _title(reading: Reading) -> Text:
     about, view = reading.daemon.about, reading.view
-    text = Text(f"jtqd on {about.instance}", style=_HEAD)
+    text = Text(f"jtqd on {about.instance}", style=HEAD)
     text.append(f"  node {about.node:02X}h  {about.method}  pid {about.pid}", style="")
     if view is not None:
         text.append(f"  cycle {view.cycle}  up {duration(view.cycle * view.period_s)}", style="")
     text.append(f"\n{about.configuration}  {about.configuration_sha256[:8]}", style="dim")
     text.overflow = "fold"
     return text
-
-
-class Columns:
-    """A table whose columns go, in the order of `dispensable`, where the terminal is too narrow for all; nothing is cut."""
-
-    def __init__(self, headings: dict[str, str], dispensable: tuple[str, ...] = ()) -> None:
-        self._headings = headings
-        self._dispensable = dispensable
-        self._rows: list[dict[str, str | Text]] = []
-
-    def add(self, *cells: str | Text) -> None:
-        """Add a row, one cell per heading."""
-        self._rows.append(dict(zip(self._headings, cells, strict=True)))
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Render for the width of the terminal (called by rich)."""
-        tables = [
-            self._table([name for name in self._headings if name not in self._dispensable[:dropped]])
-            for dropped in range(len(self._dispensable) + 1)
-        ]
-        yield first_that_fits(tables, console, options) or tables[-1]
-
-    def _table(self, names: list[str]) -> Table:
-        table = Table(
-            box=None, pad_edge=False, padding=(0, 2, 0, 0), collapse_padding=True, header_style=_HEAD
-        )
-        for name in names:
-            right = self._headings[name] == "right"
-            table.add_column(name, justify="right" if right else "left", no_wrap=True)
-        for row in self._rows:
-            table.add_row(*(row[name] for name in names))
-        return table
 
 
 def _quantity(value: float, unit: str, digits: int = 2) -> str:
@@ -391,18 +217,9 @@ def after_sync(delay_ns: int) -> str:
     return f"{delay_ns / 1000:.0f} us" if delay_ns >= 0 else f"{-delay_ns / 1000:.0f} us old"
 
 
-def _line(heading: str, text: str | Text) -> RenderableType:
-    """Return a heading of fixed width and text that wraps beside it."""
-    grid = Table.grid(padding=(0, 1))
-    grid.add_column(width=_HEADING, no_wrap=True, style=_HEAD)
-    grid.add_column(overflow="fold")
-    grid.add_row(heading, text)
-    return grid
-
-
 def _loop(reading: Reading, view: View, width: int) -> RenderableType:
     grid = Table.grid(padding=(0, 1))
-    grid.add_column(width=_HEADING, no_wrap=True, style=_HEAD)
+    grid.add_column(width=HEADING, no_wrap=True, style=HEAD)
     grid.add_column()
     for name, values, bins, bin_ns in (
         ("work", reading.work_us, reading.work, WORK_BIN_NS),
@@ -423,7 +240,7 @@ def _loop(reading: Reading, view: View, width: int) -> RenderableType:
 
 def _bus(about: About, view: View, earlier: View) -> RenderableType:
     now = bus_load(earlier, view, about.bitrate)
-    return _line(
+    return line(
         "bus load",
         f"{share(now)} now, with worst-case stuff bits; {share(view.worst_load)} by configuration",
     )
@@ -441,7 +258,7 @@ def _frames(reading: Reading) -> Iterator[RenderableType]:
     text = f"{state}, {counted(errors, 'error frame')}"
     if long_frames := reading.bus.get("long_frames", 0):
         text += f", {counted(long_frames, 'CAN FD or XL frame')} not read"
-    yield _line("bus state", text)
+    yield line("bus state", text)
 
 
 def _nodes(about: About, view: View) -> Columns:
@@ -463,11 +280,11 @@ def _nodes(about: About, view: View) -> Columns:
 
 def _log(log: CurrentLog | None) -> Iterator[RenderableType]:
     if log is None:
-        yield _line("recorder", "no recording")
+        yield line("recorder", "no recording")
         return
     lost = Text(f"{log.account.lost} lost", style="bold red" if log.account.lost else "")
     held = f", {log.account.let_go} discarded (flight recorder)" if log.account.let_go else ""
-    yield _line(
+    yield line(
         "recorder",
         Text.assemble(
             f"{counted(log.account.written, 'cycle')} written, ",
@@ -475,8 +292,8 @@ def _log(log: CurrentLog | None) -> Iterator[RenderableType]:
             f"{held}, {size(log.size)} in this file",
         ),
     )
-    yield _line("", str(log.path) if log.path else "no file is being written")
-    yield _line("disk", f"{size(log.disk_free)} free of {size(log.disk_size)}")
+    yield line("", str(log.path) if log.path else "no file is being written")
+    yield line("disk", f"{size(log.disk_free)} free of {size(log.disk_size)}")
 
 
 def _style_of(level: int) -> str:
@@ -489,7 +306,7 @@ def _conditions(conditions: Sequence[Condition]) -> Iterator[RenderableType]:
         yield ""
     now_ns = time.monotonic_ns()
     for each in conditions:
-        yield _line(
+        yield line(
             SEVERITIES[each.severity],
             Text(
                 f"{each.line} (for {duration((now_ns - each.since_ns) * 1e-9)})",
@@ -503,53 +320,7 @@ def _notices(notices: Sequence[Notice]) -> Iterator[RenderableType]:
         yield ""
     for each in notices[-_LAST_NOTICES:]:
         when = time.strftime("%H:%M:%S", time.localtime(each.realtime_ns * 1e-9))
-        yield _line(when, Text(each.text, style=_style_of(each.level)))
-
-
-def clock(pages: str = "") -> RenderableType:
-    """Return the line below a live view."""
-    return Padding(
-        Text(time.strftime(f"%H:%M:%S  {pages}Ctrl-C ends this view; jtqd continues"), style="dim"),
-        (1, 0, 0, 0),
-    )
-
-
-_FOOT_LINES = 2
-
-
-def paged(console: Console, picture: RenderableType, number: int) -> tuple[RenderableType, int]:
-    """Return the page of a picture that fits the terminal, with the line below, and its number: no line is dropped."""
-    lines = console.render_lines(picture, console.options.update(height=None), pad=False)
-    shown, number, count = page(lines, console.height - _FOOT_LINES, number)
-    rows = [Segments([*line, Segment.line()]) for line in shown]
-    return Group(*rows, clock(f"page {number + 1} of {count}, SPACE turns; " if count > 1 else "")), number
-
-
-class Keys:
-    """Keys of the terminal, without their echo, while a view is shown; nothing where standard input is none."""
-
-    def __enter__(self) -> Keys:
-        self._before: list[Any] | None = None
-        if sys.stdin.isatty():
-            self._before = termios.tcgetattr(sys.stdin)
-            tty.setcbreak(sys.stdin.fileno())
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._before is not None:
-            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._before)
-
-    def turned(self, wait_s: float) -> int:
-        """Wait, at most until a key comes; return how many pages to turn: SPACE, n forward, b, p back."""
-        if self._before is None:
-            time.sleep(wait_s)
-            return 0
-        if not select.select([sys.stdin.fileno()], [], [], wait_s)[0]:
-            return 0
-        pressed = os.read(sys.stdin.fileno(), 64)
-        if not pressed:  # the terminal has gone
-            time.sleep(wait_s)
-        return sum(pressed.count(key) for key in b" n") - sum(pressed.count(key) for key in b"bp")
+        yield line(when, Text(each.text, style=_style_of(each.level)))
 
 
 def parser() -> argparse.ArgumentParser:

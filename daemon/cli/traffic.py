@@ -18,7 +18,8 @@ from jtqd.daemon.core import estimate_pdo
 from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.loop.input_pdos import input_pdos
 from jtqd.drivers import nmt
-from jtqd.drivers.devices import estimate_tpdos
+from jtqd.drivers.devices import SYNC_COB_ID, estimate_tpdos
+from jtqd.drivers.emcy import EMCY_BASE
 from jtqd.drivers.frame import (
     CAN_EFF_FLAG,
     CAN_EFF_MASK,
@@ -31,6 +32,7 @@ from jtqd.drivers.frame import (
     stuffed_bits,
 )
 from jtqd.drivers.frame_socket import BusDown, FrameSocket
+from jtqd.drivers.sdo import REQUEST_ID, RESPONSE_ID
 
 _BIN_NS = 2_000
 _BINS = 5_000
@@ -63,8 +65,6 @@ class TimeHistogram:
         return float("nan")
 
 
-SYNC = 0x080
-_EMCY = 0x080
 _SERVICES = (0x000, 0x100, 0x7E4, 0x7E5)
 """NMT, TIME, LSS: of nobody in particular."""
 _LATE = 1000
@@ -142,8 +142,8 @@ class Traffic:
         self.nodes = {node: NodeCount(name) for node, name in names.items()}
         self.nodes[config.node_id] = NodeCount("jtqd")
         known = {row.cob_id for row in bus_load_of(config).rows}
-        services = {base + node for node in self.nodes for base in (0x080, 0x580, 0x600)}
-        self._known = known | services | {*_SERVICES, SYNC}
+        services = {base + node for node in self.nodes for base in (EMCY_BASE, RESPONSE_ID, REQUEST_ID)}
+        self._known = known | services | {*_SERVICES, SYNC_COB_ID}
         self.frames = self.bits = 0
         self.first_ns = self.last_ns = 0
         self.cycles = self.complete = 0
@@ -191,7 +191,7 @@ class Traffic:
         pdo = self.inputs.get(can_id)
         if pdo is not None:
             self._input(pdo, data, stamp_ns)
-        elif can_id == SYNC:
+        elif can_id == SYNC_COB_ID:
             self._sync(data, stamp_ns)
         elif can_id in self.estimates:
             self._input(self.estimates[can_id], data, stamp_ns)
@@ -279,7 +279,7 @@ class Traffic:
             node.heartbeats += 1
             node.last_ns, node.state = stamp_ns, data[0]
             node.boot_ups += data[0] == 0
-        elif function == _EMCY and len(data) == 8:
+        elif function == EMCY_BASE and len(data) == 8:
             node.emergencies += 1
             node.last_emergency = int.from_bytes(data[:2], "little")
 
@@ -330,7 +330,7 @@ def drive(socket: FrameSocket, traffic: Traffic, seconds: float, config: Config)
     """
     timing = Timing()
     overflow = config.counter_overflow
-    syncs = [pack(SYNC, bytes((n,)) if overflow else b"") for n in range(max(overflow, 1) + 1)]
+    syncs = [pack(SYNC_COB_ID, bytes((n,)) if overflow else b"") for n in range(max(overflow, 1) + 1)]
     heartbeat = nmt.heartbeat(config.node_id, nmt.OPERATIONAL)
     every = max(1, config.heartbeat_ms * 1_000_000 // config.period_ns)
     counter, sent_ns = 0, 0
@@ -360,7 +360,7 @@ def silent(socket: FrameSocket, seconds: float) -> bool:
         if not socket.wait(left):
             return True
         for n in range(socket.receive()):
-            if int.from_bytes(socket.frames[FRAME_SIZE * n : FRAME_SIZE * n + 4], "little") == SYNC:
+            if int.from_bytes(socket.frames[FRAME_SIZE * n : FRAME_SIZE * n + 4], "little") == SYNC_COB_ID:
                 return False
     return True
 
@@ -408,6 +408,6 @@ def _take(socket: FrameSocket, traffic: Traffic, echo: TimeHistogram | None = No
             can_id, length, data = unpack(frames, FRAME_SIZE * n)
             if can_id & CAN_RTR_FLAG and not can_id & CAN_ERR_FLAG:
                 data = b""
-            if echo is not None and own[n] and can_id == SYNC:
+            if echo is not None and own[n] and can_id == SYNC_COB_ID:
                 echo.add(stamps[n] - sent_ns)
             traffic.feed(can_id, data[:length], stamps[n])

@@ -15,10 +15,10 @@ from jtqd.daemon.shared.snapshot import Snapshot
 from jtqd.drivers.frame_socket import FrameSocket
 from jtqd.estimator.methods import AnyEstimator
 
-STARTING_CYCLES: Final = 20
-CYCLE_ENDED: Final = 0
-SLOT_PASSED: Final = 1
-RUN_ENDED: Final = 2
+STARTING_CYCLES: Final[int]
+CYCLE_ENDED: Final[int]
+SLOT_PASSED: Final[int]
+RUN_ENDED: Final[int]
 clock: Clock
 
 class Cycle:

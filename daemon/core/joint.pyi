@@ -6,7 +6,7 @@ from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.core.status import JointCounts, JointRules
 from jtqd.estimator.methods import AnyEstimator
 
-STAMP_ACCURACY_NS: Final = 5000
+STAMP_ACCURACY_NS: Final[int]
 
 class Unwrap:
     def __init__(self, offset: int = 0) -> None: ...

@@ -1,7 +1,7 @@
 from typing import Final
 
-RESERVED_NS: Final = 40000
-FORGET_CYCLES: Final = 1024
+RESERVED_NS: Final[int]
+FORGET_CYCLES: Final[int]
 
 class Grid:
     slot_ns: int

@@ -4,8 +4,8 @@ from jtqd.daemon.config import SafetySettings
 from jtqd.daemon.core.joint_safety import JointSafety
 
 NEEDED: Final[dict[int, int]]
-RELAPSE: Final = 10
-MOST: Final = 4
+RELAPSE: Final[int]
+MOST: Final[int]
 
 class JointCounts(Protocol):
     """Where a joint counts: the loop's snapshot, or two arrays in a replay.

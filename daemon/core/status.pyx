@@ -24,7 +24,7 @@ No clock and no randomness: the same statuses and faults give the same answer ag
 """
 
 from libc.math cimport INFINITY, NAN, fabs, isnan, sqrt
-from libc.stdint cimport int64_t, uint64_t
+from libc.stdint cimport int8_t, int64_t, uint64_t
 
 from typing import Final
 
@@ -32,6 +32,7 @@ from jtqd.daemon.core.estimate_pdo cimport has_torque
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared import faults
 from jtqd.daemon.shared.snapshot import COUNTERS
+from jtqd.drivers.cia402 import STATES, TOLD
 from jtqd.estimator import status as st
 from jtqd.estimator.observer cimport follow_reference, restart_reference
 from jtqd.estimator.plausibility cimport Plausibility
@@ -301,19 +302,26 @@ cdef class JointTally:
 # The rules of docs/safety.md ------------------------------------------------------------------------------------------
 
 
-cdef bint _powered(int statusword) noexcept nogil:
-    """Operation enabled and quick stop active (6041h masked with 6Fh): in these states the motor carries current."""
-    return statusword & 0x6F == 0x27 or statusword & 0x6F == 0x07
+cdef enum:
+    POWERED = -1  # the motor carries current
+    STATE_BITS = 0x7F
+if STATE_BITS != TOLD:
+    raise ImportError(f"found {TOLD:02X}h, expected the state of a drive in the bits {STATE_BITS:02X}h of its statusword")
+cdef int8_t OF_STATE[STATE_BITS + 1]
+for _code in range(STATE_BITS + 1):
+    _forced = faults.STATUS_OF_STATE.get(STATES[_code], st.OFF)
+    OF_STATE[_code] = POWERED if _forced is None else _forced
 
 
-cdef int _unpowered(int statusword) noexcept nogil:
-    """Status of a drive whose motor carries none: fault reaction active and fault (6041h masked with 4Fh), or off."""
-    return DRIVE_FAULT if statusword & 0x4F == 0x0F or statusword & 0x4F == 0x08 else OFF
+cdef int _forced_status(int statusword) noexcept nogil:
+    """Return the status that the state of a drive forces (`faults.STATUS_OF_STATE`), POWERED for none."""
+    return OF_STATE[statusword & STATE_BITS]
 
 
 def drive_status(int statusword):
     """Return the status forced by a drive's statusword (6041h), or None if the motor carries current."""
-    return None if _powered(statusword) else _unpowered(statusword)
+    cdef int forced = _forced_status(statusword)
+    return None if forced == POWERED else forced
 
 
 cdef class JointRules:
@@ -372,7 +380,7 @@ cdef class JointRules:
         sample: what the estimate was made of; reference_nm: of the same age, NaN where unknown; while `starting`, an
         estimate with a number has status 1 instead.
         """
-        cdef int found = 0, status = estimate.status
+        cdef int found = 0, status = estimate.status, forced = _forced_status(statusword)
         if self.is_checked:
             found = self.plausibility.check(
                 sample.dt_s,
@@ -383,8 +391,8 @@ cdef class JointRules:
             )
         if self.with_network and not network_wanted:
             flags[0] |= FLAG_NETWORK_SKIPPED
-        if not _powered(statusword):
-            status = _unpowered(statusword)
+        if forced != POWERED:
+            status = forced
         elif has_torque(status):
             found |= self.faults_of(estimate, reference_nm, network_wanted)
             if starting:

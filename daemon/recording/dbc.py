@@ -14,6 +14,7 @@ from jtqd.daemon.core.estimate_pdo import NO_TORQUE, SIGMA_UNIT_NM, SIGMA_UNKNOW
 from jtqd.daemon.recording.schemas import STATUS_NAMES
 from jtqd.drivers.devices import (
     NOT_MEASURED,
+    SYNC_COB_ID,
     TEMPERATURE,
     TEMPERATURE_C_PER_UNIT,
     contact_tpdos,
@@ -22,6 +23,7 @@ from jtqd.drivers.devices import (
     sensor_tpdo1,
     sensor_tpdo2,
 )
+from jtqd.drivers.emcy import EMCY_BASE
 from jtqd.drivers.layout import places
 from jtqd.drivers.nmt import HEARTBEAT_BASE, STATES
 from jtqd.drivers.pdo import PdoMap
@@ -29,7 +31,6 @@ from jtqd.drivers.pdo import PdoMap
 if TYPE_CHECKING:
     from jtqd.daemon.config import Config
 
-SYNC_ID, EMCY_BASE = 0x080, 0x080
 _RECEIVER = "Vector__XXX"  # the format's word for "nobody in particular"
 _DRIVE_QUANTITIES = {
     "motor_position": ("motor_rad_per_count", "rad"),
@@ -100,7 +101,7 @@ def dbc_of(
         ValueError: a PDO is on no identifier of the set, or its node has no name.
     """
     counter = [_Signal("sync_counter", 0, 8, False, _PLAIN)] if sync_counter else []
-    messages = [(SYNC_ID, "SYNC", len(counter), sync_producer, counter)]
+    messages = [(SYNC_COB_ID, "SYNC", len(counter), sync_producer, counter)]
     for pdo in pdo_maps:
         base, node = pdo.cob_id & 0x780, pdo.cob_id & 0x07F
         if base not in _PDO_NUMBER or node not in node_names:

@@ -5,7 +5,7 @@ is what only the loop could know: which inputs counted, how long a step was, tha
 else (positions that roll over, temperatures and their age, estimate, status, the bytes of the estimate PDO) is computed from
 the raw frames again.
 
-In arrays (`replay_whole`), one call of the estimator takes a whole run: the same numbers, much faster. Inputs are
+In arrays (`replay_whole`), one call of the estimator takes a whole run: the same numbers, without the frames. Inputs are
 the SI values of the log. What the loop decides after the estimate (starting, drive off or in fault, too late, what fits the
 field of the PDO) is decided here again.
 """

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from math import isfinite
 
 from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_NETWORK_SKIPPED, FLAG_POSITION, FLAG_SENSOR
-from jtqd.daemon.shared.faults import MEANINGS, NAMES
+from jtqd.daemon.shared.faults import MEANINGS, NAMES, STATUS_OF_STATE
 from jtqd.daemon.shared.runtime_dir import About, AboutJoint
 from jtqd.daemon.shared.snapshot import (
     NMT_STATES,
@@ -16,6 +16,7 @@ from jtqd.daemon.shared.snapshot import (
     JointView,
     View,
 )
+from jtqd.drivers.cia402 import State, state_of
 from jtqd.estimator import status as st
 from jtqd.estimator.learned import APART, LEFT, Zeros
 
@@ -24,18 +25,6 @@ SILENT_AFTER = 3.0
 _FIRST_CYCLES = 20
 _HELD = "waiting for enough consecutive good cycles"
 """Hysteresis of `jtqd.daemon.core.status`."""
-_DRIVE_STATES = {
-    0x00: "not ready to switch on",
-    0x40: "switch on disabled",
-    0x21: "ready to switch on",
-    0x23: "switched on, not enabled",
-    0x27: "operation enabled",
-    0x07: "quick stop active",
-    0x0F: "fault reaction active",
-    0x08: "fault",
-}
-_STATUS_OF_STATE = {0x27: None, 0x07: None, 0x0F: st.DRIVE_FAULT, 0x08: st.DRIVE_FAULT}
-"""As `jtqd.daemon.core.status.drive_status`: None where the motor carries current; every other state is off."""
 _ON_THE_BUS = (
     ("bus_errors", "the bus is down"),
     ("foreign_sync", "another SYNC producer is on the bus"),
@@ -51,11 +40,11 @@ _SENSOR_STATUS = {1: "not valid", 2: "positive overload", 4: "negative overload"
 
 
 def joint_reason(about: About, number: int, view: View, earlier: View) -> str:
-    """Explain the status of joint 1 or 2; "" where nothing needs a reason.
+    """Explain the status of a joint; "" where nothing needs a reason.
 
     Args:
         about: of the daemon.
-        number: 1 or 2.
+        number: of the joint, from 1 on.
         view: the reading.
         earlier: one from a moment before; what has been counted since then points at a cause.
     """
@@ -92,22 +81,18 @@ def fault_meanings(faults: int, *, names: bool = False) -> str:
 
 def drive_state(statusword: int) -> str:
     """Return the state of a CiA 402 drive by its statusword (6041h)."""
-    return _DRIVE_STATES.get(_state_bits(statusword), f"statusword {statusword:04X}h")
+    state = state_of(statusword)
+    if state is State.UNKNOWN:
+        return f"statusword {statusword:04X}h"
+    return "switched on, not enabled" if state is State.SWITCHED_ON else state.value
 
 
 def drive_reason(seen: JointView) -> str:
     """Explain status 0 (off) or 5 (drive fault) by the drive's state."""
     word = seen.statusword
     state = f"{drive_state(word)} (6041h {word:04X}h)"
-    now = _STATUS_OF_STATE.get(_state_bits(word), st.OFF)
+    now = STATUS_OF_STATE.get(state_of(word), st.OFF)
     return state if now == seen.status else f"{state}; {_HELD}"
-
-
-def _state_bits(statusword: int) -> int:
-    short = statusword & 0x4F
-    return (
-        short if short in (0x00, 0x40, 0x0F, 0x08) else statusword & 0x6F
-    )  # bit 5 does not count in the first
 
 
 def degraded_reason(seen: JointView, network_limit_nm: float | None, zeros: Zeros = NO_ZEROS) -> str:

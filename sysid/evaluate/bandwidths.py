@@ -19,13 +19,13 @@ import numpy as np
 from jtqd.estimator.age import age_ms, aligned
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.run import JointColumns, RunTableError
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import DEGRADED, VALID
 from jtqd.sysid.evaluate.methods import OURS, SETTLE_S, load_models
-from jtqd.sysid.fit.fused import GAUSS
 from jtqd.sysid.runs.files import RunError, read_runs
 from jtqd.sysid.runs.truth import read_truth
 

@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from jtqd.estimator.fusion import GAUSS
 from jtqd.sysid.evaluate.constant import PlateauScore
 from jtqd.sysid.evaluate.methods import OURS, PAPERS, TITLES, Samples
 from jtqd.sysid.evaluate.scores import (
@@ -21,7 +22,6 @@ from jtqd.sysid.evaluate.scores import (
     bin_name,
     common_methods,
 )
-from jtqd.sysid.fit.fused import GAUSS
 from jtqd.sysid.report.figures import SENSOR, STANDING, plain, shade, thinned
 from jtqd.sysid.report.page import LIGHT
 

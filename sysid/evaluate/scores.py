@@ -30,9 +30,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import QUADRANTS
 from jtqd.sysid.evaluate.methods import OURS, TITLES, Samples
-from jtqd.sysid.fit.fused import GAUSS
 
 VELOCITY_EDGES_RAD_S: Final = (0.0, 0.05, 0.2, 0.5, 1.0, 2.0, math.inf)
 """Bins of |v|, joint side: creeping, the paper's slowest, slow, medium, fast, faster."""

@@ -451,6 +451,12 @@ def _lines(joint: Joint, fit: FusedFit) -> list[str]:
             f"  stiffness {torsion.stiffness_nm_per_rad:.0f} Nm/rad (file: {joint.stiffness_nm_per_rad:.0f}), kinematic "
             f"error {amplitude[0]:.0f} urad at 2 per motor revolution, {amplitude[1]:.0f} at 4"
         )
+    agreement = fit.fused.agreement
+    if agreement is not None:
+        lines.append(
+            f"  current and torsion differ by up to {agreement.slow_nm:.2f} Nm slowly and {agreement.fast_nm:.2f} Nm "
+            "over the motor's turn; sigma grows beyond"
+        )
     return lines
 
 

@@ -32,7 +32,7 @@ from jtqd.estimator.arrays import FloatArray, QuadrantArray
 from jtqd.estimator.checked import counted
 from jtqd.estimator.envelope import MAX_CELLS, Envelope
 from jtqd.estimator.estimator import SLOPE_NM, quadrants
-from jtqd.estimator.fusion import Fusion, held
+from jtqd.estimator.fusion import GAUSS, Fusion, held
 from jtqd.estimator.joint import AdditiveLoss, Agreement, Friction, Fused, FusedSigma, Torsion
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.sysid.fit.agreement import fit_agreement
@@ -43,8 +43,6 @@ from jtqd.sysid.fit.torsion import fit_torsion
 from jtqd.sysid.fit.torsion_signals import torsion_torque
 
 COVERAGE: Final = 0.9
-GAUSS: Final = 1.6448536269514722
-"""Half width of a normal distribution's 90 % interval in standard deviations: the interval is value +- GAUSS sigma."""
 _FLOOR_NM: Final = 0.02
 _FAST_RAD_S: Final = 0.1
 """Slower samples do not count for sigma: near a reversal the loss is not settled, which `half` accounts for."""

@@ -14,8 +14,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
+from jtqd.drivers.cia402 import State, fast_state
 from jtqd.drivers.devices import COMMANDER_NODE, SYNC_COB_ID
-from jtqd.sysid.motion.cia402 import QUICK_STOP_WORD, State, describe, enabling_word, fast_state
+from jtqd.sysid.motion.cia402 import QUICK_STOP_WORD, describe, enabling_word
 from jtqd.sysid.motion.commands import Commands, Heartbeat
 from jtqd.sysid.motion.inputs import Inputs, Supervision
 from jtqd.sysid.motion.setpoints import (

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from jtqd.drivers import nmt
 from jtqd.drivers.devices import COMMANDER_NODE, drive_rpdo1, drive_rpdo2
 from jtqd.drivers.frame import FRAME, pack
-from jtqd.drivers.sdo import Transfer
-from jtqd.drivers.sdo_client import REQUEST_ID
+from jtqd.drivers.sdo import REQUEST_ID, Transfer
 from jtqd.sysid.motion.cia402 import ENABLE_OPERATION, QUICK_STOP_WORD
 from jtqd.sysid.motion.setpoints import MotionError, Setpoints
 from jtqd.sysid.motion.setup import DriveUnits

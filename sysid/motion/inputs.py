@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final
 
+from jtqd.drivers.cia402 import State, fast_state
 from jtqd.drivers.devices import (
     NOT_MEASURED,
     SYNC_COB_ID,
@@ -25,7 +26,8 @@ from jtqd.drivers.devices import (
 from jtqd.drivers.emcy import NO_ERROR, Emergency, parse
 from jtqd.drivers.layout import places
 from jtqd.drivers.nmt import BOOT_UP, HEARTBEAT_BASE, OPERATIONAL, STATES
-from jtqd.sysid.motion.cia402 import FAULTED, POWERED, State, describe, fast_state
+from jtqd.drivers.sdo import RESPONSE_ID
+from jtqd.sysid.motion.cia402 import FAULTED, POWERED, describe
 from jtqd.sysid.motion.setpoints import JointSample, Sample, Timing, Violation
 from jtqd.sysid.motion.setup import DriveUnits, SensorUnits
 
@@ -222,7 +224,7 @@ class Inputs:
             handlers[0x080 + node.node] = node.on_emergency
         for drive in self.drives:
             handlers |= drive.handlers
-            handlers[0x580 + drive.node] = drive.on_sdo
+            handlers[RESPONSE_ID + drive.node] = drive.on_sdo
             if drive.units.temperature:
                 handlers[drive_tpdo3(drive.node).cob_id] = drive.on_temperature
         if self.sensor is not None:

@@ -22,6 +22,7 @@ from typing import Final
 from jtqd.drivers import nmt
 from jtqd.drivers.boot_error import BootError, mismatch
 from jtqd.drivers.boot_procedure import BusSettings, NodeBoot
+from jtqd.drivers.cia402 import state_of
 from jtqd.drivers.devices import (
     COMMANDER_NODE,
     JTQD_NODE,
@@ -40,8 +41,8 @@ from jtqd.drivers.frame import FRAME, FRAME_SIZE
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
 from jtqd.drivers.layout import EVERY_SYNC, LayoutError, chosen, pdo_of_words
 from jtqd.drivers.pdo import CAN_ID, INVALID, PdoError, PdoMap, split_word
-from jtqd.drivers.sdo import Key
-from jtqd.drivers.sdo_client import RESPONSE_ID, FrameChannel, NodeObjects, SdoAccess, SdoClient
+from jtqd.drivers.sdo import RESPONSE_ID, Key
+from jtqd.drivers.sdo_client import FrameChannel, NodeObjects, SdoAccess, SdoClient
 from jtqd.sysid.motion.cia402 import (
     CST,
     CSV,
@@ -51,7 +52,6 @@ from jtqd.sysid.motion.cia402 import (
     POWERED,
     QUICK_STOP_WORD,
     describe,
-    state_of,
 )
 from jtqd.sysid.motion.setpoints import Limits, MotionError, Setpoints, Timing
 from jtqd.sysid.motion.turns import turns

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jtqd.daemon.logs import LogError, LogFile, Records, iter_topics, log_parts, topics_of
+from jtqd.drivers.cia402 import STATES, TOLD, State
 from jtqd.drivers.devices import NOT_MEASURED, TEMPERATURE_C_PER_UNIT, drive_tpdo3
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError, counted
@@ -25,9 +26,10 @@ from jtqd.models.files import parse_yaml
 
 DRIVE_INPUTS: Final = 3
 """input_flags of the log: both PDOs of the drive are of this cycle."""
-_ENABLED_MASK, _ENABLED = 0x6F, 0x27  # 6041h: "operation enabled" of CiA 402
-_NO_POWER: Final = ((0x4F, 0x40), (0x6F, 0x21), (0x6F, 0x23))
-"""Mask and value of 6041h: switch on disabled, ready to switch on, switched on."""
+_ENABLED: Final = np.array([state is State.OPERATION_ENABLED for state in STATES])
+_NO_POWER: Final = np.array(
+    [state in (State.SWITCH_ON_DISABLED, State.READY, State.SWITCHED_ON) for state in STATES]
+)
 _LINK: Final = "link_position_rad"
 """Not there in the log of a joint with one encoder."""
 _INPUTS: Final = ("current_a", "motor_position_rad", "motor_velocity_rad_s", _LINK)
@@ -109,59 +111,80 @@ def log_to_run(
         OSError: the file cannot be read.
     """
     name = log if isinstance(log, Path) else log[0]  # names the run where something is wrong
-    there = sorted(int(found[1]) for found in map(_TOPIC.fullmatch, topics_of(log)) if found)
-    if not there:
-        raise LogError(f"{name}: found no message on /joint/1/state, expected one per cycle")
-    wanted = list(dict.fromkeys(there if joints is None else joints))
+    there = _joints_of(log, name)
+    wanted = _Wanted(name, list(dict.fromkeys(there if joints is None else joints)), all_needed)
     have = ", ".join(map(str, there))
-    left_out = {
-        number: f"found no joint {number}, the log has {have}" for number in wanted if number not in there
-    }
-    if left_out and (all_needed or len(left_out) == len(wanted)):
-        raise LogError(f"{name}: {'; '.join(left_out.values())}")
-    nodes = nodes or _nodes(log, there)
-    node_of = dict(zip(there, nodes, strict=False))
-    looked_at = [*wanted, *(number for number in enabled if number not in wanted)]
-    states, readings = _read(
-        log, name, {number: node_of.get(number, number) for number in looked_at if number in there}
-    )
-    beside = {number: states.pop(number) for number in list(states) if number not in wanted}
-    left_out |= {number: why for number, state in states.items() if (why := _unusable(number, state))}
-    if left_out and (all_needed or len(left_out) == len(wanted)):
-        raise LogError(f"{name}: {'; '.join(left_out.values())}")
-    states = {number: state for number, state in states.items() if number not in left_out}
+    wanted.leave_out({n: f"found no joint {n}, the log has {have}" for n in wanted.numbers if n not in there})
+    node_of = dict(zip(there, nodes or _nodes(log, there), strict=False))
+    looked_at = dict.fromkeys(number for number in (*wanted.numbers, *enabled) if number in there)
+    states, readings = _read(log, name, {number: node_of.get(number, number) for number in looked_at})
+    beside = {number: states.pop(number) for number in list(states) if number not in wanted.numbers}
+    wanted.leave_out({number: why for number, state in states.items() if (why := _unusable(number, state))})
+    states = {number: state for number, state in states.items() if number not in wanted.left_out}
     span = _span(states | beside, name, last_motion=last_motion)
     temperatures = {number: _temperature(readings[number], span) for number in states}
     states = {number: state[span] for number, state in states.items()}
-    present = {f"joint {number}": _complete(number, state, name) for number, state in states.items()}
+    return _run_of(name, states, temperatures, sensor=sensor, left_out=wanted.left_out)
+
+
+@dataclass
+class _Wanted:
+    """Joints that are wanted of a log, and why some of them are left out."""
+
+    log: Path
+    numbers: Sequence[int]
+    all_needed: bool
+    left_out: dict[int, str] = field(default_factory=dict)
+
+    def leave_out(self, reasons: Mapping[int, str]) -> None:
+        """Leave joints out; LogError where all are needed, or none would be left."""
+        self.left_out |= reasons
+        if self.left_out and (self.all_needed or len(self.left_out) == len(self.numbers)):
+            raise LogError(f"{self.log}: {'; '.join(self.left_out.values())}")
+
+
+def _run_of(
+    log: Path,
+    states: Mapping[int, Records],
+    temperatures: Mapping[int, FloatArray | None],
+    *,
+    sensor: bool,
+    left_out: Mapping[int, str],
+) -> LoggedRun:
+    """Return the complete cycles of a motion as a table, with the account of the others; LogError where there are none."""
+    present = {f"joint {number}": _complete(number, state, log) for number, state in states.items()}
     with_sensor = _with_sensor(states.values()) if sensor else None
     if with_sensor is not None:  # a dead sensor must not take the drives' columns with it
         present["sensor"] = with_sensor
     used: Flags = np.logical_and.reduce(list(present.values()))
-    if np.count_nonzero(used) < 2:
-        raise LogError(
-            f"{name}: found {counted(int(np.count_nonzero(used)), 'complete cycle')}, expected at least 2"
-        )
+    complete = int(np.count_nonzero(used))
+    if complete < 2:
+        raise LogError(f"{log}: found {counted(complete, 'complete cycle')}, expected at least 2")
     one = next(iter(states.values()))
-    stamps = one["sync_monotonic_ns"][used]
-    cycles = one["cycle"].astype(np.int64)
-    columns = {
-        number: _columns(
-            state[used],
-            with_sensor is not None,
-            None if (temperature := temperatures[number]) is None else temperature[used],
+    stamps, cycles = one["sync_monotonic_ns"][used], one["cycle"].astype(np.int64)
+    columns = {}
+    for number, state in states.items():
+        celsius = temperatures[number]
+        columns[number] = _columns(
+            state[used], with_sensor is not None, None if celsius is None else celsius[used]
         )
-        for number, state in states.items()
-    }
     table = RunTable((stamps - stamps[0]) * _NS, columns)
     return LoggedRun(
         table=table,
         missed=int(cycles[-1] - cycles[0]) + 1 - len(cycles),
-        incomplete=int(np.count_nonzero(~used)),
+        incomplete=len(used) - complete,
         incomplete_by={each: int(np.count_nonzero(~flags)) for each, flags in present.items()},
         longest_gap_s=float(np.diff(table.time_s).max()),
         left_out=left_out,
     )
+
+
+def _joints_of(log: Path | Sequence[Path], name: Path) -> list[int]:
+    """Return the numbers of the joints of a log; LogError where there is none."""
+    there = sorted(int(found[1]) for found in map(_TOPIC.fullmatch, topics_of(log)) if found)
+    if not there:
+        raise LogError(f"{name}: found no message on /joint/1/state, expected one per cycle")
+    return there
 
 
 def _nodes(log: Path | Sequence[Path], there: Sequence[int]) -> list[int]:
@@ -240,7 +263,7 @@ def _temperatures(frames: Records, nodes: Mapping[int, int]) -> dict[int, Readin
 
 def _enabled(state: Records) -> Flags:
     """Return cycles [n] in which the drive is in "operation enabled", by a fresh statusword."""
-    found: Flags = (state["statusword"] & _ENABLED_MASK) == _ENABLED
+    found: Flags = _ENABLED[state["statusword"] & TOLD]
     return found & _fresh(state)
 
 
@@ -321,7 +344,7 @@ def _columns(state: Records, sensor: bool, temperature: FloatArray | None) -> Jo
 
 
 def _unpowered(statusword: NDArray[Any]) -> Flags:
-    found: Flags = np.logical_or.reduce([(statusword & mask) == value for mask, value in _NO_POWER])
+    found: Flags = _NO_POWER[statusword & TOLD]
     return found
 
 

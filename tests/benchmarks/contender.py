@@ -51,7 +51,7 @@ _LIBC = ctypes.CDLL(None)
 _PR_SET_PDEATHSIG = 1
 
 
-def _die_with_parent() -> None:
+def die_with_parent() -> None:
     """However the benchmark ends, no process of it goes on: some of them hold a core at a real-time priority."""
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
 
@@ -69,7 +69,7 @@ class Process:
             text=True,
             cwd=ROOT,
             env=environment,
-            preexec_fn=_die_with_parent,  # noqa: PLW1509 - the benchmark has no threads
+            preexec_fn=die_with_parent,  # noqa: PLW1509 - the benchmark has no threads
         )
         self.pid = self._process.pid
         self._line()

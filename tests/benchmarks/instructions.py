@@ -18,11 +18,13 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from jtqd.estimator import load_network, make_estimator, onnx_graph
+from jtqd.estimator.joint import Agreement
 from jtqd.estimator.settings import recommended
 from jtqd.models.files import load_joint, shipped
 
@@ -37,7 +39,10 @@ def work(method: str) -> None:
     fused = method == "fused"
     name = "trained/joint1.fused.onnx" if fused else "trained/joint1.onnx"
     network = load_network(method, str(shipped(name))) if method in ("network", "fused") else None
-    estimator = make_estimator(load_joint(shipped("trained/joint1.yaml")), recommended(method), network)
+    joint = load_joint(shipped("trained/joint1.yaml"))
+    assert joint.fused is not None
+    joint = replace(joint, fused=replace(joint.fused, agreement=Agreement(0.4, 0.5, 0.004, 0.15)))
+    estimator = make_estimator(joint, recommended(method), network)
     time = np.arange(SAMPLES) * 1e-3
     angle = np.sin(3.0 * time)
     run = estimator.run(

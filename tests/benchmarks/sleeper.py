@@ -1,33 +1,51 @@
-"""The bare loop beside jtqd: sleep until the slot, look at the clock, nothing else. Its missed slots are the machine's."""
+"""The bare loops beside jtqd: sleep until the slot, look at the clock. Their missed slots are the machine's.
+
+`python -m tests.benchmarks.sleeper TASK` does nothing else. `... TASK CPU` (which may be empty) also does in each slot
+what the SYNC of jtqd's loop does on a unix bus: it wakes a process on that CPU by one datagram, and takes the five that
+answered the last one.
+"""
 
 from __future__ import annotations
 
 import gc
+import os
+import socket
 import sys
 import time
+from functools import partial
 from typing import Any
 
 from jtqd.daemon.core.schedule import Grid
-from tests.benchmarks.contender import Task, serve
+from tests.benchmarks.contender import Task, die_with_parent, serve
 from tests.benchmarks.measure import CycleMeter, punctual
 
 _PERIOD_NS = 1_000_000
 _OFFSET_NS = 750_000
 """jtqd wakes up at 0 and 500 us of its grid; this one stays out of its way as far as it can."""
+_WAKING_OFFSET_NS = 250_000
+_FRAME = bytes(16)
+_ANSWERS = 5
+_ANSWERING_PRIORITY = 50
+"""As the traffic source that answers jtqd."""
 
 
 class Sleeper:
     """Same grid, same scheduling, same rule for a missed slot as jtqd's loop."""
+
+    offset_ns = _OFFSET_NS
 
     def __init__(self, task: Task) -> None:
         punctual(task.cpu, task.priority)
         gc.freeze()
         gc.disable()
 
+    def in_slot(self) -> None:
+        """Do what belongs to a slot that was begun in time."""
+
     def run(self, cycles: int) -> dict[str, Any]:
         """One round."""
         meter = CycleMeter()
-        grid = Grid(time.monotonic_ns() + 2 * _PERIOD_NS + _OFFSET_NS, _PERIOD_NS)
+        grid = Grid(time.monotonic_ns() + 2 * _PERIOD_NS + self.offset_ns, _PERIOD_NS)
         end_ns = grid.slot_ns + cycles * _PERIOD_NS
         while grid.slot_ns < end_ns:
             pause = grid.slot_ns - time.monotonic_ns()
@@ -38,10 +56,47 @@ class Sleeper:
                 grid.missed += 1
             else:
                 meter.late_ns.append(now - grid.slot_ns)
+                self.in_slot()
             meter.cycle_done()
             grid.advance(now)
         return meter.result(grid.missed)
 
 
+class WakingSleeper(Sleeper):
+    """... and in each slot one datagram to a process on another core, which answers with five."""
+
+    offset_ns = _WAKING_OFFSET_NS
+
+    def __init__(self, task: Task, answering_cpu: int | None) -> None:
+        self._socket, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        if os.fork() == 0:
+            die_with_parent()
+            self._socket.close()
+            _answer(other, answering_cpu)
+        other.close()
+        self._socket.setblocking(False)
+        super().__init__(task)
+
+    def in_slot(self) -> None:
+        """Take what was answered to the datagram of the last slot, and send the next one."""
+        try:
+            for _ in range(_ANSWERS):
+                self._socket.recv(len(_FRAME))
+        except BlockingIOError:
+            pass  # the other core was away as well: the next slot takes them
+        self._socket.send(_FRAME)
+
+
+def _answer(port: socket.socket, cpu: int | None) -> None:
+    """Be the process that answers, until the other end has gone."""
+    punctual(cpu, _ANSWERING_PRIORITY)
+    while port.recv(len(_FRAME)):
+        for _ in range(_ANSWERS):
+            port.send(_FRAME)
+    os._exit(0)
+
+
 if __name__ == "__main__":
-    sys.exit(serve(Sleeper))
+    if len(sys.argv) == 2:
+        sys.exit(serve(Sleeper))
+    sys.exit(serve(partial(WakingSleeper, answering_cpu=int(sys.argv[2]) if sys.argv[2] else None)))

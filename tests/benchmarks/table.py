@@ -28,3 +28,12 @@ def mark(value: float, limit: float, *, at_least: bool = False) -> str:
     good = value >= limit if at_least else value <= limit
     wrong = "under" if at_least else "over"
     return f"{'PASS' if good else wrong} ({'>=' if at_least else '<='} {limit:g})"
+
+
+def mark_beside_error(value: float, error: float, limit: float) -> str:
+    """PASS or over only where the limit is more than two standard errors away, else that the two cannot be told apart."""
+    if isnan(value) or isnan(error):
+        return "not measured"
+    if abs(value - limit) <= 2.0 * error:
+        return f"cannot be told from {limit:g}"
+    return mark(value, limit)

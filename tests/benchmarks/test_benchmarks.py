@@ -16,10 +16,10 @@ from jtqd.daemon.core import estimate_pdo
 from jtqd.daemon.core.clock import PythonClock
 from jtqd.daemon.loop import process as loop
 from jtqd.drivers.frame import FRAME, pack
-from tests.benchmarks import c_program, traffic
+from tests.benchmarks import c_program, long_run, traffic
 from tests.benchmarks.fixture import make_fixture
 from tests.benchmarks.measure import SETTLE_CYCLES, Samples, quantile
-from tests.benchmarks.table import mark
+from tests.benchmarks.table import mark, mark_beside_error
 from tests.paths import ROOT
 
 pytestmark = pytest.mark.native
@@ -138,6 +138,43 @@ def test_samples_take_differences_after_settling():
     assert mark(60.0, 60.0).startswith("PASS")
 
 
+def test_missed_slots_are_compared_round_by_round():
+    """A stall of the machine that takes slots from both loops is in neither figure nor error."""
+    assert long_run.beyond([403, 1, 2], [400, 0, 0], 1000) == {
+        "per_million": pytest.approx(2000.0),
+        "error": pytest.approx(1000.0 / math.sqrt(3.0)),
+    }
+    assert math.isnan(long_run.beyond([3], [1], 1000)["error"])
+
+
+def test_a_figure_that_its_error_does_not_hold_is_not_marked():
+    assert mark_beside_error(20.0, 14.0, 50.0).startswith("PASS")
+    assert mark_beside_error(20.0, 16.0, 50.0) == "cannot be told from 50"
+    assert mark_beside_error(80.0, 16.0, 50.0) == "cannot be told from 50"
+    assert mark_beside_error(80.0, 14.0, 50.0).startswith("over")
+    assert mark_beside_error(50.0, 0.0, 50.0) == "cannot be told from 50"
+    assert mark_beside_error(20.0, math.nan, 50.0) == "not measured"
+
+
+def test_the_text_says_of_each_pair_what_one_misses_more():
+    loop = {"slots": 1000, "late_median_us": 1.0, "late_p99_us": 1.0, "late_p999_us": 1.0, "late_max_us": 1.0}
+    result = {
+        "minutes": 1.0,
+        "rounds": 5,
+        "cpus_busy": 1.0,
+        "loops": {name: loop | {"missed": 1} for name in ("jtqd", "bare sleep", "bare, waking")},
+        "beyond": {
+            "jtqd beyond bare sleep": {"per_million": 60.0, "error": 40.0},
+            "jtqd beyond bare, waking": {"per_million": 6.0, "error": 3.0},
+            "bare, waking beyond bare sleep": {"per_million": 54.0, "error": 30.0},
+        },
+    }
+    first, second, third = long_run.text(result).splitlines()[-3:]
+    assert " ".join(first.split()) == "jtqd beyond bare sleep 60 +- 40 per million cannot be told from 50"
+    assert " ".join(second.split()) == "jtqd beyond bare, waking 6 +- 3 per million"
+    assert third.startswith("bare, waking beyond bare sleep")
+
+
 def benchmark(*arguments):
     result = subprocess.run(
         [sys.executable, "-m", "tests.benchmarks", *arguments],
@@ -166,12 +203,14 @@ def test_quick_prints_the_table_and_the_ratios():
 
 
 @needs_gcc
-def test_results_as_json_hold_every_stage_and_both_loops():
+def test_results_as_json_hold_every_stage_and_all_loops():
     content = json.loads(benchmark("stages", "grid", "--quick", "--minutes", "0.01", "--json"))
     stages = content["stages"]["stages"]
     assert set(stages) >= {"begin", "gather", "observe", "publish", "record"}
     assert all(each["median_us"] > 0.0 for each in stages.values())
-    assert set(content["grid"]["loops"]) == {"jtqd", "bare sleep"}
+    assert set(content["grid"]["loops"]) == {"jtqd", "bare sleep", "bare, waking"}
+    assert {len(each["missed_by_round"]) for each in content["grid"]["loops"].values()} == {5}
+    assert all(math.isfinite(each["error"]) for each in content["grid"]["beyond"].values())
 
 
 def test_an_unknown_name_is_a_usage_error():

@@ -32,6 +32,7 @@ import numpy as np
 from jtqd.estimator.age import aligned
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.estimator import FusedEstimator
+from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.run import RunTable
@@ -40,7 +41,6 @@ from jtqd.estimator.status import DEGRADED, VALID
 from jtqd.models.files import load_joint
 from jtqd.sim_can.emulated_run import JointCommand, emulate
 from jtqd.sim_can.plants import load_any_plant
-from jtqd.sysid.fit.fused import GAUSS
 from jtqd.sysid.runs.files import read_run
 from jtqd.sysid.runs.truth import read_truth
 from tests.worlds.judge import write

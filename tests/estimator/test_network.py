@@ -275,11 +275,97 @@ def test_float32_is_refused() -> None:
     assert "found input 'x' of type tensor(float), expected tensor(double)" in message
 
 
+def with_weight(value: float, name: str = "W1") -> Callable[[onnx.ModelProto], None]:
+    """Put a value into the middle of an initializer."""
+
+    def edit(model: onnx.ModelProto) -> None:
+        tensor = next(each for each in model.graph.initializer if each.name == name)
+        values = onnx.numpy_helper.to_array(tensor).copy()
+        values.flat[values.size // 2] = value
+        tensor.CopyFrom(onnx.numpy_helper.from_array(values, name))
+
+    return edit
+
+
+def with_last(model: onnx.ModelProto, *nodes: onnx.NodeProto) -> None:
+    """Append nodes that make the answer of "before", which is the answer so far."""
+    model.graph.node[-1].output[0] = "before"
+    model.graph.node.extend(nodes)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_weights_that_are_not_finite_are_refused_although_a_layer_hides_them(value: float) -> None:
+    words = "found weights 'W1' with a value that is not finite"
+    assert words in refused(edited(with_weight(value)))
+    kind, answer = onnx.TensorProto, onnx.load_from_string(small_network().data).graph.output[0].name
+
+    def hidden(model: onnx.ModelProto) -> None:
+        with_weight(value)(model)
+        model.graph.initializer.append(onnx.helper.make_tensor("zero", kind.DOUBLE, [], [0.0]))
+        with_last(model, onnx.helper.make_node("Mul", ["before", "zero"], [answer]))
+
+    assert words in refused(edited(hidden))
+
+
+@pytest.mark.parametrize(
+    "kind", [onnx.TensorProto.FLOAT, onnx.TensorProto.FLOAT16, onnx.TensorProto.BFLOAT16]
+)
+@pytest.mark.parametrize("raw", [True, False])
+def test_constants_of_a_node_are_looked_at_too(kind: int, raw: bool) -> None:
+    helper, answer = onnx.helper, onnx.load_from_string(small_network().data).graph.output[0].name
+
+    def constant(value: float) -> Callable[[onnx.ModelProto], None]:
+        tensor = helper.make_tensor("c", kind, [], [value])
+        if raw:
+            tensor = onnx.numpy_helper.from_array(onnx.numpy_helper.to_array(tensor), "c")
+
+        def edit(model: onnx.ModelProto) -> None:
+            with_last(
+                model,
+                helper.make_node("Constant", [], ["small"], value=tensor),
+                helper.make_node("Cast", ["small"], ["wide"], to=onnx.TensorProto.DOUBLE),
+                helper.make_node("Min", ["before", "wide"], [answer]),
+            )
+
+        return edit
+
+    assert "found weights 'c' with a value that is not finite" in refused(edited(constant(math.inf)))
+    assert TorqueNetwork(edited(constant(1000.0))).perceptron is None
+
+
+def test_weights_in_another_file_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The SHA-256 is of the graph alone then: whoever changes the other file changes the network unseen."""
+    monkeypatch.chdir(tmp_path)
+
+    def external(model: onnx.ModelProto) -> None:
+        tensor = model.graph.initializer[0]
+        Path("weights.bin").write_bytes(tensor.raw_data)
+        tensor.ClearField("raw_data")
+        tensor.data_location = onnx.TensorProto.EXTERNAL
+        tensor.external_data.add(key="location", value="weights.bin")
+
+    assert "found weights 'W0' in another file, expected them in this one" in refused(edited(external))
+
+
 def test_a_network_that_gives_nan_is_refused() -> None:
-    small = small_network()
-    w, b = small.layers[-1]
-    nan = SmallNetwork((*small.layers[:-1], (w * np.nan, b)), small.mean, small.std, 0.0, 1.0, small.metadata)
-    assert "found nan at the centre of its envelope" in refused(nan.data)
+    answer = onnx.load_from_string(small_network().data).graph.output[0].name
+
+    def root(model: onnx.ModelProto) -> None:
+        """Of minus the answer's size."""
+        steps = (("Abs", "before", "size"), ("Neg", "size", "less"), ("Sqrt", "less", answer))
+        with_last(model, *(onnx.helper.make_node(name, [x], [y]) for name, x, y in steps))
+
+    assert "found nan at the centre of its envelope" in refused(edited(root))
+
+
+def test_a_graph_that_draws_lots_is_refused() -> None:
+    answer = onnx.load_from_string(small_network().data).graph.output[0].name
+
+    def drawn(model: onnx.ModelProto) -> None:
+        like = onnx.helper.make_node("RandomNormalLike", ["before"], ["lot"], dtype=onnx.TensorProto.DOUBLE)
+        with_last(model, like, onnx.helper.make_node("Add", ["before", "lot"], [answer]))
+
+    assert "found different answers to one input" in refused(edited(drawn))
 
 
 def test_the_writer_refuses_what_does_not_fit() -> None:
@@ -386,7 +472,7 @@ def test_wrong_graphs_of_a_fused_network() -> None:
     small = fused_network()
     w, b = small.layers[-1]
     nan = SmallNetwork((*small.layers[:-1], (w * np.nan, b)), small.mean, small.std, 0.0, 1.0, small.metadata)
-    assert "found nan at the centre of its envelope" in fused_refused(nan.data)
+    assert "with a value that is not finite" in fused_refused(nan.data)
 
 
 def test_the_two_kinds_are_not_mistaken_for_each_other() -> None:

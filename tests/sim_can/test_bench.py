@@ -93,6 +93,21 @@ def test_demo_is_released_without_the_master_and_begins_again_from_rest():
     assert player.bench._profile_s == 0.0
 
 
+def test_demo_s_currents_do_not_depend_on_the_period_of_sync():
+    """At 500 Hz the drives interpolate between the targets: a staircase would show in what SYNC samples of the current."""
+
+    def currents(period_ms):
+        player = mapped_player(PlantSource(PLANT, 1), "demo")
+        found = []
+        for _ in range(5600 // period_ms):
+            player.sync(after_ms=period_ms)
+            found.append([signals.current_a for signals in player.source.drives])
+        return np.array(found)
+
+    every, second = currents(1)[4000::2], currents(2)[2000:]
+    assert np.abs(every - second).mean(axis=0) == pytest.approx([0.0, 0.0], abs=0.03)  # A; a staircase: 0.3
+
+
 def test_powered_drives_go_on_slowly_without_sync():
     player = Player()
     enabled(player)

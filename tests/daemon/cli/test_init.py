@@ -149,7 +149,7 @@ def test_a_drive_that_tells_less_gets_objects_that_say_so(without, wanted, objec
     assert why in text
     (tmp_path / "joint_1.yaml").write_text(joint_text(draft))
     config = tmp_path / "c.yaml"
-    config.write_text(config_text(ConfigDraft("can0", 1_000_000, 1000, [draft], None, None, (), 2000, 9)))
+    config.write_text(config_text(ConfigDraft("can0", 1_000_000, 1000, [draft], None, None, (), 2000)))
     joint = load_config(config).joints[0]
     profile = DriveProfile(NODE, objects=joint.objects, torque_constant_nm_per_a=0.05)
     scaling, _ = drive_scaling(profile, found.numbers)
@@ -184,8 +184,7 @@ def test_one_joint_alone(tmp_path, capsys):
     status, _, err = run(capsys, *arguments, "--out", tmp_path)
     assert (status, err) == (0, "")
     config = load_config(tmp_path / "jtqd.yaml")
-    assert config.joints[0].node_id == 9
-    assert [each.node_id for each in config.joints if each.mandatory] == [9]
+    assert [(each.number, each.node_id) for each in config.joints] == [(1, 9)]
 
 
 def test_a_slower_bus_gets_a_longer_period(tmp_path, capsys):

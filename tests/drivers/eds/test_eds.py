@@ -6,8 +6,9 @@ import re
 import pytest
 from canopen import import_od
 
-from jtqd.drivers.eds.generate import SHEETS, U8, Var, drive, jtqd, render
+from jtqd.drivers.eds.generate import SHEETS, drive, jtqd
 from jtqd.drivers.eds.own_objects import COUNTERS
+from jtqd.drivers.eds.sheet import U8, Var, render
 from tests.drivers.canopen_nodes import EDS
 
 FILES = ("drive.eds", "torque_sensor.eds", "jtqd.eds")

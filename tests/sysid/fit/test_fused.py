@@ -10,7 +10,7 @@ import pytest
 
 from jtqd.estimator import status as st
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.fusion import Fusion
+from jtqd.estimator.fusion import GAUSS, Fusion
 from jtqd.estimator.joint import AdditiveLoss, Friction, FusedSigma, Joint
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.methods import estimate_columns
@@ -21,7 +21,6 @@ from jtqd.sim_can.emulated_run import JointCommand, emulate, emulate_run
 from jtqd.sim_can.plant import joint_friction
 from jtqd.sysid.fit.fused import (
     FOLDS,
-    GAUSS,
     FusedFit,
     PathResiduals,
     conformal_scale,

@@ -2,6 +2,7 @@
 
 import pytest
 
+from jtqd.drivers.cia402 import State, fast_state, state_of
 from jtqd.sim_can import drive_node as cia402
 from jtqd.sysid.motion.cia402 import (
     DISABLE_VOLTAGE,
@@ -9,11 +10,8 @@ from jtqd.sysid.motion.cia402 import (
     FAULTED,
     POWERED,
     QUICK_STOP_WORD,
-    State,
     describe,
     enabling_word,
-    fast_state,
-    state_of,
 )
 
 

@@ -1,0 +1,109 @@
+"""How a view fills a terminal: tables and lines of its width, pages of its height, and the keys that turn them."""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+import termios
+import time
+import tty
+from typing import Any
+
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.padding import Padding
+from rich.segment import Segment, Segments
+from rich.table import Table
+from rich.text import Text
+
+from jtqd.daemon.cli.recent import page
+from jtqd.daemon.supervisor.table import first_that_fits
+
+HEAD = "bold"
+HEADING = 9
+"""Width of the headings of lines."""
+_FOOT_LINES = 2
+
+
+class Columns:
+    """A table whose columns go, in the order of `dispensable`, where the terminal is too narrow for all; nothing is cut."""
+
+    def __init__(self, headings: dict[str, str], dispensable: tuple[str, ...] = ()) -> None:
+        self._headings = headings
+        self._dispensable = dispensable
+        self._rows: list[dict[str, str | Text]] = []
+
+    def add(self, *cells: str | Text) -> None:
+        """Add a row, one cell per heading."""
+        self._rows.append(dict(zip(self._headings, cells, strict=True)))
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Render for the width of the terminal (called by rich)."""
+        tables = [
+            self._table([name for name in self._headings if name not in self._dispensable[:dropped]])
+            for dropped in range(len(self._dispensable) + 1)
+        ]
+        yield first_that_fits(tables, console, options) or tables[-1]
+
+    def _table(self, names: list[str]) -> Table:
+        table = Table(
+            box=None, pad_edge=False, padding=(0, 2, 0, 0), collapse_padding=True, header_style=HEAD
+        )
+        for name in names:
+            right = self._headings[name] == "right"
+            table.add_column(name, justify="right" if right else "left", no_wrap=True)
+        for row in self._rows:
+            table.add_row(*(row[name] for name in names))
+        return table
+
+
+def line(heading: str, text: str | Text) -> RenderableType:
+    """Return a heading of fixed width and text that wraps beside it."""
+    grid = Table.grid(padding=(0, 1))
+    grid.add_column(width=HEADING, no_wrap=True, style=HEAD)
+    grid.add_column(overflow="fold")
+    grid.add_row(heading, text)
+    return grid
+
+
+def clock(pages: str = "") -> RenderableType:
+    """Return the line below a live view."""
+    return Padding(
+        Text(time.strftime(f"%H:%M:%S  {pages}Ctrl-C ends this view; jtqd continues"), style="dim"),
+        (1, 0, 0, 0),
+    )
+
+
+def paged(console: Console, picture: RenderableType, number: int) -> tuple[RenderableType, int]:
+    """Return the page of a picture that fits the terminal, with the line below, and its number: no line is dropped."""
+    lines = console.render_lines(picture, console.options.update(height=None), pad=False)
+    shown, number, count = page(lines, console.height - _FOOT_LINES, number)
+    rows = [Segments([*line, Segment.line()]) for line in shown]
+    return Group(*rows, clock(f"page {number + 1} of {count}, SPACE turns; " if count > 1 else "")), number
+
+
+class Keys:
+    """Keys of the terminal, without their echo, while a view is shown; nothing where standard input is none."""
+
+    def __enter__(self) -> Keys:
+        self._before: list[Any] | None = None
+        if sys.stdin.isatty():
+            self._before = termios.tcgetattr(sys.stdin)
+            tty.setcbreak(sys.stdin.fileno())
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._before is not None:
+            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._before)
+
+    def turned(self, wait_s: float) -> int:
+        """Wait, at most until a key comes; return how many pages to turn: SPACE, n forward, b, p back."""
+        if self._before is None:
+            time.sleep(wait_s)
+            return 0
+        if not select.select([sys.stdin.fileno()], [], [], wait_s)[0]:
+            return 0
+        pressed = os.read(sys.stdin.fileno(), 64)
+        if not pressed:  # the terminal has gone
+            time.sleep(wait_s)
+        return sum(pressed.count(key) for key in b" n") - sum(pressed.count(key) for key in b"bp")
