@@ -7,6 +7,10 @@ access to the same values, without rights. Pure: no bus and no clock.
 
 from __future__ import annotations
 
+import io
+import logging
+import os
+import stat
 import struct
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
@@ -42,6 +46,9 @@ _LETTERS = {
 _FLOAT_LETTERS = {REAL32: "f", REAL64: "d"}
 _SIGNED = frozenset({0x02, 0x03, 0x04, 0x15})
 _FIRST_REAL_INDEX = 0x1000  # below: dummy entries of [DummyUsage], which are types and not objects
+
+_LARGEST_EDS = 16_000_000
+"""Bytes; those of large drives have one million."""
 
 ReadHook = Callable[[], "bytes | float"]
 WriteHook = Callable[[bytes], None]
@@ -225,13 +232,44 @@ def read_eds(eds: Path | str, node_id: int) -> list[Entry]:
     The parser is canopen's. It is loaded here and not with this module: it takes 20 MB, and a process that is
     handed its entries as JSON (`entries_to_json`, `entries_from_json`) does without. Raises EdsError.
     """
-    from canopen.objectdictionary import import_od
+    from canopen.objectdictionary import eds as parser
 
+    name = str(eds) if str(eds).isprintable() else repr(str(eds))
+    text = _eds_text(eds, name)
+    logger = logging.getLogger(parser.__name__)
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)  # what matters of it is told in one line
     try:
-        return [_entry(variable) for variable in _variables(import_od(str(eds), node_id))]
+        return [_entry(variable) for variable in _variables(parser.import_eds(io.StringIO(text), node_id))]
     except Exception as error:  # the parser has no exception class of its own
         reason = " ".join(str(error).split())[:200]
-        raise EdsError(f"{eds}: not a readable EDS: {type(error).__name__}: {reason}") from None
+        raise EdsError(f"{name}: not a readable EDS: {type(error).__name__}: {reason}") from None
+    finally:
+        logger.setLevel(level)
+
+
+def _eds_text(eds: Path | str, name: str) -> str:
+    """Return the text of a regular file that is not too large. Raises EdsError.
+
+    CiA 306 wants ASCII; makers write units and names in the code page of their machines.
+    """
+    try:
+        with open(eds, "rb", opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK)) as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise EdsError(f"{name}: found no regular file, expected an EDS")
+            data = file.read(_LARGEST_EDS + 1)
+    except OSError as error:
+        raise EdsError(f"{name}: cannot be read: {error.strerror or error}") from None
+    except EdsError:
+        raise
+    except ValueError as error:  # a NUL in the name
+        raise EdsError(f"{name}: cannot be read: {error}") from None
+    if len(data) > _LARGEST_EDS:
+        raise EdsError(f"{name}: found more than {_LARGEST_EDS} bytes, expected an EDS")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("cp1252", "replace")
 
 
 _JSON_FIELDS = ("index", "subindex", "name", "data_type", "access", "mappable", "low", "high")

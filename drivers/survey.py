@@ -1,14 +1,15 @@
 """What a device tells of itself, read by SDO or from its EDS: identity, scaling, the objects that jtqd maps.
 
 Reading changes nothing in a device and starts nothing. Objects: CiA 301 (1000h, 1008h to 100Ah, 1018h), CiA 402-2
-(6075h, 6076h, 6077h, 608Fh, 6090h, 6091h, 60E6h, 60EBh and what the TPDOs carry), CiA 404 (6131h, 6132h, 9130h, 6150h).
+(6075h, 6076h, 6077h, 608Fh, 6090h, 6091h, 60E6h, 60EBh, units by 6092h, 60A8h and 60A9h where there are such, and what the
+TPDOs carry), CiA 404 (6131h, 6132h, 9130h, 6150h).
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from jtqd.drivers.devices import (
@@ -23,10 +24,11 @@ from jtqd.drivers.devices import (
 from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import FRAME, FRAME_SIZE, pack
 from jtqd.drivers.frame_socket import FrameSocket, open_frame_socket
-from jtqd.drivers.object_dictionary import VISIBLE_STRING, read_eds
+from jtqd.drivers.object_dictionary import VISIBLE_STRING, Entry, read_eds
 from jtqd.drivers.pdo import CAN_ID, INVALID
 from jtqd.drivers.sdo import REQUEST_ID, RESPONSE_ID, Key, SdoAbort, Transfer, label
 from jtqd.drivers.sdo_client import FrameChannel, SdoAccess, SdoClient, SdoTimeout
+from jtqd.drivers.units import OTHER_SCALING_OBJECTS
 
 DRIVE, SENSOR = 402, 404
 """Device profiles: low 16 bits of 1000h."""
@@ -51,10 +53,37 @@ _READ: Mapping[int, tuple[Key, ...]] = {
         *MAPPED[SENSOR],
     ),
 }
+UNITS: tuple[Key, ...] = tuple(key for key in OTHER_SCALING_OBJECTS if key not in _READ[DRIVE])
+"""Objects that tell in which units a drive counts, where it has such; none of them is missed."""
 _NODES = range(1, 128)
 _LISTEN_S = 0.12
 """A SYNC comes within this, where there is one."""
 _ANSWER_S = 0.5
+
+
+@dataclass(frozen=True)
+class Tpdo:
+    """One TPDO as it is configured.
+
+    Attributes:
+        words: its mapping entries 0xIIIISSLL.
+        timer_ms: its event timer (1800h:5); 0: none.
+        mapping_fixed, type_fixed: its EDS says that they cannot be written; a bus does not tell.
+    """
+
+    number: int
+    cob_id: int
+    on: bool
+    transmission_type: int
+    words: tuple[int, ...]
+    timer_ms: int = 0
+    mapping_fixed: bool = False
+    type_fixed: bool = False
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Its objects as "6064h:0/32" (bits)."""
+        return tuple(f"{label(each >> 16, each >> 8 & 0xFF)}/{each & 0xFF}" for each in self.words)
 
 
 @dataclass(frozen=True)
@@ -69,6 +98,7 @@ class Survey:
         missing: objects of its profile that it does not have.
         unmappable: objects that its EDS says cannot be mapped; empty when read on a bus, which does not tell.
         defaults: the numbers are defaults; the device itself may have others.
+        tpdos: as they are configured, where they were read.
     """
 
     node: int
@@ -79,6 +109,7 @@ class Survey:
     missing: frozenset[Key] = frozenset()
     unmappable: frozenset[Key] = frozenset()
     defaults: bool = False
+    tpdos: tuple[Tpdo, ...] = ()
 
     @property
     def title(self) -> str:
@@ -96,29 +127,24 @@ class Survey:
         return self.number(key) is not None or (self.defaults and key in self.numbers)
 
 
-@dataclass(frozen=True)
-class Tpdo:
-    """One TPDO as it is configured: its objects as "6064h:0/32" (bits)."""
-
-    number: int
-    cob_id: int
-    on: bool
-    transmission_type: int
-    objects: tuple[str, ...]
-
-
-def tpdos(access: SdoAccess) -> list[Tpdo]:
+def tpdos(access: SdoAccess) -> tuple[Tpdo, ...]:
     """Read the four TPDOs of the predefined connection set (CiA 301, 1800h and 1A00h)."""
+    return _tpdos(lambda key: _number(access, key))
+
+
+def _tpdos(number_of: Callable[[Key], int | None]) -> tuple[Tpdo, ...]:
     found = []
     for number in range(1, 5):
-        cob_id, kind = (_number(access, (0x1800 + number - 1, sub)) for sub in (1, 2))
+        communication = 0x1800 + number - 1
+        mapping = communication + 0x200
+        cob_id = number_of((communication, 1))
         if cob_id is None:
             continue
-        count = min(_number(access, (0x1A00 + number - 1, 0)) or 0, 64)
-        entries = [_number(access, (0x1A00 + number - 1, sub)) or 0 for sub in range(1, count + 1)]
-        objects = tuple(f"{label(each >> 16, each >> 8 & 0xFF)}/{each & 0xFF}" for each in entries)
-        found.append(Tpdo(number, cob_id & CAN_ID, not cob_id & INVALID, kind or 0, objects))
-    return found
+        kind, timer_ms = (number_of((communication, sub)) or 0 for sub in (2, 5))
+        count = min(number_of((mapping, 0)) or 0, 64)
+        words = tuple(number_of((mapping, sub)) or 0 for sub in range(1, count + 1))
+        found.append(Tpdo(number, cob_id & CAN_ID, not cob_id & INVALID, kind, words, timer_ms))
+    return tuple(found)
 
 
 def _number(access: SdoAccess, key: Key) -> int | None:
@@ -136,12 +162,13 @@ def survey(access: SdoAccess, node: int) -> Survey:
         raw = _optional(access, key)
         if raw is not None:
             texts[name] = _text(raw)
-    for key in (*IDENTITY.values(), *_READ.get(device_type & 0xFFFF, ())):
+    optional = UNITS if device_type & 0xFFFF == DRIVE else ()
+    for key in (*IDENTITY.values(), *_READ.get(device_type & 0xFFFF, ()), *optional):
         raw = _optional(access, key)
-        if raw is None:
-            missing.add(key)
-        else:
+        if raw is not None:
             numbers[key] = int.from_bytes(raw[:8], "little")
+        elif key not in optional:
+            missing.add(key)
     return Survey(node, "the bus", device_type & 0xFFFF, texts, numbers, frozenset(missing))
 
 
@@ -155,6 +182,7 @@ def survey_of_eds(path: Path, node: int, more: Iterable[Key] = ()) -> Survey:
 
     profile = number((0x1000, 0)) & 0xFFFF if (0x1000, 0) in entries else 0
     wanted = (*IDENTITY.values(), *_READ.get(profile, ()), *more)
+    optional = UNITS if profile == DRIVE else ()
     return Survey(
         node=node,
         source=f"defaults of {path.name}",
@@ -167,12 +195,23 @@ def survey_of_eds(path: Path, node: int, more: Iterable[Key] = ()) -> Survey:
             and entries[key].data_type == VISIBLE_STRING
             and (text := _text(entries[key].default))
         },
-        numbers={key: number(key) for key in wanted if key in entries},
+        numbers={key: number(key) for key in (*wanted, *optional) if key in entries},
         missing=frozenset(key for key in wanted if key not in entries),
         unmappable=frozenset(
             key for key in (*MAPPED.get(profile, ()), *more) if key in entries and not entries[key].mappable
         ),
+        tpdos=tuple(
+            _fixed_by(each, entries) for each in _tpdos(lambda key: number(key) if key in entries else None)
+        ),
     )
+
+
+def _fixed_by(pdo: Tpdo, entries: Mapping[Key, Entry]) -> Tpdo:
+    """Return the TPDO with what its EDS says of its mapping and transmission type: whether they can be written."""
+    communication = 0x1800 + pdo.number - 1
+    mapping = [(communication + 0x200, sub) for sub in range(len(pdo.words) + 1)]
+    fixed = [key in entries and not entries[key].writable for key in (*mapping, (communication, 2))]
+    return replace(pdo, mapping_fixed=any(fixed[:-1]), type_fixed=fixed[-1])
 
 
 class BusSurvey:
@@ -227,7 +266,7 @@ class BusSurvey:
         found = {key: _number(access, key) for key in keys}
         return {key: number for key, number in found.items() if number is not None}
 
-    def tpdos(self, node: int) -> list[Tpdo]:
+    def tpdos(self, node: int) -> tuple[Tpdo, ...]:
         """Read the TPDOs of one node."""
         return tpdos(SdoClient(FrameChannel(self._socket, node), _ANSWER_S))
 

@@ -12,7 +12,7 @@
 
 Unit codes: CiA DR-303-2, tables 4.1, 4.2 and 4.4 (not at hand themselves; github.com/heig-vd-iai/canopen-stack,
 generator/validation/helpers.py, has them): radian 10h, degree 41h, second 03h, minute 47h. The revolution B4h is that of
-60A9h in the manuals of Synapticon and Nanotec (B4h 47h is rpm).
+60A9h in the manuals of Synapticon and Nanotec (B4h 47h is rpm); increments B5h are those of maxon's and Nanotec's.
 
 6092h, 60A8h and 60A9h count at the driving shaft, behind the gear of 6091h (CiA 402-2): the motor's quantities are
 6091h:1 / 6091h:2 times as large, unless the drive counts at the motor's shaft. Pure.
@@ -41,8 +41,11 @@ OTHER_SCALING_OBJECTS: dict[Key, tuple[str, int]] = {
 
 _ANGLES = {0x10: 1.0, 0x41: math.pi / 180.0, 0xB4: TURN}
 """Radian, degree, revolution."""
-_TIMES = {0x03: 1.0, 0x47: 60.0}
+SECOND = 0x03
+_TIMES = {SECOND: 1.0, 0x47: 60.0}
 """Second, minute."""
+INCREMENTS = 0xB5
+"""Increments of the encoder: code of the numerator in 60A8h and 60A9h of maxon and Nanotec drives."""
 _ANGLE_TEXT = "0xXX100000 (rad), 0xXX410000 (degree) or 0xXXB40000 (revolution)"
 _SPEED_TEXT = "0xXX10, 0xXX41 or 0xXXB4 (rad, degree, revolution), then 0300 or 4700 (per second, per minute)"
 
@@ -78,6 +81,11 @@ def unit_of_velocity(word: int) -> float:
     if angle not in _ANGLES or time not in _TIMES or word & 0xFF:
         raise UnitError((0x60A9, 0), _SPEED_TEXT, word)
     return _prefix(word) * _ANGLES[angle] / _TIMES[time]
+
+
+def is_increments(word: int, denominator: int = 0) -> bool:
+    """Return whether a word of 60A8h, or of 60A9h with the code of its time, names increments: scaled by 608Fh."""
+    return word == INCREMENTS << 16 | denominator << 8
 
 
 def _prefix(word: int) -> float:

@@ -17,6 +17,7 @@ import pytest
 from jtqd.sim_can.bench_kernel import build, guest, packages, vcan
 from tests.native_pace import NativePace
 
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # tests that import onnxruntime themselves
 FORWARDED = "JTQD_FORWARDED_TESTS"  # set for the guest's pytest: write reports for the host's pytest
 REPORTS = "reports.jsonl"  # in the guest's job directory, where writes reach the host at once
 

@@ -12,9 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
 
+from jtqd.daemon.cli.as_told import Instead, Layout, layout_told, tpdo_lines, unit_problems, units_told
+from jtqd.daemon.config import ObjectsSection
 from jtqd.daemon.profiles import INIT, Family
-from jtqd.drivers.devices import CIA_402, COMMANDER_NODE, JTQD_NODE, parse_key
+from jtqd.drivers.devices import CIA_402, COMMANDER_NODE, JTQD_NODE, DriveObjects, parse_key
 from jtqd.drivers.sdo import Key, label
 from jtqd.drivers.survey import (
     DRIVE,
@@ -27,6 +31,7 @@ from jtqd.drivers.survey import (
     TORQUE,
     Survey,
 )
+from jtqd.estimator.checked import Section
 
 EFFICIENCY = 0.7
 """Of a harmonic drive near its rated torque (catalogues: 0.6 to 0.8): joint torque of a motor's rated torque."""
@@ -75,14 +80,6 @@ class Value:
 
 
 @dataclass(frozen=True)
-class Instead:
-    """What section `objects` says of a quantity, and why."""
-
-    text: str
-    why: str
-
-
-@dataclass(frozen=True)
 class JointDraft:
     """One joint: `values` by the keys of the joint file, objects of the drive that the configuration gives instead."""
 
@@ -98,18 +95,31 @@ class JointDraft:
     own: Mapping[str, Value] = field(default_factory=dict)
     """What the profile leaves to the drive and the operator: keys of the section, such as "objects.current.factor"."""
     instead: Mapping[str, Instead] = field(default_factory=dict)
-    """Quantities that the drive does not have as CiA 402 or its profile has them."""
+    """Quantities that the drive does not have, or does not scale, as CiA 402 or its profile has them."""
+    layout: Layout = field(default_factory=Layout)
+    """TPDOs that stay as they are."""
 
     @property
     def guesses(self) -> list[str]:
         """One line per guess: what, how much, what to do."""
         named = [(f"joint_{self.number}.yaml: {name}", value) for name, value in self.values.items()]
         named += [(f"joint_{self.number}.given: {label(*key)}", value) for key, value in self.given.items()]
-        return [
+        found = [
             f"{name} = {plain(value.number)} ({value.origin}): {value.better}"
             for name, value in named
             if value.guess
         ]
+        found += [
+            f"joint_{self.number}.objects: {name} = {each.text} ({each.why}): {each.better}"
+            for name, each in self.instead.items()
+            if each.better
+        ]
+        if self.layout.max_age_ms is not None:
+            age = f"joint_{self.number}: max_age_ms = {self.layout.max_age_ms}"
+            found.append(
+                f"{age}: the longest time between two frames of the drive at rest, and a little more"
+            )
+        return found
 
 
 def _guess(number: float, origin: str, better: str) -> Value:
@@ -142,7 +152,7 @@ def _instead(survey: Survey | None, wanted: Wanted, family: Family | None) -> di
     """Return what a drive with fewer objects is told to jtqd as: one encoder, a derived velocity, torque for current."""
     found: dict[str, Instead] = {}
     if wanted.one_encoder:
-        found["link_position"] = Instead("false", "--one-encoder")
+        found["link_position"] = Instead(None, "--one-encoder")
     if survey is None:
         return found
 
@@ -154,9 +164,9 @@ def _instead(survey: Survey | None, wanted: Wanted, family: Family | None) -> di
     keys = quantities_by(family)
     for name in ("link_position", "motor_velocity"):
         if name not in found and (why := lacks(keys[name])):
-            found[name] = Instead("false", why)
+            found[name] = Instead(None, why)
     if family is None and (why := lacks(keys["current"])) and TORQUE in survey.numbers:
-        found["current"] = Instead(f"{{index: 0x{TORQUE[0]:04X}}}", f"{why}: torque by 6076h")
+        found["current"] = Instead({"index": TORQUE[0]}, f"{why}: torque by 6076h")
     return found
 
 
@@ -172,6 +182,13 @@ def draft_joint(
         filled = _filled(number, node, survey, wanted, family, instead)
         survey = _translated(survey, filled)
     gear = _gear(number, node, survey, wanted, given)
+    if family is None:
+        scaled = {"motor_position", "motor_velocity"} if wanted.encoder_counts is not None else set()
+        scaled |= {"link_position"} if wanted.link_encoder_counts is not None else set()
+        there = [name for name in quantities_by(None) if name not in instead]
+        instead |= units_told(survey, gear.number, there, scaled)
+        if wanted.encoder_counts is None:
+            problems += tuple(unit_problems(node, survey))
     current_a = _rated_current(survey, wanted, given)
     motor_mnm = None if survey is None else survey.number(RATED_TORQUE)
     rated = _rated_torque(number, wanted, gear, None if motor_mnm is None else 1e-3 * motor_mnm, survey)
@@ -200,7 +217,20 @@ def draft_joint(
         "viscous_nms_per_rad": _guess(VISCOUS * torque, origin, "jtq fit friction"),
     }
     own = {key: value for key, value in filled.items() if key.startswith("objects.")}
-    return JointDraft(number, node, survey, values, given, problems, family, own, instead)
+    layout = layout_told(node, survey, _objects(family, instead, own))
+    problems += layout.problems
+    return JointDraft(number, node, survey, values, given, problems, family, own, instead, layout)
+
+
+def _objects(family: Family | None, instead: Mapping[str, Instead], own: Mapping[str, Value]) -> DriveObjects:
+    """Return the objects of a drive as its section will say."""
+    section: dict[str, Any] = {} if family is None else dict(family.section().get("objects", {}))
+    for key, value in own.items():
+        _, quantity, name = key.split(".")
+        section[quantity] = {**section.get(quantity, {}), name: value.number}
+    for quantity, each in instead.items():
+        section[quantity] = False if each.keys is None else {**section.get(quantity, {}), **each.keys}
+    return ObjectsSection.from_section(Section(section, "jtq init")).of_drive("joint_N", Path("jtq init"))
 
 
 def _filled(  # noqa: PLR0917
@@ -480,8 +510,9 @@ def drive_lines(joint: JointDraft) -> list[str]:
     if joint.own or joint.instead:
         lines.append(f"  objects:                # of this drive; all else is as in {rest}")
     for name, each in joint.instead.items():
-        lines.append(f"{f'    {name}: {each.text}':<26}# {each.why}")
-    return [*lines, *_own_lines(joint.own)]
+        guess = "GUESS, " if each.better else ""
+        lines.append(f"{f'    {name}: {each.text}':<26}# {guess}{each.why}")
+    return [*lines, *_own_lines(joint.own), *(f"  {line}" for line in tpdo_lines(joint.layout))]
 
 
 def _own_lines(own: Mapping[str, Value]) -> list[str]:

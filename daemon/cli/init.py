@@ -30,11 +30,12 @@ from jtqd.daemon.cli.draft import (
 )
 from jtqd.daemon.config import MAX_NODE_ID, load_config
 from jtqd.daemon.profiles import Family, named, of_vendor
+from jtqd.daemon.profiles import names as profile_names
 from jtqd.drivers.bus_load import LIMIT, BusLoadError
 from jtqd.drivers.frame_socket import BusError
 from jtqd.drivers.object_dictionary import EdsError
 from jtqd.drivers.survey import DRIVE, IDENTITY, SENSOR, BusSurvey, Survey, survey_of_eds
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.checked import ConfigError, counted
 
 MAX_JOINTS = 2
 _PERIODS_US = (1000, 2000, 4000, 5000, 10_000)
@@ -109,7 +110,7 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument(
         "--profile",
-        metavar="NAME|none",
+        choices=[*profile_names(), "none"],
         help="profile of the drives' family (default: by their vendor-ID; docs/profiles.md)",
     )
     made.add_argument("--out", type=Path, required=True, metavar="DIR", help="directory for the files")
@@ -190,6 +191,12 @@ def _run(options: argparse.Namespace) -> int:
         f"joint {joint.number}: objects.{name}: {each.text} ({each.why})"
         for joint in joints
         for name, each in joint.instead.items()
+    ]
+    less += [
+        f"joint {joint.number}: tpdos: {counted(len(joint.layout.tpdos), 'TPDO')} of the drive "
+        f"({joint.layout.why}); without this section jtqd maps its own, where the drive lets it"
+        for joint in joints
+        if joint.layout.tpdos
     ]
     if found.sensor is not None:
         problems += sensor_problems(found.sensor, found.surveys.get(found.sensor))
@@ -286,6 +293,8 @@ def family_of(survey: Survey | None, name: str | None) -> Family | None:
 def surveyed(reader: BusSurvey, node: int, profile: str | None) -> Survey | None:
     """Survey one node, with the objects that its profile needs; None when it does not answer. Raises ConfigError."""
     found = reader.read(node)
+    if found is not None:
+        found = replace(found, tpdos=reader.tpdos(node))
     if found is None or (family := family_of(found, profile)) is None:
         return found
     wanted = {*family.objects, *mapped_by(family)}
@@ -318,8 +327,19 @@ def _survey(bus: str) -> Iterator[BusSurvey]:
 
 
 def merged(eds: Survey, bus: Survey | None) -> Survey:
-    """A device on the bus knows its values; its EDS knows what can be mapped."""
-    return eds if bus is None else replace(bus, unmappable=eds.unmappable)
+    """A device on the bus knows its values; its EDS knows what can be mapped, and what cannot be written."""
+    if bus is None:
+        return eds
+    known = {each.number: each for each in eds.tpdos}
+    tpdos = tuple(
+        replace(
+            each, mapping_fixed=known[each.number].mapping_fixed, type_fixed=known[each.number].type_fixed
+        )
+        if each.number in known
+        else each
+        for each in bus.tpdos
+    )
+    return replace(bus, unmappable=eds.unmappable, tpdos=tpdos)
 
 
 def description(survey: Survey) -> str:
@@ -435,13 +455,17 @@ def _config(options: argparse.Namespace, found: Found, joints: list[JointDraft])
 def _write(directory: Path, name: str, draft: ConfigDraft) -> tuple[list[Path], int]:
     """Write the files with the shortest period whose bus load fits; returns paths and period [us]. Raises ConfigError."""
     directory.mkdir(parents=True, exist_ok=True)
-    files = []
-    for joint in draft.joints:
-        files.append(directory / f"joint_{joint.number}.yaml")
-        files[-1].write_text(joint_text(joint), encoding="utf-8")
+    files = [directory / f"joint_{joint.number}.yaml" for joint in draft.joints]
     files.append(directory / f"{name}.yaml")
-    for period_us in _PERIODS_US:
-        files[-1].write_text(config_text(replace(draft, period_us=period_us)), encoding="utf-8")
-        if bus_load_of(load_config(files[-1])).worst <= LIMIT:
-            return files, period_us
-    raise ConfigError(f"{files[-1]}: at {draft.bitrate} bit/s not even 100 Hz fit the bus")
+    try:
+        for path, joint in zip(files, draft.joints, strict=False):
+            path.write_text(joint_text(joint), encoding="utf-8")
+        for period_us in _PERIODS_US:
+            files[-1].write_text(config_text(replace(draft, period_us=period_us)), encoding="utf-8")
+            if bus_load_of(load_config(files[-1])).worst <= LIMIT:
+                return files, period_us
+        raise ConfigError(f"{files[-1]}: at {draft.bitrate} bit/s not even 100 Hz fit the bus")
+    except (ConfigError, BusLoadError):
+        for path in files:  # what jtqd refuses does not stay
+            path.unlink(missing_ok=True)
+        raise

@@ -12,13 +12,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from jtqd.daemon.cli.as_told import unit_problems
 from jtqd.daemon.cli.draft import DraftError, Wanted, draft_joint, drive_lines, sensor_lines, sensor_problems
 from jtqd.daemon.cli.init import description, eds_survey, family_of, merged, node_id, surveyed
 from jtqd.daemon.profiles import Family
+from jtqd.daemon.profiles import names as profile_names
 from jtqd.drivers.frame_socket import BusError
 from jtqd.drivers.object_dictionary import EdsError
 from jtqd.drivers.sdo import label
-from jtqd.drivers.survey import DRIVE, IDENTITY, SENSOR, BusSurvey, Survey, Tpdo
+from jtqd.drivers.survey import DRIVE, IDENTITY, SENSOR, BusSurvey, Survey
 
 _EXAMPLES = """examples:
   jtq probe --bus can0                      which nodes are there
@@ -41,7 +43,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--eds", type=Path, metavar="FILE", help="its EDS, which tells what can be mapped")
     made.add_argument(
         "--profile",
-        metavar="NAME|none",
+        choices=[*profile_names(), "none"],
         help="profile of its family (default: by its vendor-ID; docs/profiles.md)",
     )
     made.add_argument("--json", action="store_true", help="print as JSON")
@@ -68,7 +70,7 @@ def main(argv: list[str]) -> int:
 def _list(options: argparse.Namespace, bus: BusSurvey) -> int:
     found = [each for node in bus.nodes() if (each := bus.read(node)) is not None]
     if options.json:
-        print(json.dumps([content(each, [], [])["device"] for each in found]))
+        print(json.dumps([content(each, [])["device"] for each in found]))
     else:
         print("\n".join(f"node {each.node}: {description(each)}" for each in found) or "no node answers")
     return 0 if found else 1
@@ -78,15 +80,14 @@ def _one(options: argparse.Namespace, bus: BusSurvey) -> int:
     found = surveyed(bus, options.node, options.profile)
     if found is None:
         raise ValueError(f"node {options.node} does not answer on {options.bus}")
-    tpdos = bus.tpdos(options.node)
     if options.eds is not None:
         found = merged(eds_survey(options.eds, options.node, options.profile), found)
     family = family_of(found, options.profile)
     problems = problems_of(found, family)
     if options.json:
-        print(json.dumps(content(found, tpdos, problems, family)))
+        print(json.dumps(content(found, problems, family)))
     else:
-        print(text(found, tpdos, problems, family))
+        print(text(found, problems, family))
     return 3 if problems else 0
 
 
@@ -94,7 +95,9 @@ def problems_of(survey: Survey, family: Family | None = None) -> list[str]:
     """Why this version of jtqd does not work with a device."""
     if survey.profile == DRIVE:
         try:
-            return list(draft_joint(1, survey.node, survey, _ANY, family).problems)
+            found = draft_joint(1, survey.node, survey, _ANY, family).problems
+            units = unit_problems(survey.node, survey) if family is None else []
+            return list(dict.fromkeys((*found, *units)))
         except DraftError as error:
             return [str(error)]
     if survey.profile == SENSOR:
@@ -118,9 +121,7 @@ def section(survey: Survey, family: Family | None = None) -> list[str]:
     return drive_lines(draft)
 
 
-def content(
-    survey: Survey, tpdos: list[Tpdo], problems: list[str], family: Family | None = None
-) -> dict[str, Any]:
+def content(survey: Survey, problems: list[str], family: Family | None = None) -> dict[str, Any]:
     """Return everything for a program."""
     return {
         "schema": "jtq.probe/1",
@@ -141,14 +142,14 @@ def content(
                 "type": each.transmission_type,
                 "objects": list(each.objects),
             }
-            for each in tpdos
+            for each in survey.tpdos
         ],
         "problems": problems,
         "family": None if family is None else family.name,
     }
 
 
-def text(survey: Survey, tpdos: list[Tpdo], problems: list[str], family: Family | None = None) -> str:
+def text(survey: Survey, problems: list[str], family: Family | None = None) -> str:
     """Return everything for people."""
     lines = [f"node {survey.node}: {description(survey)}"]
     if family is not None:
@@ -156,7 +157,7 @@ def text(survey: Survey, tpdos: list[Tpdo], problems: list[str], family: Family 
     lines += [f"  {label(*key):<8} {value}" for key, value in sorted(survey.numbers.items())]
     lines += [f"  {label(*key):<8} not there" for key in sorted(survey.missing)]
     lines.append("TPDOs as they are now (jtqd writes its own mapping at its start, where the drive lets it)")
-    for each in tpdos:
+    for each in survey.tpdos:
         kind = f"type {each.transmission_type}" if each.on else "off"
         lines.append(f"  {each.number}  {each.cob_id:X}h  {kind:<8}  {', '.join(each.objects) or 'nothing'}")
     if survey.profile in (DRIVE, SENSOR):

@@ -6,6 +6,7 @@ sections    the whole file as it is written
 load        with joint files, networks and profiles: `Config`
 """
 
+from jtqd.daemon.config.drive import ObjectsSection
 from jtqd.daemon.config.load import Config, JointConfig, NetworkFile, SensorConfig, as_booted, load_config
 from jtqd.daemon.config.sections import MAX_NODE_ID, Identity
 from jtqd.daemon.config.settings import (
@@ -29,6 +30,7 @@ __all__ = [
     "Identity",
     "JointConfig",
     "NetworkFile",
+    "ObjectsSection",
     "Realtime",
     "RecordingSettings",
     "Ros2Settings",

@@ -333,6 +333,18 @@ class Line(NamedTuple):
     severity: int
     text: str
 
+    @property
+    def rate_class(self) -> str:
+        """Lines of one class share a rate limit; "": none.
+
+        What concerns a joint may come and go with its cable: few lines of each joint reach the operator. What waits for the
+        operator is not held back by them.
+        """
+        if self.definition.about not in (JOINT, PDO):
+            return ""
+        waits = self.definition.repeat_s < inf
+        return f"{self.subject.name} {self.definition.name}" if waits else self.subject.name
+
 
 class Occurrences(NamedTuple):
     """Count, total duration and first occurrence (CLOCK_MONOTONIC) of a condition."""

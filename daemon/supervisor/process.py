@@ -7,7 +7,6 @@ cycle is late for it.
 from __future__ import annotations
 
 import json
-import math
 import os
 import select
 import signal
@@ -30,7 +29,7 @@ from jtqd.daemon.recording.keeper import Keeper, recording_request
 from jtqd.daemon.reload.files import Reload, ReloadError
 from jtqd.daemon.ros2.keeper import Ros2Keeper
 from jtqd.daemon.shared.child_process import Child, ChildError, ChildSilence
-from jtqd.daemon.shared.conditions import JOINT, PDO, THE_MACHINE, Conditions, ConditionsFile
+from jtqd.daemon.shared.conditions import THE_MACHINE, Conditions, ConditionsFile
 from jtqd.daemon.shared.log_lines import ERROR, INFO, WARNING, EventLog, OperatorLog
 from jtqd.daemon.shared.notices import FILE as NOTICES
 from jtqd.daemon.shared.notices import Notices
@@ -48,6 +47,8 @@ from jtqd.drivers.long_frames import LongFrames
 from jtqd.drivers.object_dictionary import ObjectStore, entries_from_json
 
 _WARM_UP_TIMEOUT_S = 60.0
+_BOOT_REQUESTS = 100
+"""SDO requests of a node's boot, at most; each may take the time that the configuration allows it."""
 """Generous: a controller that loads its libraries from a slow card may take its time; nothing is published meanwhile."""
 _BENCH_PRIORITY = 40
 
@@ -132,7 +133,11 @@ def boot_nodes(config: Config, bus: str, child: Child, stopped: Stopped) -> dict
     The child sends jtqd's heartbeat until its input ends.
     """
     child.tell(boot_request(config, bus))
-    report = wait_for(child, stopped)
+    waits_ms = [joint.sdo_timeout_ms for joint in config.joints]
+    if config.sensor is not None:
+        waits_ms.append(config.sensor.sdo_timeout_ms)
+    slowest_s = _BOOT_REQUESTS * 1e-3 * sum(waits_ms)
+    report = wait_for(child, stopped, _WARM_UP_TIMEOUT_S + slowest_s)
     if report is None:
         return None
     if not report["ok"]:
@@ -149,20 +154,20 @@ def check_gears(config: Config, report: dict[str, Any]) -> str | None:
     return None
 
 
-def wait_for(child: Child, stopped: Stopped) -> dict[str, Any] | None:
+def wait_for(child: Child, stopped: Stopped, longest_s: float = _WARM_UP_TIMEOUT_S) -> dict[str, Any] | None:
     """Return the child's next answer; None after a stop order.
 
     Raises:
         ChildError: it ended, or kept silent for too long.
         SupervisorError: it reports that it has failed; ConfigurationRefused where a file is the reason.
     """
-    deadline = time.monotonic() + _WARM_UP_TIMEOUT_S
+    deadline = time.monotonic() + longest_s
     while not stopped():
         try:
             answer = child.answer(0.25)
         except ChildSilence:
             if time.monotonic() > deadline:
-                raise
+                raise ChildSilence(f"{child.name} did not answer within {longest_s:g} s") from None
             continue
         if "failed" in answer:
             failure = ConfigurationRefused if answer.get("configuration") else SupervisorError
@@ -482,11 +487,8 @@ class Supervisor:
     def _report_conditions(self, now: float) -> None:
         """Log the lines that are due and keep `conditions.json` up to date."""
         for line in self._conditions.lines(now):
-            # What concerns a joint may come and go with its cable: few lines of each joint reach the operator.
-            kind = line.subject.name if line.definition.about in (JOINT, PDO) else ""
-            if kind and line.definition.repeat_s < math.inf:
-                kind += f" {line.definition.name}"  # what waits for the operator is not held back by the inputs' lines
-            self._log_event(line.definition.topic, line.subject.node, line.text, kind, line.severity)
+            topic, node = line.definition.topic, line.subject.node
+            self._log_event(topic, node, line.text, line.rate_class, line.severity)
         self._conditions_file.write(self._conditions.present())
 
     def _serve(self, view: View, now: float) -> None:

@@ -36,6 +36,7 @@ from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable, RunTableErr
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.column_map import JOINTS, TIME, Column, ColumnMap, targets
 from jtqd.sysid.runs.expressions import Expression, ExpressionError
+from jtqd.sysid.runs.same_run import Stretches, same_run, stretches
 
 TABLES: Final = (".csv", ".csv.gz", ".parquet")
 LOGS: Final = (".mcap",)
@@ -121,11 +122,13 @@ def read_runs(
     table gives the joints that it has.
 
     Raises:
-        RunError: as `read_run` and `run_paths`, or the same data given twice, which would count it twice.
+        RunError: as `read_run` and `run_paths`, or one run given twice, which would count it twice: the same data, or a
+            log and the table of it (`same_run`).
         ConfigError: the column map cannot be used.
     """
     mapping = ColumnMap.load(columns) if isinstance(columns, Path) else columns
     runs: list[RunFile] = []
+    known: list[tuple[str, Stretches]] = []
     paths = run_paths(arguments)
     groups = _recordings(paths) if in_pieces else [(path,) for path in paths]
     for path, *parts in progress(groups, "reading runs"):
@@ -136,6 +139,12 @@ def read_runs(
         same = next((other.name for other in runs if other.sha256 == read[0].sha256), None)
         if same is not None:
             raise RunError(f"{path}: found the same data as in {same}, expected every run once")
+        found = [stretches(run.table) for run in read]
+        same = next((name for name, each in known for one in found if same_run(each, one)), None)
+        if same is not None:
+            raise RunError(
+                f"{path}: found the same run as in {same} (position and current agree), expected every run once"
+            )
         if runs and mapping is not None:  # what holds for every file is said once
             said = set(mapping.remarks())
             read[0] = replace(read[0], notes=tuple(note for note in read[0].notes if note not in said))
@@ -144,6 +153,7 @@ def read_runs(
             replace(run, name=run.name.replace(path.name, str(path), 1)) if run.name in taken else run
             for run in read
         ]
+        known += [(run.name, each) for run, each in zip(runs[-len(read) :], found, strict=True)]
     return runs
 
 

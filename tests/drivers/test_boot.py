@@ -87,6 +87,41 @@ def test_three_nodes_end_operational_and_mapped(bench):
     assert report.nodes[3].scaling.nm_per_unit == {1: pytest.approx(1e-3)}
 
 
+class Ear:
+    """Hears what the boot sends, and says nothing."""
+
+    def __init__(self):
+        self.heard = []
+
+    def frames(self, can_id, data):
+        self.heard.append((can_id, data))
+        return []
+
+    def beat(self, _now):
+        return []
+
+
+def test_the_master_s_heartbeat_runs_and_all_are_reset_before_anything_is_asked(bench):
+    """A drive that watches its master would miss it, and one whose master has ended refuses to be started."""
+    ear = Ear()
+    bench.nodes.append(ear)
+    bench.boot(reset=True)
+    boot_up, asked = (
+        ear.heard.index((0x720, b"\0")),
+        [n for n, each in enumerate(ear.heard) if each[0] > 0x600],
+    )
+    resets = [ear.heard.index((0x000, bytes([130, node]))) for node in (1, 2, 3)]
+    start = ear.heard.index((0x000, bytes([1, 1])))
+    beats = [n for n, each in enumerate(ear.heard) if each == (0x720, b"\x7f")]
+    requests = [n for n in asked if ear.heard[n][0] < 0x680]
+    assert boot_up < beats[0] < requests[0] < start
+    assert boot_up < min(resets) <= max(resets) < requests[0]
+    assert len([n for n in beats if n < start]) >= 3
+    ear.heard.clear()
+    bench.boot(reset=False)
+    assert not [data for can_id, data in ear.heard if can_id == 0 and data[0] in (129, 130)]
+
+
 def test_second_channel_is_mapped_when_used(bench):
     bench.boot(nodes=[{"node": 3, "kind": "sensor", "channels": [1, 2]}])
     assert bench.sensor.parameters.tpdos() == [sensor_tpdo1(3), sensor_tpdo2(3)]

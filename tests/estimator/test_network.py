@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import threading
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from tests.estimator.estimator_helpers import HIGH, LOW, SmallNetwork, small_net
 from tests.estimator.fused_helpers import HIGH as FUSED_HIGH
 from tests.estimator.fused_helpers import LOW as FUSED_LOW
 from tests.estimator.fused_helpers import everywhere, fused_network
+from tests.paths import ROOT
 
 
 def inputs(count: int, seed: int = 2) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -92,8 +94,8 @@ def test_without_aliasing_it_falls_back_to_plain_run(monkeypatch: pytest.MonkeyP
     )
 
 
-def test_the_runtime_has_no_thread_of_its_own() -> None:
-    """Its telemetry would start one; ORT_DISABLE_TELEMETRY is read when the library is loaded."""
+def test_the_runtime_has_no_thread_of_its_own_and_writes_nothing(tmp_path: Path) -> None:
+    """Its telemetry would start one, and write a device-ID; ORT_DISABLE_TELEMETRY is read when the library is loaded."""
     code = (
         "import os, time; from jtqd.estimator.network import TorqueNetwork as N; "
         "from tests.estimator.estimator_helpers import small_network as s; "
@@ -101,7 +103,16 @@ def test_the_runtime_has_no_thread_of_its_own() -> None:
     )  # the threads that load it have ended, and need a moment to go
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     environment.pop("ORT_DISABLE_TELEMETRY", None)
+    environment |= {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
     assert subprocess.check_output([sys.executable, "-c", code], text=True, env=environment) == "1\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_runtime_is_of_a_version_in_which_that_was_tried() -> None:
+    requirements = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    (needed,) = (each for each in requirements if each.startswith("onnxruntime"))
+    assert needed == "onnxruntime>=1.20,<1.33"
+    assert (1, 20) <= tuple(map(int, onnxruntime.__version__.split(".")[:2])) < (1, 33)
 
 
 def test_metadata_and_hash(tmp_path: Path) -> None:

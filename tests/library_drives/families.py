@@ -1,7 +1,7 @@
 """Nodes with the object layouts of drive families, as their makers' data sheets and manuals have them (docs/profiles.md).
 
 They show that a profile configures such a layout, and scales it right. They are no drives: what a data sheet does not say is
-as in `StrictDrive`.
+as in `StrictDrive`. `Millidegrees` and `Feed` are of no maker: drives of CiA 402 in other units.
 """
 
 from __future__ import annotations
@@ -142,11 +142,46 @@ class Nanotec(StrictDrive):
         }[index, subindex]
 
 
+class Millidegrees(StrictDrive):
+    """Thousandths of a degree of the joint, and these per second: 60A8h and 60A9h, beside the encoders' resolutions."""
+
+    process: ClassVar[Numbers] = {
+        **StrictDrive.process,
+        (0x60A8, 0): (_U32, 0xFD410000, "rw"),
+        (0x60A9, 0): (_U32, 0xFD410300, "rw"),
+    }
+
+    def value(self, index: int, subindex: int, now: float) -> int:
+        turns, per_s, _ = _motion(now)
+        told = {0x6064: 360_000 * turns, 0x606C: 360_000 * per_s, 0x60E4: 360_000 * turns}
+        return round(told[index] / GEAR) if index in told else super().value(index, subindex, now)
+
+
+class Feed(StrictDrive):
+    """36 000 units per turn of the shaft that the drive knows: the motor's, as its 6091h is 1:1; no 6090h, no 60A9h."""
+
+    lacks = (0x6090,)
+    process: ClassVar[Numbers] = {
+        **StrictDrive.process,
+        (0x6091, 1): (_U32, 1, "rw"),
+        (0x6092, 0): (_U8, 2, "const"),
+        (0x6092, 1): (_U32, 36_000, "rw"),
+        (0x6092, 2): (_U32, 1, "rw"),
+    }
+
+    def value(self, index: int, subindex: int, now: float) -> int:
+        turns, per_s, _ = _motion(now)
+        told = {0x6064: 36_000 * turns, 0x606C: 36_000 * per_s, 0x60E4: 36_000 * turns / GEAR}
+        return round(told[index]) if index in told else super().value(index, subindex, now)
+
+
 FAMILIES: dict[str, type[StrictDrive]] = {
     "standard": StrictDrive,
     "epos4": Epos4,
     "elmo_gold": ElmoGold,
     "nanotec": Nanotec,
+    "millidegrees": Millidegrees,
+    "feed": Feed,
 }
 
 

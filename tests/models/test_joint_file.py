@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -247,6 +248,12 @@ def test_a_file_too_large_for_anything_written_by_hand_is_refused_without_readin
             with pytest.raises(ConfigError) as caught:
                 load(large)
             assert str(caught.value) == f"{large}: found {found}, expected a YAML file written by hand"
+
+
+@pytest.mark.parametrize("load", [load_yaml, load_joint, load_config, load_plant])
+def test_a_nul_in_a_name_is_one_line(load: Callable[[str], object]) -> None:
+    with pytest.raises(ConfigError, match=r"^'a\\x00b\.yaml': cannot be read: embedded null byte$"):
+        load("a\0b.yaml")
 
 
 def test_whole_limits_are_told_as_whole_numbers() -> None:

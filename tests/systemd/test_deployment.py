@@ -44,6 +44,7 @@ def test_the_page_names_the_directories_of_the_unit() -> None:
 def test_the_unit_grants_what_the_loop_asks_for_and_no_more() -> None:
     service = unit("jtqd@.service")["Service"]
     assert service["Type"] == "notify"
+    assert service["RestartPreventExitStatus"] == "2", "a wrong configuration stays wrong"
     assert service["NotifyAccess"] == "all", "the loop, which feeds the watchdog, is not the main process"
     assert int(service["LimitRTPRIO"]) >= 80
     assert service["LimitMEMLOCK"] == "infinity"

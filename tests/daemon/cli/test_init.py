@@ -245,6 +245,9 @@ def test_what_is_there_is_not_overwritten(tmp_path, capsys):
         (["--bus", "unix:/none/bus"], 1, "/none"),
         (["--node", "5", "--from-eds", str(EDS.parent / "torque_sensor.eds")], 2, "no CiA 402 drive"),
         (["--node", "5", "--sensor-joint", "1"], 2, "--gear-ratio"),
+        (["--node", "5", "--from-eds", "/dev/zero"], 1, "/dev/zero: found no regular file, expected an EDS"),
+        (["--node", "5", "--from-eds", "a\x1b[31m.eds"], 1, "'a\\x1b[31m.eds': cannot be read"),
+        (["--node", "5", "--from-eds", "a\0.eds"], 1, "cannot be read: "),
     ],
 )
 def test_wrong_input_is_one_line(arguments, status, told, tmp_path, capsys):
@@ -252,6 +255,60 @@ def test_wrong_input_is_one_line(arguments, status, told, tmp_path, capsys):
     assert (found, out) == (status, "")
     assert told in err
     assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"garbage\x00\xff", b"[DeviceInfo]\nVendorNumber=zz\n", b"\0" * 16_000_001]
+)
+def test_a_broken_eds_is_one_line(data, tmp_path):
+    """Of a process of its own, as the library's parser writes to stderr by itself."""
+    (tmp_path / "bad.eds").write_bytes(data)
+    command = [
+        sys.executable,
+        "-m",
+        "jtqd.daemon.jtq",
+        "init",
+        "--from-eds",
+        "bad.eds",
+        "--node",
+        "5",
+        "--out",
+        "d",
+    ]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == (1 if data else 2)
+    assert (done.stdout, done.stderr.count("\n")) == ("", 1)
+    assert "bad.eds" in done.stderr
+
+
+def test_a_pipe_is_not_waited_for(tmp_path, capsys):
+    os.mkfifo(tmp_path / "pipe.eds")
+    status, _, err = run(capsys, "--from-eds", tmp_path / "pipe.eds", "--node", 5, "--out", tmp_path)
+    assert (status, err.endswith("found no regular file, expected an EDS\n")) == (1, True)
+
+
+def test_an_eds_in_the_maker_s_code_page_is_read(tmp_path, capsys):
+    (tmp_path / "maker.eds").write_bytes(b"; 0.1 \xb0\n" + EDS.read_bytes())
+    arguments = ["--from-eds", tmp_path / "maker.eds", "--node", 5, "--gear-ratio", 101, "--out", tmp_path]
+    assert run(capsys, *arguments)[0] == 0
+
+
+def test_files_that_jtqd_refuses_do_not_stay(tmp_path, capsys):
+    arguments = [
+        "--node",
+        5,
+        "--gear-ratio",
+        101,
+        "--rated-torque",
+        30,
+        "--torque-constant",
+        0.1,
+        "--out",
+        tmp_path,
+    ]
+    status, _, err = run(capsys, *arguments, "--bitrate", 1)
+    assert (status, err.count("\n")) == (1, 1)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.fixture
@@ -322,10 +379,10 @@ def test_probe_names_what_a_drive_lacks():
     found = drive(without=[(0x6041, 0)])
     (problem,) = probe.problems_of(found)
     assert "6041h:0" in problem
-    assert "6041h:0  not there" in probe.text(found, [], [problem])
+    assert "6041h:0  not there" in probe.text(found, [problem])
     less = drive(without=[(0x60E4, 1)])
     assert probe.problems_of(less) == []
-    assert "link_position: false" in probe.text(less, [], [])
+    assert "link_position: false" in probe.text(less, [])
 
 
 def test_on_a_terminal_what_is_missing_is_asked_for(tmp_path):

@@ -92,6 +92,21 @@ def test_what_waits_for_the_operator_is_said_again_while_it_lasts():
     assert len([text for _, text in lines if "inputs lost" in text]) == 1
 
 
+def test_a_latched_fault_has_a_rate_limit_of_its_own():
+    """Else the lines of a cable that comes and goes would use it up, and the latched fault would stay untold."""
+    conditions = Conditions()
+    classes = {}
+    for second in range(3):
+        conditions.update("fault_latched", JOINT, True, float(second), "position jump")
+        conditions.update("stale_input", JOINT, True, float(second), "gone")
+        conditions.update("joint_fault", JOINT, True, float(second), "position jump")
+        conditions.update("bus_passive", Subject("bus"), True, float(second), "error active")
+        classes |= {line.definition.name: line.rate_class for line in conditions.lines(float(second))}
+    assert classes["stale_input"] == JOINT.name
+    assert classes["fault_latched"] not in {each for name, each in classes.items() if name != "fault_latched"}
+    assert classes["bus_passive"] == ""
+
+
 def test_the_catalogue_is_complete_and_consistent():
     for definition in CATALOGUE.values():
         if definition.emcy is not None:

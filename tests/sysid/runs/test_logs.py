@@ -372,7 +372,7 @@ def test_the_parts_of_a_run_are_one_recording(tmp_path: Path) -> None:
     parts = [tmp_path / f"b-20260101T000000Z-000{k}.mcap" for k in (1, 2)]
     write_log(parts[0], cycles[:2000])
     write_log(parts[1], cycles[2060:])
-    write_log(tmp_path / "b-20260102T000000Z-0001.mcap", regular(1500, joints, start=9))
+    write_log(tmp_path / "b-20260102T000000Z-0001.mcap", regular(1500, lambda n: joints(n + 9000), start=9))
     runs = read_runs([tmp_path], in_pieces=True)
     assert [run.name for run in runs] == [
         f"{parts[0].name} (1 of 2)",
