@@ -5,17 +5,13 @@ Effects of the joint file are applied here, whatever the method: the estimators 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from itertools import pairwise
-
 import numpy as np
 
-from jtqd.estimator.arrays import BoolArray, FloatArray
+from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.corrections import acting_effects, plain_joint
 from jtqd.estimator.estimator import ExtendedEstimator, FusedEstimator, JointEstimator
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.learned import learner_of
 from jtqd.estimator.network import FusedNetwork, TorqueNetwork
 from jtqd.estimator.onnx_graph import Verdict
 from jtqd.estimator.run import EstimateRun, JointColumns
@@ -61,37 +57,10 @@ def estimate_columns(
 
     Raises ConfigError as `make_estimator` does, ValueError for a missing column.
     """
-    return estimate_steps(joint, settings, network, np.diff(time_s, prepend=time_s[0]), columns)
-
-
-def estimate_steps(  # noqa: PLR0917 - as `estimate_columns`, and which samples have a network
-    joint: Joint,
-    settings: EstimatorSettings,
-    network: AnyNetwork | None,
-    dt_s: FloatArray,
-    columns: JointColumns,
-    network_wanted: BoolArray | None = None,
-    pasts: Mapping[int, bytes] | None = None,
-) -> EstimateRun:
-    """Return the estimates as `estimate_columns`, by time steps: dt_s[k] is the time since sample k-1, 0 starts again.
-
-    network_wanted [n]: False where there was no time for the network. pasts: before these samples the estimator takes a
-    state of before (`FusedEstimator.past`), where it has one.
-    """
     current, motor, velocity, link = _inputs(joint, columns)
-    temperature = columns.temperature_c
-    estimator = make_estimator(joint, settings, network)
-    learner = learner_of(estimator)
-    given = (dt_s, current, motor, velocity, link, temperature, network_wanted)
-    if not pasts or learner is None:
-        return estimator.run(*given)
-    made = []
-    for first, end in pairwise(sorted({0, *pasts, len(dt_s)})):
-        if first in pasts:
-            learner.past = pasts[first]
-        made.append(estimator.run(*(None if each is None else each[first:end] for each in given)))  # type: ignore[arg-type]
-    return EstimateRun(
-        *(np.concatenate([getattr(run, name) for run in made]) for name in EstimateRun.__slots__)
+    dt_s = np.diff(time_s, prepend=time_s[0])
+    return make_estimator(joint, settings, network).run(
+        dt_s, current, motor, velocity, link, columns.temperature_c
     )
 
 

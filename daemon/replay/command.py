@@ -21,7 +21,7 @@ from jtqd.daemon.recording.schemas import SCHEMAS
 from jtqd.daemon.replay.compare import Comparison, Difference, Identity, Unknown
 from jtqd.daemon.replay.contacts import Contacts
 from jtqd.daemon.replay.origin import SAMPLE
-from jtqd.daemon.replay.session import SHORT_CYCLES, ReplayOptions, Result, replay_each
+from jtqd.daemon.replay.session import ReplayOptions, Result, replay_each
 from jtqd.estimator.arrays import RecordArray
 from jtqd.estimator.checked import ConfigError, check_output
 from jtqd.estimator.onnx_graph import NetworkError
@@ -47,11 +47,10 @@ def text(result: Result, *, compared: bool) -> str:
 
 def _head(result: Result) -> list[str]:
     logs = ", ".join(str(part.path) for part in result.run.parts)
-    way = "cycle by cycle with the loop's code" if result.exact else "in arrays"
     speed = result.seconds / max(result.replay_s, 1e-9)
     lines = [
         logs,
-        f"  {number(result.run.cycles)} cycles, {result.seconds:.3f} s, method {result.method}; {way}: "
+        f"  {number(result.run.cycles)} cycles, {result.seconds:.3f} s, method {result.method}; "
         f"{result.replay_s:.2f} s ({speed:.0f} times real time), reading {result.read_s:.2f} s",
     ]
     if result.identity is None:
@@ -73,12 +72,7 @@ def _identity(result: Result, same: Identity) -> list[str]:
     verdict = f"{number(same.identical)} of {number(same.cycles)} cycles"
     since = same.from_cycle
     from_on = "" if since in (None, _first_cycle(result)) else f" from cycle {number(since)} on"
-    if not result.exact:
-        word = "equal" if same.explained else "NOT equal"
-        lines = [
-            f"  {word} to {same.tolerance_nm:g} Nm{from_on}; bit-identical: {verdict} (in arrays; --exact compares bits)"
-        ]
-    elif same.explained and since is not None and same.network_nm:
+    if same.explained and since is not None and same.network_nm:
         lines = [
             f"  equal to {same.network_nm:.1g} Nm{from_on}; bit-identical: {verdict} (the networks were evaluated otherwise "
             "when this log was recorded)"
@@ -91,15 +85,7 @@ def _identity(result: Result, same: Identity) -> list[str]:
         lines.append(
             f"  estimate PDO on the bus: same bytes in {number(same.pdos_equal)} of {number(same.pdos)}"
         )
-    if not result.exact:
-        for each in result.comparisons:
-            lines.append(
-                f"  joint {each.joint}: same estimate PDO in {number(each.pdo_equal)} of {number(each.cycles)} cycles, "
-                f"largest difference {_nm(each.max_nm, 'g')}"
-            )
     lines += [_contacts(each) for each in same.contacts]
-    if not result.exact and result.run.origin.config.contact is not None:
-        lines.append("  contacts are compared cycle by cycle only (--exact)")
     lines += [_unknown(each) for each in same.unknown]
     lines += [_difference(each) for each in same.differences]
     return lines
@@ -309,15 +295,14 @@ def _messages(result: Result, number: int) -> RecordArray:
     return out
 
 
-_EXAMPLES = f"""examples:
+_EXAMPLES = """examples:
   jtq replay run.mcap                          check that the log's estimator reproduces the published values
   jtq replay part1.mcap part2.mcap             parts of one run, in any order; or their directory
   jtq replay run.mcap --model trained/         with other joint files and networks
   jtq replay run.mcap --method efficiency      with another method
   jtq replay run.mcap --model new/ --out both.mcap   a log with both results, for Foxglove
 
-Up to {SHORT_CYCLES:,} cycles with the logged models are replayed cycle by cycle with the loop's code, longer logs
-and other models in arrays; --exact forces cycle by cycle.
+Every cycle goes through the loop's own code.
 exit status: 0 replayed (with the logged models: identical), 1 a log or model cannot be used, 2 usage, 3 different"""
 
 
@@ -340,7 +325,7 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument("--method", choices=METHODS, help="another method of the estimator")
     made.add_argument("--compare", action="store_true", help="show differences also with the logged models")
-    made.add_argument("--exact", action="store_true", help="cycle by cycle for any length")
+    made.add_argument("--exact", action="store_true", help="as without it: every replay is cycle by cycle")
     made.add_argument("--json", action="store_true", help="results as JSON")
     made.add_argument(
         "--out",
@@ -360,9 +345,7 @@ def main(argv: list[str]) -> int:
     if options.out is not None and options.out.exists():
         print(f"jtq replay: {options.out}: exists already, expected a new file", file=sys.stderr)
         return 2
-    replay_options = ReplayOptions(
-        options.model, options.method, True if options.exact or _short(options) else None
-    )
+    replay_options = ReplayOptions(options.model, options.method)
     bar = _Bar()
     try:
         if options.out is not None:
@@ -392,11 +375,6 @@ def _replay(options: argparse.Namespace, replay_options: ReplayOptions, bar: _Ba
         write(options.out, kept)
     print(json.dumps({"schema": "jtq.replay/1", "runs": made}) if options.json else "\n\n".join(made))
     return good
-
-
-def _short(options: argparse.Namespace) -> bool:
-    """--compare with the logged models asks for the loop's own numbers."""
-    return bool(options.compare and options.model is None and options.method is None)
 
 
 def _failed(bar: _Bar, line: str) -> int:

@@ -11,12 +11,12 @@ import numpy.typing as npt
 
 from jtqd.daemon.replay.contacts import BITS as CONTACT_BITS
 from jtqd.daemon.replay.contacts import Contacts, contacts
-from jtqd.daemon.replay.estimates import fields
 from jtqd.daemon.replay.origin import ADDED
-from jtqd.daemon.replay.runs import CUT, Steps
+from jtqd.daemon.replay.rows import fields
+from jtqd.daemon.replay.runs import Steps
 from jtqd.estimator.arrays import BoolArray, FloatArray, RecordArray
 from jtqd.estimator.observer import reference_of
-from jtqd.estimator.status import NAMES, STANDSTILL
+from jtqd.estimator.status import NAMES
 
 
 @dataclass(frozen=True)
@@ -181,8 +181,8 @@ class Identity:
         unknown: where the state was not known.
         differences: what has no reason.
         from_cycle: all cycles from this one on are identical; None where the last one is not.
-        tolerance_nm: numbers that differ by no more count as identical in all of this but `identical`; 0: bits.
-        network_nm: the same for what a network adds, where it was evaluated otherwise when the log was recorded; 0: bits.
+        network_nm: numbers that a network is part of and that differ by no more count as identical in all of this but
+            `identical`, where it was evaluated otherwise when the log was recorded; 0: bits.
         contacts: of each joint that is watched; they are in no other count.
     """
 
@@ -193,7 +193,6 @@ class Identity:
     unknown: tuple[Unknown, ...]
     differences: tuple[Difference, ...]
     from_cycle: int | None
-    tolerance_nm: float = 0.0
     network_nm: float = 0.0
     contacts: tuple[Contacts, ...] = ()
 
@@ -227,18 +226,16 @@ def identity(
     steps: Sequence[Steps],
     estimate: tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8], BoolArray] | None = None,
     *,
-    tolerance_nm: float = 0.0,
     network_nm: float = 0.0,
 ) -> Identity:
     """Compare n cycles of all joints, all fields of `replayed`.
 
     `estimate`: bytes of the estimate PDOs [n, 8 PDOs] in the frames and replayed, and whether they are logged [n]; None: the
-    frames were not read. `tolerance_nm`: what rounding may do to a replay in arrays; `network_nm`: what another evaluation
-    of the networks may do to their share, in cycles where that share itself differs.
+    frames were not read. `network_nm`: what another evaluation of the networks may do to their share, in cycles where that
+    share itself differs.
     """
     cycle = logged[0]["cycle"].astype(np.int64)
-    same = [_same(one, two, tolerance_nm) for one, two in zip(logged, replayed, strict=True)]
-    bits = [_same(one, two, 0.0) for one, two in zip(logged, replayed, strict=True)] if tolerance_nm else same
+    same = bits = [_same(one, two) for one, two in zip(logged, replayed, strict=True)]
     if network_nm:
         same = [
             each | _same_network(one, two, network_nm)
@@ -256,13 +253,13 @@ def identity(
         parts = _segments(len(cycle), steps[n])
         for first, end, reason in parts:
             settled = _settled(same[n], steps[n].used, first, end) if reason else first
-            if reason and not (reason == CUT and settled == first):
+            if reason:
                 after = cycle[settled] if settled < end else cycle[end - 1] + 1
                 count = int(after - cycle[first])
                 unknown.append(Unknown(n + 1, int(cycle[first]), count, reason, settled >= end))
             wrong = np.flatnonzero(~same[n][settled:end]) + settled
             if len(wrong):
-                differences.append(_difference(n, logged[n], replayed[n], wrong, tolerance_nm))
+                differences.append(_difference(n, logged[n], replayed[n], wrong))
     numbers: BoolArray = np.logical_and.reduce(same)
     every = numbers & pdo
     if not (pdo | ~numbers).all():
@@ -280,7 +277,6 @@ def identity(
         tuple(sorted(unknown, key=lambda each: (each.first_cycle, each.joint))),
         tuple(_first_of_each(differences)),
         int(cycle[start]) if start < len(cycle) else None,
-        tolerance_nm,
         network_nm,
         contacts(logged, replayed, excused=bool(unknown)),
     )
@@ -315,10 +311,10 @@ def _compared(replayed: RecordArray) -> list[str]:
     return [name for name in replayed.dtype.names or () if name not in ADDED]
 
 
-def _same(logged: RecordArray, replayed: RecordArray, tolerance: float) -> BoolArray:
+def _same(logged: RecordArray, replayed: RecordArray) -> BoolArray:
     same = np.ones(len(logged), np.bool_)
     for name in _compared(replayed):
-        same &= _equal(logged, replayed, name, tolerance)
+        same &= _equal(logged, replayed, name, 0.0)
     return same
 
 
@@ -334,10 +330,7 @@ def _same_network(logged: RecordArray, replayed: RecordArray, limit: float) -> B
 
 
 def _equal(logged: RecordArray, replayed: RecordArray, name: str, tolerance: float) -> BoolArray:
-    """Equal bit for bit in this field, or, where there is a tolerance, numbers that are so near to each other [n].
-
-    Sigma at standstill is then not compared: its scale is that of a quadrant by the sign of a speed that is all rounding.
-    """
+    """Equal bit for bit in this field, or, where there is a tolerance, numbers that are so near to each other [n]."""
     one, two = logged[name], replayed[name]
     if name == "input_flags":  # contacts are compared apart: what they remember fades more slowly
         one, two = one & ~np.uint16(CONTACT_BITS), two & ~np.uint16(CONTACT_BITS)
@@ -345,8 +338,6 @@ def _equal(logged: RecordArray, replayed: RecordArray, name: str, tolerance: flo
     if tolerance and one.dtype.kind == "f":
         with np.errstate(invalid="ignore"):
             same |= np.abs(one - two) <= tolerance
-        if name == "sigma_nm":
-            same |= (logged["status"] == STANDSTILL) & (replayed["status"] == STANDSTILL)
     return same
 
 
@@ -373,15 +364,13 @@ def _settled(same: BoolArray, used: BoolArray, first: int, end: int) -> int:
 
 
 def _difference(
-    number: int, logged: RecordArray, replayed: RecordArray, wrong: npt.NDArray[np.intp], tolerance: float
+    number: int, logged: RecordArray, replayed: RecordArray, wrong: npt.NDArray[np.intp]
 ) -> Difference:
     row = int(wrong[0])
     names = [name for name in _FIELDS if name in _compared(replayed)]
     names += [name for name in _compared(replayed) if name not in names]
     field = next(
-        name
-        for name in names
-        if not _equal(logged[row : row + 1], replayed[row : row + 1], name, tolerance)[0]
+        name for name in names if not _equal(logged[row : row + 1], replayed[row : row + 1], name, 0.0)[0]
     )
     with np.errstate(invalid="ignore"):
         apart = np.abs(logged["torque_nm"][wrong] - replayed["torque_nm"][wrong])

@@ -1,13 +1,8 @@
-"""Estimates of a replay, two ways: cycle by cycle through the loop's own code, and in arrays.
+"""Estimates of a replay, cycle by cycle through the loop's own code.
 
-Cycle by cycle (`ExactReplay`), what comes out is bit for bit what the loop had, or something differs. Taken from the log
-is what only the loop could know: which inputs counted, how long a step was, that an estimate was ready too late. Everything
-else (positions that roll over, temperatures and their age, estimate, status, the bytes of the estimate PDO) is computed from
-the raw frames again.
-
-In arrays (`replay_whole`), one call of the estimator takes a whole run: the same numbers, without the frames. Inputs are
-the SI values of the log. What the loop decides after the estimate (starting, drive off or in fault, too late, what fits the
-field of the PDO) is decided here again.
+What comes out is bit for bit what the loop had, or something differs. Taken from the log is what only the loop could know:
+which inputs counted, how long a step was, that an estimate was ready too late. Everything else (positions that roll over,
+temperatures and their age, estimate, status, the bytes of the estimate PDO) is computed from the raw frames again.
 """
 
 from __future__ import annotations
@@ -17,18 +12,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from jtqd.daemon.config import SafetySettings
-from jtqd.daemon.core import estimate_pdo
-from jtqd.daemon.core.cycle import STARTING_CYCLES
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import JointCycle
 from jtqd.daemon.core.joint_safety import JointSafety
-from jtqd.daemon.core.status import JointStatus, drive_status
 from jtqd.daemon.loop.input_pdos import input_pdos, joint_temperatures
 from jtqd.daemon.loop.process import contacts_of
 from jtqd.daemon.replay.frames import Frames, offsets
@@ -37,18 +27,13 @@ from jtqd.daemon.replay.pasts import NO_PASTS, Pasts
 from jtqd.daemon.replay.rows import CycleRows
 from jtqd.daemon.replay.runs import Steps
 from jtqd.daemon.shared import cycle_record as cr
-from jtqd.daemon.shared import faults
-from jtqd.daemon.shared.cycle_record import FLAG_LATCHED, FLAG_NETWORK_SKIPPED, FLAG_TEMPERATURE
+from jtqd.daemon.shared.cycle_record import FLAG_NETWORK_SKIPPED, FLAG_TEMPERATURE
 from jtqd.daemon.shared.snapshot import COUNTERS
-from jtqd.estimator.arrays import CodeArray, FloatArray, RecordArray
+from jtqd.estimator.arrays import FloatArray, RecordArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.learned import learner_of
-from jtqd.estimator.methods import AnyEstimator, AnyNetwork, estimate_steps
-from jtqd.estimator.run import JointColumns
+from jtqd.estimator.methods import AnyEstimator, AnyNetwork
 from jtqd.estimator.settings import EstimatorSettings
-from jtqd.estimator.status import DEGRADED, INVALID, OFF, PUBLISHED, STALE, STANDSTILL, STARTING, VALID
-
-# ---- cycle by cycle, through the loop's own code ----
 
 _TOLD = 1 << 14
 """Cycles between two calls of `progress`."""
@@ -223,19 +208,6 @@ class ExactReplay:
         self._unknown[number] = False
 
 
-WHOLE = np.dtype(
-    [
-        *((name, "<f8") for name in ("torque_nm", "sigma_nm", "tob_nm", "physics_nm", "network_nm")),
-        ("status", "<u2"),
-    ]
-)
-"""What the estimator makes of a cycle."""
-_STAGES = ("torque_nm", "sigma_nm", "tob_nm", "physics_nm", "network_nm")
-_IS_PUBLISHED = np.isin(np.arange(16), [*PUBLISHED])
-_STEADY = frozenset((VALID, STANDSTILL, DEGRADED, OFF))
-"""A status that is asked for and published stays as it is while the same is asked for."""
-
-
 @dataclass(frozen=True)
 class Model:
     """Estimator model of one joint."""
@@ -243,143 +215,3 @@ class Model:
     joint: Joint
     settings: EstimatorSettings
     network: AnyNetwork | None
-
-
-def replay_whole(
-    model: Model, safety: JointSafety, records: RecordArray, steps: Steps, pasts: Pasts = NO_PASTS
-) -> RecordArray:
-    """Estimates [n] of the states `records` of one joint, fields as `WHOLE`. Raises ConfigError where nothing fits.
-
-    Faults of the inputs, and those that are latched, are taken from the log. `pasts`: states to go on from, where the
-    estimator's own is not known: the first one behind each such place.
-    """
-    rows: npt.NDArray[np.intp] | slice = slice(None) if steps.used.all() else np.flatnonzero(steps.used)
-    flags, word, cycle = (records[name][rows] for name in ("input_flags", "statusword", "cycle"))
-    motor, link = records["motor_position_rad"][rows].copy(), records["link_position_rad"][rows].copy()
-    if np.isnan(link).all():  # one encoder: as `JointCycle`
-        link = motor / model.joint.gear_ratio
-    columns = JointColumns(
-        current_a=records["current_a"][rows].copy(),
-        motor_position_rad=motor,
-        motor_velocity_rad_s=records["motor_velocity_rad_s"][rows].copy(),
-        link_position_rad=link,
-        temperature_c=np.where(flags & FLAG_TEMPERATURE, records["temperature_c"][rows], np.nan),
-    )
-    values = {name: np.full(len(records), np.nan) for name in _STAGES}
-    status = np.full(len(records), STALE, np.uint16)
-    found = np.zeros(len(records), np.int64)
-    if len(flags):
-        dt_s = steps.dt_ns[rows].astype(np.float64) * 1e-9
-        wanted = (flags & FLAG_NETWORK_SKIPPED) == 0
-        known = _first_known(pasts, records["cycle"], steps)
-        starts = {int(np.count_nonzero(steps.used[:row])): content for row, content in known.items()}
-        made = estimate_steps(model.joint, model.settings, model.network, dt_s, columns, wanted, starts)
-        for name in _STAGES:
-            values[name][rows] = getattr(made, name)
-        asked = made.status.astype(np.uint16)
-        status[rows], found[rows] = _asked(
-            made.torque_nm, made.sigma_nm, asked, _Cycles(flags, word, cycle), safety
-        )
-    status = status_many(status, found, records, safety.settings)
-    fits = fields(values["torque_nm"], values["sigma_nm"], status)[0] != estimate_pdo.NO_TORQUE
-    values["torque_nm"][~fits] = values["sigma_nm"][~fits] = np.nan
-    out = np.empty(len(records), WHOLE)
-    for name, column in values.items():
-        out[name] = column
-    out["status"] = status
-    return out
-
-
-def _first_known(pasts: Pasts, cycle: npt.NDArray[np.uint64], steps: Steps) -> dict[int, bytes]:
-    """Return the first state behind each place where it was not known, by the row before which it holds."""
-    rows = pasts.rows(cycle)
-    found = {}
-    for lost, _ in steps.breaks:
-        row = min((row for row in rows if row >= lost), default=None)
-        if row is not None and not any(lost < begun <= row for begun in steps.begins.tolist()):
-            found[row] = rows[row]
-    return found
-
-
-class _Cycles(NamedTuple):
-    """Flags of the inputs, statusword and number of the cycles [n]."""
-
-    flags: CodeArray
-    statusword: CodeArray
-    cycle: npt.NDArray[np.uint64]
-
-
-def _asked(
-    torque_nm: FloatArray, sigma_nm: FloatArray, status: CodeArray, cycles: _Cycles, safety: JointSafety
-) -> tuple[CodeArray, npt.NDArray[np.int64]]:
-    """Status that each cycle asks for, and its faults [n]: twin of what `JointCycle.observe` does with an estimate."""
-    found = np.where(cycles.flags & FLAG_LATCHED, 0, cycles.flags >> 8).astype(np.int64)
-    found &= ~(faults.OUT_OF_RANGE | faults.NOT_FINITE)
-    found[status == INVALID] |= faults.OUT_OF_RANGE
-    powered = np.ones(len(status), np.bool_)
-    for word in np.flatnonzero(
-        np.bincount(cycles.statusword)
-    ).tolist():  # there are few different ones in a run
-        said = drive_status(word)
-        if said is not None:
-            here = cycles.statusword == word
-            status[here], powered[here], found[here] = said, False, found[here] & ~faults.OUT_OF_RANGE
-    publishable = powered & _IS_PUBLISHED[status]
-    limit = safety.torque_limit_nm
-    with np.errstate(invalid="ignore"):
-        sigma_good = (sigma_nm >= 0.0) & np.isfinite(sigma_nm)
-        good = (np.abs(torque_nm) <= limit) & sigma_good
-        finite = np.isfinite(torque_nm) & sigma_good
-    found[publishable & ~good & finite] |= faults.OUT_OF_RANGE
-    found[publishable & ~good & ~finite] |= faults.NOT_FINITE
-    status[publishable & (cycles.cycle < STARTING_CYCLES)] = STARTING
-    return status, found
-
-
-def status_many(
-    asked: CodeArray, found: npt.NDArray[np.int64], records: RecordArray, settings: SafetySettings
-) -> CodeArray:
-    """Status to publish [n]: `JointStatus` over a whole run, which is asked only where something changes."""
-    state = JointStatus(settings)
-    latched = (records["input_flags"] & FLAG_LATCHED) != 0
-    key = asked.astype(np.int64) | found << 8 | latched.astype(np.int64) << 24
-    key |= (records["cycle_flags"] & (cr.FLAG_WITHDRAWN | cr.FLAG_RESET)).astype(np.int64) << 25
-    starts = np.concatenate(([0], np.flatnonzero(np.diff(key)) + 1))
-    out = asked.copy()
-    for start, end in zip(starts.tolist(), [*starts[1:].tolist(), len(key)], strict=True):
-        if latched[start]:
-            out[start:end] = records["status"][start:end]
-            continue
-        status, faulty = int(asked[start]), int(found[start])
-        flags = int(records["cycle_flags"][start])
-        row = start
-        while row < end:
-            if flags & cr.FLAG_RESET:
-                state.reset_latch()
-            said = state.update(status, faulty)
-            if flags & cr.FLAG_WITHDRAWN:
-                said = state.late()
-            out[row] = said
-            row += 1
-            settled = said == status == state.held and status in _STEADY
-            if settled and not faulty and not flags & cr.FLAG_WITHDRAWN:
-                state.pass_over(end - row)
-                out[row:end] = said
-                break
-    return out
-
-
-def fields(
-    torque_nm: FloatArray, sigma_nm: FloatArray, status: CodeArray
-) -> tuple[npt.NDArray[np.int16], npt.NDArray[np.uint8], CodeArray]:
-    """Twin of `estimate_pdo.field` [n]: integers of torque, sigma and status."""
-    limit = -estimate_pdo.NO_TORQUE - 1
-    publishable = _IS_PUBLISHED[status]
-    with np.errstate(invalid="ignore"):
-        counts = torque_nm * 100.0
-        fits = publishable & (np.abs(counts) <= limit) & (sigma_nm >= 0.0) & (sigma_nm < np.inf)
-        known = fits & (sigma_nm <= 12.7)
-    whole = np.where(fits, np.rint(np.where(fits, counts, 0.0)), estimate_pdo.NO_TORQUE).astype(np.int16)
-    widths = np.ceil(np.where(known, sigma_nm, 0.0) * 20.0 - 1e-9)
-    sigma = np.where(known, widths, estimate_pdo.SIGMA_UNKNOWN).astype(np.uint8)
-    return whole, sigma, np.where(publishable & ~fits, INVALID, status).astype(np.uint16)

@@ -6,7 +6,11 @@ import numpy.typing as npt
 from jtqd.daemon.core.contact import ContactWatch
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import JointCycle
-from jtqd.estimator.arrays import BoolArray, FloatArray, IntegerArray
+from jtqd.estimator.arrays import BoolArray, CodeArray, FloatArray, IntegerArray
+
+Codes = npt.NDArray[np.intc]
+
+def fields(torque_nm: FloatArray, sigma_nm: FloatArray, status: CodeArray) -> tuple[Codes, Codes, Codes]: ...
 
 class CycleRows:
     samples: npt.NDArray[np.uint8]

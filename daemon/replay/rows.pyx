@@ -9,7 +9,7 @@ import numpy as np
 
 from jtqd.daemon.core.cycle import STARTING_CYCLES
 from jtqd.daemon.core.contact cimport ContactWatch
-from jtqd.daemon.core.estimate_pdo cimport NOBODY, Published, encode_into
+from jtqd.daemon.core.estimate_pdo cimport NOBODY, Published, encode_into, field_of
 from jtqd.daemon.core.intake cimport MOST_FIELDS, Intake, Temperature, temperature_at
 from jtqd.daemon.core.joint cimport JointCycle, JointState
 from jtqd.daemon.core.record cimport MOST_JOINTS, JointBlock
@@ -17,6 +17,21 @@ from jtqd.estimator import status as st
 
 cdef int64_t FIRST_CYCLES = STARTING_CYCLES
 cdef int STALE = st.STALE
+
+
+def fields(torque_nm, sigma_nm, status):
+    """Return the integers (torque, sigma, status) of an estimate PDO's field, arrays [n], as the loop makes them."""
+    cdef const double[::1] torque = np.ascontiguousarray(torque_nm, np.float64)
+    cdef const double[::1] sigma = np.ascontiguousarray(sigma_nm, np.float64)
+    cdef const int[::1] code = np.ascontiguousarray(status, np.intc)
+    out = np.empty((3, torque.shape[0]), np.intc)
+    cdef int[:, ::1] to = out
+    cdef Published made
+    cdef Py_ssize_t k
+    for k in range(torque.shape[0]):
+        made = field_of(torque[k], sigma[k], code[k])
+        to[0, k], to[1, k], to[2, k] = made.torque, made.sigma, made.status
+    return out[0], out[1], out[2]
 
 
 cdef class CycleRows:

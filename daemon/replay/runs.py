@@ -41,7 +41,6 @@ from jtqd.estimator.arrays import RecordArray
 
 _BOTH = FLAG_POSITION | FLAG_MOTION
 BEGINS, LOST = "the log begins in the middle of the run", "cycles are missing from the log"
-CUT = "a long run is replayed in stretches"
 
 
 @dataclass(frozen=True)
@@ -65,11 +64,6 @@ class Steps:
         begins = self.begins[(self.begins >= first) & (self.begins < end)] - first
         breaks = tuple((row - first, why) for row, why in self.breaks if first <= row < end)
         return Steps(self.used[first:end], self.dt_ns[first:end], begins, breaks)
-
-
-def cut_before(steps: Steps) -> Steps:
-    """Return the same where the state at the first row is not quite known."""
-    return replace(steps, breaks=((0, CUT), *(each for each in steps.breaks if each[0])))
 
 
 def steps_of(records: RecordArray, config: Config) -> Steps:

@@ -6,7 +6,6 @@ import hashlib
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +18,7 @@ from jtqd.daemon.config import Config
 from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.logs import LogError, log_parts
 from jtqd.daemon.replay.compare import Comparison, Identity, compare, identity, with_states
-from jtqd.daemon.replay.estimates import ExactReplay, Model, replay_whole
+from jtqd.daemon.replay.estimates import ExactReplay, Model
 from jtqd.daemon.replay.frames import decode
 from jtqd.daemon.replay.origin import Origin
 from jtqd.daemon.replay.pasts import NO_PASTS, Pasts
@@ -28,7 +27,6 @@ from jtqd.daemon.replay.runs import (
     Part,
     Run,
     Steps,
-    cut_before,
     in_order,
     lost_cycles,
     read_pieces,
@@ -162,12 +160,6 @@ def _logged_network(origin: Origin, number: int, method: str) -> AnyNetwork | No
     return load_network(method, str(file.path), file.sha256)
 
 
-SHORT_CYCLES = 120_000
-"""Up to so many cycles a replay with the logged models is exact without being asked: some seconds."""
-ROUNDING_NM = 1e-9
-"""In arrays sums are in another order, and numpy's functions differ from libm's in the last bit (`docs/replay.md`)."""
-
-
 @dataclass(frozen=True)
 class ReplayOptions:
     """Options of a replay.
@@ -175,13 +167,11 @@ class ReplayOptions:
     Attributes:
         model: directory with other joint files and networks.
         method: another method of the estimator.
-        exact: cycle by cycle; None: where it is short and with the logged models.
         compare: differences and errors against the sensor, too.
     """
 
     model: Path | None = None
     method: str | None = None
-    exact: bool | None = None
     compare: bool = False
 
     @property
@@ -198,20 +188,18 @@ class Result:
         run: its logs and states.
         files: of the models.
         method: of the estimator.
-        exact: cycle by cycle with the loop's code.
         seconds, read_s, replay_s: length of the run; wall time of reading and of estimating.
         lost: cycles that are missing in the middle of the logs.
-        from_si: inputs whose frame was not in the log, from the SI values beside it (exact only).
+        from_si: inputs whose frame was not in the log, from the SI values beside it.
         temperatures_from_log: the same of temperatures.
         identity: comparison bit for bit, with the logged models only.
         comparisons: of each joint.
-        joints: estimates of each joint, fields as `WHOLE` at least.
+        joints: estimates of each joint, fields as `SAMPLE`.
     """
 
     run: Run
     files: tuple[str, ...]
     method: str
-    exact: bool
     seconds: float
     read_s: float
     replay_s: float
@@ -238,7 +226,6 @@ class Result:
             "seconds": self.seconds,
             "method": self.method,
             "models": list(self.files),
-            "exact": self.exact,
             "read_s": self.read_s,
             "replay_s": self.replay_s,
             "times_real_time": self.seconds / max(self.replay_s, 1e-9),
@@ -319,31 +306,23 @@ def _replay_run(
     run: Run, options: ReplayOptions, progress: Progress, read_s: float, replayers: dict[int, ExactReplay]
 ) -> Result:
     models = _models(run, options)
-    short = run.before is None and run.cycles <= SHORT_CYCLES
-    exact = (not options.other and short) if options.exact is None else options.exact
     logged = run.joints
     begun = time.perf_counter()
-    if exact:
-        steps = run.steps()
-        replayer = replayers.get(run.number)
-        if replayer is None:
-            safety = models.safety(run.origin.config)
-            replayers[run.number] = replayer = ExactReplay(run.origin, models.estimators(), safety)
-        found = _exact(run, replayer, steps, progress, _known_pasts(run, models))
-        estimate = (found.sent, found.made, found.recorded)
-    else:
-        progress("replaying", 0, run.cycles)
-        found, steps = _in_arrays(run, models)
-        estimate = None
+    steps = run.steps()
+    replayer = replayers.get(run.number)
+    if replayer is None:
+        safety = models.safety(run.origin.config)
+        replayers[run.number] = replayer = ExactReplay(run.origin, models.estimators(), safety)
+    found = _replayed(run, replayer, steps, progress, _known_pasts(run, models))
+    estimate = (found.sent, found.made, found.recorded)
     replay_s = time.perf_counter() - begun
     progress("replaying", run.cycles, run.cycles)
     same = None
     if not options.other:
-        same = identity(logged, found.joints, steps, estimate, tolerance_nm=0.0 if exact else ROUNDING_NM)
-        if exact and not same.explained and any(each.network is not None for each in models.joints):
+        same = identity(logged, found.joints, steps, estimate)
+        if not same.explained and any(each.network is not None for each in models.joints):
             limit = NATIVE_LIMIT * min(each.joint.rated_torque_nm for each in models.joints)
             same = identity(logged, found.joints, steps, estimate, network_nm=limit)
-    if same is not None and exact:
         same = with_states(same, found.pasts_differ)
     comparisons = tuple(
         compare(number, *both, _known(run, same, number), _bandwidths(run, models, number))
@@ -353,7 +332,6 @@ def _replay_run(
         run,
         models.files,
         models.joints[0].settings.method,
-        exact,
         run.cycles * run.origin.config.period_ns * 1e-9,
         read_s,
         replay_s,
@@ -381,7 +359,7 @@ def _tell(progress: Progress, before: int, total: int, row: int) -> None:
 
 
 @dataclass(frozen=True)
-class _Exact:
+class _Replayed:
     """Results of all parts, one after the other."""
 
     joints: tuple[RecordArray, ...]
@@ -393,21 +371,6 @@ class _Exact:
     pasts_differ: tuple[tuple[int, int], ...] = ()
 
 
-def _in_arrays(run: Run, models: Models) -> tuple[_Exact, tuple[Steps, ...]]:
-    """In arrays; a later stretch of a run begins with states of the one before, whose estimates are dropped."""
-    records, steps, kept = run.widened()
-    safety = models.safety(run.origin.config)
-    pasts = _known_pasts(run, models)
-    with ThreadPoolExecutor(len(records)) as pool:  # numpy and ONNX Runtime let go of the interpreter
-        made = list(pool.map(replay_whole, models.joints, safety, records, steps, pasts))
-    if kept:
-        end = len(records[0])
-        steps = tuple(cut_before(each.part(kept, end)) for each in steps)
-    empty = np.zeros((run.cycles, 8), np.uint8)
-    recorded = np.zeros(run.cycles, np.bool_)
-    return _Exact(tuple(each[kept:] for each in made), empty, empty, recorded, 0, 0), steps
-
-
 def _known_pasts(run: Run, models: Models) -> list[Pasts]:
     """Return the states of the log for each model: none where something differs that the zeros were learned with."""
     if not any(len(each.cycle) for each in run.pasts):
@@ -417,9 +380,9 @@ def _known_pasts(run: Run, models: Models) -> list[Pasts]:
     return [pasts if same_past(old, new) else NO_PASTS for pasts, old, new in pairs]
 
 
-def _exact(
+def _replayed(
     run: Run, replayer: ExactReplay, steps: Sequence[Steps], progress: Progress, pasts: Sequence[Pasts]
-) -> _Exact:
+) -> _Replayed:
     """Cycle by cycle, part by part: the raw frames of only one part are in memory at a time.
 
     `replayer`: new, or as the stretch before has left it.
@@ -441,7 +404,7 @@ def _exact(
         temperatures += result.temperatures_from_log
         states += result.pasts_differ
         done = end
-    return _Exact(
+    return _Replayed(
         tuple(np.concatenate(each) for each in zip(*joints, strict=True)),
         np.concatenate(sent),
         np.concatenate(made),

@@ -169,9 +169,6 @@ def _replay(options: argparse.Namespace) -> tuple[tuple[str, ...], dict[str, Any
     if options.method is not None:
         arguments += ["--method", options.method]
         parameters["method"] = options.method
-    if options.exact:
-        arguments.append("--exact")
-        parameters["exact"] = True
     return tuple(arguments), parameters
 
 
@@ -207,7 +204,7 @@ def parser() -> argparse.ArgumentParser:
     replay = _common(commands, REPLAY, "replay the estimator over each run, and compare")
     replay.add_argument("--model", type=Path, metavar="DIR", help="other models; see jtq replay --help")
     replay.add_argument("--method", choices=METHODS, help="another method of the estimator")
-    replay.add_argument("--exact", action="store_true", help="cycle by cycle for any length")
+    replay.add_argument("--exact", action="store_true", help="as without it: every replay is cycle by cycle")
     return result
 
 

@@ -45,9 +45,9 @@ CASES = {
 """Name of a stored output -> what gives it: every method, two of them as recorded."""
 
 
-def replayed(case: Case, *, exact: bool = True) -> tuple[Output, Result]:
-    """Output of the estimator as it is now, cycle by cycle or in arrays."""
-    (result,) = replay([HERE / f"{case.log}.mcap"], ReplayOptions(exact=exact, method=case.method))
+def replayed(case: Case) -> tuple[Output, Result]:
+    """Output of the estimator as it is now."""
+    (result,) = replay([HERE / f"{case.log}.mcap"], ReplayOptions(method=case.method))
     values = {
         f"j{n}.{name}": np.asarray(records[name], np.float64)
         for n, records in enumerate(result.joints, start=1)

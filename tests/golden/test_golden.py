@@ -11,7 +11,7 @@ import pytest
 from jtqd.estimator.observer import reference_of
 from jtqd.estimator.settings import METHODS
 from tests.benchmarks import replay_speed
-from tests.golden.reference import CASES, HERE, Case, Output, difference, replayed, store, stored
+from tests.golden.reference import CASES, HERE, Output, difference, replayed, store, stored
 from tests.golden.scene import SCENES
 
 MOST_BYTES = 450_000
@@ -45,14 +45,6 @@ def test_the_loop_gives_the_sensor_the_age_of_the_estimate(name: str) -> None:
         assert np.isfinite(expected).sum() > 500
         np.testing.assert_array_equal(records["reference_nm"], expected)
         assert set(records["age_ms"]) == {5.0}
-
-
-@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_in_arrays_the_same_to_rounding(case: Case) -> None:
-    exact, _ = replayed(case)
-    whole, _ = replayed(case, exact=False)
-    for name, values in exact.values.items():
-        np.testing.assert_allclose(whole.values[name], values, rtol=0, atol=1e-9, err_msg=name)
 
 
 def output() -> Output:
@@ -112,9 +104,9 @@ def test_stored_text_comes_back(tmp_path: Path) -> None:
 
 
 def test_the_benchmark_of_replay_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a golden log that is made longer, so that whole-run observers are used; no time is asserted."""
+    """No time is asserted."""
     monkeypatch.setattr(replay_speed, "METHODS", {"tob": "network"})
-    (found,) = replay_speed.run(tmp_path, seconds=5.0)
-    assert found["cycles"] > 2000
-    assert found["arrays_times"] > found["exact_times"] > 0
+    (found,) = replay_speed.run(tmp_path)
+    assert found["cycles"] > 1000
+    assert found["exact_times"] > 0
     assert "tob" in replay_speed.text([found])

@@ -8,24 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.logs import LogError
 from jtqd.daemon.replay.command import main
-from jtqd.daemon.replay.estimates import _asked, _Cycles
 from jtqd.daemon.replay.frames import decode
 from jtqd.daemon.replay.runs import (
-    BEGINS,
-    CUT,
     LOST,
-    cut_before,
     lost_cycles,
     read_part,
     read_pieces,
     steps_of,
 )
 from jtqd.daemon.replay.session import ReplayOptions, replay
-from jtqd.daemon.shared import faults
-from jtqd.estimator.status import INVALID, VALID
 from jtqd.models.files import shipped
 from tests.daemon.replay.replay_helpers import cut, cycles
 from tests.daemon.replay.test_replay_parts import CONFIG, MS, records
@@ -53,14 +46,6 @@ def test_holes_longer_than_a_round_of_the_sync_counter_are_counted_in_full() -> 
     assert lost_cycles(stood, CONFIG) == 0
 
 
-def test_the_first_row_of_a_stretch_has_one_reason() -> None:
-    log = records([*range(20, 40), *range(50, 100)])
-    steps = steps_of(log, CONFIG)
-    assert steps.breaks == ((0, BEGINS), (20, LOST))
-    assert cut_before(steps).breaks == ((0, CUT), (20, LOST))
-    assert cut_before(steps.part(10, 70)).breaks == ((0, CUT), (10, LOST))
-
-
 def test_of_a_record_without_room_for_all_frames_the_si_values_count(tmp_path: Path) -> None:
     """The last frame in the record may be an older one: what the log says beside it is what was used."""
     part = read_part(LOG, tmp_path)
@@ -85,25 +70,12 @@ def test_of_a_record_without_room_for_all_frames_the_si_values_count(tmp_path: P
     )
 
 
-def test_an_estimate_that_is_invalid_by_itself_is_a_fault() -> None:
-    """As in the loop: the status is held as after any other value out of range."""
-    joint = CONFIG.joints[0].joint
-    safety = JointSafety(CONFIG.safety, CONFIG.estimator, joint, CONFIG.period_ns)
-    status = np.array([VALID, INVALID, VALID], np.uint16)
-    rest = _Cycles(
-        np.full(3, 7, np.uint16), np.full(3, 0x1237, np.uint16), np.arange(10_000, 10_003, dtype=np.uint64)
-    )
-    asked, found = _asked(np.ones(3), np.ones(3), status, rest, safety)
-    assert asked.tolist() == [VALID, INVALID, VALID]
-    assert found.tolist() == [0, faults.OUT_OF_RANGE, 0]
-
-
 def test_logs_that_tell_a_cycle_differently_are_refused(tmp_path: Path) -> None:
     """Cycles that two parts have, after a crash of the recorder, are the same in both; else it is not one run."""
     numbers = cycles(LOG)
     first = cut(LOG, tmp_path / "1.mcap", lambda cycle: cycle < numbers[700])
     second = cut(LOG, tmp_path / "2.mcap", lambda cycle: cycle >= numbers[650])
-    (result,) = replay([first, second], ReplayOptions(exact=True))
+    (result,) = replay([first, second], ReplayOptions())
     assert result.run.cycles == len(numbers)
     assert result.identity is not None
     assert result.identity.explained

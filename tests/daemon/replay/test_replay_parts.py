@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-from jtqd.daemon.config import SafetySettings, load_config
+from jtqd.daemon.config import load_config
 from jtqd.daemon.core import estimate_pdo
 from jtqd.daemon.core.joint import Unwrap
-from jtqd.daemon.core.status import JointStatus
 from jtqd.daemon.loop.input_pdos import JointInputs, drive_places
 from jtqd.daemon.replay.compare import SETTLED_CYCLES, bits_equal, identity
-from jtqd.daemon.replay.estimates import fields, status_many
 from jtqd.daemon.replay.frames import Pdo, offsets
 from jtqd.daemon.replay.origin import SAMPLE
+from jtqd.daemon.replay.rows import fields
 from jtqd.daemon.replay.runs import BEGINS, LOST, lost_cycles, steps_of
-from jtqd.daemon.shared import cycle_record as cr
-from jtqd.daemon.shared import faults
 
 MS = 1_000_000
 CONFIG = load_config(None)
@@ -53,29 +49,6 @@ def test_fields_are_those_of_the_pdo() -> None:
     status = rng.choice([0, 1, 2, 3, 4, 5, 6, 15], len(torque)).astype(np.uint16)
     expected = [estimate_pdo.field(*each) for each in zip(torque, sigma, status.tolist(), strict=True)]
     assert list(zip(*(each.tolist() for each in fields(torque, sigma, status)), strict=True)) == expected
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_statuses_of_a_run_are_those_of_the_loop(seed: int) -> None:
-    """Stretches of random statuses and faults, late estimates, resets: as asked cycle by cycle."""
-    rng = np.random.default_rng(seed)
-    settings = SafetySettings()
-    asked = np.repeat(
-        rng.choice([0, 1, 2, 2, 2, 3, 4, 5, 6, 15], 80),
-        np.concatenate((rng.integers(1, 9, 60), rng.integers(20, 300, 20))),
-    ).astype(np.uint16)
-    log = records(list(range(len(asked))))
-    found = np.where(rng.random(len(asked)) < 0.01, faults.MOTOR_JUMP, 0).astype(np.int64)
-    log["cycle_flags"][rng.random(len(asked)) < 0.01] |= cr.FLAG_WITHDRAWN
-    log["cycle_flags"][rng.random(len(asked)) < 0.01] |= cr.FLAG_RESET
-    state = JointStatus(settings)
-    expected = []
-    for status, fault, flags in zip(asked.tolist(), found.tolist(), log["cycle_flags"].tolist(), strict=True):
-        if flags & cr.FLAG_RESET:
-            state.reset_latch()
-        said = state.update(status, fault)
-        expected.append(state.late() if flags & cr.FLAG_WITHDRAWN else said)
-    assert status_many(asked, found, log, settings).tolist() == expected
 
 
 def test_a_position_goes_on_with_the_turns_that_it_had() -> None:

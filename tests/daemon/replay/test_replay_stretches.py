@@ -35,41 +35,35 @@ def parts_of(log: Path, directory: Path, *ends: int) -> list[Path]:
     ]
 
 
-@pytest.mark.parametrize("exact", [True, False])
 @pytest.mark.parametrize("name", LOGS)
-def test_pieces_of_one_log_give_what_the_whole_gives(name: str, exact: bool) -> None:
+def test_pieces_of_one_log_give_what_the_whole_gives(name: str) -> None:
     log = GOLDEN / f"{name}.mcap"
-    (whole,) = replay([log], ReplayOptions(exact=exact))
-    pieces = list(replay_each([log], ReplayOptions(exact=exact), stretch=300))
+    (whole,) = replay([log], ReplayOptions())
+    pieces = list(replay_each([log], ReplayOptions(), stretch=300))
     assert len(pieces) > 2
     assert all(each.run.cycles < 600 for each in pieces)
     assert sum(each.run.cycles for each in pieces) == whole.run.cycles
     for number in (0, 1):
         for field in whole.joints[number].dtype.names:
             one, other = joined(pieces, number)[field], whole.joints[number][field]
-            if exact:
-                assert np.array_equal(one, other, equal_nan=True), field
-            else:
-                assert one == pytest.approx(other, abs=1e-9, nan_ok=True), field
+            assert np.array_equal(one, other, equal_nan=True), field
     assert all(each.good for each in pieces)
     assert all(each.identity is not None and not each.identity.unknown for each in pieces)
-    if exact and name != "network":  # recorded when ONNX Runtime evaluated the networks
+    if name != "network":  # recorded when ONNX Runtime evaluated the networks
         assert all(each.identity is not None and each.identity.whole for each in pieces)
 
 
-@pytest.mark.parametrize("exact", [True, False])
-def test_parts_of_a_run_are_joined_up_to_the_limit(tmp_path: Path, exact: bool) -> None:
+def test_parts_of_a_run_are_joined_up_to_the_limit(tmp_path: Path) -> None:
     """Parts of 400, 300, 300 and the rest with a limit of 700: two stretches or three, in any order of the files."""
     log = GOLDEN / "network.mcap"
     parts = parts_of(log, tmp_path / "p", 400, 700, 1000)
-    (whole,) = replay([log], ReplayOptions(exact=exact))
-    found = list(replay_each(parts[::-1], ReplayOptions(exact=exact), stretch=700))
+    (whole,) = replay([log], ReplayOptions())
+    found = list(replay_each(parts[::-1], ReplayOptions(), stretch=700))
     assert [[part.path.name[-6] for part in each.run.parts] for each in found] == [["1", "2"], ["3", "4"]]
     assert [each.run.cycles for each in found] == [700, len(cycles(log)) - 700]
     for number in (0, 1):
-        assert joined(found, number)["torque_nm"] == pytest.approx(
-            whole.joints[number]["torque_nm"], abs=0.0 if exact else 1e-9, nan_ok=True
-        )
+        one, other = joined(found, number)["torque_nm"], whole.joints[number]["torque_nm"]
+        assert np.array_equal(one, other, equal_nan=True)
     assert all(each.good for each in found)
 
 
@@ -89,7 +83,7 @@ def test_a_difference_in_a_later_stretch_is_found(tmp_path: Path) -> None:
         return data[: at + 5] + bytes((data[at + 5] ^ 4,)) + data[at + 6 :]
 
     spoilt = cut(log, tmp_path / "a.mcap", payload=payload)
-    found = list(replay_each([spoilt], ReplayOptions(exact=True), stretch=400))
+    found = list(replay_each([spoilt], ReplayOptions(), stretch=400))
     assert sum(each.run.cycles for each in found) == len(numbers)
     assert [each.good for each in found] == [True] * (len(found) - 1) + [False]
     assert found[-1].identity is not None
@@ -110,7 +104,7 @@ def test_only_one_stretch_is_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
         return result
 
     monkeypatch.setattr(session, "_replay_run", counting)
-    results = replay_each([GOLDEN / "network.mcap"], ReplayOptions(exact=True), stretch=300)
+    results = replay_each([GOLDEN / "network.mcap"], ReplayOptions(), stretch=300)
     while (result := next(results, None)) is not None:
         del result
     assert alive == [0, 0, 0]
