@@ -67,9 +67,9 @@ def _ticks() -> tuple[int, int]:
     return sum(fields) - idle, sum(fields)
 
 
-def traffic(directory: Path, where: Cpus, bitrate: int | None = None) -> Process:
+def traffic(directory: Path, where: Cpus, bitrate: int | None = None, period_us: int = 1000) -> Process:
     """Start the bench's traffic on `directory`/bus; with a bit rate its frames come as far apart as on a wire."""
-    arguments = ["" if each is None else str(each) for each in (where.traffic, bitrate)]
+    arguments = ["" if each is None else str(each) for each in (where.traffic, bitrate, period_us)]
     return Process(python("traffic", str(directory / "bus"), *arguments), "the traffic source")
 
 

@@ -1,4 +1,4 @@
-"""Instructions of one joint's step, counted by callgrind: no noise of a machine touches them.
+"""Instructions of one joint's step, and of one whole cycle, counted by callgrind: no noise of a machine touches them.
 
     python -m tests.benchmarks.instructions [--store WHY]
 
@@ -18,20 +18,36 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from jtqd.daemon.config import load_config
+from jtqd.daemon.loop import process as loop
+from jtqd.daemon.shared.snapshot import SnapshotReader
+from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.estimator import load_network, make_estimator, onnx_graph
 from jtqd.estimator.joint import Agreement
 from jtqd.estimator.settings import recommended
+from jtqd.estimator.status import PUBLISHED
 from jtqd.models.files import load_joint, shipped
+from tests.benchmarks.fixture import Fixture
+from tests.benchmarks.host import Cpus, traffic
 
 STORED = Path(__file__).with_name("instructions.json")
 SAMPLES = 2000
 METHODS = ("tob", "efficiency", "network", "fused")
-_STEP = "__pyx_f_4jtqd_9estimator_9estimator_*Estimator_advance"
+STEPS = ("__pyx_f_4jtqd_9estimator_9estimator_*Estimator_advance",)
+STAGES = tuple(
+    f"__pyx_f_4jtqd_6daemon_4core_5cycle_5Cycle_{stage}"
+    for stage in ("begin", "gather", "observe", "publish", "record")
+)
+CYCLE = "cycle"
+"""Two joints, method `fused`, of SYNC to the record; what the kernel does in its system calls is not counted."""
+SLOTS, PERIOD_US = 150, 20_000
+"""Under valgrind a cycle takes some milliseconds."""
 
 
 def work(method: str) -> None:
@@ -51,15 +67,42 @@ def work(method: str) -> None:
     assert np.isfinite(run.torque_nm[1:]).all()
 
 
+def cycles() -> None:
+    """Go through the loop's own cycle on a unix bus, beside the bench's traffic: what is counted."""
+    with tempfile.TemporaryDirectory() as name:
+        directory = Path(name)
+        original = shipped("bench.yaml")
+        text = original.read_text(encoding="utf-8").replace("trained/", f"{original.parent}/trained/")
+        configuration = directory / "bench.yaml"
+        configuration.write_text(text.replace("period_us: 1000", f"period_us: {PERIOD_US}"), encoding="utf-8")
+        config = load_config(configuration)
+        source = traffic(directory, Cpus(None, None), period_us=PERIOD_US)
+        estimators = [loop.build_estimator(config, joint) for joint in config.joints]
+        request = {
+            "ring": str(directory / "ring"),
+            "snapshot": str(directory / "snapshot"),
+            "worst_load": 0.0,
+        }
+        socket = open_frame_socket(f"unix:{directory / 'bus'}", loop.loop_filters(config), receive_own=True)
+        cycle, grid = loop.build_cycle(config, request, Fixture(directory).report, socket, estimators)
+        grid.slot_ns = time.monotonic_ns() + grid.period_ns
+        cycle.go_on(SLOTS, 0)
+        view = SnapshotReader(directory / "snapshot").read()
+        source.end()
+        torques = min(sum(spent[code] for code in PUBLISHED) for spent in view.status_cycles)
+        assert torques > SLOTS // 2, f"found {torques} cycles of {SLOTS} with a torque"
+
+
 def count(method: str) -> float:
-    """Return the instructions of one sample. Raises RuntimeError where they cannot be counted."""
+    """Return the instructions of one sample, or of one CYCLE. Raises RuntimeError where they cannot be counted."""
+    counted = [f"--toggle-collect={each}" for each in (STAGES if method == CYCLE else STEPS)]
     if shutil.which("valgrind") is None:
         raise RuntimeError("found no valgrind")
     with tempfile.TemporaryDirectory() as directory:
         out = Path(directory) / "callgrind.out"
         done = subprocess.run(
             [
-                *("valgrind", "--tool=callgrind", "--collect-atstart=no", f"--toggle-collect={_STEP}"),
+                *("valgrind", "--tool=callgrind", "--collect-atstart=no", *counted),
                 *(f"--callgrind-out-file={out}", sys.executable, "-m", "tests.benchmarks.instructions"),
                 *("--work", method),
             ],
@@ -76,7 +119,7 @@ def count(method: str) -> float:
         found = re.search(r"^(?:totals|summary): (\d+)", out.read_text(), re.MULTILINE)
     if found is None or int(found[1]) == 0:
         raise RuntimeError("callgrind has counted nothing: is the build stripped?")
-    return int(found[1]) / SAMPLES
+    return int(found[1]) / (SLOTS if method == CYCLE else SAMPLES)
 
 
 def main() -> int:
@@ -85,23 +128,24 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--store", metavar="WHY", help="store them, with this reason")
-    parser.add_argument("--work", choices=METHODS, help=argparse.SUPPRESS)
+    parser.add_argument("--work", choices=(*METHODS, CYCLE), help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.work:
         onnx_graph._LONGEST_S = math.inf  # type: ignore[misc]  # valgrind takes fifty times as long
-        work(options.work)
+        cycles() if options.work == CYCLE else work(options.work)
         return 0
-    counts = {method: round(count(method), 1) for method in METHODS}
-    stored = json.loads(STORED.read_text())["per_step"] if STORED.exists() else {}
+    counts = {method: round(count(method), 1) for method in (*METHODS, CYCLE)}
+    stored = json.loads(STORED.read_text())["instructions"] if STORED.exists() else {}
     for method, now in counts.items():
         before = stored.get(method)
+        what = "cycle of two joints" if method == CYCLE else "joint and sample"
         change = "" if not before else f"  stored {before:8.1f}  {100.0 * (now / before - 1.0):+.1f} %"
-        print(f"{method:12}{now:10.1f} instructions per joint and sample{change}")
+        print(f"{method:12}{now:10.1f} instructions per {what}{change}")
     if options.store:
         compiler = subprocess.run(
             ["cc", "--version"], capture_output=True, text=True, check=True
         ).stdout.splitlines()[0]
-        content = {"compiler": compiler, "why": options.store, "per_step": counts}
+        content = {"compiler": compiler, "why": options.store, "instructions": counts}
         STORED.write_text(json.dumps(content, indent=2) + "\n")
     return 0
 

@@ -8,7 +8,7 @@ import subprocess
 
 import pytest
 
-from tests.benchmarks.instructions import METHODS, STORED, count
+from tests.benchmarks.instructions import CYCLE, METHODS, STORED, count
 
 WITHIN = 0.05
 
@@ -23,7 +23,11 @@ def compiler() -> str:
 
 
 @pytest.mark.parametrize(
-    "method", [pytest.param(each, marks=() if each == "fused" else pytest.mark.campaign) for each in METHODS]
+    "method",
+    [
+        pytest.param(each, marks=() if each in ("fused", CYCLE) else pytest.mark.campaign)
+        for each in (*METHODS, CYCLE)
+    ],
 )
 def test_a_step_costs_what_it_did(method: str) -> None:
     stored = json.loads(STORED.read_text())
@@ -31,6 +35,6 @@ def test_a_step_costs_what_it_did(method: str) -> None:
         pytest.skip("found no valgrind: instructions cannot be counted here")
     if compiler() != stored["compiler"]:
         pytest.skip(f"found the compiler {compiler()}, the stored counts are of {stored['compiler']}")
-    assert count(method) == pytest.approx(stored["per_step"][method], rel=WITHIN), (
+    assert count(method) == pytest.approx(stored["instructions"][method], rel=WITHIN), (
         "on purpose: python -m tests.benchmarks.instructions --store WHY"
     )

@@ -1,8 +1,8 @@
 """The traffic of the bench, the same for every contender: five TPDOs per SYNC with values that vary like a robot's.
 
-`python -m tests.benchmarks.traffic PATH CPU BITRATE` (the last two may be empty) runs it: a hub on a unix socket with
-one lean node that answers each SYNC with the next cycle of a table of finished frames. It does no arithmetic while it
-runs, so that it has answered long before the inputs are due.
+`python -m tests.benchmarks.traffic PATH CPU BITRATE PERIOD_US` (CPU and bit rate may be empty) runs it: a hub on a unix
+socket with one lean node that answers each SYNC with the next cycle of a table of finished frames. It does no arithmetic
+while it runs, so that it has answered long before the inputs are due.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ _POSITION, _MOTION, _SENSOR = struct.Struct("<ii"), struct.Struct("<ihH"), struc
 _PRIORITY = 50
 
 
-def cycle_frames(cycle: int) -> list[bytes]:
+def cycle_frames(cycle: int, period_s: float = 1e-3) -> list[bytes]:
     """The five TPDOs of one cycle as `struct can_frame`, in the order of their identifiers.
 
     Both joints swing through all four quadrants and through standstill, sometimes beyond the network's envelope.
     """
     phase = 2.0 * pi * (cycle % CYCLES) / CYCLES
-    omega = 2.0 * pi / (CYCLES * 1e-3)
+    omega = 2.0 * pi / (CYCLES * period_s)
     velocity = 1.2 * cos(phase) + 0.3 * cos(3.0 * phase)  # joint side [rad/s]
     angle = (1.2 * sin(phase) + 0.1 * sin(3.0 * phase)) / omega
     torque = 9.0 * sin(2.0 * phase + 0.4) + 2.0 * sin(7.0 * phase)
@@ -54,10 +54,10 @@ def cycle_frames(cycle: int) -> list[bytes]:
     return [positions[0], positions[1], sensor, motions[0], motions[1]]
 
 
-def serve(path: str, cpu: int | None, bitrate: int | None) -> None:
+def serve(path: str, cpu: int | None, bitrate: int | None, period_s: float) -> None:
     """Answer every SYNC on the hub at `path` until it is killed; prints one line when it is ready."""
     punctual(cpu, _PRIORITY)  # drives answer in time whatever else runs on a controller
-    table = [cycle_frames(cycle) for cycle in range(CYCLES)]
+    table = [cycle_frames(cycle, period_s) for cycle in range(CYCLES)]
     hub = Hub(path, bitrate)
     step = 0
 
@@ -75,5 +75,5 @@ def serve(path: str, cpu: int | None, bitrate: int | None) -> None:
 
 
 if __name__ == "__main__":
-    _, _path, _cpu, _bitrate = sys.argv
-    serve(_path, int(_cpu) if _cpu else None, int(_bitrate) if _bitrate else None)
+    _, _path, _cpu, _bitrate, _period_us = sys.argv
+    serve(_path, int(_cpu) if _cpu else None, int(_bitrate) if _bitrate else None, 1e-6 * int(_period_us))
