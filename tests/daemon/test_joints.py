@@ -142,7 +142,7 @@ def test_a_run_and_its_log(tmp_path: Path, joints: int, sensor: bool) -> None:
         assert np.isfinite(state["sensor_torque_nm"]).any() == sensor
         assert (state["status"] == 4).mean() < 0.2
     check_frames(run, states)
-    (result,) = replay([run.log], ReplayOptions(exact=True))
+    (result,) = replay([run.log], ReplayOptions())
     assert result.identity is not None
     assert result.identity.whole
     assert result.identity.pdos_equal == result.identity.pdos > 0
