@@ -202,8 +202,11 @@ def _with_fewer(  # noqa: PLR0917
     for other in (*beside.values(), *(search.hypothesis(chosen, found.best.model) for chosen in sets)):
         if compared.clearly_better(other) and compared.nm(other) < compared.nm(kept):
             refined = refine(dataset, present_effects(other), noise)
-            if not objections(dataset, other, refined):
-                kept = other
+            if objections(dataset, other, refined):
+                continue
+            if found.beside and _proven(dataset, search, other, refined, noise, joints)[0] is not other:
+                continue  # beside what is left over it has to be as certain as any cause
+            kept = other
     proven = refine(
         dataset, present_effects(kept), noise
     )  # also where nothing is kept: torsion is set by the last one
