@@ -198,15 +198,11 @@ def _with_fewer(  # noqa: PLR0917
         for key, (c, _) in gone.items()
         if search.fits_beside(c, found.best.chosen)
     }
-    kept = found.best
-    for other in (*beside.values(), *(search.hypothesis(chosen, found.best.model) for chosen in sets)):
-        if compared.clearly_better(other) and compared.nm(other) < compared.nm(kept):
-            refined = refine(dataset, present_effects(other), noise)
-            if objections(dataset, other, refined):
-                continue
-            if found.beside and _proven(dataset, search, other, refined, noise, joints)[0] is not other:
-                continue  # beside what is left over it has to be as certain as any cause
-            kept = other
+    tried = [
+        *beside.items(),
+        *((None, search.hypothesis(chosen, found.best.model)) for chosen in sets),
+    ]
+    kept, why = _borne_out(dataset, found, compared, tried, noise, joints)
     proven = refine(
         dataset, present_effects(kept), noise
     )  # also where nothing is kept: torsion is set by the last one
@@ -215,7 +211,9 @@ def _with_fewer(  # noqa: PLR0917
     for key, (c, runs) in gone.items():
         if key not in there:
             with_it = beside.get(key) or search.hypothesis([c], found.best.model)
-            said.append(Gone(c, tuple(runs), (compared.nm(with_it), compared.nm(kept))).text)
+            said.append(
+                Gone(c, tuple(runs), (compared.nm(with_it), compared.nm(kept)), why.get(key, "")).text
+            )
     if kept is not found.best:
         same = found.whole is found.best
         found = replace(found, best=kept, proven=proven)
@@ -223,6 +221,35 @@ def _with_fewer(  # noqa: PLR0917
             found = replace(found, whole=kept, refined=proven)
         classes = _classes(search, found)
     return found, classes, said
+
+
+def _borne_out(  # noqa: PLR0917
+    dataset: Dataset,
+    found: _Found,
+    compared: Compared,
+    tried: Sequence[tuple[Key | None, Hypothesis]],
+    noise: Noise,
+    joints: Mapping[int, Joint],
+) -> tuple[Hypothesis, dict[Key, str]]:
+    """Return the set that predicts the runs left out best, what is named included, and what speaks against an effect (by its
+    key) that would have been better. Beside what is left over all have to be as certain as any cause.
+    """
+    kept, why = found.best, {}
+    for key, other in tried:
+        if not compared.clearly_better(other) or compared.nm(other) >= compared.nm(kept):
+            continue
+        refined = refine(dataset, present_effects(other), noise)
+        against = objections(dataset, other, refined)
+        unsteady = (
+            found.beside
+            and not against
+            and (_proven(dataset, compared.search, other, refined, noise, joints)[0] is not other)
+        )
+        if not against and not unsteady:
+            kept = other
+        elif key is not None:
+            why[key] = against[0][1] if against else _UNSTEADY
+    return kept, why
 
 
 def named(  # noqa: PLR0917
