@@ -112,14 +112,12 @@ def write_secret(directory: Path, name: str) -> Path:
 
 
 def write_config(path: Path, joint_files: Mapping[int, Path], method: str) -> Path:
-    """Write a configuration of jtqd for the bench: these joint files, this method, no network. Raises OSError."""
+    """Write a configuration of jtqd for the bench: these joint files, this method. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     mapping: dict[str, Any] = load_yaml(shipped("bench.yaml"))
     mapping["estimator"] = {**mapping["estimator"], "method": method}
     for number, file in joint_files.items():
-        joint = mapping[f"joint_{number}"]
-        joint["file"] = str(file.resolve())
-        joint.pop("network", None)
+        mapping[f"joint_{number}"]["file"] = str(file.resolve())
     path.write_text(yaml.safe_dump(mapping, sort_keys=False), encoding="utf-8")
     return path
 

@@ -214,14 +214,16 @@ def _write_outside_plan(path: Path, seed: int, count: int) -> None:
 
 
 def write_config(path: Path, name: str) -> None:
-    """Write a shipped configuration beside the models that are there, with their hashes; without networks that are not."""
+    """Write a shipped configuration beside the models that are there, with the networks of its method, if there are some."""
     text = shipped(name).read_text(encoding="utf-8").replace(f" {TRAINED}/", " ")
+    text = re.sub(r"  network:\n    file: .*\n    sha256: .*\n", "", text)
+    ending = ".fused.onnx" if "  method: fused" in text else ".onnx"
 
-    def renewed(match: re.Match[str]) -> str:
-        if not (path.parent / match[2]).exists():
-            return ""
-        digest = hashlib.sha256((path.parent / match[2]).read_bytes()).hexdigest()
-        return f"{match[1]}{match[2]}{match[3]}{digest}\n"
+    def with_network(joint: re.Match[str]) -> str:
+        file = path.parent / f"{joint[1]}{ending}"
+        if not file.exists():
+            return joint[0]
+        digest = hashlib.sha256(file.read_bytes()).hexdigest()
+        return f"{joint[0]}  network:\n    file: {file.name}\n    sha256: {digest}\n"
 
-    text = re.sub(r"([^\S\n]*network:\s*\n\s+file: )(\S+)(\s*\n\s+sha256: )[0-9a-f]{64}\n", renewed, text)
-    path.write_text(text, encoding="utf-8")
+    path.write_text(re.sub(r"  file: (joint\d)\.yaml\n", with_network, text), encoding="utf-8")

@@ -30,11 +30,13 @@ from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.estimator import load_network, make_estimator, onnx_graph
 from jtqd.estimator.joint import Agreement
+from jtqd.estimator.methods import AnyNetwork
 from jtqd.estimator.settings import recommended
 from jtqd.estimator.status import PUBLISHED
 from jtqd.models.files import load_joint, shipped
-from tests.benchmarks.fixture import Fixture
+from tests.benchmarks.fixture import Fixture, small_network
 from tests.benchmarks.host import Cpus, traffic
+from tests.estimator.fused_configuration import network_of
 
 STORED = Path(__file__).with_name("instructions.json")
 SAMPLES = 2000
@@ -52,19 +54,26 @@ SLOTS, PERIOD_US = 150, 20_000
 
 def work(method: str) -> None:
     """Estimate a run: what is counted."""
-    fused = method == "fused"
-    name = "trained/joint1.fused.onnx" if fused else "trained/joint1.onnx"
-    network = load_network(method, str(shipped(name))) if method in ("network", "fused") else None
     joint = load_joint(shipped("trained/joint1.yaml"))
     assert joint.fused is not None
     joint = replace(joint, fused=replace(joint.fused, agreement=Agreement(0.4, 0.5, 0.004, 0.15)))
-    estimator = make_estimator(joint, recommended(method), network)
+    with tempfile.TemporaryDirectory() as directory:
+        estimator = make_estimator(joint, recommended(method), _network(method, Path(directory)))
     time = np.arange(SAMPLES) * 1e-3
     angle = np.sin(3.0 * time)
     run = estimator.run(
         np.full(SAMPLES, 1e-3), 3.0 * np.cos(5.0 * time), 100.0 * angle, 300.0 * np.cos(3.0 * time), angle
     )
     assert np.isfinite(run.torque_nm[1:]).all()
+
+
+def _network(method: str, directory: Path) -> AnyNetwork | None:
+    """Return one of the paper's form and size, or of ours, whatever is shipped."""
+    if method not in ("network", "fused"):
+        return None
+    file = directory / "network.onnx"
+    file.write_bytes(small_network(1).onnx("joint1") if method == "network" else network_of(1))
+    return load_network(method, str(file))
 
 
 def cycles() -> None:

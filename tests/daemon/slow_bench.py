@@ -7,17 +7,13 @@ from typing import Any
 
 import yaml
 
-from jtqd.models.files import shipped
+from tests.shipped_bench import shipped_bench
 
 
 def slow_configuration(directory: Path, period_us: int, **sections: Any) -> Path:
     """Write it to `directory`/c.yaml; sections: those that are replaced."""
-    content = {**yaml.safe_load(shipped("bench.yaml").read_text()), **sections}
+    content = {**shipped_bench(), **sections}
     content["sync"]["period_us"] = period_us
-    for joint in ("joint_1", "joint_2"):
-        content[joint]["file"] = str(shipped(content[joint]["file"]))
-        if "network" in content[joint]:
-            content[joint]["network"]["file"] = str(shipped(content[joint]["network"]["file"]))
     path = directory / "c.yaml"
     path.write_text(yaml.safe_dump(content))
     return path

@@ -43,7 +43,7 @@ def test_the_shipped_configuration_is_read() -> None:
         method="fused", bandwidth_rad_s=200.0, torsion_bandwidth_rad_s=800.0, track_zeros=True
     )
     assert config.realtime == Realtime(80, None, True)
-    assert all(joint.network is not None and joint.temperature for joint in config.joints)
+    assert all(joint.network is None and joint.temperature for joint in config.joints)
 
 
 def test_what_is_left_out_has_its_default(tmp_path: Path) -> None:

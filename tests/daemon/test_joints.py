@@ -21,8 +21,8 @@ from jtqd.daemon.logs.can_frames import iter_frames
 from jtqd.daemon.replay.session import ReplayOptions, replay
 from jtqd.drivers.can_unix import UnixBus
 from jtqd.drivers.eds import own_objects
-from jtqd.models.files import shipped
 from tests.paths import ROOT
+from tests.shipped_bench import shipped_bench
 
 canopen = pytest.importorskip("canopen")
 pytestmark = pytest.mark.native
@@ -30,12 +30,10 @@ pytestmark = pytest.mark.native
 
 def configuration(directory: Path, joints: int, *, sensor: bool) -> Path:
     """Pairs of the shipped bench; with more than two joints at 500 Hz, the sensor then being node 5 with two channels."""
-    content = yaml.safe_load(shipped("bench.yaml").read_text())
+    content = shipped_bench()
     pair = content.pop("joint_1"), content.pop("joint_2")
     for n in range(joints):
         joint = yaml.safe_load(yaml.safe_dump(pair[n % 2])) | {"node": n + 1, "sensor_channel": 1 + n // 2}
-        joint["file"] = str(shipped(joint["file"]))
-        joint["network"]["file"] = str(shipped(joint["network"]["file"]))
         if not sensor:
             del joint["sensor_channel"]
         content[f"joint_{n + 1}"] = joint

@@ -29,6 +29,7 @@ from jtqd.models.files import shipped
 from tests.drivers.hub_helpers import until_it_listens
 from tests.estimator.fused_configuration import configured, networks
 from tests.paths import JTQD_EDS
+from tests.shipped_bench import shipped_bench
 
 pytestmark = pytest.mark.native
 
@@ -349,11 +350,7 @@ def test_usage(arguments: list[str], environment: dict[str, str]) -> None:
 
 
 def configuration(directory: Path, **changes: object) -> str:
-    content = yaml.safe_load(shipped("bench.yaml").read_text())
-    for joint in ("joint_1", "joint_2"):
-        content[joint]["file"] = str(shipped(content[joint]["file"]))
-        if "network" in content[joint]:
-            content[joint]["network"]["file"] = str(shipped(content[joint]["network"]["file"]))
+    content = shipped_bench()
     for key, value in changes.items():
         section, _, name = key.partition("__")
         if name:

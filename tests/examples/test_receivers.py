@@ -23,8 +23,8 @@ from jtqd.daemon.core import contact_pdo, estimate_pdo
 from jtqd.drivers.can_unix import UnixBus
 from jtqd.drivers.hub import Hub
 from jtqd.estimator import contact, status
-from jtqd.models.files import shipped
 from tests.paths import ROOT
+from tests.shipped_bench import shipped_bench
 
 # -7.75 Nm, sigma 0.2 Nm, valid; joint 2 stale; SYNC counter 42
 FRAME = bytes.fromhex("f9fc 0080 04 ff 42 2a")
@@ -393,12 +393,8 @@ def test_beside_jtqd_withheld_late_and_lost_estimates(program, tmp_path: Path) -
 
 def with_contacts(directory: Path) -> Path:
     """Write the shipped configuration with section contact; return its path."""
-    content = yaml.safe_load(shipped("bench.yaml").read_text())
-    for joint in (content["joint_1"], content["joint_2"]):
-        for section in (joint, joint["network"]):
-            section["file"] = str(shipped(section["file"]))
     path = directory / "contact.yaml"
-    path.write_text(yaml.safe_dump(content | {"contact": {"opposed": True}}))
+    path.write_text(yaml.safe_dump(shipped_bench() | {"contact": {"opposed": True}}))
     return path
 
 

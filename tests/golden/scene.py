@@ -77,7 +77,7 @@ def configuration(scene: Scene, directory: Path) -> Path:
     content["inputs"] = {"wait_us": 500, "deadline_us": 850}
     for number in (1, 2):
         joint = content[f"joint_{number}"]
-        for section in (joint, joint["network"]):
+        for section in (joint, *([joint["network"]] if "network" in joint else [])):
             shutil.copy(
                 shipped(section["file"]), directory
             )  # its name is enough: no path of this machine is in the log

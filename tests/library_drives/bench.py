@@ -112,8 +112,7 @@ class LibraryBench:
         content["safety"] = {"latch": []}
         for number in (1, 2):
             joint = content[f"joint_{number}"]
-            for key in ("network", "temperature"):
-                del joint[key]
+            del joint["temperature"]
             joint["file"] = str(shipped(f"joint{number}.yaml"))
         for key, value in changes.items():
             content[key] = {**content.get(key, {}), **value} if isinstance(value, dict) else value

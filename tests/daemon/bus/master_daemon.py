@@ -25,6 +25,7 @@ from jtqd.drivers.frame import FRAME, pack
 from jtqd.drivers.frame_socket import BusDown, open_frame_socket
 from jtqd.models.files import shipped
 from tests.drivers.canopen_nodes import TestNode, sensor_store
+from tests.shipped_bench import shipped_bench
 
 INTERFACE = os.environ.get("JTQD_CAN_INTERFACE", "vcan0")
 STALE = 4
@@ -66,10 +67,9 @@ class Daemon:
         self.reader = SnapshotReader(snapshot)
 
     def _configuration(self, changes: dict[str, Any]) -> str:
-        content = yaml.safe_load(shipped("bench.yaml").read_text())
+        content = shipped_bench()
         content["estimator"] = {"method": "efficiency"}
         for number in (1, 2):
-            content[f"joint_{number}"].pop("network")
             content[f"joint_{number}"]["file"] = str(shipped(f"joint{number}.yaml"))
         content.update(changes)
         path = self.directory / "c.yaml"

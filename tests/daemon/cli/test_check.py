@@ -21,8 +21,8 @@ from jtqd.daemon.loop.realtime import stolen_s
 from jtqd.daemon.shared.conditions import Condition
 from jtqd.daemon.shared.notices import ERROR, WARNING
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, stuffed_bits
-from jtqd.models.files import shipped
 from tests.drivers.hub_helpers import until_it_listens
+from tests.shipped_bench import shipped_bench
 
 pytestmark = pytest.mark.native
 
@@ -133,11 +133,7 @@ def test_late_twice_and_wrong_frames_are_told_apart(config: Config) -> None:
 
 def by_itself(tmp_path: Path) -> Config:
     """Drive 1 sends its positions by itself; they count for 5 ms."""
-    content = yaml.safe_load(shipped("bench.yaml").read_text())
-    for number in (1, 2):
-        joint = content[f"joint_{number}"]
-        joint["file"] = str(shipped(joint["file"]))
-        del joint["network"]
+    content = shipped_bench()
     content["joint_1"] |= {
         "max_age_ms": 5,
         "tpdos": [

@@ -78,8 +78,8 @@ def test_a_network_that_does_not_load_is_found_before_the_daemon_starts(
     doctor: Doctor, tmp_path: Path
 ) -> None:
     shutil.copytree(shipped("bench.yaml").parent / "trained", tmp_path / "trained")
-    text = shipped("bench.yaml").read_text()
-    (tmp_path / "trained" / "joint1.fused.onnx").write_bytes(b"not a network")
+    text = shipped("bench_paper.yaml").read_text()
+    (tmp_path / "trained" / "joint1.onnx").write_bytes(b"not a network")
     (tmp_path / "bench.yaml").write_text(text)
     _, found = doctor("--bus", "sim", "--config", str(tmp_path / "bench.yaml"))
     assert level(found, "configuration") == FAIL

@@ -34,7 +34,6 @@ def config_with(directory: Path, tpdos: Any, **more: Any) -> Config:
     content["estimator"] = {"method": "efficiency"}
     for number in (1, 2):
         content[f"joint_{number}"]["file"] = str(shipped(f"joint{number}.yaml"))
-        del content[f"joint_{number}"]["network"]
         content[f"joint_{number}"]["temperature"] = False
     content["joint_1"] |= {"tpdos": tpdos, **more}
     path = directory / "c.yaml"

@@ -15,7 +15,7 @@ from jtqd.daemon.core.counters import frame_counts
 from jtqd.daemon.core.intake import Intake, JointTemperature
 from jtqd.daemon.loop.input_pdos import InputPdo, joint_temperatures
 from jtqd.daemon.loop.process import joint_inputs
-from jtqd.models.files import shipped
+from tests.shipped_bench import shipped_bench
 
 POSITION = InputPdo(0x181, 8, struct.Struct("<ii"), 1, "181h drive 1 TPDO1")
 NAME = "381h drive 1 TPDO3"
@@ -166,12 +166,10 @@ def test_two_users_of_one_identifier_are_refused() -> None:
 
 @pytest.mark.parametrize("have", [(), (1,), (2,), (1, 2)])
 def test_each_joint_finds_its_own(tmp_path: Path, have: tuple[int, ...]) -> None:
-    content = yaml.safe_load(shipped("bench.yaml").read_text())
+    content = shipped_bench()
     content["estimator"] = {"method": "tob"}
     for number in (1, 2):
-        section = content[f"joint_{number}"]
-        section |= {"file": str(shipped(section["file"])), "temperature": number in have}
-        del section["network"]
+        content[f"joint_{number}"]["temperature"] = number in have
     path = tmp_path / "c.yaml"
     path.write_text(yaml.safe_dump(content))
     config = load_config(path)

@@ -15,6 +15,7 @@ from jtqd.estimator.estimator import FusedEstimator, JointEstimator
 from jtqd.estimator.onnx_graph import NetworkError
 from tests.estimator.estimator_helpers import small_network
 from tests.estimator.fused_configuration import configured, joint_of, networks
+from tests.estimator.fused_helpers import fused_network
 
 JOINTS = (1, 2)
 
@@ -51,9 +52,12 @@ def notes(config: Config) -> list[str]:
 
 
 def test_a_joint_that_is_its_physics_alone_is_told(tmp_path: Path) -> None:
-    shipped_ones = load_config(None)
-    expected = "joint {0}: no network, physics only (joint{0}.fused.onnx has the share 0: envelope and calibration only)"
-    assert notes(shipped_ones) == [expected.format(number) for number in JOINTS]
+    assert notes(load_config(None)) == [f"joint {number}: no network, physics only" for number in JOINTS]
+    nothing = {number: fused_network(joint=f"joint{number}", noise=0.0).data for number in JOINTS}
+    expected = (
+        "joint {0}: no network, physics only (n{0}.onnx has the share 0: envelope and calibration only)"
+    )
+    assert notes(load_config(configured(tmp_path, "fused", nothing))) == [expected.format(n) for n in JOINTS]
     half = load_config(configured(tmp_path, "fused", {1: networks()[1]}))
     assert notes(half) == ["joint 2: no network, physics only"]
 

@@ -20,6 +20,7 @@ from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import load_joint, shipped
 from tests.daemon.loop.cycle_helpers import SCALE
 from tests.daemon.loop.one_drive import MS, OneDrive, config_with
+from tests.shipped_bench import shipped_bench
 
 BOTH = cr.FLAG_POSITION | cr.FLAG_MOTION
 JOINT = load_joint(shipped("joint1.yaml"))
@@ -153,13 +154,8 @@ def test_what_a_derived_velocity_costs(tmp_path: Path) -> None:
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(tmp_path: Path, method: str, objects: Any, said: str) -> None:
-    content = yaml.safe_load(shipped("bench.yaml").read_text())
+    content = shipped_bench("bench_paper.yaml")
     content["estimator"] = {"method": method}
-    for number in (1, 2):
-        joint = content[f"joint_{number}"]
-        joint["file"] = str(shipped(joint["file"]))
-        if method in ("network", "fused"):
-            joint["network"]["file"] = str(shipped(joint["network"]["file"]))
     content["joint_1"]["objects"] = objects
     (tmp_path / "c.yaml").write_text(yaml.safe_dump(content))
     with pytest.raises(ConfigError) as caught:

@@ -214,7 +214,6 @@ def test_two_joints_with_files_of_one_name_have_two_attachments(tmp_path):
     content = yaml.safe_load(shipped("bench.yaml").read_text())
     content["estimator"] = {"method": "efficiency"}
     for number in (1, 2):
-        content[f"joint_{number}"].pop("network")
         content[f"joint_{number}"]["file"] = f"arm{number}/joint.yaml"
     (tmp_path / "c.yaml").write_text(yaml.safe_dump(content))
     where = {name: tmp_path / name for name in ("directory", "ring", "progress", "snapshot", "notices")}

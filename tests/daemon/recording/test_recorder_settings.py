@@ -58,8 +58,8 @@ def test_what_is_wrong_is_named(key, value):
 
 
 def test_request_carries_all_that_a_log_must_hold(tmp_path):
-    """From the shipped configuration to the attachments, byte for byte; joint files and networks by their hashes."""
-    config = load_config(None)
+    """From the shipped configuration of the paper's chain to the attachments, byte for byte; joint files and networks by their hashes."""
+    config = load_config(shipped("bench_paper.yaml"))
     nodes = {str(n): {"scaling": SCALING} for n in (1, 2)} | {"3": {"scaling": {"nm_per_unit": {"1": 0.001}}}}
     content = recording_request(
         config,
@@ -79,7 +79,7 @@ def test_request_carries_all_that_a_log_must_hold(tmp_path):
     assert problems == []
     files = {item.name: item.data for item in loaded}
     assert len(files) == len(loaded), "two attachments of one name"
-    assert files["configuration.yaml"] == Path(shipped("bench.yaml")).read_bytes()
+    assert files["configuration.yaml"] == Path(shipped("bench_paper.yaml")).read_bytes()
     assert b"BO_ 385 drive_1_TPDO1" in files["bus.dbc"]
     assert {"drive.eds", "jtqd.eds", "torque_sensor.eds"} <= files.keys()
     provenance = json.loads(files["provenance.json"])
@@ -95,7 +95,7 @@ def test_request_carries_all_that_a_log_must_hold(tmp_path):
 def test_what_is_attached_is_what_was_read_whatever_becomes_of_the_files(tmp_path):
     """Files edited, or gone, after the configuration was read: a recorder that starts later attaches what is in force."""
     shutil.copytree(shipped("bench.yaml").parent / "trained", tmp_path / "trained")
-    shutil.copy(shipped("bench.yaml"), tmp_path / "bench.yaml")
+    shutil.copy(shipped("bench_paper.yaml"), tmp_path / "bench.yaml")
     read = {path.name: path.read_bytes() for path in (tmp_path / "trained").iterdir()}
     config = load_config(tmp_path / "bench.yaml")
     (tmp_path / "trained" / "joint1.yaml").write_text("name: edited without a reload\n")
@@ -113,4 +113,4 @@ def test_what_is_attached_is_what_was_read_whatever_becomes_of_the_files(tmp_pat
     joint = json.loads(files["provenance.json"])["joints"]["1"]
     assert joint["file_sha256"] == hashlib.sha256(read["joint1.yaml"]).hexdigest()
     assert files[joint["network"]] == read[joint["network"]]
-    assert files["configuration.yaml"] == Path(shipped("bench.yaml")).read_bytes()
+    assert files["configuration.yaml"] == Path(shipped("bench_paper.yaml")).read_bytes()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import struct
@@ -11,12 +12,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from jtqd.daemon.logs import read_attachments, read_topic
 from jtqd.daemon.replay.command import main
 from jtqd.daemon.replay.session import ReplayOptions, replay
 from tests.daemon.replay.replay_helpers import cut, cycles, provenance
+from tests.estimator.fused_configuration import networks
 from tests.paths import GOLDEN
+from tests.shipped_bench import shipped_bench
 
 pytestmark = pytest.mark.native
 
@@ -26,12 +30,21 @@ VALUES = 4 + 24 + 16
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """2.2 s of jtqd on the emulated bench, method fused, in real time: with whatever the machine did meanwhile."""
+    """2.2 s of jtqd on the emulated bench, method fused with networks, in real time: with whatever the machine did."""
     directory = tmp_path_factory.mktemp("recorded")
+    content = shipped_bench()
+    for number, data in networks().items():
+        file = directory / f"joint{number}.fused.onnx"
+        file.write_bytes(data)
+        content[f"joint_{number}"]["network"] = {
+            "file": str(file),
+            "sha256": hashlib.sha256(data).hexdigest(),
+        }
+    (directory / "bench.yaml").write_text(yaml.safe_dump(content))
     result = subprocess.run(
         [
             *(sys.executable, "-m", "jtqd.daemon.jtqd", "--bus", "sim", "--duration", "2.2"),
-            *("--record", str(directory / "logs"), "--json"),
+            *("--config", str(directory / "bench.yaml"), "--record", str(directory / "logs"), "--json"),
         ],
         env={**os.environ, "RUNTIME_DIRECTORY": str(directory)},
         capture_output=True,

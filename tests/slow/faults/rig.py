@@ -115,10 +115,9 @@ class Rig:
         content: dict[str, Any] = yaml.safe_load(shipped("bench.yaml").read_text())
         # so that each frame on the bus shows its cycle; a strict node loses 1019h when it restarts
         content["sync"]["counter_overflow"] = 0 if self._library else 240
-        content["estimator"] = {"method": "efficiency"}  # the start is short, and no network decides a status
+        content["estimator"] = {"method": "efficiency"}  # the start is short
         for number in (1, 2):
             joint = content[f"joint_{number}"]
-            joint.pop("network")
             joint["file"] = str(shipped(f"joint{number}.yaml"))
             identity = self.bench.drives[0].store
             joint["identity"] = {"vendor": identity.number(0x1018, 1), "product": identity.number(0x1018, 2)}

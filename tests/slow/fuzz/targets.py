@@ -117,6 +117,7 @@ def targets(directory: Path) -> list[Target]:
     plan.write_text(make_plan("efficiency", Scale()).to_yaml())
     log = directory / "log.mcap"
     from tests.daemon.logs import log_files
+    from tests.estimator.fused_configuration import network_of
 
     log_files.ours(log)
     run = directory / "run.csv"
@@ -126,6 +127,8 @@ def targets(directory: Path) -> list[Target]:
     )
     eds = Path(sys.modules["jtqd.drivers.object_dictionary"].__file__ or "").parent / "eds" / "jtqd.eds"
     models = shipped("bench.yaml").parent
+    network = directory / "joint1.fused.onnx"
+    network.write_bytes(network_of(1))
     logs = (LogError,)
     return [
         Target("configuration", configuration, ".yaml", damage_yaml, load_config, (ConfigError,)),
@@ -145,7 +148,7 @@ def targets(directory: Path) -> list[Target]:
         Target("EDS", eds, ".eds", damage_bytes, lambda path: read_eds(path, 0x20), (EdsError,)),
         Target(
             "network, ours",
-            models / "trained" / "joint1.fused.onnx",
+            network,
             ".onnx",
             damage_bytes,
             _network("fused"),

@@ -17,6 +17,7 @@ from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.campaign.plan import expand, load_plan
 from jtqd.sysid.runs.files import read_run
 from jtqd.sysid.runs.logs import log_to_run
+from tests.shipped_bench import shipped_bench
 
 pytestmark = pytest.mark.socketcan
 
@@ -49,11 +50,8 @@ def arguments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[
     """A campaign of two runs in a directory of its own; nothing of it is left on the bus afterwards."""
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
     (tmp_path / "two.yaml").write_text(yaml.safe_dump(PLAN))
-    config = yaml.safe_load(shipped("bench.yaml").read_text())
-    config["estimator"]["method"] = "tob"  # half of the start of jtqd would be onnxruntime
-    for key in ("joint_1", "joint_2"):
-        config[key]["file"] = str(shipped(config[key]["file"]))
-        config[key].pop("network", None)
+    config = shipped_bench()
+    config["estimator"]["method"] = "tob"
     (tmp_path / "bench.yaml").write_text(yaml.safe_dump(config))
     options = ["--config", str(tmp_path / "bench.yaml"), "--bus", "sim:vcan0", "--out", str(tmp_path / "out")]
     yield [str(tmp_path / "two.yaml"), *options, "--json"]

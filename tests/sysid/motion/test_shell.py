@@ -20,9 +20,9 @@ import yaml
 from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import FRAME
 from jtqd.drivers.frame_socket import open_frame_socket
-from jtqd.models.files import shipped
 from jtqd.sysid.motion.setpoints import Limits, MotionError, Timing
 from jtqd.sysid.motion.shell import play
+from tests.shipped_bench import shipped_bench
 from tests.sysid.motion.lock_step import plateau
 
 pytestmark = pytest.mark.native
@@ -35,12 +35,9 @@ PATIENT = Timing(
 
 def patient_config(directory: Path) -> Path:
     """The shipped bench without networks, whose nodes wait 1.5 s for jtqd before they leave operational."""
-    content = yaml.safe_load(shipped("bench.yaml").read_text())
+    content = shipped_bench()
     content["nodes"]["heartbeat_ms"] = 500
     content["estimator"]["method"] = "tob"
-    for joint in ("joint_1", "joint_2"):
-        del content[joint]["network"]
-        content[joint]["file"] = str(shipped(content[joint]["file"]))
     path = directory / "bench.yaml"
     path.write_text(yaml.safe_dump(content))
     return path
