@@ -51,10 +51,8 @@ class Cause:
     held_out_gain: float  # share of the held-out residual energy that it takes away
     rms_nm: float  # of its contribution over the runs, in the balance where it is largest
     balance: str  # "motor" or "torsion": where it is largest
-    explained_share: float = float("nan")  # of all that is structure in these runs, as squares
-    steadiness: float = float(
-        "nan"
-    )  # its size in standard errors where it is least certain (`steadiness.py`)
+    explained_share: float = math.nan  # of all that is structure in these runs, as squares
+    steadiness: float = math.nan  # its size in standard errors where it is least certain (`steadiness.py`)
 
 
 @dataclass(frozen=True)
@@ -69,9 +67,7 @@ class CandidateEvidence:
     minimum: Mapping[str, Value]  # minimum detectable size of its leading parameter(s); value inf: invisible
     reason: str  # "chosen", "class of X", "below threshold", "invisible in these runs", "needs temperature_c", ...
     at_minimum: tuple[Mapping[str, float], ...] = ()  # all parameters at that size, per way of looking for it
-    minimum_rms_nm: float = float(
-        "nan"
-    )  # what it contributes at that size, rms over the runs; inf: invisible
+    minimum_rms_nm: float = math.nan  # what it contributes at that size, rms over the runs; inf: invisible
 
 
 @dataclass(frozen=True)
@@ -86,7 +82,7 @@ class Place:
     low: float
     high: float
     unit: str
-    rms_nm: float = float("nan")
+    rms_nm: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -121,11 +117,11 @@ class Gain:
     rmse_after_nm: float
     split: str
     ci95: tuple[float, float]
-    free_run_before: float = float("nan")  # rad/s, joint side
-    free_run_after: float = float("nan")
+    free_run_before: float = math.nan  # rad/s, joint side
+    free_run_after: float = math.nan
     runs: tuple[RunGain, ...] = ()
-    free_run_position_before: float = float("nan")  # rad, joint side
-    free_run_position_after: float = float("nan")
+    free_run_position_before: float = math.nan  # rad, joint side
+    free_run_position_after: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -209,10 +205,8 @@ class Findings:
     channel_notes: tuple[str, ...] = ()
     next_experiment: Mapping[str, Any] | None = None  # {"why": text, "plan": mapping of jtq.plan/1}
     traces: tuple[Trace, ...] = field(default=(), repr=False)
-    joint_files: Mapping[int, Joint] = field(
-        default_factory=dict, repr=False
-    )  # to compare the found values with
-    explained_share: float = float("nan")
+    joint_files: Mapping[int, Joint] = field(default_factory=dict, repr=False)  # to compare what was found
+    explained_share: float = math.nan
     left_over: LeftOver | None = None
     odd_runs: tuple[OddRun, ...] = ()
 

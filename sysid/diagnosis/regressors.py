@@ -133,6 +133,10 @@ def all_in_bin(good: BoolArray, samples: int) -> BoolArray:
     return np.asarray(good[: count * samples].reshape(count, samples).all(axis=1), np.bool_)
 
 
+Index = np.ndarray[tuple[int], np.dtype[np.intp]]
+"""Numbers of bins, columns or families [n]."""
+
+
 @dataclass
 class ChannelData:
     """One channel of one run, binned: valid [n], residual [n], regressors [n, p] of columns `index` [p], nuisances
@@ -142,9 +146,9 @@ class ChannelData:
     valid: BoolArray
     residual: FloatArray
     regressors: FloatArray
-    index: np.ndarray[tuple[int], np.dtype[np.intp]]
+    index: Index
     nuisances: FloatArray
-    families: np.ndarray[tuple[int], np.dtype[np.intp]]
+    families: Index
 
 
 @dataclass
