@@ -26,6 +26,7 @@ from jtqd.sysid.diagnosis.findings import (
     UNEXPLAINED,
     Findings,
     OddRun,
+    shows_at,
 )
 from jtqd.sysid.diagnosis.named import named_in
 from jtqd.sysid.diagnosis.next_experiment import each_joint, next_experiment
@@ -61,7 +62,7 @@ def diagnose(
     applied = {n: with_effects_applied(joint) for n, joint in joints.items()}
     findings = _diagnosed(runs, applied, numbers, scope, relevance)
     for n in numbers:
-        new = {c.name for c in findings.causes if c.joint in (n, "sensor")}
+        new = {c.name for c in findings.causes if shows_at(c.joint, n)}
         kept = tuple(e for e in applied[n].effects if e.name not in new)
         if len(kept) < len(applied[n].effects):
             applied[n] = replace(applied[n], effects=kept)

@@ -21,13 +21,19 @@ UNEXPLAINED: Final = "unexplained"
 INSUFFICIENT: Final = "insufficient_data"
 VERDICTS: Final = (NO_GAP, CAUSE, AMBIGUOUS, UNEXPLAINED, INSUFFICIENT)
 
+SENSOR: Final = "sensor"
 JointName = int | str
-"""1 to 7, or "sensor"."""
+"""1 to 7, or SENSOR."""
+
+
+def shows_at(where: JointName, number: int) -> bool:
+    """Return whether what is wrong at a joint or the sensor shows in the balances of joint `number`."""
+    return where in (SENSOR, number)
 
 
 def joint_text(joint: JointName) -> str:
     """Return "joint 2", or "the sensor"."""
-    return "the sensor" if joint == "sensor" else f"joint {joint}"
+    return "the sensor" if joint == SENSOR else f"joint {joint}"
 
 
 @dataclass(frozen=True)
@@ -173,7 +179,7 @@ class OddRun:
     @property
     def text(self) -> str:
         """One line for people."""
-        channel = "torque_nm" if self.joint == "sensor" else f"j{self.joint}.{self.channel}"
+        channel = "torque_nm" if self.joint == SENSOR else f"j{self.joint}.{self.channel}"
         what, scale, unit = {
             "gain": ("reads", 100.0, "%"),
             "zero": ("has its zero", 100.0, "% of rated torque"),

@@ -17,7 +17,7 @@ from jtqd.estimator.effects.whole import Whole
 from jtqd.estimator.joint import Effect as Effect_parameters
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.dataset import Dataset
-from jtqd.sysid.diagnosis.findings import Gain, RunGain
+from jtqd.sysid.diagnosis.findings import Gain, RunGain, shows_at
 from jtqd.sysid.diagnosis.mixed_model import solve
 from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, places
 from jtqd.sysid.diagnosis.signals import BaseLoss, Channel, JointSignals
@@ -84,7 +84,7 @@ def free_run_errors(
     for run, step in zip(dataset.signals, steps, strict=True):
         causes = [p.moved(step[own].tolist()) for p, own in zip(refined.present, mine, strict=True)]
         for s in run:
-            there = [k for k, p in enumerate(causes) if p.joint in ("sensor", s.number)]
+            there = [k for k, p in enumerate(causes) if shows_at(p.joint, s.number)]
             asked = there if cause is None else [cause]
             if not set(asked) & set(there):
                 continue

@@ -53,9 +53,9 @@ def objections(
     if falls[worst] <= 0.0:
         return [(worst, "it raises the error on runs left out")]
     if dataset.no_torque:
-        places = [k for k, p in enumerate(refined.present) if free_run_fall(dataset, refined, k) < 0.0]
-        if places:
-            worst = min(places, key=lambda k: falls[k])
+        harmful = [k for k in range(len(refined.present)) if free_run_fall(dataset, refined, k) < 0.0]
+        if harmful:
+            worst = min(harmful, key=lambda k: falls[k])
             return [(worst, "it raises the error of the position in a free run on runs left out")]
     pair = cancelling(dataset, refined.present)
     if pair is None:

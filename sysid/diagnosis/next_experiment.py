@@ -68,7 +68,12 @@ def next_experiment(
     setpoints = check_plan(plan)
     travel = 1.1 * max(travel_rad(one) for one in setpoints.values()) + 1.0
     plan = replace(plan, limits=replace(plan.limits, travel_rad=float(np.ceil(travel))))
-    return {"why": _text(classes, kinds, why, plan), "plan": plan.to_mapping()}
+    parts = _begun(classes, why, {kind: EXPERIMENTS[kind].what for kind in kinds})
+    parts.append(
+        f"{counted(len(plan.runs), 'run')}, {plan.duration_s / 60.0:.0f} min, at most {plan.limits.torque_nm:g} Nm and "
+        f"{plan.limits.current_a:g} A."
+    )
+    return {"why": " ".join(parts), "plan": plan.to_mapping()}
 
 
 def campaign_command(plan: str = PLAN_FILE, bus: str = "can0", config: str = CONFIG) -> str:
@@ -111,10 +116,7 @@ def _of_one_joint(
     classes: Sequence[Sequence[str]], kinds: Sequence[str], number: int, why: str, room: Room | None
 ) -> dict[str, Any]:
     """Return the experiment of a joint that nothing tows."""
-    parts = _begun(classes, why)
-    parts += [f"{kind}: {KINDS[kind][0]}." for kind in kinds]
-    parts += [note for pair, note in _BY_HAND.items() if any(pair <= set(names) for names in classes)]
-    parts.append(_TOWING)
+    parts = [*_begun(classes, why, {kind: KINDS[kind][0] for kind in kinds}), _TOWING]
     if room is None:
         parts.append(
             "No motion is planned: neither these runs nor motion_limits of the joint file (or --limits) say where it may go."
@@ -145,21 +147,11 @@ def _of_one_joint(
     }
 
 
-def _begun(classes: Sequence[Sequence[str]], why: str) -> list[str]:
-    """Reason, and what is to be separated."""
+def _begun(classes: Sequence[Sequence[str]], why: str, done: Mapping[str, str]) -> list[str]:
+    """Reason, what is to be separated, what is done by kind of experiment, what is left to do by hand."""
     parts = [why.strip().rstrip(".") + "."] if why.strip() else []
     aims = [f"to distinguish {', '.join(names[:-1])} from {names[-1]}" for names in classes if len(names) > 1]
     aims += [f"to detect {names[0]}" for names in classes if len(names) == 1]
-    return [*parts, f"Proposed{' ' if aims else ''}{' and '.join(aims)}:"]
-
-
-def _text(classes: Sequence[Sequence[str]], kinds: Sequence[str], why: str, plan: Plan) -> str:
-    """Reason, what is to be separated, what is done, what it takes, what is left to do by hand."""
-    parts = _begun(classes, why)
-    parts += [f"{kind}: {EXPERIMENTS[kind].what}." for kind in kinds]
-    parts += [note for pair, note in _BY_HAND.items() if any(pair <= set(names) for names in classes)]
-    parts.append(
-        f"{counted(len(plan.runs), 'run')}, {plan.duration_s / 60.0:.0f} min, at most {plan.limits.torque_nm:g} Nm and "
-        f"{plan.limits.current_a:g} A."
-    )
-    return " ".join(parts)
+    parts.append(f"Proposed{' ' if aims else ''}{' and '.join(aims)}:")
+    parts += [f"{kind}: {what}." for kind, what in done.items()]
+    return parts + [note for pair, note in _BY_HAND.items() if any(pair <= set(names) for names in classes)]

@@ -20,7 +20,7 @@ from jtqd.estimator.effects.effect import MOTOR, TORSION, Effect, Parameter
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.current_zero import UnpoweredColumn, unpowered, with_readings
 from jtqd.sysid.diagnosis.dataset import Dataset
-from jtqd.sysid.diagnosis.findings import JointName
+from jtqd.sysid.diagnosis.findings import JointName, shows_at
 from jtqd.sysid.diagnosis.mixed_model import Mixed, Model
 from jtqd.sysid.diagnosis.noise import Noise, run_sums
 from jtqd.sysid.diagnosis.regressors import ChannelData, RunData, binned, contribution
@@ -178,7 +178,7 @@ def set_torsion(s: JointSignals, present: Sequence[PresentEffect]) -> None:
     """Set the torsion that effects see to what it is: that of the encoders for what follows it with memory or play, else
     what the spring does with the causes, K d = tau + their contributions.
     """
-    mine = [p for p in present if p.joint in ("sensor", s.number)]
+    mine = [p for p in present if shows_at(p.joint, s.number)]
     if s.twist_rad is not None and any(p.effect.follows_torsion for p in mine):
         s.state.torsion_rad = s.twist_rad
         return
@@ -196,7 +196,7 @@ def _run_at(
     columns: dict[Channel, list[tuple[int, FloatArray]]] = {c: [] for c in base.channels}
     for p, mine in zip(present, places(present), strict=True):
         for s in run:
-            if p.joint not in ("sensor", s.number):
+            if not shows_at(p.joint, s.number):
                 continue
             here = _contribution(p, s, p.values)
             for balance in (MOTOR, TORSION):
@@ -226,7 +226,7 @@ def contributions(dataset: Dataset, present: PresentEffect) -> dict[Channel, lis
     out: dict[Channel, list[FloatArray]] = {}
     for run, data in zip(dataset.signals, dataset.runs, strict=True):
         for s in run:
-            if present.joint not in ("sensor", s.number):
+            if not shows_at(present.joint, s.number):
                 continue
             for balance, value in contribution(present.effect, present.values, s).items():
                 channel = Channel(s.number, balance)

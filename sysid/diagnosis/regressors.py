@@ -17,7 +17,7 @@ import numpy as np
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.effects.effect import MOTOR, TORSION, Effect, Term, Values
 from jtqd.estimator.effects.whole import Whole
-from jtqd.sysid.diagnosis.findings import JointName
+from jtqd.sysid.diagnosis.findings import JointName, shows_at
 from jtqd.sysid.diagnosis.signals import (
     SLOWEST_RAD_S,
     Channel,
@@ -284,7 +284,7 @@ def _fill(
     found: dict[Channel, list[tuple[int, FloatArray]]] = {c: [] for c in channels}
     for candidate in candidates:
         for s in run:
-            if candidate.joint not in ("sensor", s.number):
+            if not shows_at(candidate.joint, s.number):
                 continue
             for column, p in zip(candidate.columns, candidate.term.basis, strict=True):
                 for balance, value in contribution(candidate.effect, p, s).items():

@@ -19,6 +19,7 @@ from scipy import stats
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.library import EFFECTS
+from jtqd.sysid.diagnosis.findings import shows_at
 from jtqd.sysid.diagnosis.gain import left_out_steps
 from jtqd.sysid.diagnosis.mixed_model import solve
 from jtqd.sysid.diagnosis.noise import Noise, whitened_rows
@@ -77,7 +78,7 @@ def steadiness(refined: Refined, noise: Noise, nothing: Sequence[Mapping[str, fl
         return out
     rows = [whitened_rows(run, noise, refined.mixed.columns, len(refined.variances)) for run in refined.runs]
     for joint in refined.runs[0].axes:
-        acting = [k for k, p in enumerate(refined.present) if p.joint in ("sensor", joint)]
+        acting = [k for k, p in enumerate(refined.present) if shows_at(p.joint, joint)]
         for axis in CONDITIONS if acting else ():
             cells = _cells(refined, rows, joint, axis)
             if cells is None:
