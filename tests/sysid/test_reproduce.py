@@ -120,19 +120,18 @@ def python(monkeypatch):
 
 
 def test_steps_run_at_once_unless_one_reads_what_another_writes(tmp_path, python, capfd):
-    """a and b wait for each other, so neither ends alone; c needs both, by directory and by file; d nothing."""
+    """a and b wait for each other, so neither ends alone; c reads both, one by its file and one by its directory."""
     meet = (
         "import pathlib, sys, time; end = time.monotonic() + 60; pathlib.Path(sys.argv[-1]).touch()\n"
         "while not pathlib.Path('{other}').exists():\n"
         "    if time.monotonic() > end: sys.exit(1)\n"
         "    time.sleep(0.01)"
     )
-    check = "import pathlib, sys; sys.exit(0 if all(pathlib.Path(p).exists() for p in sys.argv[1:3]) else 1)"
     a, b, c, d = (tmp_path / name for name in ("a", "models/b", "c", "d"))
     b.parent.mkdir()
     one = step(a, words=meet.format(other=b))
     two = step(b, words=meet.format(other=a))
-    three = step(c, a, b.parent, words=check)
+    three = step(c, a, b.parent)
     assert reproduce_command.run_steps((one, two, three, step(d, words="print('said', flush=True)")), 2) == 0
     told = capfd.readouterr()
     assert "said" in told.out
@@ -143,6 +142,14 @@ def test_steps_run_at_once_unless_one_reads_what_another_writes(tmp_path, python
         False,
         False,
     ]
+
+
+def test_a_step_waits_for_what_it_reads_although_there_is_room(tmp_path, python):
+    late = "import pathlib, sys, time; time.sleep(0.5); pathlib.Path(sys.argv[-1]).touch()"
+    check = "import pathlib, sys; sys.exit(0 if pathlib.Path(sys.argv[1]).exists() else 1)"
+    writer = step(tmp_path / "a", words=late)
+    reader = step(tmp_path / "b", tmp_path / "a", words=check)
+    assert reproduce_command.run_steps((writer, reader), 2) == 0
 
 
 def test_a_step_that_fails_ends_those_beside_it(tmp_path, python, capfd):
