@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
 from itertools import pairwise
-from typing import Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -94,8 +94,9 @@ def pieces_of(run: RunSignals, count: int = PIECES) -> list[RunSignals]:
 
 def _cut(of: _Rows, rows: slice) -> _Rows:
     """Return these rows of every array."""
-    values = {item.name: getattr(of, item.name) for item in fields(of)}
-    return replace(of, **{key: each[rows] for key, each in values.items() if isinstance(each, np.ndarray)})
+    values: dict[str, Any] = {item.name: getattr(of, item.name) for item in fields(of)}
+    arrays = {key: each[rows] for key, each in values.items() if isinstance(each, np.ndarray)}
+    return replace(of, **arrays)
 
 
 def rows() -> list[Row]:

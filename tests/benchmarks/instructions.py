@@ -29,7 +29,7 @@ from jtqd.daemon.loop import process as loop
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.estimator import load_network, make_estimator, onnx_graph
-from jtqd.estimator.joint import Agreement
+from jtqd.estimator.joint import Agreement, Tracking
 from jtqd.estimator.settings import recommended
 from jtqd.estimator.status import PUBLISHED
 from jtqd.models.files import load_joint, shipped
@@ -57,7 +57,10 @@ def work(method: str) -> None:
     network = load_network(method, str(shipped(name))) if method in ("network", "fused") else None
     joint = load_joint(shipped("trained/joint1.yaml"))
     assert joint.fused is not None
-    joint = replace(joint, fused=replace(joint.fused, agreement=Agreement(0.4, 0.5, 0.004, 0.15)))
+    fused_now = replace(
+        joint.fused, agreement=Agreement(0.4, 0.5, 0.004, 0.15), tracking=Tracking(220.0, 0.1, 0.05)
+    )
+    joint = replace(joint, fused=fused_now)
     estimator = make_estimator(joint, recommended(method), network)
     time = np.arange(SAMPLES) * 1e-3
     angle = np.sin(3.0 * time)
