@@ -95,7 +95,7 @@ def pieces_of(run: RunSignals, count: int = PIECES) -> list[RunSignals]:
 def _cut(of: _Rows, rows: slice) -> _Rows:
     """Return these rows of every array."""
     values: dict[str, Any] = {item.name: getattr(of, item.name) for item in fields(of)}
-    arrays = {key: each[rows] for key, each in values.items() if isinstance(each, np.ndarray)}
+    arrays: dict[str, Any] = {key: each[rows] for key, each in values.items() if isinstance(each, np.ndarray)}
     return replace(of, **arrays)
 
 
