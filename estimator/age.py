@@ -1,7 +1,8 @@
 """How old an estimate is, and with what it is compared.
 
 Every path of an estimator passes g/(s+g): its group delay at low frequency is 1/g (`observer`). An estimate of method
-`fused` is as old as its torsion path, whose bandwidth is g_t; every other one as old as the motor path.
+`fused` is as old as its torsion path, whose bandwidth is g_t, or of now where the link is tracked: its bandwidth is then
+infinite, and its age 0. Every other one is as old as the motor path.
 
 Like is compared with like: the sensor through the same filter (`aligned`, and `reference_of` where samples may be
 missing). Against the sensor as it is, the age counts as error: that is what a controller meets.
@@ -9,6 +10,7 @@ missing). Against the sensor as it is, the age counts as error: that is what a c
 
 from __future__ import annotations
 
+from math import inf
 from typing import TYPE_CHECKING
 
 from jtqd.estimator.joint import Joint
@@ -18,8 +20,21 @@ if TYPE_CHECKING:
     from jtqd.estimator.arrays import FloatArray
 
 
+def tracking_rad_s(joint: Joint, settings: EstimatorSettings) -> float:
+    """Return the rate at which a joint's link encoder is tracked; 0: it is not.
+
+    It is where the settings want it and the joint file says what it adds to sigma.
+    """
+    fused = joint.fused if settings.method == "fused" and settings.track_link else None
+    if fused is None or fused.torsion is None or fused.tracking is None:
+        return 0.0
+    return fused.tracking.rate_rad_s
+
+
 def bandwidth_of(joint: Joint, settings: EstimatorSettings) -> float:
-    """Return the bandwidth of a joint's estimate [rad/s]."""
+    """Return the bandwidth of a joint's estimate [rad/s]; infinite for an estimate of now."""
+    if tracking_rad_s(joint, settings):
+        return inf
     if settings.method == "fused" and joint.fused is not None and joint.fused.torsion is not None:
         return settings.own_torsion_bandwidth_rad_s
     return settings.bandwidth_rad_s

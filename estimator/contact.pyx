@@ -2,8 +2,9 @@
 
 Link side of one joint, own frame; neither current nor friction is in it. k: sample, T: step, q: link position:
 
-    tau     = torsion, unfiltered: young + K (d - d_f) + D (d - d_f)'     d_f: d through the torsion's own filter g_t
+    tau     = torsion, unfiltered: young + K (d - d_f) + D (d' - d_f')    d_f: d through the torsion's own filter g_t
     rate    = g_t K (d - d_f)                                             tau' through g_t/(s + g_t)
+              K d_f'                                                      where the link is tracked, as is d_f
     p_k     = J (q_k - q_(k-1))/T                                         momentum of the link over a step
     load    = tau_(k-1) - (p_k - p_(k-1))/T                               what the joint hands on to what is beyond its link
 
@@ -28,6 +29,7 @@ from jtqd.estimator.observer cimport FusedObserved, GuardLaw, GuardState
 from jtqd.estimator.sample cimport Sample
 from jtqd.estimator.zeros cimport local_stiffness
 
+from jtqd.estimator.age import tracking_rad_s
 from jtqd.estimator.sample import columns
 from jtqd.estimator.status import CONTACT_CODES
 
@@ -87,11 +89,16 @@ cdef void follow_link(
         return
     stiffness = local_stiffness(observer, now.z.d)
     behind = now.last.d - now.z.d
-    out.rate_nm_s = observer.torsion_rate * stiffness * behind
     torque = young_nm + stiffness * behind
     step = (now.link - s.q) / dt
-    if s.samples >= 1:
-        torque += law.damping * (behind - s.behind) / dt
+    if observer.tracking > 0.0:
+        out.rate_nm_s = stiffness * now.d_rate
+        if s.samples >= 1:
+            torque += law.damping * (now.track.velocity - step)
+    else:
+        out.rate_nm_s = observer.torsion_rate * stiffness * behind
+        if s.samples >= 1:
+            torque += law.damping * (behind - s.behind) / dt
     if s.samples >= 1 and fabs(dt - s.dt) > UNEVEN_STEPS * dt:
         s.samples = 1
     if s.samples >= 3:
@@ -243,6 +250,7 @@ def link_loads(joint, settings, dt_s, current_a, motor_position_rad, motor_veloc
         settings.bandwidth_rad_s,
         settings.link_bandwidth_rad_s,
         settings.own_torsion_bandwidth_rad_s,
+        tracking_rad_s(joint, settings),
     )
     fill_link(&link, joint, joint.fused.torsion)
     restart_guard(&guarded)

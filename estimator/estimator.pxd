@@ -53,6 +53,8 @@ cdef struct FusedLaw:
     ZerosLaw zeros
     AgreementLaw agreement
     LinkLaw link
+    bint tracked  # the link: variances of what is quicker than the motor path
+    double tracking_noise, tracking_viscous
     double physics_scale[4]
     double network_scale[4]
     double stand_share, stand_floor, limit, network_limit, fade, inverse_fade

@@ -74,6 +74,7 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator import status as st
+from jtqd.estimator.age import tracking_rad_s
 from jtqd.estimator.corrections import ExtendedInputs
 from jtqd.estimator.fusion import FOREIGN_SIGMAS
 from jtqd.estimator.network import FEATURES, FUSED_FEATURES, checked_fused, checked_network, native_of
@@ -282,12 +283,17 @@ cdef class FusedEstimator(Estimator):
             settings.bandwidth_rad_s,
             settings.link_bandwidth_rad_s,
             settings.own_torsion_bandwidth_rad_s,
+            tracking_rad_s(joint, settings),
         )
         self.law.loss = (<AdditiveLossModel>AdditiveLossModel(fused.loss)).law
         fill_fusion(&self.law.fusion, fused.sigma, fused.torsion is not None)
         self.law.fusion.reference = 0.0  # sigma is that of the torque, not of a comparison with a sensor
         per_ampere = joint.gear_ratio * joint.torque_constant_nm_per_a
         watched = fused.agreement is not None
+        self.law.tracked = self.law.observer.tracking > 0.0
+        if self.law.tracked:
+            self.law.tracking_noise = fused.tracking.sigma_nm**2
+            self.law.tracking_viscous = fused.tracking.viscous_nms_per_rad**2
         fill_zeros(&self.law.zeros, per_ampere, joint.rated_torque_nm, fused, settings.track_zeros, watched)
         fill_agreement(&self.law.agreement, fused.agreement, joint.rated_torque_nm)
         fill_link(&self.law.link, joint, fused.torsion)
@@ -506,6 +512,8 @@ cdef class FusedEstimator(Estimator):
             out.status = DEGRADED
         elif out.status == STANDSTILL:
             out.sigma_nm = fmin(law.stand_share * loss.half + law.stand_floor, STANDSTILL_WIDTH * out.sigma_nm)
+        if law.tracked and out.status != STANDSTILL:  # measured in motion
+            out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + law.tracking_noise + law.tracking_viscous * v * v)
         publish_within(out, law.limit)
 
     def run_observed(self, seen):
@@ -588,6 +596,7 @@ def observe_run(
         settings.bandwidth_rad_s,
         settings.link_bandwidth_rad_s,
         settings.own_torsion_bandwidth_rad_s,
+        tracking_rad_s(joint, settings),
     )
     restart_guard(&guard)
     n = inputs.shape[1]

@@ -228,11 +228,27 @@ class Agreement:
 
 
 @dataclass(frozen=True, slots=True)
+class Tracking:
+    """How the link encoder is tracked where the configuration has `track_link`, and what that adds to sigma, as squares.
+
+    rate_rad_s: of the tracking filter: larger is noisier and follows quicker (observer.tracked); sigma_nm,
+    viscous_nms_per_rad |v|: of what is quicker than the motor path, found on runs that the fit had not seen.
+    """
+
+    rate_rad_s: Annotated[float, limits("rad/s", ge=10.0, le=5000.0)]
+    sigma_nm: Annotated[float, limits("Nm", ge=0.0)]
+    viscous_nms_per_rad: Annotated[float, limits("Nms/rad", ge=0.0)]
+
+    def __post_init__(self) -> None:
+        check(self, "fused.tracking")
+
+
+@dataclass(frozen=True, slots=True)
 class Fused:
     """Section `fused` of a joint file; torsion None: a joint whose link encoder says nothing about torque.
 
     agreement: of the two paths on runs that the fit had not seen. envelope: what the runs of the fit covered; outside of it
-    the status is degraded. None: nothing is known of that.
+    the status is degraded. tracking: of the link encoder. None: nothing is known of that.
     """
 
     loss: AdditiveLoss
@@ -240,6 +256,7 @@ class Fused:
     sigma: FusedSigma
     agreement: Agreement | None = None
     envelope: Envelope | None = None
+    tracking: Tracking | None = None
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain dicts and lists, as `Joint.to_mapping`."""

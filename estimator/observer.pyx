@@ -306,12 +306,61 @@ cdef Inputs _inputs(const FusedObserverLaw *law, const Sample *x) noexcept nogil
     return to
 
 
-cdef void _torsion(const FusedObserverLaw *law, FusedObserverState *s, double d, double dt, FusedObserved *out) noexcept nogil:
-    """Move the slip to the filtered deflection d [rad], dt after the last one, and set the torsion's outputs there."""
+cdef void _start_track(LinkTrack *t, double q, double v) noexcept nogil:
+    """Set the filter to a link that has always moved at this speed."""
+    t.position, t.velocity, t.acceleration = q, v, 0.0
+
+
+cdef inline double _track(LinkTrack *t, double fade, double dt, double q) noexcept nogil:
+    """Take a reading q of the link encoder, dt after the one before; return what of it is taken for noise [rad].
+
+    Least squares on a parabola whose past fades by `fade`, 1 - exp(-rate dt), from sample to sample (Morrison 1969: fading-memory polynomial of degree 2):
+    no lag at any constant acceleration.
+    """
+    cdef double m = 1.0 - fade
+    cdef double off
+    t.position += dt * (t.velocity + 0.5 * dt * t.acceleration)
+    t.velocity += dt * t.acceleration
+    off = q - t.position
+    t.position += (1.0 - m * m * m) * off
+    off *= fade * fade / dt
+    t.velocity += 1.5 * (1.0 + m) * off
+    t.acceleration += fade / dt * off
+    return q - t.position
+
+
+def tracked(position_rad, dt_s, double rate_rad_s, double max_gap_s=0.05):
+    """Return (noise [n], velocity [n]) of an encoder's positions [n]: reading less its tracking filter's, and the filter's.
+
+    dt_s [n]: step that ends at the sample; after one that is none, or longer than max_gap_s, the filter starts again, at rest.
+    Raises ValueError for arrays of different length.
+    """
+    cdef const double[::1] q = np.ascontiguousarray(position_rad, np.float64)
+    cdef const double[::1] dt = np.ascontiguousarray(dt_s, np.float64)
+    noise, velocity = np.zeros(len(q)), np.zeros(len(q))
+    cdef double[::1] e = noise
+    cdef double[::1] v = velocity
+    cdef LinkTrack t = LinkTrack(0.0, 0.0, 0.0)
+    cdef Py_ssize_t k
+    if q.shape[0] != dt.shape[0]:
+        raise ValueError(f"found {q.shape[0]} positions and {dt.shape[0]} steps, expected as many")
+    for k in range(q.shape[0]):
+        if k > 0 and 0.0 < dt[k] <= max_gap_s:
+            e[k] = _track(&t, -expm1(-rate_rad_s * dt[k]), dt[k], q[k])
+        else:
+            _start_track(&t, q[k], 0.0)
+        v[k] = t.velocity
+    return noise, velocity
+
+
+cdef void _torsion(
+    const FusedObserverLaw *law, FusedObserverState *s, double d, double damped_nm, FusedObserved *out
+) noexcept nogil:
+    """Move the slip to the filtered deflection d [rad] and set the torsion's outputs there; damped_nm: D d'."""
     cdef double step = d - s.d, size = fabs(d), beyond = 0.0
     cdef int k
     s.d = d
-    out.torsion_nm = d * (law.stiffness + law.cubic * d * d) + law.damping * step / dt
+    out.torsion_nm = d * (law.stiffness + law.cubic * d * d) + damped_nm
     for k in range(law.hardenings):
         beyond += law.hardening[k].stiffness * fmax(size - law.hardening[k].deflection, 0.0)
     if law.hardenings:
@@ -324,7 +373,8 @@ cdef void _torsion(const FusedObserverLaw *law, FusedObserverState *s, double d,
 cdef void _age(const FusedObserverLaw *law, FusedObserverState *s, const Hold *h, FusedObserved *out) noexcept nogil:
     """Make the torsion as old as the motor path, and set by how much the young one is ahead of it.
 
-    g/(s+g) over g_t/(s+g_t) is r + (1 - r) g/(s+g) with r = g/g_t: linear in the torque, whatever the spring.
+    g/(s+g) over g_t/(s+g_t) is r + (1 - r) g/(s+g) with r = g/g_t: linear in the torque, whatever the spring. With the link
+    tracked the young one is of now: r = 0.
     """
     cdef double young = out.torsion_nm
     s.torsion_z = _filtered(h, s.torsion_z, young, s.torsion)
@@ -389,7 +439,9 @@ cdef void _start_fused(const FusedObserverLaw *law, FusedObserverState *s, const
     s.link = x.link_position_rad
     s.link_velocity = s.z.v
     s.d = s.z.d
-    _torsion(law, s, s.z.d, 1.0, out)
+    s.d_rate = 0.0
+    _start_track(&s.track, x.link_position_rad, s.z.v)
+    _torsion(law, s, s.z.d, 0.0, out)
     s.torsion = s.torsion_z = out.torsion_nm
     out.ahead_nm = 0.0
     _set_outputs(law, s, out)
@@ -402,8 +454,17 @@ cdef void _step_fused(const FusedObserverLaw *law, FusedObserverState *s, const 
     cdef Inputs now = _inputs(law, x)
     s.z.u = _filtered(&h, s.z.u, now.u, s.last.u)
     s.z.v = _filtered(&h, s.z.v, now.v, s.last.v)
-    cdef Hold own = _hold(law.torsion_rate, x.dt_s) if law.apart else h
-    s.z.d = _filtered(&own, s.z.d, now.d, s.last.d)
+    cdef Hold own
+    cdef double damped, fade
+    if law.tracking > 0.0:
+        fade = h.gone if law.tracking == law.rate else -expm1(-law.tracking * x.dt_s)
+        s.z.d = now.d + _track(&s.track, fade, x.dt_s, x.link_position_rad)
+        s.d_rate = (now.d - s.last.d + x.link_position_rad - s.link) / x.dt_s - s.track.velocity
+        damped = law.damping * s.d_rate
+    else:
+        own = _hold(law.torsion_rate, x.dt_s) if law.apart else h
+        s.z.d = _filtered(&own, s.z.d, now.d, s.last.d)
+        damped = law.damping * (s.z.d - s.d) / x.dt_s
     s.z.cos2 = _filtered(&h, s.z.cos2, now.cos2, s.last.cos2)
     s.z.sin2 = _filtered(&h, s.z.sin2, now.sin2, s.last.sin2)
     s.z.cos4 = _filtered(&h, s.z.cos4, now.cos4, s.last.cos4)
@@ -413,7 +474,7 @@ cdef void _step_fused(const FusedObserverLaw *law, FusedObserverState *s, const 
     cdef double gone = h.gone if law.link_rate == law.rate else -expm1(-law.link_rate * x.dt_s)
     s.link_velocity += gone * ((x.link_position_rad - s.link) / x.dt_s - s.link_velocity)
     s.link = x.link_position_rad
-    _torsion(law, s, s.z.d, x.dt_s, out)
+    _torsion(law, s, s.z.d, damped, out)
     out.ahead_nm = 0.0
     if law.apart:
         _age(law, s, &h, out)
@@ -424,11 +485,19 @@ cdef void _step_fused(const FusedObserverLaw *law, FusedObserverState *s, const 
 
 
 cdef int fill_fused_observer(
-    FusedObserverLaw *law, joint, torsion, double bandwidth, double link_bandwidth, double torsion_bandwidth
+    FusedObserverLaw *law,
+    joint,
+    torsion,
+    double bandwidth,
+    double link_bandwidth,
+    double torsion_bandwidth,
+    double tracking
 ) except -1:
-    """Set the parameters from a joint file; torsion None: its torque is always 0."""
-    law.apart = torsion is not None and torsion_bandwidth != bandwidth
-    law.torsion_rate, law.torsion_share = torsion_bandwidth, bandwidth / torsion_bandwidth
+    """Set the parameters from a joint file; torsion None: its torque is always 0; tracking: 0 for none."""
+    law.tracking = tracking if torsion is not None else 0.0
+    law.apart = torsion is not None and (torsion_bandwidth != bandwidth or tracking > 0.0)
+    law.torsion_rate = torsion_bandwidth
+    law.torsion_share = 0.0 if law.tracking > 0.0 else bandwidth / torsion_bandwidth
     law.gear = joint.gear_ratio
     law.inverse_gear = 1.0 / joint.gear_ratio
     law.kt = joint.torque_constant_nm_per_a
@@ -515,14 +584,26 @@ cdef class FusedObserver:
     g_t/(s+g_t). `torsion_nm` is then that torque through [g/(s+g)]/[g_t/(s+g_t)], as old as all the rest, and `ahead_nm`
     the young torque less it.
 
-    torsion None: its torque is always 0. torsion_bandwidth_rad_s: g_t, None for g.
+    With the link tracked the deflection passes no filter: only what the tracking filter of the link encoder (`tracked`)
+    takes for noise is taken off it, and D d' has the filter's velocity. `torsion_nm` is that torque through g/(s+g).
+
+    torsion None: its torque is always 0. torsion_bandwidth_rad_s: g_t, None for g. tracking_rad_s: rate of the link's tracking
+    filter, 0 for none.
     """
 
     def __init__(
-        self, joint, torsion, double bandwidth_rad_s, double link_bandwidth_rad_s, torsion_bandwidth_rad_s=None
+        self,
+        joint,
+        torsion,
+        double bandwidth_rad_s,
+        double link_bandwidth_rad_s,
+        torsion_bandwidth_rad_s=None,
+        double tracking_rad_s=0.0,
     ):
         own = bandwidth_rad_s if torsion_bandwidth_rad_s is None else torsion_bandwidth_rad_s
-        fill_fused_observer(&self.law, joint, torsion, bandwidth_rad_s, link_bandwidth_rad_s, own)
+        fill_fused_observer(
+            &self.law, joint, torsion, bandwidth_rad_s, link_bandwidth_rad_s, own, tracking_rad_s
+        )
 
     def start(
         self, double current_a, double motor_position_rad, double motor_velocity_rad_s, double link_position_rad

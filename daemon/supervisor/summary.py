@@ -103,7 +103,8 @@ class Summary:
         ):
             shown = "no reference"
             if isfinite(rmse):
-                shown = f"{rmse:.3f} Nm against the sensor in motion, both {age:.2f} ms old ({now:.3f} Nm against it now)"
+                older = f", both {age:.2f} ms old ({now:.3f} Nm against it now)" if age > 0.0 else " now"
+                shown = f"{rmse:.3f} Nm against the sensor in motion{older}"
             lines.append(f"RMSE joint {joint}  {shown}")
         lines += [
             f"zeros joint {joint} {zeros.text}"

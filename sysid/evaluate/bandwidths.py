@@ -1,8 +1,9 @@
-"""`python -m jtqd.sysid.evaluate.bandwidths`: noise of the fused estimate against its age, by the bandwidth of its torsion.
+"""`python -m jtqd.sysid.evaluate.bandwidths`: noise of the fused estimate against its age, by the filter of its torsion.
 
-One row per bandwidth, over emulated runs with their true torque: what a controller meets (error against the torque now,
-in motion), what is left when the age is no error, the noise from sample to sample, and the share of samples in motion
-inside the 90 % interval.
+One row per bandwidth of the low pass, and per rate of the link's tracking filter (`+`), over emulated runs with their true
+torque: what a controller meets (error against the torque now, in motion), what is left when the age is no error, the noise
+from sample to sample in motion and at standstill, and the share of samples in motion inside the 90 % interval. Below it,
+what the age of a low pass alone costs, and at what frequencies.
 """
 
 from __future__ import annotations
@@ -17,31 +18,42 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.age import age_ms, aligned
-from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.fusion import GAUSS
-from jtqd.estimator.joint import Joint
+from jtqd.estimator.joint import Joint, Tracking
 from jtqd.estimator.methods import estimate_columns
+from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns, RunTableError
-from jtqd.estimator.settings import EstimatorSettings
-from jtqd.estimator.status import DEGRADED, VALID
+from jtqd.estimator.settings import TORSION_BANDWIDTH_RAD_S, EstimatorSettings
+from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
 from jtqd.sysid.evaluate.methods import OURS, SETTLE_S, load_models
 from jtqd.sysid.runs.files import RunError, read_runs
 from jtqd.sysid.runs.truth import read_truth
 
 BANDWIDTHS_RAD_S: Final = (200.0, 300.0, 400.0, 600.0, 800.0, 1200.0, 1600.0)
+RATES_RAD_S: Final = (120.0, 160.0, 200.0, 250.0, 320.0)
+"""Of the link's tracking filter."""
+_MOVING_RAD_S: Final = 0.05
+_PIECE: Final = 400
+"""Samples of a spectrum: 2.5 Hz at 1 kHz."""
+_RIPPLE_HZ: Final = (20.0, 100.0)
 _EXAMPLE: Final = "example: python -m jtqd.sysid.evaluate.bandwidths days --models models/trained"
 
 
 @dataclass(frozen=True)
 class Tradeoff:
-    """One bandwidth [rad/s]: age [ms], errors and noise in % of rated torque (RMS), coverage in %; over all runs."""
+    """One filter: bandwidth or rate [rad/s], whether it tracks the link, age [ms], errors and noise in % of rated torque
+    (RMS), coverage in %; over all runs.
+    """
 
     bandwidth_rad_s: float
+    tracks: bool
     age_ms: float
     now_percent: float
     aligned_percent: float
     noise_percent: float
+    standing_percent: float
     inside_percent: float
 
 
@@ -55,36 +67,93 @@ class TrueRun:
     true_nm: FloatArray
 
 
-def tradeoff(runs: Sequence[TrueRun], bandwidth_rad_s: float) -> Tradeoff:
-    """Score one bandwidth of the torsion over runs of joints with torsion. Raises ValueError without samples in motion."""
-    settings = EstimatorSettings(method=OURS, torsion_bandwidth_rad_s=bandwidth_rad_s)
-    now, fair, noise, inside = [], [], [], []
+def tradeoff(runs: Sequence[TrueRun], bandwidth_rad_s: float, *, tracks: bool = False) -> Tradeoff:
+    """Score one filter over runs of joints with torsion. Raises ValueError without samples in motion.
+
+    tracks: the link at this rate, in place of the low pass of this bandwidth; sigma is that of the joint file's rate.
+    """
+    settings = EstimatorSettings(method=OURS, track_link=True)
+    if not tracks:
+        settings = EstimatorSettings(method=OURS, torsion_bandwidth_rad_s=bandwidth_rad_s)
+    now, fair, noise, standing, inside = [], [], [], [], []
     for run in runs:
-        found = estimate_columns(run.joint, settings, None, run.time_s, run.columns)
+        joint = _at_rate(run.joint, bandwidth_rad_s) if tracks else run.joint
+        found = estimate_columns(joint, settings, None, run.time_s, run.columns)
         dt = np.diff(run.time_s, prepend=run.time_s[0])
-        moving = np.isin(found.status, (VALID, DEGRADED)) & (run.time_s - run.time_s[0] >= SETTLE_S)
-        error = found.torque_nm - aligned(run.true_nm, dt, run.joint, settings)
+        settled = run.time_s - run.time_s[0] >= SETTLE_S
+        moving = settled & np.isin(found.status, (VALID, DEGRADED))
+        error = found.torque_nm - aligned(run.true_nm, dt, joint, settings)
         rated = run.joint.rated_torque_nm
         now.append((found.torque_nm - run.true_nm)[moving] / rated)
         fair.append(error[moving] / rated)
         # a second difference knows nothing of slow errors; of white noise it is sqrt(6) times as large
-        noise.append(np.diff(error, 2)[moving[2:] & moving[1:-1] & moving[:-2]] / (rated * 6.0**0.5))
+        rough = np.diff(error, 2) / (rated * 6.0**0.5)
+        noise.append(rough[_three(moving)])
+        standing.append(rough[_three(settled & (found.status == STANDSTILL))])
         inside.append((np.abs(error) <= GAUSS * found.sigma_nm)[moving])
     if not sum(map(len, now)):
         raise ValueError("found no samples in motion, expected some")
-    joint = runs[0].joint
     return Tradeoff(
         bandwidth_rad_s,
+        tracks,
         age_ms(joint, settings),
         _rms_percent(now),
         _rms_percent(fair),
         _rms_percent(noise),
+        _rms_percent(standing),
         100.0 * float(np.mean(np.concatenate(inside))),
     )
 
 
+def _at_rate(joint: Joint, rate_rad_s: float) -> Joint:
+    fused = joint.fused
+    if fused is None:
+        raise ValueError(f"joint {joint.name}: found no section fused, expected one")
+    known = fused.tracking or Tracking(rate_rad_s, 0.0, 0.0)
+    return replace(joint, fused=replace(fused, tracking=replace(known, rate_rad_s=rate_rad_s)))
+
+
+def _three(where: BoolArray) -> BoolArray:
+    result: BoolArray = where[2:] & where[1:-1] & where[:-2]
+    return result
+
+
 def _rms_percent(parts: Sequence[FloatArray]) -> float:
-    return 100.0 * float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
+    every = np.concatenate(parts)
+    return 100.0 * float(np.sqrt(np.mean(every**2))) if len(every) else float("nan")
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What an age alone costs, of the true torque itself: RMS in % of rated; share [%] of its square within _RIPPLE_HZ."""
+
+    percent: float
+    ripple_percent: float
+
+
+def cost_of_age(runs: Sequence[TrueRun], bandwidth_rad_s: float = TORSION_BANDWIDTH_RAD_S) -> Cost:
+    """Return what a low pass takes off the true torque of moving joints. Raises ValueError without 0.4 s of motion."""
+    square = ripple = count = 0.0
+    for run in runs:
+        dt = np.diff(run.time_s, prepend=run.time_s[0])
+        error = (low_pass(run.true_nm, dt, bandwidth_rad_s) - run.true_nm) / run.joint.rated_torque_nm
+        speed = run.columns.motor_velocity_rad_s
+        assert speed is not None
+        moving = np.abs(speed) > _MOVING_RAD_S * run.joint.gear_ratio
+        hz = np.fft.rfftfreq(_PIECE, float(np.median(dt)))
+        inside = (hz >= _RIPPLE_HZ[0]) & (hz <= _RIPPLE_HZ[1])
+        for first in range(0, len(error) - _PIECE + 1, _PIECE):
+            piece = slice(first, first + _PIECE)
+            if not moving[piece].all():
+                continue
+            part = error[piece]
+            power = np.abs(np.fft.rfft((part - part.mean()) * np.hanning(_PIECE))) ** 2
+            ripple += float(part @ part) * float(power[inside].sum() / power.sum())
+            square += float(part @ part)
+            count += _PIECE
+    if not count:
+        raise ValueError("found no 0.4 s of motion, expected some")
+    return Cost(100.0 * float(np.sqrt(square / count)), 100.0 * ripple / square)
 
 
 def true_runs(paths: Sequence[Path], models: Path, link_noise_urad: float, seed: int) -> list[TrueRun]:
@@ -112,12 +181,13 @@ def true_runs(paths: Sequence[Path], models: Path, link_noise_urad: float, seed:
 
 def lines(rows: Sequence[Tradeoff]) -> list[str]:
     """Return the table as text."""
-    head = "torsion [rad/s]  age [ms]  RMSE now [%]  aligned [%]  noise [%]  inside 90 % [%]"
+    head = "torsion [rad/s]  age [ms]  RMSE now [%]  aligned [%]  noise: moving, at rest [%]  inside 90 % [%]"
     return [
         head,
         *(
-            f"{row.bandwidth_rad_s:15.0f}  {row.age_ms:8.2f}  {row.now_percent:12.2f}  {row.aligned_percent:11.2f}  "
-            f"{row.noise_percent:9.3f}  {row.inside_percent:15.1f}"
+            f"{'+' * row.tracks + format(row.bandwidth_rad_s, '.0f'):>15}  {row.age_ms:8.2f}  {row.now_percent:12.2f}  "
+            f"{row.aligned_percent:11.2f}  {row.noise_percent:18.3f}, {row.standing_percent:.3f}  "
+            f"{row.inside_percent:15.1f}"
             for row in rows
         ),
     ]
@@ -127,7 +197,7 @@ def main(argv: list[str]) -> int:
     """Print the table; exit status 0 done, 1 failure, 2 usage."""
     parser = argparse.ArgumentParser(
         prog="python -m jtqd.sysid.evaluate.bandwidths",
-        description="Noise against age: the fused estimate by the bandwidth of its torsion, in % of rated torque.",
+        description="Noise against age: the fused estimate by the filter of its torsion, in % of rated torque.",
         epilog=_EXAMPLE,
     )
     parser.add_argument(
@@ -143,7 +213,15 @@ def main(argv: list[str]) -> int:
     options = parser.parse_args(argv)
     try:
         runs = true_runs(options.runs, options.models, options.link_noise, options.seed)
-        print("\n".join(lines([tradeoff(runs, bandwidth) for bandwidth in BANDWIDTHS_RAD_S])))
+        rows = [tradeoff(runs, bandwidth) for bandwidth in BANDWIDTHS_RAD_S]
+        rows += [tradeoff(runs, rate, tracks=True) for rate in RATES_RAD_S]
+        cost = cost_of_age(runs)
+        print("\n".join(lines(rows)))
+        print(
+            f"age of a low pass of {TORSION_BANDWIDTH_RAD_S:.0f} rad/s alone: {cost.percent:.2f} % of rated, "
+            f"{cost.ripple_percent:.0f} % of its square at {_RIPPLE_HZ[0]:.0f} to {_RIPPLE_HZ[1]:.0f} Hz; "
+            "+: the link tracked at that rate"
+        )
     except (ConfigError, RunError, RunTableError, ValueError, OSError) as error:
         print(f"bandwidths: {error}", file=sys.stderr)
         return 1

@@ -10,6 +10,7 @@ With residuals e_c = tau_raw - loss - sensor and e_t = tau_t - sensor on runs no
     e_t^2 - reference^2 - open^2 ~ torsion^2 + (load tau_t)^2
     scale_q = 90 % quantile of |error|/sigma in quadrant q, over 1.645: split conformal prediction by runs
               (Vovk et al. 2005), every run weighted alike, its level set so that a run left out is covered to 90 %
+    tracking: what an estimate of now errs by beyond that (`sysid/fit/tracking.py`)
 
 A joint with one encoder has the current path alone (torsion None): nothing tells the sensor's zero from that path's
 own error, so reference is 0 and sigma holds both.
@@ -35,12 +36,14 @@ from jtqd.estimator.estimator import SLOPE_NM, quadrants
 from jtqd.estimator.fusion import GAUSS, Fusion, held
 from jtqd.estimator.joint import AdditiveLoss, Agreement, Friction, Fused, FusedSigma, Torsion
 from jtqd.estimator.losses import AdditiveLossModel
+from jtqd.estimator.observer import low_pass
 from jtqd.sysid.fit.agreement import fit_agreement
 from jtqd.sysid.fit.envelope import FIT_ROOM_K, TORQUE_STEP_SHARE, envelope_of, velocity_step
 from jtqd.sysid.fit.losses import LossFit, fit_loss
 from jtqd.sysid.fit.signals import RunSignals
 from jtqd.sysid.fit.torsion import fit_torsion
-from jtqd.sysid.fit.torsion_signals import torsion_torque
+from jtqd.sysid.fit.torsion_signals import torsion_now, torsion_torque
+from jtqd.sysid.fit.tracking import TRACKING_RAD_S, fit_tracking
 
 COVERAGE: Final = 0.9
 _FLOOR_NM: Final = 0.02
@@ -56,7 +59,8 @@ class PathResiduals(NamedTuple):
     """One unseen run: arrays [n] of its moving samples (Nm, rad/s); half: `AdditiveLossModel.loss`; open: of the slip.
 
     torsion_nm, open_nm and torsion_error_nm are 0 where there is no torsion. dt_s, direction and slope (dL/draw of the loss)
-    are for `fused.agreement`; empty: the run does not count there.
+    are for `fused.agreement`, now (the torsion's error with the link tracked, and through the motor path's filter) for
+    `fused.tracking`; empty: the run does not count there.
     """
 
     raw_nm: FloatArray
@@ -69,6 +73,7 @@ class PathResiduals(NamedTuple):
     dt_s: FloatArray = _NONE
     direction: FloatArray = _NONE
     slope: FloatArray = _NONE
+    now: tuple[FloatArray, FloatArray] = (_NONE, _NONE)
 
 
 def fit_sigma(runs: Sequence[PathResiduals], *, with_torsion: bool = True) -> FusedSigma:
@@ -243,6 +248,17 @@ def fit_fused(
     fused = Fused(fit.loss, torsion, sigma, envelope=envelope)
     if rated_nm is not None and torsion is not None:
         fused = replace(fused, agreement=_agreement(unseen, fused, rated_nm))
+    if torsion is not None and all(len(run.now[0]) == len(run.raw_nm) for run in unseen):
+        scales = [np.array(sigma.scale)[quadrants_of(run)] for run in unseen]
+        fused = replace(
+            fused,
+            tracking=fit_tracking(
+                errors,
+                [scale * each for scale, each in zip(scales, sigmas, strict=True)],
+                [_error_now(run, sigma) for run in unseen],
+                [run.velocity_rad_s for run in unseen],
+            ),
+        )
     return FusedFit(fused, fit, rmse)
 
 
@@ -310,7 +326,11 @@ def path_residuals(run: RunSignals, loss: AdditiveLoss, torsion: Torsion | None)
     )
     slope = (more - loss_nm[keep]) / SLOPE_NM
     dt, direction = seen.dt_s[keep], seen.direction[keep]
-    return PathResiduals(raw, velocity, half, tau, open_nm, current, tau - sensor, dt, direction, slope)
+    now = (_NONE, _NONE)
+    if run.as_read is not None:
+        error = torsion_now(torsion, run, run.as_read, TRACKING_RAD_S) - run.as_read.sensor_nm
+        now = (error[keep], low_pass(error, seen.dt_s, run.bandwidth_rad_s)[keep])
+    return PathResiduals(raw, velocity, half, tau, open_nm, current, tau - sensor, dt, direction, slope, now)
 
 
 def loss_and_width(run: RunSignals, loss: AdditiveLoss) -> tuple[FloatArray, FloatArray]:
@@ -330,3 +350,13 @@ def fused_error(
         run.raw_nm, run.half_nm, run.velocity_rad_s, run.torsion_nm, run.open_nm
     )
     return run.current_error_nm + alpha * (run.torsion_error_nm - run.current_error_nm), spread
+
+
+def _error_now(run: PathResiduals, sigma: FusedSigma) -> FloatArray:
+    """Return the error [n] of the estimate of now: tau_t + (1 - alpha) (tau_c - tau_t'), as `FusedEstimator` forms it."""
+    alpha, _ = Fusion(sigma, True).weigh_many(
+        run.raw_nm, run.half_nm, run.velocity_rad_s, run.torsion_nm, run.open_nm
+    )
+    young, aged = run.now
+    result: FloatArray = young + (1.0 - alpha) * (run.current_error_nm - aged)
+    return result

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -30,13 +30,21 @@ _COLUMNS: Final = (
 )
 
 
+class AsRead(NamedTuple):
+    """What no filter has passed, arrays [n]: torsion angle of both encoders [rad], torque sensor [Nm]."""
+
+    torsion_rad: FloatArray
+    sensor_nm: FloatArray
+
+
 @dataclass(frozen=True)
 class RunSignals:
     """One joint of one run, at the estimator's age; arrays [n].
 
     name: of the run, the unit of every split; seen: outputs of the observer, with `torsion_nm` the filtered torsion
     angle [rad]; sensor_nm: torque sensor through the estimator's filter; moving: status valid and settled;
-    standing: status standstill; positions: of the encoders as read, None where they are not known.
+    standing: status standstill; positions: of the encoders as read, None where they are not known; as_read: what is needed
+    for an estimate of now, None where it is not known.
     """
 
     name: str
@@ -47,6 +55,7 @@ class RunSignals:
     motor_position_rad: FloatArray | None = None
     link_position_rad: FloatArray | None = None
     bandwidth_rad_s: float = EstimatorSettings().bandwidth_rad_s
+    as_read: AsRead | None = None
 
     def waves(self, angle_rad: FloatArray, order: float) -> FloatArray:
         """Return cos and sin [n, 2] of a multiple of an angle [n], through the estimator's filter."""
@@ -89,4 +98,5 @@ def run_signals(
         np.asarray(motor, np.float64),
         np.asarray(link, np.float64),
         settings.bandwidth_rad_s,
+        AsRead(np.asarray(motor, np.float64) / joint.gear_ratio - link, sensor),
     )

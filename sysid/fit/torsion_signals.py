@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from math import inf
+
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Torsion
-from jtqd.estimator.observer import RIPPLE_ORDERS, slipped
-from jtqd.sysid.fit.signals import RunSignals
+from jtqd.estimator.observer import RIPPLE_ORDERS, slipped, tracked
+from jtqd.sysid.fit.signals import AsRead, RunSignals
 
 
 def deflection(torsion: Torsion, run: RunSignals) -> FloatArray:
@@ -57,8 +60,29 @@ def rate_of(d_rad: FloatArray, run: RunSignals) -> FloatArray:
 def torsion_torque(torsion: Torsion, run: RunSignals) -> tuple[FloatArray, FloatArray]:
     """Return tau_t and open [n] of observed signals, as FusedObserver gives them. Raises ValueError as `deflection`."""
     d = deflection(torsion, run)
+    return _torque(torsion, d, rate_of(d, run))
+
+
+def torsion_now(torsion: Torsion, run: RunSignals, as_read: AsRead, rate_rad_s: float) -> FloatArray:
+    """Return the torsion's torque [n] as FusedObserver forms it with the link tracked at this rate, of now.
+
+    Raises ValueError where the run's positions are not known.
+    """
+    link, dt_s = _known(run.link_position_rad, 0.0), run.seen.dt_s
+    motor = _known(run.motor_position_rad, 0.0)
+    waves = [part(order * motor) for order in RIPPLE_ORDERS for part in (np.cos, np.sin)]
+    seen = replace(run.seen, torsion_nm=as_read.torsion_rad, waves=np.column_stack(waves))
+    d = deflection(torsion, replace(run, seen=seen, bandwidth_rad_s=inf))
+    noise, velocity = tracked(link, dt_s, rate_rad_s)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        moved = np.diff(d + link, prepend=np.nan) / np.where(dt_s > 0.0, dt_s, np.nan)
+    return _torque(torsion, d + noise, np.nan_to_num(moved - velocity, nan=0.0))[0]
+
+
+def _torque(torsion: Torsion, d: FloatArray, rate_rad_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return tau_t and open [n] of a deflection and its rate [n]."""
     result: FloatArray = d * (torsion.stiffness_nm_per_rad + torsion.cubic_nm_per_rad3 * d * d)
-    result = result + torsion.damping_nms_per_rad * rate_of(d, run)
+    result = result + torsion.damping_nms_per_rad * rate_rad_s
     for beyond, stiffness in zip(torsion.hardening_rad, torsion.hardening_nm_per_rad, strict=True):
         result = result + stiffness * stretched(d, beyond)
     open_nm = np.zeros_like(d)

@@ -18,7 +18,7 @@ from jtqd.estimator.settings import EstimatorSettings, recommended
 from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
 from jtqd.sysid.evaluate.methods import OURS, PAPERS, SETTLE_S
 from jtqd.sysid.goals.baselines import BASELINES
-from jtqd.sysid.goals.identify import Driven, Identified, observed
+from jtqd.sysid.goals.identify import OF_BASELINES, Driven, Identified, observed
 
 ZEROS: Final = "ours_zeros"
 TITLES: Final = {
@@ -84,7 +84,7 @@ def judge(
     for name in methods:
         if name in BASELINES:
             baseline = BASELINES[name]
-            settings = recommended(OURS)
+            settings = OF_BASELINES
             rate = settings.own_torsion_bandwidth_rad_s if baseline.young else settings.bandwidth_rad_s
             torque = baseline.estimate(seen, one.baselines[name])
             results[name] = Result(torque, low_pass(true, dt, rate))

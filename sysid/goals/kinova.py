@@ -16,14 +16,15 @@ import argparse
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import pairwise
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.run import JointColumns, ObservedRun, RunTableError
@@ -41,10 +42,10 @@ from jtqd.sysid.runs.files import RunError, RunFile, read_run
 
 BY: Final = "python -m jtqd.sysid.goals.kinova"
 PIECES: Final = 8
-Z90: Final = 1.645
 INSIDE: Final = (85.0, 95.0)
 """Of an honest 90 % interval [%], as on the bench `bad_day`."""
-OURS: Final = ("tob", "fused")
+METHODS: Final = ("tob", "fused")
+"""Ours."""
 
 
 def _current_and_speed(seen: ObservedRun) -> FloatArray:
@@ -61,9 +62,12 @@ SIMPLE: Final = {
 }
 
 
+_Rows = TypeVar("_Rows", RunSignals, ObservedRun)
+
+
 class Row(NamedTuple):
-    """One joint in one run: RMSE in motion of each method [Nm]; share of the 90 % interval of ours, in motion and at
-    standstill (there value and sigma) [%], NaN without such samples. A method that cannot be fitted to the run is in none.
+    """One joint in one run, by method: RMSE in motion [Nm]; of ours, how often the 90 % interval holds the sensor in motion,
+    and value +- sigma at standstill [%, NaN without such samples]. A method that cannot be fitted to the run is in none.
     """
 
     joint: int
@@ -81,31 +85,18 @@ class Row(NamedTuple):
 
 def pieces_of(run: RunSignals, count: int = PIECES) -> list[RunSignals]:
     """Cut a run into pieces of equal length: as many runs, but all of one day."""
-    edges = np.linspace(0, len(run.sensor_nm), count + 1).astype(int)
-    return [_part(run, f"{run.name}.{n}", slice(a, b)) for n, (a, b) in enumerate(pairwise(edges.tolist()))]
+    edges = np.linspace(0, len(run.sensor_nm), count + 1).astype(int).tolist()
+    return [
+        _cut(replace(run, name=f"{run.name}.{n}", as_read=None, seen=_cut(run.seen, rows)), rows)
+        for n, rows in enumerate(slice(a, b) for a, b in pairwise(edges))
+    ]
 
 
-def _part(run: RunSignals, name: str, rows: slice) -> RunSignals:
-    seen = replace(run.seen, **{key: each[rows] for key, each in vars_of(run.seen).items()})
-    position = None if run.motor_position_rad is None else run.motor_position_rad[rows]
-    link = None if run.link_position_rad is None else run.link_position_rad[rows]
-    return RunSignals(
-        name,
-        seen,
-        run.sensor_nm[rows],
-        run.moving[rows],
-        run.standing[rows],
-        position,
-        link,
-        run.bandwidth_rad_s,
-    )
-
-
-def vars_of(seen: ObservedRun) -> dict[str, Any]:
-    """Return the arrays of an observed run by their names."""
-    return {
-        key: each for key in seen.__dataclass_fields__ if isinstance(each := getattr(seen, key), np.ndarray)
-    }
+def _cut(of: _Rows, rows: slice) -> _Rows:
+    """Return these rows of every array."""
+    values: dict[str, Any] = {item.name: getattr(of, item.name) for item in fields(of)}
+    arrays: dict[str, Any] = {key: each[rows] for key, each in values.items() if isinstance(each, np.ndarray)}
+    return replace(of, **arrays)
 
 
 def rows() -> list[Row]:
@@ -113,27 +104,31 @@ def rows() -> list[Row]:
     columns = ColumnMap.load(shipped("kinova_gen3/columns.yaml"))
     files = {run: read_run(shipped(f"kinova_gen3/{run}.csv.gz"), columns) for run in RUNS}
     return [
-        _row(load_joint(columns.joint_files[number]), number, files[fitted], files[judged], judged, fitted)
+        _row(
+            load_joint(columns.joint_files[number]), number, (fitted, files[fitted]), (judged, files[judged])
+        )
         for number in JOINTS
         for judged, fitted in (RUNS, RUNS[::-1])
     ]
 
 
-def _row(joint: Joint, number: int, known: RunFile, other: RunFile, judged: str, fitted: str) -> Row:  # noqa: PLR0917
-    settings = {name: EstimatorSettings(method=name) for name in OURS}
-    known_columns, columns = (_one_encoder(each.table.joints[number], joint) for each in (known, other))
+def _row(joint: Joint, number: int, known: tuple[str, RunFile], other: tuple[str, RunFile]) -> Row:
+    """Fit a joint to the run `known`, and judge it on the run `other`."""
+    settings = {name: EstimatorSettings(method=name) for name in METHODS}
+    (fitted, known_table), (judged, table) = ((name, file.table) for name, file in (known, other))
+    columns = _one_encoder(table.joints[number], joint)
     learned, seen = (
-        run_signals(name, joint, settings["tob"], file.table.time_s, each)
-        for name, file, each in ((fitted, known, known_columns), (judged, other, columns))
+        run_signals(name, joint, settings["tob"], each.time_s, _one_encoder(each.joints[number], joint))
+        for name, each in ((fitted, known_table), (judged, table))
     )
-    friction = fit_friction(known.table.time_s, known.table.joints[number], joint).friction
+    friction = fit_friction(known_table.time_s, known_table.joints[number], joint).friction
     joints = {"tob": replace(joint, friction=friction)}
     with suppress(LossFitError):  # too little motion in one direction
         fused = fit_fused(pieces_of(learned), joint.friction, with_torsion=False).fused
         joints["fused"] = replace(joint, fused=fused)
     example = Example(learned.seen, learned.sensor_nm, learned.sensor_nm, learned.moving)
     found = {
-        name: estimate_columns(each, settings[name], None, other.table.time_s, columns)
+        name: estimate_columns(each, settings[name], None, table.time_s, columns)
         for name, each in joints.items()
     }
     keep = seen.moving.copy()
@@ -149,9 +144,9 @@ def _row(joint: Joint, number: int, known: RunFile, other: RunFile, judged: str,
         judged,
         fitted,
         {name: float(np.sqrt(np.mean(each[keep] ** 2))) for name, each in errors.items()},
-        {name: _inside(errors[name], Z90 * each.sigma_nm, keep) for name, each in found.items()},
+        {name: _inside(errors[name], GAUSS * each.sigma_nm, keep) for name, each in found.items()},
         {
-            name: _inside(errors[name], each.sigma_nm, each.status == STANDSTILL)
+            name: _inside(errors[name], each.sigma_nm, seen.standing & (each.status == STANDSTILL))
             for name, each in found.items()
         },
     )
@@ -169,7 +164,7 @@ def _inside(error: FloatArray, half: FloatArray, where: BoolArray) -> float:
 
 def markdown(found: Sequence[Row]) -> list[str]:
     """Return the table, and what holds of the goal."""
-    names = (*OURS, *SIMPLE)
+    names = (*METHODS, *SIMPLE)
     titles = ("ours, `tob`", "ours, `fused`", *(each.title for each in SIMPLE.values()))
     lines = [
         "| joint, judged on | "
@@ -185,11 +180,11 @@ def markdown(found: Sequence[Row]) -> list[str]:
             for n in names
         )
         inside, standing = (
-            ", ".join("-" if np.isnan(each.get(n, np.nan)) else f"{each[n]:.0f} %" for n in OURS)
+            ", ".join("-" if np.isnan(each.get(n, np.nan)) else f"{each[n]:.0f} %" for n in METHODS)
             for each in (row.inside, row.standing)
         )
         lines.append(f"| {row.joint}, {row.judged} | " + " | ".join(numbers) + f" | {inside} | {standing} |")
-    lines += ["", *(_verdict(found, name) for name in OURS)]
+    lines += ["", *(_verdict(found, name) for name in METHODS)]
     return lines
 
 

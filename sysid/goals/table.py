@@ -166,7 +166,7 @@ def method_lines(columns: Sequence[Column]) -> list[list[str]]:
 def change_lines(columns: Sequence[Column]) -> list[list[str]]:
     """Return the table of changes: RMSE [Nm] and share inside [%] of ours without and with zeros; RMSE of least squares."""
     head = [
-        "changed after identification: RMSE Nm, inside %, degraded %: ours | zeros tracked | RMSE of least squares",
+        "changed after identification: RMSE Nm, inside %, degraded %: ours / zeros tracked / RMSE of least squares",
         *(column.name for column in columns),
     ]
     names = list(dict.fromkeys(name for column in columns for name in column.changed[OURS]))

@@ -84,8 +84,7 @@ def _share(result: TrainedNetwork) -> list[str]:
     share = float(result.metadata.get("share", 1.0))
     if share >= 1.0:
         return []
-    nothing = "" if share else ": the estimate is the physics alone"
-    return [f"- Share of the correction that improves held-out runs and worsens none: {share:.2f}{nothing}"]
+    return [f"- Share of the correction that improves held-out runs and worsens none: {share:.2f}"]
 
 
 def _mean(result: TrainedNetwork, which: int) -> float:
@@ -273,7 +272,7 @@ def _train_joint(
         if options.show_leakage:
             claimed = split_by_sample(blocks, **settings)
     path = options.out / f"{name}.onnx"
-    gate = judge(list(result.held_out.values())) if options.network == "ours" else None
+    gate = judge(result.held_out.values(), result.metadata["share"]) if options.network == "ours" else None
     if gate is not None and not gate.passed:
         left = f"; {path} is of an earlier training" if path.exists() else ""
         print(
@@ -292,9 +291,8 @@ def _train_joint(
     )
     share = result.metadata.get("share", 1.0)
     if share < 1.0:
-        nothing = "" if share else ": it worsens some of them, so the estimate is the physics alone"
         print(
-            f"  share of its correction that improves them and worsens none: {share:.2f}{nothing}",
+            f"  share of its correction that improves them and worsens none: {share:.2f}",
             file=sys.stderr if options.json else sys.stdout,
         )
     if claimed is not None:

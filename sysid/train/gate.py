@@ -21,12 +21,14 @@ class Gate:
     Attributes:
         network_rmse_nm, physics_rmse_nm: over all runs, each of the same weight.
         runs, worse: how many there were, and how many were worse with it.
+        share: of its correction that the network is written with, 0 to 1.
     """
 
     network_rmse_nm: float
     physics_rmse_nm: float
     runs: int
     worse: int
+    share: float = 1.0
 
     @property
     def gain(self) -> float:
@@ -35,8 +37,12 @@ class Gate:
 
     @property
     def passed(self) -> bool:
-        """Return whether it may be used."""
-        return self.runs > 0 and self.gain >= LEAST_GAIN and self.worse <= MOST_WORSE * self.runs
+        """Return whether it may be used: not with the share 0, which is no network, however the runs were judged."""
+        return self._earned and self.share > 0.0
+
+    @property
+    def _earned(self) -> bool:
+        return self.gain >= LEAST_GAIN and self.worse <= MOST_WORSE * self.runs
 
     @property
     def text(self) -> str:
@@ -46,6 +52,11 @@ class Gate:
             f"(RMSE {self.physics_rmse_nm:.3f} -> {self.network_rmse_nm:.3f} Nm; "
             f"expected at least {100 * LEAST_GAIN:.0f} %) "
             f"and is worse in {self.worse} (expected at most {100 * MOST_WORSE:.0f} %)"
+            + (
+                "; but no share of it is without harm to all of them"
+                if self._earned and not self.passed
+                else ""
+            )
         )
 
     def to_mapping(self) -> dict[str, Any]:
@@ -60,13 +71,14 @@ class Gate:
         }
 
 
-def judge(scores: Collection[tuple[float, float]]) -> Gate:
+def judge(scores: Collection[tuple[float, float]], share: float = 1.0) -> Gate:
     """Return the verdict on the MSE [Nm²] of each run left out: (with the network, physics alone).
 
-    A network that changes nothing takes nothing off, and is worse nowhere. Raises ValueError without a run.
+    share: of its correction that the network is to be written with; a run is judged with one that it had no say in. A
+    network that changes nothing takes nothing off, and is worse nowhere. Raises ValueError without a run.
     """
     if not scores:
         raise ValueError("found no run left out, expected at least one")
     table = np.array(list(scores), np.float64)
     network, physics = np.sqrt(table.mean(axis=0)).tolist()
-    return Gate(network, physics, len(table), int((table[:, 0] > table[:, 1]).sum()))
+    return Gate(network, physics, len(table), int((table[:, 0] > table[:, 1]).sum()), share)

@@ -162,7 +162,7 @@ def train_fused(
             conformal_scale(errors, [one.sigma_nm for one, _ in unseen], [one.quadrant for one, _ in unseen])
         ),
         "share": share,
-        "gate": judge(list(scores.values())).to_mapping(),
+        "gate": judge(scores.values(), share).to_mapping(),
         "input_low": low.tolist(),
         "input_high": high.tolist(),
         "joint": joint.name,

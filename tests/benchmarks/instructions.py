@@ -19,7 +19,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +28,6 @@ from jtqd.daemon.loop import process as loop
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.estimator import load_network, make_estimator, onnx_graph
-from jtqd.estimator.joint import Agreement
 from jtqd.estimator.methods import AnyNetwork
 from jtqd.estimator.settings import recommended
 from jtqd.estimator.status import PUBLISHED
@@ -56,7 +54,8 @@ def work(method: str) -> None:
     """Estimate a run: what is counted."""
     joint = load_joint(shipped("trained/joint1.yaml"))
     assert joint.fused is not None
-    joint = replace(joint, fused=replace(joint.fused, agreement=Agreement(0.4, 0.5, 0.004, 0.15)))
+    assert joint.fused.agreement is not None
+    assert joint.fused.tracking is not None
     with tempfile.TemporaryDirectory() as directory:
         estimator = make_estimator(joint, recommended(method), _network(method, Path(directory)))
     time = np.arange(SAMPLES) * 1e-3

@@ -40,7 +40,11 @@ def test_the_shipped_configuration_is_read() -> None:
     assert config.node_id == 0x20
     assert (config.input_wait_ns, config.input_deadline_ns) == (500_000, 850_000)
     assert config.estimator == EstimatorSettings(
-        method="fused", bandwidth_rad_s=200.0, torsion_bandwidth_rad_s=800.0, track_zeros=True
+        method="fused",
+        bandwidth_rad_s=200.0,
+        torsion_bandwidth_rad_s=800.0,
+        track_link=True,
+        track_zeros=True,
     )
     assert config.realtime == Realtime(80, None, True)
     assert all(joint.network is None and joint.temperature for joint in config.joints)

@@ -58,7 +58,7 @@ def test_what_is_wrong_is_named(key, value):
 
 
 def test_request_carries_all_that_a_log_must_hold(tmp_path):
-    """From the shipped configuration of the paper's chain to the attachments, byte for byte; joint files and networks by their hashes."""
+    """From the configuration of the paper's chain to the attachments, byte for byte; files by their hashes."""
     config = load_config(shipped("bench_paper.yaml"))
     nodes = {str(n): {"scaling": SCALING} for n in (1, 2)} | {"3": {"scaling": {"nm_per_unit": {"1": 0.001}}}}
     content = recording_request(

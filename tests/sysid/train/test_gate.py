@@ -53,6 +53,14 @@ def test_a_run_has_no_say_in_the_share_that_it_is_judged_with():
     assert judge(scores).worse == 1
 
 
+def test_what_is_written_with_the_share_0_is_no_network():
+    """A run of fifty may be harmed; the share that harms none can then be 0, and what is written corrects nothing."""
+    found = judge([GOOD] * 50, share=0.0)
+    assert not found.passed
+    assert found.text.endswith("(expected at most 2 %); but no share of it is without harm to all of them")
+    assert judge([FAIR] * 50, share=0.0).text == judge([FAIR] * 50).text
+
+
 @pytest.fixture
 def train(tmp_path, monkeypatch, capsys):
     """`jtq train` whose training gives these scores; exit status, standard output, JSON or None."""
