@@ -69,6 +69,13 @@ def test_the_estimate_is_of_now_whatever_the_weights(current_nm: float, torsion_
     assert np.array_equal(aligned(step, even, joint, TRACKED), step)
 
 
+def test_a_joint_that_moves_at_its_start_has_no_transient() -> None:
+    torque, dt = np.full(100, 7.0), np.full(100, 0.001)
+    assert estimated(following(lossless(0.3, 0.4)), TRACKED, torque, dt)[1:] == pytest.approx(
+        torque[1:], abs=1e-6
+    )
+
+
 def test_a_torque_on_the_link_is_followed_within_milliseconds_and_white_noise_is_as_that_of_800() -> None:
     n, dt = 4000, np.full(4000, 0.001)
     noise = np.random.default_rng(4).normal(0.0, 6e-6, n)
