@@ -32,7 +32,7 @@ from jtqd.sysid.runs.files import RunError, read_runs
 from jtqd.sysid.runs.truth import read_truth
 
 BANDWIDTHS_RAD_S: Final = (200.0, 300.0, 400.0, 600.0, 800.0, 1200.0, 1600.0)
-RATES_RAD_S: Final = (120.0, 160.0, 200.0, 250.0, 320.0)
+RATES_RAD_S: Final = (160.0, 200.0, 220.0, 260.0, 320.0)
 """Of the link's tracking filter."""
 _MOVING_RAD_S: Final = 0.05
 _PIECE: Final = 400

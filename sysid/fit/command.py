@@ -457,6 +457,12 @@ def _lines(joint: Joint, fit: FusedFit) -> list[str]:
             f"  current and torsion differ by up to {agreement.slow_nm:.2f} Nm slowly and {agreement.fast_nm:.2f} Nm "
             "over the motor's turn; sigma grows beyond"
         )
+    tracking = fit.fused.tracking
+    if tracking is not None:
+        lines.append(
+            f"  with the link tracked, an estimate of now: {tracking.sigma_nm:.2f} Nm and "
+            f"{tracking.viscous_nms_per_rad:.2f} Nms/rad more, added as squares"
+        )
     return lines
 
 

@@ -68,8 +68,9 @@ def torsion_now(torsion: Torsion, run: RunSignals, as_read: AsRead, rate_rad_s: 
 
     Raises ValueError where the run's positions are not known.
     """
-    link, dt_s = _known(run.link_position_rad, 0.0), run.seen.dt_s
-    motor = _known(run.motor_position_rad, 0.0)
+    link, motor, dt_s = run.link_position_rad, run.motor_position_rad, run.seen.dt_s
+    if link is None or motor is None:
+        raise ValueError(f"{run.name}: found no positions, expected those of both encoders")
     waves = [part(order * motor) for order in RIPPLE_ORDERS for part in (np.cos, np.sin)]
     seen = replace(run.seen, torsion_nm=as_read.torsion_rad, waves=np.column_stack(waves))
     d = deflection(torsion, replace(run, seen=seen, bandwidth_rad_s=inf))

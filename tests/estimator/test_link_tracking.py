@@ -54,6 +54,17 @@ def test_a_constant_acceleration_is_followed_without_lag_at_uneven_steps_and_a_g
         tracked(np.zeros(3), np.zeros(2), 200.0)
 
 
+def test_how_far_it_follows_steps_and_waves_as_docs_say() -> None:
+    dt = np.full(4000, 0.001)
+    step = np.where(np.arange(4000) < 100, 0.0, 1.0)
+    followed = step - tracked(step, dt, 220.0)[0]
+    assert followed[100:103] == pytest.approx([0.48, 0.79, 0.97], abs=0.01)
+    assert followed.max() == pytest.approx(1.15, abs=0.01)
+    for hz, missed in ((10.0, 0.015), (20.0, 0.09), (40.0, 0.30)):
+        noise, _ = tracked(np.sin(2.0 * np.pi * hz * 0.001 * np.arange(4000)), dt, 220.0)
+        assert np.sqrt(2.0 * np.mean(noise[2000:] ** 2)) == pytest.approx(missed, rel=0.05)
+
+
 @WEIGHTS
 def test_the_estimate_is_of_now_whatever_the_weights(current_nm: float, torsion_nm: float) -> None:
     """A ramp without lag, and a step of the motor's side in the sample that shows it."""
@@ -67,6 +78,13 @@ def test_the_estimate_is_of_now_whatever_the_weights(current_nm: float, torsion_
     assert estimated(joint, TRACKED, step, even)[1:] == pytest.approx(step[1:], abs=0.1)
     assert (bandwidth_of(joint, TRACKED), age_ms(joint, TRACKED)) == (inf, 0.0)
     assert np.array_equal(aligned(step, even, joint, TRACKED), step)
+
+
+def test_a_joint_that_moves_at_its_start_has_no_transient() -> None:
+    torque, dt = np.full(100, 7.0), np.full(100, 0.001)
+    assert estimated(following(lossless(0.3, 0.4)), TRACKED, torque, dt)[1:] == pytest.approx(
+        torque[1:], abs=1e-6
+    )
 
 
 def test_a_torque_on_the_link_is_followed_within_milliseconds_and_white_noise_is_as_that_of_800() -> None:
