@@ -63,6 +63,10 @@ class Line:
         origins = [name for name in ("value", "read", "option") if getattr(self, name) is not None]
         if (self.key is not None) != (len(origins) == 1):
             raise FieldError("line", "key", self.key, "a key with one of value, read and option, or neither")
+        if self.key is not None and self.key.startswith("objects.temperature"):
+            raise FieldError(
+                "line", "key", self.key, "that of a quantity: a temperature is named by the joint's section"
+            )
         if (self.check is None) != (self.expected is None) or (self.check and self.key):
             raise FieldError("line", "check", self.check, "an object with its expected value, and no key")
 

@@ -13,7 +13,6 @@ At the first boot this process sends it, also after its report, until its standa
 from __future__ import annotations
 
 import json
-import logging
 import select
 import sys
 import threading
@@ -30,10 +29,9 @@ from jtqd.drivers import nmt
 from jtqd.drivers.boot_error import BootError
 from jtqd.drivers.boot_procedure import BootedNode, NodeBoot, reset_during_boot
 from jtqd.drivers.boot_request import BootRequest, RequestError, node_report, parse_request
-from jtqd.drivers.can_unix import UnixBus
 from jtqd.drivers.devices import Profile
 from jtqd.drivers.emcy import EMCY_BASE, HISTORY_INDEX, Emergency, name_of, parse, register_text
-from jtqd.drivers.frame import CAN_RTR_FLAG, CAN_SFF_MASK
+from jtqd.drivers.network import close, network_on, open_can
 from jtqd.drivers.object_dictionary import entries_to_json, read_eds
 from jtqd.drivers.sdo import RESPONSE_ID, Key, SdoAbort
 from jtqd.drivers.sdo_client import NetworkChannel, SdoClient, SdoTimeout
@@ -47,8 +45,6 @@ _REPORT_S = 0.25
 _LONGEST_HOLD_S = 60.0
 """After its report this process sends heartbeats for so long at most."""
 SYNC_LISTEN_S = 0.12  # a little more than the longest period that jtqd itself may have
-NOTIFIER_S = 0.01  # canopen's default of 1 s is what closing the network would wait for
-_UNIX = "unix:"
 _SILENCES = 2.6
 """Of a node's longest silence: two repetitions of a request, and half of it again."""
 
@@ -85,11 +81,7 @@ def boot(
         BootError: a node, or the bus, cannot be used.
     """
     started = time.monotonic()
-    network = canopen.Network()
-    network.bus = open_bus(request) if bus is None else bus
-    network.NOTIFIER_CYCLE = NOTIFIER_S
-    errors = BusErrors()
-    network.listeners.append(errors)
+    network, errors = network_on(_open_bus(request) if bus is None else bus)
     beat = MasterHeartbeat(network, request)
     try:
         network.connect()
@@ -104,7 +96,7 @@ def boot(
         raise _bus_error(request.bus, error) from error
     finally:
         beat.stop()
-        _close(network)
+        close(network)
     return report
 
 
@@ -254,33 +246,20 @@ def _require_operational(network: canopen.Network, heartbeats: Heartbeats, node:
         raise BootError(node, "NMT state", expected="operational", found=found, detail=detail)
 
 
-def open_bus(request: BootRequest) -> can.BusABC:
+def _open_bus(request: BootRequest) -> can.BusABC:
     """Open a bus that receives the nodes' answers and heartbeats, SYNC and our own node-ID. Raises BootError."""
     bases = RESPONSE_ID, nmt.HEARTBEAT_BASE, EMCY_BASE
     identifiers = [base + profile.node_id for profile in request.profiles for base in bases]
     if request.check_foreign_sync:
         identifiers += [request.settings.sync_cob_id, nmt.HEARTBEAT_BASE + request.settings.master_node]
-    # "extended": False puts CAN_EFF_FLAG into the mask: canopen takes 29-bit frames for 11-bit ones
-    mask = CAN_SFF_MASK | CAN_RTR_FLAG
-    filters = [{"can_id": cob_id, "can_mask": mask, "extended": False} for cob_id in identifiers]
     try:
-        if request.bus.startswith(_UNIX):
-            return UnixBus(channel=request.bus.removeprefix(_UNIX), can_filters=filters)
-        return can.Bus(interface="socketcan", channel=request.bus, can_filters=filters)
+        return open_can(request.bus, identifiers)
     except (can.CanError, OSError) as error:
         raise _bus_error(request.bus, error) from error
 
 
 def _bus_error(bus: str, error: Exception) -> BootError:
     return BootError(None, bus, expected="a bus", found=str(error), detail=f"bus {bus}: {error}")
-
-
-def _close(network: canopen.Network) -> None:
-    try:
-        network.disconnect()
-    except Exception as error:
-        # disconnect() re-raises what the receiving thread met; that has been reported already
-        logging.getLogger(__name__).debug("closing the network: %s", error)
 
 
 class Heartbeats:
@@ -426,25 +405,8 @@ class ForeignMaster:
             raise BootError(None, where, expected="no such node", found="heartbeat", detail=detail)
 
 
-class BusErrors(can.Listener):  # type: ignore[misc]
-    """Keep canopen's receiving thread from dying with a traceback, and the reason in `last`."""
-
-    def __init__(self) -> None:
-        self.last: Exception | None = None
-
-    def on_message_received(self, msg: can.Message) -> None:
-        """Do nothing: canopen's own listener takes the message."""
-
-    def on_error(self, exc: Exception) -> None:
-        """Keep the reason; a failing recv returns at once, so wait a little."""
-        self.last = exc
-        time.sleep(NOTIFIER_S)
-
-
 def main() -> int:
     """Read a request from stdin, boot, print the report; return the exit status. Never a traceback."""
-    logging.getLogger("canopen").setLevel(logging.CRITICAL)  # what it logs as error is in the report
-    logging.getLogger("can").setLevel(logging.CRITICAL)
     try:
         request = parse_request(_read_request())
         boot(request, hold=partial(_report_and_hold, request))

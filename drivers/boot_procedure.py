@@ -14,7 +14,6 @@ from jtqd.drivers.boot_tpdos import TpdoSetup
 from jtqd.drivers.devices import (
     OPERATING_MODE_OBJECT,
     SYNC_COB_ID,
-    TEMPERATURE,
     DriveProfile,
     DriveScaling,
     Profile,
@@ -165,17 +164,14 @@ class NodeBoot:
             raise mismatch(self._node, key, name, expected=expected, found=found, letter="H")
 
     def check_temperature(self) -> None:
-        """Require 3001h of a drive whose temperature is asked for; its value does not matter here."""
+        """Require the object of a drive whose temperature is asked for; its value does not matter here."""
         profile = self._profile
-        if (
-            isinstance(profile, DriveProfile)
-            and profile.temperature
-            and self._objects.read(TEMPERATURE) is None
-        ):
+        wanted = profile.temperature if isinstance(profile, DriveProfile) else None
+        if wanted is not None and self._objects.read(wanted.key) is None:
             expected = "a value (required by the configuration)"
             what = "joint temperature"
             raise mismatch(
-                self._node, TEMPERATURE, what, expected=expected, found="no such object", letter="J"
+                self._node, wanted.key, what, expected=expected, found="no such object", letter="J"
             )
 
     def configure_pdos(self) -> tuple[PdoMap, ...]:

@@ -7,10 +7,10 @@
                {"node": 2, "kind": "drive", "given": {"6091h:1": 100}, "temperature": true, "sdo_timeout_ms": 1000},
                {"node": 3, "kind": "sensor", "channels": [1], "unit_words": {"0x00560000": 1.0}, "mandatory": false}]}
 
-Only "bus" and "nodes" with "node" and "kind" are needed. `given` replaces objects that are then not read; `temperature` of
-a drive asks for TPDO3 with 3001h; a node that is not `mandatory` may be absent. "error_behaviour" is 1029h:1; without it
-the nodes keep theirs. "reset": NMT reset communication comes first. `sdo_timeout_ms`: silence of the node after which a
-request is repeated.
+Only "bus" and "nodes" with "node" and "kind" are needed. `given` replaces objects that are then not read; `temperature` of a
+drive (true: 3001h, or fields of `devices.Temperature`) asks for TPDO3; a node that is not `mandatory` may be absent.
+"error_behaviour" is 1029h:1; without it the nodes keep theirs. "reset": NMT reset communication comes first.
+`sdo_timeout_ms`: silence of the node after which a request is repeated.
 `objects` of a drive: fields of `devices.DriveObjects`, each with those of `DriveObject`, or null; `tpdos`: TPDOs that
 shall carry them (`layout.tpdos_as_json`), without it TPDO1 and TPDO2 as jtqd maps them. `torque_constant_nm_per_a`: for a
 current by its torque (6077h). `by_itself`: TPDOs of transmission types 0, 254 and 255 are accepted.
@@ -32,6 +32,7 @@ from jtqd.drivers.devices import (
     Identity,
     Profile,
     SensorProfile,
+    Temperature,
     parse_key,
 )
 from jtqd.drivers.layout import maps_of_json, tpdos_as_json
@@ -150,7 +151,7 @@ def _profile(raw: object, where: str) -> Profile:
     given = _given(node.get("given"), f"{where}.given")
     kind = node.get("kind")
     if kind == "drive":
-        temperature = _boolean(node, "temperature", default=False, where=where)
+        temperature = _temperature(node, where)
         objects = _objects(node.get("objects"), f"{where}.objects")
         layout = _layout(node.get("tpdos", []), number, objects, f"{where}.tpdos")
         constant = node.get("torque_constant_nm_per_a", 0.0)
@@ -231,6 +232,20 @@ def _mapping(raw: object, where: str, known: set[str] | None) -> Mapping[str, An
     if unknown:
         raise RequestError(f"{where}: unknown key {unknown[0]!r}, expected one of {sorted(known or ())}")
     return raw
+
+
+def _temperature(node: Mapping[str, Any], where: str) -> Temperature | None:
+    """Return the object of the joint's temperature: true for 3001h, false for none, or a mapping."""
+    value = node.get("temperature", False)
+    if not isinstance(value, dict):
+        return Temperature() if _boolean(node, "temperature", default=False, where=where) else None
+    where = f"{where}.temperature"
+    known = _mapping(value, where, {"index", "subindex", "c_per_unit"})
+    factor = known.get("c_per_unit")
+    if isinstance(factor, bool) or not isinstance(factor, int | float) or not factor > 0.0:
+        raise RequestError(f"{where}.c_per_unit: found {factor!r}, expected a number above 0")
+    index = _integer(known, "index", 0x1000, 0xFFFF, None, where=where)
+    return Temperature(index, _integer(known, "subindex", 0, 254, 0, where=where), float(factor))
 
 
 def _boolean(mapping: Mapping[str, Any], key: str, *, default: bool, where: str = "node") -> bool:

@@ -15,7 +15,7 @@ from contextlib import suppress
 from typing import NamedTuple
 
 from jtqd.drivers.boot_error import BootError
-from jtqd.drivers.devices import EVENT_DRIVEN, EVENT_MS, TEMPERATURE, DriveProfile, Profile
+from jtqd.drivers.devices import EVENT_DRIVEN, EVENT_MS, DriveProfile, Profile
 from jtqd.drivers.layout import BY_ITSELF, EVERY_SYNC, LayoutError, chosen, pdo_of_words
 from jtqd.drivers.pdo import CAN_ID, EXTENDED, INVALID, NO_RTR, PdoError, PdoMap
 from jtqd.drivers.sdo import Key, label
@@ -223,15 +223,15 @@ class TpdoSetup:
                 raise LayoutError(f"no TPDO is that of {', '.join(missing)}")
             return tuple(found)
         used = chosen(profile.objects, found)
-        if not profile.temperature:
+        if profile.temperature is None:
             return used
-        (wanted,) = (pdo for pdo in profile.tpdos if (pdo.objects[0].index, 0) == TEMPERATURE)
+        (wanted,) = filter(_is_temperature, profile.tpdos)
         same = [pdo for pdo in found if (pdo.cob_id, pdo.words) == (wanted.cob_id, wanted.words)]
         if not same:
             raise LayoutError(
-                f"no TPDO with COB-ID {wanted.cob_id:03X}h carries {label(*TEMPERATURE)} alone (temperature)"
+                f"no TPDO with COB-ID {wanted.cob_id:03X}h carries {label(*profile.temperature.key)} alone (temperature)"
             )
-        return (*used, same[0])
+        return (*used, PdoMap(wanted.cob_id, wanted.objects, same[0].transmission_type, same[0].number))
 
     def _try_to_switch_off(self, number: int) -> None:
         """Switch off a TPDO that nobody needs; one that cannot be costs bus load and no more."""
@@ -287,7 +287,7 @@ class TpdoSetup:
 
 def _is_temperature(pdo: PdoMap) -> bool:
     """Return whether this is the event-driven TPDO with the temperature, whose timers jtqd sets."""
-    return pdo.transmission_type in EVENT_DRIVEN and (pdo.objects[0].index, 0) == TEMPERATURE
+    return pdo.transmission_type in EVENT_DRIVEN and pdo.names[0] == "temperature"
 
 
 def _is_refused_write(error: BootError) -> bool:

@@ -56,11 +56,10 @@ SENSOR_SCALING_OBJECTS: dict[Key, tuple[str, int]] = {
 }
 """Objects that scale a sensor's channels, with their largest value."""
 
-TEMPERATURE: Key = (0x3001, 0)
-"""Joint temperature of a drive, I16."""
 TEMPERATURE_C_PER_UNIT = 0.1
+"""Of 3001h."""
 NOT_MEASURED = -0x8000
-"""3001h of a drive that has the object and no sensor behind it."""
+"""Temperature of a drive that has the object and no sensor behind it."""
 EVENT_MS = 500
 """Event timer and inhibit time of an event-driven TPDO: at least, and at most, one in this time."""
 EVENT_DRIVEN = (254, 255)
@@ -129,13 +128,27 @@ CIA_402 = DriveObjects()
 
 
 @dataclass(frozen=True)
+class Temperature:
+    """Object of a drive with the temperature of its joint, 16 bits, signed; `NOT_MEASURED` for none."""
+
+    index: int = 0x3001
+    subindex: int = 0
+    c_per_unit: float = TEMPERATURE_C_PER_UNIT
+
+    @property
+    def key(self) -> Key:
+        """Index and sub-index."""
+        return self.index, self.subindex
+
+
+@dataclass(frozen=True)
 class DriveProfile:
     """A CiA 402 drive as jtqd configures it.
 
     Attributes:
         objects: which of its objects are mapped.
         given: scaling objects by the configuration, which are then not read.
-        temperature: it has 3001h, and shall send it by TPDO3.
+        temperature: object that it shall send by TPDO3; None: it sends none.
         torque_constant_nm_per_a: of the motor, for a drive that tells torque instead of current; 0: not known.
         by_itself: its TPDOs may have transmission types 0, 254, 255.
         layout: TPDOs that shall carry its quantities; empty: TPDO1 and TPDO2 as jtqd maps them.
@@ -144,7 +157,7 @@ class DriveProfile:
     node_id: int
     identity: Identity = Identity()
     given: Mapping[Key, int] = field(default_factory=dict)
-    temperature: bool = False
+    temperature: Temperature | None = None
     objects: DriveObjects = CIA_402
     layout: tuple[PdoMap, ...] = ()
     torque_constant_nm_per_a: float = 0.0
@@ -156,7 +169,7 @@ class DriveProfile:
         """TPDOs of the quantities, and TPDO3 with the temperature."""
         node, objects = self.node_id, self.objects
         layout = self.layout or drive_layout(node, objects)
-        return (*layout, drive_tpdo3(node)) if self.temperature else layout
+        return layout if self.temperature is None else (*layout, drive_tpdo3(node, self.temperature))
 
     @property
     def scaling_objects(self) -> tuple[Key, ...]:
@@ -248,9 +261,9 @@ def _mapped(objects: DriveObjects, *names: str) -> tuple[MappedObject, ...]:
     )
 
 
-def drive_tpdo3(node: int) -> PdoMap:
+def drive_tpdo3(node: int, temperature: Temperature = Temperature()) -> PdoMap:
     """380h+n: joint temperature, not bound to SYNC: when the event timer runs out (transmission type 255)."""
-    return PdoMap(0x380 + node, (MappedObject(*TEMPERATURE, 16, True, "temperature"),), 255)
+    return PdoMap(0x380 + node, (MappedObject(*temperature.key, 16, True, "temperature"),), 255)
 
 
 def drive_rpdo1(node: int) -> PdoMap:

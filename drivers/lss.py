@@ -19,19 +19,17 @@ from functools import partial
 from typing import Final, Self
 
 import can
-import canopen
 from canopen import lss
 
-from jtqd.drivers.bus_socket import PREFIX, BusError
-from jtqd.drivers.can_unix import UnixBus
 from jtqd.drivers.devices import SYNC_COB_ID
-from jtqd.drivers.frame import CAN_RTR_FLAG, CAN_SFF_MASK
+from jtqd.drivers.network import close, network_on, open_can
 
 BIT_RATES: Final = (1_000_000, 800_000, 500_000, 250_000, 125_000, 100_000, 50_000, 20_000, 10_000)
 """[bit/s] in the order of table 0 of CiA 305."""
 UNCONFIGURED: Final = 0xFF
 """Node-ID of a device that has none."""
 _LISTEN_S, _ANSWER_S, _SETTLED_S = 0.12, 0.2, 0.03
+_LENGTH: Final = 8
 _PARTS: Final = (
     lss.CS_INQUIRE_VENDOR_ID,
     lss.CS_INQUIRE_PRODUCT_CODE,
@@ -114,29 +112,24 @@ class LssDevice:
 
 
 class LssBus:
-    """A bus without a master, to which LSS is sent. Raises LssFailure where there is SYNC or no bus."""
+    """A bus without a master, to which LSS is sent. Raises LssFailure where there is SYNC or no bus, or it has ended."""
 
     def __init__(self, name: str) -> None:
-        mask = CAN_SFF_MASK | CAN_RTR_FLAG
-        identifiers = (lss.LssMaster.LSS_RX_COBID, SYNC_COB_ID)
-        filters = [{"can_id": each, "can_mask": mask, "extended": False} for each in identifiers]
-        self._network = canopen.Network()
-        self._network.NOTIFIER_CYCLE = 0.01
-        try:
-            if name.startswith(PREFIX):
-                self._network.bus = UnixBus(channel=name.removeprefix(PREFIX), can_filters=filters)
-            else:
-                self._network.bus = can.Bus(interface="socketcan", channel=name, can_filters=filters)
-            self._network.connect()
-        except (can.CanError, OSError, BusError) as error:
-            raise LssFailure(f"bus {name}: {error}") from None
         self._name = name
+        try:
+            bus = open_can(name, (lss.LssMaster.LSS_RX_COBID, SYNC_COB_ID))
+        except (can.CanError, OSError, ValueError) as error:
+            raise self._failure(error) from None
+        self._network, self._errors = network_on(bus)
         self._master: lss.LssMaster = self._network.lss
         self._master.RESPONSE_TIMEOUT = _ANSWER_S
+        self._network.unsubscribe(self._master.LSS_RX_COBID)
+        self._network.subscribe(self._master.LSS_RX_COBID, self._on_answer)
         self._syncs: queue.Queue[int] = queue.Queue(1)
+        self._network.subscribe(SYNC_COB_ID, self._on_sync)
 
     def __enter__(self) -> Self:
-        self._network.subscribe(SYNC_COB_ID, self._on_sync)
+        self._network.connect()
         try:
             self._syncs.get(timeout=_LISTEN_S)
         except queue.Empty:
@@ -151,9 +144,17 @@ class LssBus:
         if self._syncs.empty():
             self._syncs.put(1)
 
+    def _on_answer(self, can_id: int, data: bytes, timestamp: float) -> None:
+        """Take what is 8 bytes long, as every message of CiA 305; the library unpacks whatever comes."""
+        if len(data) == _LENGTH:
+            self._master.on_message_received(can_id, data, timestamp)
+
+    def _failure(self, error: Exception) -> LssFailure:
+        return LssFailure(f"bus {self._name}: {error}")
+
     def close(self) -> None:
         """Close the bus."""
-        self._network.disconnect()
+        close(self._network)
 
     @contextmanager
     def selected(self, address: LssAddress | None = None) -> Iterator[LssDevice]:
@@ -161,30 +162,34 @@ class LssBus:
 
         Raises LssFailure: none has this address.
         """
-        master = self._master
-        master.send_switch_state_global(master.WAITING_STATE)
-        if address is None:
-            master.send_switch_state_global(master.CONFIGURATION_STATE)
-        else:
-            parts = address.vendor, address.product, address.revision, address.serial
-            try:
-                master.send_switch_state_selective(*parts)
-            except lss.LssError:
-                raise LssFailure(f"LSS: no device with the identity {address} answers") from None
-        yield from self._until_waiting()
+        with self._until_waiting() as device:
+            master = self._master
+            if address is None:
+                master.send_switch_state_global(master.CONFIGURATION_STATE)
+            else:
+                parts = address.vendor, address.product, address.revision, address.serial
+                try:
+                    master.send_switch_state_selective(*parts)
+                except lss.LssError:
+                    raise LssFailure(f"LSS: no device with the identity {address} answers") from None
+            yield device
 
     @contextmanager
     def unconfigured(self) -> Iterator[LssDevice | None]:
         """Find a device without a node-ID by fast scan, and put it into configuration state; None: there is none."""
-        self._master.send_switch_state_global(self._master.WAITING_STATE)
-        found, _ = self._master.fast_scan()
-        if found:
-            yield from self._until_waiting()
-        else:
-            yield None
+        with self._until_waiting() as device:
+            found, _ = self._master.fast_scan()
+            yield device if found else None
 
+    @contextmanager
     def _until_waiting(self) -> Iterator[LssDevice]:
+        """Put all devices into waiting state, before and after. Raises LssFailure where the bus ends."""
+        waiting = partial(self._master.send_switch_state_global, self._master.WAITING_STATE)
         try:
-            yield LssDevice(self._master)
-        finally:
-            self._master.send_switch_state_global(self._master.WAITING_STATE)
+            waiting()
+            try:
+                yield LssDevice(self._master)
+            finally:
+                waiting()
+        except (can.CanError, OSError) as error:
+            raise self._failure(self._errors.last or error) from None

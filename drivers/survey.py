@@ -8,7 +8,8 @@ TPDOs carry), CiA 404 (6131h, 6132h, 9130h, 6150h).
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,11 +23,11 @@ from jtqd.drivers.devices import (
     sensor_tpdo1,
 )
 from jtqd.drivers.filters import exact
-from jtqd.drivers.frame import FRAME, FRAME_SIZE, pack
+from jtqd.drivers.frame import CAN_EFF_MASK, FRAME, FRAME_SIZE, pack
 from jtqd.drivers.frame_socket import FrameSocket, open_frame_socket
 from jtqd.drivers.object_dictionary import VISIBLE_STRING, Entry, read_eds
-from jtqd.drivers.pdo import CAN_ID, INVALID
-from jtqd.drivers.sdo import REQUEST_ID, RESPONSE_ID, Key, SdoAbort, Transfer, label
+from jtqd.drivers.pdo import CAN_ID, EXTENDED, INVALID
+from jtqd.drivers.sdo import ANSWER_S, REQUEST_ID, RESPONSE_ID, Key, SdoAbort, Transfer, label
 from jtqd.drivers.sdo_client import FrameChannel, SdoAccess, SdoClient, SdoTimeout
 from jtqd.drivers.units import OTHER_SCALING_OBJECTS
 
@@ -37,8 +38,6 @@ IDENTITY: Mapping[str, Key] = {
     name: (0x1018, sub) for sub, name in enumerate(("vendor", "product", "revision", "serial"), 1)
 }
 RATED_CURRENT, RATED_TORQUE, TORQUE = (0x6075, 0), (0x6076, 0), (0x6077, 0)
-GEAR: tuple[Key, Key] = ((0x6091, 1), (0x6091, 2))
-"""Motor shaft revolutions per driving shaft revolutions."""
 MAPPED: Mapping[int, tuple[Key, ...]] = {
     DRIVE: tuple(
         (each.index, each.subindex) for pdo in (drive_tpdo1(1), drive_tpdo2(1)) for each in pdo.objects
@@ -48,17 +47,21 @@ MAPPED: Mapping[int, tuple[Key, ...]] = {
 """Objects that jtqd maps into TPDOs, by profile; of a sensor the first channel."""
 _READ: Mapping[int, tuple[Key, ...]] = {
     DRIVE: (*DRIVE_SCALING_OBJECTS, RATED_TORQUE, TORQUE, *MAPPED[DRIVE]),
-    SENSOR: (
-        *((index, channel) for index in (UNIT_OBJECT, DECIMALS_OBJECT) for channel in (1,)),
-        *MAPPED[SENSOR],
-    ),
+    SENSOR: ((UNIT_OBJECT, 1), (DECIMALS_OBJECT, 1), *MAPPED[SENSOR]),
 }
 UNITS: tuple[Key, ...] = tuple(key for key in OTHER_SCALING_OBJECTS if key not in _READ[DRIVE])
 """Objects that tell in which units a drive counts, where it has such; none of them is missed."""
 _NODES = range(1, 128)
 _LISTEN_S = 0.12
 """A SYNC comes within this, where there is one."""
-_ANSWER_S = 0.5
+_PRESENT_S = 1.0
+"""For the first sign of a node that nobody has named."""
+_SILENCES = 2.6
+"""Of `ANSWER_S`: two repetitions of a request, and half of it again; as at the boot."""
+
+
+class SurveyError(ValueError):
+    """A device that cannot be read to the end; the message is one line."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +131,7 @@ class Survey:
 
 
 def tpdos(access: SdoAccess) -> tuple[Tpdo, ...]:
-    """Read the four TPDOs of the predefined connection set (CiA 301, 1800h and 1A00h)."""
+    """Read the four TPDOs of the predefined connection set (CiA 301, 1800h and 1A00h). Raises SurveyError."""
     return _tpdos(lambda key: _number(access, key))
 
 
@@ -143,33 +146,48 @@ def _tpdos(number_of: Callable[[Key], int | None]) -> tuple[Tpdo, ...]:
         kind, timer_ms = (number_of((communication, sub)) or 0 for sub in (2, 5))
         count = min(number_of((mapping, 0)) or 0, 64)
         words = tuple(number_of((mapping, sub)) or 0 for sub in range(1, count + 1))
-        found.append(Tpdo(number, cob_id & CAN_ID, not cob_id & INVALID, kind, words, timer_ms))
+        identifier = cob_id & (CAN_EFF_MASK if cob_id & EXTENDED else CAN_ID)
+        found.append(Tpdo(number, identifier, not cob_id & INVALID, kind, words, timer_ms))
     return tuple(found)
 
 
 def _number(access: SdoAccess, key: Key) -> int | None:
-    raw = _optional(access, key)
-    return None if raw is None else int.from_bytes(raw[:8], "little")
+    """Return a number of up to 32 bits, as the boot reads it; None when the device refuses it. Raises SurveyError."""
+    try:
+        return int.from_bytes(access.read(*key)[:4], "little")
+    except SdoAbort:
+        return None
+    except SdoTimeout as silence:  # not to be taken for an object that is not there
+        raise SurveyError(f"{label(*key)}: {silence}") from None
 
 
 def survey(access: SdoAccess, node: int) -> Survey:
-    """Read a device by SDO. Raises SdoTimeout: it does not answer."""
-    numbers: dict[Key, int] = {}
+    """Read a device by SDO; one that refuses 1000h has profile 0.
+
+    Raises:
+        SdoTimeout: it does not answer.
+        SurveyError: it has answered, but to an object that matters it does not.
+    """
+    try:
+        device_type = int.from_bytes(access.read(0x1000, 0)[:4], "little")
+    except SdoAbort:
+        device_type = 0
     texts: dict[str, str] = {}
-    missing: set[Key] = set()
-    device_type = int.from_bytes(access.read(0x1000, 0)[:4], "little")
     for name, key in TEXTS.items():
-        raw = _optional(access, key)
-        if raw is not None:
-            texts[name] = _text(raw)
-    optional = UNITS if device_type & 0xFFFF == DRIVE else ()
-    for key in (*IDENTITY.values(), *_READ.get(device_type & 0xFFFF, ()), *optional):
-        raw = _optional(access, key)
-        if raw is not None:
-            numbers[key] = int.from_bytes(raw[:8], "little")
-        elif key not in optional:
-            missing.add(key)
-    return Survey(node, "the bus", device_type & 0xFFFF, texts, numbers, frozenset(missing))
+        with suppress(SdoAbort, SdoTimeout):  # cosmetic
+            texts[name] = _text(access.read(*key))
+    profile = device_type & 0xFFFF
+    needed = (*IDENTITY.values(), *_READ.get(profile, ()))
+    optional = UNITS if profile == DRIVE else ()
+    found = {key: _number(access, key) for key in (*needed, *optional)}
+    return Survey(
+        node,
+        "the bus",
+        profile,
+        texts,
+        {key: number for key, number in found.items() if number is not None},
+        frozenset(key for key in needed if found[key] is None),
+    )
 
 
 def survey_of_eds(path: Path, node: int, more: Iterable[Key] = ()) -> Survey:
@@ -236,7 +254,7 @@ class BusSurvey:
         self._socket.close()
 
     def nodes(self, among: Iterable[int] = _NODES) -> list[int]:
-        """Return the nodes that answer to a read of 1000h within half a second, a few asked at a time."""
+        """Return the nodes that answer to a read of 1000h within a second, a few asked at a time."""
         found: set[int] = set()
         waiting = list(among)
         while waiting:
@@ -244,31 +262,37 @@ class BusSurvey:
             for node in asked:
                 self._socket.send(pack(REQUEST_ID + node, Transfer(0x1000, 0).request))
             found |= self._answers(0.02)
-        end = time.monotonic() + _ANSWER_S
+        end = time.monotonic() + _PRESENT_S
         while (left := end - time.monotonic()) > 0.0:
             found |= self._answers(left)
         return sorted(found)
 
     def read(self, node: int) -> Survey | None:
-        """Survey one node; None when it does not answer."""
+        """Survey one node; None when it does not answer. Raises SurveyError."""
         try:
-            return survey(SdoClient(FrameChannel(self._socket, node), _ANSWER_S), node)
+            with _of(node):
+                return survey(self.access(node), node)
         except SdoTimeout:
             return None
 
-    def access(self, node: int, answer_s: float = _ANSWER_S) -> SdoClient:
-        """Return the SDO client of one node; it waits `answer_s` for an answer, and repeats nothing within it."""
-        return SdoClient(FrameChannel(self._socket, node), answer_s, answer_s)
+    def access(self, node: int, patience_s: float | None = None) -> SdoClient:
+        """Return the SDO client of one node, which asks again as the boot does; with `patience_s` it asks once and waits."""
+        channel = FrameChannel(self._socket, node)
+        if patience_s is None:
+            return SdoClient(channel, _SILENCES * ANSWER_S)
+        return SdoClient(channel, patience_s, patience_s)
 
     def numbers(self, node: int, keys: Iterable[Key]) -> dict[Key, int]:
-        """Read further numbers of one node; those that it does not have are left out."""
+        """Read further numbers of one node; those that it does not have are left out. Raises SurveyError."""
         access = self.access(node)
-        found = {key: _number(access, key) for key in keys}
+        with _of(node):
+            found = {key: _number(access, key) for key in keys}
         return {key: number for key, number in found.items() if number is not None}
 
     def tpdos(self, node: int) -> tuple[Tpdo, ...]:
-        """Read the TPDOs of one node."""
-        return tpdos(SdoClient(FrameChannel(self._socket, node), _ANSWER_S))
+        """Read the TPDOs of one node. Raises SurveyError."""
+        with _of(node):
+            return tpdos(self.access(node))
 
     def _answers(self, timeout_s: float) -> set[int]:
         return {can_id - RESPONSE_ID for can_id in self._received(timeout_s) if can_id > RESPONSE_ID}
@@ -280,12 +304,13 @@ class BusSurvey:
         return [FRAME.unpack_from(socket.frames, FRAME_SIZE * at)[0] for at in range(socket.receive())]
 
 
-def _optional(access: SdoAccess, key: Key) -> bytes | None:
-    """Return an object, None when the device refuses it or is silent about it."""
+@contextmanager
+def _of(node: int) -> Iterator[None]:
+    """Name the node in a SurveyError."""
     try:
-        return access.read(*key)
-    except (SdoAbort, SdoTimeout):
-        return None
+        yield
+    except SurveyError as error:
+        raise SurveyError(f"node {node}: {error}") from None
 
 
 def _text(raw: bytes) -> str:

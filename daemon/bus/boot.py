@@ -36,7 +36,7 @@ def boot_request(
             "kind": "drive",
             "identity": asdict(joint.identity),
             "given": joint.given,
-            "temperature": joint.temperature,
+            "temperature": False if joint.temperature is None else asdict(joint.temperature),
             "sdo_timeout_ms": joint.sdo_timeout_ms,
             "objects": asdict(joint.objects),
             "tpdos": tpdos_as_json(joint.tpdos),

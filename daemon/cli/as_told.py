@@ -20,10 +20,11 @@ from jtqd.drivers.devices import DriveObjects, drive_layout
 from jtqd.drivers.layout import BY_ITSELF, EVERY_SYNC, LayoutError, chosen, pdo_of_words
 from jtqd.drivers.pdo import PdoError
 from jtqd.drivers.sdo import Key, label
-from jtqd.drivers.survey import GEAR, Survey, Tpdo
+from jtqd.drivers.survey import Survey, Tpdo
 from jtqd.drivers.units import (
     AT_JOINT,
     AT_MOTOR,
+    GEAR,
     SECOND,
     UnitError,
     is_increments,
@@ -34,6 +35,13 @@ from jtqd.drivers.units import (
 
 _POSITION_UNIT, _VELOCITY_UNIT = (0x60A8, 0), (0x60A9, 0)
 _FEED: tuple[Key, Key] = ((0x6092, 1), (0x6092, 2))
+_TOLD_BY: Mapping[str, Key] = {
+    "60A8h": _POSITION_UNIT,
+    "60A9h": _VELOCITY_UNIT,
+    "608Fh": _VELOCITY_UNIT,  # increments per second
+    "6092h": _FEED[0],
+}
+"""What has told by which object a quantity is scaled."""
 _COMPARE = "turn the joint by a known angle and compare jtq status"
 _AGE_MS = 100
 """For how long a frame counts that is sent by itself, where the drive has no event timer."""
@@ -116,6 +124,7 @@ def units_told(
     gear_ratio: of the joint. quantities: those that the drive has. by_options: those that the operator has scaled.
     """
     found: dict[str, Instead] = {}
+    velocity = ""
     if survey is None:
         return found
     with suppress(UnitError):
@@ -134,8 +143,10 @@ def units_told(
     with suppress(UnitError):
         if velocity := _velocity(survey):
             found["motor_velocity"] = _scaled(survey, "motor_velocity", velocity, gear_ratio)
-    chosen_by_options = set(by_options)
-    return {name: found[name] for name in quantities if name in found and name not in chosen_by_options}
+    unless = set(by_options)
+    if velocity == "608Fh":  # counts of that option, per second
+        unless.discard("motor_velocity")
+    return {name: found[name] for name in quantities if name in found and name not in unless}
 
 
 def _is_counts(survey: Survey, by: str) -> bool:
@@ -156,9 +167,9 @@ def _gear(survey: Survey) -> float | None:
 
 def _scaled(survey: Survey, quantity: str, by: str, gear_ratio: float, better: str = "") -> Instead:
     """Return the entry by an object; by a factor where the drive counts behind another gear than the joint's."""
-    key = _FEED[0] if by == "6092h" else (int(by[:4], 16), 0 if by in ("60A8h", "60A9h") else 1)
-    why = f"{label(*key)} is {survey.numbers[key] if by in ('6092h', '608Fh') else f'0x{survey.numbers[key]:08X}'}"
-    why = f"{why}, by {survey.source}" if key in survey.numbers else f"by {survey.source}"
+    key = _TOLD_BY[by]
+    word = survey.numbers[key]
+    why = f"{label(*key)} is {word if by == '6092h' else f'0x{word:08X}'}, by {survey.source}"
     gear = _gear(survey)
     if by == "608Fh" or not quantity.startswith("motor") or gear == gear_ratio:
         return Instead({"by": by}, why, better)

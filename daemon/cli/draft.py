@@ -18,11 +18,18 @@ from typing import Any
 from jtqd.daemon.cli.as_told import Instead, Layout, layout_told, tpdo_lines, unit_problems, units_told
 from jtqd.daemon.config import ObjectsSection
 from jtqd.daemon.profiles import INIT, Family
-from jtqd.drivers.devices import CIA_402, COMMANDER_NODE, JTQD_NODE, DriveObjects, parse_key
+from jtqd.drivers.devices import (
+    CIA_402,
+    COMMANDER_NODE,
+    EVERY_SCALING_OBJECT,
+    JTQD_NODE,
+    DriveObjects,
+    DriveProfile,
+    parse_key,
+)
 from jtqd.drivers.sdo import Key, label
 from jtqd.drivers.survey import (
     DRIVE,
-    GEAR,
     IDENTITY,
     MAPPED,
     RATED_CURRENT,
@@ -31,6 +38,7 @@ from jtqd.drivers.survey import (
     TORQUE,
     Survey,
 )
+from jtqd.drivers.units import GEAR
 from jtqd.estimator.checked import Section
 
 EFFICIENCY = 0.7
@@ -136,10 +144,13 @@ def _guess(number: float, origin: str, better: str) -> Value:
 def plain(number: float) -> str:
     """Return a number of at most six digits as YAML reads it.
 
-    >>> plain(100.0), plain(0.0000712), plain(12000.0), plain(0.062)
-    ('100.0', '7.12e-05', '12000.0', '0.062')
+    >>> plain(100.0), plain(0.0000712), plain(0.00001), plain(0.062)
+    ('100.0', '7.12e-05', '1.0e-05', '0.062')
     """
-    return repr(float(f"{number:.6g}"))
+    mantissa, exponential, exponent = repr(float(f"{number:.6g}")).partition("e")
+    if exponential and "." not in mantissa:  # YAML 1.1 takes 1e-05 for a text
+        mantissa += ".0"
+    return mantissa + exponential + exponent
 
 
 def mapped_by(family: Family | None) -> tuple[Key, ...]:
@@ -223,8 +234,9 @@ def draft_joint(
         "viscous_nms_per_rad": _guess(VISCOUS * torque, origin, "jtq fit friction"),
     }
     own = {key: value for key, value in filled.items() if key.startswith("objects.")}
-    layout = layout_told(node, survey, _objects(family, instead, own))
-    problems += layout.problems
+    objects = _objects(family, instead, own)
+    layout = layout_told(node, survey, objects)
+    problems += (*_implausible(node, survey, objects, given), *layout.problems)
     return JointDraft(number, node, survey, values, given, problems, family, own, instead, layout)
 
 
@@ -420,6 +432,21 @@ def _problems(
             for text in family.findings(survey.numbers)
         ]
     return tuple(found)
+
+
+def _implausible(
+    node: int, survey: Survey | None, objects: DriveObjects, given: Mapping[Key, Value]
+) -> list[str]:
+    """Return one line for each scaling object whose value the boot would refuse."""
+    if survey is None or survey.defaults:
+        return []
+    read = DriveProfile(node, objects=objects, given=dict.fromkeys(given, 1)).scaling_objects
+    return [
+        f"node {node} ({survey.title}): {label(*key)} {name}: expected 1..{highest}, found {survey.numbers[key]}"
+        for key in read
+        for name, highest in (EVERY_SCALING_OBJECT[key],)
+        if survey.numbers.get(key, 0) > highest
+    ]
 
 
 # ---- files ----

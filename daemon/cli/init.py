@@ -10,7 +10,8 @@ import argparse
 import json
 import re
 import sys
-from collections.abc import Iterator, Sequence
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -37,7 +38,7 @@ from jtqd.drivers.object_dictionary import EdsError
 from jtqd.drivers.survey import DRIVE, IDENTITY, SENSOR, BusSurvey, Survey, survey_of_eds
 from jtqd.estimator.checked import ConfigError, counted
 
-MAX_JOINTS = 2
+MAX_JOINTS = 4
 _PERIODS_US = (1000, 2000, 4000, 5000, 10_000)
 _EXAMPLES = """examples:
   jtq init --bus can0 --out arm                        look on the bus, ask for what the devices do not tell
@@ -265,25 +266,24 @@ def _found(options: argparse.Namespace) -> Found:
         raise UsageError(f"--node: {len(nodes)} drives, this version of jtqd has at most {MAX_JOINTS} joints")
     for node, path in zip(nodes, _each("from_eds", options.from_eds, len(nodes)), strict=True):
         if path is not None:
-            eds, device = eds_survey(path, node, options.profile), surveys.get(node)
-            _refuse_the_eds_of_another(node, path, eds, device)
-            surveys[node] = merged(eds, device)
+            eds = eds_survey(path, node, options.profile)
+            surveys[node] = merged(eds, surveys.get(node), path)
             notes.append(f"node {node}: {description(eds)}")
-    for node in nodes:
-        if node in surveys and surveys[node].profile != DRIVE:
-            raise UsageError(f"node {node} is no CiA 402 drive: {description(surveys[node])}")
+    if sensor and options.bus is not None and sensor not in surveys:
+        raise UsageError(f"--sensor: node {sensor} does not answer on {options.bus}{_others(surveys)}")
+    _refuse_other_kinds(nodes, sensor, surveys)
     families = {node: family_of(surveys.get(node), options.profile) for node in nodes}
     notes += [f"node {node}: profile {each.name} ({each.title})" for node, each in families.items() if each]
     return Found(nodes, surveys, sensor or None, notes, families, guessed)
 
 
-def _refuse_the_eds_of_another(node: int, path: Path, eds: Survey, device: Survey | None) -> None:
-    vendor = IDENTITY["vendor"]
-    told, found = eds.numbers.get(vendor), device.numbers.get(vendor) if device else None
-    if told and found and told != found:
-        raise UsageError(
-            f"--from-eds {path}: is of vendor {told:08X}h, but node {node} says {found:08X}h (1018h:1)"
-        )
+def _refuse_other_kinds(nodes: Sequence[int], sensor: int | None, surveys: Mapping[int, Survey]) -> None:
+    """Raise UsageError for a joint's node that is no drive, and a sensor that is none."""
+    for node in nodes:
+        if node in surveys and surveys[node].profile != DRIVE:
+            raise UsageError(f"node {node} is no CiA 402 drive: {description(surveys[node])}")
+    if sensor is not None and sensor in surveys and surveys[sensor].profile != SENSOR:
+        raise UsageError(f"--sensor: node {sensor} is no CiA 404 sensor: {description(surveys[sensor])}")
 
 
 def family_of(survey: Survey | None, name: str | None) -> Family | None:
@@ -331,10 +331,21 @@ def _survey(bus: str) -> Iterator[BusSurvey]:
         reader.close()
 
 
-def merged(eds: Survey, bus: Survey | None) -> Survey:
-    """A device on the bus knows its values; its EDS knows what can be mapped, and what cannot be written."""
+def merged(eds: Survey, bus: Survey | None, path: Path) -> Survey:
+    """A device on the bus knows its values; its EDS knows what can be mapped, and what cannot be written.
+
+    Raises UsageError for the EDS of another vendor's device, or of another kind.
+    """
     if bus is None:
         return eds
+    vendor = IDENTITY["vendor"]
+    told, found = eds.numbers.get(vendor), bus.numbers.get(vendor)
+    if told and found and told != found:
+        raise UsageError(f"{path}: is of vendor {told:08X}h, but node {bus.node} says {found:08X}h (1018h:1)")
+    if eds.profile != bus.profile:
+        raise UsageError(
+            f"{path}: is of profile {eds.profile}, but node {bus.node} says {bus.profile} (1000h)"
+        )
     known = {each.number: each for each in eds.tpdos}
     tpdos = tuple(
         replace(
@@ -457,19 +468,29 @@ def _config(options: argparse.Namespace, found: Found, joints: list[JointDraft])
 
 
 def _write(directory: Path, name: str, draft: ConfigDraft) -> tuple[list[Path], int]:
-    """Write the files with the shortest period whose bus load fits; returns paths and period [us]. Raises ConfigError."""
+    """Write the files with the shortest period whose bus load fits; returns paths and period [us].
+
+    They are made beside and put in place together: what jtqd refuses replaces nothing. Raises ConfigError, BusLoadError.
+    """
     directory.mkdir(parents=True, exist_ok=True)
-    files = [directory / f"joint_{joint.number}.yaml" for joint in draft.joints]
-    files.append(directory / f"{name}.yaml")
-    try:
+    names = [*(f"joint_{joint.number}.yaml" for joint in draft.joints), f"{name}.yaml"]
+    with tempfile.TemporaryDirectory(dir=directory, prefix=".jtq-init-") as beside:
+        files = [Path(beside, each) for each in names]
         for path, joint in zip(files, draft.joints, strict=False):
             path.write_text(joint_text(joint), encoding="utf-8")
-        for period_us in _PERIODS_US:
-            files[-1].write_text(config_text(replace(draft, period_us=period_us)), encoding="utf-8")
-            if bus_load_of(load_config(files[-1])).worst <= LIMIT:
-                return files, period_us
-        raise ConfigError(f"{files[-1]}: at {draft.bitrate} bit/s not even 100 Hz fit the bus")
-    except (ConfigError, BusLoadError):
-        for path in files:  # what jtqd refuses does not stay
-            path.unlink(missing_ok=True)
-        raise
+        try:
+            period_us = _fitting_period_us(files[-1], draft)
+        except ConfigError as error:
+            raise ConfigError(str(error).replace(beside, str(directory))) from None
+        for path in files:
+            path.replace(directory / path.name)
+    return [directory / each for each in names], period_us
+
+
+def _fitting_period_us(path: Path, draft: ConfigDraft) -> int:
+    """Write the configuration with the shortest period whose bus load fits. Raises ConfigError, BusLoadError."""
+    for period_us in _PERIODS_US:
+        path.write_text(config_text(replace(draft, period_us=period_us)), encoding="utf-8")
+        if bus_load_of(load_config(path)).worst <= LIMIT:
+            return period_us
+    raise ConfigError(f"{path}: at {draft.bitrate} bit/s not even 100 Hz fit the bus")

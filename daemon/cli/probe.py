@@ -14,13 +14,13 @@ from typing import Any
 
 from jtqd.daemon.cli.as_told import unit_problems
 from jtqd.daemon.cli.draft import DraftError, Wanted, draft_joint, drive_lines, sensor_lines, sensor_problems
-from jtqd.daemon.cli.init import description, eds_survey, family_of, merged, node_id, surveyed
+from jtqd.daemon.cli.init import UsageError, description, eds_survey, family_of, merged, node_id, surveyed
 from jtqd.daemon.profiles import Family
 from jtqd.daemon.profiles import names as profile_names
 from jtqd.drivers.frame_socket import BusError
 from jtqd.drivers.object_dictionary import EdsError
 from jtqd.drivers.sdo import label
-from jtqd.drivers.survey import DRIVE, IDENTITY, SENSOR, BusSurvey, Survey
+from jtqd.drivers.survey import DRIVE, IDENTITY, SENSOR, BusSurvey, Survey, SurveyError
 
 _EXAMPLES = """examples:
   jtq probe --bus can0                      which nodes are there
@@ -62,18 +62,30 @@ def main(argv: list[str]) -> int:
             return _list(options, bus) if options.node is None else _one(options, bus)
         finally:
             bus.close()
-    except (BusError, EdsError, ValueError) as error:  # ConfigError is one
+    except UsageError as error:
+        print(f"jtq probe: {error}", file=sys.stderr)
+        return 2
+    except (BusError, EdsError, ValueError) as error:  # ConfigError and SurveyError are, too
         print(f"jtq probe: {error}", file=sys.stderr)
         return 1
 
 
 def _list(options: argparse.Namespace, bus: BusSurvey) -> int:
-    found = [each for node in bus.nodes() if (each := bus.read(node)) is not None]
+    found: list[Survey] = []
+    silent: list[str] = []
+    for node in bus.nodes():
+        try:
+            if (each := bus.read(node)) is not None:
+                found.append(each)
+        except SurveyError as error:
+            silent.append(str(error))
+    for line in silent:
+        print(f"jtq probe: {line}", file=sys.stderr)
     if options.json:
         print(json.dumps([content(each, [])["device"] for each in found]))
     else:
         print("\n".join(f"node {each.node}: {description(each)}" for each in found) or "no node answers")
-    return 0 if found else 1
+    return 0 if found and not silent else 1
 
 
 def _one(options: argparse.Namespace, bus: BusSurvey) -> int:
@@ -81,7 +93,7 @@ def _one(options: argparse.Namespace, bus: BusSurvey) -> int:
     if found is None:
         raise ValueError(f"node {options.node} does not answer on {options.bus}")
     if options.eds is not None:
-        found = merged(eds_survey(options.eds, options.node, options.profile), found)
+        found = merged(eds_survey(options.eds, options.node, options.profile), found, options.eds)
     family = family_of(found, options.profile)
     problems = problems_of(found, family)
     if options.json:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from jtqd.drivers.devices import CIA_402, DriveObject, DriveObjects, drive_layout, parse_key
+from jtqd.drivers.devices import CIA_402, DriveObject, DriveObjects, Temperature, drive_layout, parse_key
 from jtqd.drivers.layout import BY_ITSELF, LayoutError, chosen, pdo_of_words
 from jtqd.drivers.pdo import PdoError, PdoMap
 from jtqd.drivers.sdo import Key, label
@@ -81,6 +81,16 @@ class _Object:
             raise ConfigError(f"{where}.type': expected I32: a position rolls over at 32 bits")
 
 
+@dataclass(frozen=True)
+class _Temperature:
+    """The joint's temperature in section `joint_N.objects`: another object than 3001h, 16 bits, signed."""
+
+    index: _Index
+    factor: Annotated[float, limits(gt=0.0, le=1000.0)]
+    """Degrees Celsius per unit."""
+    sub: _SubIndex = 0
+
+
 _OPTIONAL: Final = ("link_position", "motor_velocity")
 """Quantities that a drive need not have."""
 
@@ -94,6 +104,7 @@ class ObjectsSection:
     motor_velocity: _Object | None = _Object()
     current: _Object = _Object()
     statusword: _Object = _Object()
+    temperature: _Temperature | None = None
 
     @classmethod
     def from_section(cls, section: Section) -> ObjectsSection:
@@ -105,7 +116,7 @@ class ObjectsSection:
         """Return the objects of the drive. Raises ConfigError for what cannot be mapped or scaled."""
         where = f"{path}: key '{joint}.objects"
         found: dict[str, DriveObject | None] = {}
-        for each in fields(self):
+        for each in fields(CIA_402):
             written: _Object | None = getattr(self, each.name)
             found[each.name] = None
             if written is not None:
@@ -114,6 +125,12 @@ class ObjectsSection:
                 written.check(each.name, standard, f"{where}.{each.name}")
         made: dict[str, Any] = found
         return DriveObjects(**made)
+
+    @property
+    def of_joint(self) -> Temperature:
+        """Return the object of the joint's temperature."""
+        own = self.temperature
+        return Temperature() if own is None else Temperature(own.index, own.sub, own.factor)
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from jtqd.daemon.config.settings import (
     SafetySettings,
 )
 from jtqd.daemon.profiles import path_of, with_profiles
-from jtqd.drivers.devices import DriveObjects
+from jtqd.drivers.devices import DriveObjects, Temperature
 from jtqd.drivers.layout import chosen, maps_of_json
 from jtqd.drivers.pdo import PdoMap
 from jtqd.estimator.checked import ConfigError, Section
@@ -73,8 +73,8 @@ class JointConfig:
     joint: Joint
     network: NetworkFile | None
     sensor_channel: int | None
-    temperature: bool
-    """The drive sends the joint's temperature (3001h by TPDO3)."""
+    temperature: Temperature | None
+    """Object of the joint's temperature, which the drive sends by TPDO3; None: it sends none."""
     mandatory: bool
     """jtqd does not start without it."""
     sdo_timeout_ms: int
@@ -280,7 +280,7 @@ def _joint(path: Path, number: int, section: JointSection, method: str, sdo_time
         joint=joint,
         network=network if method in _WITH_NETWORK else None,
         sensor_channel=section.sensor_channel,
-        temperature=section.temperature,
+        temperature=section.objects.of_joint if section.temperature else None,
         mandatory=section.mandatory,
         sdo_timeout_ms=section.sdo_timeout_ms or sdo_timeout_ms,
         objects=objects,

@@ -121,6 +121,8 @@ class JointSection:
 
     def __post_init__(self) -> None:
         check_given("joint", self.given, EVERY_SCALING_OBJECT)
+        if self.objects.temperature is not None and not self.temperature:
+            raise FieldError("joint", "temperature", False, "true because of objects.temperature")
 
 
 def _check_unit_words(words: Mapping[str, float]) -> None:

@@ -33,7 +33,7 @@ cdef struct Temperature:
     int node_id
     int64_t life_cycles, until
     bint news
-    double celsius
+    double celsius, c_per_unit
     int64_t lost, rejected
 
 cdef struct GapState:

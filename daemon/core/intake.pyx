@@ -75,7 +75,6 @@ if NOT_HEARD in nmt.STATES:
 
 cdef int TEMPERATURE_BYTES = 2
 cdef int NOT_MEASURED = devices.NOT_MEASURED
-cdef double C_PER_UNIT = devices.TEMPERATURE_C_PER_UNIT
 
 _SIZES: Final = {"b": 1, "h": 2, "i": 4, "q": 8, "B": 1, "H": 2, "I": 4, "Q": 8}
 """Bytes of the objects that a PDO may carry, by their letters in `struct`; a small letter is a signed one."""
@@ -275,6 +274,7 @@ cdef class JointTemperature:
         node_id: of its drive.
         name: as it appears in counters and lines, e.g. "381h drive 1 TPDO3".
         life_cycles: slots after which a value is forgotten.
+        c_per_unit: degrees Celsius per unit of its object.
 
     Attributes:
         celsius: what the cycle may use; NaN where it is not known.
@@ -282,8 +282,11 @@ cdef class JointTemperature:
         rejected: frames with this identifier and a wrong length, or 29-bit or remote frames.
     """
 
-    def __init__(self, uint32_t cob_id, int node_id, name, int64_t life_cycles):
+    def __init__(
+        self, uint32_t cob_id, int node_id, name, int64_t life_cycles, double c_per_unit=devices.TEMPERATURE_C_PER_UNIT
+    ):
         self.name = name
+        self.known.c_per_unit = c_per_unit
         self.known.cob_id, self.known.node_id, self.known.life_cycles = cob_id, node_id, life_cycles
         self.known.until = NEVER
         self.known.celsius = NAN
@@ -331,7 +334,7 @@ cdef bint _receive_temperature(Temperature *known, const Frame *frame) noexcept 
         known.rejected += 1
         return False
     raw = _number(frame.data, &field)
-    known.celsius = NAN if raw == NOT_MEASURED else raw * C_PER_UNIT
+    known.celsius = NAN if raw == NOT_MEASURED else raw * known.c_per_unit
     known.news = True
     return True
 

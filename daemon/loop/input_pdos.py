@@ -133,8 +133,10 @@ def joint_temperatures(config: Config) -> list[JointTemperature]:
     """Return the temperatures of the joints whose drive sends one, in joint order; all unknown at first."""
     life = round(TEMPERATURE_LIFE_S * 1e9 / config.period_ns)
     return [
-        JointTemperature(cob_id, node, f"{cob_id:03X}h drive {node} TPDO3", life)
-        for node, cob_id in (
-            (j.node_id, drive_tpdo3(j.node_id).cob_id) for j in config.joints if j.temperature
+        JointTemperature(cob_id, node, f"{cob_id:03X}h drive {node} TPDO3", life, temperature.c_per_unit)
+        for node, cob_id, temperature in (
+            (j.node_id, drive_tpdo3(j.node_id).cob_id, j.temperature)
+            for j in config.joints
+            if j.temperature is not None
         )
     ]

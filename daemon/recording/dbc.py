@@ -15,8 +15,6 @@ from jtqd.daemon.recording.schemas import STATUS_NAMES
 from jtqd.drivers.devices import (
     NOT_MEASURED,
     SYNC_COB_ID,
-    TEMPERATURE,
-    TEMPERATURE_C_PER_UNIT,
     contact_tpdos,
     drive_tpdo3,
     estimate_tpdos,
@@ -202,11 +200,11 @@ def dbc_text(config: Config, report: Mapping[str, Any] | None) -> str:
                     pdo = joint.tpdos[found[name].pdo]
                     mapped = pdo.objects[found[name].entry]
                     quantities[pdo.cob_id, mapped.index, mapped.subindex] = Quantity(scaling[factor], unit)
-        if joint.temperature:
-            pdo3 = drive_tpdo3(node)
+        if joint.temperature is not None:
+            pdo3 = drive_tpdo3(node, joint.temperature)
             maps.append(pdo3)
-            degrees = Quantity(TEMPERATURE_C_PER_UNIT, "degC", {NOT_MEASURED: "not_measured"})
-            quantities[pdo3.cob_id, *TEMPERATURE] = degrees
+            degrees = Quantity(joint.temperature.c_per_unit, "degC", {NOT_MEASURED: "not_measured"})
+            quantities[pdo3.cob_id, *joint.temperature.key] = degrees
     if config.sensor is not None:
         node = config.sensor.node_id
         names[node] = "torque_sensor"

@@ -53,6 +53,6 @@ def _joint(config: Config, number: int, joint: JointConfig, names: tuple[str, ..
         network_limit_nm=config.estimator.network_limit * rated,
         inputs=names_of_inputs(config, number),
         sensor=None if sensor is None else names[sensor],
-        temperature=joint.temperature,
+        temperature=joint.temperature is not None,
         contact_threshold_nm=None if config.contact is None else config.contact.threshold_of(rated),
     )

@@ -16,6 +16,7 @@ from jtqd.drivers.devices import (
     DriveProfile,
     Identity,
     SensorProfile,
+    Temperature,
     parse_key,
 )
 from jtqd.drivers.pdo import PdoMap
@@ -88,7 +89,7 @@ class BenchConfig:
             drives=tuple(_drive(config.path, joint) for joint in joints),
             joints=tuple(joint.joint for joint in joints),
             channels=tuple(joint.sensor_channel for joint in joints),
-            temperatures=tuple(joint.temperature for joint in joints),
+            temperatures=tuple(joint.temperature is not None for joint in joints),
             sensor=None
             if sensor is None
             else SensorProfile(
@@ -232,6 +233,8 @@ def _drive(path: Path, joint: JointConfig) -> DriveProfile:
             )
     if objects.statusword != CIA_402.statusword:
         raise ConfigError(f"{where}.objects.statusword': found another one, expected 6041h for a campaign")
+    if joint.temperature not in (None, Temperature()):
+        raise ConfigError(f"{where}.objects.temperature': found another one, expected 3001h for a campaign")
     return DriveProfile(
         joint.node_id,
         Identity(**asdict(joint.identity)),

@@ -115,9 +115,12 @@ def log_to_run(
     wanted = _Wanted(name, list(dict.fromkeys(there if joints is None else joints)), all_needed)
     have = ", ".join(map(str, there))
     wanted.leave_out({n: f"found no joint {n}, the log has {have}" for n in wanted.numbers if n not in there})
-    node_of = dict(zip(there, nodes or _nodes(log, there), strict=False))
+    by_log = _temperatures_of(log, there)
+    node_of = dict(zip(there, nodes or [node for node, _ in by_log], strict=False))
+    scale_of = {number: scale for number, (_, scale) in zip(there, by_log, strict=True)}
     looked_at = dict.fromkeys(number for number in (*wanted.numbers, *enabled) if number in there)
-    states, readings = _read(log, name, {number: node_of.get(number, number) for number in looked_at})
+    told_by = {number: (node_of.get(number, number), scale_of[number]) for number in looked_at}
+    states, readings = _read(log, name, told_by)
     beside = {number: states.pop(number) for number in list(states) if number not in wanted.numbers}
     wanted.leave_out({number: why for number, state in states.items() if (why := _unusable(number, state))})
     states = {number: state for number, state in states.items() if number not in wanted.left_out}
@@ -187,17 +190,31 @@ def _joints_of(log: Path | Sequence[Path], name: Path) -> list[int]:
     return there
 
 
-def _nodes(log: Path | Sequence[Path], there: Sequence[int]) -> list[int]:
-    """Return the node-IDs of the drives by the attached configuration; the joints' numbers where it cannot be read."""
+TemperatureOf = tuple[int, float]
+"""Node-ID of a drive, and degrees Celsius per unit of what its TPDO3 carries."""
+
+
+def _temperatures_of(log: Path | Sequence[Path], there: Sequence[int]) -> list[TemperatureOf]:
+    """Return those of the joints by the attached configuration; where it cannot be read, their numbers and 3001h."""
     mapping: Mapping[str, Any] = {}
     with LogFile(log_parts(log)[0]) as file:
         for index in file.attachments:
             if index.name == _CONFIGURATION:
                 with contextlib.suppress(ConfigError, LogError):
                     mapping = parse_yaml(file.attachment(index), _CONFIGURATION)
-    sections = [mapping.get(f"joint_{number}") for number in there]
-    found = [each.get("node") if isinstance(each, dict) else None for each in sections]
-    return [node if isinstance(node, int) else number for node, number in zip(found, there, strict=True)]
+    return [_temperature_of(number, mapping.get(f"joint_{number}")) for number in there]
+
+
+def _temperature_of(number: int, section: object) -> TemperatureOf:
+    """Return that of one joint by its section, which may be anything."""
+    keys = section if isinstance(section, dict) else {}
+    node, objects = keys.get("node"), keys.get("objects")
+    own = objects.get("temperature") if isinstance(objects, dict) else None
+    scale = own.get("factor") if isinstance(own, dict) else None
+    return (
+        node if isinstance(node, int) else number,
+        float(scale) if isinstance(scale, int | float) else TEMPERATURE_C_PER_UNIT,
+    )
 
 
 Readings = tuple[NDArray[np.int64], FloatArray]
@@ -205,7 +222,7 @@ Readings = tuple[NDArray[np.int64], FloatArray]
 
 
 def _read(
-    log: Path | Sequence[Path], name: Path, nodes: Mapping[int, int]
+    log: Path | Sequence[Path], name: Path, nodes: Mapping[int, TemperatureOf]
 ) -> tuple[dict[int, Records], dict[int, Readings]]:
     """Return states and temperatures of the joints, in one pass; all have the same cycles."""
     topics = {number: f"/joint/{number}/state" for number in nodes}
@@ -245,19 +262,19 @@ def _read(
     return whole, joined
 
 
-def _temperatures(frames: Records, nodes: Mapping[int, int]) -> dict[int, Readings]:
+def _temperatures(frames: Records, nodes: Mapping[int, TemperatureOf]) -> dict[int, Readings]:
     """Return what the drives' TPDO3 say in these cycles: rows and values [degC] by joint, for those that say anything."""
     raw = frames["frames"]
     stored = np.arange(raw.shape[1]) < frames["frame_count"][:, None]
     stored &= raw["length"] >= 2
     found = {}
-    for number, node in nodes.items():
+    for number, (node, c_per_unit) in nodes.items():
         rows, places = np.nonzero(stored & (raw["id"] == drive_tpdo3(node).cob_id))
         if not len(rows):
             continue
         counts = np.ascontiguousarray(raw["data"][rows, places][:, :2]).view("<i2")[:, 0]
         good = counts != NOT_MEASURED
-        found[number] = rows[good], counts[good] * TEMPERATURE_C_PER_UNIT
+        found[number] = rows[good], counts[good] * c_per_unit
     return found
 
 

@@ -172,6 +172,21 @@ def test_a_bus_has_one_to_four_joints(tmp_path: Path, joints: int) -> None:
         (drop("sensor"), ["joint_1.sensor_channel", "found 1", "no channel without a sensor"]),
         (put("metrics", {}), ["metrics.file", "missing", "a text"]),
         (put("joint_1.temperature", 1), ["joint_1.temperature", "found 1", "true or false"]),
+        (
+            put("joint_1.objects", {"temperature": {"index": 0x2040}}),
+            ["joint_1.objects.temperature.factor", "missing"],
+        ),
+        (
+            put(
+                "joint_1",
+                {
+                    "node": 1,
+                    "file": "joint1.yaml",
+                    "objects": {"temperature": {"index": 0x2040, "factor": 1}},
+                },
+            ),
+            ["joint_1.temperature", "found False", "true because of objects.temperature"],
+        ),
         (put("joint_1.temperatur", True), ["joint_1.temperatur", "did you mean 'temperature'"]),
         (put("joint_1.network", {"file": "bench.yaml", "sha256": "00"}), ["sha256", "expected 00"]),
         (put("joint_1.network", {"file": "none.onnx", "sha256": "00"}), ["none.onnx", "cannot be read"]),

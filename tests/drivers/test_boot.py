@@ -18,6 +18,7 @@ from jtqd.drivers.devices import (
     DriveProfile,
     Identity,
     SensorProfile,
+    Temperature,
     drive_tpdo1,
     drive_tpdo2,
     drive_tpdo3,
@@ -148,7 +149,7 @@ def test_mapping_is_written_in_the_order_of_cia_301():
             written.append((index, subindex, int.from_bytes(data, "little")))
             node.store.write(index, subindex, data)
 
-    NodeBoot(Access(), DriveProfile(1, temperature=True), BusSettings(0x20)).configure_pdos()
+    NodeBoot(Access(), DriveProfile(1, temperature=Temperature()), BusSettings(0x20)).configure_pdos()
     assert written[:7] == [
         (0x1800, 1, 0xC0000181),
         (0x1A00, 0, 0),
@@ -184,6 +185,21 @@ def test_temperature_is_mapped_where_it_is_asked_for(bench):
     cold = report.nodes[1].configuration_sha256
     bench.drive1.store.set_number(0x3001, 0, 300)
     assert bench.boot(nodes=nodes).nodes[1].configuration_sha256 == cold, "a value is no configuration"
+
+
+def test_a_temperature_in_another_object_is_mapped_as_3001h_would_be(bench):
+    store, standard = bench.drive1.store, bench.drive1.store.entries[0x3001, 0]
+    store.entries[0x2040, 1] = dataclasses.replace(standard, index=0x2040, subindex=1)
+    store._indices.add(0x2040)
+    store._values[0x2040, 1] = standard.default
+    own = {"index": 0x2040, "subindex": 1, "c_per_unit": 0.01}
+    report = bench.boot(nodes=[{"node": 1, "kind": "drive", "temperature": own}])
+    assert report.nodes[1].tpdos[2] == drive_tpdo3(1, Temperature(0x2040, 1))
+    assert bench.drive1.parameters.tpdos()[2].words == (0x2040_0110,)
+    assert (store.number(0x1802, 3), store.number(0x1802, 5)) == (5000, 500)
+    own["index"] = 0x2041
+    with pytest.raises(BootError, match="2041h:1 joint temperature: expected a value"):
+        bench.boot(nodes=[{"node": 1, "kind": "drive", "temperature": own}])
 
 
 def test_a_node_without_an_inhibit_time_is_mapped_all_the_same(bench):
@@ -479,6 +495,10 @@ def test_a_drive_that_leaves_operational_once_is_started_again() -> None:
         ({"nodes": [{"node": 1, "kind": "drive", "given": {"x": 1}}]}, "nodes[0].given"),
         ({"nodes": [{"node": 3, "kind": "sensor", "channels": [2]}]}, "nodes[0].channels: found [2]"),
         ({"nodes": [{"node": 1, "kind": "drive", "temperature": 1}]}, "nodes[0].temperature: found 1"),
+        (
+            {"nodes": [{"node": 1, "kind": "drive", "temperature": {"index": 0x2040}}]},
+            "nodes[0].temperature.c_per_unit: found None",
+        ),
         ({"answer_timeout_s": 0}, "answer_timeout_s: found 0"),
         ({"heartbeat_ms": True}, "heartbeat_ms: found True"),
     ],

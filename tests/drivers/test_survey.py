@@ -1,6 +1,7 @@
 """What a device tells of itself: a node in memory, its EDS, and nodes on a bus."""
 
 import threading
+import time
 from dataclasses import replace
 
 import pytest
@@ -9,10 +10,10 @@ from jtqd.drivers.frame import pack
 from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.drivers.hub import Hub
 from jtqd.drivers.object_dictionary import EdsError, ObjectStore, read_eds
-from jtqd.drivers.sdo import REQUEST_ID, RESPONSE_ID
+from jtqd.drivers.sdo import GENERAL_ERROR, REQUEST_ID, RESPONSE_ID, SdoAbort
 from jtqd.drivers.sdo_client import SdoTimeout
 from jtqd.drivers.sdo_server import SdoServer
-from jtqd.drivers.survey import DRIVE, SENSOR, BusSurvey, Tpdo, survey, survey_of_eds, tpdos
+from jtqd.drivers.survey import DRIVE, SENSOR, BusSurvey, SurveyError, Tpdo, survey, survey_of_eds, tpdos
 from tests.paths import ROOT
 
 EDS = ROOT / "drivers" / "eds"
@@ -75,6 +76,41 @@ def test_a_node_that_does_not_answer():
         survey(Silent(), 5)
 
 
+class Wayward:
+    """A drive that is silent about some objects, and refuses others."""
+
+    def __init__(self, silent=(), refused=()):
+        self._store, self._silent, self._refused = without(), silent, refused
+
+    def read(self, index, subindex):
+        if (index, subindex) in self._silent:
+            raise SdoTimeout(1.56)
+        if (index, subindex) in self._refused:
+            raise SdoAbort(GENERAL_ERROR)
+        return self._store.read(index, subindex)
+
+
+def test_silence_is_not_taken_for_an_object_that_is_not_there():
+    """A drive that is slow once would be one without a second encoder."""
+    with pytest.raises(SurveyError, match=r"^60E4h:1: no answer within 1\.56 s$"):
+        survey(Wayward(silent=[(0x60E4, 1)]), 5)
+    with pytest.raises(SurveyError, match=r"^1A00h:0: no answer"):
+        tpdos(Wayward(silent=[(0x1A00, 0)]))
+    assert survey(Wayward(silent=[(0x1008, 0)]), 5).title == "drive", "its name is cosmetic"
+    assert survey(Wayward(refused=[(0x60E4, 1)]), 5).missing == {(0x60E4, 1)}
+
+
+def test_a_device_that_refuses_its_type_has_no_profile():
+    found = survey(Wayward(refused=[(0x1000, 0)]), 5)
+    assert (found.profile, found.title) == (0, "emulated joint drive")
+
+
+def test_a_29_bit_identifier_is_told_as_it_is():
+    store = without()
+    store.set_number(0x1800, 1, 0x2123_4185)
+    assert tpdos(store)[0].cob_id == 0x0123_4185
+
+
 def test_an_eds_tells_defaults_and_what_can_be_mapped(tmp_path):
     text = DRIVE_EDS.read_text()
     start = text.index("[60E4sub1]")
@@ -103,7 +139,9 @@ def bus(tmp_path):
     """A unix bus with nodes 5 and 127 as SDO servers; whoever asks for `syncs` gets a SYNC every 10 ms."""
     path = f"unix:{tmp_path}/bus"
     hub, stop, syncs = Hub(str(tmp_path / "bus")), threading.Event(), threading.Event()
-    servers = {node: SdoServer(ObjectStore(DRIVE_EDS, node)) for node in (5, 127)}
+    servers = {node: SdoServer(ObjectStore(DRIVE_EDS, node)) for node in (5, 8, 127)}
+    late = []
+    """Answers of node 8: 0.65 s after the request, so that each request is sent twice."""
 
     def serve_hub():
         while not stop.is_set():
@@ -119,8 +157,12 @@ def bus(tmp_path):
                 server = servers.get(can_id - REQUEST_ID)
                 if server is not None:
                     answer = server.handle(data)
-                    if answer is not None:
+                    if answer is not None and can_id == REQUEST_ID + 8:
+                        late.append((time.monotonic() + 0.65, pack(RESPONSE_ID + 8, answer)))
+                    elif answer is not None:
                         socket.send(pack(RESPONSE_ID + can_id - REQUEST_ID, answer))
+            while late and late[0][0] <= time.monotonic():
+                socket.send(late.pop(0)[1])
             if syncs.is_set():
                 socket.send(pack(0x080, b""))
         socket.close()
@@ -139,12 +181,15 @@ def test_nodes_are_found_on_a_bus_and_read(bus):
     path, _ = bus
     reader = BusSurvey(path)
     try:
-        assert reader.nodes() == [5, 127]
+        assert reader.nodes() == [5, 8, 127]
         assert reader.nodes([5, 6]) == [5]
         found = reader.read(127)
         assert found is not None
         assert found.profile == DRIVE
         assert reader.read(6) is None
+        assert reader.numbers(8, [(0x6091, 1), (0x6041, 7)]) == {(0x6091, 1): 100}, (
+            "slow, and one is not there"
+        )
     finally:
         reader.close()
 

@@ -21,6 +21,8 @@ class LssSlave:
         self.node, self.rate, self.state = node, 0, WAITING
         self.stored: tuple[int, int] | None = None
         self.refuses: dict[int, int] = {}
+        self.length = 8
+        """Of its answers."""
         self._selected = self._position = 0
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -41,7 +43,7 @@ class LssSlave:
                 continue
             answer = self.answer(bytes(message.data))
             if answer is not None:
-                data = answer.ljust(8, b"\0")
+                data = answer.ljust(8, b"\0")[: self.length]
                 self._bus.send(can.Message(arbitration_id=ANSWER, data=data, is_extended_id=False))
 
     def answer(self, data: bytes) -> bytes | None:

@@ -121,6 +121,16 @@ def test_what_is_not_sure_is_a_guess() -> None:
     assert sum("# GUESS" in line for line in drive_lines(draft)) == 2
 
 
+def test_increments_per_second_are_those_of_the_option() -> None:
+    """A drive that names the unit of its velocity, and has no 608Fh that tells how many a turn are."""
+    survey = drive({(0x608F, 1): 0, (0x608F, 2): 0, (0x60A8, 0): 0x00B5_0000, (0x60A9, 0): 0x00B5_0300})
+    assert "give --encoder-counts" in probe.section(survey)[0]
+    draft = draft_joint(1, 5, survey, Wanted(rated_torque_nm=30.0, encoder_counts=4096))
+    assert {name: each.keys for name, each in draft.instead.items()} == {"motor_velocity": {"by": "608Fh"}}
+    assert draft.instead["motor_velocity"].why == "60A9h:0 is 0x00B50300, by the bus"
+    assert (0x6090, 1) not in draft.given
+
+
 def test_counts_by_an_option_go_before_what_the_drive_tells() -> None:
     survey = drive({(0x60A8, 0): MILLIDEGREE, (0x60A9, 0): 0xFD41_0300})
     wanted = Wanted(rated_torque_nm=30.0, encoder_counts=4096, link_encoder_counts=8192)
@@ -178,6 +188,11 @@ def test_a_layout_that_is_sent_at_each_sync_and_carries_all_is_kept() -> None:
 def test_any_other_is_mapped_by_jtqd(tpdos: tuple[Tpdo, ...]) -> None:
     layout = layout_told(5, drive(tpdos=tpdos), CIA_402)
     assert (layout.tpdos, layout.problems) == ((), ())
+
+
+def test_a_tpdo_with_a_29_bit_identifier_is_not_kept() -> None:
+    tpdos = (replace(MAKERS[0], cob_id=0x0123_4185), *MAKERS[1:])
+    assert layout_told(5, drive(tpdos=tpdos), CIA_402).tpdos == ()
 
 
 def test_a_mapping_that_an_eds_says_is_fixed_is_kept_or_refused() -> None:

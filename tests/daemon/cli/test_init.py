@@ -19,6 +19,7 @@ from jtqd.daemon.cli.draft import (
     draft_joint,
     drive_lines,
     joint_text,
+    plain,
 )
 from jtqd.daemon.config import load_config
 from jtqd.drivers.devices import DriveProfile, drive_scaling
@@ -122,6 +123,17 @@ def test_a_drive_without_scaling_is_scaled_by_options_as_the_boot_does():
 def test_a_drive_that_jtqd_cannot_use_is_told():
     (problem,) = draft_joint(1, NODE, drive(without=[(0x6041, 0)]), Wanted()).problems
     assert problem == "node 5 (emulated joint drive): has no 6041h:0, which jtqd maps"
+
+
+def test_a_value_that_the_boot_would_refuse_is_told():
+    (problem,) = draft_joint(1, NODE, drive({(0x6075, 0): 2_000_000}), Wanted()).problems
+    assert problem.endswith("6075h:0 motor rated current in mA: expected 1..1000000, found 2000000")
+    assert draft_joint(1, NODE, drive({(0x6075, 0): 2_000_000}), Wanted(rated_current_a=8.0)).problems == ()
+
+
+def test_every_number_is_one_in_yaml():
+    for number in (1e-05, 2e-300, 1e16, 7.12e-05, 100.0):
+        assert yaml.safe_load(plain(number)) == number
 
 
 LINK = ((0x60E4, 1), (0x60E6, 1), (0x60EB, 1))
@@ -250,7 +262,7 @@ def test_what_is_there_is_not_overwritten(tmp_path, capsys):
     ("arguments", "status", "told"),
     [
         (["--node", "5", "--node", "5"], 2, "names a node twice"),
-        (["--node", "5", "--node", "6", "--node", "7"], 2, "at most"),
+        ([f"--node={node}" for node in range(5, 10)], 2, "at most 4 joints"),
         ([], 2, "give --node"),
         (["--node", "5", "--gear-ratio", "1", "--gear-ratio", "2"], 2, "--gear-ratio: given 2 times"),
         (["--node", "5", "--from-eds", "none.eds"], 1, "none.eds"),
@@ -321,7 +333,19 @@ def test_files_that_jtqd_refuses_do_not_stay(tmp_path, capsys):
     ]
     status, _, err = run(capsys, *arguments, "--bitrate", 1)
     assert (status, err.count("\n")) == (1, 1)
+    assert f"{tmp_path / 'jtqd.yaml'}: key 'bitrate'" in err
     assert list(tmp_path.iterdir()) == []
+    (tmp_path / "jtqd.yaml").write_text("mine")
+    assert run(capsys, *arguments, "--bitrate", 1, "--force")[0] == 1
+    assert [each.read_text() for each in tmp_path.iterdir()] == ["mine"], "nothing is lost"
+
+
+def test_four_joints(tmp_path, capsys):
+    arguments = ["--from-eds", EDS, "--gear-ratio", 101, "--out", tmp_path]
+    status, _, err = run(capsys, *arguments, *(f"--node={node}" for node in (5, 6, 7, 8)))
+    assert (status, err) == (0, "")
+    config = load_config(tmp_path / "jtqd.yaml")
+    assert [joint.node_id for joint in config.joints] == [5, 6, 7, 8]
 
 
 @pytest.fixture
@@ -359,6 +383,12 @@ def test_the_devices_of_a_bus(bench, tmp_path, capsys):
     assert (status, err.count("\n")) == (2, 1)
     assert "is of vendor 0000009Ah, but node 1 says 000007A1h" in err
 
+    for sensor, told in ((2, "node 2 is no CiA 404 sensor"), (9, "node 9 does not answer")):
+        arguments = ["--bus", bench, "--node", 1, "--sensor", sensor, "--out", tmp_path / "other"]
+        status, _, err = run(capsys, *arguments)
+        assert (status, err.count("\n")) == (2, 1)
+        assert f"--sensor: {told}" in err
+
     status, _, err = run(capsys, "--bus", bench, "--node", 8, "--out", tmp_path / "other")
     assert status == 2
     assert "node 8 does not answer" in err
@@ -386,6 +416,9 @@ def test_probe_of_a_bus_and_of_its_devices(bench, capsys):
     assert probe.main(["--bus", bench, "--node", "9"]) == 1
     assert capsys.readouterr().err == f"jtq probe: node 9 does not answer on {bench}\n"
     assert probe.main(["--bus", bench, "--eds", "x.eds"]) == 2
+    capsys.readouterr()
+    assert probe.main(["--bus", bench, "--node", "1", "--eds", str(EDS.parent / "torque_sensor.eds")]) == 2
+    assert "is of profile 404, but node 1 says 402 (1000h)" in capsys.readouterr().err
 
 
 def test_probe_names_what_a_drive_lacks():

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import struct
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -13,6 +15,7 @@ import can
 import pytest
 
 from jtqd.daemon.cli import control, lss
+from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import pack
 from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.drivers.hub import Hub
@@ -103,6 +106,29 @@ def test_a_refusal_is_one_line(
         slave.refuses[service] = code
         assert lss.main(["set-node-id", "9", "--bus", bus, "--single", "--store", "--yes"]) == 1
         assert capsys.readouterr().err == f"jtq lss: LSS: {line}\n"
+
+
+def test_an_answer_that_is_too_short_is_none(bus: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with LssSlave(open_bus(bus), EPOS4, 7) as slave:
+        slave.length = 1
+        assert lss.main(["inquire", "--bus", bus, "--single"]) == 1
+        assert capsys.readouterr().err == "jtq lss: LSS: no LSS response received\n"
+
+
+@pytest.mark.parametrize("verb", [["scan"], ["set-node-id", "9", "--single", "--yes"]])
+def test_a_bus_that_ends_is_one_line(verb: list[str], tmp_path: Path) -> None:
+    """Of a process of its own, as the library logs to stderr by itself."""
+    hub = Hub(str(tmp_path / "h"), None)
+    command = [sys.executable, "-m", "jtqd.daemon.jtq", "lss", *verb, "--bus", f"unix:{tmp_path / 'h'}"]
+    done = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    heard = open_frame_socket(f"unix:{tmp_path / 'h'}", [exact(0x7E5)])
+    while not heard.receive():
+        hub.run_once(0.02)
+    heard.close()
+    hub.close()
+    out, err = done.communicate(timeout=20)
+    assert (done.returncode, out, err.count("\n")) == (1, "", 1), err
+    assert "bus lost" in err
 
 
 def test_without_yes_and_terminal_nothing_is_written(

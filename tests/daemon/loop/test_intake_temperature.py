@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from jtqd.daemon.bus.boot import bus_load_of
+from jtqd.daemon.bus.boot import boot_request, bus_load_of
 from jtqd.daemon.config import load_config
 from jtqd.daemon.core.counters import frame_counts
 from jtqd.daemon.core.intake import Intake, JointTemperature
@@ -172,6 +172,8 @@ def test_each_joint_finds_its_own(tmp_path: Path, have: tuple[int, ...]) -> None
         section = content[f"joint_{number}"]
         section |= {"file": str(shipped(section["file"])), "temperature": number in have}
         del section["network"]
+    if 2 in have:
+        content["joint_2"]["objects"] = {"temperature": {"index": 0x2040, "sub": 1, "factor": 0.01}}
     path = tmp_path / "c.yaml"
     path.write_text(yaml.safe_dump(content))
     config = load_config(path)
@@ -183,6 +185,11 @@ def test_each_joint_finds_its_own(tmp_path: Path, have: tuple[int, ...]) -> None
     for number, inputs in enumerate(joint_inputs(config, report), start=1):
         node = None if inputs.temperature is None else found[inputs.temperature].node_id
         assert node == (number if number in have else None)
+    for each in found:
+        each.receive(frame(each.cob_id, struct.pack("<h", 250)), 0)
+        assert each.celsius == pytest.approx(25.0 if each.node_id == 1 else 2.5), "by the unit of its object"
+    asked = {node["node"]: node.get("temperature") for node in boot_request(config, "b")["nodes"]}
+    assert (2 in have) == (asked[2] == {"index": 0x2040, "subindex": 1, "c_per_unit": 0.01})
     assert [row.cob_id for row in bus_load_of(config).rows if row.length == 2] == [0x380 + n for n in have]
 
 

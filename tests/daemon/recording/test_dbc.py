@@ -8,7 +8,7 @@ import pytest
 
 from jtqd.daemon.core.estimate_pdo import encode
 from jtqd.daemon.recording.dbc import Quantity, dbc_of, dbc_text
-from jtqd.drivers.devices import CIA_402, drive_layout
+from jtqd.drivers.devices import CIA_402, Temperature, drive_layout
 from jtqd.drivers.pdo import MappedObject, PdoMap
 
 TURN = 2 * math.pi
@@ -20,7 +20,7 @@ SCALING = {
 }
 
 
-def drive(number, *, temperature=False):
+def drive(number, *, temperature=None):
     return SimpleNamespace(
         number=number,
         node_id=number,
@@ -32,7 +32,11 @@ def drive(number, *, temperature=False):
 
 @pytest.fixture(scope="module")
 def database():
-    joints = tuple(drive(n, temperature=n == 2) for n in (1, 2))
+    joints = (
+        drive(1),
+        drive(2, temperature=Temperature()),
+        drive(4, temperature=Temperature(0x2040, 1, 0.01)),
+    )
     config = SimpleNamespace(
         counter_overflow=240,
         node_id=0x20,
@@ -53,8 +57,9 @@ def decode(database, line):
 
 def test_every_frame_of_the_bus_is_there(database):
     expected = {0x080: 1, 0x181: 8, 0x281: 8, 0x182: 8, 0x282: 8, 0x183: 5, 0x283: 3, 0x1A0: 8, 0x3A0: 4}
-    expected[0x382] = 2  # the second drive alone tells a temperature
-    for node in (1, 2, 3, 0x20):
+    expected |= {0x184: 8, 0x284: 8, 0x2A0: 8, 0x4A0: 4}
+    expected |= {0x382: 2, 0x384: 2}  # the first drive tells no temperature
+    for node in (1, 2, 3, 4, 0x20):
         expected |= {0x080 + node: 8, 0x700 + node: 1}
     assert {message.frame_id: message.length for message in database.messages} == expected
     assert database.get_message_by_frame_id(0x182).name == "drive_2_TPDO1"
@@ -92,6 +97,7 @@ def test_drive_motion(database):
 def test_temperature(database):
     assert decode(database, "382#0501") == {"temperature": pytest.approx(26.1)}
     assert decode(database, "382#F6FF") == {"temperature": pytest.approx(-1.0)}
+    assert decode(database, "384#0501") == {"temperature": pytest.approx(2.61)}, "in its object's own unit"
     assert decode(database, "382#0080") == {"temperature": "not_measured"}
 
 

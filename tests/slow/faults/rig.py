@@ -20,7 +20,7 @@ from typing import Any
 
 import yaml
 
-from jtqd.daemon.shared.snapshot import SnapshotReader
+from jtqd.daemon.shared.snapshot import NOT_OPERATIONAL, SnapshotReader
 from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, pack
 from jtqd.drivers.frame_socket import BusDown, open_frame_socket
@@ -39,6 +39,8 @@ DEADLINE_NS = 800_000
 SYNC, OWN_EMCY, ESTIMATE = 0x080, 0x0A0, 0x1A0
 _NEEDED = ({0x181, 0x281}, {0x182, 0x282})
 _LOOK_AGAIN_NS = 10 * MS
+_RESTED_NS = 350 * MS
+"""Longer than a node is let be after its boot (`jtqd.daemon.bus.boot`)."""
 
 
 class DaemonEndedError(Exception):
@@ -70,6 +72,7 @@ class Rig:
         self._number = 0
         self._down = False
         self._sync_at_ns = 0
+        self._booting_ns = 0
         self._open()
         self.ears = Ears(bus, sync_length=0 if library else 1)
 
@@ -158,8 +161,17 @@ class Rig:
         return self.reader.read().counters
 
     def configured(self) -> bool:
-        """No node waits for its configuration."""
-        return not self.reader.read().unconfigured
+        """No node waits for its configuration, or for the heartbeat with which a boot in service ends."""
+        view = self.reader.read()
+        states = (view.node_states[number] for number in (1, 2, 3))
+        if view.unconfigured or any(state in NOT_OPERATIONAL for state in states):
+            self._booting_ns = time.monotonic_ns()
+            return False
+        return True
+
+    def rested(self) -> bool:
+        """The same for a while: jtqd does not boot a node again at once."""
+        return self.configured() and time.monotonic_ns() - self._booting_ns > _RESTED_NS
 
     def report(self) -> Any:
         """`bus.json`."""

@@ -79,7 +79,7 @@ def play(
 def _play_one(rig: Rig, case: Case) -> Outcome:
     watcher = rig.watcher
     settled = rig.until(
-        lambda: watcher.well(case.settle) and not watcher.present and rig.configured(), _LONGEST_SETTLE_S
+        lambda: watcher.well(case.settle) and not watcher.present and rig.rested(), _LONGEST_SETTLE_S
     )
     if case.wait is not None:
         settled = rig.until(lambda: case.wait(rig), _LONGEST_WAIT_S) and settled  # type: ignore[misc]

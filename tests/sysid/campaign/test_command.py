@@ -173,6 +173,10 @@ def drives_with(folder: Path, **section: object) -> Path:
             {"objects": {"current": {"sign": -1}}},
             "key 'joint_1.objects.current': found 6078h:0, sign -1, expected 6078h or 6077h with sign 1",
         ),
+        (
+            {"temperature": True, "objects": {"temperature": {"index": 0x2040, "factor": 0.01}}},
+            "key 'joint_1.objects.temperature': found another one, expected 3001h",
+        ),
     ],
 )  # fmt: skip
 def test_a_drive_that_would_be_moved_otherwise_than_planned_is_refused(

@@ -328,12 +328,15 @@ def test_a_joint_that_was_never_enabled_is_left_out_and_named(tmp_path: Path) ->
 def test_the_temperature_of_a_joint_is_that_of_the_node_in_the_attached_configuration(tmp_path: Path) -> None:
     cycles = regular(40, four)
     cycles[5] = cycles[5]._replace(frames=[temperature(1, 31.0), temperature(12, 35.5)])
-    configuration = "joint_1: {node: 11}\njoint_2: {node: 12}\njoint_3: {node: 1}\njoint_4: {}\n"
+    own = "objects: {temperature: {index: 0x2040, factor: 0.01}}"
+    configuration = (
+        f"joint_1: {{node: 11}}\njoint_2: {{node: 12, {own}}}\njoint_3: {{node: 1}}\njoint_4: {{}}\n"
+    )
     table = log_to_run(write_log(tmp_path / "a.mcap", cycles, 4, configuration)).table
     found = {number: columns.temperature_c for number, columns in table.joints.items()}
     assert found[2] is not None
     assert found[3] is not None
-    assert (found[2][0], found[3][0]) == (35.5, 31.0)
+    assert (found[2][0], found[3][0]) == (pytest.approx(3.55), 31.0), "in the unit of its object"
     assert found[1] is None
     assert found[4] is None
 
