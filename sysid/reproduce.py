@@ -12,6 +12,7 @@ import argparse
 import hashlib
 import json
 import re
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -19,7 +20,8 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import replace
 from pathlib import Path
 from threading import Lock
-from typing import Final, NamedTuple
+from types import FrameType
+from typing import Final, NamedTuple, NoReturn
 
 import yaml
 
@@ -141,6 +143,7 @@ def run_steps(wanted: Sequence[Step], jobs: int) -> int:
     Returns the worst status; 1 when one failed: the others are ended then.
     """
     commands, worst = Commands(jobs), 0
+    before = signal.signal(signal.SIGTERM, _terminated)
     left, under_way = dict(enumerate(wanted)), dict[Future[int], int]()
     with ThreadPoolExecutor(jobs) as pool:
         try:
@@ -159,7 +162,13 @@ def run_steps(wanted: Sequence[Step], jobs: int) -> int:
                     worst = max(worst, status)
         finally:
             commands.end()
+            signal.signal(signal.SIGTERM, before)
     return worst
+
+
+def _terminated(number: int, frame: FrameType | None) -> NoReturn:
+    """SIGTERM ends the steps as Ctrl-C does."""
+    raise KeyboardInterrupt
 
 
 def _run(step: Step, commands: Commands) -> int:

@@ -402,14 +402,15 @@ def _dry_run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _campaign(options: argparse.Namespace, argv: Sequence[str]) -> int:
+def _campaign(options: argparse.Namespace, argv: Sequence[str], *, exact_too: bool = True) -> int:
+    """Run the campaign; exact_too: what real time loses on the emulated bench may go on in exact time."""
     config, units = _bench_of(options)
     config.load_with_commander()  # refuses what does not fit the bus
     if options.bus == exact.BUS:
         if not exact.inside():
             return exact.campaign(argv, options.out)
         options.bus = exact.BUS_INSIDE
-    exact_next = options.bus == EMULATED and exact.ready()
+    exact_next = exact_too and options.bus == EMULATED and exact.ready()
     made_from = recipe(options, config.joints)
     directory = CampaignDirectory(options.out)
     try:
@@ -429,7 +430,11 @@ def _campaign(options: argparse.Namespace, argv: Sequence[str]) -> int:
             file=sys.stderr,
             flush=True,
         )
-        return exact.campaign(argv, options.out)
+        try:
+            return exact.campaign(argv, options.out)
+        except exact.NoExactTimeError as error:
+            print(f"jtq campaign: {error}; in real time again", file=sys.stderr)
+            return _campaign(options, argv, exact_too=False)
     print(json.dumps(outcome.content()) if options.json else outcome.text())
     if outcome.short_of_time:
         print(f"jtq campaign: {_TOO_BUSY if emulated(options.bus) else _LATE}", file=sys.stderr)

@@ -22,6 +22,10 @@ BUS: Final = "exact"
 BUS_INSIDE: Final = "sim:vcan0"
 
 
+class NoExactTimeError(ProcessError):
+    """The bench kernel cannot be built or booted; one line."""
+
+
 def inside() -> bool:
     """Return whether this process is in exact time already."""
     return os.environ.get(guest.TIME_TRAVEL_MARK) == "1"
@@ -39,7 +43,8 @@ def campaign(argv: Sequence[str], out: Path) -> int:
     """Run `jtq campaign` with these arguments in the bench kernel; returns its exit status. The last --bus counts.
 
     Raises:
-        ProcessError: the kernel cannot be built or booted, or a signal ended it.
+        NoExactTimeError: the kernel cannot be built or booted.
+        ProcessError: a signal ended it.
     """
     command = [sys.executable, "-P", "-m", "jtqd.daemon.jtq", "campaign", *argv, "--bus", BUS_INSIDE]
     sys.stdout.flush()
@@ -49,7 +54,7 @@ def campaign(argv: Sequence[str], out: Path) -> int:
             command, time_travel=True, out_dir=out, sinks=(sys.stdout.buffer, sys.stderr.buffer)
         )
     except RuntimeError as error:  # every error of the bench kernel is one
-        raise ProcessError(f"exact time: {error}") from None
+        raise NoExactTimeError(f"exact time: {error}") from None
     except KeyboardInterrupt:
         raise ProcessError("ended by a signal; the same command continues with the remaining runs") from None
     finally:

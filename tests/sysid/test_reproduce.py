@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -164,6 +166,16 @@ def test_a_step_that_fails_ends_those_beside_it(tmp_path, python, capfd):
     assert "[b] no\n" in told
     assert "ended with status 2" in told
     assert f"--out {tmp_path / 'c'}" not in told
+
+
+def test_sigterm_ends_the_steps(tmp_path, python):
+    before = signal.getsignal(signal.SIGTERM)
+    tells = f"import os, signal, time; os.kill({os.getpid()}, signal.SIGTERM); time.sleep(600)"
+    begun = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        reproduce_command.run_steps((step(tmp_path / "a", words=tells),), 1)
+    assert time.monotonic() - begun < 60
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
 def test_nothing_waits_for_what_it_writes_itself(tmp_path):

@@ -101,6 +101,27 @@ def test_what_real_time_lost_goes_on_in_exact_time_if_it_is_the_emulated_bench_a
     assert ("ended by" in captured.out) == (not goes)
 
 
+def test_a_kernel_that_does_not_boot_leaves_real_time_with_its_repeats(
+    argv: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = []
+
+    def run(*_: object, exact_next: bool) -> Outcome:
+        asked.append(exact_next)
+        return Outcome({"a": RunState("pending")}, "a: late", late=True) if exact_next else Outcome({})
+
+    def boot(*_: object, **__: object) -> None:
+        raise guest.GuestError("the guest ended without a result")
+
+    monkeypatch.delenv(guest.TIME_TRAVEL_MARK, raising=False)
+    monkeypatch.setattr(exact, "ready", lambda: True)
+    monkeypatch.setattr(guest, "run", boot)
+    monkeypatch.setattr(command, "_run", run)
+    assert command.main([*argv, "--bus", "sim"]) == 0
+    assert asked == [True, False]
+    assert "the guest ended without a result; in real time again" in capsys.readouterr().err
+
+
 def test_the_command_in_there_is_the_same_on_another_bus(monkeypatch: pytest.MonkeyPatch) -> None:
     ran: list[tuple[list[str], dict[str, Any]]] = []
 
