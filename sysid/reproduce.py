@@ -1,7 +1,8 @@
 """`jtq reproduce`: run the paper's whole procedure and ours: campaigns, fits, training, evaluation, report.
 
-Every step is a `jtq` command of its own, printed before it runs, so that it can be repeated alone. Campaigns go on where
-they were interrupted; fits and training give the same files from the same runs. With `--plant` the bench is another one
+Every step is a `jtq` command of its own, printed before it runs, so that it can be repeated alone. A step begins when all
+that it reads is there; with --jobs several are at work at once. Campaigns go on where they were interrupted; fits and
+training give the same files from the same runs. With `--plant` the bench is another one
 (docs/benches.md), and its campaigns are emulated without a bus, with the true torques beside the runs.
 """
 
@@ -13,14 +14,16 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import replace
 from pathlib import Path
+from threading import Lock
 from typing import Final, NamedTuple
 
 import yaml
 
-from jtqd.estimator.checked import ConfigError, make_directory, natural
+from jtqd.estimator.checked import ConfigError, count, make_directory, natural
 from jtqd.models.files import shipped
 from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Plan
 from jtqd.sysid.campaign.plans import outside_runs
@@ -30,6 +33,9 @@ _OUTSIDE_PLANT: Final = "campaign_plant_outside.yaml"
 _FINDINGS: Final = 3
 _OTHER_DAYS: Final = 7
 """Added to the seed: days and trajectories that no campaign has."""
+_QUICK_JOBS: Final = 2
+"""Campaigns mostly wait, fits and training mostly compute."""
+_WRITTEN: Final = ("--out", "--plot")
 _VALIDATION_DAYS: Final = 1000
 """Added to the seed of emulated runs that judge."""
 _EMULATED: Final = "jtqd.sysid.campaign.emulated"
@@ -54,27 +60,36 @@ class Step(NamedTuple):
         name = "jtq" if self.module == "jtqd.daemon.jtq" else f"python -m {self.module}"
         return " ".join((name, *self.arguments))
 
+    @property
+    def name(self) -> str:
+        """Its first words: "jtq fit"."""
+        return " ".join(self.text.split()[: 2 if self.module == "jtqd.daemon.jtq" else 3])
+
+    @property
+    def out(self) -> Path:
+        """What it writes: a file, or a directory."""
+        return Path(self.arguments[self.arguments.index("--out") + 1])
+
+    def reads(self, earlier: Step) -> bool:
+        """Return whether it needs what an earlier step writes: that very file or directory, or a file in a directory."""
+        pairs = zip(("", *self.arguments), self.arguments, strict=False)
+        return any(earlier.out.is_relative_to(word) for before, word in pairs if before not in _WRITTEN)
+
 
 def main(argv: list[str]) -> int:
     """Run all steps; exit status 0 done, 1 a step failed, 2 usage, 3 done with findings."""
     options = parser().parse_args(argv)
     out: Path = options.out
-    worst = 0
+    jobs = options.jobs or (_QUICK_JOBS if options.quick else 1)
     try:
         make_directory(out)
         (out / "models").mkdir(parents=True, exist_ok=True)
         _write_outside_plan(out / "outside.plan.yaml", options.seed, 2 if options.quick else 6)
-        for step in steps(out, options.bus, options.quick, options.seed, options.plant):
-            print(f"$ {step.text}", file=sys.stderr, flush=True)
-            status = _run(step)
-            if status and not (status == _FINDINGS and step.findings_are_fine):
-                name = " ".join(step.text.split()[: 2 if step.module == "jtqd.daemon.jtq" else 3])
-                print(f"jtq reproduce: {name} ended with status {status}", file=sys.stderr)
-                return 1
-            worst = max(worst, status)
-            if step.arguments[0] == "train" and "ours" in step.arguments:
-                for name in ("bench.yaml", "bench_paper.yaml"):
-                    write_config(out / "models" / name, name)
+        worst = run_steps(tuple(steps(out, options.bus, options.quick, options.seed, options.plant)), jobs)
+        if worst == 1:
+            return 1
+        for name in ("bench.yaml", "bench_paper.yaml"):
+            write_config(out / "models" / name, name)
     except ConfigError as error:
         print(f"jtq reproduce: {error}", file=sys.stderr)
         return 1
@@ -88,14 +103,73 @@ def main(argv: list[str]) -> int:
     return worst
 
 
-def _run(step: Step) -> int:
+class Commands:
+    """Commands of the steps that are at work, up to `jobs` at once.
+
+    Several have no terminal of their own: each line that they tell begins with their name.
+    """
+
+    def __init__(self, jobs: int) -> None:
+        self.jobs = jobs
+        self.ended = False
+        self._lock = Lock()
+        self._processes: list[subprocess.Popen[str]] = []
+
+    def run(self, name: str, command: Sequence[str]) -> int:
+        """Return the exit status of a command; 1 without running it once all were ended."""
+        told = None if self.jobs == 1 else subprocess.PIPE
+        with self._lock:
+            if self.ended:
+                return 1
+            process = subprocess.Popen(command, stderr=told, text=True, errors="replace")
+            self._processes.append(process)
+        for line in process.stderr or ():
+            print(f"[{name}] {line}", end="", file=sys.stderr, flush=True)
+        return process.wait()
+
+    def end(self) -> None:
+        """End what is at work; nothing begins any more."""
+        with self._lock:
+            self.ended = True
+            for process in self._processes:
+                process.terminate()
+
+
+def run_steps(wanted: Sequence[Step], jobs: int) -> int:
+    """Run steps, up to `jobs` at once, each when the earlier ones that it reads are done.
+
+    Returns the worst status; 1 when one failed: the others are ended then.
+    """
+    commands, worst = Commands(jobs), 0
+    left, under_way = dict(enumerate(wanted)), dict[Future[int], int]()
+    with ThreadPoolExecutor(jobs) as pool:
+        try:
+            while left or under_way:
+                unfinished = {*left, *under_way.values()}
+                for at, step in list(left.items()):
+                    waits = any(step.reads(wanted[one]) for one in unfinished if one < at)
+                    if len(under_way) < jobs and not waits:
+                        print(f"$ {step.text}", file=sys.stderr, flush=True)
+                        under_way[pool.submit(_run, left.pop(at), commands)] = at
+                for done in wait(under_way, return_when=FIRST_COMPLETED).done:
+                    step, status = wanted[under_way.pop(done)], done.result()
+                    if status and not (status == _FINDINGS and step.findings_are_fine):
+                        print(f"jtq reproduce: {step.name} ended with status {status}", file=sys.stderr)
+                        return 1
+                    worst = max(worst, status)
+        finally:
+            commands.end()
+    return worst
+
+
+def _run(step: Step, commands: Commands) -> int:
     """Run a step; a campaign that ended early goes on for as long as each attempt gets at least one more run done."""
     done = -1
     while True:
-        status = subprocess.run([sys.executable, "-m", step.module, *step.arguments], check=False).returncode
-        if status != 1 or step.arguments[0] != "campaign":
+        status = commands.run(step.out.name, [sys.executable, "-m", step.module, *step.arguments])
+        if status != 1 or step.arguments[0] != "campaign" or commands.ended:
             return status
-        now = _runs_done(Path(step.arguments[step.arguments.index("--out") + 1]))
+        now = _runs_done(step.out)
         if now <= done:
             return status
         done = now
@@ -126,7 +200,7 @@ def parser() -> argparse.ArgumentParser:
         "--bus",
         default="sim",
         metavar="BUS",
-        help="sim, or sim:vcan0: the emulated bench on SocketCAN (default sim)",
+        help="sim, sim:vcan0: the emulated bench on SocketCAN, or exact: in exact time (default sim)",
     )
     parser.add_argument(
         "--plant",
@@ -136,6 +210,9 @@ def parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--quick", action="store_true", help="small campaigns and short training, to test the steps"
+    )
+    parser.add_argument(
+        "--jobs", type=count, metavar="N", help="steps at work at once (default 1, with --quick 2)"
     )
     parser.add_argument(
         "--seed", type=natural, default=0, help="of trajectories, days and weights (default 0)"

@@ -87,6 +87,9 @@ class Value:
         return bool(self.better)
 
 
+NO_NODE = "an EDS knows no node-ID: --node, or --bus"
+
+
 @dataclass(frozen=True)
 class JointDraft:
     """One joint: `values` by the keys of the joint file, objects of the drive that the configuration gives instead."""
@@ -106,13 +109,16 @@ class JointDraft:
     """Quantities that the drive does not have, or does not scale, as CiA 402 or its profile has them."""
     layout: Layout = field(default_factory=Layout)
     """TPDOs that stay as they are."""
+    node_guessed: bool = False
+    """Nobody said which node-ID the drive has."""
 
     @property
     def guesses(self) -> list[str]:
         """One line per guess: what, how much, what to do."""
         named = [(f"joint_{self.number}.yaml: {name}", value) for name, value in self.values.items()]
         named += [(f"joint_{self.number}.given: {label(*key)}", value) for key, value in self.given.items()]
-        found = [
+        found = [f"joint_{self.number}: node = {self.node} ({NO_NODE})"] if self.node_guessed else []
+        found += [
             f"{name} = {plain(value.number)} ({value.origin}): {value.better}"
             for name, value in named
             if value.guess
@@ -522,7 +528,9 @@ def drive_lines(joint: JointDraft) -> list[str]:
     title = f"{survey.title}, by {survey.source}" if survey is not None else "not looked at"
     lines = [
         f"joint_{joint.number}:{'':18}# {title}",
-        f"  node: {joint.node}",
+        f"  node: {joint.node}"
+        if not joint.node_guessed
+        else f"{f'  node: {joint.node}':<26}# GUESS, {NO_NODE}",
         f"  file: joint_{joint.number}.yaml",
     ]
     lines += _identity(survey)

@@ -74,7 +74,8 @@ def parser() -> argparse.ArgumentParser:
         type=node_id,
         action="append",
         metavar="N",
-        help=f"node-ID of a drive; again for the next joint, at most {MAX_JOINTS} (default: drives on the bus)",
+        help=f"node-ID of a drive; again for the next joint, at most {MAX_JOINTS} (default: drives on the bus; with EDS "
+        "files alone 1, 2 as a guess)",
     )
     made.add_argument(
         "--sensor", type=_sensor, metavar="N|none", help="node-ID of the torque sensor (default: as found)"
@@ -167,6 +168,8 @@ class Found:
     notes: list[str]
     families: dict[int, Family | None] = field(default_factory=dict)
     """Profile of each drive."""
+    guessed: bool = False
+    """The node-IDs are: an EDS is all that is known."""
 
 
 def main(argv: list[str]) -> int:
@@ -254,6 +257,8 @@ def _found(options: argparse.Namespace) -> Found:
         for node in nodes:
             if node not in surveys and not options.from_eds:
                 raise UsageError(f"node {node} does not answer on {options.bus}{_others(surveys)}")
+    guessed = not nodes and options.bus is None and options.from_eds is not None
+    nodes = list(range(1, len(options.from_eds) + 1)) if guessed else nodes
     if not nodes:
         where = f"no CiA 402 drive answers on {options.bus}" if options.bus else "no drive is known"
         raise UsageError(f"{where}: give --node{_others(surveys)}")
@@ -269,7 +274,7 @@ def _found(options: argparse.Namespace) -> Found:
     _refuse_other_kinds(nodes, sensor, surveys)
     families = {node: family_of(surveys.get(node), options.profile) for node in nodes}
     notes += [f"node {node}: profile {each.name} ({each.title})" for node, each in families.items() if each]
-    return Found(nodes, surveys, sensor or None, notes, families)
+    return Found(nodes, surveys, sensor or None, notes, families, guessed)
 
 
 def _refuse_other_kinds(nodes: Sequence[int], sensor: int | None, surveys: Mapping[int, Survey]) -> None:
@@ -403,9 +408,8 @@ def _drafts(options: argparse.Namespace, found: Found) -> list[JointDraft]:
     for position, node in enumerate(found.nodes):
         values = {name: column[position] for name, column in columns.items()}
         wanted = Wanted(**values, one_encoder=options.one_encoder)
-        drafts.append(
-            _draft((position + 1, node), found.surveys.get(node), wanted, ask, found.families.get(node))
-        )
+        draft = _draft((position + 1, node), found.surveys.get(node), wanted, ask, found.families.get(node))
+        drafts.append(replace(draft, node_guessed=found.guessed))
     return drafts
 
 

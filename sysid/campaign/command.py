@@ -24,6 +24,7 @@ from jtqd.drivers.bus_load import LIMIT, BusLoad
 from jtqd.estimator.checked import ConfigError, count, counted, natural, seconds
 from jtqd.estimator.joint import Joint
 from jtqd.models.files import shipped
+from jtqd.sysid.campaign import exact
 from jtqd.sysid.campaign.alone import parsed_limits, room_of, tightest, with_limits
 from jtqd.sysid.campaign.bench import Bench, BenchConfig
 from jtqd.sysid.campaign.pieces import LONGEST_FILLED_S
@@ -61,7 +62,11 @@ def parser() -> argparse.ArgumentParser:
     )
     add = made.add_argument
     add("plan", metavar="PLAN", help="efficiency, excitation, validate, or a plan file (jtq.plan/1)")
-    add("--bus", help="can0, unix:PATH, sim (the emulated bench), or sim:BUS (the same on that bus)")
+    add(
+        "--bus",
+        help="can0, unix:PATH, sim (the emulated bench), sim:BUS (the same on that bus), or exact (the same in exact time, "
+        "however busy this machine is)",
+    )
     add("--out", type=Path, metavar="DIR", help="the campaign's directory; created if missing")
     add("--dry-run", action="store_true", help="print the plan, its length and the bus load, without motion")
     add(
@@ -134,7 +139,7 @@ def missing_option(options: argparse.Namespace) -> str:
 
 def emulated(bus: str | None) -> bool:
     """Return whether the campaign brings its own bench."""
-    return bus is not None and (bus == EMULATED or bus.startswith(f"{EMULATED}:"))
+    return bus is not None and (bus in (EMULATED, exact.BUS) or bus.startswith(f"{EMULATED}:"))
 
 
 def recipe(options: argparse.Namespace, joints: Sequence[Joint]) -> dict[str, Any]:
@@ -339,10 +344,7 @@ def dry_run_text(
 _LATE: Final = (
     "runs were lost because this machine was late: give it SCHED_FIFO (root, or ulimit -r 80); see jtq doctor"
 )
-_TOO_BUSY: Final = (
-    f"{_LATE}; or in exact time, however busy the machine is: "
-    "python -m jtqd.sim_can.bench_kernel run --time-travel --out DIR -- jtq campaign ... --bus sim:vcan0 --out DIR"
-)
+_TOO_BUSY: Final = f"{_LATE}; or in exact time, however busy the machine is: --bus {exact.BUS}"
 _MASTER_GONE: Final = "fault 8130h"
 """Drives watch jtqd's heartbeat (1016h:1): when jtqd ended with the run before, they went to this fault, powered off."""
 
@@ -358,7 +360,7 @@ def main(argv: list[str]) -> int:
         if problem:
             print(f"jtq campaign: {problem}", file=sys.stderr)
             return 2
-        return _dry_run(options) if options.dry_run else _campaign(options)
+        return _dry_run(options) if options.dry_run else _campaign(options, argv)
     except (ConfigError, StateError, ProcessError) as error:
         print(f"jtq campaign: {error}", file=sys.stderr)
         return 1
@@ -400,9 +402,14 @@ def _dry_run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _campaign(options: argparse.Namespace) -> int:
+def _campaign(options: argparse.Namespace, argv: Sequence[str]) -> int:
     config, units = _bench_of(options)
     config.load_with_commander()  # refuses what does not fit the bus
+    if options.bus == exact.BUS:
+        if not exact.inside():
+            return exact.campaign(argv, options.out)
+        options.bus = exact.BUS_INSIDE
+    exact_next = options.bus == EMULATED and exact.ready()
     made_from = recipe(options, config.joints)
     directory = CampaignDirectory(options.out)
     try:
@@ -412,9 +419,17 @@ def _campaign(options: argparse.Namespace) -> int:
         directory.begin(plan, made_from)
         for line in unit_lines(options, units, plan):
             print(f"jtq campaign: {line}", file=sys.stderr)
-        outcome = _run(options, config, plan, setpoints, directory)
+        outcome = _run(options, config, plan, setpoints, directory, exact_next=exact_next)
     finally:
         directory.close()
+    if outcome.late:
+        print(
+            f"jtq campaign: {outcome.ended}: this machine is too busy for real time; what is left takes place in exact "
+            "time, in the bench kernel",
+            file=sys.stderr,
+            flush=True,
+        )
+        return exact.campaign(argv, options.out)
     print(json.dumps(outcome.content()) if options.json else outcome.text())
     if outcome.short_of_time:
         print(f"jtq campaign: {_TOO_BUSY if emulated(options.bus) else _LATE}", file=sys.stderr)
@@ -427,6 +442,8 @@ def _run(
     plan: Plan,
     setpoints: dict[str, Setpoints],
     directory: CampaignDirectory,
+    *,
+    exact_next: bool,
 ) -> Outcome:
     to_do = [setpoints[run.name].duration_s for run in plan.runs if directory.runs[run.name].status != DONE]
     if not to_do:
@@ -456,6 +473,7 @@ def _run(
                     run, points, bench, directory.path, motion=motion, stop_asked=stop_asked
                 ),
                 keep_going=options.keep_going,
+                exact_next=exact_next,
             )
 
 

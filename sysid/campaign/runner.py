@@ -41,6 +41,8 @@ LONGEST_GAP: Final = 9.5
 """In periods of SYNC. A longer step, of 10 cycles or more: the table would be refused by whoever reads it
 (jtqd.sysid.runs.files)."""
 LOST_SHARE: Final = 0.01
+LOST_FINDING: Final = "cycles:"
+"""How the finding begins that more than that are missing."""
 LOST_END_S: Final = 0.1
 FOLLOW_VELOCITY: Final = (0.05, 0.05)
 FOLLOW_CURRENT: Final = (0.1, 0.05)
@@ -229,8 +231,8 @@ def _lost(logged: LoggedRun) -> Iterator[str]:
         return
     by = ", ".join(f"{name} {count}" for name, count in logged.incomplete_by.items() if count)
     yield (
-        f"cycles: found {logged.lost_share:.1%} missing ({logged.missed} without a cycle, {logged.incomplete} incomplete"
-        f"{': ' + by if by else ''}), expected at most {LOST_SHARE:.0%}"
+        f"{LOST_FINDING} found {logged.lost_share:.1%} missing ({logged.missed} without a cycle, "
+        f"{logged.incomplete} incomplete{': ' + by if by else ''}), expected at most {LOST_SHARE:.0%}"
     )
 
 
@@ -304,10 +306,12 @@ class Outcome:
 
     Attributes:
         runs: state of every run of the plan. ended: why it ended before the last run; "" when it did not.
+        late: it ended at the first run that was lost because this machine was late: the others are for exact time.
     """
 
     runs: Mapping[str, RunState]
     ended: str = ""
+    late: bool = False
 
     @property
     def short_of_time(self) -> bool:
@@ -383,12 +387,15 @@ def go_through(
     attempt_run: AttemptRun,
     *,
     keep_going: bool = False,
+    exact_next: bool = False,
 ) -> Outcome:
     """Play what is not done; the directory always holds the state of every run.
 
     A run whose attempt failed for want of time only is tried again, up to ATTEMPTS times; one that can be cut into
     pieces is tried once, and then each piece up to ATTEMPTS times. What is lost all the same does not keep the other runs
-    back. A limit ends the campaign unless keep_going; so does a bench that cannot be started, or a signal.
+    back. A limit ends the campaign unless keep_going; so does a bench that cannot be started, or a signal. With exact_next
+    (the emulated bench, which can be had in exact time as well) the first run that is lost for want of time ends it, and
+    so does one with more than LOST_SHARE of its cycles missing, which is not kept.
     """
     for run in plan.runs:
         if directory.runs[run.name].status == DONE:
@@ -396,18 +403,35 @@ def go_through(
         motion_s = setpoints[run.name].duration_s
         reporter.begin(run.name, motion_s)
         try:
-            last = _attempts(run, setpoints[run.name], directory, reporter, attempt_run)
+            if exact_next:
+                last = _attempt_on_time(run, setpoints[run.name], directory, attempt_run)
+            else:
+                last = _attempts(run, setpoints[run.name], directory, reporter, attempt_run)
         except Interrupted:
             return Outcome(directory.runs, f"a signal, before {run.name} moved")
         state = directory.runs[run.name]
         reporter.end(run.name, motion_s, state)
         if last.signalled:
             return Outcome(directory.runs, f"{state.reason} during {run.name}")
+        if exact_next and last.again:
+            return Outcome(directory.runs, f"{run.name}: {state.reason}", late=True)
         if state.status != DONE and not last.begun:
             return Outcome(directory.runs, f"{run.name}: {state.reason}")
         if state.status == STOPPED and not last.again and not keep_going:
             return Outcome(directory.runs, f"{run.name}: {state.reason}")
     return Outcome(directory.runs)
+
+
+def _attempt_on_time(
+    run: Run, setpoints: Setpoints, directory: CampaignDirectory, attempt_run: AttemptRun
+) -> Attempt:
+    """Return the only attempt; one that has lost too many cycles for a run without findings has failed."""
+    last = attempt_run(run, setpoints)
+    lost = [finding for finding in last.state.findings if finding.startswith(LOST_FINDING)]
+    if last.state.status == DONE and lost:
+        last = Attempt(replace(last.state, status=FAILED, reason=lost[0], sha256=""), again=True)
+    directory.put(run.name, replace(last.state, attempts=1))
+    return last
 
 
 def _attempts(

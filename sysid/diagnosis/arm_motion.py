@@ -309,7 +309,7 @@ KINDS: Final[dict[str, tuple[str, Callable[[Room, str], list[Motion]]]]] = {
         _zero,
     ),
 }
-"""Kind of experiment (`next_experiment.EXPERIMENTS`) -> what it is for one joint, and its runs."""
+"""Kind of experiment (`towing_motion.EXPERIMENTS`) -> what it is for one joint, and its runs."""
 
 
 def motions(kinds: Iterable[str], room: Room) -> list[Motion]:

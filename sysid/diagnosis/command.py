@@ -20,10 +20,12 @@ from jtqd.estimator.checked import ConfigError, counted, make_directory
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTableError
 from jtqd.sysid.campaign.alone import parsed_limits, with_limits
+from jtqd.sysid.campaign.bench import BenchConfig
 from jtqd.sysid.campaign.plan import Plan
 from jtqd.sysid.diagnosis.arm_motion import MOTION_FILE, joint_motion_file
 from jtqd.sysid.diagnosis.extended_joint import FILE, write_extended
 from jtqd.sysid.diagnosis.findings import INSUFFICIENT, NO_GAP, Findings, summary_lines, to_mapping
+from jtqd.sysid.diagnosis.next_experiment import CONFIG, PLAN_FILE, campaign_command
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, scope_of
 from jtqd.sysid.progress import waiting
 from jtqd.sysid.runs.checks import CheckedRuns, check_runs
@@ -35,10 +37,9 @@ BY: Final = "jtq diagnose"
 _NEEDED: Final = ("matplotlib", "jinja2", "scipy")
 FINDINGS: Final = "findings.json"
 REPORT: Final = "report.html"
-PLAN: Final = "next_experiment.plan.yaml"
 _JOINTS: Final = range(1, 8)
 _OWN: Final = (
-    *(FINDINGS, REPORT, PLAN, MOTION_FILE, FILE),
+    *(FINDINGS, REPORT, PLAN_FILE, MOTION_FILE, FILE),
     *(f"extended.joint{n}.yaml" for n in _JOINTS),
     *(joint_motion_file(n) for n in _JOINTS),
 )
@@ -70,7 +71,9 @@ def main(argv: list[str]) -> int:
             scope,
             options.relevance,
         )
-        findings = replace(findings, joint_files=joints, next_experiment=_with_command(options, findings))
+        findings = replace(
+            findings, joint_files=joints, next_experiment=_with_command(options, findings, joints)
+        )
         mapping = _write(options.out, findings, joints, {run.name: run.sha256 for run in runs})
     except UsageError as error:
         print(f"{BY}: {error}", file=sys.stderr)
@@ -88,14 +91,28 @@ def main(argv: list[str]) -> int:
     return 0 if findings.verdict == NO_GAP else 3
 
 
-def _with_command(options: argparse.Namespace, findings: Findings) -> dict[str, Any] | None:
+def _with_command(
+    options: argparse.Namespace, findings: Findings, joints: Mapping[int, Joint]
+) -> dict[str, Any] | None:
     """Return the next experiment with the command that runs it; nothing of ours runs the motion of an arm."""
     experiment = findings.next_experiment
     if experiment is None or not experiment.get("plan"):
         return None if experiment is None else dict(experiment)
-    config = "" if options.config is None else f" --config {shlex.quote(str(options.config))}"
-    plan = shlex.quote(str(options.out / PLAN))
-    return {**experiment, "command": f"jtq campaign {plan} --bus {options.bus}{config} --out RUNS"}
+    plan = shlex.quote(str(options.out / PLAN_FILE))
+    config = "" if _of_shipped_bench(joints) else CONFIG
+    if options.config is not None:
+        config = shlex.quote(str(options.config))
+    return {**experiment, "command": campaign_command(plan, shlex.quote(options.bus), config)}
+
+
+def _of_shipped_bench(joints: Mapping[int, Joint]) -> bool:
+    """Return whether the joints may be those of the bench that `jtq campaign` takes without --config."""
+
+    def known_by(joint: Joint) -> tuple[float, float, float]:
+        return joint.gear_ratio, joint.torque_constant_nm_per_a, joint.rated_torque_nm
+
+    bench = {n: known_by(joint) for n, joint in enumerate(BenchConfig.load(None).joints, 1)}
+    return all(bench.get(n) == known_by(joint) for n, joint in joints.items())
 
 
 def diagnosed(
@@ -160,7 +177,7 @@ def parser() -> argparse.ArgumentParser:
             "  jtq diagnose rig/*.csv --columns columns.yaml --joint 3=arm3.yaml --without sensor_drift \\\n"
             "      --limits travel_rad=-0.5:0.5,velocity_rad_s=1 --out diagnosis\n\n"
             f"DIR/{REPORT} is for people, DIR/{FINDINGS} for programs, DIR/{FILE} the joint file with the effects found;\n"
-            f"DIR/{PLAN}, when there is one, is for `jtq campaign`, DIR/{MOTION_FILE} for the controller\n"
+            f"DIR/{PLAN_FILE}, when there is one, is for `jtq campaign`, DIR/{MOTION_FILE} for the controller\n"
             "of an arm. Exit status: 0 no gap; 3 any other verdict; 1 failure; 2 usage."
         ),
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -207,7 +224,10 @@ def parser() -> argparse.ArgumentParser:
         "(default: motion_limits of the joint file); never beyond what the runs did",
     )
     parser.add_argument(
-        "--config", type=Path, metavar="FILE", help="configuration of jtqd for the printed command"
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="configuration of jtqd for the printed command (default: a place for it; none for the bench that ships)",
     )
     parser.add_argument(
         "--bus", default="can0", metavar="BUS", help="bus for the printed command (default can0)"
@@ -276,9 +296,9 @@ def _write(
             names.append(name)
             (fresh / name).write_text(text, encoding="utf-8")
         if experiment and experiment.get("plan"):
-            names.append(PLAN)
-            plan = Plan.from_mapping(experiment["plan"], PLAN)
-            (fresh / PLAN).write_text(plan.to_yaml(), encoding="utf-8")
+            names.append(PLAN_FILE)
+            plan = Plan.from_mapping(experiment["plan"], PLAN_FILE)
+            (fresh / PLAN_FILE).write_text(plan.to_yaml(), encoding="utf-8")
         names.append(REPORT)
         (fresh / REPORT).write_text(render(findings), encoding="utf-8")
         mapping = to_mapping(findings, sha256=sha256, files=names)

@@ -91,6 +91,11 @@ class Dataset:
         """The joint files by number, their own effects taken off the residuals already."""
         return {s.number: s.joint for s in self.signals[0]}
 
+    @property
+    def rated_torque_nm(self) -> float:
+        """The largest of the joints."""
+        return max(joint.rated_torque_nm for joint in self.joints.values())
+
     def valid_or_event(self, run: int, channel: Channel) -> BoolArray:
         """Return where a channel of a run is valid or in an event [n]."""
         valid = self.runs[run].channels[channel].valid

@@ -16,8 +16,8 @@ import numpy as np
 from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
+from jtqd.sysid.diagnosis.case import search_case
 from jtqd.sysid.diagnosis.dataset import Dataset, build_dataset, resolution_notes, usable_signals
-from jtqd.sysid.diagnosis.evidence import RELEVANT
 from jtqd.sysid.diagnosis.findings import (
     AMBIGUOUS,
     CAUSE,
@@ -26,19 +26,17 @@ from jtqd.sysid.diagnosis.findings import (
     UNEXPLAINED,
     Findings,
     OddRun,
+    shows_at,
 )
-from jtqd.sysid.diagnosis.leftover import events_left
+from jtqd.sysid.diagnosis.named import named_in
 from jtqd.sysid.diagnosis.next_experiment import each_joint, next_experiment
-from jtqd.sysid.diagnosis.noise import Noise
 from jtqd.sysid.diagnosis.odd_runs import odd_run
 from jtqd.sysid.diagnosis.recordings import piece_notes, recordings
-from jtqd.sysid.diagnosis.refine import Refined, present_effects, refine, set_torsion
+from jtqd.sysid.diagnosis.refine import set_torsion
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope
-from jtqd.sysid.diagnosis.search import Hypothesis, Search
-from jtqd.sysid.diagnosis.searched import searched
 from jtqd.sysid.diagnosis.signals import JointSignals
-from jtqd.sysid.diagnosis.verdict import RELEVANCE, conclude, named
+from jtqd.sysid.diagnosis.verdict import RELEVANCE, conclude
 
 _WORST_FIRST: Final = (UNEXPLAINED, AMBIGUOUS, CAUSE, INSUFFICIENT, NO_GAP)
 
@@ -64,7 +62,7 @@ def diagnose(
     applied = {n: with_effects_applied(joint) for n, joint in joints.items()}
     findings = _diagnosed(runs, applied, numbers, scope, relevance)
     for n in numbers:
-        new = {c.name for c in findings.causes if c.joint in (n, "sensor")}
+        new = {c.name for c in findings.causes if shows_at(c.joint, n)}
         kept = tuple(e for e in applied[n].effects if e.name not in new)
         if len(kept) < len(applied[n].effects):
             applied[n] = replace(applied[n], effects=kept)
@@ -88,34 +86,18 @@ def _diagnosed(
         plan = next_experiment([], there, "; ".join(reasons)) if there else None
         return Findings(INSUFFICIENT, tuple(reasons), names, numbers, next_experiment=plan)
     usable, dataset, odd = without_odd_runs(usable, joints, scope)
-    least = RELEVANT * max(joints[n].rated_torque_nm for n in numbers)
-    dataset, noise, search, best, refined = _fitted(dataset, least, joints)
+    case, fit = search_case(dataset, relevance)
     pieces = recordings(usable)
 
     def anew(number: int) -> Sequence[EffectCandidate]:
         part = [run for run, piece in zip(usable, pieces, strict=True) if piece != number]
         for s in (joint for run in part for joint in run):
             set_torsion(s, ())  # it is as the last fit left it
-        data, whiter, part_search, found, fit = _fitted(build_dataset(part, joints, scope), least, joints)
-        return named(data, part_search, found, fit, whiter, joints, relevance)
+        return named_in(*search_case(build_dataset(part, joints, scope), relevance))
 
-    findings = conclude(dataset, search, best, refined, noise, joints, names, numbers, relevance, anew)
+    findings = conclude(case, fit, names, numbers, anew)
     notes = (*reasons, *(o.text for o in odd), *resolution_notes(usable), *piece_notes(usable))
     return replace(findings, channel_notes=notes, odd_runs=tuple(odd))
-
-
-def _fitted(
-    dataset: Dataset, least_nm: float, joints: Mapping[int, Joint]
-) -> tuple[Dataset, Noise, Search, Hypothesis, Refined]:
-    """Return dataset, noise, search, best hypothesis and its refinement; again without the events that no effect makes."""
-    noise, search, best = searched(dataset, least_nm)
-    refined = refine(dataset, present_effects(best), noise)
-    events = events_left(dataset, refined, noise, joints)
-    if events:  # they shall bend none
-        dataset = dataset.without_events(events)
-        noise, search, best = searched(dataset, least_nm)
-        refined = refine(dataset, present_effects(best), noise)
-    return dataset, noise, search, best, refined
 
 
 def without_odd_runs(

@@ -76,21 +76,16 @@ class Events:
         return sum(int(m.sum()) for m in self.masks) / max(sum(len(m) for m in self.masks), 1)
 
 
-def events(  # noqa: PLR0917
-    runs: Sequence[RunData],
-    channel: Channel,
-    parts: Sequence[FloatArray],
-    ar: FloatArray,
-    step_s: float,
-    least_nm: float,
+def events(
+    runs: Sequence[RunData], channel: Channel, parts: Sequence[FloatArray], limits: EventLimits
 ) -> Events | None:
     """Return the events of a channel's residual `parts` [run][n], NaN where not valid; None without any.
 
-    Stretches whose whitened energy is far above the usual, where the residual itself moves by least_nm or more. A jump, a
+    Stretches whose whitened energy is far above the usual, where the residual itself moves by jump_nm or more. A jump, a
     dip, a dropped reading: whitening makes a short peak of each. What lies between two stretches close together is one.
     """
-    wide = max(4, round(_BURST_S / step_s))
-    energies = [_white_energy(x, ar, wide) for x in parts]
+    wide = max(4, round(_BURST_S / limits.step_s))
+    energies = [_white_energy(x, limits.ar, wide) for x in parts]
     everything = np.concatenate(energies)
     good = np.isfinite(everything)
     if good.sum() < 50:
@@ -105,9 +100,9 @@ def events(  # noqa: PLR0917
             first = max(0, (k - 1) * wide)
             near = x[first : (k + 2) * wide]
             near = near[np.isfinite(near)]
-            if len(near) > 2 and float(np.ptp(near)) > least_nm:
+            if len(near) > 2 and float(np.ptp(near)) > limits.jump_nm:
                 found.append((float(energy[k] / usual), run.name, float(run.time_s[k * wide])))
-                mask[end if 0 < first - end <= _JOIN_S / step_s else first : (k + 2) * wide] = True
+                mask[end if 0 < first - end <= _JOIN_S / limits.step_s else first : (k + 2) * wide] = True
                 end = (k + 2) * wide
         masks.append(mask)
     if not found:
@@ -125,12 +120,10 @@ def events(  # noqa: PLR0917
 def bursts(
     runs: Sequence[RunData],
     residuals: Mapping[Channel, list[FloatArray]],
-    ar: Mapping[Channel, FloatArray],
-    step_s: float,
-    least_nm: Mapping[Channel, float],
+    limits: Mapping[Channel, EventLimits],
 ) -> dict[Channel, Events]:
     """Return the events of all channels that have any, see `events`."""
-    found = {c: events(runs, c, parts, ar[c], step_s, least_nm[c]) for c, parts in residuals.items()}
+    found = {c: events(runs, c, parts, limits[c]) for c, parts in residuals.items()}
     return {c: e for c, e in found.items() if e is not None}
 
 
@@ -155,16 +148,16 @@ def _moments(found: list[tuple[float, str, float]]) -> tuple[tuple[str, float], 
 def wandering(
     runs: Sequence[RunData],
     residuals: Mapping[Channel, Sequence[FloatArray]],
-    step_s: float,
-    least_nm: Mapping[Channel, float],
+    limits: Mapping[Channel, EventLimits],
 ) -> list[Burst]:
     """Return channels whose residual, averaged over seconds, is not where it should be although no condition explains it
-    (rms of the means above least_nm, or above a third of it in seconds that stand far out of all others): a zero that
+    (rms of the means above wander_nm, or above a third of it in seconds that stand far out of all others): a zero that
     jumps, a joint that is not always the same. times: the worst seconds.
     """
-    block = max(2, round(BLOCK_S / step_s))
     out = []
     for channel, parts in residuals.items():
+        step_s, least_nm = limits[channel].step_s, limits[channel].wander_nm
+        block = max(2, round(BLOCK_S / step_s))
         means: list[tuple[float, str, float]] = []
         for run, x in zip(runs, parts, strict=True):
             many = len(x) // block
@@ -175,7 +168,7 @@ def wandering(
         energy = float(np.mean(sizes**2)) if means else 0.0
         far = sizes[sizes > _OUTLYING * np.median(sizes)] if means else sizes
         outlying = float(np.sum(far**2)) / max(len(sizes), 1)
-        if energy > least_nm[channel] ** 2 or outlying > (_OUTLYING_PART * least_nm[channel]) ** 2:
+        if energy > least_nm**2 or outlying > (_OUTLYING_PART * least_nm) ** 2:
             total = float(np.nanmean(np.concatenate(parts) ** 2))
             out.append(Burst(channel, energy, energy / total, _moments(means)[:6], "seconds"))
     return out

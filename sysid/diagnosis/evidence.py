@@ -152,8 +152,7 @@ def equivalence_class(
 ) -> tuple[EffectCandidate, ...]:
     """Return the candidates (one per effect and joint) that could stand in the place of `cause`, best first."""
     others = [c for c in best.chosen if c is not cause]
-    without = search.hypothesis(others, best.model)
-    evidence = without.model.squares - best.model.squares
+    evidence = search.without(best, cause).model.squares - best.model.squares
     room = WITHIN + MISFIT * max(evidence, 0.0)
     total, _ = search.mixed.marginal(best.model.variances)
     base = [k for c in others for k in c.columns]
@@ -217,28 +216,25 @@ def candidate_table(
     """Return one row per effect and joint, most evidence first; rivals: (effect, joint) -> cause it could replace;
     left_over: something that matters is, so that a size must be steady to be detected.
     """
-    nothing = search.hypothesis(())
-    total, _ = search.mixed.marginal(nothing.model.variances)
-    rows = []
     groups: dict[tuple[str, object], list[EffectCandidate]] = {}
     for c in search.candidates:
         groups.setdefault(c.key, []).append(c)
-    for terms in groups.values():
-        strongest = max(terms, key=lambda c: explained(total, [], list(c.columns)) - search.penalty(c))
-        rows.append(_row(search, best, nothing, strongest, terms, rivals, left_over=left_over))
+    rows = [_row(search, best, terms, rivals, left_over=left_over) for terms in groups.values()]
     return tuple(sorted(rows, key=lambda row: -row.delta_bic))
 
 
-def _row(  # noqa: PLR0917
+def _row(
     search: Search,
     best: Hypothesis,
-    nothing: Hypothesis,
-    candidate: EffectCandidate,
     terms: Sequence[EffectCandidate],
     rivals: Mapping[tuple[str, JointName], str],
     *,
     left_over: bool,
 ) -> Evidence:
+    """Return the evidence of one effect of one joint: of the term of it that explains most."""
+    nothing = search.hypothesis(())
+    total, _ = search.mixed.marginal(nothing.model.variances)
+    candidate = max(terms, key=lambda c: explained(total, [], list(c.columns)) - search.penalty(c))
     alone = search.hypothesis((candidate,))
     delta = nothing.bic - alone.bic
     drop = nothing.model.deviance - alone.model.deviance

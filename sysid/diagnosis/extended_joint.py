@@ -15,10 +15,9 @@ from typing import Any, Final
 
 from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Effect, Joint
-from jtqd.sysid.diagnosis.findings import Cause, Findings, Value
+from jtqd.sysid.diagnosis.findings import Cause, Findings, Value, shows_at
 from jtqd.sysid.fit.joint_writer import write_joint
 
-SENSOR: Final = "sensor"
 FILE: Final = "extended.joint.yaml"
 _DIGITS: Final = 7
 """Significant digits of a written value; no interval is a millionth of it."""
@@ -40,7 +39,7 @@ def extended(
 
     Raises ConfigError for an effect or a value that joint files do not allow.
     """
-    causes = [cause for cause in findings.causes if cause.joint in (number, SENSOR)]
+    causes = [cause for cause in findings.causes if shows_at(cause.joint, number)]
     replaced = {cause.name for cause in causes}
     effects = [effect for effect in joint.effects if effect.name not in replaced]
     effects += [
@@ -77,7 +76,7 @@ def files(joints: Mapping[int, Joint], findings: Findings) -> dict[str, int]:
 
 def title(number: int, findings: Findings) -> str:
     """First line of an extended joint file."""
-    names = [cause.name for cause in findings.causes if cause.joint in (number, SENSOR)]
+    names = [cause.name for cause in findings.causes if shows_at(cause.joint, number)]
     runs = counted(len(findings.runs), "run")
     what = f"found {', '.join(names)}" if names else "found no effect of this joint to add"
     return f"Written by jtq diagnose from {runs}: {what} (verdict {findings.verdict})."

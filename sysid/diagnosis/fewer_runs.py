@@ -9,16 +9,19 @@ J. R. Stat. Soc. B 72.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.sysid.diagnosis.case import Case
 from jtqd.sysid.diagnosis.dataset import FEWEST_RUNS, SHORTEST_MOVING_S, Dataset, moving_s
 from jtqd.sysid.diagnosis.findings import JointName, joint_text
+from jtqd.sysid.diagnosis.guards import objections
 from jtqd.sysid.diagnosis.leave_one_out import FALL, LeaveOneOut
+from jtqd.sysid.diagnosis.named import UNSTEADY, Found, certain, named_in
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.search import Hypothesis, Search
 
@@ -63,28 +66,6 @@ def kept_text(candidate: EffectCandidate, before_nm: float, after_nm: float) -> 
     )
 
 
-def named_by_fewer(
-    dataset: Dataset, search: Search, names: Names
-) -> Iterator[tuple[str, Sequence[EffectCandidate]]]:
-    """Yield (run left out, what the others name) of every recording, where the others are enough."""
-    for number in range(search.mixed.runs):
-        others = dataset.without_recording(number).signals
-        if search.mixed.runs - 1 < FEWEST_RUNS or moving_s(others) < SHORTEST_MOVING_S:
-            continue
-        left_out = dataset.runs[int(np.argmax(search.mixed.pieces == number))].name
-        yield left_out, names(number)
-
-
-def same_candidates(search: Search, chosen: Sequence[EffectCandidate]) -> list[EffectCandidate]:
-    """Return the search's own candidates of these effects, of the same term where it has that."""
-    out = []
-    for c in chosen:
-        mine = [o for o in search.candidates if o.key == c.key]
-        same = [o for o in mine if dict(o.term.basis[0]) == dict(c.term.basis[0])]
-        out += (same or mine)[:1]
-    return out
-
-
 class Compared:
     """Sets of effects by their errors on the runs left out, beside one that is named."""
 
@@ -109,3 +90,98 @@ class Compared:
 
     def _per_run(self, hypothesis: Hypothesis) -> FloatArray:
         return np.array([sum(run.values()) for run in self._left_out.squares(hypothesis)])
+
+
+def with_fewer(found: Found, anew: Names) -> tuple[Found, list[str]]:
+    """Return what was found, with what only fewer runs name where the runs left out bear it out, and a line about each such
+    effect; anew: what a diagnosis without a recording names.
+    """
+    case, best = found.case, found.named.hypothesis
+    here = {c.key for c in best.chosen} | {c.key for others in found.classes for c in others}
+    gone: dict[Key, tuple[EffectCandidate, list[str]]] = {}
+    sets: list[Sequence[EffectCandidate]] = []
+    for without, chosen in _named_by_fewer(found, here, anew):
+        new = [c for c in chosen if c.key not in here]
+        for c in new:
+            gone.setdefault(c.key, (c, []))[1].append(without)
+        sets += [chosen] if new else []
+    if not gone:
+        return found, []
+    beside = {
+        key: case.search.hypothesis((*best.chosen, c), best.model)
+        for key, (c, _) in gone.items()
+        if case.search.fits_beside(c, best.chosen)
+    }
+    compared = Compared(case.dataset, case.search, best)
+    together = [(None, case.search.hypothesis(chosen, best.model)) for chosen in sets]
+    kept, why = _borne_out(found, compared, [*beside.items(), *together])
+    fit = case.fit(kept)  # whatever is kept: the signals have the torsion of the last fit
+    said = [kept_text(c, compared.nm(best), compared.nm(kept)) for c in kept.chosen if c.key in gone]
+    there = {c.key for c in kept.chosen}
+    for key, (c, runs) in gone.items():
+        if key not in there:
+            with_it = beside.get(key) or case.search.hypothesis([c], best.model)
+            errors = (compared.nm(with_it), compared.nm(kept))
+            said.append(Gone(c, tuple(runs), errors, why.get(key, "")).text)
+    if kept is best:
+        return found, said
+    if found.whole is best:
+        found = replace(found, whole=kept, shown=fit)
+    return replace(found, named=fit), said
+
+
+def _named_by_fewer(
+    found: Found, here: Collection[Key], anew: Names
+) -> Iterator[tuple[str, Sequence[EffectCandidate]]]:
+    """Yield (run left out, what the others name) of every recording, where the others are enough; here: what is named with
+    all runs, and its alternatives.
+    """
+    case = found.case
+    count = case.search.mixed.runs
+    afresh = (found.large or found.few is not None) and count <= MOST_ANEW
+    for number in range(count if count > FEWEST_RUNS else 0):
+        part = case.without_recording(number)
+        if moving_s(part.dataset.signals) < SHORTEST_MOVING_S:
+            continue
+        left_out = case.dataset.runs[int(np.argmax(case.search.mixed.pieces == number))].name
+        yield left_out, _same_candidates(case.search, anew(number)) if afresh else _named_again(part, here)
+
+
+def _named_again(part: Case, here: Collection[Key]) -> Sequence[EffectCandidate]:
+    """Return what the sums of some runs name, searched again."""
+    best = part.search.confirmed()
+    quick = LeaveOneOut(part.dataset, part.search).confirmed(best) if part.few else best
+    if all(c.key in here for c in quick.chosen):
+        return quick.chosen  # nothing to look at closer
+    return named_in(part, part.fit(best))
+
+
+def _same_candidates(search: Search, chosen: Sequence[EffectCandidate]) -> list[EffectCandidate]:
+    """Return the search's own candidates of these effects, of the same term where it has that."""
+    out = []
+    for c in chosen:
+        mine = [o for o in search.candidates if o.key == c.key]
+        same = [o for o in mine if dict(o.term.basis[0]) == dict(c.term.basis[0])]
+        out += (same or mine)[:1]
+    return out
+
+
+def _borne_out(
+    found: Found, compared: Compared, tried: Sequence[tuple[Key | None, Hypothesis]]
+) -> tuple[Hypothesis, dict[Key, str]]:
+    """Return the set that predicts the runs left out best, what is named included, and what speaks against an effect (by its
+    key) that would have been better. Beside what is left over all have to be as certain as any cause.
+    """
+    kept, why = compared.named, {}
+    for key, other in tried:
+        if not compared.clearly_better(other) or compared.nm(other) >= compared.nm(kept):
+            continue
+        fit = found.case.fit(other)
+        against = [reason for _, reason in objections(found.case.dataset, other, fit.refined)]
+        if not against and found.beside and certain(found.case, fit).hypothesis is not other:
+            against = [UNSTEADY]
+        if not against:
+            kept = other
+        elif key is not None:
+            why[key] = against[0]
+    return kept, why

@@ -21,13 +21,19 @@ UNEXPLAINED: Final = "unexplained"
 INSUFFICIENT: Final = "insufficient_data"
 VERDICTS: Final = (NO_GAP, CAUSE, AMBIGUOUS, UNEXPLAINED, INSUFFICIENT)
 
+SENSOR: Final = "sensor"
 JointName = int | str
-"""1 to 7, or "sensor"."""
+"""1 to 7, or SENSOR."""
+
+
+def shows_at(where: JointName, number: int) -> bool:
+    """Return whether what is wrong at a joint or the sensor shows in the balances of joint `number`."""
+    return where in (SENSOR, number)
 
 
 def joint_text(joint: JointName) -> str:
     """Return "joint 2", or "the sensor"."""
-    return "the sensor" if joint == "sensor" else f"joint {joint}"
+    return "the sensor" if joint == SENSOR else f"joint {joint}"
 
 
 @dataclass(frozen=True)
@@ -51,10 +57,8 @@ class Cause:
     held_out_gain: float  # share of the held-out residual energy that it takes away
     rms_nm: float  # of its contribution over the runs, in the balance where it is largest
     balance: str  # "motor" or "torsion": where it is largest
-    explained_share: float = float("nan")  # of all that is structure in these runs, as squares
-    steadiness: float = float(
-        "nan"
-    )  # its size in standard errors where it is least certain (`steadiness.py`)
+    explained_share: float = math.nan  # of all that is structure in these runs, as squares
+    steadiness: float = math.nan  # its size in standard errors where it is least certain (`steadiness.py`)
 
 
 @dataclass(frozen=True)
@@ -69,9 +73,7 @@ class CandidateEvidence:
     minimum: Mapping[str, Value]  # minimum detectable size of its leading parameter(s); value inf: invisible
     reason: str  # "chosen", "class of X", "below threshold", "invisible in these runs", "needs temperature_c", ...
     at_minimum: tuple[Mapping[str, float], ...] = ()  # all parameters at that size, per way of looking for it
-    minimum_rms_nm: float = float(
-        "nan"
-    )  # what it contributes at that size, rms over the runs; inf: invisible
+    minimum_rms_nm: float = math.nan  # what it contributes at that size, rms over the runs; inf: invisible
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ class Place:
     low: float
     high: float
     unit: str
-    rms_nm: float = float("nan")
+    rms_nm: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -121,11 +123,11 @@ class Gain:
     rmse_after_nm: float
     split: str
     ci95: tuple[float, float]
-    free_run_before: float = float("nan")  # rad/s, joint side
-    free_run_after: float = float("nan")
+    free_run_before: float = math.nan  # rad/s, joint side
+    free_run_after: float = math.nan
     runs: tuple[RunGain, ...] = ()
-    free_run_position_before: float = float("nan")  # rad, joint side
-    free_run_position_after: float = float("nan")
+    free_run_position_before: float = math.nan  # rad, joint side
+    free_run_position_after: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -177,7 +179,7 @@ class OddRun:
     @property
     def text(self) -> str:
         """One line for people."""
-        channel = "torque_nm" if self.joint == "sensor" else f"j{self.joint}.{self.channel}"
+        channel = "torque_nm" if self.joint == SENSOR else f"j{self.joint}.{self.channel}"
         what, scale, unit = {
             "gain": ("reads", 100.0, "%"),
             "zero": ("has its zero", 100.0, "% of rated torque"),
@@ -209,10 +211,8 @@ class Findings:
     channel_notes: tuple[str, ...] = ()
     next_experiment: Mapping[str, Any] | None = None  # {"why": text, "plan": mapping of jtq.plan/1}
     traces: tuple[Trace, ...] = field(default=(), repr=False)
-    joint_files: Mapping[int, Joint] = field(
-        default_factory=dict, repr=False
-    )  # to compare the found values with
-    explained_share: float = float("nan")
+    joint_files: Mapping[int, Joint] = field(default_factory=dict, repr=False)  # to compare what was found
+    explained_share: float = math.nan
     left_over: LeftOver | None = None
     odd_runs: tuple[OddRun, ...] = ()
 

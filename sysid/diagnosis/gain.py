@@ -17,9 +17,9 @@ from jtqd.estimator.effects.whole import Whole
 from jtqd.estimator.joint import Effect as Effect_parameters
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.dataset import Dataset
-from jtqd.sysid.diagnosis.findings import Gain, RunGain
+from jtqd.sysid.diagnosis.findings import Gain, RunGain, shows_at
 from jtqd.sysid.diagnosis.mixed_model import solve
-from jtqd.sysid.diagnosis.refine import PresentEffect, Refined
+from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, places
 from jtqd.sysid.diagnosis.signals import BaseLoss, Channel, JointSignals
 
 _BOOTSTRAPS: Final = 2000
@@ -80,13 +80,11 @@ def free_run_errors(
     """
     squares = np.zeros((2, 2))
     count = 0
+    mine = places(refined.present)
     for run, step in zip(dataset.signals, steps, strict=True):
-        place, causes = 0, []
-        for p in refined.present:
-            causes.append(p.moved([float(x) for x in step[place : place + len(p.free)]]))
-            place += len(p.free)
+        causes = [p.moved(step[own].tolist()) for p, own in zip(refined.present, mine, strict=True)]
         for s in run:
-            there = [k for k, p in enumerate(causes) if p.joint in ("sensor", s.number)]
+            there = [k for k, p in enumerate(causes) if shows_at(p.joint, s.number)]
             asked = there if cause is None else [cause]
             if not set(asked) & set(there):
                 continue
@@ -183,7 +181,7 @@ def free_run(
     drive, torque = _inputs(signals, joint, terms)
     time = signals.state.time_s
     index = _windows(time, window_s)
-    simulated = _simulate(signals, joint, base, terms, drive, torque, index)
+    simulated = _simulate(_Model(signals, joint, base, terms), drive, torque, index)
     error = simulated - signals.state.velocity_rad_s[index]
     squares = np.mean(np.square(error[1:]), axis=0)
     return FreeRun(
@@ -243,7 +241,7 @@ class _Model:
     """
 
     def __init__(self, signals: JointSignals, joint: Joint, base: BaseLoss, terms: Sequence[Term]) -> None:
-        self._joint, self._base = joint, base
+        self.signals, self.joint, self._base = signals, joint, base
         self._side = -1.0 if signals.number == 2 else 1.0  # coupling angle: joint 1's frame
         self._measured = {name: getattr(signals.state, name) for name in _MEASURED} if terms else {}
         losses = [(e, p) for e, p in terms if "loss_nm" in e.hooks]
@@ -252,12 +250,13 @@ class _Model:
         self._others += [(e.load_nm, p, _Stepwise()) for e, p in terms if "load_nm" in e.hooks]
         self._state = State()
 
-    def look(  # noqa: PLR0917
+    def look(
         self,
         at: Index,
         v: FloatArray,
         motor: FloatArray,
         link: FloatArray,
+        *,
         acceleration: FloatArray,
         gear: FloatArray,
     ) -> None:
@@ -273,13 +272,13 @@ class _Model:
         state.motor_position_rad, state.link_position_rad = motor, link
         state.coupling_position_rad = self._side * link
         state.link_acceleration_rad_s2 = acceleration
-        state.motor_acceleration_rad_s2 = self._joint.gear_ratio * acceleration
+        state.motor_acceleration_rad_s2 = self.joint.gear_ratio * acceleration
 
     def pushing(self) -> FloatArray | float:
         """Return what the effects that are no friction add to the torque that accelerates, negative for a loss."""
         total: FloatArray | float = 0.0
         for hook, p, functions in self._others:
-            total = total - hook(p, self._state, self._joint, functions)
+            total = total - hook(p, self._state, self.joint, functions)
         return total
 
     def friction(self, s: FloatArray, speed: FloatArray) -> FloatArray:
@@ -291,28 +290,19 @@ class _Model:
             state.velocity_rad_s = state.link_velocity_rad_s = v
             state.direction = s
             for hook, p, functions in self._frictions:
-                loss = loss + hook(p, state, self._joint, functions)
+                loss = loss + hook(p, state, self.joint, functions)
         return np.maximum(s * loss, 0.0)
 
 
-def _simulate(  # noqa: PLR0917
-    signals: JointSignals,
-    joint: Joint,
-    base: BaseLoss,
-    terms: Sequence[Term],
-    drive: FloatArray,
-    sensor: FloatArray,
-    index: Index,
-) -> FloatArray:
+def _simulate(model: _Model, drive: FloatArray, sensor: FloatArray, index: Index) -> FloatArray:
     """Return velocities [steps + 1, windows], joint side; row 0 is the measured start.
 
     Inputs are linear between samples: a step takes their mean, positions and speed in its middle. A step in which the
     joint comes to rest is divided there: what is left of it begins at rest, and friction may hold it.
     """
-    seen = signals.state
+    seen, joint = model.signals.state, model.joint
     G, Jl = joint.gear_ratio, joint.link_inertia_kgm2
     inertia = G * G * joint.rotor_inertia_kgm2 + Jl
-    model = _Model(signals, joint, base, terms)
     steps = np.diff(seen.time_s[index], axis=0)
     push = 0.5 * (drive[index[:-1]] + drive[index[1:]])
     torque = 0.5 * (sensor[index[:-1]] + sensor[index[1:]])
@@ -322,9 +312,8 @@ def _simulate(  # noqa: PLR0917
     acceleration = seen.link_acceleration_rad_s2[index[0]]
     for k, h in enumerate(steps):
         turned = 0.5 * h * (v + 0.5 * h * acceleration)
-        model.look(
-            index[k], v, motor + G * turned, link + turned, acceleration, torque[k] + Jl * acceleration
-        )
+        gear = torque[k] + Jl * acceleration
+        model.look(index[k], v, motor + G * turned, link + turned, acceleration=acceleration, gear=gear)
         pushing = push[k] + model.pushing()
         s = np.where(v != 0.0, np.sign(v), np.sign(pushing))
         held = model.friction(s, np.abs(v) + 0.5 * h * s * acceleration)

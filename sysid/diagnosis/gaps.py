@@ -24,7 +24,7 @@ from jtqd.sysid.diagnosis.events import BLOCK_S, Burst, EventLimits, block_means
 from jtqd.sysid.diagnosis.findings import Gap, Place, Trace
 from jtqd.sysid.diagnosis.leftover import Leftover, less_nuisances
 from jtqd.sysid.diagnosis.refine import Refined
-from jtqd.sysid.diagnosis.regressors import LINE, RunData
+from jtqd.sysid.diagnosis.regressors import LINE, Index, RunData
 from jtqd.sysid.diagnosis.signals import Channel, Line
 from jtqd.sysid.diagnosis.structure import (
     SIGNIFICANT,
@@ -88,7 +88,7 @@ def channel_gaps(dataset: Dataset, refined: Refined, left: Leftover | None) -> t
         limits = None if left is None else left.limits[channel]
         lines = [] if left is None else [x for x in left.lines if x.channel == channel]
         by_axis = {m.axis: m for m in mine}
-        locations = locate(dataset.runs, channel, shown[channel], limits, lines, by_axis)
+        locations = locate(dataset.runs, channel, shown[channel], limits, lines=lines, maps=by_axis)
         excess = max(rmse**2 - noise**2, 1e-30)
         places = _places(locations, by_axis, noise, excess, left is not None)
         out.append(Gap(channel.joint, channel.balance, rmse, floor, origin, tuple(places), tuple(every)))
@@ -240,10 +240,7 @@ class _Axis:
 
 
 def explained_by_bins(
-    places: Sequence[np.ndarray[tuple[int], np.dtype[np.intp]]],
-    parts: Sequence[FloatArray],
-    bins: int,
-    step_s: float,
+    places: Sequence[Index], parts: Sequence[FloatArray], bins: int, step_s: float
 ) -> tuple[FloatArray, list[FloatArray]]:
     """Return the energy that the bins' means over the other runs take off each run, and bin [runs, bins] (sum of squares
     over samples, Nm^2), and those means at every sample [run][n]. places: bin of every sample.
@@ -259,11 +256,12 @@ def explained_by_bins(
     return explained, [others[r][place] for r, place in enumerate(places)]
 
 
-def locate(  # noqa: PLR0917
+def locate(
     runs: Sequence[RunData],
     channel: Channel,
     parts: Sequence[FloatArray],
     limits: EventLimits | None,
+    *,
     lines: Sequence[Line],
     maps: Mapping[str, AxisMap],
 ) -> list[Location]:
@@ -277,7 +275,9 @@ def locate(  # noqa: PLR0917
     out: list[Location] = []
     while len(out) < MOST:
         used = [t.axis for t in out]  # empty names: events, seconds, lines
-        axis = _best_axis(runs, channel, now, used, maps, LEAST * whole, certain=limits is not None)
+        axis = _best_axis(
+            runs, channel, now, maps, used=used, least_nm2=LEAST * whole, certain=limits is not None
+        )
         rest = now if axis is None else [x - y for x, y in zip(now, axis.prediction, strict=True)]
         found = [] if axis is None else [Location(axis.energy_nm2, axis.axis, _descending(axis.bins))]
         found += [
@@ -285,13 +285,13 @@ def locate(  # noqa: PLR0917
         ]
         masked = now
         if limits is not None and not any(t.burst is not None and t.burst.what == "events" for t in out):
-            seen = events(runs, channel, rest, limits.ar, limits.step_s, limits.jump_nm)
+            seen = events(runs, channel, rest, limits)
             if seen is not None:
                 found.append(Location(seen.burst.excess_nm2, burst=seen.burst))
                 masked = [np.where(m, np.nan, x) for m, x in zip(seen.masks, now, strict=True)]
                 rest = [np.where(m, np.nan, x) for m, x in zip(seen.masks, rest, strict=True)]
         if limits is not None and not any(t.burst is not None and t.burst.what == "seconds" for t in out):
-            off = wandering(runs, {channel: rest}, limits.step_s, {channel: limits.wander_nm})
+            off = wandering(runs, {channel: rest}, {channel: limits})
             found += [Location(b.excess_nm2, burst=b) for b in off]
         best = max(found, key=lambda t: t.energy_nm2, default=None)
         if best is None or best.energy_nm2 < LEAST * whole:
@@ -321,14 +321,14 @@ def _less_seconds(parts: Sequence[FloatArray], step_s: float) -> list[FloatArray
     return out
 
 
-def _best_axis(  # noqa: PLR0917
+def _best_axis(
     runs: Sequence[RunData],
     channel: Channel,
     parts: Sequence[FloatArray],
-    used: Sequence[str],
     maps: Mapping[str, AxisMap],
-    least_nm2: float,
     *,
+    used: Sequence[str],
+    least_nm2: float,
     certain: bool,
 ) -> _Axis | None:
     """Return the axis that explains most of what is left; certain: none that could be chance, by its map while nothing is
@@ -355,7 +355,7 @@ def _best_axis(  # noqa: PLR0917
             values = [axis_values(run.axes[channel.joint], axis) for run in runs]
             block = max(2, round(BLOCK_S / step_s))
             rng = np.random.default_rng(0)
-            p = axis_map(channel, axis, edges, values, signed(parts, side), block, rng).p
+            p = axis_map(channel, axis, edges, values, signed(parts, side), block=block, rng=rng).p
         if p < _BEYOND:
             return _Axis(axis, energy, prediction, explained.sum(axis=0))
     return None

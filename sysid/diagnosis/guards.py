@@ -18,7 +18,7 @@ from jtqd.estimator.effects.effect import TORSION
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.findings import joint_text
 from jtqd.sysid.diagnosis.gain import free_run_errors, left_out_steps
-from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, contributions, parameter
+from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, contributions, parameter, places
 from jtqd.sysid.diagnosis.search import Hypothesis
 
 _AT_BOUND: Final = 1e-6
@@ -53,9 +53,9 @@ def objections(
     if falls[worst] <= 0.0:
         return [(worst, "it raises the error on runs left out")]
     if dataset.no_torque:
-        places = [k for k, p in enumerate(refined.present) if free_run_fall(dataset, refined, k) < 0.0]
-        if places:
-            worst = min(places, key=lambda k: falls[k])
+        harmful = [k for k in range(len(refined.present)) if free_run_fall(dataset, refined, k) < 0.0]
+        if harmful:
+            worst = min(harmful, key=lambda k: falls[k])
             return [(worst, "it raises the error of the position in a free run on runs left out")]
     pair = cancelling(dataset, refined.present)
     if pair is None:
@@ -102,17 +102,15 @@ def held_out_gains(dataset: Dataset, refined: Refined) -> list[float]:
     parameters of all others, as a part of what is there without it; at or below zero it is better left out.
     """
     steps = left_out_steps(refined)
-    out, first = [], 0
-    for p in refined.present:
-        mine = list(range(first, first + len(p.free)))
-        first += len(p.free)
+    out = []
+    for p, mine in zip(refined.present, places(refined.present), strict=True):
         here = contributions(dataset, p)
         without, within = 0.0, 0.0
         for c, parts in here.items():
             for r, (run, step) in enumerate(zip(refined.runs, steps, strict=True)):
                 d = run.channels[c]
                 left = (d.residual - d.regressors @ step[d.index])[d.valid]
-                own = [k for k, i in enumerate(d.index) if i in mine]
+                own = [k for k, i in enumerate(d.index) if mine.start <= i < mine.stop]
                 part = parts[r] + (d.regressors[:, own] @ step[d.index[own]])[d.valid]
                 if c.balance == TORSION and len(left):
                     left, part = left - left.mean(), part - part.mean()

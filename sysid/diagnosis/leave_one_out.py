@@ -19,7 +19,7 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.evidence import WITHIN
-from jtqd.sysid.diagnosis.findings import Cause, JointName
+from jtqd.sysid.diagnosis.findings import Cause, JointName, joint_text
 from jtqd.sysid.diagnosis.mixed_model import explained
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.search import DEEPEST, Hypothesis, Search, friction_pairs
@@ -87,7 +87,7 @@ class LeaveOneOut:
         chosen = hypothesis.chosen
         if min(self._falls(hypothesis, self.search.hypothesis(()), chosen)) < LARGE_FALL:
             return False
-        each = [self._falls(hypothesis, self._without(hypothesis, c), (c,)) for c in chosen]
+        each = [self._falls(hypothesis, self.search.without(hypothesis, c), (c,)) for c in chosen]
         return all(min(falls) > -2.0 * FALL and sum(falls) > 2.0 * FALL for falls in each)
 
     def holds(self, hypothesis: Hypothesis) -> bool:
@@ -101,7 +101,7 @@ class LeaveOneOut:
         """
         if not hypothesis.chosen:
             return True
-        before = [self._without(hypothesis, c) for c in hypothesis.chosen]
+        before = [self.search.without(hypothesis, c) for c in hypothesis.chosen]
         before += [
             self.search.hypothesis([c for c in hypothesis.chosen if c not in pair], hypothesis.model)
             for pair in friction_pairs(hypothesis.chosen)
@@ -114,7 +114,7 @@ class LeaveOneOut:
         sensor gain are never separated, whose difference is a factor on friction and inertia.
         """
         others = [c for c in best.chosen if c is not cause]
-        base = self._without(best, cause)
+        base = self.search.without(best, cause)
         found: dict[tuple[str, object], tuple[float, EffectCandidate]] = {}
         twins = _SCALES if self.search.joints == 1 and cause.effect.name in _SCALES else frozenset()
         for rival in self._grown(base):
@@ -157,7 +157,7 @@ class LeaveOneOut:
 
     def doubt(self, unsure: Sequence[tuple[str, JointName]]) -> str:
         """Return a sentence about what is unsure."""
-        names = ", ".join(f"{n} of {'the sensor' if j == 'sensor' else f'joint {j}'}" for n, j in unsure)
+        names = ", ".join(f"{n} of {joint_text(j)}" for n, j in unsure)
         return (
             f"indicated by all {self.search.mixed.runs} runs together, but not confirmed on every held-out run: {names}; "
             f"expected {ENOUGH_RUNS} runs or more"
@@ -206,7 +206,7 @@ class LeaveOneOut:
     def _idle(self, hypothesis: Hypothesis) -> list[EffectCandidate]:
         """Return the candidates without which some run left out does as well."""
         chosen = hypothesis.chosen
-        return [c for c in chosen if not self._helps(hypothesis, self._without(hypothesis, c), (c,))]
+        return [c for c in chosen if not self._helps(hypothesis, self.search.without(hypothesis, c), (c,))]
 
     def _helps(
         self, hypothesis: Hypothesis, without: Hypothesis, new: Sequence[EffectCandidate], least: float = FALL
@@ -218,9 +218,6 @@ class LeaveOneOut:
             return False
         drops = self.search.held_out_deviances(without) - self.search.held_out_deviances(hypothesis)
         return fall >= LARGE_FALL or bool(np.all(drops > 0.0))
-
-    def _without(self, hypothesis: Hypothesis, candidate: EffectCandidate) -> Hypothesis:
-        return self.search.hypothesis([c for c in hypothesis.chosen if c is not candidate], hypothesis.model)
 
     def _falls(self, one: Hypothesis, other: Hypothesis, where: Sequence[EffectCandidate]) -> list[float]:
         """Return per run the part of the other's squared error that `one` takes away, summed over the channels in which

@@ -130,29 +130,28 @@ def less_nuisances(dataset: Dataset, refined: Refined) -> dict[Channel, list[Flo
     return out
 
 
-def events_left(
-    dataset: Dataset, refined: Refined, noise: Noise, joints: Mapping[int, Joint]
-) -> dict[Channel, Events]:
+def events_left(dataset: Dataset, refined: Refined, noise: Noise) -> dict[Channel, Events]:
     """Return rare events where the causes leave any that are large enough to matter, else nothing.
 
     Whether there are any is asked of what the causes leave. Where they are is asked of what no effect of the library at all
     explains: causes that are bent by events leave others than those that are there.
     """
-    if not _bursts(dataset, less_nuisances(dataset, refined), noise, joints):
+    if not _bursts(dataset, less_nuisances(dataset, refined), noise):
         return {}
-    found = _bursts(dataset, dataset.unexplained, noise, joints)
+    found = _bursts(dataset, dataset.unexplained, noise)
     return {c: e for c, e in found.items() if e.part < MOST_OF_THE_TIME}
 
 
 def _bursts(
-    dataset: Dataset,
-    residuals: Mapping[Channel, list[FloatArray]],
-    noise: Noise,
-    joints: Mapping[int, Joint],
+    dataset: Dataset, residuals: Mapping[Channel, list[FloatArray]], noise: Noise
 ) -> dict[Channel, Events]:
-    jumps = {c: _JUMP * joints[c.joint].rated_torque_nm for c in residuals}
-    found = bursts(dataset.runs, residuals, noise.ar, dataset.step_s, jumps)
-    return {c: e for c, e in found.items() if e.burst.excess_nm2 > 0.25 * _least(joints[c.joint])}
+    found = bursts(dataset.runs, residuals, _limits(dataset, noise))
+    return {c: e for c, e in found.items() if e.burst.excess_nm2 > 0.25 * _least(dataset.joints[c.joint])}
+
+
+def _limits(dataset: Dataset, noise: Noise) -> dict[Channel, EventLimits]:
+    rated = {c: dataset.joints[c.joint].rated_torque_nm for c in dataset.runs[0].channels}
+    return {c: EventLimits(noise.ar[c], dataset.step_s, _JUMP * x, _WANDER * x) for c, x in rated.items()}
 
 
 def _least(joint: Joint) -> float:
@@ -160,19 +159,19 @@ def _least(joint: Joint) -> float:
     return (_RELEVANT * joint.rated_torque_nm) ** 2
 
 
-def leftover(dataset: Dataset, refined: Refined, noise: Noise, joints: Mapping[int, Joint]) -> Leftover:
+def leftover(dataset: Dataset, refined: Refined, noise: Noise) -> Leftover:
     """Return what is left over when causes and the runs' own changes are taken out."""
+    joints = dataset.joints
     whole = less_nuisances(dataset, refined)
-    found = _bursts(dataset, whole, noise, joints)
+    found = _bursts(dataset, whole, noise)
     # maps and lines of what is no event: a few moments say nothing about a condition
     residuals = {c: _without_rare_events(parts, found.get(c)) for c, parts in whole.items()}
     maps = axis_maps(refined.runs, residuals, dataset.step_s)
     significant = tuple(
         m for m in maps if m.p < SIGNIFICANT and m.energy_nm2 > _least(joints[m.channel.joint])
     )
-    wander = {c: _WANDER * joints[c.joint].rated_torque_nm for c in whole}
-    burst = tuple(e.burst for e in found.values())
-    burst += tuple(wandering(refined.runs, residuals, dataset.step_s, wander))
+    limits = _limits(dataset, noise)
+    burst = (*(e.burst for e in found.values()), *wandering(refined.runs, residuals, limits))
     lines = tuple(
         sharpened(line, refined.runs, residuals[line.channel], dataset.step_s)
         for line in (
@@ -182,18 +181,17 @@ def leftover(dataset: Dataset, refined: Refined, noise: Noise, joints: Mapping[i
         if line.ratio > (_HZ_RATIO if line.unit == "Hz" else _LINE_RATIO)
         and 0.5 * line.amplitude_nm**2 > _least(joints[line.channel.joint])
     )
-    limits = {
-        c: EventLimits(noise.ar[c], dataset.step_s, _JUMP * joints[c.joint].rated_torque_nm, wander[c])
-        for c in whole
-    }
-    worst = _worst_runs(refined.runs, whole, dataset.step_s, significant, found, burst, lines)
+    worst = _worst_runs(
+        refined.runs, whole, dataset.step_s, maps=significant, events=found, bursts=burst, lines=lines
+    )
     return Leftover(tuple(maps), significant, burst, lines, limits, worst)
 
 
-def _worst_runs(  # noqa: PLR0917
+def _worst_runs(
     runs: Sequence[RunData],
     whole: Mapping[Channel, Sequence[FloatArray]],
     step_s: float,
+    *,
     maps: Sequence[AxisMap],
     events: Mapping[Channel, Events],
     bursts: Sequence[Burst],

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
-from jtqd.sysid.diagnosis.regressors import ChannelData, RunData
+from jtqd.sysid.diagnosis.regressors import ChannelData, Index, RunData
 from jtqd.sysid.diagnosis.signals import Channel
 
 ORDER: Final = 24
@@ -183,13 +183,12 @@ def run_sums(run: RunData, noise: Noise, columns: int, nuisances: int) -> Sums:
     rows = 0
     for at, there, white, weight in _whitened(run, noise):
         rows += len(at) * len(there)
-        gram += _pattern_gram(run, white, there, weight, width, columns)
+        places = [_places(run.channels[c], columns, width) for c in there]
+        gram += _pattern_gram(white, places, weight, width)
     return Sums(gram / noise.inflation, rows)
 
 
-def whitened_rows(
-    run: RunData, noise: Noise, columns: int, nuisances: int
-) -> tuple[FloatArray, np.ndarray[tuple[int], np.dtype[np.intp]]]:
+def whitened_rows(run: RunData, noise: Noise, columns: int, nuisances: int) -> tuple[FloatArray, Index]:
     """Return independent rows [m, P + Q + 1] of which `run_sums` is the sum of the products, and the bin of each [m]."""
     width = columns + nuisances + 1
     blocks, bins = [np.empty((0, width))], [np.empty(0, np.intp)]
@@ -206,7 +205,7 @@ def whitened_rows(
 
 def _whitened(
     run: RunData, noise: Noise
-) -> Iterator[tuple[np.ndarray[tuple[int], np.dtype[np.intp]], list[Channel], list[FloatArray], FloatArray]]:
+) -> Iterator[tuple[Index, list[Channel], list[FloatArray], FloatArray]]:
     """Yield per pattern of valid channels its bins, the channels, their whitened columns (regressors, nuisances, residual)
     and the inverse covariance between them.
     """
@@ -227,22 +226,16 @@ def _whitened(
             yield at, there, [white[c][at] for c in there], weight
 
 
-def _places(d: ChannelData, columns: int, width: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+def _places(d: ChannelData, columns: int, width: int) -> Index:
     return np.concatenate((d.index, columns + d.families, [width - 1])).astype(np.intp)
 
 
-def _pattern_gram(  # noqa: PLR0917
-    run: RunData,
-    white: Sequence[FloatArray],
-    there: Sequence[Channel],
-    weight: FloatArray,
-    width: int,
-    columns: int,
+def _pattern_gram(
+    white: Sequence[FloatArray], places: Sequence[Index], weight: FloatArray, width: int
 ) -> FloatArray:
     """Return sum over channel pairs of inverse covariance times cross products, at the global places."""
     out = np.zeros((width, width))
-    places = [_places(run.channels[c], columns, width) for c in there]
-    for a in range(len(there)):
+    for a in range(len(white)):
         for b in range(a + 1):
             product = weight[a, b] * (white[a].T @ white[b])
             out[np.ix_(places[a], places[b])] += product  # places are unique within a channel

@@ -27,7 +27,7 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import MOTOR
 from jtqd.sysid.diagnosis.dataset import Dataset
-from jtqd.sysid.diagnosis.findings import JointName, OddRun
+from jtqd.sysid.diagnosis.findings import JointName, OddRun, joint_text
 from jtqd.sysid.diagnosis.mixed_model import explained, solve
 from jtqd.sysid.diagnosis.noise import noise_model, run_sums, saturated_residuals
 from jtqd.sysid.diagnosis.regressors import EffectCandidate, RunData, binned, gain_columns
@@ -92,7 +92,7 @@ def odd_run(dataset: Dataset) -> tuple[list[int], OddRun] | None:
         leave = set(range(columns)) - set(chosen)
     most, (r, k), (apart, spread) = max(far)
     others = tuple(
-        f"{o.what} of {o.channel} of {'the sensor' if o.joint == 'sensor' else f'joint {o.joint}'}"
+        f"{o.what} of {o.channel} of {joint_text(o.joint)}"
         for j, o in enumerate(kinds)
         if j != k and comparison.drop(chosen, odd, r, j) >= _AS_GOOD * most
     )

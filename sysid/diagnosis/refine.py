@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from typing import Final
 
 import numpy as np
@@ -19,7 +20,7 @@ from jtqd.estimator.effects.effect import MOTOR, TORSION, Effect, Parameter
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.current_zero import UnpoweredColumn, unpowered, with_readings
 from jtqd.sysid.diagnosis.dataset import Dataset
-from jtqd.sysid.diagnosis.findings import JointName
+from jtqd.sysid.diagnosis.findings import JointName, shows_at
 from jtqd.sysid.diagnosis.mixed_model import Mixed, Model
 from jtqd.sysid.diagnosis.noise import Noise, run_sums
 from jtqd.sysid.diagnosis.regressors import ChannelData, RunData, binned, contribution
@@ -76,6 +77,12 @@ class Refined:
 def parameter(effect: Effect, name: str) -> Parameter:
     """Return the parameter of this name."""
     return next(p for p in effect.parameters if p.name == name)
+
+
+def places(present: Sequence[PresentEffect]) -> list[slice]:
+    """Return where the free parameters of each cause are among those of all."""
+    ends = list(accumulate(len(p.free) for p in present))
+    return [slice(end - len(p.free), end) for p, end in zip(present, ends, strict=True)]
 
 
 def free_names(effect: Effect, values: Mapping[str, float]) -> tuple[str, ...]:
@@ -157,15 +164,13 @@ def _linearised(dataset: Dataset, present: Sequence[PresentEffect], noise: Noise
 
 def _stepped(iterate: _Iterate) -> tuple[list[PresentEffect], bool]:
     """Return the causes one step further, and whether that step was none."""
-    now, settled, first = [], True, 0
-    for p in iterate.present:
-        mine = slice(first, first + len(p.free))
+    now, settled = [], True
+    for p, mine in zip(iterate.present, places(iterate.present), strict=True):
         moved = p.moved([float(b) for b in iterate.model.beta[mine]])
         deviation = np.sqrt(np.maximum(np.diag(iterate.model.covariance)[mine], 0.0))
         change = np.array([moved.values[name] - p.values[name] for name in p.free])
         settled = settled and bool(np.all(np.abs(change) <= _SETTLED * deviation))
         now.append(moved)
-        first += len(p.free)
     return now, settled
 
 
@@ -173,7 +178,7 @@ def set_torsion(s: JointSignals, present: Sequence[PresentEffect]) -> None:
     """Set the torsion that effects see to what it is: that of the encoders for what follows it with memory or play, else
     what the spring does with the causes, K d = tau + their contributions.
     """
-    mine = [p for p in present if p.joint in ("sensor", s.number)]
+    mine = [p for p in present if shows_at(p.joint, s.number)]
     if s.twist_rad is not None and any(p.effect.follows_torsion for p in mine):
         s.state.torsion_rad = s.twist_rad
         return
@@ -189,24 +194,22 @@ def _run_at(
     """Return the run with what is left at these parameters, and derivatives by each free one, as regressors."""
     left = {c: d.residual.copy() for c, d in base.channels.items()}
     columns: dict[Channel, list[tuple[int, FloatArray]]] = {c: [] for c in base.channels}
-    place = 0
-    for p in present:
+    for p, mine in zip(present, places(present), strict=True):
         for s in run:
-            if p.joint not in ("sensor", s.number):
+            if not shows_at(p.joint, s.number):
                 continue
             here = _contribution(p, s, p.values)
             for balance in (MOTOR, TORSION):
                 channel = Channel(s.number, balance)
                 if channel in left and balance in here:
                     left[channel] = left[channel] - binned(s.seen(balance, here[balance]), samples)
-            for k, name in enumerate(p.free):
+            for place, name in enumerate(p.free, mine.start):
                 size = _step_size(p, name)
                 there = _contribution(p, s, {**p.values, name: p.values[name] + size})
                 for balance, value in there.items():
                     slope = (value - here[balance]) / size
                     seen = binned(s.seen(balance, slope), samples)
-                    columns[Channel(s.number, balance)].append((place + k, seen))
-        place += len(p.free)
+                    columns[Channel(s.number, balance)].append((place, seen))
     channels = {}
     for c, d in base.channels.items():
         found = columns[c]
@@ -223,7 +226,7 @@ def contributions(dataset: Dataset, present: PresentEffect) -> dict[Channel, lis
     out: dict[Channel, list[FloatArray]] = {}
     for run, data in zip(dataset.signals, dataset.runs, strict=True):
         for s in run:
-            if present.joint not in ("sensor", s.number):
+            if not shows_at(present.joint, s.number):
                 continue
             for balance, value in contribution(present.effect, present.values, s).items():
                 channel = Channel(s.number, balance)
@@ -237,16 +240,14 @@ def contributions(dataset: Dataset, present: PresentEffect) -> dict[Channel, lis
 def _unpowered(present: Sequence[PresentEffect], joints: Mapping[int, Joint]) -> list[UnpoweredColumn]:
     """Return what the causes read without power: the derivatives by the free parameters, and off the residual."""
     out: list[UnpoweredColumn] = []
-    place = 0
-    for p in present:
+    for p, mine in zip(present, places(present), strict=True):
         if "current_a" in p.effect.hooks and isinstance(p.joint, int):
             here = unpowered(p.effect, p.values, joints[p.joint])
             out.append((p.joint, -1, -here))
-            for k, name in enumerate(p.free):
+            for place, name in enumerate(p.free, mine.start):
                 size = _step_size(p, name)
                 there = unpowered(p.effect, {**p.values, name: p.values[name] + size}, joints[p.joint])
-                out.append((p.joint, place + k, (there - here) / size))
-        place += len(p.free)
+                out.append((p.joint, place, (there - here) / size))
     return out
 
 

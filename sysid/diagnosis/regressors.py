@@ -17,7 +17,7 @@ import numpy as np
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.effects.effect import MOTOR, TORSION, Effect, Term, Values
 from jtqd.estimator.effects.whole import Whole
-from jtqd.sysid.diagnosis.findings import JointName
+from jtqd.sysid.diagnosis.findings import JointName, shows_at
 from jtqd.sysid.diagnosis.signals import (
     SLOWEST_RAD_S,
     Channel,
@@ -133,6 +133,10 @@ def all_in_bin(good: BoolArray, samples: int) -> BoolArray:
     return np.asarray(good[: count * samples].reshape(count, samples).all(axis=1), np.bool_)
 
 
+Index = np.ndarray[tuple[int], np.dtype[np.intp]]
+"""Numbers of bins, columns or families [n]."""
+
+
 @dataclass
 class ChannelData:
     """One channel of one run, binned: valid [n], residual [n], regressors [n, p] of columns `index` [p], nuisances
@@ -142,9 +146,9 @@ class ChannelData:
     valid: BoolArray
     residual: FloatArray
     regressors: FloatArray
-    index: np.ndarray[tuple[int], np.dtype[np.intp]]
+    index: Index
     nuisances: FloatArray
-    families: np.ndarray[tuple[int], np.dtype[np.intp]]
+    families: Index
 
 
 @dataclass
@@ -280,7 +284,7 @@ def _fill(
     found: dict[Channel, list[tuple[int, FloatArray]]] = {c: [] for c in channels}
     for candidate in candidates:
         for s in run:
-            if candidate.joint not in ("sensor", s.number):
+            if not shows_at(candidate.joint, s.number):
                 continue
             for column, p in zip(candidate.columns, candidate.term.basis, strict=True):
                 for balance, value in contribution(candidate.effect, p, s).items():

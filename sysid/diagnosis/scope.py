@@ -10,9 +10,8 @@ from typing import Final
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.joint import Joint
-from jtqd.sysid.diagnosis.findings import JointName
+from jtqd.sysid.diagnosis.findings import SENSOR, JointName
 
-SENSOR: Final = "sensor"
 _ITEM: Final = re.compile(r"(?:(?P<joint>[1-7]|sensor)=)?(?P<name>[a-z_]+)")
 
 

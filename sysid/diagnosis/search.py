@@ -60,13 +60,14 @@ class Search:
     columns make them read that (`current_zero`).
     """
 
-    def __init__(  # noqa: PLR0917
+    def __init__(
         self,
         mixed: Mixed,
         candidates: Sequence[EffectCandidate],
         effective_rows: float,
         moments: FloatArray,
         least_nm: float,
+        *,
         readings: Sequence[Readings] = (),
         unpowered: Sequence[UnpoweredColumn] = (),
     ) -> None:
@@ -100,8 +101,8 @@ class Search:
             math.exp(self.log_n) * len(runs) / self.mixed.runs,
             self._moments,
             self.least_nm,
-            [self._readings[r] for r in of_runs] if self._readings else (),
-            self._unpowered,
+            readings=[self._readings[r] for r in of_runs] if self._readings else (),
+            unpowered=self._unpowered,
         )
 
     def penalty(self, candidate: EffectCandidate) -> float:
@@ -125,6 +126,10 @@ class Search:
             cost = sum(self.penalty(c) for c in ordered)
             self._cache[key] = Hypothesis(ordered, model, model.deviance + cost)
         return self._cache[key]
+
+    def without(self, hypothesis: Hypothesis, candidate: EffectCandidate) -> Hypothesis:
+        """Return the fit of a set less one of its candidates, begun at its variances."""
+        return self.hypothesis([c for c in hypothesis.chosen if c is not candidate], hypothesis.model)
 
     def plausible(self, hypothesis: Hypothesis) -> bool:
         """Return whether all parameters lie in their plausible ranges, and all contributions matter."""
@@ -186,14 +191,14 @@ class Search:
         while best.chosen:
             weak = []
             for c in best.chosen:
-                without = self.hypothesis([o for o in best.chosen if o is not c], best.model)
+                without = self.without(best, c)
                 evidence = without.model.deviance - best.model.deviance
                 if self.held_out(best, c) < HELD_OUT * evidence:
                     weak.append((evidence, c))
             if not weak:
                 return best
             weakest = min(weak, key=lambda pair: pair[0])[1]
-            best = self.hypothesis([c for c in best.chosen if c is not weakest], best.model)
+            best = self.without(best, weakest)
         return best
 
     def children(self, parent: Hypothesis) -> list[Hypothesis]:
@@ -229,10 +234,7 @@ class Search:
     def pruned(self, best: Hypothesis) -> Hypothesis:
         """Return the set without candidates that are no longer worth their place."""
         while best.chosen:
-            smaller = [
-                self.hypothesis([c for c in best.chosen if c is not one], best.model) for one in best.chosen
-            ]
-            candidate = min(smaller, key=lambda h: h.bic)
+            candidate = min((self.without(best, c) for c in best.chosen), key=lambda h: h.bic)
             if candidate.bic - best.bic >= ENTER or not self.plausible(candidate):
                 return best
             best = candidate
@@ -240,7 +242,7 @@ class Search:
 
     def held_out(self, hypothesis: Hypothesis, candidate: EffectCandidate) -> float:
         """Return the drop of the deviance on held-out runs that the candidate brings, summed over the runs."""
-        without = self.hypothesis([c for c in hypothesis.chosen if c is not candidate], hypothesis.model)
+        without = self.without(hypothesis, candidate)
         return float(np.sum(self.held_out_deviances(without) - self.held_out_deviances(hypothesis)))
 
     def held_out_deviances(self, hypothesis: Hypothesis) -> FloatArray:

@@ -10,6 +10,7 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.sysid.diagnosis.current_zero import unpowered_columns, with_readings
 from jtqd.sysid.diagnosis.dataset import Dataset
+from jtqd.sysid.diagnosis.evidence import RELEVANT
 from jtqd.sysid.diagnosis.mixed_model import Mixed
 from jtqd.sysid.diagnosis.noise import Noise, noise_model, run_sums
 from jtqd.sysid.diagnosis.regressors import RunData, column_moments
@@ -19,7 +20,7 @@ from jtqd.sysid.diagnosis.signals import Channel
 _PASSES: Final = 2
 
 
-def searched(dataset: Dataset, least_nm: float) -> tuple[Noise, Search, Hypothesis]:
+def searched(dataset: Dataset) -> tuple[Noise, Search, Hypothesis]:
     """Return noise model and best hypothesis: the noise first from what nothing explains, then from what the best
     hypothesis leaves, which is more by what the many columns of the first have fitted of the noise itself.
     """
@@ -29,6 +30,7 @@ def searched(dataset: Dataset, least_nm: float) -> tuple[Noise, Search, Hypothes
     sigma = np.array([g.sigma for g in groups])
     moments = column_moments(runs, columns)
     unpowered = unpowered_columns(candidates, dataset.joints)
+    least_nm = RELEVANT * dataset.rated_torque_nm
     residuals = dataset.unexplained
     for k in range(_PASSES):
         noise = noise_model(runs, residuals, dataset.step_s)
@@ -36,7 +38,9 @@ def searched(dataset: Dataset, least_nm: float) -> tuple[Noise, Search, Hypothes
         sums = with_readings(sums, dataset.readings, unpowered)
         mixed = Mixed(sums, columns, sigma, dataset.pieces)
         effective = mixed.rows / noise.inflation
-        search = Search(mixed, candidates, effective, moments, least_nm, dataset.readings, unpowered)
+        search = Search(
+            mixed, candidates, effective, moments, least_nm, readings=dataset.readings, unpowered=unpowered
+        )
         best = search.confirmed()
         if k + 1 < _PASSES:
             residuals = {c: unexplained_residual(runs, best, c) for c in residuals}

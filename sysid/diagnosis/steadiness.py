@@ -19,10 +19,12 @@ from scipy import stats
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.library import EFFECTS
+from jtqd.sysid.diagnosis.findings import shows_at
 from jtqd.sysid.diagnosis.gain import left_out_steps
 from jtqd.sysid.diagnosis.mixed_model import solve
 from jtqd.sysid.diagnosis.noise import Noise, whitened_rows
-from jtqd.sysid.diagnosis.refine import PresentEffect, Refined
+from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, places
+from jtqd.sysid.diagnosis.regressors import Index
 from jtqd.sysid.diagnosis.structure import axis_values
 
 CHANCE: Final = 0.01
@@ -68,26 +70,23 @@ def steadiness(refined: Refined, noise: Noise, nothing: Sequence[Mapping[str, fl
     """Return how steady each cause is where it is least; nothing: per cause the values at which it is none."""
     first_piece = np.unique(refined.mixed.pieces, return_index=True)[1]
     steps = np.array(left_out_steps(refined))[first_piece]
-    out, places, first = [], [], 0
-    for p, none in zip(refined.present, nothing, strict=True):
-        mine = slice(first, first + len(p.free))
-        first += len(p.free)
-        places.append(mine)
+    out, own = [], places(refined.present)
+    for p, none, mine in zip(refined.present, nothing, own, strict=True):
         ratio = _ratio(p, none, jackknife(steps)[mine]) if len(steps) > 1 else 0.0
         out.append(Steadiness(ratio, needed(len(steps)), RUNS))
     if not refined.present:
         return out
-    rows = [whitened_rows(run, noise, first, len(refined.variances)) for run in refined.runs]
+    rows = [whitened_rows(run, noise, refined.mixed.columns, len(refined.variances)) for run in refined.runs]
     for joint in refined.runs[0].axes:
-        acting = [k for k, p in enumerate(refined.present) if p.joint in ("sensor", joint)]
+        acting = [k for k, p in enumerate(refined.present) if shows_at(p.joint, joint)]
         for axis in CONDITIONS if acting else ():
             cells = _cells(refined, rows, joint, axis)
             if cells is None:
                 continue
             for k in acting:
-                left = _slices_left_out(refined, cells, places[k])
+                left = _slices_left_out(refined, cells, own[k])
                 if len(left) >= _FEWEST_SLICES:
-                    ratio = _ratio(refined.present[k], nothing[k], jackknife(left)[places[k]])
+                    ratio = _ratio(refined.present[k], nothing[k], jackknife(left)[own[k]])
                     found = Steadiness(ratio, needed(len(left)), axis)
                     out[k] = min(out[k], found, key=lambda s: s.margin)
     return out
@@ -106,10 +105,7 @@ def _ratio(present: PresentEffect, nothing: Mapping[str, float], errors: FloatAr
 
 
 def _cells(
-    refined: Refined,
-    rows: Sequence[tuple[FloatArray, np.ndarray[tuple[int], np.dtype[np.intp]]]],
-    joint: int,
-    axis: str,
+    refined: Refined, rows: Sequence[tuple[FloatArray, Index]], joint: int, axis: str
 ) -> FloatArray | None:
     """Return the normal equations of every run in cells of a condition [r, cells, w, w], None where it does not vary."""
     values = [axis_values(run.axes[joint], axis)[at] for run, (_, at) in zip(refined.runs, rows, strict=True)]

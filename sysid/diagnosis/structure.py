@@ -127,7 +127,7 @@ def axis_maps(
             edges = axis_edges(axis, np.concatenate(there))
             if edges is not None:
                 maps = [
-                    axis_map(channel, axis, edges, values, signed(plain, side), block, rng)
+                    axis_map(channel, axis, edges, values, signed(plain, side), block=block, rng=rng)
                     for side in directions(runs, channel)
                 ]
                 out.append(max(maps, key=lambda m: (m.p < SIGNIFICANT, m.energy_nm2)))
@@ -150,12 +150,13 @@ def signed(parts: Sequence[FloatArray], side: Sequence[FloatArray] | None) -> li
     return list(parts) if side is None else [x * d for x, d in zip(parts, side, strict=True)]
 
 
-def axis_map(  # noqa: PLR0917
+def axis_map(
     channel: Channel,
     axis: str,
     edges: FloatArray,
     values: Sequence[FloatArray],
     parts: Sequence[FloatArray],
+    *,
     block: int,
     rng: np.random.Generator,
 ) -> AxisMap:

@@ -1,4 +1,4 @@
-"""A contender is a process that makes everything ready, then runs one round per line "run CYCLES" on its input."""
+"""A contender is a process that makes all ready, then runs a round per line "run CYCLES [FIRST_SLOT_NS]" of its input."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -33,8 +34,12 @@ class Task:
 class Runner(Protocol):
     """What a contender's process holds."""
 
-    def run(self, cycles: int) -> dict[str, Any]:
-        """Run one round and return `CycleMeter.result`."""
+    def run(self, cycles: int, first_slot_ns: int | None = None) -> dict[str, Any]:
+        """Run one round and return `CycleMeter.result`; first_slot_ns: CLOCK_MONOTONIC, None: in two periods."""
+
+
+_ASIDE_S = 0.2
+"""Results are encoded when every contender of a round has ended: it takes a core for tens of milliseconds."""
 
 
 def serve(make: Callable[[Task], Runner]) -> int:
@@ -43,7 +48,9 @@ def serve(make: Callable[[Task], Runner]) -> int:
     runner = make(Task(content["bus"], Path(content["directory"]), content["cpu"], content["priority"]))
     print("ready", flush=True)
     for line in sys.stdin:
-        print(json.dumps(runner.run(int(line.split()[1]))), flush=True)
+        result = runner.run(*map(int, line.split()[1:]))
+        time.sleep(_ASIDE_S)
+        print(json.dumps(result), flush=True)
     return 0
 
 
@@ -81,10 +88,11 @@ class Process:
             raise RuntimeError(f"{self.name} ended with exit status {self._process.wait()}")
         return line
 
-    def start(self, cycles: int) -> None:
+    def start(self, cycles: int, first_slot_ns: int | None = None) -> None:
         """Begin a round."""
         assert self._process.stdin is not None
-        self._process.stdin.write(f"run {cycles}\n")
+        first = "" if first_slot_ns is None else f" {first_slot_ns}"
+        self._process.stdin.write(f"run {cycles}{first}\n")
         self._process.stdin.flush()
 
     def result(self) -> dict[str, Any]:

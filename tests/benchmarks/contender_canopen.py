@@ -66,7 +66,7 @@ class CanopenLoop:
         gc.freeze()
         gc.disable()
 
-    def run(self, cycles: int) -> dict[str, Any]:
+    def run(self, cycles: int, first_slot_ns: int | None = None) -> dict[str, Any]:
         """Connect, run one round, disconnect."""
         self._network = canopen.Network(bus=UnixBus(self._bus))
         self._network.connect()
@@ -77,7 +77,7 @@ class CanopenLoop:
         for estimator in self._estimators:
             estimator.reset()
         meter = CycleMeter()
-        grid = Grid(time.monotonic_ns() + 2 * _PERIOD_NS, _PERIOD_NS)
+        grid = Grid(first_slot_ns or time.monotonic_ns() + 2 * _PERIOD_NS, _PERIOD_NS)
         end_ns = grid.slot_ns + cycles * _PERIOD_NS
         last_ns, index = 0, 0
         while grid.slot_ns < end_ns:

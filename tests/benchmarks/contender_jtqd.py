@@ -49,20 +49,15 @@ class JtqdLoop:
         cycle, grid = loop.build_cycle(self.config, request, report, socket, self.estimators)
         return cycle, grid, socket
 
-    def run(self, cycles: int) -> dict[str, Any]:
+    def run(self, cycles: int, first_slot_ns: int | None = None) -> dict[str, Any]:
         """One round of `cycles` slots."""
         cycle, grid, socket = self.connect()
         meter = CycleMeter()
-        loop_start(grid)
+        grid.slot_ns = first_slot_ns or time.monotonic_ns() + 2 * grid.period_ns
         measured = Measured(cycle, meter)
         loop.run(measured, grid, _never, grid.slot_ns + cycles * grid.period_ns)  # type: ignore[arg-type]
         socket.close()
         return meter.result(grid.missed)
-
-
-def loop_start(grid: Grid) -> None:
-    """Put the first slot two periods ahead, as jtqd.daemon.loop.process does."""
-    grid.slot_ns = time.monotonic_ns() + 2 * grid.period_ns
 
 
 class Measured:

@@ -1,17 +1,24 @@
-"""`grid`: jtqd's loop for minutes beside two bare loops on the same core at the same time, missed slots of all three.
+"""`grid`: jtqd's loop for minutes beside three bare loops on the same core at the same time, missed slots of all four.
 
 bare sleep     sleeps and looks at the clock: what it misses, nothing on this core could have kept
-bare, waking   also wakes a process on the other core in each slot and takes its answers, as SYNC does on a unix bus
+bare, twice    sleeps a second time in each slot and computes for as long as a cycle of jtqd takes: a core that is taken
+               away costs it a slot at either sleep and during the work, as it does jtqd
+bare, waking   wakes a process on the other core in each slot and takes its answers, as SYNC does on a unix bus
+
+All lie on one grid of a millisecond, none at the time of another, and change places from round to round: how late a loop
+wakes depends on what ran before it. They begin and end a round together, since what one does before and after it takes
+the core from the others.
 
 A machine that is shared takes a core away for milliseconds, now and then, from all loops alike. So a figure is the mean
 of the differences of two loops in the same round, and its standard error is that of these differences from round to
 round: without it a count of some hundred clustered misses says nothing. What jtqd misses beyond the bare sleep is all
-that it adds, the waking of another process included; beyond the waking one, what is its own.
+that it adds; beyond the one that sleeps twice, what is not the form of a cycle that sends, waits and computes.
 """
 
 from __future__ import annotations
 
 import statistics
+import time
 from dataclasses import dataclass, field
 from math import nan, sqrt
 from typing import Any
@@ -26,10 +33,14 @@ BEYOND_LIMIT = 50.0
 """Missed slots per million above those of the bare sleep beside it."""
 _ROUND_S = 60.0
 """Results are collected every minute, so that a long run needs no more memory than a short one."""
-_FEWEST_ROUNDS = 5
-"""... or more often: fewer differences have no standard error worth the name."""
-JTQD, BARE, WAKING = "jtqd", "bare sleep", "bare, waking"
-_PAIRS = ((JTQD, BARE), (JTQD, WAKING), (WAKING, BARE))
+_FEWEST_ROUNDS = 6
+"""... or more often: fewer differences have no standard error worth the name. Always an even number (`_PLACES_US`)."""
+JTQD, BARE, TWICE, WAKING = "jtqd", "bare sleep", "bare, twice", "bare, waking"
+_READY_NS = 500_000_000
+"""From the order to the first slot."""
+_PLACES_US = {JTQD: (0, 125), TWICE: (125, 0), WAKING: (250, 750), BARE: (750, 250)}
+"""Where in the millisecond the slots of a loop begin, in rounds in turns; the first two wake again 500 us later."""
+_PAIRS = ((JTQD, BARE), (JTQD, TWICE), (TWICE, BARE), (WAKING, BARE))
 
 
 @dataclass
@@ -74,20 +85,22 @@ def run(fixture: Fixture, *, minutes: float) -> dict[str, Any]:
     where = host.cpus()
     traffic = host.traffic(fixture.directory, where)
     task = Task(f"unix:{fixture.directory / 'bus'}", fixture.directory, where.loop)
-    answering = "" if where.traffic is None else str(where.traffic)
+    answering = [] if where.traffic is None else [str(where.traffic)]
     processes = {
         JTQD: Process(python("contender_jtqd", task.to_json()), JTQD),
-        BARE: Process(python("sleeper", task.to_json()), "the sleeper"),
-        WAKING: Process(python("sleeper", task.to_json(), answering), "the waking sleeper"),
+        BARE: Process(python("sleeper", task.to_json(), "once"), "the sleeper"),
+        TWICE: Process(python("sleeper", task.to_json(), "twice"), "the sleeper of two sleeps"),
+        WAKING: Process(python("sleeper", task.to_json(), "waking", *answering), "the waking sleeper"),
     }
     loops = {name: Loop() for name in processes}
     load = host.OtherLoad()
-    rounds = max(_FEWEST_ROUNDS, round(minutes * 60.0 / _ROUND_S))
+    rounds = max(_FEWEST_ROUNDS, 2 * round(minutes * 30.0 / _ROUND_S))
     cycles = max(1, round(minutes * 60_000 / rounds))
     try:
-        for _ in range(rounds):
-            for process in processes.values():
-                process.start(cycles)
+        for k in range(rounds):
+            first_ns = time.monotonic_ns() + _READY_NS
+            for name, process in processes.items():
+                process.start(cycles, first_ns + 1000 * _PLACES_US[name][k % 2])
             for name, process in processes.items():
                 loops[name].add(cycles, process.result())
     finally:

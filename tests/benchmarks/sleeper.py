@@ -1,8 +1,9 @@
 """The bare loops beside jtqd: sleep until the slot, look at the clock. Their missed slots are the machine's.
 
-`python -m tests.benchmarks.sleeper TASK` does nothing else. `... TASK CPU` (which may be empty) also does in each slot
-what the SYNC of jtqd's loop does on a unix bus: it wakes a process on that CPU by one datagram, and takes the five that
-answered the last one.
+`python -m tests.benchmarks.sleeper TASK once` does nothing else. `... TASK twice` sleeps a second time in each slot and
+then computes for as long as a cycle of jtqd takes, without a system call but the clock's. `... TASK waking [CPU]` does in
+each slot what the SYNC of jtqd's loop does on a unix bus: it wakes a process on that CPU by one datagram, and takes the
+five that answered the last one.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from tests.benchmarks.contender import Task, die_with_parent, serve
 from tests.benchmarks.measure import CycleMeter, punctual
 
 _PERIOD_NS = 1_000_000
-_OFFSET_NS = 750_000
-"""jtqd wakes up at 0 and 500 us of its grid; this one stays out of its way as far as it can."""
-_WAKING_OFFSET_NS = 250_000
+_SECOND_SLEEP_NS = 500_000
+_WORK_NS = 60_000
+"""What a whole cycle of jtqd takes on the fixture (docs/speed.md, stages)."""
 _FRAME = bytes(16)
 _ANSWERS = 5
 _ANSWERING_PRIORITY = 50
@@ -32,40 +33,51 @@ _ANSWERING_PRIORITY = 50
 class Sleeper:
     """Same grid, same scheduling, same rule for a missed slot as jtqd's loop."""
 
-    offset_ns = _OFFSET_NS
-
     def __init__(self, task: Task) -> None:
         punctual(task.cpu, task.priority)
         gc.freeze()
         gc.disable()
 
-    def in_slot(self) -> None:
+    def in_slot(self, slot_ns: int) -> None:
         """Do what belongs to a slot that was begun in time."""
 
-    def run(self, cycles: int) -> dict[str, Any]:
+    def run(self, cycles: int, first_slot_ns: int | None = None) -> dict[str, Any]:
         """One round."""
         meter = CycleMeter()
-        grid = Grid(time.monotonic_ns() + 2 * _PERIOD_NS + self.offset_ns, _PERIOD_NS)
+        grid = Grid(first_slot_ns or time.monotonic_ns() + 2 * _PERIOD_NS, _PERIOD_NS)
         end_ns = grid.slot_ns + cycles * _PERIOD_NS
         while grid.slot_ns < end_ns:
-            pause = grid.slot_ns - time.monotonic_ns()
-            if pause > 0:
-                time.sleep(pause * 1e-9)
+            _sleep_until(grid.slot_ns)
             now = time.monotonic_ns()
             if grid.too_late(now):
                 grid.missed += 1
             else:
                 meter.late_ns.append(now - grid.slot_ns)
-                self.in_slot()
+                self.in_slot(grid.slot_ns)
             meter.cycle_done()
-            grid.advance(now)
+            grid.advance(time.monotonic_ns())
         return meter.result(grid.missed)
+
+
+def _sleep_until(until_ns: int) -> None:
+    pause = until_ns - time.monotonic_ns()
+    if pause > 0:
+        time.sleep(pause * 1e-9)
+
+
+class TwiceSleeper(Sleeper):
+    """... and in each slot a second sleep, then work."""
+
+    def in_slot(self, slot_ns: int) -> None:
+        """Sleep where jtqd waits for its inputs, and compute for as long as its cycle does."""
+        _sleep_until(slot_ns + _SECOND_SLEEP_NS)
+        done_ns = time.monotonic_ns() + _WORK_NS
+        while time.monotonic_ns() < done_ns:
+            pass
 
 
 class WakingSleeper(Sleeper):
     """... and in each slot one datagram to a process on another core, which answers with five."""
-
-    offset_ns = _WAKING_OFFSET_NS
 
     def __init__(self, task: Task, answering_cpu: int | None) -> None:
         self._socket, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -77,7 +89,7 @@ class WakingSleeper(Sleeper):
         self._socket.setblocking(False)
         super().__init__(task)
 
-    def in_slot(self) -> None:
+    def in_slot(self, slot_ns: int) -> None:
         """Take what was answered to the datagram of the last slot, and send the next one."""
         try:
             for _ in range(_ANSWERS):
@@ -97,6 +109,6 @@ def _answer(port: socket.socket, cpu: int | None) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) == 2:
-        sys.exit(serve(Sleeper))
-    sys.exit(serve(partial(WakingSleeper, answering_cpu=int(sys.argv[2]) if sys.argv[2] else None)))
+    kind, *cpu = sys.argv[2:]
+    waking = partial(WakingSleeper, answering_cpu=int(cpu[0]) if cpu else None)
+    sys.exit(serve({"once": Sleeper, "twice": TwiceSleeper, "waking": waking}[kind]))

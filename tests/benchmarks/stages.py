@@ -13,7 +13,7 @@ from typing import Any
 from jtqd.daemon.core.cycle import Cycle
 from jtqd.daemon.core.schedule import Grid
 from tests.benchmarks.contender import serve
-from tests.benchmarks.contender_jtqd import JtqdLoop, loop_start
+from tests.benchmarks.contender_jtqd import JtqdLoop
 from tests.benchmarks.measure import SETTLE_CYCLES, quantile
 
 STAGES = {
@@ -56,12 +56,12 @@ class Staged:
 class StagedLoop(JtqdLoop):
     """jtqd's loop with timers around its stages."""
 
-    def run(self, cycles: int) -> dict[str, Any]:
+    def run(self, cycles: int, first_slot_ns: int | None = None) -> dict[str, Any]:
         """One plain round for the whole, one with timers for the parts."""
         plain = super().run(cycles)
         cycle, grid, socket = self.connect()
         staged = Staged(cycle, grid)
-        loop_start(grid)
+        grid.slot_ns = first_slot_ns or time.monotonic_ns() + 2 * grid.period_ns
         staged.run(grid.slot_ns + cycles * grid.period_ns)
         socket.close()
         kept = staged.cycles[SETTLE_CYCLES:]

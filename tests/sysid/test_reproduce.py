@@ -4,7 +4,7 @@ import hashlib
 import json
 import subprocess
 import sys
-from types import SimpleNamespace
+import time
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from jtqd.models.files import load_joint, shipped
 from jtqd.sysid import reproduce as reproduce_command
 from jtqd.sysid.campaign import command as campaign_command
 from jtqd.sysid.campaign.plan import check_plan, load_plan
-from jtqd.sysid.reproduce import steps, write_config
+from jtqd.sysid.reproduce import Step, steps, write_config
 
 
 def test_every_step_comes_after_what_it_reads(tmp_path):
@@ -60,38 +60,119 @@ def test_nothing_is_trained_on_what_judges(tmp_path):
             )
 
 
-def test_failed_step_ends_it_and_findings_of_a_campaign_do_not(tmp_path, monkeypatch, capsys):
-    called = []
+@pytest.fixture
+def scripted(monkeypatch):
+    """Return what puts a function of command and call number in the place of the commands; the list is what ran."""
 
-    def run(command, check):
-        called.append(command[3])
-        return SimpleNamespace(returncode=3 if command[3] == "campaign" else 1)
+    def put(answer):
+        called = []
 
-    monkeypatch.setattr(subprocess, "run", run)
-    assert reproduce_command.main(["--out", str(tmp_path), "--quick"]) == 1
+        def run(self, name, command):
+            called.append(command[3])
+            return answer(command[3], len(called))
+
+        monkeypatch.setattr(reproduce_command.Commands, "run", run)
+        return called
+
+    return put
+
+
+def test_failed_step_ends_it_and_findings_of_a_campaign_do_not(tmp_path, scripted, capsys):
+    called = scripted(lambda name, _: 3 if name == "campaign" else 1)
+    assert reproduce_command.main(["--out", str(tmp_path), "--quick", "--jobs", "1"]) == 1
     assert called == ["campaign", "campaign", "fit"]
     assert "jtq fit ended with status 1" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("done", "calls"), [([1, 2, 2], 3), ([0, 0], 2), ([], 1)])
-def test_campaign_that_ended_early_goes_on_while_runs_get_done(tmp_path, monkeypatch, capsys, done, calls):
+def test_campaign_that_ended_early_goes_on_while_runs_get_done(tmp_path, scripted, capsys, done, calls):
     """Each number is how many runs are done after an attempt that ended early; without a state nothing was begun."""
-    called = []
 
-    def run(command, check):
-        called.append(command[3])
+    def answer(name, number):
         state = tmp_path / "campaigns" / "excitation" / "campaign.json"
         if done:
             state.parent.mkdir(parents=True, exist_ok=True)
-            count = done[len(called) - 1]
+            count = done[number - 1]
             runs = [{"name": f"run{n}", "status": "done" if n < count else "pending"} for n in range(3)]
             state.write_text(json.dumps({"runs": runs}))
-        return SimpleNamespace(returncode=1)
+        return 1
 
-    monkeypatch.setattr(subprocess, "run", run)
-    assert reproduce_command.main(["--out", str(tmp_path), "--quick"]) == 1
+    called = scripted(answer)
+    assert reproduce_command.main(["--out", str(tmp_path), "--quick", "--jobs", "1"]) == 1
     assert called == ["campaign"] * calls
     assert "jtq campaign ended with status 1" in capsys.readouterr().err
+
+
+def step(out, *reads, words="pass", **options):
+    """A step that runs Python; what it reads are arguments that Python does not look at."""
+    return Step(("-c", words, *map(str, reads), "--out", str(out)), module="ignored", **options)
+
+
+@pytest.fixture
+def python(monkeypatch):
+    """Steps are what `python -c` makes of them: `-m MODULE` is left out."""
+    started = subprocess.Popen
+    monkeypatch.setattr(
+        reproduce_command.subprocess,
+        "Popen",
+        lambda command, **more: started([command[0], *command[3:]], **more),
+    )
+
+
+def test_steps_run_at_once_unless_one_reads_what_another_writes(tmp_path, python, capfd):
+    """a and b wait for each other, so neither ends alone; c reads both, one by its file and one by its directory."""
+    meet = (
+        "import pathlib, sys, time; end = time.monotonic() + 60; pathlib.Path(sys.argv[-1]).touch()\n"
+        "while not pathlib.Path('{other}').exists():\n"
+        "    if time.monotonic() > end: sys.exit(1)\n"
+        "    time.sleep(0.01)"
+    )
+    a, b, c, d = (tmp_path / name for name in ("a", "models/b", "c", "d"))
+    b.parent.mkdir()
+    one = step(a, words=meet.format(other=b))
+    two = step(b, words=meet.format(other=a))
+    three = step(c, a, b.parent)
+    assert reproduce_command.run_steps((one, two, three, step(d, words="print('said', flush=True)")), 2) == 0
+    told = capfd.readouterr()
+    assert "said" in told.out
+    assert told.err.count("$ ") == 4
+    assert [three.reads(one), three.reads(two), two.reads(one), one.reads(three)] == [
+        True,
+        True,
+        False,
+        False,
+    ]
+
+
+def test_a_step_waits_for_what_it_reads_although_there_is_room(tmp_path, python):
+    late = "import pathlib, sys, time; time.sleep(0.5); pathlib.Path(sys.argv[-1]).touch()"
+    check = "import pathlib, sys; sys.exit(0 if pathlib.Path(sys.argv[1]).exists() else 1)"
+    writer = step(tmp_path / "a", words=late)
+    reader = step(tmp_path / "b", tmp_path / "a", words=check)
+    assert reproduce_command.run_steps((writer, reader), 2) == 0
+
+
+def test_a_step_that_fails_ends_those_beside_it(tmp_path, python, capfd):
+    forever = step(tmp_path / "a", words="import time; time.sleep(600)")
+    fails = step(tmp_path / "b", words="import sys; print('no', file=sys.stderr); sys.exit(2)")
+    after = step(tmp_path / "c", tmp_path / "a")
+    begun = time.monotonic()
+    assert reproduce_command.run_steps((forever, fails, after), 2) == 1
+    assert time.monotonic() - begun < 60
+    told = capfd.readouterr().err
+    assert "[b] no\n" in told
+    assert "ended with status 2" in told
+    assert f"--out {tmp_path / 'c'}" not in told
+
+
+def test_nothing_waits_for_what_it_writes_itself(tmp_path):
+    """Else two steps that write into one directory would wait for each other's files."""
+    made = list(steps(tmp_path, "sim", True, 0))
+    paper, ours = (each for each in made if each.arguments[0] == "train")
+    assert not ours.reads(paper)
+    judged = made[-1]
+    assert judged.reads(ours)
+    assert judged.reads(paper)
 
 
 def test_out_that_cannot_be_made_is_one_line(tmp_path, capsys):

@@ -11,6 +11,7 @@ from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.effects.effect import Effect
 from jtqd.sysid.diagnosis.arm_motion import MOTION_FILE, joint_motion_file
 from jtqd.sysid.diagnosis.findings import AMBIGUOUS, CAUSE, INSUFFICIENT, UNEXPLAINED, Findings
+from jtqd.sysid.diagnosis.next_experiment import PLAN_FILE, campaign_command
 from jtqd.sysid.diagnosis.report import views
 from jtqd.sysid.diagnosis.report.pictures import pictures, trace_rows
 from jtqd.sysid.diagnosis.report.views import gap_views
@@ -19,7 +20,6 @@ from jtqd.sysid.report import page
 from jtqd.sysid.report.numbers import number
 
 TEMPLATE: Final = "report.html.j2"
-PLAN_FILE: Final = "next_experiment.plan.yaml"
 
 
 def render(findings: Findings, made: str = "", effects: Mapping[str, Effect] | None = None) -> str:
@@ -86,8 +86,7 @@ def _next(findings: Findings) -> dict[str, Any] | None:
     return {
         "why": findings.next_experiment["why"],
         "file": PLAN_FILE,
-        "command": findings.next_experiment.get("command")
-        or f"jtq campaign {PLAN_FILE} --bus can0 --out RUNS",
+        "command": findings.next_experiment.get("command") or campaign_command(),
         "motions": [(file, _runs_of(motion)) for file, motion in made],
         "amount": plan_amount(plan)
         if plan is not None

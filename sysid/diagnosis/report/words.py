@@ -10,6 +10,7 @@ from jtqd.sysid.diagnosis.findings import (
     CAUSE,
     INSUFFICIENT,
     NO_GAP,
+    SENSOR,
     UNEXPLAINED,
     Cause,
     Findings,
@@ -20,7 +21,6 @@ from jtqd.sysid.diagnosis.findings import (
 )
 from jtqd.sysid.report.numbers import SPACE, number, percent, unit_name, with_interval
 
-SENSOR: Final = "sensor"
 BADGES: Final = {
     NO_GAP: ("good", "no gap"),
     CAUSE: ("after", "cause found"),

@@ -191,6 +191,18 @@ def test_from_an_eds_alone(tmp_path, capsys):
     assert config.joints[0].identity.vendor == 0x7A1
 
 
+def test_an_eds_without_a_node_id_is_one_joint_at_a_guessed_node(tmp_path, capsys):
+    status, out, err = run(capsys, "--from-eds", EDS, "--gear-ratio", 101, "--out", tmp_path / "arm")
+    assert (status, err) == (0, "")
+    assert (
+        "joint_1: node = 1 (an EDS knows no node-ID: --node, or --bus)" in out.partition("still a guess:")[2]
+    )
+    assert "  node: 1                 # GUESS, an EDS" in (tmp_path / "arm" / "jtqd.yaml").read_text()
+    assert [joint.node_id for joint in load_config(tmp_path / "arm" / "jtqd.yaml").joints] == [1]
+    given = run(capsys, "--from-eds", EDS, "--node", 1, "--gear-ratio", 101, "--out", tmp_path / "given")[1]
+    assert "node = " not in given
+
+
 def test_one_joint_alone(tmp_path, capsys):
     arguments = ["--node", 9, "--gear-ratio", 50, "--rated-torque", 20, "--torque-constant", 0.05]
     status, _, err = run(capsys, *arguments, "--out", tmp_path)
@@ -254,6 +266,7 @@ def test_what_is_there_is_not_overwritten(tmp_path, capsys):
         ([], 2, "give --node"),
         (["--node", "5", "--gear-ratio", "1", "--gear-ratio", "2"], 2, "--gear-ratio: given 2 times"),
         (["--node", "5", "--from-eds", "none.eds"], 1, "none.eds"),
+        (["--from-eds", "none.eds"], 1, "none.eds: cannot be read"),
         (["--bus", "unix:/none/bus"], 1, "/none"),
         (["--node", "5", "--from-eds", str(EDS.parent / "torque_sensor.eds")], 2, "no CiA 402 drive"),
         (["--node", "5", "--sensor-joint", "1"], 2, "--gear-ratio"),

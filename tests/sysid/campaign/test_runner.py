@@ -125,6 +125,40 @@ def test_what_is_tried_and_what_becomes_of_it(
     assert all(state.attempts <= ATTEMPTS for state in outcome.runs.values())
 
 
+MISSING = Attempt(
+    RunState(DONE, rows=900, findings=("cycles: found 9.1% missing (90 ..), expected at most 1%",))
+)
+OTHER_FINDING = Attempt(RunState(DONE, rows=1000, findings=("j1.torque_nm: found no value",)))
+
+
+@pytest.mark.parametrize(
+    ("attempts", "asked", "late", "statuses"),
+    [
+        ({}, "abc", False, [DONE, DONE, DONE]),
+        ({"b": [LATE]}, "ab", True, [DONE, STOPPED, "pending"]),
+        ({"b": [GAP]}, "ab", True, [DONE, FAILED, "pending"]),
+        ({"b": [MISSING]}, "ab", True, [DONE, FAILED, "pending"]),
+        ({"b": [REFUSED]}, "ab", True, [DONE, FAILED, "pending"]),
+        ({"b": [OTHER_FINDING]}, "abc", False, [DONE, DONE, DONE]),
+        ({"b": [LIMIT]}, "ab", False, [DONE, STOPPED, "pending"]),
+        ({"b": [SIGNAL]}, "ab", False, [DONE, STOPPED, "pending"]),
+    ],
+)
+def test_where_exact_time_can_be_had_nothing_is_tried_again_in_real_time(
+    directory: CampaignDirectory,
+    attempts: dict[str, list[Attempt | BaseException]],
+    asked: str,
+    late: bool,
+    statuses: list[str],
+) -> None:
+    script = Script(**attempts)
+    outcome = gone(directory, script, exact_next=True)
+    assert "".join(script.asked) == asked
+    assert [state.status for state in outcome.runs.values()] == statuses
+    assert outcome.late == late
+    assert bool(outcome.ended) == (asked != "abc")
+
+
 def fourier_run(name: str = "b", trajectories: int = 2) -> Run:
     segments: list[Segment] = [Rest(1.0, 0.0)]
     for number in range(trajectories):

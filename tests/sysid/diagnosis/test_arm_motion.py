@@ -9,8 +9,9 @@ from jtqd.estimator.joint import MotionLimits
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.arm_motion import KINDS, RATE_HZ, Room, csv_text, motions, room_of
-from jtqd.sysid.diagnosis.next_experiment import EXPERIMENTS, each_joint, next_experiment
+from jtqd.sysid.diagnosis.next_experiment import each_joint, next_experiment
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
+from jtqd.sysid.diagnosis.towing_motion import EXPERIMENTS
 
 JOINT = load_joint(shipped("joint1.yaml"))
 GRAVITY_NM = 20.0

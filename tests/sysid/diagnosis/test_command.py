@@ -14,7 +14,7 @@ import yaml
 
 from jtqd.daemon import jtq as jtq_module
 from jtqd.estimator.run import RunTable
-from jtqd.models.files import load_joint
+from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.campaign.plan import load_plan
 from jtqd.sysid.diagnosis.command import main
 from jtqd.sysid.diagnosis.findings import VERDICTS
@@ -223,11 +223,12 @@ def test_the_next_experiment_is_a_plan_that_the_campaign_reads(tmp_path: Path, c
     core.answer = findings("ambiguous", next_experiment={"why": "load both ways", "plan": PLAN})
     write_runs(tmp_path)
     out = tmp_path / "o"
-    assert run(tmp_path, "--joint", JOINT_FILE, "--out", out) == 3
+    both = [text for n in (1, 2) for text in ("--joint", f"{n}={shipped(f'joint{n}.yaml')}")]
+    assert run(tmp_path, *both, "--out", out) == 3
     assert load_plan(out / "next_experiment.plan.yaml").name == "more"
     made = json.loads((out / "findings.json").read_text())
     plan = out / "next_experiment.plan.yaml"
-    command = f"jtq campaign {plan} --bus can0 --out RUNS"
+    command = f"jtq campaign {plan} --bus can0 --out RUNS"  # the joints of the configuration that ships
     assert made["next_experiment"] == {"why": "load both ways", "plan": PLAN, "command": command}
     assert "next_experiment.plan.yaml" in made["files"]
 
@@ -239,10 +240,10 @@ def test_the_printed_command_has_the_users_bus_and_configuration(
     write_runs(tmp_path)
     out = tmp_path / "o"
     run(tmp_path, "--joint", JOINT_FILE, "--out", out, "--config", "my arm.yaml", "--bus", "can1")
-    plan = out / "next_experiment.plan.yaml"
-    assert (
-        f"run it: jtq campaign {plan} --bus can1 --config 'my arm.yaml' --out RUNS" in capsys.readouterr().out
-    )
+    command = f"jtq campaign {out / 'next_experiment.plan.yaml'} --bus can1 --config"
+    assert f"run it: {command} 'my arm.yaml' --out RUNS" in capsys.readouterr().out
+    run(tmp_path, "--joint", JOINT_FILE, "--out", out, "--bus", "can1", "--force")
+    assert f"run it: {command} CONFIG --out RUNS" in capsys.readouterr().out, "joint 2 is another one there"
 
 
 def test_the_motion_of_an_arm_is_a_file_beside(tmp_path: Path, core: Core) -> None:

@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 import pytest
 
-from jtqd.sysid.diagnosis.fewer_runs import Compared, Gone
+from jtqd.sysid.diagnosis import fewer_runs, named
+from jtqd.sysid.diagnosis.case import Case, Fit
+from jtqd.sysid.diagnosis.dataset import Dataset
+from jtqd.sysid.diagnosis.fewer_runs import Compared, Gone, _borne_out
 from jtqd.sysid.diagnosis.findings import UNEXPLAINED
+from jtqd.sysid.diagnosis.leftover import Leftover
 from jtqd.sysid.diagnosis.mixed_model import Mixed
+from jtqd.sysid.diagnosis.named import UNSTEADY, Found
+from jtqd.sysid.diagnosis.noise import Noise
+from jtqd.sysid.diagnosis.refine import Refined
 from jtqd.sysid.diagnosis.search import Hypothesis
-from tests.sysid.diagnosis.diagnose_core_helpers import Dense, search_of
+from jtqd.sysid.diagnosis.signals import Channel
+from jtqd.sysid.diagnosis.steadiness import Steadiness
+from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, Dense, search_of
 from tests.sysid.diagnosis.test_search import LIBRARY, problem
 from tests.worlds.judge import judged
 from tests.worlds.measured_bench import MeasuredBench
@@ -41,24 +52,59 @@ def test_a_subset_keeps_its_pieces() -> None:
     assert part.grams == pytest.approx(pieces.grams[[0, 2]])
 
 
-@pytest.mark.parametrize(
-    ("squares", "better"),
-    [([0.5, 0.9, 1.0], True), ([0.97, 0.98, 0.96], False), ([0.1, 0.2, 1.2], False)],
-    ids=["all together", "as good", "one run worse"],
-)
-def test_clearly_better_is_on_all_runs_together_and_worse_on_none(squares: list[float], better: bool) -> None:
+def one_beside_none(squares: Sequence[float]) -> tuple[Compared, Hypothesis]:
+    """Nothing named, and an effect with these squared errors on the runs left out where nothing leaves 1."""
     search = search_of(problem(3, {0: 0.8}), LIBRARY)
-    named, other = search.hypothesis(()), search.hypothesis(LIBRARY[:1])
+    other = search.hypothesis(LIBRARY[:1])
 
     class LeftOut:
         def squares(self, h: Hypothesis) -> list[dict[str, float]]:
             return [{"motor": x} for x in (squares if h is other else [1.0, 1.0, 1.0])]
 
     compared = object.__new__(Compared)
-    compared.search, compared.named = search, named
+    compared.search, compared.named = search, search.hypothesis(())
     vars(compared)["_left_out"] = LeftOut()
+    return compared, other
+
+
+@pytest.mark.parametrize(
+    ("squares", "better"),
+    [([0.5, 0.9, 1.0], True), ([0.97, 0.98, 0.96], False), ([0.1, 0.2, 1.2], False)],
+    ids=["all together", "as good", "one run worse"],
+)
+def test_clearly_better_is_on_all_runs_together_and_worse_on_none(squares: list[float], better: bool) -> None:
+    compared, other = one_beside_none(squares)
     assert compared.clearly_better(other) is better
-    assert compared.nm(named) == pytest.approx(1.0)
+    assert compared.nm(compared.named) == pytest.approx(1.0)
+
+
+class Unfitted(Case):
+    """A case whose fits are the sets of effects alone, each of 1 Nm rms."""
+
+    def fit(self, hypothesis: Hypothesis) -> Fit:
+        return Fit(hypothesis, cast("Refined", None))
+
+    def rms_nm(self, fit: Fit) -> list[dict[Channel, float]]:
+        return [{MOTOR1: 1.0} for _ in fit.chosen]
+
+
+@pytest.mark.parametrize(
+    ("left_nm", "ratio", "kept"), [(0.5, 7.0, False), (0.5, 9.0, True), (0.1, 7.0, True)]
+)
+def test_beside_what_is_left_over_only_what_is_steady_is_kept(
+    monkeypatch: pytest.MonkeyPatch, left_nm: float, ratio: float, kept: bool
+) -> None:
+    """However much better the runs left out are with it: what is left over may make it so."""
+    compared, other = one_beside_none([0.5, 0.5, 0.5])
+    monkeypatch.setattr(fewer_runs, "objections", lambda *_: [])
+    steady = Steadiness(ratio, 8.0, "velocity")
+    monkeypatch.setattr(named, "steadiness", lambda _, __, nothing: [steady for _ in nothing])
+    case = Unfitted(cast("Dataset", None), cast("Noise", None), compared.search, 0.005)
+    nothing, left = case.fit(compared.named), Leftover((), (), (), (), worst_nm={MOTOR1: left_nm})
+    found = Found(case, compared.named, nothing, nothing, None, left, 0.01, {MOTOR1: 0.2}, ())
+    key = LIBRARY[0].key
+    best, why = _borne_out(found, compared, [(key, other)])
+    assert (best is other, why) == (kept, {} if kept else {key: UNSTEADY})
 
 
 def test_a_line_says_what_went_and_what_the_runs_left_out_say() -> None:

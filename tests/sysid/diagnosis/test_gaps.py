@@ -57,7 +57,7 @@ def told(
         run_data(f"run{k}", {channel: x}, a) for k, (x, a) in enumerate(zip(parts, axes, strict=True))
     ]
     maps = {m.axis: m for m in axis_maps(runs, {channel: parts}, STEP_S)}
-    return locate(runs, channel, parts, EventLimits(AR, STEP_S, 0.5, 0.3), lines, maps), maps
+    return locate(runs, channel, parts, EventLimits(AR, STEP_S, 0.5, 0.3), lines=lines, maps=maps), maps
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import pytest
 
 from examples.kinova_diagnosis import diagnose_all
-from jtqd.sysid.diagnosis import verdict
+from jtqd.sysid.diagnosis import named
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import AMBIGUOUS, CAUSE, INSUFFICIENT, NO_GAP, UNEXPLAINED, Findings
@@ -58,7 +58,7 @@ def test_with_four_runs_nothing_of_this_applies(monkeypatch: pytest.MonkeyPatch)
             assert search.mixed.runs < ENOUGH_RUNS, "asked for with four runs"
             super().__init__(dataset, search)
 
-    monkeypatch.setattr(verdict, "LeaveOneOut", Refusing)
+    monkeypatch.setattr(named, "LeaveOneOut", Refusing)
     assert found(206, runs=4).verdict == NO_GAP
 
 

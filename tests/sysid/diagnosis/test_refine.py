@@ -15,6 +15,7 @@ from jtqd.estimator.run import RunTable
 from jtqd.sysid.diagnosis import guards
 from jtqd.sysid.diagnosis import refine as refine_module
 from jtqd.sysid.diagnosis import regressors as columns_module
+from jtqd.sysid.diagnosis.causes import _normal_phase
 from jtqd.sysid.diagnosis.current_zero import RestCurrent, offset_at_rest, rest_current
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.diagnose import combined, one_sensor, with_effects_applied
@@ -27,7 +28,6 @@ from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, free_names, para
 from jtqd.sysid.diagnosis.regressors import contribution, families
 from jtqd.sysid.diagnosis.search import Hypothesis
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
-from jtqd.sysid.diagnosis.verdict import _normal_phase
 from tests.estimator.effects.effect_signals import PLAIN, extended
 from tests.estimator.effects.effect_signals import state as made_up_state
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, TORSION1, candidates, rigid_run, run_data

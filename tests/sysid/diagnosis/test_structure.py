@@ -9,7 +9,7 @@ import pytest
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.sysid.diagnosis import structure
-from jtqd.sysid.diagnosis.events import Burst, bursts, wandering
+from jtqd.sysid.diagnosis.events import Burst, EventLimits, bursts, wandering
 from jtqd.sysid.diagnosis.leftover import Leftover
 from jtqd.sysid.diagnosis.regressors import RunData
 from jtqd.sysid.diagnosis.signals import Channel, Line
@@ -170,13 +170,18 @@ def gaussian(seed: int, count: int = 12000) -> FloatArray:
     return out
 
 
+def limits(nm: float) -> dict[Channel, EventLimits]:
+    """What moves or wanders by this much is no noise."""
+    return {MOTOR1: EventLimits(AR, STEP_S, jump_nm=nm, wander_nm=nm)}
+
+
 def test_events_are_found_at_their_times() -> None:
     parts = [gaussian(k) for k in range(3)]
     parts[0][4000:4010] += 3.0  # a reading that drops for 50 ms
     parts[2][8000:8200] -= 2.0  # a second that is off: a step at both ends
     parts[2][11000:11050] = np.nan
     runs = [run_data(f"run{k}", {MOTOR1: x}, {}) for k, x in enumerate(parts)]
-    events = bursts(runs, {MOTOR1: parts}, {MOTOR1: AR}, STEP_S, {MOTOR1: 0.5})[MOTOR1]
+    events = bursts(runs, {MOTOR1: parts}, limits(0.5))[MOTOR1]
     found = events.burst
     assert [t for name, t in found.times if name == "run0"] == [20.0]
     off = sorted(t for name, t in found.times if name == "run2")
@@ -193,9 +198,7 @@ def test_events_are_found_at_their_times() -> None:
     assert not events.masks[1].any()
     assert events.part == pytest.approx(sum(m.sum() for m in events.masks) / 36000.0)
     assert events.part < 0.01
-    assert bursts(runs, {MOTOR1: parts}, {MOTOR1: AR}, STEP_S, {MOTOR1: 9.0}) == {}, (
-        "too small to be relevant"
-    )
+    assert bursts(runs, {MOTOR1: parts}, limits(9.0)) == {}, "too small to be relevant"
 
 
 def test_an_event_is_all_of_it() -> None:
@@ -203,7 +206,7 @@ def test_an_event_is_all_of_it() -> None:
     x = gaussian(4)
     x[6000:6066] += 5.0
     run = run_data("run0", {MOTOR1: x}, {})
-    found = bursts([run], {MOTOR1: [x]}, {MOTOR1: AR}, STEP_S, {MOTOR1: 0.5})[MOTOR1]
+    found = bursts([run], {MOTOR1: [x]}, limits(0.5))[MOTOR1]
     assert found.masks[0][6000:6066].all()
     assert found.masks[0].sum() < 66 + 60
     assert found.burst.excess_nm2 == pytest.approx(66 * 25.0 / 12000.0, rel=0.1)
@@ -213,7 +216,7 @@ def test_gaussian_noise_has_no_events() -> None:
     for seed in range(5):
         parts = [gaussian(10 * seed + k, 24000) for k in range(2)]
         runs = [run_data(f"run{k}", {MOTOR1: x}, {}) for k, x in enumerate(parts)]
-        assert bursts(runs, {MOTOR1: parts}, {MOTOR1: AR}, STEP_S, {MOTOR1: 0.0}) == {}
+        assert bursts(runs, {MOTOR1: parts}, limits(0.0)) == {}
 
 
 def turning(seed: int) -> dict[str, FloatArray]:
@@ -291,16 +294,14 @@ def test_a_zero_that_jumps_wanders() -> None:
     steady = rng.normal(0.0, 0.5, 6000)
     level = np.repeat(rng.choice([-0.3, 0.3], 30), 200)
     runs = [run_data("run", {MOTOR1: steady}, {})]
-    assert wandering(runs, {MOTOR1: [steady]}, STEP_S, {MOTOR1: 0.1}) == []
+    assert wandering(runs, {MOTOR1: [steady]}, limits(0.1)) == []
     seldom = steady + np.repeat(np.where(np.arange(30) % 10 == 4, 1.0, 0.0), 200)
-    (far,) = wandering(runs, {MOTOR1: [seldom]}, STEP_S, {MOTOR1: 0.7})
+    (far,) = wandering(runs, {MOTOR1: [seldom]}, limits(0.7))
     assert sorted(t for _, t in far.times[:3]) == pytest.approx([4.5, 14.5, 24.5]), (
         "seldom, but far out of all others"
     )
-    assert wandering(runs, {MOTOR1: [steady]}, STEP_S, {MOTOR1: 0.05}) == [], (
-        "ordinary seconds are not far out"
-    )
-    (found,) = wandering(runs, {MOTOR1: [steady + level]}, STEP_S, {MOTOR1: 0.1})
+    assert wandering(runs, {MOTOR1: [steady]}, limits(0.05)) == [], "ordinary seconds are not far out"
+    (found,) = wandering(runs, {MOTOR1: [steady + level]}, limits(0.1))
     assert found.excess_nm2 == pytest.approx(0.09, rel=0.15)
     assert found.share == pytest.approx(0.09 / 0.34, rel=0.2)
     assert found.name.startswith("seconds: run ")

@@ -1,0 +1,98 @@
+"""The runs of a diagnosis with all that effects in them are judged by, and the effects fitted to them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from jtqd.sysid.diagnosis.dataset import Dataset
+from jtqd.sysid.diagnosis.leave_one_out import ENOUGH_RUNS
+from jtqd.sysid.diagnosis.leftover import Leftover, events_left, leftover
+from jtqd.sysid.diagnosis.noise import Noise
+from jtqd.sysid.diagnosis.refine import Refined, contributions, present_effects, refine
+from jtqd.sysid.diagnosis.regressors import EffectCandidate
+from jtqd.sysid.diagnosis.search import Hypothesis, Search
+from jtqd.sysid.diagnosis.searched import searched
+from jtqd.sysid.diagnosis.signals import Channel
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A set of effects with refined parameters."""
+
+    hypothesis: Hypothesis
+    refined: Refined
+
+    @property
+    def chosen(self) -> tuple[EffectCandidate, ...]:
+        """The effects, in the order of `refined.present`."""
+        return self.hypothesis.chosen
+
+
+@dataclass(frozen=True)
+class Case:
+    """Runs, their noise, the library's search on them; relevance: part of the rated torque, rms over a run, from which what
+    effects leave matters.
+    """
+
+    dataset: Dataset
+    noise: Noise
+    search: Search
+    relevance: float
+
+    @property
+    def few(self) -> bool:
+        """Whether what is named must hold on each held-out run (`leave_one_out`)."""
+        return self.search.mixed.runs < ENOUGH_RUNS
+
+    @property
+    def limits(self) -> dict[Channel, float]:
+        """Rms from which what is left over matters, per channel [Nm]."""
+        rated = {n: joint.rated_torque_nm for n, joint in self.dataset.joints.items()}
+        return {c: self.relevance * rated[c.joint] for c in self.dataset.runs[0].channels}
+
+    def without_recording(self, number: int) -> Case:
+        """Return the case of the other recordings, with the noise of all of them."""
+        others = self.dataset.without_recording(number)
+        return Case(others, self.noise, self.search.without_run(number), self.relevance)
+
+    def fit(self, hypothesis: Hypothesis) -> Fit:
+        """Return a set of effects with refined parameters; the signals then have the torsion that it says."""
+        return Fit(hypothesis, refine(self.dataset, present_effects(hypothesis), self.noise))
+
+    def refit(self, fit: Fit, chosen: Sequence[EffectCandidate]) -> Fit:
+        """Return the fit of other effects, begun at the variances of a fit."""
+        return self.fit(self.search.hypothesis(chosen, fit.hypothesis.model))
+
+    def rms_nm(self, fit: Fit) -> list[dict[Channel, float]]:
+        """Return per effect the rms of its contribution in each channel, over valid bins [Nm]."""
+        out = []
+        for present in fit.refined.present:
+            found = {c: np.concatenate(parts) for c, parts in contributions(self.dataset, present).items()}
+            out.append({c: float(np.sqrt(np.mean(x * x))) for c, x in found.items() if len(x)})
+        return out
+
+    def energies_nm2(self, fit: Fit) -> list[float]:
+        """Return the energy that each effect explains, summed over channels [Nm^2]."""
+        return [sum(r * r for r in rms.values()) for rms in self.rms_nm(fit)]
+
+    def left_over(self, fit: Fit) -> Leftover:
+        """Return what the effects leave over."""
+        return leftover(self.dataset, fit.refined, self.noise)
+
+
+def search_case(dataset: Dataset, relevance: float) -> tuple[Case, Fit]:
+    """Return a dataset with noise and search, and the fit of what the search finds; again without the events that no effect
+    makes: they shall bend none.
+    """
+    case, fit = _searched(dataset, relevance)
+    events = events_left(dataset, fit.refined, case.noise)
+    return _searched(dataset.without_events(events), relevance) if events else (case, fit)
+
+
+def _searched(dataset: Dataset, relevance: float) -> tuple[Case, Fit]:
+    noise, search, best = searched(dataset)
+    case = Case(dataset, noise, search, relevance)
+    return case, case.fit(best)

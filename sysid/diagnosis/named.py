@@ -1,0 +1,155 @@
+"""What was found, and what of it may be named: relevant, not objected to, and certain beside what is left over."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final
+
+from jtqd.sysid.diagnosis.case import Case, Fit
+from jtqd.sysid.diagnosis.evidence import class_beside, equivalence_class
+from jtqd.sysid.diagnosis.findings import joint_text
+from jtqd.sysid.diagnosis.guards import nothing_of, objections
+from jtqd.sysid.diagnosis.leave_one_out import LeaveOneOut
+from jtqd.sysid.diagnosis.leftover import Leftover
+from jtqd.sysid.diagnosis.regressors import EffectCandidate
+from jtqd.sysid.diagnosis.search import Hypothesis
+from jtqd.sysid.diagnosis.signals import Channel
+from jtqd.sysid.diagnosis.steadiness import steadiness
+
+UNEXPLAINED_SHARE: Final = 0.05
+"""Part of all structure (as squares) that must be left over as well for it to matter."""
+FEW_UNEXPLAINED_SHARE: Final = 0.2
+"""The same with two or three runs, where more of what is left over is the runs' own."""
+UNSTEADY: Final = "its size is not the same in all runs and under all conditions"
+BESIDE: Final = 0.02
+"""Part of the largest cause's contribution below which another one is within the model's own inaccuracy."""
+_FAR_FROM_CERTAIN: Final = 0.25
+"""Part of the steadiness that is needed below which effects are taken away at once, not one by one."""
+_MOST_SAID: Final = 4
+"""Lines about effects that fit and are not named."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """What was found in a case, and what may be named of it.
+
+    whole: all that no guard objects to; named: what of it is certain enough; shown: the fit that what is left over is drawn
+    with; few: the rule for few runs, None with enough; left: what is left over; share: of all structure; limits: rms from
+    which it matters [Nm]; refused: the objections.
+    """
+
+    case: Case
+    whole: Hypothesis
+    named: Fit
+    shown: Fit
+    few: LeaveOneOut | None
+    left: Leftover
+    share: float
+    limits: Mapping[Channel, float]
+    refused: Sequence[str]
+
+    @property
+    def large(self) -> bool:
+        """Whether what is left over is relevant by its size."""
+        return any(nm > self.limits[c] for c, nm in self.left.worst_nm.items())
+
+    @property
+    def matters(self) -> bool:
+        """Whether what is left over matters: by its size, and as a part of the gap."""
+        part = UNEXPLAINED_SHARE if self.few is None else FEW_UNEXPLAINED_SHARE
+        return self.large and (self.share > part or not self.whole.chosen)
+
+    @property
+    def beside(self) -> bool:
+        """Whether causes have to be certain beside what is left over, however small a part of the gap it is: a small effect
+        may imitate it. With few runs they have a rule of their own.
+        """
+        return self.large and self.few is None
+
+    @cached_property
+    def classes(self) -> list[tuple[EffectCandidate, ...]]:
+        """Per effect that may be named the alternatives that these runs do not rule out."""
+        best = self.named.hypothesis
+        if self.few is not None:
+            return [self.few.rivals(best, c) for c in best.chosen]
+        alternatives = class_beside if self.beside else equivalence_class
+        return [alternatives(self.case.search, best, c) for c in best.chosen]
+
+
+def found_in(case: Case, fit: Fit) -> Found:
+    """Return what was found in a case; fit: of the best set of its search."""
+    few = LeaveOneOut(case.dataset, case.search) if case.few else None
+    fit, refused = _guarded(case, fit, bounds_only=few is not None)
+    whole, left, explained = fit.hypothesis, case.left_over(fit), sum(case.energies_nm2(fit))
+    if few is not None:  # what is left over is judged with all that was found, names need more
+        fit, refused = _guarded(case, case.fit(few.confirmed(whole)))
+        with_names = case.left_over(fit)
+        if with_names.energy_nm2() < left.energy_nm2():
+            whole, left, explained = fit.hypothesis, with_names, sum(case.energies_nm2(fit))
+    found = Found(case, whole, fit, fit, few, left, left.share(explained), case.limits, refused)
+    if not found.beside:
+        return found
+    sure = certain(case, fit)
+    weak = [c for c in whole.chosen if c not in sure.chosen]
+    if weak and not found.matters:  # what is not certain is left over, too
+        left = case.left_over(sure)
+        found = replace(
+            found,
+            whole=sure.hypothesis,
+            shown=sure,
+            left=left,
+            share=left.share(sum(case.energies_nm2(sure))),
+            refused=[*refused, *(_refused(c, UNSTEADY) for c in weak)],
+        )
+    return replace(found, named=sure)
+
+
+def named_in(case: Case, fit: Fit) -> Sequence[EffectCandidate]:
+    """Return what may be named of a case, without a look at fewer runs."""
+    return found_in(case, fit).named.chosen
+
+
+def certain(case: Case, fit: Fit) -> Fit:
+    """Return the fit of those effects only that are certain whatever is left over (`steadiness`)."""
+    while fit.chosen:
+        margins = [s.margin for s in steadiness(fit.refined, case.noise, nothing_of(fit.hypothesis))]
+        if min(margins) >= 1.0:
+            break
+        least = max(min(margins), _FAR_FROM_CERTAIN)
+        fit = case.refit(fit, [c for c, m in zip(fit.chosen, margins, strict=True) if m > least])
+    return _relevant(case, fit)
+
+
+def _guarded(case: Case, fit: Fit, *, bounds_only: bool = False) -> tuple[Fit, list[str]]:
+    """Return the fit without irrelevant effects and without those that a guard objects to, and the objections; with enough
+    runs the search is made again without the first of them.
+    """
+    said: list[str] = []
+    while True:
+        fit = _relevant(case, fit)
+        against = objections(case.dataset, fit.hypothesis, fit.refined, bounds_only=bounds_only)
+        if not against:
+            return fit, said[:_MOST_SAID]
+        again = not said and not case.few
+        weak = [fit.chosen[k] for k, _ in against]
+        said += [_refused(c, why) for c, (_, why) in zip(weak, against, strict=True)]
+        case.search.rejected.update(c.key for c in weak)
+        rest = [c for c in fit.chosen if c not in weak]
+        fit = case.fit(case.search.confirmed()) if again else case.refit(fit, rest)
+
+
+def _relevant(case: Case, fit: Fit) -> Fit:
+    """Return the fit without effects that are too small to matter, by themselves or beside the largest."""
+    while True:
+        sizes = [max(rms.values(), default=0.0) for rms in case.rms_nm(fit)]
+        least = max(case.search.least_nm, BESIDE * max(sizes, default=0.0))
+        large = [c for c, size in zip(fit.chosen, sizes, strict=True) if size >= least]
+        if len(large) == len(fit.chosen):
+            return fit
+        fit = case.refit(fit, large)
+
+
+def _refused(candidate: EffectCandidate, why: str) -> str:
+    return f"{candidate.effect.name} of {joint_text(candidate.joint)} fits but is not named: {why}"
