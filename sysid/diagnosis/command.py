@@ -227,7 +227,7 @@ def parser() -> argparse.ArgumentParser:
         "--config",
         type=Path,
         metavar="FILE",
-        help="configuration of jtqd for the printed command (default: a place for it; none for the bench that ships)",
+        help="configuration of jtqd for the printed command (default: CONFIG, to be replaced; none for the shipped bench)",
     )
     parser.add_argument(
         "--bus", default="can0", metavar="BUS", help="bus for the printed command (default can0)"

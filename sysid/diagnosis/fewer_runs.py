@@ -106,6 +106,7 @@ def with_fewer(found: Found, anew: Names) -> tuple[Found, list[str]]:
             gone.setdefault(c.key, (c, []))[1].append(without)
         sets += [chosen] if new else []
     if not gone:
+        case.fit(best)  # the signals have the torsion of the last fit, which was of fewer runs
         return found, []
     beside = {
         key: case.search.hypothesis((*best.chosen, c), best.model)
@@ -115,7 +116,7 @@ def with_fewer(found: Found, anew: Names) -> tuple[Found, list[str]]:
     compared = Compared(case.dataset, case.search, best)
     together = [(None, case.search.hypothesis(chosen, best.model)) for chosen in sets]
     kept, why = _borne_out(found, compared, [*beside.items(), *together])
-    fit = case.fit(kept)  # whatever is kept: the signals have the torsion of the last fit
+    fit = case.fit(kept)  # whatever is kept: as above
     said = [kept_text(c, compared.nm(best), compared.nm(kept)) for c in kept.chosen if c.key in gone]
     there = {c.key for c in kept.chosen}
     for key, (c, runs) in gone.items():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 from jtqd.sysid.diagnosis import fewer_runs, named
 from jtqd.sysid.diagnosis.case import Case, Fit
 from jtqd.sysid.diagnosis.dataset import Dataset
-from jtqd.sysid.diagnosis.fewer_runs import Compared, Gone, _borne_out
+from jtqd.sysid.diagnosis.fewer_runs import Compared, Gone, _borne_out, with_fewer
 from jtqd.sysid.diagnosis.findings import UNEXPLAINED
 from jtqd.sysid.diagnosis.leftover import Leftover
 from jtqd.sysid.diagnosis.mixed_model import Mixed
@@ -123,3 +124,26 @@ def test_what_two_recordings_of_a_real_arm_name_does_not_go_without_a_word() -> 
     assert three.verdict == UNEXPLAINED
     assert not three.causes
     assert any(r.startswith("coulomb_friction of joint 1 would be named without") for r in three.reasons)
+
+
+def test_the_signals_end_with_the_torsion_of_what_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fewer runs are fitted on the same signals; where they name nothing new, what is named is fitted last all the same."""
+    fitted = []
+
+    class Recorded:
+        def fit(self, hypothesis: object) -> object:
+            fitted.append(hypothesis)
+            return Fit(cast(Hypothesis, hypothesis), cast(Refined, None))
+
+    def of_fewer(found: Found, here: object, anew: object) -> list[tuple[str, list[object]]]:
+        cast(Recorded, found.case).fit("of fewer runs")
+        return [("run_1", [])]
+
+    monkeypatch.setattr(fewer_runs, "_named_by_fewer", of_fewer)
+    best = search_of(problem(3, {0: 0.8}), LIBRARY).hypothesis(())
+    found = SimpleNamespace(
+        case=Recorded(), named=Fit(best, cast(Refined, None)), classes=[], whole=best, shown=None
+    )
+    after, said = with_fewer(cast(Found, found), lambda number: [])
+    assert (after, said) == (found, [])
+    assert fitted == ["of fewer runs", best]
