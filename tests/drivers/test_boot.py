@@ -716,6 +716,19 @@ def test_a_mapping_that_is_fixed_in_the_drive_is_used_where_it_is_the_right_one(
     assert node.tpdos == (drive_tpdo1(1), drive_tpdo2(1))
 
 
+def test_a_temperature_in_a_fixed_mapping_is_used_where_it_is_alone_in_tpdo3(bench):
+    fixed(bench.drive1, *ELSEWHERE[:2], (0x3001_0010,))
+    bench.drive1.store.set_number(0x1802, 2, 255)
+    objects = {"link_position": None}
+    nodes = [{"node": 1, "kind": "drive", "temperature": True, "objects": objects}]
+    used = bench.boot(nodes=nodes).nodes[1].tpdos
+    assert [pdo.words for pdo in used][2:] == [(0x3001_0010,)]
+    assert used[2].transmission_type == 255
+    nodes[0]["temperature"] = {"index": 0x6077, "c_per_unit": 0.1}
+    with pytest.raises(BootError, match=r"no TPDO with COB-ID 381h carries 6077h:0 alone \(temperature\)"):
+        bench.boot(nodes=nodes)
+
+
 @pytest.mark.parametrize("writable", [(), COB_IDS])
 def test_a_mapping_that_is_fixed_otherwise_is_used_as_it_is(bench, writable):
     fixed(bench.drive1, *ELSEWHERE, writable=writable)

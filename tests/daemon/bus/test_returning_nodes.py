@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
-from jtqd.daemon.bus.boot import ReturningNodes, gear_ratio_error
+from jtqd.daemon.bus.boot import ReturningNodes, boot_request, gear_ratio_error
 from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
+from jtqd.models.files import shipped
 
 NODE = {"scaling": {"k": 1.0}, "gear_ratio": 100.0, "serial": 7, "notes": []}
 
@@ -160,3 +163,38 @@ def test_a_gear_ratio_of_another_joint_is_an_error_from_half_a_percent_on(config
     assert gear_ratio_error(config, joint.node_id, None) is None
     assert "6091h gear ratio" in (gear_ratio_error(config, joint.node_id, 0.99 * ratio) or "")
     assert gear_ratio_error(config, 99, 1.0) is None
+
+
+def test_what_the_configuration_says_of_the_boot_is_in_its_request(tmp_path: Path) -> None:
+    content = yaml.safe_load(shipped("bench.yaml").read_text())
+    for number in (1, 2):
+        section = content[f"joint_{number}"]
+        section["file"] = str(shipped(section["file"]))
+        del section["network"]
+    content["estimator"] = {"method": "tob"}
+    content["joint_2"]["sdo_timeout_ms"] = 900
+    path = tmp_path / "c.yaml"
+
+    def asked(**nodes: object) -> dict[str, Any]:
+        path.write_text(yaml.safe_dump(content | {"nodes": nodes}))
+        return boot_request(load_config(path), "b")
+
+    assert asked()["reset"] is True
+    assert asked()["sync"]["counter_overflow"] == 0, "a drive comes back with 1019h = 0"
+    found = asked(reset_communication=False, sdo_timeout_ms=700)
+    assert found["reset"] is False
+    assert [each["sdo_timeout_ms"] for each in found["nodes"]] == [700, 900, 700]
+    content["sync"]["counter_overflow"] = 240
+    assert asked()["sync"]["counter_overflow"] == 240
+
+
+def test_where_resets_are_switched_off_a_boot_that_failed_resets_nothing(
+    tmp_path: Path, config: Config
+) -> None:
+    case = Case(tmp_path, replace(config, reset_communication=False))
+    case.nodes.told(1, 0x11)
+    case.nodes.request(1, "changed")
+    case.now[1] = None
+    for _ in range(2):
+        case.run(1.0)
+        assert case.boot.request["reset"] is False
