@@ -538,7 +538,7 @@ def drive_lines(joint: JointDraft) -> list[str]:
         lines.append("  given:                  # instead of what the drive says")
         for key, value in joint.given.items():
             entry = f'    "{label(*key)}": {round(value.number)}'
-            lines.append(f"{entry:<26}# {'GUESS, ' * value.guess}{value.origin}")
+            lines.append(f"{entry:<25} # {'GUESS, ' * value.guess}{value.origin}")
     if joint.family is not None:
         lines.append(f"  profile: {joint.family.name:<15}# docs/profiles.md")
     rest = "CiA 402" if joint.family is None else "the profile"
@@ -546,7 +546,7 @@ def drive_lines(joint: JointDraft) -> list[str]:
         lines.append(f"  objects:                # of this drive; all else is as in {rest}")
     for name, each in joint.instead.items():
         guess = "GUESS, " if each.better else ""
-        lines.append(f"{f'    {name}: {each.text}':<26}# {guess}{each.why}")
+        lines.append(f"{f'    {name}: {each.text}':<25} # {guess}{each.why}")
     return [*lines, *_own_lines(joint.own), *(f"  {line}" for line in tpdo_lines(joint.layout))]
 
 

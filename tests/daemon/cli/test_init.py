@@ -159,6 +159,9 @@ def test_a_drive_that_tells_less_gets_objects_that_say_so(without, wanted, objec
     text = "\n".join(drive_lines(draft))
     assert yaml.safe_load(text)["joint_1"]["objects"] == objects
     assert why in text
+    assert all(line[at - 1] == " " for line in text.splitlines() if (at := line.find("#")) > 0), (
+        "YAML wants it"
+    )
     (tmp_path / "joint_1.yaml").write_text(joint_text(draft))
     config = tmp_path / "c.yaml"
     config.write_text(config_text(ConfigDraft("can0", 1_000_000, 1000, [draft], None, None, (), 2000)))
