@@ -52,7 +52,7 @@ def write_png(card: Card, path: Path) -> None:
         above, panels, below = figure.subfigures(3, 1, height_ratios=(head, 6.4, foot))
         _panels(panels, card)
         above.text(0.012, 0.86, f"Accuracy of {card.joint}", fontsize=15, weight="bold", va="top")
-        above.text(0.012, 0.56, f"{name_of(card.method)}; {source(card)}", color=LIGHT["soft"], va="top")
+        above.text(0.012, 0.56, f"method {card.method}; {source(card)}", color=LIGHT["soft"], va="top")
         for place, (title, value, more) in enumerate(tiles(card)):
             x = 0.012 + 0.245 * place
             above.text(x, 0.34, f"{title}: {value}", weight="bold", va="top")
@@ -68,11 +68,6 @@ def write_png(card: Card, path: Path) -> None:
         )
         figure.savefig(path, dpi=110)
         plt.close(figure)
-
-
-def name_of(method: str) -> str:
-    """Return a method as jtqd's configuration names it."""
-    return "method fused, without a network" if method == "physics" else f"method {method}"
 
 
 def source(card: Card) -> str:

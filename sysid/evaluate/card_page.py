@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from jtqd.sysid.evaluate.card import SCHEMA, Advice, Bin, Card, load_name
-from jtqd.sysid.evaluate.card_figure import card_figure, name_of, source, tiles
+from jtqd.sysid.evaluate.card_figure import card_figure, source, tiles
 from jtqd.sysid.evaluate.report import plain_values, table
 from jtqd.sysid.report import page
 from jtqd.sysid.report.figures import page_svg
@@ -23,7 +23,7 @@ def card_html(
         "cards": [
             {
                 "joint": card.joint,
-                "title": name_of(card.method),
+                "title": f"method {card.method}",
                 "source": source(card),
                 "tiles": tiles(card),
                 "advice": card.advice,
@@ -60,7 +60,7 @@ def _bin(each: Bin) -> dict[str, Any]:
 
 def card_lines(card: Card) -> list[str]:
     """Return the card for a terminal."""
-    lines = [f"{card.joint}: {name_of(card.method)}; {source(card)}"]
+    lines = [f"{card.joint}: method {card.method}; {source(card)}"]
     lines += [
         f"  {title:<15}{value}{f' ({more})' if more else ''}".rstrip() for title, value, more in tiles(card)
     ]

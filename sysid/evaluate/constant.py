@@ -193,15 +193,14 @@ def outside_scores(samples: Sequence[Samples], envelopes: dict[int, Envelope]) -
     """Return the scores of each joint that has an envelope and samples outside of it."""
     found = []
     for number, envelope in sorted(envelopes.items()):
-        own = [
-            each for each in samples if each.number == number and {OURS, "physics"} <= set(each.estimate_nm)
-        ]
+        own = [each for each in samples if each.number == number and OURS in each.estimate_nm]
         limits = training_range(envelope)
         beyonds = [beyond(each, limits) for each in own]
         masks = [each.scored & (load | warm) for each, (load, warm) in zip(own, beyonds, strict=True)]
         pairs = list(zip(own, masks, strict=True))
         ours = score([Block(each.error_nm(OURS)[mask], each.rated_nm) for each, mask in pairs])
-        physics = score([Block(each.error_nm("physics")[mask], each.rated_nm) for each, mask in pairs])
+        bare = "physics" if all("physics" in each.estimate_nm for each in own) else OURS
+        physics = score([Block(each.error_nm(bare)[mask], each.rated_nm) for each, mask in pairs])
         if ours is None or physics is None:
             continue
         status = np.concatenate([each.status[OURS][mask] for each, mask in pairs])

@@ -224,10 +224,13 @@ def _samples(judged: Iterable[_Judged]) -> list[Samples]:
 
 
 def _envelopes(models: Iterable[JointModels]) -> dict[int, Envelope]:
-    networks = {each.number: each.networks.get(OURS) for each in models}
-    return {
-        number: network.envelope for number, network in networks.items() if isinstance(network, FusedNetwork)
-    }
+    """Return where each joint was known to the network of ours, or without one to the fit."""
+    found = {}
+    for each in models:
+        network = each.networks.get(OURS)
+        fitted = None if each.joint.fused is None else each.joint.fused.envelope
+        found[each.number] = network.envelope if isinstance(network, FusedNetwork) else fitted
+    return {number: envelope for number, envelope in found.items() if envelope is not None}
 
 
 def _picture(samples: Sequence[Samples], modes: Mapping[str, int | None]) -> Samples | None:
@@ -441,7 +444,7 @@ def _outside(found: Sequence[constant.Outside]) -> tuple[Target, Target]:
         ),
         Target(
             "outside_flagged",
-            "flagged degraded outside the network's own envelope",
+            "flagged degraded outside the envelope of network or fit",
             "-",
             "-",
             "not evaluated (--outside)" if flagged is None else f"{100.0 * flagged:.2f} %",

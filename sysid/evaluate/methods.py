@@ -1,9 +1,9 @@
 """Load the methods that are compared from a directory of models, and estimate one joint of a run with each.
 
 DIR holds jointN.yaml or joint_N.yaml (joint file; the second as `jtq init` writes it), jointN.onnx (the paper's network)
-and jointN.fused.onnx (ours). What is missing leaves its methods out, by name. Joint files name the runs that they were made
-from in `provenance` (every mapping of a section's `sha256`), networks in the metadata key `runs` and in a card jointN.json
-or jointN.fused.json beside them.
+and jointN.fused.onnx (ours; without it ours is its physics alone). What is missing leaves its methods out, by name. Joint
+files name the runs that they were made from in `provenance` (every mapping of a section's `sha256`), networks in the
+metadata key `runs` and in a card jointN.json or jointN.fused.json beside them.
 
 Only samples at which all methods move and have a value are scored, the same ones for each: a method must not look better
 because it was silent where the others were wrong.
@@ -121,7 +121,9 @@ TITLES: Final = MappingProxyType(
         "fused": "ours",
     }
 )
-"""Methods in the order of every table. `physics` is `fused` without its network; the others are jtqd's own names."""
+"""Methods in the order of every table. `physics` is `fused` without its network, where it has one; the others are jtqd's
+own names.
+"""
 
 OURS: Final = "fused"
 PAPERS_BANDWIDTH: Final = EstimatorSettings().bandwidth_rad_s
@@ -213,7 +215,10 @@ def _joint_models(path: Path, number: int) -> JointModels:
     for method, name in ((PAPERS, f"joint{number}.onnx"), (OURS, f"joint{number}.fused.onnx")):
         source = directory / name
         if not source.exists():
-            missing[method] = f"no {name} in {directory}"
+            if method == PAPERS:
+                missing[method] = f"no {name} in {directory}"
+            else:  # as jtqd runs it
+                missing["physics"] = f"ours is its physics, since there is no {name} in {directory}"
             continue
         network = load_network(method, str(source))
         if network.joint != joint.name:

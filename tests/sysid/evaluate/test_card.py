@@ -159,12 +159,12 @@ def test_the_command_writes_page_pictures_and_values(
     arguments = [str(base / "runs"), "--models", str(base / "models"), "--out", str(base / "out")]
     assert main([*arguments, "--card"]) == 0
     shown = capsys.readouterr().out
-    assert "method fused, without a network; 2 runs" in shown
+    assert "method fused; 2 runs" in shown
     assert "what to measure next" in shown
     values = json.loads((base / "out" / "card.json").read_text())
     assert values["schema"] == "jtq.accuracy/1"
     (joint,) = values["joints"]
-    assert joint["method"] == "physics"
+    assert joint["method"] == "fused"
     assert joint["baseline"]["rmse_nm"] > 0.0
     assert f"RMSE           {joint['error']['rmse_nm']:.2g} Nm" in shown
     page = (base / "out" / "card.html").read_text()
