@@ -351,7 +351,13 @@ def bad_reload():
         "a joint file that is none": (joint, "name: joint1\ngear_ratio: -5\n"),
         "a joint file without YAML": (joint, "name: [\n"),
         "another period": (CONFIG, configuration.replace(f"period_us: {PERIOD_US}", "period_us: 20000")),
-        "a network with another hash": (CONFIG, re.sub("sha256: [0-9a-f]", "sha256: x", configuration)),
+        "a network with another hash": (
+            CONFIG,
+            configuration.replace(
+                "  file: trained/joint1.yaml\n",
+                "  file: trained/joint1.yaml\n  network: {file: trained/joint1.onnx, sha256: '00'}\n",
+            ),
+        ),
     }
     seen = {}
     try:
