@@ -73,9 +73,7 @@ def recommended(method: str) -> EstimatorSettings:
     """Return the settings of a new configuration with this method. Raises ConfigError for an unknown one."""
     if method != "fused":
         return EstimatorSettings(method=method)
-    return EstimatorSettings(
-        method=method, torsion_bandwidth_rad_s=TORSION_BANDWIDTH_RAD_S, track_zeros=True, track_link=True
-    )
+    return EstimatorSettings(method=method, torsion_bandwidth_rad_s=TORSION_BANDWIDTH_RAD_S, track_zeros=True)
 
 
 @dataclass(frozen=True, slots=True)

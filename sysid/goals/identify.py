@@ -195,7 +195,7 @@ def _with_others(
     return replace(one, joint=joint, network=network.data, baselines=baselines)
 
 
-OF_BASELINES: Final = replace(recommended("fused"), track_link=False)
+OF_BASELINES: Final = recommended("fused")
 """What is least squares on torsion and current has the torsion through its low pass."""
 
 

@@ -21,12 +21,12 @@ from jtqd.sysid.goals.baselines import BASELINES
 from jtqd.sysid.goals.identify import OF_BASELINES, Driven, Identified, observed
 
 ZEROS: Final = "ours_zeros"
-LOW_PASS: Final = "ours_low_pass"
-"""As ZEROS, but with the low pass of the torsion in place of the tracked link: 1.25 ms old."""
+TRACKED: Final = "ours_tracked"
+"""As ZEROS, but with the link tracked in place of the low pass of the torsion: of now."""
 TITLES: Final = {
     OURS: "ours",
     ZEROS: "ours, zeros tracked",
-    LOW_PASS: "ours, zeros tracked, torsion through its low pass",
+    TRACKED: "ours, zeros and link tracked",
     **{name: baseline.title for name, baseline in BASELINES.items()},
     PAPERS: "the paper's chain",
     "efficiency": "TOB with efficiency",
@@ -113,8 +113,8 @@ def judge(
 
 def settings_of(name: str) -> EstimatorSettings:
     """Return the settings of a new configuration for a method of the estimator."""
-    if name in (*OWN, LOW_PASS):
-        return replace(recommended(OURS), track_zeros=name != OURS, track_link=name != LOW_PASS)
+    if name in (*OWN, TRACKED):
+        return replace(recommended(OURS), track_zeros=name != OURS, track_link=name == TRACKED)
     return recommended(name)
 
 

@@ -102,7 +102,7 @@ def errors_on(name: str, table: RunTable, number: int, joint: Joint) -> RunError
         ):
             continue
         # it is the joint file that is scored: one age for all files, also of before the link was tracked
-        settings = replace(recommended(method), track_zeros=False, track_link=False)
+        settings = replace(recommended(method), track_zeros=False)
         estimate = estimate_columns(joint, settings, None, table.time_s, columns).torque_nm
         sensor = aligned(columns.torque_nm, dt, joint, settings)
         errors[title] = _rms((estimate - sensor)[settled])

@@ -59,7 +59,7 @@ class Row(NamedTuple):
 
 def judged(run: WorldRun, joint: Joint, change: Change) -> Row | None:
     """Return the row of one joint in one run; None where it hardly moves."""
-    settings = replace(recommended("fused"), track_zeros=True, track_link=False)
+    settings = replace(recommended("fused"), track_zeros=True)
     _, current, motor, velocity, link = run.table.estimator_inputs(run.number, joint.gear_ratio)
     changed = change(link, motor / joint.gear_ratio, joint.gear_ratio)
     temperature = run.table.joint(run.number, joint.gear_ratio).temperature_c

@@ -67,7 +67,7 @@ def judged(joint: Joint, table: RunTable, number: int, truth_nm: FloatArray) -> 
     envelope = joint.fused.envelope
     assert envelope is not None
     assert envelope.temperature_c is not None
-    settings = replace(recommended("fused"), track_zeros=False, track_link=False)
+    settings = replace(recommended("fused"), track_zeros=False)
     columns = table.joint(number, joint.gear_ratio)
     _, current, motor, velocity, link = table.estimator_inputs(number, joint.gear_ratio)
     got = make_estimator(joint, settings).run(

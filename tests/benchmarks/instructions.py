@@ -55,7 +55,6 @@ def work(method: str) -> None:
     joint = load_joint(shipped("trained/joint1.yaml"))
     assert joint.fused is not None
     assert joint.fused.agreement is not None
-    assert joint.fused.tracking is not None
     with tempfile.TemporaryDirectory() as directory:
         estimator = make_estimator(joint, recommended(method), _network(method, Path(directory)))
     time = np.arange(SAMPLES) * 1e-3

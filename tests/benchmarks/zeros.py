@@ -79,7 +79,7 @@ def estimated(  # noqa: PLR0917 - a run and how it is estimated
     joint: Joint, table: RunTable, number: int, truth_nm: FloatArray, link_zero_rad: float, track: bool
 ) -> Estimated:
     """Estimate one joint of a run."""
-    settings = replace(recommended("fused"), track_zeros=track, track_link=False)
+    settings = replace(recommended("fused"), track_zeros=track)
     columns = table.joint(number, joint.gear_ratio)
     _, current, motor, velocity, link = table.estimator_inputs(number, joint.gear_ratio)
     estimator = make_estimator(joint, settings)

@@ -43,7 +43,6 @@ def test_the_shipped_configuration_is_read() -> None:
         method="fused",
         bandwidth_rad_s=200.0,
         torsion_bandwidth_rad_s=800.0,
-        track_link=True,
         track_zeros=True,
     )
     assert config.realtime == Realtime(80, None, True)

@@ -13,7 +13,7 @@ import yaml
 from jtqd.daemon.bus.boot import ReturningNodes, boot_request, gear_ratio_error
 from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
-from jtqd.models.files import shipped
+from tests.shipped_bench import shipped_bench
 
 NODE = {"scaling": {"k": 1.0}, "gear_ratio": 100.0, "serial": 7, "notes": []}
 
@@ -166,11 +166,7 @@ def test_a_gear_ratio_of_another_joint_is_an_error_from_half_a_percent_on(config
 
 
 def test_what_the_configuration_says_of_the_boot_is_in_its_request(tmp_path: Path) -> None:
-    content = yaml.safe_load(shipped("bench.yaml").read_text())
-    for number in (1, 2):
-        section = content[f"joint_{number}"]
-        section["file"] = str(shipped(section["file"]))
-        del section["network"]
+    content = shipped_bench()
     content["estimator"] = {"method": "tob"}
     content["joint_2"]["sdo_timeout_ms"] = 900
     path = tmp_path / "c.yaml"

@@ -178,11 +178,12 @@ def test_drive_states(bench: About) -> None:
 def test_degraded_and_invalid(bench: About) -> None:
     far = 1.01 * bench.joints[0].network_limit_nm
     degraded = WELL._replace(status=st.DEGRADED, physics_nm=10.0, network_nm=10.5)
+    alone = bench
+    bench = replace(bench, joints=(replace(bench.joints[0], network="joint1.fused.onnx"), *bench.joints[1:]))
     assert why(bench, degraded).startswith("outside the network's training range")
     assert "Nm from physics, limit" in why(bench, degraded._replace(network_nm=10.0 - far))
     assert "not finite" in why(bench, degraded._replace(network_nm=NAN))
     assert "no time for the network" in why(bench, degraded._replace(input_flags=0x1F))
-    alone = replace(bench, joints=(replace(bench.joints[0], network=None), *bench.joints[1:]))
     assert why(alone, degraded._replace(network_nm=NAN)).startswith(
         "outside of what the joint file was fitted to"
     )
