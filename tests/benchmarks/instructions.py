@@ -45,7 +45,7 @@ STAGES = tuple(
     for stage in ("begin", "gather", "observe", "publish", "record")
 )
 CYCLE = "cycle"
-"""Two joints, method `fused`, of SYNC to the record; what the kernel does in its system calls is not counted."""
+"""Two joints, method `fused`, of SYNC to the record, per cycle with a torque; what the kernel does is not counted."""
 SLOTS, PERIOD_US = 150, 20_000
 """Under valgrind a cycle takes some milliseconds."""
 
@@ -98,6 +98,7 @@ def cycles() -> None:
         source.end()
         torques = min(sum(spent[code] for code in PUBLISHED) for spent in view.status_cycles)
         assert torques > SLOTS // 2, f"found {torques} cycles of {SLOTS} with a torque"
+        print(torques)
 
 
 def count(method: str) -> float:
@@ -126,7 +127,8 @@ def count(method: str) -> float:
         found = re.search(r"^(?:totals|summary): (\d+)", out.read_text(), re.MULTILINE)
     if found is None or int(found[1]) == 0:
         raise RuntimeError("callgrind has counted nothing: is the build stripped?")
-    return int(found[1]) / (SLOTS if method == CYCLE else SAMPLES)
+    # a busy machine leaves inputs out, and a cycle without a torque costs little
+    return int(found[1]) / (int(done.stdout) if method == CYCLE else SAMPLES)
 
 
 def main() -> int:
